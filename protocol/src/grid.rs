@@ -1,0 +1,141 @@
+//! The grid every other module indexes: its [`Shape`], its [`Cell`]s and [`Grid`]s over it.
+//!
+//! Cells are `[row, col]`, rows grow downward, storage is row-major.
+
+use ndarray::{Array2, Array3};
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// One value per cell, shape `[H, W]`, row-major.
+pub type Grid<T> = Array2<T>;
+
+/// One probability per state and cell, shape `[S, H, W]`; sums to one over the first axis.
+///
+/// Planar, so that the kernels of eq. 2 run over contiguous rows of one state.
+pub type Probabilities = Array3<f32>;
+
+/// Largest height and width: 4096, so that one frame stays below 16 MiB.
+pub const MAX_SIDE: usize = 4096;
+
+/// Height and width of a grid, each in `1..=MAX_SIDE`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(try_from = "RawShape", into = "RawShape")]
+pub struct Shape {
+    height: usize,
+    width: usize,
+}
+
+/// One cell of a grid.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct Cell {
+    /// Row, 0 at the top.
+    pub row: usize,
+    /// Column, 0 at the left.
+    pub col: usize,
+}
+
+/// A height or width outside `1..=MAX_SIDE`.
+#[derive(Debug, Error, PartialEq, Eq)]
+#[error("grid shape: expected height and width in 1..={MAX_SIDE}, got {height} x {width}")]
+pub struct ShapeError {
+    height: usize,
+    width: usize,
+}
+
+impl Shape {
+    /// Checks both sides.
+    ///
+    /// # Errors
+    /// [`ShapeError`] when a side is outside `1..=MAX_SIDE`.
+    pub fn new(height: usize, width: usize) -> Result<Self, ShapeError> {
+        let side = 1..=MAX_SIDE;
+        if side.contains(&height) && side.contains(&width) {
+            Ok(Self { height, width })
+        } else {
+            Err(ShapeError { height, width })
+        }
+    }
+
+    /// Number of rows.
+    pub fn height(self) -> usize {
+        self.height
+    }
+
+    /// Number of columns.
+    pub fn width(self) -> usize {
+        self.width
+    }
+
+    /// `H * W`.
+    pub fn n_cells(self) -> usize {
+        self.height * self.width
+    }
+
+    /// Whether the cell lies on the grid.
+    pub fn contains(self, cell: Cell) -> bool {
+        cell.row < self.height && cell.col < self.width
+    }
+
+    /// Row-major index of a cell on the grid, in `0..n_cells()`.
+    pub fn index(self, cell: Cell) -> usize {
+        debug_assert!(self.contains(cell));
+        cell.row * self.width + cell.col
+    }
+
+    /// The cell at a row-major index.
+    pub fn cell(self, index: usize) -> Cell {
+        debug_assert!(index < self.n_cells());
+        Cell {
+            row: index / self.width,
+            col: index % self.width,
+        }
+    }
+
+    /// The cell in the middle (the lower right of the middle four on even sides).
+    pub fn centre(self) -> Cell {
+        Cell {
+            row: self.height / 2,
+            col: self.width / 2,
+        }
+    }
+
+    /// `(H, W)`, the shape of a [`Grid`].
+    pub fn dim(self) -> (usize, usize) {
+        (self.height, self.width)
+    }
+}
+
+impl std::fmt::Display for Shape {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} x {}", self.height, self.width)
+    }
+}
+
+impl std::fmt::Display for Cell {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "({}, {})", self.row, self.col)
+    }
+}
+
+#[derive(Serialize, Deserialize)]
+struct RawShape {
+    height: usize,
+    width: usize,
+}
+
+impl TryFrom<RawShape> for Shape {
+    type Error = ShapeError;
+
+    fn try_from(raw: RawShape) -> Result<Self, ShapeError> {
+        Self::new(raw.height, raw.width)
+    }
+}
+
+impl From<Shape> for RawShape {
+    fn from(shape: Shape) -> Self {
+        Self {
+            height: shape.height,
+            width: shape.width,
+        }
+    }
+}
