@@ -1,0 +1,415 @@
+//! The channels of one instance: names, node configuration, services and their limits.
+//!
+//! All channels of an instance live under `emberwatch/v1/<instance>/`, in a directory and under a
+//! prefix of the user's own, so that users never meet and no stray configuration file is read.
+
+use crate::message::{
+    ControlReply, ControlRequest, FrameHeader, Header, StepReply, StepRequest, TruthHeader,
+};
+use iceoryx2::node::{Node, NodeBuilder};
+use iceoryx2::prelude::{Config, FileName, Path, SemanticString, ServiceName};
+use iceoryx2::prelude::{SignalHandlingMode, ipc};
+use iceoryx2::service::builder::request_response as request_response_builder;
+use iceoryx2::service::builder::request_response::RequestResponseOpenError;
+use iceoryx2::service::port_factory::{PortFactory, event, publish_subscribe, request_response};
+use std::fmt::Debug;
+use std::fs::DirBuilder;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::path::PathBuf;
+use thiserror::Error;
+
+/// Most clients at a time on each of `step` and `control`.
+pub const MAX_CLIENTS: usize = 16;
+
+/// Most observers of `frames` at a time.
+pub const MAX_OBSERVERS: usize = 16;
+
+/// Most readers of `truth` at a time.
+pub const MAX_TRUTH_READERS: usize = 4;
+
+/// Frames that an observer may fall behind before it loses the oldest.
+pub const FRAME_BUFFER: usize = 16;
+
+/// Hidden states that a reader may fall behind: a batch of this many worlds is never lost.
+pub const TRUTH_BUFFER: usize = 128;
+
+/// Most processes attached to an instance at a time.
+pub const MAX_NODES: usize = 64;
+
+/// iceoryx2's inter-process flavour.
+pub type Ipc = ipc::Service;
+
+/// A request-response service of bytes behind headers `Q` and `R`.
+pub type RequestResponse<Q, R> = request_response::PortFactory<Ipc, [u8], Q, [u8], R>;
+
+/// The `step` service.
+pub type StepService = RequestResponse<StepRequest, StepReply>;
+
+/// The `control` service.
+pub type ControlService = RequestResponse<ControlRequest, ControlReply>;
+
+/// The `frames` service.
+pub type FrameService = publish_subscribe::PortFactory<Ipc, [u8], FrameHeader>;
+
+/// The `truth` service.
+pub type TruthService = publish_subscribe::PortFactory<Ipc, [u8], TruthHeader>;
+
+/// A wake service.
+pub type WakeService = event::PortFactory<Ipc>;
+
+/// The name of one running server.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Instance(String);
+
+/// Why a channel could not be had.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ChannelError {
+    /// A name that cannot be an instance's.
+    #[error("instance name: expected 1 to 64 letters, digits, '-' or '_', got {0:?}")]
+    InstanceName(String),
+    /// The directory for the channels' files cannot be used.
+    #[error("channel directory {path}: {problem}")]
+    Directory {
+        /// The directory.
+        path: String,
+        /// What is wrong.
+        problem: String,
+    },
+    /// Nobody serves the instance.
+    #[error(
+        "no server on instance {instance:?}: start one with `emberwatch-server --instance {instance}`"
+    )]
+    NoServer {
+        /// The instance.
+        instance: String,
+    },
+    /// iceoryx2 refused.
+    #[error("{what}: iceoryx2 says {problem}")]
+    Ipc {
+        /// What was attempted.
+        what: &'static str,
+        /// iceoryx2's reason.
+        problem: String,
+    },
+}
+
+/// A channel of an instance.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Channel {
+    /// Steps, request-response.
+    Step,
+    /// Everything rare, request-response.
+    Control,
+    /// What robots saw, publish-subscribe.
+    Frames,
+    /// Hidden states, publish-subscribe.
+    Truth,
+    /// Wakes the server, event.
+    WakeServer,
+    /// Wakes clients, event.
+    WakeClient,
+}
+
+impl Instance {
+    /// Checks a name.
+    ///
+    /// # Errors
+    /// [`ChannelError::InstanceName`] unless it is 1 to 64 letters, digits, `-` or `_`.
+    pub fn new(name: &str) -> Result<Self, ChannelError> {
+        let allowed = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+        if (1..=64).contains(&name.len()) && name.chars().all(allowed) {
+            Ok(Self(name.into()))
+        } else {
+            Err(ChannelError::InstanceName(name.into()))
+        }
+    }
+
+    /// The name.
+    pub fn name(&self) -> &str {
+        &self.0
+    }
+
+    /// The service name of a channel.
+    pub fn service_name(&self, channel: Channel) -> ServiceName {
+        let name = format!("emberwatch/v1/{}/{}", self.0, channel.name());
+        ServiceName::new(&name).expect("invariant: instance names are short and plain")
+    }
+
+    /// The error for an instance that nobody serves.
+    pub fn no_server(&self) -> ChannelError {
+        ChannelError::NoServer {
+            instance: self.0.clone(),
+        }
+    }
+}
+
+impl Channel {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Step => "step",
+            Self::Control => "control",
+            Self::Frames => "frames",
+            Self::Truth => "truth",
+            Self::WakeServer => "wake-server",
+            Self::WakeClient => "wake-client",
+        }
+    }
+}
+
+/// Makes this process known to iceoryx2, under the user's own directory and prefix.
+///
+/// # Errors
+/// [`ChannelError`] if the directory is somebody else's or the node cannot be created.
+pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
+    iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
+    let node = NodeBuilder::new()
+        .config(&node_config()?)
+        .signal_handling_mode(SignalHandlingMode::Disabled);
+    node.create().map_err(ipc_error("create a node"))
+}
+
+/// The directory of this user's channel files: `/tmp/emberwatch-<uid>/`.
+pub fn channel_directory() -> PathBuf {
+    PathBuf::from(format!(
+        "/tmp/emberwatch-{}/",
+        rustix::process::getuid().as_raw()
+    ))
+}
+
+/// iceoryx2's configuration: its defaults, the user's own directory and prefix.
+///
+/// # Errors
+/// [`ChannelError::Directory`] if the directory cannot be made or is somebody else's.
+pub fn node_config() -> Result<Config, ChannelError> {
+    let directory = channel_directory();
+    own_directory(&directory)?;
+    let path = Path::new(directory.as_os_str().as_encoded_bytes())
+        .map_err(ipc_error("set the root path"))?;
+    let prefix = format!("emberwatch_{}_", rustix::process::getuid().as_raw());
+    let prefix = FileName::new(prefix.as_bytes()).map_err(ipc_error("set the prefix"))?;
+    let mut config = Config::default();
+    config.global.set_root_path(&path);
+    config.global.prefix = prefix;
+    Ok(config)
+}
+
+/// Adds context to an error of iceoryx2.
+pub fn ipc_error<E: Debug>(what: &'static str) -> impl Fn(E) -> ChannelError {
+    move |error| ChannelError::Ipc {
+        what,
+        problem: format!("{error:?}"),
+    }
+}
+
+/// Opens, or creates with its limits, each service of an instance.
+pub struct Services<'a> {
+    /// The process's node.
+    pub node: &'a Node<Ipc>,
+    /// The instance.
+    pub instance: &'a Instance,
+}
+
+impl Services<'_> {
+    /// The `step` service, created if need be; for the server.
+    ///
+    /// # Errors
+    /// [`ChannelError::Ipc`], also when old clients hold a service of other limits.
+    pub fn create_step(&self) -> Result<StepService, ChannelError> {
+        self.create(Channel::Step)
+    }
+
+    /// The `control` service, created if need be; for the server.
+    ///
+    /// # Errors
+    /// As [`Self::create_step`].
+    pub fn create_control(&self) -> Result<ControlService, ChannelError> {
+        self.create(Channel::Control)
+    }
+
+    /// The `step` service of a running server.
+    ///
+    /// # Errors
+    /// [`ChannelError::NoServer`] if there is none.
+    pub fn open_step(&self) -> Result<StepService, ChannelError> {
+        self.open(Channel::Step)
+    }
+
+    /// The `control` service of a running server.
+    ///
+    /// # Errors
+    /// [`ChannelError::NoServer`] if there is none.
+    pub fn open_control(&self) -> Result<ControlService, ChannelError> {
+        self.open(Channel::Control)
+    }
+
+    /// The `frames` service; observers may create it before the server starts.
+    ///
+    /// # Errors
+    /// [`ChannelError::Ipc`].
+    pub fn frames(&self) -> Result<FrameService, ChannelError> {
+        let builder = self
+            .node
+            .service_builder(&self.instance.service_name(Channel::Frames));
+        let builder = builder
+            .publish_subscribe::<[u8]>()
+            .user_header::<FrameHeader>();
+        let builder = builder
+            .max_publishers(1)
+            .max_subscribers(MAX_OBSERVERS)
+            .max_nodes(MAX_NODES);
+        let builder = builder
+            .history_size(1)
+            .subscriber_max_buffer_size(FRAME_BUFFER);
+        let builder = builder
+            .subscriber_max_borrowed_samples(1)
+            .enable_safe_overflow(true);
+        builder
+            .open_or_create()
+            .map_err(ipc_error("open the frames channel"))
+    }
+
+    /// The `truth` service; for evaluation and pictures, never for learners.
+    ///
+    /// # Errors
+    /// [`ChannelError::Ipc`].
+    pub fn truth(&self) -> Result<TruthService, ChannelError> {
+        let builder = self
+            .node
+            .service_builder(&self.instance.service_name(Channel::Truth));
+        let builder = builder
+            .publish_subscribe::<[u8]>()
+            .user_header::<TruthHeader>();
+        let builder = builder
+            .max_publishers(1)
+            .max_subscribers(MAX_TRUTH_READERS)
+            .max_nodes(MAX_NODES);
+        let builder = builder
+            .history_size(1)
+            .subscriber_max_buffer_size(TRUTH_BUFFER);
+        let builder = builder
+            .subscriber_max_borrowed_samples(1)
+            .enable_safe_overflow(true);
+        builder
+            .open_or_create()
+            .map_err(ipc_error("open the truth channel"))
+    }
+
+    /// One of the two wake services.
+    ///
+    /// # Errors
+    /// [`ChannelError::Ipc`].
+    pub fn wake(&self, channel: Channel) -> Result<WakeService, ChannelError> {
+        let builder = self
+            .node
+            .service_builder(&self.instance.service_name(channel))
+            .event();
+        let builder = builder
+            .max_listeners(MAX_NODES)
+            .max_notifiers(MAX_NODES)
+            .max_nodes(MAX_NODES);
+        builder
+            .open_or_create()
+            .map_err(ipc_error("open a wake channel"))
+    }
+
+    fn create<Q: Header, R: Header>(
+        &self,
+        channel: Channel,
+    ) -> Result<RequestResponse<Q, R>, ChannelError> {
+        let builder = self
+            .builder::<Q, R>(channel)
+            .max_servers(1)
+            .max_clients(MAX_CLIENTS)
+            .max_nodes(MAX_NODES);
+        let builder = builder
+            .max_active_requests_per_client(1)
+            .max_loaned_requests(1);
+        let builder = builder
+            .max_response_buffer_size(1)
+            .max_borrowed_responses_per_pending_response(1);
+        let builder = builder.enable_fire_and_forget_requests(false);
+        builder
+            .open_or_create()
+            .map_err(ipc_error("create a request channel"))
+    }
+
+    fn open<Q: Header, R: Header>(
+        &self,
+        channel: Channel,
+    ) -> Result<RequestResponse<Q, R>, ChannelError> {
+        let service = self
+            .builder::<Q, R>(channel)
+            .open()
+            .map_err(|error| match error {
+                RequestResponseOpenError::DoesNotExist => self.instance.no_server(),
+                other => ipc_error("open a request channel")(other),
+            })?;
+        if service.dynamic_config().number_of_servers() > 0 {
+            Ok(service)
+        } else {
+            Err(self.instance.no_server())
+        }
+    }
+
+    fn builder<Q: Header, R: Header>(
+        &self,
+        channel: Channel,
+    ) -> request_response_builder::Builder<[u8], Q, [u8], R, Ipc> {
+        let builder = self
+            .node
+            .service_builder(&self.instance.service_name(channel));
+        let builder = builder.request_response::<[u8], [u8]>();
+        builder
+            .request_user_header::<Q>()
+            .response_user_header::<R>()
+    }
+}
+
+/// Makes the directory, for this user alone, or checks that it is this user's.
+fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
+    let wrong = |problem: String| ChannelError::Directory {
+        path: path.display().to_string(),
+        problem,
+    };
+    match DirBuilder::new().mode(0o700).create(path) {
+        Ok(()) => return Ok(()),
+        Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
+        Err(error) => return Err(wrong(error.to_string())),
+    }
+    let bare = path.components().as_path(); // without the trailing slash, so that a link is seen
+    let found = std::fs::symlink_metadata(bare).map_err(|error| wrong(error.to_string()))?;
+    let mine = found.is_dir() && found.uid() == rustix::process::getuid().as_raw();
+    if mine && found.mode() & 0o022 == 0 {
+        return Ok(());
+    }
+    Err(wrong(
+        "expected a directory that belongs to this user and that others cannot write to".into(),
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn instance_names_are_plain() {
+        for good in ["default", "a-b_3", &"x".repeat(64)] {
+            assert_eq!(Instance::new(good).expect("good name").name(), good);
+        }
+        for bad in ["", "a b", "../x", "é", &"x".repeat(65)] {
+            assert!(Instance::new(bad).is_err(), "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn a_directory_that_others_may_write_to_is_refused() {
+        use std::os::unix::fs::PermissionsExt;
+        let path = std::env::temp_dir().join(format!("emberwatch-test-{}", std::process::id()));
+        own_directory(&path).expect("a new directory");
+        own_directory(&path).expect("the same again");
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o777)).expect("chmod");
+        assert!(own_directory(&path).is_err());
+        std::fs::remove_dir(&path).expect("clean up");
+    }
+}

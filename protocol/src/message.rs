@@ -1,0 +1,405 @@
+//! The binary messages: `#[repr(C)]` headers of the `step`, `control`, `frames` and `truth`
+//! channels, and the status codes. PROTOCOL.md holds their byte tables.
+//!
+//! Headers hold integers and floats only, in the byte order of the host; everything with fewer
+//! valid values than bit patterns is converted with `TryFrom` and checked. Variable parts travel
+//! as the `[u8]` payload behind the header.
+
+use bytemuck::{Pod, Zeroable};
+use iceoryx2::prelude::ZeroCopySend;
+use thiserror::Error;
+
+/// Version of everything in this module and in [`crate::control`].
+pub const VERSION: u32 = 1;
+
+/// A header that can lie in shared memory.
+pub trait Header: std::fmt::Debug + Default + Copy + ZeroCopySend {}
+
+impl<T: std::fmt::Debug + Default + Copy + ZeroCopySend> Header for T {}
+
+/// Set in [`StepRequest::flags`]: observe every cell, not only the path (needs a server whose
+/// coverage is `client`).
+pub const FLAG_FULL_COVERAGE: u32 = 1;
+
+/// What a step request asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u32)]
+pub enum Operation {
+    /// Fly one path in each of the worlds and move them from k to k + 1; needs a lease.
+    Step = 1,
+    /// Return the last results and frames again, changing nothing; needs no lease.
+    Observe = 2,
+}
+
+/// Answer to a request; every rejection has its own code and changes nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[repr(u32)]
+pub enum Status {
+    /// Done.
+    Ok = 0,
+    /// The request's version is not the server's; detail: the server's version.
+    VersionMismatch = 1,
+    /// No such operation; detail: the operation received.
+    UnknownOperation = 2,
+    /// Not a well-formed control message.
+    Malformed = 3,
+    /// A world outside the server's; detail: number of worlds.
+    NoSuchWorld = 4,
+    /// The payload is not `n_worlds * n_moves` bytes; detail: bytes expected.
+    WrongLength = 5,
+    /// Not the server's number of moves in a path; detail: moves expected.
+    WrongPathLength = 6,
+    /// A byte that is no move; detail: its position in the payload.
+    BadMove = 7,
+    /// The lease does not cover these worlds, or was never given; detail: the first such world.
+    NoLease = 8,
+    /// The lease was taken over, expired or released; detail: pid of the holder, 0 if none.
+    LeaseLost = 9,
+    /// Another client holds a world; detail: its pid.
+    Busy = 10,
+    /// A world is being reset; detail: the world.
+    Resetting = 11,
+    /// A world was truncated and must be reset first; detail: the world.
+    EpisodeOver = 12,
+    /// Full frames were asked of a server that gives none; detail: 0.
+    NotPermitted = 13,
+    /// The server is shutting down; detail: 0.
+    Stopping = 14,
+}
+
+/// A number that is no [`Status`] or no [`Operation`].
+#[derive(Debug, Error, PartialEq, Eq)]
+#[error("{what}: {value} is not a known code")]
+pub struct UnknownCode {
+    /// `status` or `operation`.
+    pub what: &'static str,
+    /// The number received.
+    pub value: u32,
+}
+
+/// Header of a `step` request; the payload is `n_worlds` paths of `n_moves` bytes each.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("emberwatch.v1.StepRequest")]
+pub struct StepRequest {
+    /// [`VERSION`].
+    pub version: u32,
+    /// An [`Operation`].
+    pub operation: u32,
+    /// The lease from `acquire`; ignored by `Observe`.
+    pub lease: u64,
+    /// Chosen by the client, returned in the answer.
+    pub sequence: u64,
+    /// First world.
+    pub first_world: u32,
+    /// Number of consecutive worlds.
+    pub n_worlds: u32,
+    /// Moves in each path; 0 for `Observe`.
+    pub n_moves: u32,
+    /// [`FLAG_FULL_COVERAGE`] or 0.
+    pub flags: u32,
+    /// Low half of the id of the client's listener on `wake-client`; both halves 0: wake nobody.
+    pub listener_low: u64,
+    /// High half of that id.
+    pub listener_high: u64,
+    /// 0.
+    pub reserved: u64,
+}
+
+/// Header of a `step` answer; the payload is `n_worlds` [`StepResult`]s, then `n_worlds` frames
+/// of `height * width` bytes, both empty unless the status is `Ok`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("emberwatch.v1.StepReply")]
+pub struct StepReply {
+    /// [`VERSION`].
+    pub version: u32,
+    /// A [`Status`].
+    pub status: u32,
+    /// The request's sequence number.
+    pub sequence: u64,
+    /// First world, as asked.
+    pub first_world: u32,
+    /// Number of worlds in the payload; 0 unless the status is `Ok`.
+    pub n_worlds: u32,
+    /// Grid height H.
+    pub height: u32,
+    /// Grid width W.
+    pub width: u32,
+    /// Time that simulating took, nanoseconds.
+    pub simulation_nanos: u64,
+    /// See [`Status`].
+    pub detail: u64,
+    /// 0.
+    pub reserved: [u64; 2],
+}
+
+/// What one world's step gave; also the state of a world after a reset.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("emberwatch.v1.StepResult")]
+pub struct StepResult {
+    /// Step index k after the step; 0 after a reset.
+    pub step: u64,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Number of resets of this world since the server started.
+    pub episode: u64,
+    /// Sum of rewards over the distinct visited cells in `X_{k+1}`.
+    pub reward: f64,
+    /// Cells of the whole grid in the state that pays most (burning cells).
+    pub n_target_cells: u32,
+    /// Distinct cells visited by the path.
+    pub n_visited: u32,
+    /// Distinct visited cells in the state that pays most.
+    pub n_hits: u32,
+    /// The robot's row.
+    pub row: u32,
+    /// The robot's column.
+    pub col: u32,
+    /// A [`crate::frame::Coverage`].
+    pub coverage: u32,
+    /// 1 if the episode ended by itself (never, in this model), else 0.
+    pub terminated: u16,
+    /// 1 if the episode reached the server's `max_steps`, else 0.
+    pub truncated: u16,
+    /// 0.
+    pub reserved: u32,
+}
+
+/// Header of a `control` request; the payload is JSON, a [`crate::control::Request`].
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("emberwatch.v1.ControlRequest")]
+pub struct ControlRequest {
+    /// [`VERSION`].
+    pub version: u32,
+    /// 0.
+    pub reserved: u32,
+    /// Chosen by the client, returned in the answer.
+    pub sequence: u64,
+    /// Low half of the id of the client's listener on `wake-client`; both halves 0: wake nobody.
+    pub listener_low: u64,
+    /// High half of that id.
+    pub listener_high: u64,
+}
+
+/// Header of a `control` answer; the payload is JSON, a [`crate::control::Reply`].
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("emberwatch.v1.ControlReply")]
+pub struct ControlReply {
+    /// [`VERSION`].
+    pub version: u32,
+    /// A [`Status`].
+    pub status: u32,
+    /// The request's sequence number.
+    pub sequence: u64,
+}
+
+/// Header of a sample on `frames`; the payload is the frame (`height * width` bytes), then the
+/// path that was flown (`n_moves` bytes).
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("emberwatch.v1.FrameHeader")]
+pub struct FrameHeader {
+    /// [`VERSION`].
+    pub version: u32,
+    /// The world.
+    pub world: u32,
+    /// Number of samples published on this channel before this one: a gap is a loss.
+    pub sequence: u64,
+    /// Grid height H.
+    pub height: u32,
+    /// Grid width W.
+    pub width: u32,
+    /// Moves in the path; 0 after a reset.
+    pub n_moves: u32,
+    /// Row where the path began.
+    pub start_row: u32,
+    /// Column where the path began.
+    pub start_col: u32,
+    /// 0.
+    pub reserved: u32,
+    /// The step's result.
+    pub result: StepResult,
+}
+
+/// Header of a sample on `truth`; the payload is the hidden state (`height * width` bytes).
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("emberwatch.v1.TruthHeader")]
+pub struct TruthHeader {
+    /// [`VERSION`].
+    pub version: u32,
+    /// The world.
+    pub world: u32,
+    /// Number of samples published on this channel before this one: a gap is a loss.
+    pub sequence: u64,
+    /// Number of resets of this world since the server started.
+    pub episode: u64,
+    /// Step index k of the state shown.
+    pub step: u64,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Grid height H.
+    pub height: u32,
+    /// Grid width W.
+    pub width: u32,
+}
+
+/// Bytes of one [`StepResult`] in a payload.
+pub const RESULT_BYTES: usize = size_of::<StepResult>();
+
+impl TryFrom<u32> for Operation {
+    type Error = UnknownCode;
+
+    fn try_from(value: u32) -> Result<Self, UnknownCode> {
+        match value {
+            1 => Ok(Self::Step),
+            2 => Ok(Self::Observe),
+            _ => Err(UnknownCode {
+                what: "operation",
+                value,
+            }),
+        }
+    }
+}
+
+impl Status {
+    /// Every status, in the order of its code.
+    pub const ALL: [Self; 15] = [
+        Self::Ok,
+        Self::VersionMismatch,
+        Self::UnknownOperation,
+        Self::Malformed,
+        Self::NoSuchWorld,
+        Self::WrongLength,
+        Self::WrongPathLength,
+        Self::BadMove,
+        Self::NoLease,
+        Self::LeaseLost,
+        Self::Busy,
+        Self::Resetting,
+        Self::EpisodeOver,
+        Self::NotPermitted,
+        Self::Stopping,
+    ];
+
+    /// One sentence for people: what the status with this detail says and what to do.
+    pub fn explain(self, detail: u64) -> String {
+        match self {
+            Self::Ok => "ok".into(),
+            Self::VersionMismatch => format!(
+                "protocol version mismatch: the client speaks {VERSION}, the server {detail}; \
+                 use a client and a server of one release"
+            ),
+            Self::UnknownOperation => {
+                format!("operation: expected 1 (step) or 2 (observe), got {detail}")
+            }
+            Self::Malformed => "malformed control message".into(),
+            Self::NoSuchWorld => format!(
+                "no such world: the server has worlds 0 to {}",
+                detail.saturating_sub(1)
+            ),
+            Self::WrongLength => format!("wrong payload length: expected {detail} bytes"),
+            Self::WrongPathLength => {
+                format!("wrong path length: the server flies {detail} moves a step")
+            }
+            Self::BadMove => format!("byte {detail} of the paths: expected a move in 0..=3"),
+            Self::NoLease => format!("no lease on world {detail}: acquire it first"),
+            Self::LeaseLost if detail == 0 => {
+                "lease lost: it expired or was released; acquire the worlds again".into()
+            }
+            Self::LeaseLost => format!("lease lost to pid {detail}"),
+            Self::Busy => {
+                format!("busy: held by pid {detail}; wait for its release or take the worlds over")
+            }
+            Self::Resetting => {
+                format!("world {detail} is being reset; wait for the answer to the reset")
+            }
+            Self::EpisodeOver => format!("world {detail} was truncated: reset it first"),
+            Self::NotPermitted => {
+                "full frames need a server with coverage \"client\" or \"full\"".into()
+            }
+            Self::Stopping => "the server is shutting down".into(),
+        }
+    }
+}
+
+impl TryFrom<u32> for Status {
+    type Error = UnknownCode;
+
+    fn try_from(value: u32) -> Result<Self, UnknownCode> {
+        let known = Self::ALL.get(value as usize).copied();
+        known.ok_or(UnknownCode {
+            what: "status",
+            value,
+        })
+    }
+}
+
+/// The results and frames in the payload of a successful step answer.
+///
+/// # Errors
+/// The number of bytes expected, if the payload is not as long as its header says.
+pub fn split_step_payload<'a>(
+    reply: &StepReply,
+    payload: &'a [u8],
+) -> Result<(Vec<StepResult>, &'a [u8]), usize> {
+    let n_worlds = reply.n_worlds as usize;
+    let n_cells = (reply.height as usize).saturating_mul(reply.width as usize);
+    let expected = n_cells
+        .saturating_add(RESULT_BYTES)
+        .saturating_mul(n_worlds);
+    if payload.len() != expected {
+        return Err(expected);
+    }
+    let (results, frames) = payload.split_at(n_worlds * RESULT_BYTES);
+    let results = results
+        .chunks_exact(RESULT_BYTES)
+        .map(bytemuck::pod_read_unaligned)
+        .collect();
+    Ok((results, frames))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn status_codes_survive_the_wire() {
+        for (code, status) in Status::ALL.into_iter().enumerate() {
+            assert_eq!(status as usize, code);
+            assert_eq!(Status::try_from(code as u32), Ok(status));
+        }
+        assert_eq!(
+            Status::try_from(15),
+            Err(UnknownCode {
+                what: "status",
+                value: 15
+            })
+        );
+    }
+
+    #[test]
+    fn a_step_payload_of_the_wrong_length_is_refused() {
+        let reply = StepReply {
+            n_worlds: 2,
+            height: 3,
+            width: 5,
+            ..StepReply::default()
+        };
+        let expected = 2 * (64 + 15);
+        assert!(split_step_payload(&reply, &vec![0; expected]).is_ok());
+        assert_eq!(split_step_payload(&reply, &[0; 3]), Err(expected));
+        let huge = StepReply {
+            n_worlds: u32::MAX,
+            height: u32::MAX,
+            width: u32::MAX,
+            ..reply
+        };
+        assert!(split_step_payload(&huge, &[]).is_err());
+    }
+}

@@ -1,0 +1,117 @@
+//! The bounded wait that both sides use: spin, then yield, then block, never past a deadline.
+//!
+//! Measured on two cores (round trip of 64 bytes against 4 KiB): spinning answers in 0.9 us when
+//! both processes have a core, but costs 115 us when they share one; `sched_yield` costs 1.6 us and
+//! 4.8 us; blocking costs 53 us always. So: spin as long as a quick answer takes, yield while a
+//! wake-up would cost more than it saves, then leave the processor to others.
+
+use crate::channels::Ipc;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::prelude::FileDescriptorBased;
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
+use std::os::fd::BorrowedFd;
+use std::time::{Duration, Instant};
+
+/// How long to poll without giving up the processor.
+pub const SPIN: Duration = Duration::from_micros(5);
+
+/// How long to poll, from the start, before blocking.
+pub const YIELD: Duration = Duration::from_micros(50);
+
+/// Polls until something arrives or the timeout has passed, then returns `None`.
+///
+/// `block` may sleep for at most the duration it is given; it is called again and again until the
+/// timeout, so it may return early for any reason.
+///
+/// # Errors
+/// The first error of `poll` or `block`.
+pub fn poll_then_block<T, E>(
+    timeout: Duration,
+    mut poll: impl FnMut() -> Result<Option<T>, E>,
+    mut block: impl FnMut(Duration) -> Result<(), E>,
+) -> Result<Option<T>, E> {
+    let start = Instant::now();
+    loop {
+        if let Some(arrived) = poll()? {
+            return Ok(Some(arrived));
+        }
+        let waited = start.elapsed();
+        if waited < SPIN {
+            std::hint::spin_loop();
+        } else if waited < YIELD {
+            rustix::thread::sched_yield();
+        } else if waited < timeout {
+            block(timeout - waited)?;
+        } else {
+            return Ok(None);
+        }
+    }
+}
+
+/// The descriptor that is readable while a listener has notifications to drain.
+#[expect(unsafe_code, reason = "iceoryx2 hands out the raw descriptor only")]
+pub fn descriptor(listener: &Listener<Ipc>) -> BorrowedFd<'_> {
+    // SAFETY: the descriptor stays open as long as its listener, which the result borrows.
+    unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) }
+}
+
+/// Sleeps until one of the descriptors is readable, a signal arrives or the timeout has passed;
+/// returns which of them are readable.
+///
+/// # Errors
+/// The system's error, never `EINTR`.
+pub fn sleep_until_readable(
+    descriptors: &[BorrowedFd<'_>],
+    timeout: Duration,
+) -> Result<Vec<bool>, Errno> {
+    let mut polled: Vec<PollFd<'_>> = descriptors
+        .iter()
+        .map(|fd| PollFd::from_borrowed_fd(*fd, PollFlags::IN))
+        .collect();
+    let timeout = Timespec::try_from(timeout).unwrap_or(Timespec {
+        tv_sec: 1,
+        tv_nsec: 0,
+    });
+    match poll(&mut polled, Some(&timeout)) {
+        Ok(_) => Ok(polled.iter().map(|fd| !fd.revents().is_empty()).collect()),
+        Err(Errno::INTR) => Ok(vec![false; descriptors.len()]),
+        Err(error) => Err(error),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_wait_ends_at_its_timeout_and_blocks_no_longer() {
+        let mut longest = Duration::ZERO;
+        let block = |limit: Duration| {
+            longest = longest.max(limit);
+            std::thread::sleep(limit.min(Duration::from_millis(1)));
+            Ok::<_, ()>(())
+        };
+        let timeout = Duration::from_millis(5);
+        assert_eq!(poll_then_block(timeout, || Ok(None::<u8>), block), Ok(None));
+        assert!(longest <= timeout);
+    }
+
+    #[test]
+    fn what_arrives_is_returned_and_errors_end_the_wait() {
+        let mut calls = 0;
+        let third = || {
+            calls += 1;
+            Ok::<_, &str>((calls == 3).then_some(calls))
+        };
+        assert_eq!(
+            poll_then_block(Duration::from_secs(9), third, |_| Ok(())),
+            Ok(Some(3))
+        );
+        let failing = || Err::<Option<u8>, _>("gone");
+        assert_eq!(
+            poll_then_block(Duration::from_secs(9), failing, |_| Ok(())),
+            Err("gone")
+        );
+    }
+}
