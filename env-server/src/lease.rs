@@ -1,0 +1,277 @@
+//! Who may act on which worlds, and until when. Pure: time and tokens come in as arguments.
+//!
+//! A lease covers consecutive worlds. It ends by release, by expiry, by its client's death or by a
+//! takeover; a world taken from a lease is lost to that lease for good, also when it is free again.
+
+use protocol::message::Status;
+use std::collections::{HashMap, VecDeque};
+use std::ops::Range;
+use std::time::{Duration, Instant};
+
+/// Ended leases that are remembered, to tell "lost" from "never had".
+const REMEMBERED: usize = 1024;
+
+/// The process behind a request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ClientId {
+    /// iceoryx2's id of the client's node.
+    pub node: u128,
+    /// Its process id.
+    pub pid: u32,
+}
+
+/// A right to act.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Lease {
+    /// Names the lease in requests.
+    pub token: u64,
+    /// Who holds it.
+    pub client: ClientId,
+    /// The worlds it was given for.
+    pub worlds: Range<usize>,
+    /// It ends this long after its last use.
+    pub time_to_live: Duration,
+    expires: Instant,
+}
+
+/// Why a request may not act, as the wire says it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Refusal {
+    /// The status.
+    pub status: Status,
+    /// Its detail.
+    pub detail: u64,
+}
+
+/// All leases of a server.
+#[derive(Debug)]
+pub struct Leases {
+    /// The token that holds each world.
+    holders: Vec<Option<u64>>,
+    live: HashMap<u64, Lease>,
+    ended: VecDeque<u64>,
+}
+
+/// What a client asks for.
+#[derive(Debug, Clone)]
+pub struct Claim {
+    /// Who asks.
+    pub client: ClientId,
+    /// Which worlds.
+    pub worlds: Range<usize>,
+    /// Whether to take worlds from their holders.
+    pub takeover: bool,
+    /// How long the lease lives without use.
+    pub time_to_live: Duration,
+}
+
+impl Refusal {
+    /// A refusal with its detail.
+    pub fn new(status: Status, detail: u64) -> Self {
+        Self { status, detail }
+    }
+}
+
+impl Leases {
+    /// No leases on `n_worlds` worlds.
+    pub fn new(n_worlds: usize) -> Self {
+        Self { holders: vec![None; n_worlds], live: HashMap::new(), ended: VecDeque::new() }
+    }
+
+    /// Gives a lease under a new token.
+    ///
+    /// A client that claims worlds it holds already gets them anew, under the new token.
+    ///
+    /// # Errors
+    /// [`Status::NoSuchWorld`]; [`Status::Busy`] with the holder's pid, unless it is a takeover.
+    pub fn acquire(&mut self, now: Instant, claim: Claim, token: u64) -> Result<&Lease, Refusal> {
+        self.check_worlds(&claim.worlds)?;
+        self.expire(now);
+        let others = claim.worlds.clone().filter_map(|world| self.holder(world));
+        let other = others.into_iter().find(|holder| holder.client != claim.client);
+        if let Some(holder) = other.filter(|_| !claim.takeover) {
+            return Err(Refusal::new(Status::Busy, holder.client.pid.into()));
+        }
+        for world in claim.worlds.clone() {
+            self.holders[world] = Some(token);
+        }
+        self.forget_empty_leases();
+        let Claim { client, worlds, time_to_live, .. } = claim;
+        let lease = Lease { token, client, worlds, time_to_live, expires: now + time_to_live };
+        Ok(self.live.entry(token).or_insert(lease))
+    }
+
+    /// Checks that a client may act on worlds under a lease, and extends the lease.
+    ///
+    /// # Errors
+    /// [`Status::NoSuchWorld`], [`Status::NoLease`] or [`Status::LeaseLost`].
+    pub fn use_lease(&mut self, now: Instant, token: u64, client: ClientId, worlds: &Range<usize>) -> Result<(), Refusal> {
+        self.check_worlds(worlds)?;
+        let held = self.holders[worlds.clone()].iter().position(|holder| *holder != Some(token));
+        if let Some(first) = held {
+            return Err(self.not_held(token, client, worlds.start + first));
+        }
+        self.renew(now, token, client).map(|_| ())
+    }
+
+    /// Extends a lease.
+    ///
+    /// # Errors
+    /// [`Status::NoLease`] or [`Status::LeaseLost`].
+    pub fn renew(&mut self, now: Instant, token: u64, client: ClientId) -> Result<&Lease, Refusal> {
+        let is_live = |lease: &&mut Lease| lease.client == client && now < lease.expires;
+        if self.live.get_mut(&token).filter(is_live).is_none() {
+            let world = self.live.get(&token).map_or(0, |lease| lease.worlds.start);
+            return Err(self.not_held(token, client, world));
+        }
+        let lease = self.live.get_mut(&token).expect("invariant: found above");
+        lease.expires = now + lease.time_to_live;
+        Ok(lease)
+    }
+
+    /// Ends a lease; its worlds are free.
+    ///
+    /// # Errors
+    /// [`Status::NoLease`] or [`Status::LeaseLost`].
+    pub fn release(&mut self, now: Instant, token: u64, client: ClientId) -> Result<(), Refusal> {
+        self.renew(now, token, client)?;
+        self.end(token);
+        Ok(())
+    }
+
+    /// Ends the leases that have expired; returns them.
+    pub fn expire(&mut self, now: Instant) -> Vec<Lease> {
+        self.end_where(|lease| lease.expires <= now)
+    }
+
+    /// Ends the leases of a process that has died; returns them.
+    pub fn end_of_process(&mut self, pid: u32) -> Vec<Lease> {
+        self.end_where(|lease| lease.client.pid == pid)
+    }
+
+    /// Who holds a world.
+    pub fn holder(&self, world: usize) -> Option<&Lease> {
+        self.holders[world].and_then(|token| self.live.get(&token))
+    }
+
+    fn check_worlds(&self, worlds: &Range<usize>) -> Result<(), Refusal> {
+        if worlds.start < worlds.end && worlds.end <= self.holders.len() {
+            return Ok(());
+        }
+        Err(Refusal::new(Status::NoSuchWorld, self.holders.len() as u64))
+    }
+
+    fn not_held(&self, token: u64, client: ClientId, world: usize) -> Refusal {
+        let live = self.live.get(&token).is_some_and(|lease| lease.client == client && lease.worlds.contains(&world));
+        if live || self.ended.contains(&token) {
+            let holder = self.holder(world).filter(|holder| holder.token != token);
+            return Refusal::new(Status::LeaseLost, holder.map_or(0, |lease| lease.client.pid.into()));
+        }
+        Refusal::new(Status::NoLease, world as u64)
+    }
+
+    fn end_where(&mut self, is_over: impl Fn(&Lease) -> bool) -> Vec<Lease> {
+        let over: Vec<u64> = self.live.values().filter(|lease| is_over(lease)).map(|lease| lease.token).collect();
+        over.into_iter().filter_map(|token| self.end(token)).collect()
+    }
+
+    fn end(&mut self, token: u64) -> Option<Lease> {
+        let lease = self.live.remove(&token)?;
+        for holder in self.holders.iter_mut().filter(|holder| **holder == Some(token)) {
+            *holder = None;
+        }
+        if self.ended.len() == REMEMBERED {
+            self.ended.pop_front();
+        }
+        self.ended.push_back(token);
+        Some(lease)
+    }
+
+    /// Ends leases all of whose worlds were taken.
+    fn forget_empty_leases(&mut self) {
+        let holders = self.holders.clone();
+        let is_empty = |lease: &Lease| holders[lease.worlds.clone()].iter().all(|holder| *holder != Some(lease.token));
+        self.end_where(is_empty);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TTL: Duration = Duration::from_secs(10);
+
+    fn client(pid: u32) -> ClientId {
+        ClientId { node: u128::from(pid), pid }
+    }
+
+    fn claim(pid: u32, worlds: Range<usize>, takeover: bool) -> Claim {
+        Claim { client: client(pid), worlds, takeover, time_to_live: TTL }
+    }
+
+    #[test]
+    fn a_world_has_one_holder() {
+        let (mut leases, now) = (Leases::new(4), Instant::now());
+        leases.acquire(now, claim(1, 0..2, false), 11).expect("free");
+        let refused = leases.acquire(now, claim(2, 1..3, false), 12).expect_err("held");
+        assert_eq!(refused, Refusal::new(Status::Busy, 1));
+        assert!(leases.holder(2).is_none(), "a refused claim takes nothing");
+        leases.acquire(now, claim(2, 2..4, false), 13).expect("free");
+        assert_eq!(leases.use_lease(now, 11, client(1), &(0..2)), Ok(()));
+        assert_eq!(leases.use_lease(now, 13, client(2), &(1..3)), Err(Refusal::new(Status::NoLease, 1)));
+    }
+
+    #[test]
+    fn a_takeover_costs_the_holder_the_worlds_taken() {
+        let (mut leases, now) = (Leases::new(2), Instant::now());
+        leases.acquire(now, claim(1, 0..2, false), 11).expect("free");
+        leases.acquire(now, claim(2, 1..2, true), 12).expect("takeover");
+        assert_eq!(leases.use_lease(now, 11, client(1), &(0..1)), Ok(()));
+        assert_eq!(leases.use_lease(now, 11, client(1), &(0..2)), Err(Refusal::new(Status::LeaseLost, 2)));
+        leases.acquire(now, claim(3, 0..1, true), 13).expect("takeover of the rest");
+        assert_eq!(leases.renew(now, 11, client(1)).map(|_| ()), Err(Refusal::new(Status::LeaseLost, 3)));
+    }
+
+    #[test]
+    fn use_extends_a_lease_and_idleness_ends_it() {
+        let (mut leases, now) = (Leases::new(1), Instant::now());
+        leases.acquire(now, claim(1, 0..1, false), 11).expect("free");
+        let almost = now + TTL - Duration::from_millis(1);
+        assert_eq!(leases.use_lease(almost, 11, client(1), &(0..1)), Ok(()));
+        assert!(leases.expire(now + TTL).is_empty());
+        let late = almost + TTL;
+        assert_eq!(leases.use_lease(late, 11, client(1), &(0..1)), Err(Refusal::new(Status::LeaseLost, 0)));
+        assert_eq!(leases.expire(late).len(), 1);
+        assert_eq!(leases.use_lease(late, 11, client(1), &(0..1)), Err(Refusal::new(Status::LeaseLost, 0)));
+        leases.acquire(late, claim(2, 0..1, false), 12).expect("free again");
+    }
+
+    #[test]
+    fn a_stolen_token_is_worth_nothing() {
+        let (mut leases, now) = (Leases::new(1), Instant::now());
+        leases.acquire(now, claim(1, 0..1, false), 11).expect("free");
+        assert_eq!(leases.use_lease(now, 11, client(2), &(0..1)), Err(Refusal::new(Status::NoLease, 0)));
+        assert_eq!(leases.release(now, 11, client(2)), Err(Refusal::new(Status::NoLease, 0)));
+        assert_eq!(leases.release(now, 11, client(1)), Ok(()));
+        assert!(leases.holder(0).is_none());
+    }
+
+    #[test]
+    fn a_dead_process_holds_nothing() {
+        let (mut leases, now) = (Leases::new(2), Instant::now());
+        leases.acquire(now, claim(1, 0..1, false), 11).expect("free");
+        leases.acquire(now, claim(2, 1..2, false), 12).expect("free");
+        assert_eq!(leases.end_of_process(1).len(), 1);
+        assert!(leases.holder(0).is_none() && leases.holder(1).is_some());
+    }
+
+    #[test]
+    fn worlds_outside_the_server_are_refused() {
+        let (mut leases, now) = (Leases::new(2), Instant::now());
+        #[expect(clippy::reversed_empty_ranges, reason = "what a hostile client may send")]
+        for worlds in [0..3, 2..2, 5..7, 1..0] {
+            let refused = leases.acquire(now, claim(1, worlds, true), 11).expect_err("no such world");
+            assert_eq!(refused, Refusal::new(Status::NoSuchWorld, 2));
+        }
+    }
+}
