@@ -1,18 +1,31 @@
-//! What the server and its clients agree on.
+//! What the server and its clients agree on: the model and what it does, paths and frames, and the
+//! wire.
+//!
+//! Read [`grid`], [`model`], [`dynamics`] (the world) and [`transition`] (beliefs) for the model of
+//! the paper; [`path`] and [`frame`] for what a robot does and sees; [`message`] and [`control`] for
+//! what travels; [`channels`], [`connection`], [`observer`] and [`wait`] for how. PROTOCOL.md says
+//! the same for other languages. Words: a *world* is the hidden state of one grid; a *step* `k` flies
+//! one path and moves the world once; a *frame* is what was seen; a *lease* is the right to act.
 
 pub mod channels;
 pub mod connection;
 pub mod control;
+pub mod dynamics;
 pub mod frame;
 pub mod grid;
 pub mod message;
+mod mixture;
 pub mod model;
 pub mod observer;
 pub mod path;
 pub mod randomness;
+pub mod transition;
 pub mod wait;
 
+pub use connection::Connection;
+pub use dynamics::Dynamics;
 pub use frame::{Coverage, Frame, UNOBSERVED};
 pub use grid::{Cell, Grid, Probabilities, Shape};
 pub use model::Model;
 pub use path::Move;
+pub use transition::Transition;
