@@ -75,7 +75,11 @@ impl Refusal {
 impl Leases {
     /// No leases on `n_worlds` worlds.
     pub fn new(n_worlds: usize) -> Self {
-        Self { holders: vec![None; n_worlds], live: HashMap::new(), ended: VecDeque::new() }
+        Self {
+            holders: vec![None; n_worlds],
+            live: HashMap::new(),
+            ended: VecDeque::new(),
+        }
     }
 
     /// Gives a lease under a new token.
@@ -88,7 +92,9 @@ impl Leases {
         self.check_worlds(&claim.worlds)?;
         self.expire(now);
         let others = claim.worlds.clone().filter_map(|world| self.holder(world));
-        let other = others.into_iter().find(|holder| holder.client != claim.client);
+        let other = others
+            .into_iter()
+            .find(|holder| holder.client != claim.client);
         if let Some(holder) = other.filter(|_| !claim.takeover) {
             return Err(Refusal::new(Status::Busy, holder.client.pid.into()));
         }
@@ -96,8 +102,19 @@ impl Leases {
             self.holders[world] = Some(token);
         }
         self.forget_empty_leases();
-        let Claim { client, worlds, time_to_live, .. } = claim;
-        let lease = Lease { token, client, worlds, time_to_live, expires: now + time_to_live };
+        let Claim {
+            client,
+            worlds,
+            time_to_live,
+            ..
+        } = claim;
+        let lease = Lease {
+            token,
+            client,
+            worlds,
+            time_to_live,
+            expires: now + time_to_live,
+        };
         Ok(self.live.entry(token).or_insert(lease))
     }
 
@@ -105,9 +122,17 @@ impl Leases {
     ///
     /// # Errors
     /// [`Status::NoSuchWorld`], [`Status::NoLease`] or [`Status::LeaseLost`].
-    pub fn use_lease(&mut self, now: Instant, token: u64, client: ClientId, worlds: &Range<usize>) -> Result<(), Refusal> {
+    pub fn use_lease(
+        &mut self,
+        now: Instant,
+        token: u64,
+        client: ClientId,
+        worlds: &Range<usize>,
+    ) -> Result<(), Refusal> {
         self.check_worlds(worlds)?;
-        let held = self.holders[worlds.clone()].iter().position(|holder| *holder != Some(token));
+        let held = self.holders[worlds.clone()]
+            .iter()
+            .position(|holder| *holder != Some(token));
         if let Some(first) = held {
             return Err(self.not_held(token, client, worlds.start + first));
         }
@@ -162,22 +187,39 @@ impl Leases {
     }
 
     fn not_held(&self, token: u64, client: ClientId, world: usize) -> Refusal {
-        let live = self.live.get(&token).is_some_and(|lease| lease.client == client && lease.worlds.contains(&world));
+        let live = self
+            .live
+            .get(&token)
+            .is_some_and(|lease| lease.client == client && lease.worlds.contains(&world));
         if live || self.ended.contains(&token) {
             let holder = self.holder(world).filter(|holder| holder.token != token);
-            return Refusal::new(Status::LeaseLost, holder.map_or(0, |lease| lease.client.pid.into()));
+            return Refusal::new(
+                Status::LeaseLost,
+                holder.map_or(0, |lease| lease.client.pid.into()),
+            );
         }
         Refusal::new(Status::NoLease, world as u64)
     }
 
     fn end_where(&mut self, is_over: impl Fn(&Lease) -> bool) -> Vec<Lease> {
-        let over: Vec<u64> = self.live.values().filter(|lease| is_over(lease)).map(|lease| lease.token).collect();
-        over.into_iter().filter_map(|token| self.end(token)).collect()
+        let over: Vec<u64> = self
+            .live
+            .values()
+            .filter(|lease| is_over(lease))
+            .map(|lease| lease.token)
+            .collect();
+        over.into_iter()
+            .filter_map(|token| self.end(token))
+            .collect()
     }
 
     fn end(&mut self, token: u64) -> Option<Lease> {
         let lease = self.live.remove(&token)?;
-        for holder in self.holders.iter_mut().filter(|holder| **holder == Some(token)) {
+        for holder in self
+            .holders
+            .iter_mut()
+            .filter(|holder| **holder == Some(token))
+        {
             *holder = None;
         }
         if self.ended.len() == REMEMBERED {
@@ -190,7 +232,11 @@ impl Leases {
     /// Ends leases all of whose worlds were taken.
     fn forget_empty_leases(&mut self) {
         let holders = self.holders.clone();
-        let is_empty = |lease: &Lease| holders[lease.worlds.clone()].iter().all(|holder| *holder != Some(lease.token));
+        let is_empty = |lease: &Lease| {
+            holders[lease.worlds.clone()]
+                .iter()
+                .all(|holder| *holder != Some(lease.token))
+        };
         self.end_where(is_empty);
     }
 }
@@ -202,56 +248,103 @@ mod tests {
     const TTL: Duration = Duration::from_secs(10);
 
     fn client(pid: u32) -> ClientId {
-        ClientId { node: u128::from(pid), pid }
+        ClientId {
+            node: u128::from(pid),
+            pid,
+        }
     }
 
     fn claim(pid: u32, worlds: Range<usize>, takeover: bool) -> Claim {
-        Claim { client: client(pid), worlds, takeover, time_to_live: TTL }
+        Claim {
+            client: client(pid),
+            worlds,
+            takeover,
+            time_to_live: TTL,
+        }
     }
 
     #[test]
     fn a_world_has_one_holder() {
         let (mut leases, now) = (Leases::new(4), Instant::now());
-        leases.acquire(now, claim(1, 0..2, false), 11).expect("free");
-        let refused = leases.acquire(now, claim(2, 1..3, false), 12).expect_err("held");
+        leases
+            .acquire(now, claim(1, 0..2, false), 11)
+            .expect("free");
+        let refused = leases
+            .acquire(now, claim(2, 1..3, false), 12)
+            .expect_err("held");
         assert_eq!(refused, Refusal::new(Status::Busy, 1));
         assert!(leases.holder(2).is_none(), "a refused claim takes nothing");
-        leases.acquire(now, claim(2, 2..4, false), 13).expect("free");
+        leases
+            .acquire(now, claim(2, 2..4, false), 13)
+            .expect("free");
         assert_eq!(leases.use_lease(now, 11, client(1), &(0..2)), Ok(()));
-        assert_eq!(leases.use_lease(now, 13, client(2), &(1..3)), Err(Refusal::new(Status::NoLease, 1)));
+        assert_eq!(
+            leases.use_lease(now, 13, client(2), &(1..3)),
+            Err(Refusal::new(Status::NoLease, 1))
+        );
     }
 
     #[test]
     fn a_takeover_costs_the_holder_the_worlds_taken() {
         let (mut leases, now) = (Leases::new(2), Instant::now());
-        leases.acquire(now, claim(1, 0..2, false), 11).expect("free");
-        leases.acquire(now, claim(2, 1..2, true), 12).expect("takeover");
+        leases
+            .acquire(now, claim(1, 0..2, false), 11)
+            .expect("free");
+        leases
+            .acquire(now, claim(2, 1..2, true), 12)
+            .expect("takeover");
         assert_eq!(leases.use_lease(now, 11, client(1), &(0..1)), Ok(()));
-        assert_eq!(leases.use_lease(now, 11, client(1), &(0..2)), Err(Refusal::new(Status::LeaseLost, 2)));
-        leases.acquire(now, claim(3, 0..1, true), 13).expect("takeover of the rest");
-        assert_eq!(leases.renew(now, 11, client(1)).map(|_| ()), Err(Refusal::new(Status::LeaseLost, 3)));
+        assert_eq!(
+            leases.use_lease(now, 11, client(1), &(0..2)),
+            Err(Refusal::new(Status::LeaseLost, 2))
+        );
+        leases
+            .acquire(now, claim(3, 0..1, true), 13)
+            .expect("takeover of the rest");
+        assert_eq!(
+            leases.renew(now, 11, client(1)).map(|_| ()),
+            Err(Refusal::new(Status::LeaseLost, 3))
+        );
     }
 
     #[test]
     fn use_extends_a_lease_and_idleness_ends_it() {
         let (mut leases, now) = (Leases::new(1), Instant::now());
-        leases.acquire(now, claim(1, 0..1, false), 11).expect("free");
+        leases
+            .acquire(now, claim(1, 0..1, false), 11)
+            .expect("free");
         let almost = now + TTL - Duration::from_millis(1);
         assert_eq!(leases.use_lease(almost, 11, client(1), &(0..1)), Ok(()));
         assert!(leases.expire(now + TTL).is_empty());
         let late = almost + TTL;
-        assert_eq!(leases.use_lease(late, 11, client(1), &(0..1)), Err(Refusal::new(Status::LeaseLost, 0)));
+        assert_eq!(
+            leases.use_lease(late, 11, client(1), &(0..1)),
+            Err(Refusal::new(Status::LeaseLost, 0))
+        );
         assert_eq!(leases.expire(late).len(), 1);
-        assert_eq!(leases.use_lease(late, 11, client(1), &(0..1)), Err(Refusal::new(Status::LeaseLost, 0)));
-        leases.acquire(late, claim(2, 0..1, false), 12).expect("free again");
+        assert_eq!(
+            leases.use_lease(late, 11, client(1), &(0..1)),
+            Err(Refusal::new(Status::LeaseLost, 0))
+        );
+        leases
+            .acquire(late, claim(2, 0..1, false), 12)
+            .expect("free again");
     }
 
     #[test]
     fn a_stolen_token_is_worth_nothing() {
         let (mut leases, now) = (Leases::new(1), Instant::now());
-        leases.acquire(now, claim(1, 0..1, false), 11).expect("free");
-        assert_eq!(leases.use_lease(now, 11, client(2), &(0..1)), Err(Refusal::new(Status::NoLease, 0)));
-        assert_eq!(leases.release(now, 11, client(2)), Err(Refusal::new(Status::NoLease, 0)));
+        leases
+            .acquire(now, claim(1, 0..1, false), 11)
+            .expect("free");
+        assert_eq!(
+            leases.use_lease(now, 11, client(2), &(0..1)),
+            Err(Refusal::new(Status::NoLease, 0))
+        );
+        assert_eq!(
+            leases.release(now, 11, client(2)),
+            Err(Refusal::new(Status::NoLease, 0))
+        );
         assert_eq!(leases.release(now, 11, client(1)), Ok(()));
         assert!(leases.holder(0).is_none());
     }
@@ -259,8 +352,12 @@ mod tests {
     #[test]
     fn a_dead_process_holds_nothing() {
         let (mut leases, now) = (Leases::new(2), Instant::now());
-        leases.acquire(now, claim(1, 0..1, false), 11).expect("free");
-        leases.acquire(now, claim(2, 1..2, false), 12).expect("free");
+        leases
+            .acquire(now, claim(1, 0..1, false), 11)
+            .expect("free");
+        leases
+            .acquire(now, claim(2, 1..2, false), 12)
+            .expect("free");
         assert_eq!(leases.end_of_process(1).len(), 1);
         assert!(leases.holder(0).is_none() && leases.holder(1).is_some());
     }
@@ -268,9 +365,14 @@ mod tests {
     #[test]
     fn worlds_outside_the_server_are_refused() {
         let (mut leases, now) = (Leases::new(2), Instant::now());
-        #[expect(clippy::reversed_empty_ranges, reason = "what a hostile client may send")]
+        #[expect(
+            clippy::reversed_empty_ranges,
+            reason = "what a hostile client may send"
+        )]
         for worlds in [0..3, 2..2, 5..7, 1..0] {
-            let refused = leases.acquire(now, claim(1, worlds, true), 11).expect_err("no such world");
+            let refused = leases
+                .acquire(now, claim(1, worlds, true), 11)
+                .expect_err("no such world");
             assert_eq!(refused, Refusal::new(Status::NoSuchWorld, 2));
         }
     }

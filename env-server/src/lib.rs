@@ -1,1 +1,16 @@
-//! Placeholder.
+//! The Emberwatch server: simulates worlds and serves them to agents over shared memory.
+//!
+//! One step, in reading order: [`world`] (hidden states), [`sensor`] (noise), [`episode`] (path,
+//! reward, frame), [`lease`] (who may act), [`simulator`] (request in, answer out), [`ports`] and
+//! [`server`] (shared memory and the loop). [`resets`] and [`liveness`] keep slow things off that loop.
+
+pub mod config;
+pub mod episode;
+pub mod lease;
+pub mod liveness;
+pub mod ports;
+pub mod resets;
+pub mod sensor;
+pub mod server;
+pub mod simulator;
+pub mod world;

@@ -1,3 +1,149 @@
-//! Placeholder.
+//! `emberwatch-server`: reads settings, starts logging, serves.
 
-fn main() {}
+use anyhow::{Context, Result};
+use clap::{Args, Parser, Subcommand};
+use env_server::config::ServerFlags;
+use env_server::server::serve;
+use protocol::Connection;
+use protocol::channels::Instance;
+use protocol::control::{Reply, Request, ServerStatus};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
+
+/// How long `status` and `stop` wait for the server.
+const TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Simulates worlds and serves them to agents over shared memory.
+#[derive(Parser)]
+#[command(
+    name = "emberwatch-server",
+    version,
+    args_conflicts_with_subcommands = true
+)]
+struct Cli {
+    #[command(subcommand)]
+    command: Option<Command>,
+    #[command(flatten)]
+    flags: ServerFlags,
+    /// Check the settings, print the effective ones as TOML, and end
+    #[arg(long)]
+    check: bool,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Ask a running server what is going on
+    Status(Target),
+    /// Stop a running server
+    Stop(Target),
+}
+
+#[derive(Args)]
+struct Target {
+    /// The server's instance name
+    #[arg(long, default_value = "default")]
+    instance: String,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+fn main() -> ExitCode {
+    start_logging();
+    match run(&Cli::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            tracing::error!("{error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(cli: &Cli) -> Result<()> {
+    match &cli.command {
+        Some(Command::Status(target)) => show_status(target),
+        Some(Command::Stop(target)) => ask(target, &Request::Shutdown).map(|_| ()),
+        None => {
+            let checked = cli.flags.effective()?.check()?;
+            if cli.check {
+                return print(&toml::to_string(&checked.config)?);
+            }
+            Ok(serve(checked, &stop_on_signals()?)?)
+        }
+    }
+}
+
+fn show_status(target: &Target) -> Result<()> {
+    match ask(target, &Request::Status)? {
+        Reply::Status(status) if target.json => {
+            print(&(serde_json::to_string_pretty(&status)? + "\n"))
+        }
+        Reply::Status(status) => print(&describe(&target.instance, &status)),
+        other => anyhow::bail!("expected a status, got {other:?}"),
+    }
+}
+
+fn ask(target: &Target, request: &Request) -> Result<Reply> {
+    let instance = Instance::new(&target.instance)?;
+    let mut connection = Connection::open(&instance, "emberwatch-server", TIMEOUT)?;
+    Ok(connection.control(request, TIMEOUT)?)
+}
+
+fn describe(instance: &str, status: &ServerStatus) -> String {
+    let uptime = Duration::from_millis(status.uptime_millis).as_secs();
+    let mut text = format!(
+        "instance {instance}: pid {}, up {uptime} s, {} steps, {:.0} steps/s, {} refused requests, {} clients, {} observers\n",
+        status.pid,
+        status.n_steps,
+        status.steps_per_second,
+        status.n_refused,
+        status.n_clients,
+        status.n_observers
+    );
+    text += "world  step        seed                  episode  robot         holder\n";
+    for world in &status.worlds {
+        let holder = match (world.resetting, world.holder_pid) {
+            (true, _) => "(resetting)".into(),
+            (false, Some(pid)) => format!("pid {pid}"),
+            (false, None) => "-".into(),
+        };
+        let info = &world.info;
+        let robot = format!("({}, {})", info.robot[0], info.robot[1]);
+        text += &format!(
+            "{:<6} {:<11} {:<21} {:<8} {robot:<13} {holder}\n",
+            info.world, info.step, info.seed, info.episode
+        );
+    }
+    text
+}
+
+fn print(text: &str) -> Result<()> {
+    use std::io::Write;
+    std::io::stdout()
+        .write_all(text.as_bytes())
+        .context("write to standard output")
+}
+
+/// Set by SIGINT, SIGTERM or SIGHUP; a second one ends the process at once.
+fn stop_on_signals() -> Result<Arc<AtomicBool>> {
+    use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+    let stop = Arc::new(AtomicBool::new(false));
+    for signal in [SIGINT, SIGTERM, SIGHUP] {
+        signal_hook::flag::register_conditional_shutdown(signal, 1, stop.clone())
+            .context("handle signals")?;
+        signal_hook::flag::register(signal, stop.clone()).context("handle signals")?;
+    }
+    Ok(stop)
+}
+
+fn start_logging() {
+    use tracing_subscriber::EnvFilter;
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_target(false)
+        .init();
+}

@@ -120,6 +120,8 @@ pub struct ServerInfo {
     pub burn_in: u64,
     /// Episode length; 0: never truncated.
     pub max_steps: u64,
+    /// Most clients at a time.
+    pub max_clients: usize,
     /// Which cells a step observes.
     pub coverage: CoverageRule,
     /// Whether the `truth` channel exists.

@@ -1,0 +1,133 @@
+//! Who the clients are and whether they live: pidfds for their death, and a janitor that clears
+//! away what dead processes left in shared memory.
+
+use crate::lease::ClientId;
+use iceoryx2::prelude::PayloadHeader;
+use iceoryx2::service::header::request_response::RequestHeader;
+use protocol::channels::{Ipc, create_node};
+use protocol::wait::sleep_until_readable;
+use rustix::process::{Pid, PidfdFlags, pidfd_open};
+use std::collections::HashMap;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// Nodes remembered before the table is started afresh: bounds what a client that reconnects for
+/// ever can make the server hold.
+const MAX_KNOWN_NODES: usize = 1024;
+
+/// How often the janitor looks without being asked: for observers, whose death nobody reports.
+const JANITOR_INTERVAL: Duration = Duration::from_secs(2);
+
+/// The processes behind requests.
+#[derive(Default)]
+pub struct Clients {
+    nodes: HashMap<u128, u32>,
+    processes: HashMap<u32, OwnedFd>,
+}
+
+/// Clears away what dead processes left. It is a thread because one dead process costs
+/// milliseconds, and steps must not wait for that.
+pub struct Janitor {
+    requests: Option<Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Clients {
+    /// The process behind a request; watches it from now on.
+    pub fn identify(&mut self, header: &RequestHeader) -> ClientId {
+        let node_id = header.node_id();
+        let node = node_id.value();
+        if let Some(&pid) = self.nodes.get(&node) {
+            return ClientId { node, pid };
+        }
+        let pid = node_id.pid::<Ipc>().map_or(0, |id| id.value() as u32);
+        if self.nodes.len() == MAX_KNOWN_NODES {
+            self.nodes.clear();
+        }
+        self.nodes.insert(node, pid);
+        self.watch(pid);
+        ClientId { node, pid }
+    }
+
+    /// One descriptor per process, readable when it has ended.
+    pub fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
+        self.processes.values().map(AsFd::as_fd)
+    }
+
+    /// The processes that have ended since the last call; they are forgotten.
+    pub fn take_dead(&mut self) -> Vec<u32> {
+        let pids: Vec<u32> = self.processes.keys().copied().collect();
+        let descriptors: Vec<BorrowedFd<'_>> = self.descriptors().collect();
+        let ended = sleep_until_readable(&descriptors, Duration::ZERO).unwrap_or_default();
+        let dead: Vec<u32> = pids
+            .into_iter()
+            .zip(ended)
+            .filter(|(_, ended)| *ended)
+            .map(|(pid, _)| pid)
+            .collect();
+        for pid in &dead {
+            self.processes.remove(pid);
+            self.nodes.retain(|_, process| process != pid);
+        }
+        dead
+    }
+
+    fn watch(&mut self, pid: u32) {
+        let process = i32::try_from(pid).ok().and_then(Pid::from_raw);
+        let Some(process) = process.filter(|_| !self.processes.contains_key(&pid)) else {
+            return;
+        };
+        // A process that has ended already leaves nothing to watch; its lease will expire.
+        if let Ok(descriptor) = pidfd_open(process, PidfdFlags::empty()) {
+            self.processes.insert(pid, descriptor);
+        }
+    }
+}
+
+impl Janitor {
+    /// Starts the janitor.
+    pub fn start() -> Self {
+        let (requests, receiver) = channel();
+        let thread = std::thread::Builder::new()
+            .name("janitor".into())
+            .spawn(move || clean(&receiver));
+        Self {
+            requests: Some(requests),
+            thread: thread.ok(),
+        }
+    }
+
+    /// Asks it to clean soon.
+    pub fn request(&self) {
+        if let Some(requests) = &self.requests {
+            let _ = requests.send(());
+        }
+    }
+}
+
+impl Drop for Janitor {
+    fn drop(&mut self) {
+        self.requests = None;
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+fn clean(requests: &Receiver<()>) {
+    let Ok(node) = create_node() else { return };
+    while !matches!(
+        requests.recv_timeout(JANITOR_INTERVAL),
+        Err(RecvTimeoutError::Disconnected)
+    ) {
+        let state = node.try_cleanup_dead_nodes();
+        if state.cleanups > 0 {
+            tracing::info!(
+                n_processes = state.cleanups,
+                "cleared away what dead processes left"
+            );
+        }
+    }
+}

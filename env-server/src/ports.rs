@@ -1,0 +1,361 @@
+//! The server's ends of the channels.
+
+use crate::config::Checked;
+use iceoryx2::active_request::ActiveRequest;
+use iceoryx2::node::Node;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::{ListenerKey, Notifier};
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::server::Server;
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::prelude::{AllocationStrategy, CallbackProgression, PortFactory};
+use iceoryx2::service::port_factory::server::ServerCreateError;
+use protocol::channels::{
+    Channel, ChannelError, FRAME_BUFFER, FrameService, Ipc, MAX_CLIENTS, MAX_OBSERVERS,
+    MAX_TRUTH_READERS, RequestResponse, Services, StepService, TRUTH_BUFFER, TruthService,
+    create_node, ipc_error,
+};
+use protocol::connection::server_pid;
+use protocol::message::{
+    ControlReply, ControlRequest, FrameHeader, Header, RESULT_BYTES, StepReply, StepRequest,
+    TruthHeader,
+};
+use protocol::wait::descriptor;
+use std::collections::HashMap;
+use std::os::fd::BorrowedFd;
+use thiserror::Error;
+
+/// A request on `step` that waits for its answer.
+pub type ActiveStep = ActiveRequest<Ipc, [u8], StepRequest, [u8], StepReply>;
+
+/// A request on `control` that waits for its answer.
+pub type ActiveControl = ActiveRequest<Ipc, [u8], ControlRequest, [u8], ControlReply>;
+
+/// Length that control answers may have before their segment grows, bytes.
+const CONTROL_SLICE: usize = 16_384;
+
+/// Listeners remembered before the table is started afresh.
+const MAX_KNOWN_LISTENERS: usize = 1024;
+
+/// Bytes that iceoryx2 adds to each message, at most.
+const MESSAGE_OVERHEAD: usize = 512;
+
+/// Shared memory for everything of fixed size: control messages, events, tables.
+const FIXED_BYTES: u64 = 8 << 20;
+
+/// Where shared memory lives.
+const SHARED_MEMORY: &str = "/dev/shm";
+
+/// Why the server cannot take its place.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum PortError {
+    /// Another server serves the instance.
+    #[error("instance {instance:?} is already running, as pid {pid}")]
+    AlreadyRunning {
+        /// The instance.
+        instance: String,
+        /// The other server's process.
+        pid: i32,
+    },
+    /// Too little shared memory: writing to it would end in a bus error.
+    #[error(
+        "shared memory: expected {needed} MiB free in {SHARED_MEMORY}, got {free} MiB; free some, give the \
+         container more (docker: --shm-size), or serve fewer worlds or a smaller grid"
+    )]
+    SharedMemory {
+        /// MiB needed.
+        needed: u64,
+        /// MiB there.
+        free: u64,
+    },
+    /// A channel could not be made.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+}
+
+/// All ports of a server.
+pub struct Ports {
+    step: Server<Ipc, [u8], StepRequest, [u8], StepReply>,
+    control: Server<Ipc, [u8], ControlRequest, [u8], ControlReply>,
+    frames: Publisher<Ipc, [u8], FrameHeader>,
+    truth: Option<Publisher<Ipc, [u8], TruthHeader>>,
+    listener: Listener<Ipc>,
+    notifier: Notifier<Ipc>,
+    listeners: HashMap<u128, ListenerKey>,
+    step_service: StepService,
+    frame_service: FrameService,
+    truth_service: Option<TruthService>,
+    _node: Node<Ipc>,
+}
+
+impl Ports {
+    /// Takes an instance's place, after clearing away what a dead server left.
+    ///
+    /// # Errors
+    /// [`PortError`].
+    pub fn open(checked: &Checked) -> Result<Self, PortError> {
+        check_shared_memory(checked)?;
+        let node = create_node()?;
+        node.try_cleanup_dead_nodes();
+        let services = Services {
+            node: &node,
+            instance: &checked.instance,
+        };
+        let (control_service, step_service) = (services.create_control()?, services.create_step()?);
+        let control = control_service
+            .server_builder()
+            .initial_max_slice_len(CONTROL_SLICE);
+        let control = control
+            .allocation_strategy(AllocationStrategy::PowerOfTwo)
+            .create();
+        let control = control.map_err(|error| taken(checked, &control_service, error))?;
+        let step = step_service
+            .server_builder()
+            .initial_max_slice_len(answer_bytes(checked));
+        let step = step.max_loaned_responses_per_request(1).create();
+        let step = step.map_err(|error| taken(checked, &step_service, error))?;
+        let frame_service = services.frames()?;
+        let frames = frame_service
+            .publisher_builder()
+            .initial_max_slice_len(frame_bytes(checked))
+            .max_loaned_samples(1);
+        let frames = frames.create().map_err(ipc_error("publish frames"))?;
+        let truth_service = if checked.config.publish_truth {
+            Some(services.truth()?)
+        } else {
+            None
+        };
+        let truth = truth_service.as_ref().map(|service| {
+            let publisher = service
+                .publisher_builder()
+                .initial_max_slice_len(checked.shape.n_cells());
+            publisher
+                .max_loaned_samples(1)
+                .create()
+                .map_err(ipc_error("publish the truth"))
+        });
+        let listener = services
+            .wake(Channel::WakeServer)?
+            .listener_builder()
+            .create();
+        let notifier = services
+            .wake(Channel::WakeClient)?
+            .notifier_builder()
+            .create();
+        Ok(Self {
+            step,
+            control,
+            frames,
+            truth: truth.transpose()?,
+            listener: listener.map_err(ipc_error("create a listener"))?,
+            notifier: notifier.map_err(ipc_error("create a notifier"))?,
+            listeners: HashMap::new(),
+            step_service,
+            frame_service,
+            truth_service,
+            _node: node,
+        })
+    }
+
+    /// The next step request.
+    ///
+    /// # Errors
+    /// [`ChannelError::Ipc`].
+    pub fn receive_step(&self) -> Result<Option<ActiveStep>, ChannelError> {
+        self.step
+            .receive()
+            .map_err(ipc_error("receive a step request"))
+    }
+
+    /// The next control request.
+    ///
+    /// # Errors
+    /// [`ChannelError::Ipc`].
+    pub fn receive_control(&self) -> Result<Option<ActiveControl>, ChannelError> {
+        self.control
+            .receive()
+            .map_err(ipc_error("receive a control request"))
+    }
+
+    /// Sends an answer and wakes its client. A client that is gone or that holds back its answers
+    /// loses this one: that is its own affair.
+    pub fn answer<Q: Header, R: Header>(
+        &mut self,
+        request: &ActiveRequest<Ipc, [u8], Q, [u8], R>,
+        header: R,
+        payload: &[u8],
+        listener: u128,
+    ) {
+        let sent = request
+            .loan_slice_uninit(payload.len())
+            .map_err(|error| format!("{error:?}"))
+            .and_then(|mut response| {
+                *response.user_header_mut() = header;
+                response
+                    .write_from_slice(payload)
+                    .send()
+                    .map_err(|error| format!("{error:?}"))
+            });
+        match sent {
+            Ok(()) => self.wake(listener),
+            Err(problem) => tracing::debug!(problem, "an answer was not taken"),
+        }
+    }
+
+    /// Publishes a frame and the path that was flown, if anybody observes.
+    pub fn publish_frame(&self, header: FrameHeader, frame: &[u8], path: &[u8]) {
+        let bytes = [frame, path].concat();
+        let sent = self
+            .frames
+            .loan_slice_uninit(bytes.len())
+            .map_err(|error| format!("{error:?}"))
+            .and_then(|mut sample| {
+                *sample.user_header_mut() = header;
+                sample
+                    .write_from_slice(&bytes)
+                    .send()
+                    .map_err(|error| format!("{error:?}"))
+            });
+        if let Err(problem) = sent {
+            tracing::warn!(problem, "a frame was not published");
+        }
+    }
+
+    /// Publishes hidden states, if the server does so at all.
+    pub fn publish_truth(&self, header: TruthHeader, states: &[u8]) {
+        let Some(truth) = &self.truth else { return };
+        let sent = truth
+            .loan_slice_uninit(states.len())
+            .map_err(|error| format!("{error:?}"))
+            .and_then(|mut sample| {
+                *sample.user_header_mut() = header;
+                sample
+                    .write_from_slice(states)
+                    .send()
+                    .map_err(|error| format!("{error:?}"))
+            });
+        if let Err(problem) = sent {
+            tracing::warn!(problem, "hidden states were not published");
+        }
+    }
+
+    /// Lets new observers connect; returns the number of observers of frames and of the truth.
+    pub fn observers(&self) -> (usize, usize) {
+        let n_frames = self.frame_service.dynamic_config().number_of_subscribers();
+        let n_truth = self.truth_service.as_ref().map_or(0, |service| {
+            service.dynamic_config().number_of_subscribers()
+        });
+        (n_frames, n_truth)
+    }
+
+    /// Connects to observers that have come since.
+    pub fn connect_observers(&self) {
+        // Failing to connect to one observer is that observer's loss.
+        let _ = self.frames.update_connections();
+        let _ = self
+            .truth
+            .as_ref()
+            .map(UpdateConnections::update_connections);
+    }
+
+    /// Clients connected to `step`.
+    pub fn n_clients(&self) -> usize {
+        self.step_service.dynamic_config().number_of_clients()
+    }
+
+    /// Takes note of wake-ups; returns whether there were any.
+    ///
+    /// # Errors
+    /// [`ChannelError::Ipc`].
+    pub fn drain(&self) -> Result<bool, ChannelError> {
+        let drained = self
+            .listener
+            .try_wait(|_| {})
+            .map_err(ipc_error("drain wake-ups"))?;
+        Ok(drained > 0)
+    }
+
+    /// Readable while there are wake-ups.
+    pub fn descriptor(&self) -> BorrowedFd<'_> {
+        descriptor(&self.listener)
+    }
+
+    fn wake(&mut self, listener: u128) {
+        let known = self
+            .listeners
+            .get(&listener)
+            .is_some_and(|key| self.notifier.notify_single_listener(key).is_ok());
+        if listener == 0 || known {
+            return;
+        }
+        if self.listeners.len() == MAX_KNOWN_LISTENERS {
+            self.listeners.clear();
+        }
+        self.listeners.remove(&listener);
+        let listeners = &mut self.listeners;
+        self.notifier.for_each_listener(|one, details| {
+            if details.listener_id.value() != listener {
+                return CallbackProgression::Continue;
+            }
+            listeners.insert(listener, one.listener_key());
+            let _ = one.notify();
+            CallbackProgression::Stop
+        });
+    }
+}
+
+fn taken<Q: Header, R: Header>(
+    checked: &Checked,
+    service: &RequestResponse<Q, R>,
+    error: ServerCreateError,
+) -> PortError {
+    match (error, server_pid(service)) {
+        (ServerCreateError::ExceedsMaxSupportedServers, Some(pid)) => PortError::AlreadyRunning {
+            instance: checked.instance.name().into(),
+            pid,
+        },
+        (other, _) => ipc_error("create a server")(other).into(),
+    }
+}
+
+fn answer_bytes(checked: &Checked) -> usize {
+    checked.config.worlds as usize * (RESULT_BYTES + checked.shape.n_cells())
+}
+
+fn frame_bytes(checked: &Checked) -> usize {
+    checked.shape.n_cells() + checked.config.moves
+}
+
+/// A full `/dev/shm` kills with SIGBUS whoever writes to it: look before.
+fn check_shared_memory(checked: &Checked) -> Result<(), PortError> {
+    let bytes =
+        |n_messages: usize, length: usize| (n_messages * (length + MESSAGE_OVERHEAD)) as u64;
+    // Chunks as iceoryx2 counts them: 2 requests in flight x (buffered + borrowed + loaned).
+    let answers = bytes(MAX_CLIENTS * 2 * 3, answer_bytes(checked));
+    let frames = bytes(MAX_OBSERVERS * (FRAME_BUFFER + 1) + 2, frame_bytes(checked));
+    let truth = bytes(
+        MAX_TRUTH_READERS * (TRUTH_BUFFER + 1) + 2,
+        checked.shape.n_cells(),
+    );
+    let needed = FIXED_BYTES
+        + answers
+        + frames
+        + if checked.config.publish_truth {
+            truth
+        } else {
+            0
+        };
+    let Ok(status) = rustix::fs::statvfs(SHARED_MEMORY) else {
+        return Ok(());
+    };
+    let free = status.f_bavail * status.f_frsize;
+    let mebibytes = |bytes: u64| bytes.div_ceil(1 << 20);
+    if needed <= free {
+        return Ok(());
+    }
+    Err(PortError::SharedMemory {
+        needed: mebibytes(needed),
+        free: free >> 20,
+    })
+}

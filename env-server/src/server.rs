@@ -1,0 +1,398 @@
+//! The loop: receive, check the lease, step, answer, publish.
+
+use crate::config::Checked;
+use crate::liveness::{Clients, Janitor};
+use crate::ports::{ActiveControl, ActiveStep, PortError, Ports};
+use crate::resets::Resets;
+use crate::simulator::{Awaited, Outcome, Simulator, Surroundings};
+use protocol::channels::{ChannelError, ipc_error};
+use protocol::control::Reply;
+use protocol::message::{ControlReply, FrameHeader, Status, TruthHeader, VERSION};
+use protocol::model::ModelError;
+use protocol::path::path_to_bytes;
+use protocol::wait::{poll_then_block, sleep_until_readable};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+use rayon::{ThreadPool, ThreadPoolBuilder};
+use std::cell::Cell;
+use std::collections::hash_map::RandomState;
+use std::hash::BuildHasher;
+use std::ops::Range;
+use std::os::fd::BorrowedFd;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+use thiserror::Error;
+
+/// How often an idle server looks around: leases that expire, observers that came.
+const IDLE_TICK: Duration = Duration::from_millis(250);
+
+/// How often a busy server does: bounds how late a client's death is noticed.
+const BUSY_TICK: Duration = Duration::from_millis(50);
+
+/// Over how long the step rate is measured.
+const RATE_WINDOW: Duration = Duration::from_secs(1);
+
+/// Why the server could not start or had to end.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ServeError {
+    /// Its place could not be taken.
+    #[error(transparent)]
+    Port(#[from] PortError),
+    /// A channel failed.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+    /// The model does not fit the grid.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// Threads could not be started.
+    #[error("start {n_threads} threads: {problem}")]
+    Threads {
+        /// How many.
+        n_threads: usize,
+        /// The system's reason.
+        problem: String,
+    },
+}
+
+/// Serves until `stop` is set or a client asks to shut down.
+///
+/// # Errors
+/// [`ServeError`].
+pub fn serve(checked: Checked, stop: &Arc<AtomicBool>) -> Result<(), ServeError> {
+    let mut server = Server::start(checked)?;
+    while !stop.load(Ordering::Relaxed) && !server.is_over {
+        server.turn()?;
+    }
+    tracing::info!(n_steps = server.simulator.n_steps(), "stopped");
+    Ok(())
+}
+
+struct Server {
+    simulator: Simulator,
+    ports: Ports,
+    clients: Clients,
+    janitor: Janitor,
+    resets: Resets,
+    awaiting: Vec<(ActiveControl, Awaited)>,
+    payload: Vec<u8>,
+    observers: (usize, usize),
+    n_frames: u64,
+    n_truths: u64,
+    rate: Rate,
+    started: Instant,
+    last_tick: Instant,
+    is_over: bool,
+}
+
+/// What a turn of the loop found.
+enum Found {
+    Step(ActiveStep),
+    Control(ActiveControl),
+    /// A wake-up without a request, a death or a finished reset.
+    Event,
+}
+
+/// World steps a second over the last window.
+struct Rate {
+    since: Instant,
+    n_steps: u64,
+    per_second: f64,
+}
+
+impl Server {
+    fn start(checked: Checked) -> Result<Self, ServeError> {
+        let ports = Ports::open(&checked)?;
+        let (instance, config) = (checked.instance.name().to_owned(), &checked.config);
+        tracing::info!(
+            instance,
+            pid = std::process::id(),
+            worlds = config.worlds,
+            seed = config.seed,
+            "serving"
+        );
+        let n_threads = config.threads;
+        let (simulator, orders) = Simulator::new(checked, threads(n_threads)?, token_source())?;
+        let resets = Resets::new(threads(n_threads)?, simulator.rules().clone());
+        let resets = resets.map_err(|errno| ServeError::Threads {
+            n_threads,
+            problem: errno.to_string(),
+        })?;
+        resets.start(orders);
+        let now = Instant::now();
+        Ok(Self {
+            simulator,
+            ports,
+            clients: Clients::default(),
+            janitor: Janitor::start(),
+            resets,
+            awaiting: Vec::new(),
+            payload: Vec::new(),
+            observers: (0, 0),
+            n_frames: 0,
+            n_truths: 0,
+            rate: Rate {
+                since: now,
+                n_steps: 0,
+                per_second: 0.0,
+            },
+            started: now,
+            last_tick: now,
+            is_over: false,
+        })
+    }
+
+    /// Waits for something and handles it.
+    fn turn(&mut self) -> Result<(), ServeError> {
+        let woken = Cell::new(false);
+        let found = poll_then_block(
+            IDLE_TICK,
+            || self.look(&woken),
+            |limit| {
+                woken.set(self.sleep(limit)?);
+                Ok::<_, ServeError>(())
+            },
+        )?;
+        let now = Instant::now();
+        match found {
+            Some(Found::Step(request)) => self.answer_step(now, &request),
+            Some(Found::Control(request)) => self.answer_control(now, request),
+            Some(Found::Event) | None => self.look_around(now),
+        }
+        if now - self.last_tick > BUSY_TICK {
+            self.look_around(now);
+        }
+        Ok(())
+    }
+
+    fn look(&self, woken: &Cell<bool>) -> Result<Option<Found>, ServeError> {
+        if let Some(request) = self.ports.receive_step()? {
+            return Ok(Some(Found::Step(request)));
+        }
+        if let Some(request) = self.ports.receive_control()? {
+            return Ok(Some(Found::Control(request)));
+        }
+        Ok(woken.get().then_some(Found::Event))
+    }
+
+    /// Sleeps until a wake-up, a death or a finished reset; returns whether there was one.
+    fn sleep(&self, limit: Duration) -> Result<bool, ServeError> {
+        if self.ports.drain()? {
+            return Ok(true);
+        }
+        let own = [self.ports.descriptor(), self.resets.descriptor()];
+        let descriptors: Vec<BorrowedFd<'_>> =
+            own.into_iter().chain(self.clients.descriptors()).collect();
+        let readable = sleep_until_readable(&descriptors, limit).map_err(ipc_error("sleep"))?;
+        Ok(readable.contains(&true))
+    }
+
+    fn answer_step(&mut self, now: Instant, request: &ActiveStep) {
+        let client = self.clients.identify(request.header());
+        let header = *request.user_header();
+        let mut reply =
+            self.simulator
+                .step(now, client, &header, request.payload(), &mut self.payload);
+        reply.simulation_nanos = now.elapsed().as_nanos() as u64;
+        let listener = listener_id(header.listener_low, header.listener_high);
+        self.ports.answer(request, reply, &self.payload, listener);
+        if header.operation == protocol::message::Operation::Step as u32 {
+            self.publish(self.simulator.worlds_of(&reply));
+        }
+    }
+
+    fn answer_control(&mut self, now: Instant, request: ActiveControl) {
+        // A holder that died a moment ago must not keep its worlds from the next.
+        self.bury_the_dead();
+        let client = self.clients.identify(request.header());
+        let surroundings = Surroundings {
+            uptime: self.started.elapsed(),
+            steps_per_second: self.rate.per_second,
+            n_clients: self.ports.n_clients(),
+            n_observers: self.ports.observers().0,
+        };
+        let version = request.user_header().version;
+        match self
+            .simulator
+            .control(now, client, version, request.payload(), &surroundings)
+        {
+            Outcome::Answer(reply) => self.send_reply(&request, &reply),
+            Outcome::Later(orders, awaited) => {
+                self.resets.start(orders);
+                self.awaiting.push((request, awaited));
+                self.answer_awaiting(now);
+            }
+            Outcome::Shutdown => {
+                self.send_reply(&request, &Reply::Done);
+                tracing::info!(client = client.pid, "a client asked to shut down");
+                self.is_over = true;
+            }
+        }
+    }
+
+    fn send_reply(&mut self, request: &ActiveControl, reply: &Reply) {
+        let header = request.user_header();
+        let answer = ControlReply {
+            version: VERSION,
+            status: reply.status() as u32,
+            sequence: header.sequence,
+        };
+        let listener = listener_id(header.listener_low, header.listener_high);
+        let text = serde_json::to_vec(reply).expect("invariant: replies serialise");
+        if reply.status() != Status::Ok {
+            tracing::debug!(status = ?reply.status(), "refused a control request");
+        }
+        self.ports.answer(request, answer, &text, listener);
+    }
+
+    fn answer_awaiting(&mut self, now: Instant) {
+        for (request, awaited) in std::mem::take(&mut self.awaiting) {
+            match self.simulator.answer_awaited(now, &awaited) {
+                Some(reply) => self.send_reply(&request, &reply),
+                None => self.awaiting.push((request, awaited)),
+            }
+        }
+    }
+
+    /// Everything that no request asks for.
+    fn look_around(&mut self, now: Instant) {
+        self.last_tick = now;
+        self.take_resets(now);
+        self.bury_the_dead();
+        for pid in self.simulator.expire(now) {
+            tracing::warn!(pid, "a lease expired");
+        }
+        self.greet_observers();
+        self.rate.update(now, self.simulator.n_steps());
+    }
+
+    fn take_resets(&mut self, now: Instant) {
+        let finished = self.resets.finished();
+        if finished.is_empty() {
+            return;
+        }
+        for (world, episode) in finished {
+            self.simulator.finish_reset(world, episode);
+            self.publish(world..world + 1);
+        }
+        self.answer_awaiting(now);
+    }
+
+    fn bury_the_dead(&mut self) {
+        for pid in self.clients.take_dead() {
+            let n_leases = self.simulator.end_of_process(pid);
+            tracing::info!(pid, n_leases, "a client ended");
+            self.janitor.request();
+        }
+    }
+
+    /// Shows every world to observers that have just come.
+    fn greet_observers(&mut self) {
+        let observers = self.ports.observers();
+        let has_new = observers.0 > self.observers.0 || observers.1 > self.observers.1;
+        self.observers = observers;
+        if has_new {
+            self.ports.connect_observers();
+            self.publish(self.simulator.worlds());
+        }
+    }
+
+    fn publish(&mut self, worlds: Range<usize>) {
+        let (n_observers, n_readers) = self.ports.observers();
+        if n_observers == 0 && n_readers == 0 {
+            return;
+        }
+        for world in worlds {
+            if n_readers > 0 {
+                self.publish_truth(world);
+            }
+            if n_observers > 0 {
+                self.publish_frame(world);
+            }
+        }
+    }
+
+    fn publish_frame(&mut self, world: usize) {
+        let Some(episode) = self.simulator.episode(world) else {
+            return;
+        };
+        let (height, width) = episode.states().dim();
+        let (start, path) = episode.path();
+        let header = FrameHeader {
+            version: VERSION,
+            world: world as u32,
+            sequence: self.n_frames,
+            height: height as u32,
+            width: width as u32,
+            n_moves: path.len() as u32,
+            start_row: start.row as u32,
+            start_col: start.col as u32,
+            reserved: 0,
+            result: *episode.result(),
+        };
+        self.ports
+            .publish_frame(header, episode.frame().as_bytes(), &path_to_bytes(path));
+        self.n_frames += 1;
+    }
+
+    fn publish_truth(&mut self, world: usize) {
+        let Some(episode) = self.simulator.episode(world) else {
+            return;
+        };
+        let (states, result) = (episode.states(), episode.result());
+        let (height, width) = states.dim();
+        let header = TruthHeader {
+            version: VERSION,
+            world: world as u32,
+            sequence: self.n_truths,
+            episode: result.episode,
+            step: result.step,
+            seed: result.seed,
+            height: height as u32,
+            width: width as u32,
+        };
+        self.ports.publish_truth(
+            header,
+            states.as_slice().expect("invariant: states are row-major"),
+        );
+        self.n_truths += 1;
+    }
+}
+
+impl Rate {
+    fn update(&mut self, now: Instant, n_steps: u64) {
+        let elapsed = now - self.since;
+        if elapsed >= RATE_WINDOW {
+            let per_second = (n_steps - self.n_steps) as f64 / elapsed.as_secs_f64();
+            *self = Self {
+                since: now,
+                n_steps,
+                per_second,
+            };
+        }
+    }
+}
+
+fn listener_id(low: u64, high: u64) -> u128 {
+    u128::from(low) | u128::from(high) << 64
+}
+
+fn threads(n_threads: usize) -> Result<ThreadPool, ServeError> {
+    let pool = ThreadPoolBuilder::new().num_threads(n_threads).build();
+    pool.map_err(|error| ServeError::Threads {
+        n_threads,
+        problem: error.to_string(),
+    })
+}
+
+/// Lease tokens that nobody can guess, below 2^53 so that every JSON reader holds them; never 0.
+fn token_source() -> Box<dyn FnMut() -> u64> {
+    let entropy = RandomState::new();
+    let mut key = [0; 32];
+    for (index, bytes) in key.chunks_mut(8).enumerate() {
+        bytes.copy_from_slice(&entropy.hash_one(index).to_le_bytes());
+    }
+    let mut rng = ChaCha8Rng::from_seed(key);
+    Box::new(move || (rng.next_u64() >> 11).max(1))
+}
