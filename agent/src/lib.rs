@@ -1,1 +1,2 @@
-//! Placeholder.
+//! The Emberwatch agent.
+pub mod client;

@@ -1,1 +1,1 @@
-//! Placeholder.
+//! Tests of the real processes together.

@@ -1,0 +1,171 @@
+//! The agent's end of the wire: acquire worlds, fly paths, receive frames.
+
+use protocol::channels::Instance;
+use protocol::connection::{ConnectionError, StepAnswer, unexpected};
+use protocol::control::{LeaseInfo, Reply, Request, ServerInfo, WorldInfo, WorldSeed};
+use protocol::message::{FLAG_FULL_COVERAGE, Operation, StepRequest, StepResult};
+use protocol::path::path_to_bytes;
+use protocol::{Cell, Connection, Frame, Move, Shape};
+use std::ops::Range;
+use std::time::Duration;
+
+/// How long a step may take.
+pub const STEP_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// How long anything else may take; resets simulate the burn-in of all their worlds.
+pub const CONTROL_TIMEOUT: Duration = Duration::from_secs(120);
+
+/// What a world shows after a step, or when it is taken over.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Observation {
+    /// Step index, reward, counts, robot.
+    pub result: StepResult,
+    /// What the robot saw.
+    pub frame: Frame,
+}
+
+/// A connection with a lease on consecutive worlds.
+pub struct Client {
+    connection: Connection,
+    lease: u64,
+    worlds: Range<u32>,
+    shape: Shape,
+}
+
+/// Which worlds to act on, and how to get them.
+#[derive(Debug, Clone)]
+pub struct Claim {
+    /// The worlds.
+    pub worlds: Range<u32>,
+    /// Take them from their holder.
+    pub takeover: bool,
+    /// The lease ends this long after its last use; `None`: the server's default.
+    pub time_to_live: Option<Duration>,
+}
+
+impl Observation {
+    /// The robot's cell.
+    pub fn robot(&self) -> Cell {
+        Cell { row: self.result.row as usize, col: self.result.col as usize }
+    }
+}
+
+impl Client {
+    /// Connects and acquires worlds; they stay where they are.
+    ///
+    /// # Errors
+    /// [`ConnectionError`]; a refusal names the holder of a world that is taken.
+    pub fn acquire(instance: &Instance, claim: &Claim) -> Result<Self, ConnectionError> {
+        let name = concat!("emberwatch-agent ", env!("CARGO_PKG_VERSION"));
+        let mut connection = Connection::open(instance, name, CONTROL_TIMEOUT)?;
+        let lease = acquire(&mut connection, claim)?.lease;
+        let (height, width) = (connection.info().height, connection.info().width);
+        let shape = Shape::new(height, width);
+        let shape = shape.map_err(|error| ConnectionError::Garbled { what: "hello", problem: error.to_string() })?;
+        Ok(Self { connection, lease, worlds: claim.worlds.clone(), shape })
+    }
+
+    /// What the server said of itself.
+    pub fn info(&self) -> &ServerInfo {
+        self.connection.info()
+    }
+
+    /// The grid.
+    pub fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// The worlds held.
+    pub fn worlds(&self) -> Range<u32> {
+        self.worlds.clone()
+    }
+
+    /// Flies one path in each of consecutive worlds.
+    ///
+    /// # Errors
+    /// [`ConnectionError`]; after a timeout, [`Self::observe`] tells whether the step was made.
+    pub fn step(&mut self, worlds: Range<u32>, paths: &[Vec<Move>]) -> Result<Vec<Observation>, ConnectionError> {
+        self.step_with_flags(worlds, paths, 0)
+    }
+
+    /// As [`Self::step`], asking for full frames.
+    ///
+    /// # Errors
+    /// A refusal, unless the server's coverage is `client` or `full`.
+    pub fn step_full(&mut self, worlds: Range<u32>, paths: &[Vec<Move>]) -> Result<Vec<Observation>, ConnectionError> {
+        self.step_with_flags(worlds, paths, FLAG_FULL_COVERAGE)
+    }
+
+    /// The worlds as they are, changing nothing.
+    ///
+    /// # Errors
+    /// [`ConnectionError`].
+    pub fn observe(&mut self, worlds: Range<u32>) -> Result<Vec<Observation>, ConnectionError> {
+        let request = self.request(Operation::Observe, &worlds);
+        let answer = self.connection.step(request, &[], STEP_TIMEOUT)?;
+        self.observations(&answer)
+    }
+
+    /// Starts new episodes with the given seeds; returns when burn-in is done.
+    ///
+    /// # Errors
+    /// [`ConnectionError`].
+    pub fn reset(&mut self, seeds: &[WorldSeed]) -> Result<Vec<WorldInfo>, ConnectionError> {
+        let request = Request::Reset { lease: self.lease, worlds: seeds.to_vec() };
+        match self.connection.control(&request, CONTROL_TIMEOUT)? {
+            Reply::Reset { worlds } => Ok(worlds),
+            other => Err(unexpected("reset", &other)),
+        }
+    }
+
+    /// Gives the worlds back.
+    ///
+    /// # Errors
+    /// [`ConnectionError`].
+    pub fn release(mut self) -> Result<(), ConnectionError> {
+        let request = Request::Release { lease: self.lease };
+        self.connection.control(&request, STEP_TIMEOUT).map(|_| ())
+    }
+
+    fn step_with_flags(&mut self, worlds: Range<u32>, paths: &[Vec<Move>], flags: u32) -> Result<Vec<Observation>, ConnectionError> {
+        let bytes: Vec<u8> = paths.iter().flat_map(|path| path_to_bytes(path)).collect();
+        let n_moves = paths.first().map_or(0, Vec::len) as u32;
+        let request = StepRequest { n_moves, flags, ..self.request(Operation::Step, &worlds) };
+        let answer = self.connection.step(request, &bytes, STEP_TIMEOUT)?;
+        self.observations(&answer)
+    }
+
+    fn request(&self, operation: Operation, worlds: &Range<u32>) -> StepRequest {
+        StepRequest {
+            operation: operation as u32,
+            lease: self.lease,
+            first_world: worlds.start,
+            n_worlds: worlds.len() as u32,
+            ..StepRequest::default()
+        }
+    }
+
+    fn observations(&self, answer: &StepAnswer) -> Result<Vec<Observation>, ConnectionError> {
+        let n_observations = self.info().n_observations;
+        let frames = answer.frames.chunks_exact(self.shape.n_cells());
+        let observation = |(result, bytes): (&StepResult, &[u8])| {
+            let frame = Frame::from_bytes(self.shape, n_observations, bytes);
+            let frame = frame.map_err(|error| ConnectionError::Garbled { what: "step", problem: error.to_string() })?;
+            Ok(Observation { result: *result, frame })
+        };
+        answer.results.iter().zip(frames).map(observation).collect()
+    }
+}
+
+fn acquire(connection: &mut Connection, claim: &Claim) -> Result<LeaseInfo, ConnectionError> {
+    let request = Request::Acquire {
+        first_world: claim.worlds.start,
+        n_worlds: claim.worlds.len() as u32,
+        takeover: claim.takeover,
+        ttl_millis: claim.time_to_live.map(|time| time.as_millis() as u64),
+    };
+    match connection.control(&request, CONTROL_TIMEOUT)? {
+        Reply::Lease(lease) => Ok(lease),
+        other => Err(unexpected("acquire", &other)),
+    }
+}
