@@ -15,6 +15,9 @@ const PAGE_HEIGHT: f64 = 860.0;
 /// Least height of a panel that the page's height may press it to.
 const LEAST_HEIGHT: f64 = 130.0;
 
+/// Longest side of a panel in points: more would not show more.
+const MOST_SIDE: f64 = 540.0;
+
 /// How many pixels a cell takes, or how many cells a pixel stands for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Zoom {
@@ -133,7 +136,10 @@ impl Zoom {
         let columns = columns as f64;
         let room = (width - GAP * (columns - 1.0)) / columns * SCALE;
         let height = (PAGE_HEIGHT / rows - TITLE_ROOM - GAP).max(LEAST_HEIGHT) * SCALE;
-        let cell = (room / shape.width() as f64).min(height / shape.height() as f64);
+        let longer = shape.width().max(shape.height()) as f64;
+        let cell = (room / shape.width() as f64)
+            .min(height / shape.height() as f64)
+            .min(MOST_SIDE * SCALE / longer);
         if cell >= 1.0 {
             Self {
                 pixels: cell as usize,
