@@ -119,8 +119,8 @@ impl Canvas<'_> {
         if size.0 < 1 || size.1 < 1 {
             return;
         }
-        // plotters includes both corners.
-        let corner = (at.0 + size.0 - 1, at.1 + size.1 - 1);
+        // A filled rectangle of plotters leaves out its lower right edges, unlike an outlined one.
+        let corner = (at.0 + size.0, at.1 + size.1);
         let drawn = self
             .area
             .draw(&Rectangle::new([at, corner], color.filled()));
@@ -207,4 +207,28 @@ fn pixel(point: Point) -> (i32, i32) {
         (point.0 * SCALE).round() as i32,
         (point.1 * SCALE).round() as i32,
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rectangles_fill_exactly_their_pixels() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let path = directory.path().join("page.png");
+        let drawn = draw_page(&path, (10.0, 5.0), |canvas| {
+            canvas.pixel_rectangle((3, 2), (4, 1), INK);
+            canvas.pixel_rectangle((19, 9), (1, 1), INK);
+            canvas.pixel_rectangle((0, 0), (0, 5), INK);
+        });
+        assert_eq!(drawn, Ok(()));
+        let file = std::io::BufReader::new(std::fs::File::open(&path).expect("a file"));
+        let mut reader = png::Decoder::new(file).read_info().expect("a PNG");
+        let mut pixels = vec![0; reader.output_buffer_size()];
+        reader.next_frame(&mut pixels).expect("a whole PNG");
+        let dark = (0..200).filter(|at| pixels[3 * at..3 * at + 3] == [INK.0, INK.1, INK.2]);
+        assert_eq!(dark.collect::<Vec<_>>(), [43, 44, 45, 46, 199]);
+        assert_eq!(pixels.iter().filter(|&&channel| channel != 255).count(), 15);
+    }
 }

@@ -159,7 +159,7 @@ impl Plot {
                 .iter()
                 .flat_map(|line| line.points.iter().map(|point| point.1))
         };
-        let rewards = Axis::covering(values(), 6);
+        let rewards = Axis::covering(values(), 8);
         let widths = rewards
             .ticks
             .iter()

@@ -20,6 +20,8 @@ const LEGEND_TOP: f64 = 76.0;
 /// Room for the colour bar below the panels.
 const FOOT: f64 = 84.0;
 const COLOR_BAR: f64 = 260.0;
+/// Side in points of a cell that shows its colour beside a path with a white rim.
+const WIDE_CELL: f64 = 12.0;
 
 /// One step of one world, with hindsight.
 pub struct Snapshot<'a> {
@@ -261,7 +263,7 @@ fn draw_entry(canvas: &mut Canvas<'_>, entry: &Entry) {
             canvas.rectangle(from, to, color);
             canvas.outline(from, to, 0.5, MUTED);
         }
-        Mark::Path => draw_path(canvas, &[(x + 2.0, y), (x + SWATCH + 7.0, y)], 2.0),
+        Mark::Path => draw_path(canvas, &[(x + 2.0, y), (x + SWATCH + 7.0, y)], 2.0, 0.0),
         Mark::Start => draw_start(canvas, middle, 4.5),
         Mark::Robot => draw_robot(canvas, middle, 6.5),
     }
@@ -315,7 +317,13 @@ fn draw_worlds(
         .map(|&cell| layout.center(corner, cell))
         .collect();
     // Thin against the cells, whose colours it must not hide, and never too thin to see.
-    draw_path(canvas, &points, (layout.cell_size() * 0.2).clamp(1.0, 3.0));
+    let width = (layout.cell_size() * 0.2).clamp(1.0, 3.0);
+    let rim = if layout.cell_size() < WIDE_CELL {
+        0.0
+    } else {
+        1.0
+    };
+    draw_path(canvas, &points, width, rim);
     let radius = (layout.cell_size() * 0.4).clamp(4.5, 9.0);
     if let (Some(&start), Some(&end)) = (points.first(), points.last()) {
         draw_start(canvas, start, radius * 0.8);
@@ -354,9 +362,16 @@ fn draw_panel(
     );
 }
 
-fn draw_path(canvas: &mut Canvas<'_>, points: &[Point], width: f64) {
-    canvas.line(points, width + 1.5, PAPER);
-    canvas.line(points, width, INK);
+/// Draws a path of straight legs, with a white rim where cells are wide enough to show beside it.
+fn draw_path(canvas: &mut Canvas<'_>, points: &[Point], width: f64, rim: f64) {
+    for (half, color) in [(width / 2.0 + rim, PAPER), (width / 2.0, INK)] {
+        for ends in points.windows(2) {
+            let ((x0, y0), (x1, y1)) = (ends[0], ends[1]);
+            // A leg runs along a row or a column, so it is a rectangle, without blurred edges.
+            let from = (x0.min(x1) - half, y0.min(y1) - half);
+            canvas.rectangle(from, (x0.max(x1) + half, y0.max(y1) + half), color);
+        }
+    }
 }
 
 fn draw_start(canvas: &mut Canvas<'_>, (x, y): Point, half: f64) {
