@@ -5,6 +5,7 @@
 
 pub mod csv;
 pub mod figures;
+mod number;
 pub mod statistics;
 pub mod table;
 

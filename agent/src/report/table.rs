@@ -1,5 +1,6 @@
 //! The comparison as text: fits a terminal, and pastes into Markdown as a table.
 
+use super::number::{NOTHING, decimals, number, with_error};
 use super::statistics::{Estimate, median, ratio_of_means};
 use super::{Group, PolicyRun, groups};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
@@ -7,9 +8,6 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// The policy that others are given as a percentage of: the best planner fed with the true state.
 const ORACLE: &str = "oracle_beam";
-
-/// What stands where there is no number.
-const NOTHING: &str = "-";
 
 /// Every policy over all worlds, then over the worlds with less and with more fire.
 ///
@@ -49,45 +47,58 @@ fn heading(runs: &[PolicyRun], groups: &[Group<'_>], baseline: &str) -> String {
     format!("{worlds}, {steps} each; {error}; {baseline}.")
 }
 
+/// What every row of the summary is compared with: mean rewards by world.
+struct References<'a> {
+    baseline: &'a str,
+    base: Option<BTreeMap<u64, f64>>,
+    oracle: Option<BTreeMap<u64, f64>>,
+}
+
 fn summary(groups: &[Group<'_>], baseline: &str) -> Table {
     let reward = |run: &PolicyRun| run.mean_reward;
     let of_policy = |name: &str| {
         let group = groups.iter().find(|group| group.policy == name);
         group.map(|group| group.by_seed(reward))
     };
-    let (base, oracle) = (of_policy(baseline), of_policy(ORACLE));
+    let references = References {
+        baseline,
+        base: of_policy(baseline),
+        oracle: of_policy(ORACLE),
+    };
     let decimals = decimals(groups.iter().flat_map(|group| group.values(reward)));
-
     let mut header = vec!["policy", "estimator", "mean reward", "difference"];
     header.extend(["distinct cells", "hit rate"]);
-    header.extend(oracle.is_some().then_some("% of oracle"));
+    header.extend(references.oracle.is_some().then_some("% of oracle"));
     header.extend(["Brier", "ms/plan"]);
     let mut table = plain_table(&header);
     for group in groups {
-        let rewards = group.by_seed(reward);
-        let difference = match &base {
-            Some(_) if group.policy == baseline => "baseline".into(),
-            Some(base) => signed(Estimate::of_difference(&rewards, base), decimals),
-            None => NOTHING.into(),
-        };
-        let percent = oracle.as_ref().map(|oracle| {
-            let ratio = ratio_of_means(&rewards, oracle);
-            ratio.map_or(NOTHING.into(), |ratio| number(100.0 * ratio, 1))
-        });
-        let mut row = vec![group.policy.to_string(), group.estimator.to_string()];
-        row.push(with_error(Estimate::of(&group.values(reward)), decimals));
-        row.push(difference);
-        row.push(mean(group.values(|run| run.mean_distinct_cells), 1));
-        row.push(mean(group.values(|run| run.hit_rate), 3));
-        row.extend(percent);
-        row.push(mean(
-            group.runs.iter().filter_map(|run| run.brier).collect(),
-            4,
-        ));
-        row.push(mean(group.values(|run| run.mean_plan_millis), 3));
-        table.add_row(row);
+        table.add_row(summary_row(group, &references, decimals));
     }
     table
+}
+
+fn summary_row(group: &Group<'_>, references: &References<'_>, decimals: usize) -> Vec<String> {
+    let rewards = group.by_seed(|run| run.mean_reward);
+    let difference = match &references.base {
+        Some(_) if group.policy == references.baseline => "baseline".into(),
+        Some(base) => signed(Estimate::of_difference(&rewards, base), decimals),
+        None => NOTHING.into(),
+    };
+    let percent = references.oracle.as_ref().map(|oracle| {
+        let ratio = ratio_of_means(&rewards, oracle);
+        ratio.map_or(NOTHING.into(), |ratio| number(100.0 * ratio, 1))
+    });
+    let reward = Estimate::of(&group.values(|run| run.mean_reward));
+    let brier = group.runs.iter().filter_map(|run| run.brier).collect();
+    let mut row = vec![group.policy.to_string(), group.estimator.to_string()];
+    row.push(with_error(reward, decimals));
+    row.push(difference);
+    row.push(mean(group.values(|run| run.mean_distinct_cells), 1));
+    row.push(mean(group.values(|run| run.hit_rate), 3));
+    row.extend(percent);
+    row.push(mean(brier, 4));
+    row.push(mean(group.values(|run| run.mean_plan_millis), 3));
+    row
 }
 
 /// Mean rewards over the half of the worlds with less fire and the half with more; the middle one
@@ -162,27 +173,6 @@ fn plain_table(header: &[&str]) -> Table {
     table
 }
 
-/// Decimals that show about three digits of the largest value, at least two.
-fn decimals(values: impl Iterator<Item = f64>) -> usize {
-    let largest = values.fold(0.0_f64, |largest, value| largest.max(value.abs()));
-    match largest {
-        _ if largest >= 1.0 || largest == 0.0 => 2,
-        _ if largest >= 0.1 => 3,
-        _ => 5,
-    }
-}
-
-fn with_error(estimate: Option<Estimate>, decimals: usize) -> String {
-    let Some(estimate) = estimate else {
-        return NOTHING.into();
-    };
-    let mean = number(estimate.mean, decimals);
-    match estimate.standard_error {
-        Some(error) => format!("{mean} ± {}", number(error, decimals)),
-        None => format!("{mean} (n = 1)"),
-    }
-}
-
 fn signed(estimate: Option<Estimate>, decimals: usize) -> String {
     let text = with_error(estimate, decimals);
     let sign = if estimate.is_some() && !text.starts_with('-') {
@@ -195,13 +185,4 @@ fn signed(estimate: Option<Estimate>, decimals: usize) -> String {
 
 fn mean(values: Vec<f64>, decimals: usize) -> String {
     Estimate::of(&values).map_or(NOTHING.into(), |estimate| number(estimate.mean, decimals))
-}
-
-/// Fixed decimals, without the sign of a negative zero.
-fn number(value: f64, decimals: usize) -> String {
-    let text = format!("{value:.decimals$}");
-    let is_zero = text
-        .strip_prefix('-')
-        .is_some_and(|digits| digits.chars().all(|digit| matches!(digit, '0' | '.')));
-    if is_zero { text[1..].into() } else { text }
 }

@@ -146,6 +146,19 @@ fn parts_that_do_not_fit_are_named() {
         "observation",
     );
     rejected(&|s| s.observation[[1, 1]] = 255, "observation");
+    let nan = protocol::Probabilities::from_elem((3, 6, 9), f32::NAN);
+    let error = {
+        let scene = scene(Model::wildfire(), 6, 9);
+        let snapshot = Snapshot {
+            belief: &nan,
+            ..snapshot(&scene)
+        };
+        draw_snapshot(&target("never"), &snapshot).expect_err("a NaN")
+    };
+    assert!(
+        error.to_string().contains("belief: expected finite"),
+        "{error}"
+    );
     rejected(&|s| s.path_cells.push(Cell { row: 6, col: 0 }), "path");
     assert!(!target("never").exists());
 }

@@ -33,10 +33,13 @@ impl Axis {
         }
     }
 
-    /// An axis from zero to exactly `most` (positive), whose ticks need not reach it.
-    pub fn up_to(most: f64, n_ticks: usize) -> Self {
-        let mut axis = Self::covering(std::iter::once(most), n_ticks);
-        axis.ticks.retain(|&tick| tick <= most);
+    /// An axis from zero to exactly `n` (positive) with ticks at whole numbers, not always at `n`.
+    pub fn counting_to(n: usize, n_ticks: usize) -> Self {
+        let most = n as f64;
+        let mut axis = Self::covering(std::iter::once(most), n_ticks.min(n));
+        axis.ticks
+            .retain(|&tick| tick <= most && tick.fract() == 0.0);
+        axis.decimals = 0;
         axis.range = (0.0, most);
         axis
     }

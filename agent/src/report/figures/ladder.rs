@@ -4,6 +4,7 @@ use super::axis::Axis;
 use super::canvas::{Align, Canvas, TextStyle, draw_page};
 use super::palette::{GRID, INK, MUTED, PAPER, blend};
 use super::{WIDTH, check_finite, readable};
+use crate::report::number::{decimals, with_error};
 use crate::report::statistics::Estimate;
 use crate::report::{Group, PolicyRun, ReportError, groups};
 use plotters::style::RGBColor;
@@ -45,6 +46,8 @@ struct Plot {
     right: f64,
     bottom: f64,
     axis: Axis,
+    /// Of the value labels.
+    decimals: usize,
     seeds: Vec<u64>,
 }
 
@@ -134,12 +137,8 @@ impl Family {
 }
 
 impl Row<'_> {
-    fn value_label(&self) -> String {
-        let mean = format!("{:.2}", self.reward.mean);
-        match self.reward.standard_error {
-            Some(error) => format!("{mean} ± {error:.2}"),
-            None => mean,
-        }
+    fn value_label(&self, decimals: usize) -> String {
+        with_error(Some(self.reward), decimals)
     }
 
     fn estimator_label(&self) -> String {
@@ -163,7 +162,8 @@ impl Plot {
             let policy = TextStyle::LABEL.width(&readable(row.group.policy));
             policy + TextStyle::NOTE.width(&row.estimator_label())
         };
-        let values = widest(&|row| TextStyle::LABEL.width(&row.value_label()));
+        let decimals = decimals(rows.iter().map(|row| row.reward.mean));
+        let values = widest(&|row| TextStyle::LABEL.width(&row.value_label(decimals)));
         let seeds: BTreeSet<u64> = rows
             .iter()
             .flat_map(|row| &row.worlds)
@@ -173,7 +173,8 @@ impl Plot {
             left: MARGIN + widest(&label).min(LABEL_ROOM) + 14.0,
             right: WIDTH - MARGIN - values - 24.0,
             bottom: TOP + ROW * rows.len() as f64,
-            axis: Axis::covering(rows.iter().flat_map(Row::extent), 6),
+            axis: Axis::covering(rows.iter().flat_map(Row::extent), 8),
+            decimals,
             seeds: seeds.into_iter().collect(),
         }
     }
@@ -264,7 +265,12 @@ fn draw_row(canvas: &mut Canvas<'_>, plot: &Plot, row: &Row<'_>, middle: f64) {
         }
     }
     let at = (WIDTH - MARGIN, middle);
-    canvas.text(at, Align::Right, TextStyle::LABEL, &row.value_label());
+    canvas.text(
+        at,
+        Align::Right,
+        TextStyle::LABEL,
+        &row.value_label(plot.decimals),
+    );
 }
 
 fn draw_label(canvas: &mut Canvas<'_>, plot: &Plot, row: &Row<'_>, middle: f64) {

@@ -9,7 +9,7 @@ const GAP: f64 = 26.0;
 /// Room for a panel's title above it.
 pub const TITLE_ROOM: f64 = 30.0;
 /// Narrowest room for a panel in points, for the sake of its title.
-const LEAST_ROOM: f64 = 170.0;
+const LEAST_ROOM: f64 = 190.0;
 /// Height in points that all panels together should keep to, where rows stay legible.
 const PAGE_HEIGHT: f64 = 860.0;
 /// Least height of a panel that the page's height may press it to.

@@ -78,6 +78,9 @@ pub fn draw_rewards(
         for line in &lines {
             let points: Vec<Point> = line.points.iter().map(|&at| plot.place(at)).collect();
             canvas.line(&points, 2.0, line.color);
+            if let [only] = points[..] {
+                canvas.disc(only, 4.0, line.color);
+            }
         }
         draw_names(canvas, &plot, &lines);
     })
@@ -168,7 +171,7 @@ impl Plot {
         Self {
             left: MARGIN + widths.fold(0.0, f64::max) + 10.0,
             right: WIDTH - MARGIN - names.fold(0.0, f64::max) - LEADER - 6.0,
-            steps: Axis::up_to(n_steps as f64, 6),
+            steps: Axis::counting_to(n_steps, 6),
             rewards,
         }
     }

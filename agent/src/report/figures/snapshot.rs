@@ -6,6 +6,7 @@ use super::canvas::{Align, Canvas, Point, TextStyle, draw_page};
 use super::palette::{INK, MUTED, PAPER, sequential, unlike};
 use super::panels::{Layout, TITLE_ROOM};
 use crate::report::ReportError;
+use ndarray::ArrayView2;
 use plotters::style::RGBColor;
 use protocol::model::parse_color;
 use protocol::{Cell, Frame, Grid, Model, Probabilities, Shape, UNOBSERVED};
@@ -93,16 +94,6 @@ pub fn draw_snapshot(path: &Path, snapshot: &Snapshot<'_>) -> Result<(), ReportE
 fn check(snapshot: &Snapshot<'_>) -> Result<Shape, ReportError> {
     let (height, width) = snapshot.truth.dim();
     let n_states = snapshot.model.n_states();
-    let expect = |what, fits: bool, expected: String, got: String| {
-        if fits {
-            return Ok(());
-        }
-        Err(ReportError::Snapshot {
-            what,
-            expected,
-            got,
-        })
-    };
     let shape = Shape::new(height, width).map_err(|error| ReportError::Snapshot {
         what: "truth",
         expected: "a grid".into(),
@@ -121,28 +112,7 @@ fn check(snapshot: &Snapshot<'_>) -> Result<Shape, ReportError> {
         format!("shape {fits:?}"),
         format!("{dim:?}"),
     )?;
-    for (what, grid, n, may_be_unobserved) in [
-        ("truth", snapshot.truth.view(), n_states, false),
-        (
-            "observation",
-            snapshot.observation.view(),
-            snapshot.model.n_observations(),
-            false,
-        ),
-        (
-            "frame",
-            snapshot.frame.values(),
-            snapshot.model.n_observations(),
-            true,
-        ),
-    ] {
-        let wrong = |value: &&u8| {
-            usize::from(**value) >= n && !(may_be_unobserved && **value == UNOBSERVED)
-        };
-        let found = grid.iter().find(wrong);
-        let got = found.map_or(String::new(), u8::to_string);
-        expect(what, found.is_none(), format!("values below {n}"), got)?;
-    }
+    check_values(snapshot)?;
     let off = snapshot
         .path_cells
         .iter()
@@ -155,6 +125,53 @@ fn check(snapshot: &Snapshot<'_>) -> Result<Shape, ReportError> {
         got,
     )?;
     Ok(shape)
+}
+
+fn check_values(snapshot: &Snapshot<'_>) -> Result<(), ReportError> {
+    let (n_states, n_observations) = (snapshot.model.n_states(), snapshot.model.n_observations());
+    let below = |what, grid: ArrayView2<'_, u8>, n: usize, besides: Option<u8>| {
+        let wrong = |value: &&u8| usize::from(**value) >= n && Some(**value) != besides;
+        let found = grid.iter().find(wrong);
+        let got = found.map_or(String::new(), u8::to_string);
+        expect(what, found.is_none(), format!("values below {n}"), got)
+    };
+    below("truth", snapshot.truth.view(), n_states, None)?;
+    below(
+        "observation",
+        snapshot.observation.view(),
+        n_observations,
+        None,
+    )?;
+    below(
+        "frame",
+        snapshot.frame.values(),
+        n_observations,
+        Some(UNOBSERVED),
+    )?;
+    let is_no_number = snapshot.belief.iter().find(|value| !value.is_finite());
+    let got = is_no_number.map_or(String::new(), f32::to_string);
+    expect(
+        "belief",
+        is_no_number.is_none(),
+        "finite numbers".into(),
+        got,
+    )
+}
+
+fn expect(
+    what: &'static str,
+    fits: bool,
+    expected: String,
+    got: String,
+) -> Result<(), ReportError> {
+    if fits {
+        return Ok(());
+    }
+    Err(ReportError::Snapshot {
+        what,
+        expected,
+        got,
+    })
 }
 
 impl Colors {
