@@ -3,7 +3,7 @@
 use super::axis::Axis;
 use super::canvas::{Align, Canvas, TextStyle, draw_page};
 use super::palette::{GRID, INK, MUTED, PAPER, blend};
-use super::{WIDTH, check_finite, readable};
+use super::{MARGIN, WIDTH, check_finite, readable};
 use crate::report::number::{decimals, with_error};
 use crate::report::statistics::Estimate;
 use crate::report::{Group, PolicyRun, ReportError, groups};
@@ -11,7 +11,6 @@ use plotters::style::RGBColor;
 use std::collections::BTreeSet;
 use std::path::Path;
 
-const MARGIN: f64 = 32.0;
 const ROW: f64 = 44.0;
 const BAR: f64 = 26.0;
 /// Upper edge of the bars, below title, subtitle and legend.

@@ -6,6 +6,7 @@
 mod axis;
 mod canvas;
 mod ladder;
+mod legend;
 mod palette;
 mod panels;
 mod rewards;
@@ -20,6 +21,9 @@ use super::{Group, PolicyRun, ReportError};
 
 /// Width of every figure in points.
 const WIDTH: f64 = 1200.0;
+
+/// Empty rim of every figure in points.
+const MARGIN: f64 = 32.0;
 
 /// What the reward of the wildfire model counts: the label of a reward axis.
 pub const FIRE_CELLS_PER_STEP: &str = "distinct fire cells found per step";

@@ -3,14 +3,13 @@
 use super::axis::{Axis, spread};
 use super::canvas::{Align, Canvas, Point, TextStyle, draw_page};
 use super::palette::{GRID, INK, LINES, MUTED, SHADE, blend};
-use super::{WIDTH, check_finite, short_names};
+use super::{MARGIN, WIDTH, check_finite, short_names};
 use crate::report::{PolicyRun, ReportError, groups};
 use plotters::style::RGBColor;
 use std::collections::BTreeSet;
 use std::path::Path;
 
 const HEIGHT: f64 = 700.0;
-const MARGIN: f64 = 32.0;
 const TOP: f64 = 118.0;
 const BOTTOM: f64 = HEIGHT - 76.0;
 /// Widest name at the end of a line; longer ones are shortened.
