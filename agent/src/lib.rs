@@ -1,2 +1,4 @@
 //! The Emberwatch agent.
+
 pub mod client;
+pub mod report;

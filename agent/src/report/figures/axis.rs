@@ -1,0 +1,130 @@
+//! Linear axes with round ticks, and labels that keep their distance.
+
+/// Range and ticks of an axis.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Axis {
+    /// Position of each tick, ascending.
+    pub ticks: Vec<f64>,
+    range: (f64, f64),
+    decimals: usize,
+}
+
+impl Axis {
+    /// An axis over zero and all the given (finite) values, with about `n_ticks` ticks,
+    /// the first and last of them at its ends.
+    pub fn covering(values: impl Iterator<Item = f64>, n_ticks: usize) -> Self {
+        let (least, most) = values.fold((0.0_f64, 0.0_f64), |(least, most), value| {
+            (least.min(value), most.max(value))
+        });
+        let most = if most > least { most } else { least + 1.0 };
+        let step = round_step((most - least) / n_ticks as f64);
+        let (first, last) = ((least / step).floor() as i64, (most / step).ceil() as i64);
+        let ticks = (first..=last).map(|tick| tick as f64 * step).collect();
+        // Enough decimals for 2.5 of the step's power of ten.
+        let exact = |decimals: &usize| {
+            let shifted = step * 10_f64.powi(*decimals as i32);
+            (shifted - shifted.round()).abs() < 1e-6 * shifted
+        };
+        let decimals = (0..12).find(exact).unwrap_or(12);
+        Self {
+            ticks,
+            range: (first as f64 * step, last as f64 * step),
+            decimals,
+        }
+    }
+
+    /// An axis from zero to exactly `n` (positive) with ticks at whole numbers, not always at `n`.
+    pub fn counting_to(n: usize, n_ticks: usize) -> Self {
+        let most = n as f64;
+        let mut axis = Self::covering(std::iter::once(most), n_ticks.min(n));
+        axis.ticks
+            .retain(|&tick| tick <= most && tick.fract() == 0.0);
+        axis.decimals = 0;
+        axis.range = (0.0, most);
+        axis
+    }
+
+    /// Where a value lies in the range: 0 at its start, 1 at its end.
+    pub fn fraction(&self, value: f64) -> f64 {
+        let (first, last) = self.range;
+        (value - first) / (last - first)
+    }
+
+    /// Label of a tick.
+    pub fn label(&self, tick: f64) -> String {
+        format!("{tick:.*}", self.decimals)
+    }
+}
+
+/// The least of 1, 2, 2.5, 5 and 10 times a power of ten that is not below `step`.
+fn round_step(step: f64) -> f64 {
+    let power = 10_f64.powf(step.log10().floor());
+    let factor = [1.0, 2.0, 2.5, 5.0]
+        .into_iter()
+        .find(|factor| factor * power >= step * (1.0 - 1e-9));
+    factor.unwrap_or(10.0) * power
+}
+
+/// Moves positions as little as possible (in squares) so that neighbours are `gap` apart and, where
+/// there is room, all lie in `least..=most`; the order of ties is that given.
+pub fn spread(positions: &[f64], gap: f64, (least, most): (f64, f64)) -> Vec<f64> {
+    let mut order: Vec<usize> = (0..positions.len()).collect();
+    order.sort_by(|&a, &b| positions[a].total_cmp(&positions[b]));
+    // Without the gaps it is a monotone regression: pool neighbours that are out of order.
+    let mut pools: Vec<(f64, usize)> = Vec::new();
+    for (rank, &index) in order.iter().enumerate() {
+        let mut pool = (positions[index] - gap * rank as f64, 1);
+        while let Some(before) = pools.pop_if(|before| before.0 > pool.0) {
+            let n = before.1 + pool.1;
+            let sum = before.0 * before.1 as f64 + pool.0 * pool.1 as f64;
+            pool = (sum / n as f64, n);
+        }
+        pools.push(pool);
+    }
+    let highest = most - gap * positions.len().saturating_sub(1) as f64;
+    let moved = pools.iter().flat_map(|&(at, n)| std::iter::repeat_n(at, n));
+    let mut spread = vec![0.0; positions.len()];
+    for ((rank, &index), at) in order.iter().enumerate().zip(moved) {
+        spread[index] = at.min(highest).max(least) + gap * rank as f64;
+    }
+    spread
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check(values: &[f64], ticks: &[f64], label: &str) {
+        let axis = Axis::covering(values.iter().copied(), 5);
+        assert_eq!(axis.ticks.len(), ticks.len(), "{axis:?}");
+        for (got, expected) in axis.ticks.iter().zip(ticks) {
+            assert!((got - expected).abs() < 1e-9, "{axis:?}");
+        }
+        assert_eq!(axis.label(axis.ticks[1]), label);
+    }
+
+    #[test]
+    fn ticks_are_round_and_cover_zero_and_the_values() {
+        check(&[38.0, 47.9], &[0.0, 10.0, 20.0, 30.0, 40.0, 50.0], "10");
+        check(&[-3.0, 1.0], &[-3.0, -2.0, -1.0, 0.0, 1.0], "-2");
+        check(
+            &[0.011],
+            &[0.0, 0.0025, 0.005, 0.0075, 0.01, 0.0125],
+            "0.0025",
+        );
+        check(&[], &[0.0, 0.2, 0.4, 0.6, 0.8, 1.0], "0.2");
+        check(&[0.0, 0.0], &[0.0, 0.2, 0.4, 0.6, 0.8, 1.0], "0.2");
+    }
+
+    #[test]
+    fn spread_labels_keep_their_distance_order_and_bounds() {
+        assert_eq!(spread(&[10.0, 50.0], 10.0, (0.0, 100.0)), [10.0, 50.0]);
+        assert_eq!(spread(&[50.0, 50.0], 10.0, (0.0, 100.0)), [45.0, 55.0]);
+        assert_eq!(spread(&[99.0, 98.0], 10.0, (0.0, 100.0)), [100.0, 90.0]);
+        assert_eq!(
+            spread(&[1.0, 2.0, 3.0], 10.0, (0.0, 100.0)),
+            [0.0, 10.0, 20.0]
+        );
+        assert_eq!(spread(&[], 10.0, (0.0, 1.0)), Vec::<f64>::new());
+    }
+}

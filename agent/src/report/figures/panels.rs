@@ -1,0 +1,185 @@
+//! How panels of one grid each share a page, and how a grid's cells become crisp pixels.
+
+use super::canvas::{Canvas, SCALE};
+use plotters::style::RGBColor;
+use protocol::{Cell, Shape};
+
+/// Distance between panels in points.
+const GAP: f64 = 26.0;
+/// Room for a panel's title above it.
+pub const TITLE_ROOM: f64 = 30.0;
+/// Narrowest room for a panel in points, for the sake of its title.
+const LEAST_ROOM: f64 = 190.0;
+/// Height in points that all panels together should keep to, where rows stay legible.
+const PAGE_HEIGHT: f64 = 860.0;
+/// Least height of a panel that the page's height may press it to.
+const LEAST_HEIGHT: f64 = 130.0;
+
+/// Longest side of a panel in points: more would not show more.
+const MOST_SIDE: f64 = 540.0;
+
+/// How many pixels a cell takes, or how many cells a pixel stands for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Zoom {
+    pixels: usize,
+    stride: usize,
+}
+
+/// Panels of equal size in rows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Layout {
+    shape: Shape,
+    columns: usize,
+    n_panels: usize,
+    zoom: Zoom,
+    /// Left edge of the first panel in points.
+    left: f64,
+}
+
+impl Layout {
+    /// The layout with the largest cells within `width` points; of equals, the one with three
+    /// columns, then with fewer rows.
+    pub fn new(shape: Shape, n_panels: usize, (left, width): (f64, f64)) -> Self {
+        let most = ((width + GAP) / (LEAST_ROOM + GAP)) as usize;
+        let candidates = (1..=most.clamp(1, n_panels)).map(|columns| {
+            let zoom = Zoom::fitting(shape, n_panels, columns, width);
+            Self {
+                shape,
+                columns,
+                n_panels,
+                zoom,
+                left,
+            }
+        });
+        let rank = |layout: &Self| {
+            let size = (layout.zoom.pixels, std::cmp::Reverse(layout.zoom.stride));
+            (size, layout.columns == 3, layout.columns)
+        };
+        let best = candidates
+            .max_by_key(rank)
+            .expect("invariant: one column is a candidate");
+        let used = best.columns as f64 * (best.room() + GAP) - GAP;
+        Self {
+            left: left + (width - used).max(0.0) / 2.0,
+            ..best
+        }
+    }
+
+    /// Height of all rows in points, titles included.
+    pub fn height(&self) -> f64 {
+        let rows = self.n_panels.div_ceil(self.columns) as f64;
+        rows * (TITLE_ROOM + self.panel_size().1 + GAP) - GAP
+    }
+
+    /// Width in points that a panel and its title may use.
+    pub fn room(&self) -> f64 {
+        self.panel_size().0.max(LEAST_ROOM)
+    }
+
+    /// Left edge of the first panel in points.
+    pub fn left(&self) -> f64 {
+        self.left
+    }
+
+    /// Upper left corner of panel `index`, below its title, for rows that begin at `top`.
+    pub fn corner(&self, index: usize, top: f64) -> (f64, f64) {
+        let (row, column) = (index / self.columns, index % self.columns);
+        let x = self.left + column as f64 * (self.room() + GAP);
+        let y = top + row as f64 * (TITLE_ROOM + self.panel_size().1 + GAP) + TITLE_ROOM;
+        // On whole pixels, or cells would differ by one.
+        ((x * SCALE).round() / SCALE, (y * SCALE).round() / SCALE)
+    }
+
+    /// Width and height of a panel in points.
+    pub fn panel_size(&self) -> (f64, f64) {
+        let points = |cells: usize| (self.zoom.n_pixels(cells)) as f64 / SCALE;
+        (points(self.shape.width()), points(self.shape.height()))
+    }
+
+    /// Side of a cell in points.
+    pub fn cell_size(&self) -> f64 {
+        self.zoom.pixels as f64 / self.zoom.stride as f64 / SCALE
+    }
+
+    /// Middle of a cell in a panel at `corner`.
+    pub fn center(&self, corner: (f64, f64), cell: Cell) -> (f64, f64) {
+        let middle = |at: usize| (at as f64 + 0.5) * self.cell_size();
+        (corner.0 + middle(cell.col), corner.1 + middle(cell.row))
+    }
+
+    /// Fills each cell of a panel at `corner` with its colour; nearest neighbour, so that no colour
+    /// appears that is not in the legend.
+    pub fn fill(
+        &self,
+        canvas: &mut Canvas<'_>,
+        corner: (f64, f64),
+        color: impl Fn(Cell) -> RGBColor,
+    ) {
+        let Zoom { pixels, stride } = self.zoom;
+        let origin = ((corner.0 * SCALE) as i32, (corner.1 * SCALE) as i32);
+        for (down, row) in (0..self.shape.height()).step_by(stride).enumerate() {
+            for (right, col) in (0..self.shape.width()).step_by(stride).enumerate() {
+                let at = (
+                    origin.0 + (right * pixels) as i32,
+                    origin.1 + (down * pixels) as i32,
+                );
+                let side = pixels as i32;
+                canvas.pixel_rectangle(at, (side, side), color(Cell { row, col }));
+            }
+        }
+    }
+}
+
+impl Zoom {
+    fn fitting(shape: Shape, n_panels: usize, columns: usize, width: f64) -> Self {
+        let rows = n_panels.div_ceil(columns) as f64;
+        let columns = columns as f64;
+        let room = (width - GAP * (columns - 1.0)) / columns * SCALE;
+        let height = (PAGE_HEIGHT / rows - TITLE_ROOM - GAP).max(LEAST_HEIGHT) * SCALE;
+        let longer = shape.width().max(shape.height()) as f64;
+        let cell = (room / shape.width() as f64)
+            .min(height / shape.height() as f64)
+            .min(MOST_SIDE * SCALE / longer);
+        if cell >= 1.0 {
+            Self {
+                pixels: cell as usize,
+                stride: 1,
+            }
+        } else {
+            Self {
+                pixels: 1,
+                stride: (1.0 / cell).ceil() as usize,
+            }
+        }
+    }
+
+    fn n_pixels(self, cells: usize) -> usize {
+        cells.div_ceil(self.stride) * self.pixels
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check(shape: (usize, usize), n_panels: usize, columns: usize) {
+        let shape = Shape::new(shape.0, shape.1).expect("test shape");
+        let layout = Layout::new(shape, n_panels, (30.0, 1140.0));
+        assert_eq!(layout.columns, columns, "{layout:?}");
+        let (width, height) = layout.panel_size();
+        assert!(
+            width >= 1.0 && height >= 0.5 && width <= 1140.0,
+            "{layout:?}"
+        );
+        let corner = layout.corner(columns - 1, 0.0);
+        assert!(corner.0 >= 30.0 && corner.0 + width <= 1170.5, "{layout:?}");
+    }
+
+    #[test]
+    fn panels_stay_on_the_page_for_every_grid() {
+        check((64, 64), 6, 3);
+        check((5, 40), 6, 2);
+        check((4096, 4096), 6, 3);
+        check((1, 1), 5, 3);
+    }
+}

@@ -1,0 +1,137 @@
+//! Means and standard errors over worlds, and paired differences between policies.
+//!
+//! A world is one draw: its steps are far too correlated to count as draws of their own (the fire
+//! fraction forgets itself over thousands of steps), so every error here is over worlds.
+
+use std::collections::BTreeMap;
+
+/// A mean over worlds.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimate {
+    /// The mean.
+    pub mean: f64,
+    /// Standard error of the mean; one world has none.
+    pub standard_error: Option<f64>,
+    /// Number of worlds, at least 1.
+    pub n_worlds: usize,
+}
+
+impl Estimate {
+    /// Mean and standard error (with `n - 1`) of one value per world; `None` without a world.
+    pub fn of(values: &[f64]) -> Option<Self> {
+        let n_worlds = values.len();
+        if n_worlds == 0 {
+            return None;
+        }
+        let n = n_worlds as f64;
+        let mean = values.iter().sum::<f64>() / n;
+        let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+        let standard_error = (n_worlds > 1).then(|| (squares / (n - 1.0) / n).sqrt());
+        Some(Self {
+            mean,
+            standard_error,
+            n_worlds,
+        })
+    }
+
+    /// Mean of `values - baseline` over the worlds that both have; `None` if they share none.
+    pub fn of_difference(
+        values: &BTreeMap<u64, f64>,
+        baseline: &BTreeMap<u64, f64>,
+    ) -> Option<Self> {
+        let pairs = shared(values, baseline);
+        let differences: Vec<f64> = pairs.map(|(value, base)| value - base).collect();
+        Self::of(&differences)
+    }
+}
+
+/// Ratio of the means over the worlds that both have; `None` if they share none or the reference
+/// is not positive, where a ratio says nothing.
+pub fn ratio_of_means(values: &BTreeMap<u64, f64>, reference: &BTreeMap<u64, f64>) -> Option<f64> {
+    let (above, below) = shared(values, reference)
+        .fold((0.0, 0.0), |(above, below), (value, base)| {
+            (above + value, below + base)
+        });
+    (below > 0.0).then(|| above / below)
+}
+
+/// Median; the mean of the middle two where their number is even, `None` where it is zero.
+pub fn median(values: &[f64]) -> Option<f64> {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let middle = sorted.len() / 2;
+    if sorted.len() % 2 == 1 {
+        Some(sorted[middle])
+    } else {
+        let below = sorted.get(middle.checked_sub(1)?)?;
+        Some((below + sorted[middle]) / 2.0)
+    }
+}
+
+fn shared<'a>(
+    values: &'a BTreeMap<u64, f64>,
+    others: &'a BTreeMap<u64, f64>,
+) -> impl Iterator<Item = (f64, f64)> + 'a {
+    values
+        .iter()
+        .filter_map(|(seed, &value)| Some((value, *others.get(seed)?)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn check(values: &[f64], mean: f64, standard_error: Option<f64>) {
+        let got = Estimate::of(values).expect("values");
+        assert!((got.mean - mean).abs() < 1e-12, "{got:?}");
+        match (got.standard_error, standard_error) {
+            (Some(got), Some(expected)) => assert!((got - expected).abs() < 1e-12, "{got}"),
+            (got, expected) => assert_eq!(got, expected),
+        }
+    }
+
+    #[test]
+    fn standard_errors_match_hand_computed_ones() {
+        // Deviations -2, 0, 2: variance 8 / 2 = 4, error sqrt(4 / 3).
+        check(&[1.0, 3.0, 5.0], 3.0, Some((4.0_f64 / 3.0).sqrt()));
+        // Deviations +-0.5: variance 0.5, error sqrt(0.5 / 2).
+        check(&[2.0, 3.0], 2.5, Some(0.5));
+        check(&[7.0, 7.0, 7.0], 7.0, Some(0.0));
+        check(&[-4.0], -4.0, None);
+        assert_eq!(Estimate::of(&[]), None);
+    }
+
+    #[test]
+    fn differences_pair_only_the_worlds_both_ran() {
+        let a = BTreeMap::from([(1, 10.0), (2, 20.0), (3, 30.0)]);
+        let b = BTreeMap::from([(2, 19.0), (3, 26.0), (4, 1000.0)]);
+        // Differences 1 and 4: mean 2.5, variance 4.5, error sqrt(4.5 / 2) = 1.5.
+        let got = Estimate::of_difference(&a, &b).expect("two shared worlds");
+        assert_eq!(
+            (got.mean, got.standard_error, got.n_worlds),
+            (2.5, Some(1.5), 2)
+        );
+        assert_eq!(
+            Estimate::of_difference(&a, &BTreeMap::from([(9, 1.0)])),
+            None
+        );
+    }
+
+    #[test]
+    fn ratios_need_a_positive_reference() {
+        let a = BTreeMap::from([(1, 3.0), (2, 6.0)]);
+        assert_eq!(
+            ratio_of_means(&a, &BTreeMap::from([(1, 4.0), (2, 8.0)])),
+            Some(0.75)
+        );
+        assert_eq!(ratio_of_means(&a, &BTreeMap::from([(1, 0.0)])), None);
+        assert_eq!(ratio_of_means(&a, &BTreeMap::new()), None);
+    }
+
+    #[test]
+    fn medians_of_odd_even_and_empty_lists() {
+        assert_eq!(median(&[3.0, 1.0, 2.0]), Some(2.0));
+        assert_eq!(median(&[4.0, 1.0, 2.0, 3.0]), Some(2.5));
+        assert_eq!(median(&[]), None);
+    }
+}

@@ -1,0 +1,5 @@
+//! Reports on synthetic results: their text, their files and their pictures.
+
+mod figures;
+mod synthetic;
+mod text;

@@ -1,0 +1,155 @@
+use crate::synthetic::{ladder, run};
+use agent::report::{PolicyRun, ReportError, render_table, write_csv};
+
+/// Rewards 1, 3, 5 and 2, 5, 8 on worlds 1, 2, 3; the oracle earns 4, 8, 8.
+fn three_policies() -> Vec<PolicyRun> {
+    let mut runs = Vec::new();
+    for (policy, estimator, rewards) in [
+        ("coverage", "none", [1.0, 3.0, 5.0]),
+        ("beam", "known_model", [2.0, 5.0, 8.0]),
+        ("oracle_beam", "truth", [4.0, 8.0, 8.0]),
+    ] {
+        for (world, reward) in (1..).zip(rewards) {
+            runs.push(run(policy, estimator, world, reward));
+        }
+    }
+    runs
+}
+
+/// The cells of the first row of the table that starts with a policy.
+fn row(table: &str, policy: &str, skip: usize) -> Vec<String> {
+    let is_row = |line: &&str| line.starts_with(&format!("| {policy} "));
+    let line = table
+        .lines()
+        .filter(is_row)
+        .nth(skip)
+        .expect("a row of the policy");
+    let cells = line.trim_matches('|').split('|');
+    cells.map(|cell| cell.trim().to_string()).collect()
+}
+
+#[test]
+fn a_table_gives_errors_over_worlds_and_paired_differences() {
+    let table = render_table(&three_policies(), "coverage");
+    assert!(table.starts_with("3 worlds, 4 steps each; "), "{table}");
+    // Deviations -3, 0, 3: sqrt(18 / 2 / 3) = 1.73. Differences 1, 2, 3: sqrt(2 / 2 / 3) = 0.58.
+    assert_eq!(
+        row(&table, "beam", 0),
+        [
+            "beam",
+            "known_model",
+            "5.00 ± 1.73",
+            "+2.00 ± 0.58",
+            "60.0",
+            "0.250",
+            "75.0",
+            "0.1250",
+            "1.500"
+        ]
+    );
+    assert_eq!(
+        row(&table, "coverage", 0),
+        [
+            "coverage",
+            "none",
+            "3.00 ± 1.15",
+            "baseline",
+            "60.0",
+            "0.250",
+            "45.0",
+            "-",
+            "1.500"
+        ]
+    );
+}
+
+#[test]
+fn worlds_split_at_the_median_of_their_fire() {
+    let table = render_table(&three_policies(), "coverage");
+    assert!(
+        table.contains("the median of 200.0 burning cells"),
+        "{table}"
+    );
+    assert!(table.contains("less fire (1 world)") && table.contains("more fire (2 worlds)"));
+    assert_eq!(
+        row(&table, "beam", 1),
+        ["beam", "known_model", "2.00 (n = 1)", "6.50 ± 1.50"]
+    );
+}
+
+#[test]
+fn tables_leave_out_what_there_is_not() {
+    let runs: Vec<_> = three_policies()
+        .into_iter()
+        .filter(|run| run.world_seed == 2)
+        .collect();
+    let table = render_table(&runs[..2], "nobody");
+    assert!(table.contains("no standard error is possible"), "{table}");
+    assert!(table.contains("baseline \"nobody\" was not run"), "{table}");
+    assert!(
+        !table.contains("% of oracle") && !table.contains("NaN"),
+        "{table}"
+    );
+    assert!(table.contains("No split by fire"), "{table}");
+    assert_eq!(row(&table, "beam", 0)[2..4], ["5.00 (n = 1)", "-"]);
+    assert_eq!(
+        render_table(&[], "beam"),
+        "No results: no policy was run.\n"
+    );
+}
+
+#[test]
+fn a_table_is_aligned_and_pastes_into_markdown() {
+    let table = render_table(&ladder(8, 100), "coverage");
+    let lines: Vec<&str> = table.lines().filter(|line| line.starts_with('|')).collect();
+    assert_eq!(lines.len(), 2 * (2 + 12));
+    for half in lines.chunks(14) {
+        let width = half[0].chars().count();
+        assert!(
+            half.iter().all(|line| line.chars().count() == width),
+            "{table}"
+        );
+    }
+    assert!(
+        lines[1].chars().all(|letter| "|-:".contains(letter)),
+        "{table}"
+    );
+}
+
+#[test]
+fn csv_rows_read_back_as_the_same_numbers() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join("runs.csv");
+    let mut runs = three_policies();
+    runs[4].mean_reward = 0.1 + 0.2;
+    runs[4].mean_plan_millis = 1e-300;
+    write_csv(&path, &runs).expect("written");
+    let text = std::fs::read_to_string(&path).expect("readable");
+    assert!(text.starts_with(
+        "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
+         mean_fire_cells,mean_plan_millis,brier\n"
+    ));
+    let mut reader = csv::Reader::from_reader(text.as_bytes());
+    let rows: Vec<_> = reader.records().map(|row| row.expect("a row")).collect();
+    let order: Vec<_> = rows
+        .iter()
+        .map(|row| format!("{} {}", &row[0], &row[2]))
+        .collect();
+    assert_eq!(order[..4], ["beam 1", "beam 2", "beam 3", "coverage 1"]);
+    assert_eq!(rows[1][4].parse(), Ok(0.1 + 0.2));
+    assert_eq!(rows[1][8].parse(), Ok(1e-300));
+    assert_eq!((&rows[1][9], &rows[3][9]), ("0.125", ""));
+    assert_eq!(
+        std::fs::read_dir(directory.path()).expect("listed").count(),
+        1
+    );
+}
+
+#[test]
+fn a_csv_that_cannot_be_written_is_named() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join("missing").join("runs.csv");
+    let error = write_csv(&path, &three_policies()).expect_err("no such directory");
+    assert!(matches!(&error, ReportError::Write { path: named, .. } if *named == path));
+    assert!(error.to_string().contains("runs.csv"), "{error}");
+}
