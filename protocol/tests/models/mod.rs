@@ -26,7 +26,11 @@ pub fn model(
         entry.bias = bias(state);
     }
     for (to, from) in (0..n_states).flat_map(|to| (0..n_states).map(move |from| (to, from))) {
-        let row = |row| (0..kernel_size[1]).map(|col| weight(to, from, row, col)).collect();
+        let row = |row| {
+            (0..kernel_size[1])
+                .map(|col| weight(to, from, row, col))
+                .collect()
+        };
         file.kernel.push(KernelEntry {
             from: name(from),
             to: name(to),
