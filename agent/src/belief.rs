@@ -108,7 +108,8 @@ impl Belief {
         let least = probabilities.fold_axis(Axis(0), f32::INFINITY, |&a, &b| {
             if b >= 0.0 { a.min(b) } else { f32::NAN }
         });
-        let fine = |(&sum, &least): (&f32, &f32)| (sum - 1.0).abs() <= SUM_TOLERANCE && least >= 0.0;
+        let fine =
+            |(&sum, &least): (&f32, &f32)| (sum - 1.0).abs() <= SUM_TOLERANCE && least >= 0.0;
         if let Some(index) = sums.iter().zip(&least).position(|cell| !fine(cell)) {
             let cell = shape.cell(index);
             let got = probabilities.slice(ndarray::s![.., cell.row, cell.col]);
@@ -251,7 +252,9 @@ mod tests {
                 other => panic!("{value}: expected an error, got {other:?}"),
             }
         };
-        [0.5, 0.3, f32::NAN, f32::INFINITY].into_iter().for_each(check);
+        [0.5, 0.3, f32::NAN, f32::INFINITY]
+            .into_iter()
+            .for_each(check);
         let mut numbers = Probabilities::from_elem((2, 1, 2), 0.5);
         numbers[[0, 0, 1]] = 1.5;
         numbers[[1, 0, 1]] = -0.5; // sums to one, but is no distribution

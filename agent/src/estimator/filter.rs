@@ -48,7 +48,11 @@ impl Filter {
     /// # Panics
     /// If the prior has another number of states than the model.
     pub fn new(model: &Model, prior: Belief) -> Result<Self, ModelError> {
-        assert_eq!(prior.n_states(), model.n_states(), "prior: expected the model's states");
+        assert_eq!(
+            prior.n_states(),
+            model.n_states(),
+            "prior: expected the model's states"
+        );
         Ok(Self {
             transition: Transition::new(model, prior.shape())?,
             likelihood: model.likelihood().t().as_standard_layout().into_owned(),
@@ -72,21 +76,35 @@ impl Filter {
     /// If the frame is of another grid or was decoded for more observations than the model has.
     pub fn correct(&mut self, frame: &Frame) -> Result<(), ZeroEvidence> {
         let shape = self.belief.shape();
-        assert_eq!(frame.values().dim(), shape.dim(), "frame: expected the belief's grid");
+        assert_eq!(
+            frame.values().dim(),
+            shape.dim(),
+            "frame: expected the belief's grid"
+        );
         let n_cells = shape.n_cells();
         self.posteriors.clear();
         for (index, observed) in frame.observed() {
             let prior = self.belief.as_slice()[index..].iter().step_by(n_cells);
             let likelihood = self.likelihood.row(usize::from(observed));
             // In f64, where the product of two f32 cannot underflow to zero.
-            let joint = || prior.clone().zip(&likelihood).map(|(&u, b)| f64::from(u) * b);
+            let joint = || {
+                prior
+                    .clone()
+                    .zip(&likelihood)
+                    .map(|(&u, b)| f64::from(u) * b)
+            };
             let evidence: f64 = joint().sum();
             if evidence <= 0.0 {
                 let belief = prior.copied().collect();
                 let cell = shape.cell(index);
-                return Err(ZeroEvidence { cell, observed, belief });
+                return Err(ZeroEvidence {
+                    cell,
+                    observed,
+                    belief,
+                });
             }
-            self.posteriors.extend(joint().map(|p| (p / evidence) as f32));
+            self.posteriors
+                .extend(joint().map(|p| (p / evidence) as f32));
         }
         self.accept(frame);
         Ok(())
@@ -104,8 +122,11 @@ impl Filter {
         let n_states = self.belief.n_states();
         let n_cells = self.belief.shape().n_cells();
         let belief = self.belief.probabilities_mut();
-        let belief = belief.as_slice_mut().expect("invariant: beliefs are row-major");
-        for ((index, _), posterior) in frame.observed().zip(self.posteriors.chunks_exact(n_states)) {
+        let belief = belief
+            .as_slice_mut()
+            .expect("invariant: beliefs are row-major");
+        for ((index, _), posterior) in frame.observed().zip(self.posteriors.chunks_exact(n_states))
+        {
             let cell = belief[index..].iter_mut().step_by(n_cells);
             cell.zip(posterior).for_each(|(to, &p)| *to = p);
         }
@@ -125,7 +146,9 @@ mod tests {
     fn correct_leaves_unseen_cells_unchanged() {
         let shape = Shape::new(1, 3).expect("test shape");
         let mut filter = Filter::new(&Model::wildfire(), Belief::uniform(3, shape)).expect("valid");
-        filter.correct(&frame(shape, &[255, 2, 255])).expect("possible");
+        filter
+            .correct(&frame(shape, &[255, 2, 255]))
+            .expect("possible");
         let fire = filter.belief().probability(2);
         assert_eq!([fire[[0, 0]], fire[[0, 2]]], [1.0 / 3.0; 2]);
         // .98 / (.01 + .05 + .98), the column of O for an observed fire.

@@ -84,7 +84,9 @@ fn simulate(
 /// seen in a cell is still possible there.
 fn average(counts: &ndarray::Array3<u32>, n_states: usize, shape: Shape) -> Belief {
     let in_all = |state: usize| -> u32 { counts.index_axis(ndarray::Axis(0), state).sum() };
-    let totals: Vec<f64> = (0..n_states).map(|state| f64::from(in_all(state))).collect();
+    let totals: Vec<f64> = (0..n_states)
+        .map(|state| f64::from(in_all(state)))
+        .collect();
     let total: f64 = totals.iter().sum();
     // One more count of each state: nothing is impossible because it was not seen.
     let pooled = |state: usize| (totals[state] + 1.0) / (total + n_states as f64);
@@ -110,19 +112,25 @@ mod tests {
         let shape = Shape::new(9, 12).expect("test shape");
         let model = Model::wildfire();
         let on = |n_threads: usize| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build();
+            let pool = rayon::ThreadPoolBuilder::new()
+                .num_threads(n_threads)
+                .build();
             let belief = || simulated(10, 40).belief(&model, shape, 5);
             pool.expect("threads").install(belief).expect("valid model")
         };
         assert_eq!(on(1), on(3));
-        let other = simulated(10, 40).belief(&model, shape, 6).expect("valid model");
+        let other = simulated(10, 40)
+            .belief(&model, shape, 6)
+            .expect("valid model");
         assert_ne!(on(1), other);
     }
 
     #[test]
     fn without_burn_in_it_approaches_the_initial_distribution() {
         let shape = Shape::new(20, 20).expect("test shape");
-        let prior = simulated(64, 0).belief(&Model::wildfire(), shape, 0).expect("valid model");
+        let prior = simulated(64, 0)
+            .belief(&Model::wildfire(), shape, 0)
+            .expect("valid model");
         let mean = prior.probability(1).mean().expect("not empty");
         // 25,600 cells latent with .01: four standard errors are .0025.
         assert!((mean - 0.01).abs() < 0.0025, "{mean}");

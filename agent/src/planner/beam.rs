@@ -78,17 +78,38 @@ impl BeamSearch {
         }
     }
 
-    fn prepare(&mut self, problem: &PlanningProblem<'_>) {
+    /// The best path that a beam of the given width finds in the window.
+    fn search(&mut self, width: usize, n_moves: usize) -> Plan {
+        self.begin(width);
+        for _ in 0..n_moves {
+            self.expand();
+            self.select(width);
+        }
+        let rank = |state: &State| (ordered_bits(state.score), !state.hash);
+        let best = (0..self.beam.len()).max_by_key(|&index| rank(&self.beam[index]));
+        let best = best.expect("invariant: every state has successors, so no beam is empty");
+        Plan {
+            moves: self.moves_to(best, width, n_moves),
+            score: self.beam[best].score,
+        }
+    }
+
+    fn look_at(&mut self, problem: &PlanningProblem<'_>) {
         self.window.look_at(problem);
         let n_cells = self.window.n_cells();
         let known = self.cell_hashes.len() as u64;
         let missing = known..(n_cells as u64).max(known);
-        self.cell_hashes.extend(missing.map(|index| split_mix(HASH_KEY, index)));
+        self.cell_hashes
+            .extend(missing.map(|index| split_mix(HASH_KEY, index)));
+    }
+
+    /// Makes the start the only state of the beam.
+    fn begin(&mut self, width: usize) {
         let n_words = self.words_per_state();
         self.visited.clear();
-        self.visited.resize(self.width * n_words, 0);
+        self.visited.resize(width * n_words, 0);
         self.next_visited.clear();
-        self.next_visited.resize(self.width * n_words, 0);
+        self.next_visited.resize(width * n_words, 0);
         self.history.clear();
         self.beam.clear();
         self.beam.push(State {
@@ -116,13 +137,28 @@ impl BeamSearch {
                 let cell = row as usize * cols + col as usize;
                 let is_new = visited[cell / 64] >> (cell % 64) & 1 == 0;
                 let (first, cell_hash) = (self.window.first[cell], self.cell_hashes[cell]);
-                let gain = if is_new { first } else { self.window.again(first) };
+                let gain = if is_new {
+                    first
+                } else {
+                    self.window.again(first)
+                };
                 let hash = state.hash ^ if is_new { cell_hash } else { 0 };
                 let score = state.score + gain;
-                let state = State { row, col, score, hash };
-                let origin = Origin { state: index as u32, step };
+                let state = State {
+                    row,
+                    col,
+                    score,
+                    hash,
+                };
+                let origin = Origin {
+                    state: index as u32,
+                    step,
+                };
                 let candidate = Candidate { state, origin };
-                match self.seen.find_or_insert(hash ^ cell_hash.rotate_left(32), self.candidates.len()) {
+                match self
+                    .seen
+                    .find_or_insert(hash ^ cell_hash.rotate_left(32), self.candidates.len())
+                {
                     None => self.candidates.push(candidate),
                     Some(twin) if self.candidates[twin].state.score < score => {
                         self.candidates[twin] = candidate;
@@ -134,7 +170,7 @@ impl BeamSearch {
     }
 
     /// Makes the best candidates the beam.
-    fn select(&mut self) {
+    fn select(&mut self, width: usize) {
         let rank = |(index, candidate): (usize, &Candidate)| {
             let State { score, hash, .. } = candidate.state;
             // Descending, so that the best come first in ascending order of rank.
@@ -142,14 +178,19 @@ impl BeamSearch {
             (rank, index as u32)
         };
         self.ranking.clear();
-        self.ranking.extend(self.candidates.iter().enumerate().map(rank));
-        if self.ranking.len() > self.width {
-            self.ranking.select_nth_unstable(self.width - 1);
-            self.ranking.truncate(self.width);
+        self.ranking
+            .extend(self.candidates.iter().enumerate().map(rank));
+        if self.ranking.len() > width {
+            self.ranking.select_nth_unstable(width - 1);
+            self.ranking.truncate(width);
         }
         let n_words = self.words_per_state();
         self.next_beam.clear();
-        for (&(_, index), visited) in self.ranking.iter().zip(self.next_visited.chunks_exact_mut(n_words)) {
+        for (&(_, index), visited) in self
+            .ranking
+            .iter()
+            .zip(self.next_visited.chunks_exact_mut(n_words))
+        {
             let Candidate { state, origin } = self.candidates[index as usize];
             let before = origin.state as usize * n_words;
             visited.copy_from_slice(&self.visited[before..][..n_words]);
@@ -159,18 +200,21 @@ impl BeamSearch {
             self.history.push(origin);
         }
         // Every move's origins start at a multiple of the width.
-        let n_missing = self.width - self.next_beam.len();
-        let nowhere = Origin { state: 0, step: Move::Up };
+        let n_missing = width - self.next_beam.len();
+        let nowhere = Origin {
+            state: 0,
+            step: Move::Up,
+        };
         self.history.extend(std::iter::repeat_n(nowhere, n_missing));
         std::mem::swap(&mut self.beam, &mut self.next_beam);
         std::mem::swap(&mut self.visited, &mut self.next_visited);
     }
 
     /// The moves that led to a state of the last beam.
-    fn moves_to(&self, state: usize, n_moves: usize) -> Vec<Move> {
+    fn moves_to(&self, state: usize, width: usize, n_moves: usize) -> Vec<Move> {
         let mut moves = vec![Move::Up; n_moves];
         let mut state = state;
-        for (origins, step) in self.history.chunks_exact(self.width).zip(&mut moves).rev() {
+        for (origins, step) in self.history.chunks_exact(width).zip(&mut moves).rev() {
             let origin = origins[state];
             *step = origin.step;
             state = origin.state as usize;
@@ -181,17 +225,14 @@ impl BeamSearch {
 
 impl Planner for BeamSearch {
     fn plan(&mut self, problem: &PlanningProblem<'_>) -> Plan {
-        self.prepare(problem);
-        for _ in 0..problem.n_moves {
-            self.expand();
-            self.select();
-        }
-        let rank = |state: &State| (ordered_bits(state.score), !state.hash);
-        let best = (0..self.beam.len()).max_by_key(|&index| rank(&self.beam[index]));
-        let best = best.expect("invariant: every state has four successors, so no beam is empty");
-        Plan {
-            moves: self.moves_to(best, problem.n_moves),
-            score: self.beam[best].score,
+        self.look_at(problem);
+        // A beam of one is a greedy walk. A wider one hardly ever falls behind it, now never.
+        let greedy = self.search(1, problem.n_moves);
+        let plan = self.search(self.width, problem.n_moves);
+        if greedy.score > plan.score {
+            greedy
+        } else {
+            plan
         }
     }
 }

@@ -2,6 +2,7 @@
 
 use super::window::Window;
 use super::{Plan, Planner, PlanningProblem};
+use protocol::grid::{Cell, Shape};
 use protocol::path::Move;
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
@@ -48,6 +49,34 @@ struct Slot {
     stamp: u32,
 }
 
+impl Integration {
+    /// The moves that take the robot, which clamps each move, over the cells of a sample.
+    ///
+    /// Clamped sums follow each other at a distance of one cell or none. Where there is none the sum
+    /// is beyond a border, so the robot flies against that border to stay in place.
+    pub fn as_flown(self, shape: Shape, start: Cell, sampled: &[Move]) -> Vec<Move> {
+        if self == Self::ClampEachMove {
+            return sampled.to_vec();
+        }
+        let (bottom, right) = (shape.height() as i32 - 1, shape.width() as i32 - 1);
+        let clamp = |(row, col): (i32, i32)| (row.clamp(0, bottom), col.clamp(0, right));
+        let mut sum = (start.row as i32, start.col as i32);
+        let fly = |&step: &Move| {
+            let before = clamp(sum);
+            let offset = OFFSETS[step as usize];
+            sum = (sum.0 + offset.0, sum.1 + offset.1);
+            match step {
+                _ if clamp(sum) != before => step,
+                Move::Up | Move::Down if before.0 == 0 => Move::Up,
+                Move::Up | Move::Down => Move::Down,
+                Move::Left | Move::Right if before.1 == 0 => Move::Left,
+                Move::Left | Move::Right => Move::Right,
+            }
+        };
+        sampled.iter().map(fly).collect()
+    }
+}
+
 impl Shooting {
     /// Shooting with `n_samples` samples, at least one.
     pub fn new(n_samples: usize, integration: Integration) -> Self {
@@ -84,7 +113,9 @@ impl Shooting {
     #[inline(always)]
     fn score<const CLAMP_SUM: bool>(&mut self, words: &[u64], n_moves: usize) -> f32 {
         self.stamp += 1;
-        let Window { rows, cols, start, .. } = self.window;
+        let Window {
+            rows, cols, start, ..
+        } = self.window;
         let (bottom, right) = (rows as i32 - 1, cols as i32 - 1);
         let (mut row, mut col) = (start.0 as i32, start.1 as i32);
         let mut score = 0.0;
@@ -101,7 +132,11 @@ impl Shooting {
                 }
                 let slot = &mut self.slots[inside.0 as usize * cols + inside.1 as usize];
                 let again = self.window.again(slot.first);
-                score += if slot.stamp == self.stamp { again } else { slot.first };
+                score += if slot.stamp == self.stamp {
+                    again
+                } else {
+                    slot.first
+                };
                 slot.stamp = self.stamp;
             }
         }
@@ -128,46 +163,14 @@ impl Shooting {
 impl Planner for Shooting {
     fn plan(&mut self, problem: &PlanningProblem<'_>) -> Plan {
         self.prepare(problem);
-        let sampled = |words: &[u64]| -> Vec<Move> {
-            let bits = |t: usize| words[t / MOVES_PER_WORD] >> (2 * (t % MOVES_PER_WORD));
-            (0..problem.n_moves).map(|t| Move::from_low_bits(bits(t))).collect()
+        let (words, score) = match self.integration {
+            Integration::ClampEachMove => self.best::<false>(problem),
+            Integration::ClampSum => self.best::<true>(problem),
         };
-        match self.integration {
-            Integration::ClampEachMove => {
-                let (words, score) = self.best::<false>(problem);
-                let moves = sampled(&words);
-                Plan { moves, score }
-            }
-            Integration::ClampSum => {
-                let (words, score) = self.best::<true>(problem);
-                let moves = fly_as_summed(&self.window, &sampled(&words));
-                Plan { moves, score }
-            }
-        }
+        let bits = |t: usize| words[t / MOVES_PER_WORD] >> (2 * (t % MOVES_PER_WORD));
+        let sampled = (0..problem.n_moves).map(|t| Move::from_low_bits(bits(t)));
+        let (shape, sampled) = (problem.values.shape(), sampled.collect::<Vec<_>>());
+        let moves = self.integration.as_flown(shape, problem.start, &sampled);
+        Plan { moves, score }
     }
-}
-
-/// The moves that take the robot, which clamps each move, over the cells of [`Integration::ClampSum`].
-///
-/// Clamped sums follow each other at a distance of one cell or none. Where there is none the sum is
-/// beyond the border, or moves along it there: a move against that border keeps the robot in place.
-fn fly_as_summed(window: &Window, sampled: &[Move]) -> Vec<Move> {
-    let (bottom, right) = (window.rows as i32 - 1, window.cols as i32 - 1);
-    let clamp = |(row, col): (i32, i32)| (row.clamp(0, bottom), col.clamp(0, right));
-    let mut sum = (window.start.0 as i32, window.start.1 as i32);
-    let fly = |&step: &Move| {
-        let before = clamp(sum);
-        let offset = OFFSETS[step as usize];
-        sum = (sum.0 + offset.0, sum.1 + offset.1);
-        if clamp(sum) != before {
-            return step;
-        }
-        match step {
-            Move::Up | Move::Down if before.0 == 0 => Move::Up,
-            Move::Up | Move::Down => Move::Down,
-            Move::Left | Move::Right if before.1 == 0 => Move::Left,
-            Move::Left | Move::Right => Move::Right,
-        }
-    };
-    sampled.iter().map(fly).collect()
 }

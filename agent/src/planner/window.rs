@@ -27,7 +27,11 @@ impl Window {
         let (values, n_moves) = (problem.values, problem.n_moves);
         let shape = values.shape();
         let Cell { row, col } = problem.start;
-        assert!(shape.contains(problem.start), "start {} is off the {shape} grid", problem.start);
+        assert!(
+            shape.contains(problem.start),
+            "start {} is off the {shape} grid",
+            problem.start
+        );
         let (top, left) = (row.saturating_sub(n_moves), col.saturating_sub(n_moves));
         let bottom = (row + n_moves + 1).min(shape.height());
         let right = (col + n_moves + 1).min(shape.width());
