@@ -47,8 +47,8 @@ const ESCAPED: u8 = 254;
 /// in a corner 1 in 3; only models with columns of very different sums come here often.
 const ROUNDS: usize = 8;
 
-/// Cells decided at once by the first byte: SSE registers hold the bytes and states of all of them.
-const LANES: usize = 32;
+/// Cells decided at once by the first byte: eight SSE registers hold their bytes and states.
+const LANES: usize = 64;
 
 /// The world's transition for one model on one grid, with its work space (which no result depends
 /// on): give each thread its own clone.
@@ -103,8 +103,8 @@ impl Dynamics {
         let mixture = Mixture::new(model);
         let likeliest = mixture.likeliest();
         let counts = mixture.fast_counts(&likeliest);
-        let residual = Draw::new(&mixture, &likeliest, &counts);
-        let full = Draw::new(&mixture, &likeliest, &vec![0; offsets.len()]);
+        let residual = Draw::new(&mixture, &offsets, &likeliest, &counts);
+        let full = Draw::new(&mixture, &offsets, &likeliest, &vec![0; offsets.len()]);
         Ok(Self {
             shape,
             n_states,
@@ -159,7 +159,10 @@ impl Dynamics {
         );
         let rows = self.parents.chunks_exact_mut(self.stride).skip(above);
         for (from, to) in cells.chunks_exact(width).zip(rows) {
-            to[left..left + width].copy_from_slice(from);
+            let chunks = from
+                .chunks(LANES)
+                .zip(to[left..left + width].chunks_mut(LANES));
+            chunks.for_each(|(from, to)| copy_lanes(from, to));
         }
     }
 
@@ -178,7 +181,7 @@ impl Dynamics {
                     lanes = lanes.map(|parent| likeliest[usize::from(parent)]);
                 }
                 copy_lanes(&lanes, cells);
-                let on_grid = u32::MAX >> (LANES - cells.len());
+                let on_grid = u64::MAX >> (LANES - cells.len());
                 let first = (row * width + col) as u32;
                 for_each_bit(high_bits(&lanes) & on_grid, |lane| {
                     self.undecided.push(Undecided {
@@ -192,16 +195,18 @@ impl Dynamics {
 
     /// One round: draws tap and outcome for every undecided cell, and keeps the rejected ones.
     fn draw_parents(&mut self, cells: &mut [u8], rng: &mut impl Rng) {
+        let (parents, undecided) = (&self.parents[..], &mut self.undecided[..]);
+        let [residual, full] = &self.residual_and_full;
         let mut n_rejected = 0;
-        for index in 0..self.undecided.len() {
-            let Undecided { cell, home } = self.undecided[index];
-            let state = &mut cells[cell as usize];
-            let draw = &self.residual_and_full[usize::from(*state == REJECTED)];
+        for index in 0..undecided.len() {
+            let at = undecided[index];
+            let state = &mut cells[at.cell as usize];
+            let draw = if *state == REJECTED { full } else { residual };
             let random = rng.next_u64();
             let tap = draw.tap(random as u32);
-            let parent = self.parents[home as usize + self.offsets[tap]];
+            let parent = parents[(at.home + tap.offset) as usize];
             *state = draw.outcome(tap, parent, (random >> 32) as u32);
-            self.undecided[n_rejected] = self.undecided[index];
+            undecided[n_rejected] = at;
             n_rejected += usize::from(*state == REJECTED);
         }
         self.undecided.truncate(n_rejected);
@@ -251,6 +256,7 @@ fn table_unless_identity(likeliest: &[usize]) -> Option<[u8; 256]> {
 }
 
 /// Each lane's parent under the tap that its byte stands for, or [`ESCAPED`].
+#[inline(never)] // LLVM vectorises it on its own, not within its caller.
 fn blend(bytes: &[u8; LANES], fast: &[FastTap], parents: &[u8]) -> [u8; LANES] {
     let mut states = [ESCAPED; LANES];
     // From the last tap back, so that each overwrites the lanes of the taps after it.
@@ -259,9 +265,9 @@ fn blend(bytes: &[u8; LANES], fast: &[FastTap], parents: &[u8]) -> [u8; LANES] {
             .first_chunk()
             .expect("invariant: LANES places follow the last cell");
         for lane in 0..LANES {
-            if bytes[lane] <= tap.last[lane] {
-                states[lane] = parent[lane];
-            }
+            // Arithmetic where an `if` would do: LLVM vectorises this one.
+            let chosen = u8::from(bytes[lane] <= tap.last[lane]).wrapping_neg();
+            states[lane] ^= (states[lane] ^ parent[lane]) & chosen;
         }
     }
     states
@@ -279,18 +285,18 @@ fn copy_lanes(from: &[u8], to: &mut [u8]) {
 }
 
 /// The high bit of every lane.
-fn high_bits(lanes: &[u8; LANES]) -> u32 {
+fn high_bits(lanes: &[u8; LANES]) -> u64 {
     let (words, _) = lanes.as_chunks::<8>();
     let bits = words.iter().enumerate().map(|(index, word)| {
         let high = (u64::from_le_bytes(*word) >> 7) & 0x0101_0101_0101_0101;
         // The product gathers bit 8i of `high` in bit 56 + i.
         let gathered = high.wrapping_mul(0x0102_0408_1020_4080) >> 56;
-        (gathered as u32) << (8 * index)
+        gathered << (8 * index)
     });
     bits.fold(0, |all, bits| all | bits)
 }
 
-fn for_each_bit(mut bits: u32, mut visit: impl FnMut(u32)) {
+fn for_each_bit(mut bits: u64, mut visit: impl FnMut(u32)) {
     while bits != 0 {
         visit(bits.trailing_zeros());
         bits &= bits - 1;

@@ -28,18 +28,27 @@ pub(crate) struct Draw {
     slots: Vec<Slot>,
     /// Low bits of the random number that decide within a slot.
     slot_bits: u32,
-    /// Cumulative outcome probabilities in units of `2^-32`, `[tap][parent, or off the grid]`.
+    /// Cumulative outcome probabilities in units of `2^-32`, a row for each tap and parent (the last
+    /// row of a tap for a parent off the grid), in each as many quadruples as hold S.
     thresholds: Vec<[u32; 4]>,
-    /// Entries of `thresholds` for one tap and parent: S, four at a time.
     quads: usize,
 }
 
+/// A tap drawn.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Tap {
+    /// Where it reads, relative to a cell's home.
+    pub(crate) offset: u32,
+    /// The first row of its thresholds.
+    row: u32,
+}
+
 /// One slot of an alias table.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy)]
 struct Slot {
     /// Below it the first tap is drawn, else the second.
     threshold: u32,
-    taps: [u16; 2],
+    taps: [Tap; 2],
 }
 
 impl Mixture {
@@ -105,8 +114,13 @@ impl Mixture {
 }
 
 impl Draw {
-    /// The distribution of tap and outcome less `counts[t] / 256` of "tap `t`, likeliest outcome".
-    pub(crate) fn new(mixture: &Mixture, likeliest: &[usize], counts: &[usize]) -> Self {
+    /// Taps read at `offsets`. The distribution of tap and outcome, less `counts[t] / 256` of "tap `t`, likeliest outcome".
+    pub(crate) fn new(
+        mixture: &Mixture,
+        offsets: &[usize],
+        likeliest: &[usize],
+        counts: &[usize],
+    ) -> Self {
         let n_states = mixture.n_states;
         let taken = |tap: usize| counts[tap] as f64 / 256.0;
         let masses = mixture.most.iter().enumerate();
@@ -117,20 +131,24 @@ impl Draw {
         let mut thresholds = vec![[0; 4]; mixture.n_taps * (n_states + 1) * quads];
         for (tap, rows) in thresholds.chunks_mut((n_states + 1) * quads).enumerate() {
             for (from, row) in rows.chunks_mut(quads).take(n_states).enumerate() {
-                let mut sum = 0.0;
-                for (to, weight) in mixture.weights(tap, from).iter().enumerate() {
+                let parts = mixture.weights(tap, from).iter().enumerate();
+                let parts = parts.map(|(to, weight)| {
                     let fast = if to == likeliest[from] {
                         taken(tap)
                     } else {
                         0.0
                     };
-                    sum += (weight / mixture.total - fast).max(0.0);
-                    // Casts saturate: a probability of one loses 2^-32, and 0/0 becomes 0.
-                    row[to / 4][to % 4] = (sum / masses[tap] * 2f64.powi(32)) as u32;
-                }
+                    (weight / mixture.total - fast).max(0.0) / masses[tap]
+                });
+                cumulate(parts, row.as_flattened_mut());
             }
         }
-        let slots = alias_table(&masses);
+        let tap = |(tap, &offset): (usize, &usize)| Tap {
+            offset: offset as u32,
+            row: (tap * (n_states + 1)) as u32,
+        };
+        let taps: Vec<Tap> = offsets.iter().enumerate().map(tap).collect();
+        let slots = alias_table(&masses, &taps);
         Self {
             n_states,
             slot_bits: 32 - slots.len().trailing_zeros(),
@@ -140,20 +158,23 @@ impl Draw {
         }
     }
 
-    pub(crate) fn tap(&self, random: u32) -> usize {
-        let slot = self.slots[(random >> self.slot_bits) as usize];
+    pub(crate) fn tap(&self, random: u32) -> Tap {
+        let slot = &self.slots[(random >> self.slot_bits) as usize];
         let within = random & ((1 << self.slot_bits) - 1);
-        usize::from(slot.taps[usize::from(within >= slot.threshold)])
+        slot.taps[usize::from(within >= slot.threshold)]
     }
 
     /// The number of thresholds passed: branch-free, as no outcome is predictable.
-    pub(crate) fn outcome(&self, tap: usize, parent: u8, random: u32) -> u8 {
-        let parent = usize::from(parent).min(self.n_states);
-        let row = (tap * (self.n_states + 1) + parent) * self.quads;
-        let quads = &self.thresholds[row..row + self.quads];
-        let passed = |quad: &[u32; 4]| quad.iter().filter(|&&t| random >= t).count();
-        let outcome: usize = quads.iter().map(passed).sum();
-        if outcome < self.n_states {
+    pub(crate) fn outcome(&self, tap: Tap, parent: u8, random: u32) -> u8 {
+        let row = tap.row as usize + usize::from(parent).min(self.n_states);
+        let passed = |quad: &[u32; 4]| quad.iter().map(|&t| u32::from(random >= t)).sum::<u32>();
+        let outcome = if self.quads == 1 {
+            passed(&self.thresholds[row])
+        } else {
+            let quads = &self.thresholds[row * self.quads..][..self.quads];
+            quads.iter().map(passed).sum()
+        };
+        if (outcome as usize) < self.n_states {
             outcome as u8
         } else {
             REJECTED
@@ -161,9 +182,19 @@ impl Draw {
     }
 }
 
+/// Cumulative probabilities in units of `2^-32`; entries without a probability repeat the last sum.
+fn cumulate(mut probabilities: impl Iterator<Item = f64>, thresholds: &mut [u32]) {
+    let mut sum = 0.0;
+    for threshold in thresholds {
+        sum += probabilities.next().unwrap_or(0.0);
+        // Casts saturate: a probability of one loses 2^-32, and 0/0 becomes 0.
+        *threshold = (sum * 2f64.powi(32)) as u32;
+    }
+}
+
 /// The smallest alias table with a power of two of slots (Vose, IEEE TSE 17(9), 1991). The masses
 /// need not sum to one; if they sum to zero, the table must not be drawn from.
-fn alias_table(masses: &[f64]) -> Vec<Slot> {
+fn alias_table(masses: &[f64], taps: &[Tap]) -> Vec<Slot> {
     let n_slots = masses.len().next_power_of_two().max(2);
     let unit = 2f64.powi(32) / n_slots as f64;
     let per_slot = masses.iter().sum::<f64>() / n_slots as f64;
@@ -173,13 +204,13 @@ fn alias_table(masses: &[f64]) -> Vec<Slot> {
         (0..n_slots).partition(|&tap| left[tap] < 1.0);
     let whole = |tap: usize| Slot {
         threshold: u32::MAX,
-        taps: [tap as u16; 2],
+        taps: [taps[tap.min(taps.len() - 1)]; 2],
     };
     let mut slots: Vec<Slot> = (0..n_slots).map(whole).collect();
     while let Some(&over) = large.last() {
         let Some(under) = small.pop() else { break };
         slots[under].threshold = (left[under] * unit) as u32;
-        slots[under].taps[1] = over as u16;
+        slots[under].taps[1] = taps[over];
         left[over] -= 1.0 - left[under];
         if left[over] < 1.0 {
             large.pop();
