@@ -14,6 +14,9 @@ pub const PAPER_SAMPLES: usize = 2048;
 /// Moves in one word of random bits.
 const MOVES_PER_WORD: usize = 32;
 
+/// Samples whose positions are computed side by side: two SSE registers of `i16`.
+const LANES: usize = 16;
+
 /// Row and column that each [`Move`] adds, in the order of its wire value.
 const OFFSETS: [(i32, i32); 4] = [(-1, 0), (1, 0), (0, -1), (0, 1)];
 
@@ -38,6 +41,10 @@ pub struct Shooting {
     window: Window,
     slots: Vec<Slot>,
     stamp: u32,
+    /// Random bits of [`LANES`] samples, sample by sample.
+    words: Vec<u64>,
+    /// The cells that these samples visit, move by move.
+    cells: Vec<[(i16, i16); LANES]>,
 }
 
 /// A cell of the window, with all that a visit reads or writes in one place.
@@ -87,6 +94,8 @@ impl Shooting {
             window: Window::default(),
             slots: Vec::new(),
             stamp: 0,
+            words: Vec::new(),
+            cells: Vec::new(),
         }
     }
 
@@ -96,43 +105,65 @@ impl Shooting {
         Self::new(PAPER_SAMPLES, Integration::ClampSum)
     }
 
-    /// Makes room for one stamp per sample; stamps of earlier plans never equal a later one.
     fn prepare(&mut self, problem: &PlanningProblem<'_>) {
         self.window.look_at(problem);
         let slot = |&first| Slot { first, stamp: 0 };
         self.slots.clear();
         self.slots.extend(self.window.first.iter().map(slot));
         self.stamp = 0;
+        self.words.clear();
+        self.words
+            .resize(LANES * problem.n_moves.div_ceil(MOVES_PER_WORD), 0);
+        self.cells.clear();
+        self.cells.resize(problem.n_moves, [(0, 0); LANES]);
     }
 
-    /// Score of one sample, two bits a move from the low end of each word.
+    /// Fills in the cells of [`LANES`] samples, two bits a move from the low end of each word.
     ///
-    /// Without branches that depend on the random moves: a mispredicted one costs as much as four
-    /// moves. `CLAMP_SUM` is known at compile time, so the robot's position is the only chain of
-    /// dependent operations besides the score.
-    #[inline(always)]
-    fn score<const CLAMP_SUM: bool>(&mut self, words: &[u64], n_moves: usize) -> f32 {
-        self.stamp += 1;
+    /// All lanes do the same arithmetic on `i16`, which the compiler turns into vector instructions.
+    fn integrate<const CLAMP_SUM: bool>(&mut self) {
         let Window {
             rows, cols, start, ..
         } = self.window;
-        let (bottom, right) = (rows as i32 - 1, cols as i32 - 1);
-        let (mut row, mut col) = (start.0 as i32, start.1 as i32);
-        let mut score = 0.0;
-        for (word_index, &word) in words.iter().enumerate() {
-            let n_left = (n_moves - word_index * MOVES_PER_WORD).min(MOVES_PER_WORD);
-            let mut bits = word;
-            for _ in 0..n_left {
-                let (down, along) = OFFSETS[(bits & 3) as usize];
-                bits >>= 2;
-                (row, col) = (row + down, col + along);
-                let inside = (row.clamp(0, bottom), col.clamp(0, right));
+        let (bottom, right) = (rows as i16 - 1, cols as i16 - 1);
+        let (mut row, mut col) = ([start.0 as i16; LANES], [start.1 as i16; LANES]);
+        let n_words = self.words.len() / LANES;
+        let mut bits = [0_u16; LANES];
+        for (t, cells) in self.cells.iter_mut().enumerate() {
+            if t % 8 == 0 {
+                let (word, shift) = (t / MOVES_PER_WORD, 2 * (t % MOVES_PER_WORD));
+                bits =
+                    std::array::from_fn(|lane| (self.words[lane * n_words + word] >> shift) as u16);
+            }
+            for lane in 0..LANES {
+                // The offsets of `OFFSETS`: -1 or 1, to the row if the higher bit is zero.
+                let offset = 2 * (bits[lane] & 1) as i16 - 1;
+                let along_rows = (bits[lane] >> 1 & 1) as i16 - 1;
+                bits[lane] >>= 2;
+                row[lane] += offset & along_rows;
+                col[lane] += offset & !along_rows;
+                let inside = (row[lane].max(0).min(bottom), col[lane].max(0).min(right));
                 if !CLAMP_SUM {
-                    (row, col) = inside;
+                    (row[lane], col[lane]) = inside;
                 }
-                let slot = &mut self.slots[inside.0 as usize * cols + inside.1 as usize];
+                cells[lane] = inside;
+            }
+        }
+    }
+
+    /// Score of the sample in one lane.
+    ///
+    /// Without branches: whether a cell is new is as random as the moves, and a mispredicted branch
+    /// costs as much as several moves. Two sums, so that one addition need not wait for the last.
+    fn score(&mut self, lane: usize) -> f32 {
+        self.stamp += 1;
+        let mut sums = [0.0; 2];
+        for pair in self.cells.chunks(2) {
+            for (cells, sum) in pair.iter().zip(&mut sums) {
+                let (row, col) = cells[lane];
+                let slot = &mut self.slots[row as usize * self.window.cols + col as usize];
                 let again = self.window.again(slot.first);
-                score += if slot.stamp == self.stamp {
+                *sum += if slot.stamp == self.stamp {
                     again
                 } else {
                     slot.first
@@ -140,20 +171,23 @@ impl Shooting {
                 slot.stamp = self.stamp;
             }
         }
-        score
+        sums[0] + sums[1]
     }
 
     /// The random bits of the best sample, and its score.
     fn best<const CLAMP_SUM: bool>(&mut self, problem: &PlanningProblem<'_>) -> (Vec<u64>, f32) {
         let mut rng = stream(problem.seed, Purpose::Planner, problem.step);
-        let mut words = vec![0; problem.n_moves.div_ceil(MOVES_PER_WORD)];
-        let (mut best, mut best_score) = (words.clone(), f32::NEG_INFINITY);
-        for _ in 0..self.n_samples {
-            words.fill_with(|| rng.next_u64());
-            let score = self.score::<CLAMP_SUM>(&words, problem.n_moves);
-            if score > best_score {
-                best_score = score;
-                best.copy_from_slice(&words);
+        let n_words = self.words.len() / LANES;
+        let (mut best, mut best_score) = (vec![0; n_words], f32::NEG_INFINITY);
+        for first in (0..self.n_samples).step_by(LANES) {
+            self.words.fill_with(|| rng.next_u64());
+            self.integrate::<CLAMP_SUM>();
+            for lane in 0..LANES.min(self.n_samples - first) {
+                let score = self.score(lane);
+                if score > best_score {
+                    best_score = score;
+                    best.copy_from_slice(&self.words[lane * n_words..][..n_words]);
+                }
             }
         }
         (best, best_score)
