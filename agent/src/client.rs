@@ -46,7 +46,10 @@ pub struct Claim {
 impl Observation {
     /// The robot's cell.
     pub fn robot(&self) -> Cell {
-        Cell { row: self.result.row as usize, col: self.result.col as usize }
+        Cell {
+            row: self.result.row as usize,
+            col: self.result.col as usize,
+        }
     }
 }
 
@@ -61,8 +64,16 @@ impl Client {
         let lease = acquire(&mut connection, claim)?.lease;
         let (height, width) = (connection.info().height, connection.info().width);
         let shape = Shape::new(height, width);
-        let shape = shape.map_err(|error| ConnectionError::Garbled { what: "hello", problem: error.to_string() })?;
-        Ok(Self { connection, lease, worlds: claim.worlds.clone(), shape })
+        let shape = shape.map_err(|error| ConnectionError::Garbled {
+            what: "hello",
+            problem: error.to_string(),
+        })?;
+        Ok(Self {
+            connection,
+            lease,
+            worlds: claim.worlds.clone(),
+            shape,
+        })
     }
 
     /// What the server said of itself.
@@ -84,7 +95,11 @@ impl Client {
     ///
     /// # Errors
     /// [`ConnectionError`]; after a timeout, [`Self::observe`] tells whether the step was made.
-    pub fn step(&mut self, worlds: Range<u32>, paths: &[Vec<Move>]) -> Result<Vec<Observation>, ConnectionError> {
+    pub fn step(
+        &mut self,
+        worlds: Range<u32>,
+        paths: &[Vec<Move>],
+    ) -> Result<Vec<Observation>, ConnectionError> {
         self.step_with_flags(worlds, paths, 0)
     }
 
@@ -92,7 +107,11 @@ impl Client {
     ///
     /// # Errors
     /// A refusal, unless the server's coverage is `client` or `full`.
-    pub fn step_full(&mut self, worlds: Range<u32>, paths: &[Vec<Move>]) -> Result<Vec<Observation>, ConnectionError> {
+    pub fn step_full(
+        &mut self,
+        worlds: Range<u32>,
+        paths: &[Vec<Move>],
+    ) -> Result<Vec<Observation>, ConnectionError> {
         self.step_with_flags(worlds, paths, FLAG_FULL_COVERAGE)
     }
 
@@ -111,7 +130,10 @@ impl Client {
     /// # Errors
     /// [`ConnectionError`].
     pub fn reset(&mut self, seeds: &[WorldSeed]) -> Result<Vec<WorldInfo>, ConnectionError> {
-        let request = Request::Reset { lease: self.lease, worlds: seeds.to_vec() };
+        let request = Request::Reset {
+            lease: self.lease,
+            worlds: seeds.to_vec(),
+        };
         match self.connection.control(&request, CONTROL_TIMEOUT)? {
             Reply::Reset { worlds } => Ok(worlds),
             other => Err(unexpected("reset", &other)),
@@ -127,10 +149,19 @@ impl Client {
         self.connection.control(&request, STEP_TIMEOUT).map(|_| ())
     }
 
-    fn step_with_flags(&mut self, worlds: Range<u32>, paths: &[Vec<Move>], flags: u32) -> Result<Vec<Observation>, ConnectionError> {
+    fn step_with_flags(
+        &mut self,
+        worlds: Range<u32>,
+        paths: &[Vec<Move>],
+        flags: u32,
+    ) -> Result<Vec<Observation>, ConnectionError> {
         let bytes: Vec<u8> = paths.iter().flat_map(|path| path_to_bytes(path)).collect();
         let n_moves = paths.first().map_or(0, Vec::len) as u32;
-        let request = StepRequest { n_moves, flags, ..self.request(Operation::Step, &worlds) };
+        let request = StepRequest {
+            n_moves,
+            flags,
+            ..self.request(Operation::Step, &worlds)
+        };
         let answer = self.connection.step(request, &bytes, STEP_TIMEOUT)?;
         self.observations(&answer)
     }
@@ -150,8 +181,14 @@ impl Client {
         let frames = answer.frames.chunks_exact(self.shape.n_cells());
         let observation = |(result, bytes): (&StepResult, &[u8])| {
             let frame = Frame::from_bytes(self.shape, n_observations, bytes);
-            let frame = frame.map_err(|error| ConnectionError::Garbled { what: "step", problem: error.to_string() })?;
-            Ok(Observation { result: *result, frame })
+            let frame = frame.map_err(|error| ConnectionError::Garbled {
+                what: "step",
+                problem: error.to_string(),
+            })?;
+            Ok(Observation {
+                result: *result,
+                frame,
+            })
         };
         answer.results.iter().zip(frames).map(observation).collect()
     }

@@ -1,0 +1,96 @@
+//! Time of one step's work in the agent at the paper's size: 64 x 64 cells, 64 moves, 3 states.
+//!
+//! The authors' PyTorch code, one CPU thread: planner with 2048 samples 1.5 s, Bayes update 0.12 ms.
+
+use agent::belief::{Belief, EntropyKind};
+use agent::estimator::Filter;
+use agent::planner::{
+    BeamSearch, CellValues, Objective, Planner, PlanningProblem, RandomWalk, Shooting, Target,
+};
+use criterion::{Criterion, criterion_group, criterion_main};
+use protocol::frame::Frame;
+use protocol::grid::{Cell, Shape};
+use protocol::model::Model;
+use protocol::path::{Move, fly};
+use protocol::randomness::split_mix;
+use std::hint::black_box;
+
+const N_MOVES: usize = 64;
+
+fn shape() -> Shape {
+    Shape::new(64, 64).expect("valid shape")
+}
+
+/// What 40 random walks saw, so that the belief has bumps like those of a running filter.
+fn filter() -> Filter {
+    let mut filter =
+        Filter::new(&Model::wildfire(), Belief::uniform(3, shape())).expect("valid model");
+    for step in 0..40 {
+        filter.correct(&frame(step)).expect("possible frame");
+        filter.predict();
+    }
+    filter
+}
+
+/// Observations of one of three values along a random walk from the centre.
+fn frame(step: u64) -> Frame {
+    let bits = |t: u64| split_mix(step, t) >> 62;
+    let moves: Vec<Move> = (0..512).map(|t| Move::from_low_bits(bits(t))).collect();
+    let mut frame = Frame::empty(shape());
+    for index in fly(shape(), shape().centre(), &moves)
+        .visited
+        .into_iter()
+        .take(N_MOVES)
+    {
+        frame.observe(index, (split_mix(index as u64 / 5, 0) % 3) as u8);
+    }
+    frame
+}
+
+fn planners(c: &mut Criterion) {
+    let values: CellValues = Objective::new(Target::State(2)).values(filter().belief());
+    let mut bench = |name: &str, planner: &mut dyn Planner| {
+        let mut step = 0;
+        c.bench_function(name, |b| {
+            b.iter(|| {
+                step += 1;
+                planner.plan(&PlanningProblem {
+                    start: Cell { row: 20, col: 30 },
+                    n_moves: N_MOVES,
+                    values: &values,
+                    seed: 1,
+                    step,
+                })
+            });
+        });
+    };
+    bench("random walk", &mut RandomWalk);
+    bench(
+        "shooting 2048 (authors: 1.5 s)",
+        &mut Shooting::new(2048, Default::default()),
+    );
+    bench(
+        "shooting 2048, paper preset (authors: 1.5 s)",
+        &mut Shooting::paper(),
+    );
+    for width in [50, 100, 200] {
+        bench(&format!("beam search {width}"), &mut BeamSearch::new(width));
+    }
+}
+
+fn estimators(c: &mut Criterion) {
+    let mut filter = filter();
+    let frame = frame(41);
+    c.bench_function("filter: correct + predict (authors: 120 us)", |b| {
+        b.iter(|| {
+            filter.correct(black_box(&frame)).expect("possible frame");
+            filter.predict();
+        });
+    });
+    c.bench_function("entropy", |b| {
+        b.iter(|| filter.belief().entropy(EntropyKind::Sum))
+    });
+}
+
+criterion_group!(benches, planners, estimators);
+criterion_main!(benches);

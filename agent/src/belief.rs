@@ -1,0 +1,279 @@
+//! A [`Belief`]: one probability distribution over states per cell, on the simplex by construction.
+//!
+//! Estimators produce beliefs (the `u` and `p` of paper eqs. 5 and 6), objectives read them; the
+//! uncertainty that attracts an exploring robot is their entropy (eq. 14).
+
+use ndarray::{ArrayView2, ArrayView3, Axis};
+use protocol::grid::{Cell, Grid, Probabilities, Shape, ShapeError};
+use protocol::model::Model;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// How far from one a cell's probabilities may sum: about 500 roundings of an `f32`, more than any
+/// softmax or normalisation leaves and less than any real mistake.
+const SUM_TOLERANCE: f32 = 5e-5;
+
+/// One distribution over states per cell, shape `[S, H, W]`; each cell sums to one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Belief {
+    probabilities: Probabilities,
+    shape: Shape,
+}
+
+/// Which of two sums over the states counts as a cell's entropy.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum EntropyKind {
+    /// Shannon's, in nats: `-sum_m p_m log p_m` (eq. 14), at most `log S`.
+    #[default]
+    Sum,
+    /// The mean over the S terms, as in the authors' code: `1/S` of [`EntropyKind::Sum`].
+    Mean,
+}
+
+/// Numbers that are no belief.
+#[derive(Debug, Error, PartialEq)]
+pub enum BeliefError {
+    /// A grid that no [`Shape`] allows.
+    #[error("belief: {0}")]
+    Shape(#[from] ShapeError),
+    /// A cell whose numbers are no distribution.
+    #[error("belief of cell {cell}: expected probabilities >= 0 with sum 1, got {got:?}")]
+    Simplex {
+        /// The first such cell.
+        cell: Cell,
+        /// Its numbers, one per state.
+        got: Vec<f32>,
+    },
+    /// A state that the model lacks.
+    #[error("belief from states: cell {cell}: expected a state below {n_states}, got {got}")]
+    State {
+        /// The first such cell.
+        cell: Cell,
+        /// Number of states S.
+        n_states: usize,
+        /// The value found there.
+        got: u8,
+    },
+}
+
+impl Belief {
+    /// Every state equally likely in every cell.
+    pub fn uniform(n_states: usize, shape: Shape) -> Self {
+        Self::everywhere(&vec![1.0 / n_states as f32; n_states], shape)
+    }
+
+    /// The model's distribution at the start of burn-in, in every cell.
+    pub fn from_initial(model: &Model, shape: Shape) -> Self {
+        let initial: Vec<f32> = model.initial().iter().map(|&p| p as f32).collect();
+        Self::everywhere(&initial, shape)
+    }
+
+    /// Certainty about given states, shape `[H, W]`: what an oracle believes.
+    ///
+    /// # Errors
+    /// [`BeliefError`] for a state that is not below `n_states`.
+    pub fn from_states(states: &Grid<u8>, n_states: usize) -> Result<Self, BeliefError> {
+        let (height, width) = states.dim();
+        let shape = Shape::new(height, width)?;
+        let mut probabilities = Probabilities::zeros((n_states, height, width));
+        for ((row, col), &got) in states.indexed_iter() {
+            match probabilities.get_mut((usize::from(got), row, col)) {
+                Some(probability) => *probability = 1.0,
+                None => {
+                    let cell = Cell { row, col };
+                    return Err(BeliefError::State {
+                        cell,
+                        n_states,
+                        got,
+                    });
+                }
+            }
+        }
+        Ok(Self {
+            probabilities,
+            shape,
+        })
+    }
+
+    /// Checks probabilities of shape `[S, H, W]`, such as a network's.
+    ///
+    /// # Errors
+    /// [`BeliefError`] names the first cell that is no distribution.
+    pub fn from_probabilities(probabilities: Probabilities) -> Result<Self, BeliefError> {
+        let (_, height, width) = probabilities.dim();
+        let shape = Shape::new(height, width)?;
+        let probabilities = probabilities.as_standard_layout().into_owned();
+        let sums = probabilities.sum_axis(Axis(0));
+        let least = probabilities.fold_axis(Axis(0), f32::INFINITY, |&a, &b| {
+            if b >= 0.0 { a.min(b) } else { f32::NAN }
+        });
+        let fine =
+            |(&sum, &least): (&f32, &f32)| (sum - 1.0).abs() <= SUM_TOLERANCE && least >= 0.0;
+        if let Some(index) = sums.iter().zip(&least).position(|cell| !fine(cell)) {
+            let cell = shape.cell(index);
+            let got = probabilities.slice(ndarray::s![.., cell.row, cell.col]);
+            let got = got.to_vec();
+            return Err(BeliefError::Simplex { cell, got });
+        }
+        Ok(Self {
+            probabilities,
+            shape,
+        })
+    }
+
+    /// The grid.
+    pub fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// Number of states S.
+    pub fn n_states(&self) -> usize {
+        self.probabilities.dim().0
+    }
+
+    /// All probabilities, shape `[S, H, W]`.
+    pub fn view(&self) -> ArrayView3<'_, f32> {
+        self.probabilities.view()
+    }
+
+    /// Probability of one state, shape `[H, W]`; `state` must be below S.
+    pub fn probability(&self, state: usize) -> ArrayView2<'_, f32> {
+        self.probabilities.index_axis(Axis(0), state)
+    }
+
+    /// Entropy of each cell (eq. 14) in nats, with `0 log 0 = 0`; shape `[H, W]`.
+    pub fn entropy(&self, kind: EntropyKind) -> Grid<f32> {
+        let scale = match kind {
+            EntropyKind::Sum => -1.0,
+            EntropyKind::Mean => -1.0 / self.n_states() as f32,
+        };
+        let mut entropy = vec![0.0; self.shape.n_cells()];
+        for plane in self.as_slice().chunks_exact(entropy.len()) {
+            for (sum, &p) in entropy.iter_mut().zip(plane) {
+                *sum += scale * p * ln(p);
+            }
+        }
+        Grid::from_shape_vec(self.shape.dim(), entropy).expect("invariant: one value per cell")
+    }
+
+    /// The probabilities, state by state and row-major.
+    pub fn as_slice(&self) -> &[f32] {
+        let slice = self.probabilities.as_slice();
+        slice.expect("invariant: beliefs are row-major")
+    }
+
+    /// For estimators, which keep each cell on the simplex themselves.
+    pub(crate) fn probabilities_mut(&mut self) -> &mut Probabilities {
+        &mut self.probabilities
+    }
+
+    fn everywhere(distribution: &[f32], shape: Shape) -> Self {
+        let (height, width) = shape.dim();
+        let dim = (distribution.len(), height, width);
+        let probabilities = Probabilities::from_shape_fn(dim, |(state, _, _)| distribution[state]);
+        Self {
+            probabilities,
+            shape,
+        }
+    }
+}
+
+/// Natural logarithm of a probability, good to a few units in the last place, and some finite number
+/// at zero, so that `p * ln(p)` is 0 there.
+///
+/// Without branches or calls, so that the loop over cells is vectorised: the library's logarithm
+/// takes 3 times as long. Polynomial of the Cephes library's `logf` (S. Moshier) on `m - 1`, where
+/// `p = m 2^e` with `m` in `sqrt(1/2)..sqrt(2)`.
+#[inline]
+fn ln(p: f32) -> f32 {
+    const SQRT_HALF_BITS: u32 = 0x3f35_04f3;
+    let exponent = (p.to_bits().wrapping_sub(SQRT_HALF_BITS) as i32) >> 23;
+    let x = f32::from_bits(p.to_bits().wrapping_sub((exponent << 23) as u32)) - 1.0;
+    const COEFFICIENTS: [f32; 9] = [
+        7.037_683_6e-2,
+        -1.151_461e-1,
+        1.167_699_9e-1,
+        -1.242_014_1e-1,
+        1.424_932_3e-1,
+        -1.666_805_7e-1,
+        2.000_071_5e-1,
+        -2.499_999_4e-1,
+        3.333_333e-1,
+    ];
+    let tail = COEFFICIENTS.iter().fold(0.0, |sum, c| sum * x + c);
+    let squared = x * x;
+    exponent as f32 * std::f32::consts::LN_2 + (x - 0.5 * squared + squared * x * tail)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shape(height: usize, width: usize) -> Shape {
+        Shape::new(height, width).expect("test shape")
+    }
+
+    #[test]
+    fn entropy_of_known_distributions() {
+        let uniform = Belief::uniform(3, shape(2, 5));
+        let ln3 = 3.0_f32.ln();
+        let close = |grid: Grid<f32>, expected: f32| {
+            assert!(grid.iter().all(|h| (h - expected).abs() < 1e-6), "{grid}");
+        };
+        close(uniform.entropy(EntropyKind::Sum), ln3);
+        close(uniform.entropy(EntropyKind::Mean), ln3 / 3.0);
+        let certain = Belief::from_states(&Grid::from_elem((2, 5), 1), 3).expect("valid states");
+        assert!(certain.entropy(EntropyKind::Sum).iter().all(|&h| h == 0.0));
+    }
+
+    #[test]
+    fn logarithm_agrees_with_the_library() {
+        for i in 1..=100_000 {
+            let p = i as f32 / 100_000.0;
+            assert!((ln(p) - p.ln()).abs() < 2e-7 * p.ln().abs().max(1.0), "{p}");
+        }
+        for p in [f32::MIN_POSITIVE, 1e-20, 1e-9, 1.0] {
+            assert!((p * ln(p) - p * p.ln()).abs() < 1e-9, "{p}");
+        }
+        assert_eq!(0.0 * ln(0.0), 0.0);
+    }
+
+    #[test]
+    fn numbers_off_the_simplex_are_rejected_by_cell() {
+        let check = |value: f32| {
+            let mut numbers = Probabilities::from_elem((3, 2, 2), 1.0 / 3.0);
+            numbers[[2, 1, 0]] = value;
+            match Belief::from_probabilities(numbers) {
+                Err(BeliefError::Simplex { cell, got }) => {
+                    assert_eq!(cell, Cell { row: 1, col: 0 });
+                    assert_eq!(got.len(), 3);
+                }
+                other => panic!("{value}: expected an error, got {other:?}"),
+            }
+        };
+        [0.5, 0.3, f32::NAN, f32::INFINITY]
+            .into_iter()
+            .for_each(check);
+        let mut numbers = Probabilities::from_elem((2, 1, 2), 0.5);
+        numbers[[0, 0, 1]] = 1.5;
+        numbers[[1, 0, 1]] = -0.5; // sums to one, but is no distribution
+        assert!(Belief::from_probabilities(numbers).is_err());
+        assert!(Belief::from_probabilities(Probabilities::from_elem((2, 3, 4), 0.5)).is_ok());
+    }
+
+    #[test]
+    fn an_unknown_state_is_rejected() {
+        let mut states = Grid::zeros((2, 2));
+        states[[0, 1]] = 3;
+        let error = Belief::from_states(&states, 3).expect_err("state 3 of 3");
+        assert!(error.to_string().contains("cell (0, 1)"), "{error}");
+    }
+
+    #[test]
+    fn the_initial_belief_is_the_models() {
+        let belief = Belief::from_initial(&Model::wildfire(), shape(3, 4));
+        assert!(belief.probability(0).iter().all(|&p| p == 0.99));
+        assert!(belief.probability(2).iter().all(|&p| p == 0.0));
+    }
+}

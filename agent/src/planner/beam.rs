@@ -1,0 +1,288 @@
+//! Beam search over paths: keeps the best B sets of visited cells at each move.
+//!
+//! The planner of paper section III.D draws paths at random; the objective of eq. 15 over distinct
+//! cells is an orienteering problem, where extending only good beginnings finds far better paths in
+//! less time. A state of the search is a cell and the set of cells visited so far, whatever their order:
+//! of beginnings that agree in both only the best goes on.
+
+use super::window::Window;
+use super::{Plan, Planner, PlanningProblem};
+use protocol::path::Move;
+use protocol::randomness::split_mix;
+
+/// Key of the hash values that stand for cells: the word `beam` in ASCII.
+const HASH_KEY: u64 = 0x6265_616d;
+
+/// Beam search of a given width. Ties are broken by a hash of the visited cells, which prefers no
+/// direction.
+#[derive(Debug)]
+pub struct BeamSearch {
+    width: usize,
+    window: Window,
+    /// A random number for each cell of the window (Zobrist, 1970): a set's hash is their exclusive
+    /// or, so that it does not depend on the order of the visits.
+    cell_hashes: Vec<u64>,
+    beam: Vec<State>,
+    next_beam: Vec<State>,
+    /// For each state of the beam, one bit per cell of the window.
+    visited: Vec<u64>,
+    next_visited: Vec<u64>,
+    candidates: Vec<Candidate>,
+    /// Rank of each candidate and its index.
+    ranking: Vec<(u64, u32)>,
+    seen: SeenStates,
+    /// For each move and each state of the beam after it, where it came from.
+    history: Vec<Origin>,
+}
+
+/// A beginning of a path that the search goes on from.
+#[derive(Debug, Clone, Copy)]
+struct State {
+    row: u32,
+    col: u32,
+    score: f32,
+    /// Hash of the set of visited cells.
+    hash: u64,
+}
+
+/// A state one move further on.
+#[derive(Debug, Clone, Copy)]
+struct Candidate {
+    state: State,
+    origin: Origin,
+}
+
+/// The index of the state before, and the move.
+#[derive(Debug, Clone, Copy)]
+struct Origin {
+    state: u32,
+    step: Move,
+}
+
+impl BeamSearch {
+    /// A search that keeps `width` states, at least one.
+    pub fn new(width: usize) -> Self {
+        assert!(width > 0, "beam search: expected a width of at least one");
+        Self {
+            width,
+            window: Window::default(),
+            cell_hashes: Vec::new(),
+            beam: Vec::new(),
+            next_beam: Vec::new(),
+            visited: Vec::new(),
+            next_visited: Vec::new(),
+            candidates: Vec::with_capacity(4 * width),
+            ranking: Vec::with_capacity(4 * width),
+            seen: SeenStates::new(4 * width),
+            history: Vec::new(),
+        }
+    }
+
+    /// The best path that a beam of the given width finds in the window.
+    fn search(&mut self, width: usize, n_moves: usize) -> Plan {
+        self.begin(width);
+        for _ in 0..n_moves {
+            self.expand();
+            self.select(width);
+        }
+        let rank = |state: &State| (ordered_bits(state.score), !state.hash);
+        let best = (0..self.beam.len()).max_by_key(|&index| rank(&self.beam[index]));
+        let best = best.expect("invariant: every state has successors, so no beam is empty");
+        Plan {
+            moves: self.moves_to(best, width, n_moves),
+            score: self.beam[best].score,
+        }
+    }
+
+    fn look_at(&mut self, problem: &PlanningProblem<'_>) {
+        self.window.look_at(problem);
+        let n_cells = self.window.n_cells();
+        let known = self.cell_hashes.len() as u64;
+        let missing = known..(n_cells as u64).max(known);
+        self.cell_hashes
+            .extend(missing.map(|index| split_mix(HASH_KEY, index)));
+    }
+
+    /// Makes the start the only state of the beam.
+    fn begin(&mut self, width: usize) {
+        let n_words = self.words_per_state();
+        self.visited.clear();
+        self.visited.resize(width * n_words, 0);
+        self.next_visited.clear();
+        self.next_visited.resize(width * n_words, 0);
+        self.history.clear();
+        self.beam.clear();
+        self.beam.push(State {
+            row: self.window.start.0 as u32,
+            col: self.window.start.1 as u32,
+            score: 0.0,
+            hash: 0,
+        });
+    }
+
+    fn words_per_state(&self) -> usize {
+        self.window.n_cells().div_ceil(64)
+    }
+
+    /// Lists the states one move on from the beam, each once with its best score.
+    fn expand(&mut self) {
+        self.candidates.clear();
+        self.seen.clear();
+        let n_words = self.words_per_state();
+        let cols = self.window.cols;
+        for (index, state) in self.beam.iter().enumerate() {
+            let visited = &self.visited[index * n_words..][..n_words];
+            for step in Move::ALL {
+                let (row, col) = self.window.after(step, state.row, state.col);
+                let cell = row as usize * cols + col as usize;
+                let is_new = visited[cell / 64] >> (cell % 64) & 1 == 0;
+                let (first, cell_hash) = (self.window.first[cell], self.cell_hashes[cell]);
+                let gain = if is_new {
+                    first
+                } else {
+                    self.window.again(first)
+                };
+                let hash = state.hash ^ if is_new { cell_hash } else { 0 };
+                let score = state.score + gain;
+                let state = State {
+                    row,
+                    col,
+                    score,
+                    hash,
+                };
+                let origin = Origin {
+                    state: index as u32,
+                    step,
+                };
+                let candidate = Candidate { state, origin };
+                match self
+                    .seen
+                    .find_or_insert(hash ^ cell_hash.rotate_left(32), self.candidates.len())
+                {
+                    None => self.candidates.push(candidate),
+                    Some(twin) if self.candidates[twin].state.score < score => {
+                        self.candidates[twin] = candidate;
+                    }
+                    Some(_) => {}
+                }
+            }
+        }
+    }
+
+    /// Makes the best candidates the beam.
+    fn select(&mut self, width: usize) {
+        let rank = |(index, candidate): (usize, &Candidate)| {
+            let State { score, hash, .. } = candidate.state;
+            // Descending, so that the best come first in ascending order of rank.
+            let rank = u64::from(!ordered_bits(score)) << 32 | hash >> 32;
+            (rank, index as u32)
+        };
+        self.ranking.clear();
+        self.ranking
+            .extend(self.candidates.iter().enumerate().map(rank));
+        if self.ranking.len() > width {
+            self.ranking.select_nth_unstable(width - 1);
+            self.ranking.truncate(width);
+        }
+        let n_words = self.words_per_state();
+        self.next_beam.clear();
+        for (&(_, index), visited) in self
+            .ranking
+            .iter()
+            .zip(self.next_visited.chunks_exact_mut(n_words))
+        {
+            let Candidate { state, origin } = self.candidates[index as usize];
+            let before = origin.state as usize * n_words;
+            visited.copy_from_slice(&self.visited[before..][..n_words]);
+            let cell = state.row as usize * self.window.cols + state.col as usize;
+            visited[cell / 64] |= 1 << (cell % 64);
+            self.next_beam.push(state);
+            self.history.push(origin);
+        }
+        // Every move's origins start at a multiple of the width.
+        let n_missing = width - self.next_beam.len();
+        let nowhere = Origin {
+            state: 0,
+            step: Move::Up,
+        };
+        self.history.extend(std::iter::repeat_n(nowhere, n_missing));
+        std::mem::swap(&mut self.beam, &mut self.next_beam);
+        std::mem::swap(&mut self.visited, &mut self.next_visited);
+    }
+
+    /// The moves that led to a state of the last beam.
+    fn moves_to(&self, state: usize, width: usize, n_moves: usize) -> Vec<Move> {
+        let mut moves = vec![Move::Up; n_moves];
+        let mut state = state;
+        for (origins, step) in self.history.chunks_exact(width).zip(&mut moves).rev() {
+            let origin = origins[state];
+            *step = origin.step;
+            state = origin.state as usize;
+        }
+        moves
+    }
+}
+
+impl Planner for BeamSearch {
+    fn plan(&mut self, problem: &PlanningProblem<'_>) -> Plan {
+        self.look_at(problem);
+        // A beam of one is a greedy walk. A wider one hardly ever falls behind it, now never.
+        let greedy = self.search(1, problem.n_moves);
+        let plan = self.search(self.width, problem.n_moves);
+        if greedy.score > plan.score {
+            greedy
+        } else {
+            plan
+        }
+    }
+}
+
+/// Bits that order as the numbers do.
+fn ordered_bits(score: f32) -> u32 {
+    let bits = score.to_bits();
+    // Negative numbers order backwards by their bits, and lie below the others.
+    bits ^ if bits >> 31 == 1 { u32::MAX } else { 1 << 31 }
+}
+
+/// Which states are among the candidates of one move: a hash table whose keys are hashes already,
+/// cleared without touching it.
+#[derive(Debug)]
+struct SeenStates {
+    /// Key, round in which it was put there, and index of its candidate.
+    slots: Vec<(u64, u32, u32)>,
+    round: u32,
+}
+
+impl SeenStates {
+    /// Room for `n` states at most half full, so that probes stay short.
+    fn new(n: usize) -> Self {
+        let slots = vec![(0, 0, 0); (2 * n).next_power_of_two()];
+        Self { slots, round: 0 }
+    }
+
+    fn clear(&mut self) {
+        self.round = self.round.wrapping_add(1);
+        if self.round == 0 {
+            self.slots.fill((0, 0, 0));
+            self.round = 1;
+        }
+    }
+
+    /// The candidate of a key; where there is none, the key gets `candidate`.
+    #[inline]
+    fn find_or_insert(&mut self, key: u64, candidate: usize) -> Option<usize> {
+        let mask = self.slots.len() - 1;
+        let mut at = key as usize & mask;
+        loop {
+            let slot = &mut self.slots[at];
+            if slot.1 != self.round {
+                *slot = (key, self.round, candidate as u32);
+                return None;
+            }
+            if slot.0 == key {
+                return Some(slot.2 as usize);
+            }
+            at = (at + 1) & mask;
+        }
+    }
+}
