@@ -41,7 +41,8 @@ fn formula(model: &Model, belief: &Array3<f64>) -> Array3<f64> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(200))]
+    // No file of failures: tests leave the source tree alone.
+    #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..Default::default() })]
 
     #[test]
     fn apply_equals_the_formula_and_keeps_beliefs_on_the_simplex(
