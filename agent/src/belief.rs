@@ -133,6 +133,11 @@ impl Belief {
     }
 
     /// All probabilities, shape `[S, H, W]`.
+    pub fn probabilities(&self) -> &Probabilities {
+        &self.probabilities
+    }
+
+    /// All probabilities, shape `[S, H, W]`.
     pub fn view(&self) -> ArrayView3<'_, f32> {
         self.probabilities.view()
     }

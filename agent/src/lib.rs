@@ -3,11 +3,19 @@
 //! One step, in reading order: [`client`] (frames in, paths out), [`estimator`] (frame to
 //! [`belief`]), [`planner`] (belief to path).
 
+pub mod agent;
+pub mod arena;
 pub mod belief;
 pub mod client;
+pub mod compare;
+pub mod config;
 pub mod estimator;
+pub mod launch;
 pub mod planner;
+pub mod policy;
 pub mod report;
+pub mod run;
+pub mod truth;
 
 pub use belief::{Belief, EntropyKind};
 pub use planner::{Objective, Planner, PlanningProblem};

@@ -1,3 +1,37 @@
-//! Placeholder.
+//! `emberwatch-agent`: acts on a server's world, or compares ways to act.
 
-fn main() {}
+mod commands;
+
+use clap::{Parser, Subcommand};
+use std::process::ExitCode;
+
+/// Estimates, plans and acts on an Emberwatch server.
+#[derive(Parser)]
+#[command(name = "emberwatch-agent", version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Act on one world of a running server
+    Run(commands::RunCommand),
+    /// Compare policies on the same worlds: table, CSV and figures
+    Compare(commands::CompareCommand),
+}
+
+fn main() -> ExitCode {
+    protocol::program::start_logging();
+    let result = match &Cli::parse().command {
+        Command::Run(command) => command.run(),
+        Command::Compare(command) => command.run(),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            tracing::error!("{error:#}");
+            commands::exit_code(&error)
+        }
+    }
+}

@@ -7,9 +7,8 @@ use env_server::server::serve;
 use protocol::Connection;
 use protocol::channels::Instance;
 use protocol::control::{Reply, Request, ServerStatus};
+use protocol::program::{start_logging, stop_on_signals};
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 /// How long `status` and `stop` wait for the server.
@@ -30,6 +29,9 @@ struct Cli {
     /// Check the settings, print the effective ones as TOML, and end
     #[arg(long)]
     check: bool,
+    /// End when this process ends
+    #[arg(long, value_name = "PID")]
+    exit_with: Option<i32>,
 }
 
 #[derive(Subcommand)]
@@ -70,7 +72,11 @@ fn run(cli: &Cli) -> Result<()> {
             if cli.check {
                 return print(&toml::to_string(&checked.config)?);
             }
-            Ok(serve(checked, &stop_on_signals()?)?)
+            Ok(serve(
+                checked,
+                &stop_on_signals().context("handle signals")?,
+                cli.exit_with,
+            )?)
         }
     }
 }
@@ -124,26 +130,4 @@ fn print(text: &str) -> Result<()> {
     std::io::stdout()
         .write_all(text.as_bytes())
         .context("write to standard output")
-}
-
-/// Set by SIGINT, SIGTERM or SIGHUP; a second one ends the process at once.
-fn stop_on_signals() -> Result<Arc<AtomicBool>> {
-    use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [SIGINT, SIGTERM, SIGHUP] {
-        signal_hook::flag::register_conditional_shutdown(signal, 1, stop.clone())
-            .context("handle signals")?;
-        signal_hook::flag::register(signal, stop.clone()).context("handle signals")?;
-    }
-    Ok(stop)
-}
-
-fn start_logging() {
-    use tracing_subscriber::EnvFilter;
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr)
-        .with_target(false)
-        .init();
 }

@@ -1,7 +1,7 @@
 //! The loop: receive, check the lease, step, answer, publish.
 
 use crate::config::Checked;
-use crate::liveness::{Clients, Janitor};
+use crate::liveness::{Clients, Janitor, Keeper};
 use crate::ports::{ActiveControl, ActiveStep, PortError, Ports};
 use crate::resets::Resets;
 use crate::simulator::{Awaited, Outcome, Simulator, Surroundings};
@@ -46,6 +46,14 @@ pub enum ServeError {
     /// The model does not fit the grid.
     #[error(transparent)]
     Model(#[from] ModelError),
+    /// The process to end with is not there.
+    #[error("--exit-with {pid}: expected a running process, got {problem}")]
+    NoKeeper {
+        /// The process.
+        pid: i32,
+        /// The system's reason.
+        problem: String,
+    },
     /// Threads could not be started.
     #[error("start {n_threads} threads: {problem}")]
     Threads {
@@ -56,12 +64,16 @@ pub enum ServeError {
     },
 }
 
-/// Serves until `stop` is set or a client asks to shut down.
+/// Serves until `stop` is set, a client asks to shut down, or the process `exit_with` ends.
 ///
 /// # Errors
 /// [`ServeError`].
-pub fn serve(checked: Checked, stop: &Arc<AtomicBool>) -> Result<(), ServeError> {
-    let mut server = Server::start(checked)?;
+pub fn serve(
+    checked: Checked,
+    stop: &Arc<AtomicBool>,
+    exit_with: Option<i32>,
+) -> Result<(), ServeError> {
+    let mut server = Server::start(checked, exit_with)?;
     while !stop.load(Ordering::Relaxed) && !server.is_over {
         server.turn()?;
     }
@@ -73,6 +85,7 @@ struct Server {
     simulator: Simulator,
     ports: Ports,
     clients: Clients,
+    keeper: Option<Keeper>,
     janitor: Janitor,
     resets: Resets,
     awaiting: Vec<(ActiveControl, Awaited)>,
@@ -102,7 +115,8 @@ struct Rate {
 }
 
 impl Server {
-    fn start(checked: Checked) -> Result<Self, ServeError> {
+    fn start(checked: Checked, exit_with: Option<i32>) -> Result<Self, ServeError> {
+        let keeper = exit_with.map(Keeper::watch).transpose()?;
         let ports = Ports::open(&checked)?;
         let (instance, config) = (checked.instance.name().to_owned(), &checked.config);
         tracing::info!(
@@ -125,6 +139,7 @@ impl Server {
             simulator,
             ports,
             clients: Clients::default(),
+            keeper,
             janitor: Janitor::start(),
             resets,
             awaiting: Vec::new(),
@@ -182,8 +197,9 @@ impl Server {
             return Ok(true);
         }
         let own = [self.ports.descriptor(), self.resets.descriptor()];
-        let descriptors: Vec<BorrowedFd<'_>> =
-            own.into_iter().chain(self.clients.descriptors()).collect();
+        let keeper = self.keeper.iter().map(Keeper::descriptor);
+        let others = keeper.chain(self.clients.descriptors());
+        let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(others).collect();
         let readable = sleep_until_readable(&descriptors, limit).map_err(ipc_error("sleep"))?;
         Ok(readable.contains(&true))
     }
@@ -260,6 +276,7 @@ impl Server {
         self.last_tick = now;
         self.take_resets(now);
         self.bury_the_dead();
+        self.is_over |= self.keeper.as_ref().is_some_and(Keeper::has_ended);
         for pid in self.simulator.expire(now) {
             tracing::warn!(pid, "a lease expired");
         }

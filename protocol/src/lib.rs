@@ -18,6 +18,7 @@ mod mixture;
 pub mod model;
 pub mod observer;
 pub mod path;
+pub mod program;
 pub mod randomness;
 pub mod transition;
 pub mod wait;

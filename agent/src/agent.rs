@@ -1,0 +1,173 @@
+//! One agent on one world: plan, then correct and predict. Pure; the wire is elsewhere.
+
+use crate::belief::{Belief, BeliefError};
+use crate::config::AgentConfig;
+use crate::estimator::{Filter, ZeroEvidence};
+use crate::planner::{CellValues, Plan, Planner, PlanningProblem};
+use crate::policy::{EstimatorKind, Policy};
+use protocol::model::ModelError;
+use protocol::{Cell, Frame, Grid, Model, Probabilities, Shape, Transition};
+use thiserror::Error;
+
+/// A policy at work on one world.
+pub struct Agent {
+    policy: Policy,
+    estimator: Estimator,
+    planner: Box<dyn Planner + Send>,
+    n_moves: usize,
+    seed: u64,
+}
+
+/// What an agent is built for.
+#[derive(Debug, Clone, Copy)]
+pub struct Task<'a> {
+    /// The model, for filters and predictions.
+    pub model: &'a Model,
+    /// The grid.
+    pub shape: Shape,
+    /// Moves in a path.
+    pub n_moves: usize,
+    /// The belief before the first frame.
+    pub prior: &'a Belief,
+    /// Seed of the planner's random numbers: the agent's and the world's.
+    pub seed: u64,
+}
+
+/// Why an agent cannot go on.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum AgentError {
+    /// A frame that the belief held for impossible.
+    #[error(transparent)]
+    ZeroEvidence(#[from] ZeroEvidence),
+    /// The model does not fit the grid.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// Hidden states of another model.
+    #[error("hidden states: {0}")]
+    Belief(#[from] BeliefError),
+    /// A policy that needs the hidden state was not given it.
+    #[error("policy {policy:?} needs the truth channel: start the server with --publish-truth")]
+    NeedsTruth {
+        /// The policy.
+        policy: String,
+    },
+}
+
+enum Estimator {
+    /// Always the prior.
+    None(Belief),
+    KnownModel(Box<Filter>),
+    /// One-hot after `correct`, one step ahead of it after `predict`.
+    Truth {
+        belief: Belief,
+        transition: Box<Transition>,
+    },
+    /// One-hot, the state that the next path meets.
+    NextTruth(Belief),
+}
+
+impl Agent {
+    /// An agent before its first frame.
+    ///
+    /// # Errors
+    /// [`AgentError::Model`].
+    pub fn new(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Self, AgentError> {
+        let prior = task.prior.clone();
+        let estimator = match policy.estimator {
+            EstimatorKind::None => Estimator::None(prior),
+            EstimatorKind::KnownModel => {
+                Estimator::KnownModel(Box::new(Filter::new(task.model, prior)?))
+            }
+            EstimatorKind::Truth => {
+                let transition = Box::new(Transition::new(task.model, task.shape)?);
+                Estimator::Truth {
+                    belief: prior,
+                    transition,
+                }
+            }
+            EstimatorKind::NextTruth => Estimator::NextTruth(prior),
+        };
+        Ok(Self {
+            policy: policy.clone(),
+            estimator,
+            planner: config.planner(policy),
+            n_moves: task.n_moves,
+            seed: task.seed,
+        })
+    }
+
+    /// The path for step k -> k + 1, from where the robot is (paper eq. 15).
+    pub fn plan(&mut self, robot: Cell, step: u64) -> Plan {
+        let values: CellValues = self.policy.objective.values(self.estimator.belief());
+        let problem = PlanningProblem {
+            start: robot,
+            n_moves: self.n_moves,
+            values: &values,
+            seed: self.seed,
+            step,
+        };
+        self.planner.plan(&problem)
+    }
+
+    /// Takes in a frame of X_k (paper eq. 5); `truth` is X_k, for policies that are fed with it.
+    ///
+    /// # Errors
+    /// [`AgentError`]; the belief is then as it was.
+    pub fn correct(&mut self, frame: &Frame, truth: Option<&Grid<u8>>) -> Result<(), AgentError> {
+        match &mut self.estimator {
+            Estimator::None(_) | Estimator::NextTruth(_) => Ok(()),
+            Estimator::KnownModel(filter) => Ok(filter.correct(frame)?),
+            Estimator::Truth { belief, .. } => {
+                let truth = truth.ok_or_else(|| AgentError::NeedsTruth {
+                    policy: self.policy.name.clone(),
+                })?;
+                *belief = Belief::from_states(truth, belief.n_states())?;
+                Ok(())
+            }
+        }
+    }
+
+    /// Moves the belief from X_k to X_{k+1} (paper eq. 6).
+    pub fn predict(&mut self) {
+        match &mut self.estimator {
+            Estimator::None(_) | Estimator::NextTruth(_) => {}
+            Estimator::KnownModel(filter) => filter.predict(),
+            Estimator::Truth { belief, transition } => {
+                let mut next = Probabilities::zeros(belief.view().dim());
+                transition.apply(belief.probabilities_mut(), &mut next);
+                *belief.probabilities_mut() = next;
+            }
+        }
+    }
+
+    /// Tells a clairvoyant agent the state X_{k+1} that its next path will meet; others ignore it.
+    ///
+    /// # Errors
+    /// [`AgentError::Belief`].
+    pub fn foresee(&mut self, next: &Grid<u8>) -> Result<(), AgentError> {
+        if let Estimator::NextTruth(belief) = &mut self.estimator {
+            *belief = Belief::from_states(next, belief.n_states())?;
+        }
+        Ok(())
+    }
+
+    /// The belief: about X_k after `correct`, about X_{k+1} after `predict`.
+    pub fn belief(&self) -> &Belief {
+        self.estimator.belief()
+    }
+
+    /// The policy.
+    pub fn policy(&self) -> &Policy {
+        &self.policy
+    }
+}
+
+impl Estimator {
+    fn belief(&self) -> &Belief {
+        match self {
+            Self::None(belief) | Self::NextTruth(belief) | Self::Truth { belief, .. } => belief,
+            Self::KnownModel(filter) => filter.belief(),
+        }
+    }
+}

@@ -1,0 +1,343 @@
+//! The benchmark: every policy on the same worlds, scored against the hidden states.
+
+use crate::agent::{Agent, AgentError, Task};
+use crate::arena::{Arena, ArenaError};
+use crate::belief::Belief;
+use crate::client::Observation;
+use crate::config::AgentConfig;
+use crate::planner::Plan;
+use crate::policy::{EstimatorKind, Policy};
+use crate::report::PolicyRun;
+use protocol::model::ModelError;
+use protocol::path::fly;
+use protocol::{Cell, Frame, Grid};
+use rayon::iter::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
+use std::ops::Range;
+use std::time::{Duration, Instant};
+use thiserror::Error;
+
+/// What is compared.
+#[derive(Debug, Clone)]
+pub struct Comparison {
+    /// The policies, in the order of the table.
+    pub policies: Vec<Policy>,
+    /// The worlds.
+    pub seeds: Range<u64>,
+    /// Scored steps of each world.
+    pub steps: u64,
+    /// Settings of planners and estimators.
+    pub config: AgentConfig,
+}
+
+/// What came out.
+#[derive(Debug)]
+pub struct Results {
+    /// One run per policy and world, in the order of the policies.
+    pub runs: Vec<PolicyRun>,
+    /// Cells in the state that pays most, per step of the first world: the same for all policies.
+    pub fire_cells: Vec<f32>,
+    /// The end of the first world's run of the last policy with a belief of its own.
+    pub moment: Option<Moment>,
+}
+
+/// One world at one step, as a policy saw it.
+#[derive(Debug, Clone)]
+pub struct Moment {
+    /// The world's seed.
+    pub seed: u64,
+    /// Step index k.
+    pub step: u64,
+    /// Hidden states, shape `[H, W]`.
+    pub truth: Grid<u8>,
+    /// What the robot saw.
+    pub frame: Frame,
+    /// The cells of the path, its start first.
+    pub path_cells: Vec<Cell>,
+    /// The posterior after the frame.
+    pub belief: Belief,
+}
+
+/// Why a comparison failed.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum CompareError {
+    /// The worlds.
+    #[error(transparent)]
+    Arena(#[from] ArenaError),
+    /// An agent.
+    #[error("policy {policy:?}: {problem}")]
+    Agent {
+        /// The policy.
+        policy: String,
+        /// What is wrong.
+        problem: AgentError,
+    },
+    /// The model.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+}
+
+/// One world's run of one policy.
+struct Run {
+    agent: Agent,
+    observation: Observation,
+    seed: u64,
+    tally: Tally,
+    moment: Option<Moment>,
+}
+
+/// Sums over the steps of a run.
+#[derive(Default)]
+struct Tally {
+    rewards: Vec<f32>,
+    fire_cells: Vec<f32>,
+    reward: f64,
+    n_visited: u64,
+    n_hits: u64,
+    n_fire: u64,
+    planning: Duration,
+    brier: f64,
+}
+
+/// Runs every policy on every world; `progress` is told of each policy and of each world step.
+///
+/// # Errors
+/// [`CompareError`].
+pub fn compare(
+    arena: &mut Arena,
+    comparison: &Comparison,
+    progress: &dyn Fn(&str, u64),
+) -> Result<Results, CompareError> {
+    let prior = comparison.config.prior(arena.info().burn_in);
+    let prior = prior.belief(arena.model(), arena.shape(), comparison.config.seed)?;
+    let seeds: Vec<u64> = comparison.seeds.clone().collect();
+    let mut results = Results {
+        runs: Vec::new(),
+        fire_cells: Vec::new(),
+        moment: None,
+    };
+    for policy in &comparison.policies {
+        for batch in seeds.chunks(arena.batch_size()) {
+            let game = Match {
+                comparison,
+                policy,
+                prior: &prior,
+                seeds: batch,
+            };
+            let mut runs = game.play(arena, progress)?;
+            if batch[0] == comparison.seeds.start {
+                results.fire_cells.clone_from(&runs[0].tally.fire_cells);
+                results.moment = runs[0].moment.take().or(results.moment);
+            }
+            results
+                .runs
+                .extend(runs.into_iter().map(Run::into_policy_run));
+        }
+    }
+    Ok(results)
+}
+
+/// One policy on one batch of worlds.
+struct Match<'a> {
+    comparison: &'a Comparison,
+    policy: &'a Policy,
+    prior: &'a Belief,
+    seeds: &'a [u64],
+}
+
+impl Match<'_> {
+    fn play(
+        &self,
+        arena: &mut Arena,
+        progress: &dyn Fn(&str, u64),
+    ) -> Result<Vec<Run>, CompareError> {
+        let mut runs = self.start(arena)?;
+        for step in 0..self.comparison.steps {
+            self.step(arena, &mut runs, step)?;
+            progress(&self.policy.name, runs.len() as u64);
+        }
+        Ok(runs)
+    }
+
+    fn start(&self, arena: &mut Arena) -> Result<Vec<Run>, CompareError> {
+        let (observations, truths) = arena.reset(self.seeds)?;
+        let worlds = self.seeds.iter().zip(observations).zip(&truths);
+        let run = |((&seed, observation), truth): ((&u64, Observation), &Grid<u8>)| {
+            let mut agent = self.agent(arena, seed)?;
+            agent.correct(&observation.frame, Some(truth))?;
+            agent.predict();
+            Ok(Run {
+                agent,
+                observation,
+                seed,
+                tally: Tally::default(),
+                moment: None,
+            })
+        };
+        worlds
+            .map(run)
+            .collect::<Result<_, AgentError>>()
+            .map_err(|problem| self.wrong(problem))
+    }
+
+    fn step(&self, arena: &mut Arena, runs: &mut [Run], step: u64) -> Result<(), CompareError> {
+        if self.policy.estimator == EstimatorKind::NextTruth {
+            let next = arena.foresee(self.seeds, step + 1)?;
+            let foreseen = runs
+                .iter_mut()
+                .zip(&next)
+                .try_for_each(|(run, next)| run.agent.foresee(next));
+            foreseen.map_err(|problem| self.wrong(problem))?;
+        }
+        let plans: Vec<Plan> = runs.par_iter_mut().map(|run| run.plan(step)).collect();
+        let paths: Vec<_> = plans.iter().map(|plan| plan.moves.clone()).collect();
+        let (observations, truths) = arena.step(self.seeds, &paths, step + 1)?;
+        let is_last = step + 1 == self.comparison.steps;
+        let target = arena.model().target_state();
+        let seen = runs.par_iter_mut().zip(plans).zip(observations).zip(truths);
+        let taken = seen.map(|(((run, plan), observation), truth)| {
+            run.take_in(&plan, observation, truth, target, is_last)
+        });
+        taken
+            .collect::<Result<(), AgentError>>()
+            .map_err(|problem| self.wrong(problem))
+    }
+
+    fn agent(&self, arena: &Arena, seed: u64) -> Result<Agent, AgentError> {
+        let (model, shape, n_moves) = (arena.model(), arena.shape(), arena.info().n_moves);
+        let seed = planner_seed(&self.comparison.config, seed);
+        let task = Task {
+            model,
+            shape,
+            n_moves,
+            prior: self.prior,
+            seed,
+        };
+        Agent::new(self.policy, &self.comparison.config, task)
+    }
+
+    fn wrong(&self, problem: AgentError) -> CompareError {
+        CompareError::Agent {
+            policy: self.policy.name.clone(),
+            problem,
+        }
+    }
+}
+
+impl Run {
+    fn plan(&mut self, step: u64) -> Plan {
+        let start = Instant::now();
+        let plan = self.agent.plan(self.observation.robot(), step);
+        self.tally.planning += start.elapsed();
+        plan
+    }
+
+    fn take_in(
+        &mut self,
+        plan: &Plan,
+        observation: Observation,
+        truth: Grid<u8>,
+        target: usize,
+        is_last: bool,
+    ) -> Result<(), AgentError> {
+        let before = std::mem::replace(&mut self.observation, observation);
+        self.agent.correct(&self.observation.frame, Some(&truth))?;
+        self.tally.add(
+            &self.observation,
+            brier_score(self.agent.belief(), &truth, target),
+        );
+        if is_last && self.agent.policy().estimator == EstimatorKind::KnownModel {
+            self.moment = Some(self.moment(&before, plan, truth));
+        }
+        self.agent.predict();
+        Ok(())
+    }
+
+    fn moment(&self, before: &Observation, plan: &Plan, truth: Grid<u8>) -> Moment {
+        let shape = self.agent.belief().shape();
+        let mut path_cells = vec![before.robot()];
+        for (index, _) in plan.moves.iter().enumerate() {
+            path_cells.push(fly(shape, before.robot(), &plan.moves[..=index]).end);
+        }
+        Moment {
+            seed: self.seed,
+            step: self.observation.result.step,
+            truth,
+            frame: self.observation.frame.clone(),
+            path_cells,
+            belief: self.agent.belief().clone(),
+        }
+    }
+
+    fn into_policy_run(self) -> PolicyRun {
+        let (tally, policy) = (self.tally, self.agent.policy());
+        let steps = tally.rewards.len() as u64;
+        let mean = |sum: f64| sum / steps.max(1) as f64;
+        let hit_rate = tally.n_hits as f64 / tally.n_visited.max(1) as f64;
+        PolicyRun {
+            policy: policy.name.clone(),
+            estimator: policy.estimator.label().into(),
+            world_seed: self.seed,
+            steps,
+            mean_reward: mean(tally.reward),
+            mean_distinct_cells: mean(tally.n_visited as f64),
+            hit_rate,
+            mean_fire_cells: mean(tally.n_fire as f64),
+            mean_plan_millis: mean(tally.planning.as_secs_f64() * 1e3),
+            brier: (policy.estimator != EstimatorKind::None).then(|| mean(tally.brier)),
+            rewards: tally.rewards,
+        }
+    }
+}
+
+impl Tally {
+    fn add(&mut self, observation: &Observation, brier: f64) {
+        let result = &observation.result;
+        self.rewards.push(result.reward as f32);
+        self.fire_cells.push(result.n_target_cells as f32);
+        self.reward += result.reward;
+        self.n_visited += u64::from(result.n_visited);
+        self.n_hits += u64::from(result.n_hits);
+        self.n_fire += u64::from(result.n_target_cells);
+        self.brier += brier;
+    }
+}
+
+/// Seed of a planner: its world's, told apart by the agent's own.
+pub fn planner_seed(config: &AgentConfig, world_seed: u64) -> u64 {
+    world_seed ^ config.seed.rotate_left(32)
+}
+
+/// Brier score of a belief: the mean over all cells of `(p - 1[x = target])^2`, where `p` is the
+/// probability of the state that pays most. 0 is perfect; the share `q` of such cells, told of each
+/// cell alike, scores `q (1 - q)`.
+pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize) -> f64 {
+    let squared = |(&p, &state): (&f32, &u8)| {
+        let miss = f64::from(p) - f64::from(u8::from(usize::from(state) == target));
+        miss * miss
+    };
+    let sum: f64 = belief
+        .probability(target)
+        .iter()
+        .zip(truth)
+        .map(squared)
+        .sum();
+    sum / truth.len() as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::Shape;
+
+    #[test]
+    fn a_brier_score_is_the_mean_squared_miss() {
+        let shape = Shape::new(1, 4).expect("test shape");
+        let truth = Grid::from_shape_vec((1, 4), vec![2, 0, 1, 0]).expect("test grid");
+        let certain = Belief::from_states(&truth, 3).expect("test states");
+        assert_eq!(brier_score(&certain, &truth, 2), 0.0);
+        let uniform = Belief::uniform(3, shape);
+        let expected = (4.0 / 9.0 + 3.0 / 9.0) / 4.0;
+        assert!((brier_score(&uniform, &truth, 2) - expected).abs() < 1e-6);
+    }
+}

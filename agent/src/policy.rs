@@ -1,0 +1,229 @@
+//! Policies by name: which belief, which planner, which objective (the ladder of the benchmark).
+
+use crate::planner::{Objective, Target};
+use protocol::Model;
+use thiserror::Error;
+
+/// Where a policy's belief comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum EstimatorKind {
+    /// No belief at all.
+    None,
+    /// The Bayes filter with the true parameters (paper section III.A, masked as in III.C).
+    KnownModel,
+    /// The hidden state X_k, predicted one step ahead: an upper bound on estimation.
+    Truth,
+    /// The hidden state X_{k+1} that the path will meet: an upper bound on prediction too.
+    NextTruth,
+}
+
+/// How a policy plans.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum PlannerKind {
+    /// Uniform moves: the paper's baseline.
+    RandomWalk,
+    /// The best of many random paths (paper section III.D).
+    Shooting,
+    /// Beam search.
+    Beam,
+}
+
+/// A way to act.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Policy {
+    /// Its name in commands, tables and files.
+    pub name: String,
+    /// Where its belief comes from.
+    pub estimator: EstimatorKind,
+    /// How it plans.
+    pub planner: PlannerKind,
+    /// What it maximises.
+    pub objective: Objective,
+}
+
+/// A name that is no policy's.
+#[derive(Debug, Error, PartialEq, Eq)]
+#[error("policy: expected one of {expected}, got {name:?}")]
+pub struct UnknownPolicy {
+    name: String,
+    expected: String,
+}
+
+impl EstimatorKind {
+    /// Its name in tables and files.
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::KnownModel => "known_model",
+            Self::Truth => "truth",
+            Self::NextTruth => "next_truth",
+        }
+    }
+}
+
+impl Policy {
+    /// The policy of a name under a model.
+    ///
+    /// Names are `random_walk`, `coverage`, `shooting_*` and `beam_*` with `exploit` (the state that
+    /// pays most), `exploit_only` (the same without the coverage bonus), `explore` (entropy) or the name
+    /// of a state, and `oracle_*` and `clairvoyant_*` with `shooting` or `beam`.
+    ///
+    /// # Errors
+    /// [`UnknownPolicy`] lists the names that there are.
+    pub fn named(name: &str, model: &Model) -> Result<Self, UnknownPolicy> {
+        let unknown = || UnknownPolicy {
+            name: name.into(),
+            expected: known_names(model).join(", "),
+        };
+        let target = Target::State(model.target_state());
+        let policy = |estimator, planner, objective| Self {
+            name: name.into(),
+            estimator,
+            planner,
+            objective,
+        };
+        Ok(match name {
+            "random_walk" => policy(
+                EstimatorKind::None,
+                PlannerKind::RandomWalk,
+                Objective::new(Target::Coverage),
+            ),
+            "coverage" => policy(
+                EstimatorKind::None,
+                PlannerKind::Shooting,
+                Objective::new(Target::Coverage),
+            ),
+            _ => {
+                let (family, rest) = name.split_once('_').ok_or_else(unknown)?;
+                match family {
+                    "oracle" | "clairvoyant" => {
+                        let planner = planner_named(rest).ok_or_else(unknown)?;
+                        let estimator = if family == "oracle" {
+                            EstimatorKind::Truth
+                        } else {
+                            EstimatorKind::NextTruth
+                        };
+                        policy(estimator, planner, objective(planner, target))
+                    }
+                    _ => {
+                        let planner = planner_named(family).ok_or_else(unknown)?;
+                        let objective = match rest {
+                            "exploit" => objective(planner, target),
+                            "exploit_only" => Objective::new(target),
+                            "explore" => objective(planner, Target::Entropy),
+                            state => objective(
+                                planner,
+                                Target::State(model.state_named(state).ok_or_else(unknown)?),
+                            ),
+                        };
+                        policy(EstimatorKind::KnownModel, planner, objective)
+                    }
+                }
+            }
+        })
+    }
+
+    /// The benchmark's ladder under a model, from the least to the most informed.
+    pub fn ladder(model: &Model) -> Vec<Self> {
+        let named = |name: &String| {
+            Self::named(name, model).expect("invariant: the ladder's names are known")
+        };
+        ladder_names(model).iter().map(named).collect()
+    }
+}
+
+/// The authors' objective for shooting; for beam search, which finds the cells that pay, no bonus.
+fn objective(planner: PlannerKind, target: Target) -> Objective {
+    match planner {
+        PlannerKind::Shooting => Objective::paper(target),
+        PlannerKind::Beam | PlannerKind::RandomWalk => Objective::new(target),
+    }
+}
+
+fn planner_named(name: &str) -> Option<PlannerKind> {
+    match name {
+        "shooting" => Some(PlannerKind::Shooting),
+        "beam" => Some(PlannerKind::Beam),
+        _ => None,
+    }
+}
+
+fn ladder_names(model: &Model) -> Vec<String> {
+    let others = model
+        .file()
+        .states
+        .iter()
+        .enumerate()
+        .filter(|(state, _)| *state != model.target_state());
+    let others = others.map(|(_, entry)| format!("shooting_{}", entry.name));
+    let mut names: Vec<String> = ["random_walk", "coverage", "shooting_explore"]
+        .map(String::from)
+        .to_vec();
+    names.extend(others);
+    let rest = [
+        "shooting_exploit",
+        "shooting_exploit_only",
+        "beam_exploit",
+        "oracle_shooting",
+        "oracle_beam",
+        "clairvoyant_beam",
+    ];
+    names.extend(rest.map(String::from));
+    names
+}
+
+fn known_names(model: &Model) -> Vec<String> {
+    let mut names = ladder_names(model);
+    names.extend(["beam_explore", "beam_exploit_only", "clairvoyant_shooting"].map(String::from));
+    names.extend(
+        model
+            .file()
+            .states
+            .iter()
+            .map(|state| format!("beam_{}", state.name)),
+    );
+    names
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_listed_name_is_a_policy_and_no_other() {
+        let model = Model::wildfire();
+        for name in known_names(&model) {
+            assert_eq!(
+                Policy::named(&name, &model).map(|policy| policy.name),
+                Ok(name)
+            );
+        }
+        for wrong in [
+            "",
+            "beam",
+            "beam_",
+            "oracle_exploit",
+            "shooting_ash",
+            "Random_walk",
+        ] {
+            let error = Policy::named(wrong, &model).expect_err(wrong).to_string();
+            assert!(
+                error.contains("shooting_latent") && error.ends_with(&format!("got {wrong:?}")),
+                "{error}"
+            );
+        }
+    }
+
+    #[test]
+    fn the_ladder_goes_through_the_states_of_its_model() {
+        let names: Vec<String> = Policy::ladder(&Model::wildfire())
+            .into_iter()
+            .map(|policy| policy.name)
+            .collect();
+        assert!(
+            names.contains(&"shooting_normal".to_string())
+                && names.contains(&"shooting_latent".to_string())
+        );
+        assert!(!names.contains(&"shooting_fire".to_string()));
+    }
+}

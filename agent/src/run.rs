@@ -1,0 +1,285 @@
+//! The agent's life on one world: attach, act, reconnect, leave.
+
+use crate::agent::{Agent, AgentError, Task};
+use crate::client::{Claim, Client, Observation};
+use crate::compare::planner_seed;
+use crate::config::AgentConfig;
+use crate::policy::{EstimatorKind, Policy, UnknownPolicy};
+use crate::truth::{TruthError, TruthFeed};
+use protocol::channels::{ChannelError, Instance};
+use protocol::connection::ConnectionError;
+use protocol::message::Status;
+use protocol::model::ModelError;
+use protocol::{Grid, Model};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+use thiserror::Error;
+
+/// How long to wait between attempts to reach a server that is gone.
+const RETRY_INTERVAL: Duration = Duration::from_millis(200);
+
+/// How often progress is told.
+const REPORT_INTERVAL: Duration = Duration::from_secs(2);
+
+/// What to do on one world.
+#[derive(Debug, Clone)]
+pub struct Mission {
+    /// The server.
+    pub instance: Instance,
+    /// The world.
+    pub world: u32,
+    /// The policy's name.
+    pub policy: String,
+    /// Steps to act for; 0: until stopped.
+    pub steps: u64,
+    /// Take the world from its holder.
+    pub takeover: bool,
+    /// The model, where the server does not reveal its own.
+    pub model: Option<Model>,
+    /// Settings of planners and estimators.
+    pub config: AgentConfig,
+}
+
+/// Why a mission ended early.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum RunError {
+    /// The server refused, or cannot be reached in the first place.
+    #[error(transparent)]
+    Connection(#[from] ConnectionError),
+    /// The agent failed.
+    #[error(transparent)]
+    Agent(#[from] AgentError),
+    /// The policy's name.
+    #[error(transparent)]
+    Policy(#[from] UnknownPolicy),
+    /// The model.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// The hidden states that an oracle needs.
+    #[error(transparent)]
+    Truth(#[from] TruthError),
+    /// The server hides its model and none was given.
+    #[error("instance {instance:?} does not reveal its model: expected --model FILE")]
+    NoModel {
+        /// The instance.
+        instance: String,
+    },
+    /// A policy that only `compare` can feed.
+    #[error("policy {policy:?} needs worlds that run one step ahead: only `compare` has them")]
+    Clairvoyant {
+        /// The policy.
+        policy: String,
+    },
+}
+
+/// What a mission did.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Summary {
+    /// Steps acted.
+    pub steps: u64,
+    /// Sum of their rewards.
+    pub reward: f64,
+}
+
+/// Acts until the steps are done or `stop` is set. Waits for a server that ends, however often.
+///
+/// # Errors
+/// [`RunError`]; a lost lease is one.
+pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
+    let mut summary = Summary::default();
+    let mut attached = Attached::attach(mission)?;
+    while !stop.load(Ordering::Relaxed) && (mission.steps == 0 || summary.steps < mission.steps) {
+        match attached.step() {
+            Ok(reward) => {
+                summary.steps += 1;
+                summary.reward += reward;
+                attached.report.tell(&summary);
+            }
+            Err(error) if is_outage(&error) => {
+                tracing::warn!("{error}; waiting for it to come back");
+                match attach_again(mission, stop)? {
+                    Some(again) => attached = again,
+                    None => break,
+                }
+            }
+            Err(error) => return Err(error),
+        }
+    }
+    attached.client.release()?;
+    Ok(summary)
+}
+
+/// An agent at its world.
+struct Attached {
+    client: Client,
+    truth: Option<TruthFeed>,
+    agent: Agent,
+    observation: Observation,
+    report: Report,
+}
+
+/// Tells of progress now and then.
+struct Report {
+    since: Instant,
+    last: Summary,
+}
+
+impl Attached {
+    /// Acquires the world where it stands and takes in its last frame.
+    fn attach(mission: &Mission) -> Result<Self, RunError> {
+        let worlds = mission.world..mission.world + 1;
+        let claim = Claim {
+            worlds: worlds.clone(),
+            takeover: mission.takeover,
+            time_to_live: None,
+        };
+        let mut client = Client::acquire(&mission.instance, &claim)?;
+        let model = model(mission, &client)?;
+        let policy = Policy::named(&mission.policy, &model)?;
+        if policy.estimator == EstimatorKind::NextTruth {
+            return Err(RunError::Clairvoyant {
+                policy: policy.name,
+            });
+        }
+        let observation = client.observe(worlds)?.remove(0);
+        let (seed, step) = (observation.result.seed, observation.result.step);
+        tracing::info!(
+            world = mission.world,
+            seed,
+            step,
+            policy = policy.name,
+            "acting"
+        );
+        let prior = mission.config.prior(client.info().burn_in).belief(
+            &model,
+            client.shape(),
+            mission.config.seed,
+        )?;
+        let n_moves = client.info().n_moves;
+        let seed = planner_seed(&mission.config, seed);
+        let task = Task {
+            model: &model,
+            shape: client.shape(),
+            n_moves,
+            prior: &prior,
+            seed,
+        };
+        let agent = Agent::new(&policy, &mission.config, task)?;
+        let truth = if policy.estimator == EstimatorKind::Truth {
+            Some(open_truth(mission, &client)?)
+        } else {
+            None
+        };
+        let report = Report {
+            since: Instant::now(),
+            last: Summary::default(),
+        };
+        let mut attached = Self {
+            client,
+            truth,
+            agent,
+            observation,
+            report,
+        };
+        attached.take_in()?;
+        Ok(attached)
+    }
+
+    /// Plans, flies, corrects, predicts; returns the reward.
+    fn step(&mut self) -> Result<f64, RunError> {
+        let plan = self
+            .agent
+            .plan(self.observation.robot(), self.observation.result.step);
+        self.observation = self
+            .client
+            .step(self.client.worlds(), &[plan.moves])?
+            .remove(0);
+        self.take_in()?;
+        Ok(self.observation.result.reward)
+    }
+
+    fn take_in(&mut self) -> Result<(), RunError> {
+        let truth = self.read_truth()?;
+        self.agent
+            .correct(&self.observation.frame, truth.as_ref())?;
+        self.agent.predict();
+        Ok(())
+    }
+
+    fn read_truth(&self) -> Result<Option<Grid<u8>>, TruthError> {
+        let Some(feed) = &self.truth else {
+            return Ok(None);
+        };
+        let result = &self.observation.result;
+        let states = feed.states(self.client.worlds(), &[result.seed], result.step)?;
+        Ok(states.into_iter().next())
+    }
+}
+
+impl Report {
+    fn tell(&mut self, summary: &Summary) {
+        let elapsed = self.since.elapsed();
+        if elapsed < REPORT_INTERVAL {
+            return;
+        }
+        let steps = summary.steps - self.last.steps;
+        let mean_reward = (summary.reward - self.last.reward) / steps.max(1) as f64;
+        let steps_per_second = (steps as f64 / elapsed.as_secs_f64()).round();
+        tracing::info!(
+            steps = summary.steps,
+            mean_reward,
+            steps_per_second,
+            "acting"
+        );
+        *self = Self {
+            since: Instant::now(),
+            last: *summary,
+        };
+    }
+}
+
+fn model(mission: &Mission, client: &Client) -> Result<Model, RunError> {
+    match (&mission.model, &client.info().model) {
+        (Some(model), _) => Ok(model.clone()),
+        (None, Some(text)) => Ok(Model::from_toml(text)?),
+        (None, None) => Err(RunError::NoModel {
+            instance: mission.instance.name().into(),
+        }),
+    }
+}
+
+fn open_truth(mission: &Mission, client: &Client) -> Result<TruthFeed, RunError> {
+    if client.info().publish_truth {
+        return Ok(TruthFeed::open(&mission.instance, client.shape())?);
+    }
+    Err(AgentError::NeedsTruth {
+        policy: mission.policy.clone(),
+    }
+    .into())
+}
+
+/// Attaches to a server that has come back; `None` if it is time to stop.
+fn attach_again(mission: &Mission, stop: &AtomicBool) -> Result<Option<Attached>, RunError> {
+    while !stop.load(Ordering::Relaxed) {
+        match Attached::attach(mission) {
+            Ok(attached) => return Ok(Some(attached)),
+            Err(error) if is_outage(&error) => std::thread::sleep(RETRY_INTERVAL),
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(None)
+}
+
+/// Whether the server is away and may come back.
+fn is_outage(error: &RunError) -> bool {
+    let RunError::Connection(error) = error else {
+        return false;
+    };
+    match error {
+        ConnectionError::ServerGone { .. } | ConnectionError::Timeout { .. } => true,
+        ConnectionError::Channel(channel) => matches!(channel, ChannelError::NoServer { .. }),
+        ConnectionError::Refused { status, .. } => *status == Status::Stopping,
+        _ => false,
+    }
+}

@@ -1,0 +1,104 @@
+//! The hidden states of a batch of worlds, for evaluation: never for anything that learns.
+
+use protocol::channels::{ChannelError, Instance};
+use protocol::message::TruthHeader;
+use protocol::observer::{Observer, Sample};
+use protocol::{Grid, Shape};
+use std::ops::Range;
+use std::time::{Duration, Instant};
+use thiserror::Error;
+
+/// How long the hidden state may take to follow its step.
+const TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Why hidden states could not be had.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum TruthError {
+    /// The channel failed.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+    /// A state did not come.
+    #[error("truth of world {world} at step {step}: not published within {TIMEOUT:?}")]
+    Missing {
+        /// The world.
+        world: u32,
+        /// The step.
+        step: u64,
+    },
+    /// A state of another grid.
+    #[error("truth of world {world}: expected {expected} bytes, got {got}")]
+    Length {
+        /// The world.
+        world: u32,
+        /// Bytes of the grid.
+        expected: usize,
+        /// Bytes received.
+        got: usize,
+    },
+}
+
+/// Reads `truth` in step with a client that acts.
+pub struct TruthFeed {
+    observer: Observer<TruthHeader>,
+    shape: Shape,
+}
+
+impl TruthFeed {
+    /// Attaches to the truth channel.
+    ///
+    /// # Errors
+    /// [`TruthError::Channel`].
+    pub fn open(instance: &Instance, shape: Shape) -> Result<Self, TruthError> {
+        Ok(Self {
+            observer: Observer::truth(instance)?,
+            shape,
+        })
+    }
+
+    /// The states of consecutive worlds at a step of the episodes with these seeds.
+    ///
+    /// Samples of other worlds, steps and episodes are passed over, so read each step once, in order.
+    ///
+    /// # Errors
+    /// [`TruthError::Missing`] names the first world whose state did not come.
+    pub fn states(
+        &self,
+        worlds: Range<u32>,
+        seeds: &[u64],
+        step: u64,
+    ) -> Result<Vec<Grid<u8>>, TruthError> {
+        let mut states: Vec<Option<Grid<u8>>> = vec![None; worlds.len()];
+        let deadline = Instant::now() + TIMEOUT;
+        while let Some(missing) = states.iter().position(Option::is_none) {
+            let left = deadline.saturating_duration_since(Instant::now());
+            let Some(sample) = self.observer.receive(left)? else {
+                return Err(TruthError::Missing {
+                    world: worlds.start + missing as u32,
+                    step,
+                });
+            };
+            let Sample { header, payload } = sample;
+            let wanted = |index: usize| header.step == step && header.seed == seeds[index];
+            if let Some(index) = header
+                .world
+                .checked_sub(worlds.start)
+                .map(|index| index as usize)
+                && index < states.len()
+                && wanted(index)
+            {
+                states[index] = Some(self.grid(header.world, payload)?);
+            }
+        }
+        Ok(states.into_iter().flatten().collect())
+    }
+
+    fn grid(&self, world: u32, bytes: Vec<u8>) -> Result<Grid<u8>, TruthError> {
+        let (expected, got) = (self.shape.n_cells(), bytes.len());
+        Grid::from_shape_vec(self.shape.dim(), bytes).map_err(|_| TruthError::Length {
+            world,
+            expected,
+            got,
+        })
+    }
+}
