@@ -13,6 +13,11 @@ use protocol::randomness::split_mix;
 /// Key of the hash values that stand for cells: the word `beam` in ASCII.
 const HASH_KEY: u64 = 0x6265_616d;
 
+/// The default width. With the known-model filter (40 wildfire worlds, 300 steps) widths 100 and 200
+/// earn .5 and .0 more than its 36.8 per step, +- .9 each, at 2 and 5 times the time. A greedy walk
+/// earns 8.1 +- .8 less than a width of 100 (16 worlds, 400 steps).
+pub const DEFAULT_WIDTH: usize = 50;
+
 /// Beam search of a given width. Ties are broken by a hash of the visited cells, which prefers no
 /// direction.
 #[derive(Debug)]
@@ -57,6 +62,12 @@ struct Candidate {
 struct Origin {
     state: u32,
     step: Move,
+}
+
+impl Default for BeamSearch {
+    fn default() -> Self {
+        Self::new(DEFAULT_WIDTH)
+    }
 }
 
 impl BeamSearch {
