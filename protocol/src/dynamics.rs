@@ -159,10 +159,7 @@ impl Dynamics {
         );
         let rows = self.parents.chunks_exact_mut(self.stride).skip(above);
         for (from, to) in cells.chunks_exact(width).zip(rows) {
-            let chunks = from
-                .chunks(LANES)
-                .zip(to[left..left + width].chunks_mut(LANES));
-            chunks.for_each(|(from, to)| copy_lanes(from, to));
+            to[left..left + width].copy_from_slice(from);
         }
     }
 

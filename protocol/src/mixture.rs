@@ -55,6 +55,9 @@ impl Mixture {
     pub(crate) fn new(model: &Model) -> Self {
         let (n_states, _, kernel_height, kernel_width) = model.kernel().dim();
         let n_taps = kernel_height * kernel_width;
+        // Eq. 3 cancels a common factor; taken out, no sum of weights overflows.
+        let largest = model.kernel().iter().chain(model.bias()).copied();
+        let largest = largest.fold(0.0, f64::max);
         let mut weights = Vec::with_capacity(n_taps * n_states * n_states);
         for tap in 0..n_taps {
             let (row, col) = (tap / kernel_width, tap % kernel_width);
@@ -65,7 +68,7 @@ impl Mixture {
                     } else {
                         0.0
                     };
-                    model.kernel()[[to, from, row, col]] + bias
+                    (model.kernel()[[to, from, row, col]] + bias) / largest
                 }));
             }
         }
@@ -114,7 +117,8 @@ impl Mixture {
 }
 
 impl Draw {
-    /// Taps read at `offsets`. The distribution of tap and outcome, less `counts[t] / 256` of "tap `t`, likeliest outcome".
+    /// The distribution of tap and outcome, less `counts[t] / 256` of "tap `t`, likeliest outcome". The
+    /// taps read at `offsets`.
     pub(crate) fn new(
         mixture: &Mixture,
         offsets: &[usize],
@@ -123,32 +127,23 @@ impl Draw {
     ) -> Self {
         let n_states = mixture.n_states;
         let taken = |tap: usize| counts[tap] as f64 / 256.0;
-        let masses = mixture.most.iter().enumerate();
-        let masses = masses.map(|(tap, most)| (most / mixture.total - taken(tap)).max(0.0));
-        let masses: Vec<f64> = masses.collect();
+        let left = |(tap, most)| f64::max(most / mixture.total - taken(tap), 0.0);
+        let masses: Vec<f64> = mixture.most.iter().enumerate().map(left).collect();
+        let probability = |tap: usize, from: usize, to| {
+            let fast = f64::from(u8::from(to == likeliest[from])) * taken(tap);
+            let weight = mixture.weights(tap, from)[to] / mixture.total;
+            f64::max(weight - fast, 0.0) / masses[tap]
+        };
         let quads = n_states.div_ceil(4);
         // A parent off the grid keeps thresholds of zero: always rejected.
         let mut thresholds = vec![[0; 4]; mixture.n_taps * (n_states + 1) * quads];
         for (tap, rows) in thresholds.chunks_mut((n_states + 1) * quads).enumerate() {
             for (from, row) in rows.chunks_mut(quads).take(n_states).enumerate() {
-                let parts = mixture.weights(tap, from).iter().enumerate();
-                let parts = parts.map(|(to, weight)| {
-                    let fast = if to == likeliest[from] {
-                        taken(tap)
-                    } else {
-                        0.0
-                    };
-                    (weight / mixture.total - fast).max(0.0) / masses[tap]
-                });
-                cumulate(parts, row.as_flattened_mut());
+                let outcomes = (0..n_states).map(|to| probability(tap, from, to));
+                cumulate(outcomes, row.as_flattened_mut());
             }
         }
-        let tap = |(tap, &offset): (usize, &usize)| Tap {
-            offset: offset as u32,
-            row: (tap * (n_states + 1)) as u32,
-        };
-        let taps: Vec<Tap> = offsets.iter().enumerate().map(tap).collect();
-        let slots = alias_table(&masses, &taps);
+        let slots = alias_table(&masses, &taps(offsets, n_states));
         Self {
             n_states,
             slot_bits: 32 - slots.len().trailing_zeros(),
@@ -180,6 +175,14 @@ impl Draw {
             REJECTED
         }
     }
+}
+
+fn taps(offsets: &[usize], n_states: usize) -> Vec<Tap> {
+    let tap = |(tap, &offset): (usize, &usize)| Tap {
+        offset: offset as u32,
+        row: (tap * (n_states + 1)) as u32,
+    };
+    offsets.iter().enumerate().map(tap).collect()
 }
 
 /// Cumulative probabilities in units of `2^-32`; entries without a probability repeat the last sum.
