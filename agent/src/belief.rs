@@ -9,7 +9,7 @@ use protocol::model::Model;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// How far from one a cell's probabilities may sum: about 500 roundings of an `f32`, more than any
+/// How far from one a cell's probabilities may sum: about 400 roundings of an `f32`, more than any
 /// softmax or normalisation leaves and less than any real mistake.
 const SUM_TOLERANCE: f32 = 5e-5;
 
@@ -187,8 +187,7 @@ impl Belief {
 /// Natural logarithm of a probability, good to a few units in the last place, and some finite number
 /// at zero, so that `p * ln(p)` is 0 there.
 ///
-/// Without branches or calls, so that the loop over cells is vectorised: the library's logarithm
-/// takes 3 times as long. Polynomial of the Cephes library's `logf` (S. Moshier) on `m - 1`, where
+/// Without branches or calls, so that the loop over cells is vectorised. Polynomial of the Cephes library's `logf` (S. Moshier) on `m - 1`, where
 /// `p = m 2^e` with `m` in `sqrt(1/2)..sqrt(2)`.
 #[inline]
 fn ln(p: f32) -> f32 {

@@ -142,7 +142,8 @@ fn the_masked_posterior_agrees() {
 /// z = np.load("golden/a4_masked_step.npz")
 /// u, mask, p = np.stack([z["u0"], z["u_next"][0]]), z["mask"][:2], z["state_est"][:2]
 /// assert (p == u)[mask == 0].all()
-/// np.savez("a4_masked_filter.npz", W=z["W_obs_param"], u=u, obs=z["obs"][:2], mask=mask, posterior_at_mask=p[mask > 0])
+/// np.savez("a4_masked_filter.npz", W=z["W_obs_param"], u=u, obs=z["obs"][:2], mask=mask,
+///          posterior_at_mask=p[mask > 0])
 /// ```
 #[test]
 fn the_masked_posterior_agrees_along_a_path() {

@@ -127,7 +127,7 @@ fn assert_close(a: f32, b: f32) {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(200))]
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(200) })]
 
     #[test]
     fn a_plan_has_its_moves_and_the_score_it_reports(
@@ -189,20 +189,23 @@ proptest! {
     }
 
     #[test]
-    fn shooting_finds_the_best_of_its_samples(field in fields(8, 40)) {
-        let values = field.values();
+    fn shooting_finds_the_first_of_its_best_samples(field in fields(8, 70)) {
+        // Numbers of cells have no rounding and many ties.
+        let values = Objective::new(Target::Coverage).values(&field.belief);
         let (problem, shape) = (field.problem(&values, 2), values.shape());
         for integration in [Integration::ClampEachMove, Integration::ClampSum] {
             let mut rng = stream(problem.seed, Purpose::Planner, problem.step);
-            let best = (0..30).map(|_| {
-                let words: Vec<u64> = (0..field.n_moves.div_ceil(32)).map(|_| rng.next_u64()).collect();
+            let n_words = field.n_moves.div_ceil(32);
+            let samples = (0..30).map(|_| {
+                let words: Vec<u64> = (0..n_words).map(|_| rng.next_u64()).collect();
                 let bits = |t: usize| words[t / 32] >> (2 * (t % 32));
-                let sample: Vec<Move> =
-                    (0..field.n_moves).map(|t| Move::from_low_bits(bits(t))).collect();
-                values.score(field.start, &integration.as_flown(shape, field.start, &sample))
+                let sampled = (0..field.n_moves).map(|t| Move::from_low_bits(bits(t)));
+                integration.as_flown(shape, field.start, &sampled.collect::<Vec<_>>())
             });
-            let best = best.fold(f32::NEG_INFINITY, f32::max);
-            assert_close(Shooting::new(30, integration).plan(&problem).score, best);
+            let score = |moves: &Vec<Move>| values.score(field.start, moves);
+            let better = |a: Vec<Move>, b| if score(&b) > score(&a) { b } else { a };
+            let first_best = samples.reduce(better).expect("30 samples");
+            prop_assert_eq!(Shooting::new(30, integration).plan(&problem).moves, first_best);
         }
     }
 
@@ -251,7 +254,6 @@ fn paired_t(a: &[f32], b: &[f32]) -> f32 {
 fn a_wider_beam_is_better_on_average_and_shooting_worse() {
     let [narrow, middle, wide] = [2, 8, 80].map(|width| scores(BeamSearch::new(width)));
     let shooting = scores(Shooting::new(2048, Integration::ClampEachMove));
-    // Measured: more than 8 standard errors each.
     assert!(paired_t(&middle, &narrow) > 3.0);
     assert!(paired_t(&wide, &middle) > 3.0);
     assert!(paired_t(&narrow, &shooting) > 3.0);

@@ -9,7 +9,8 @@ use rand_chacha::rand_core::Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// How much the average over the grid weighs in a cell's prior, in worlds.
+/// How much the average over the grid weighs in a cell's prior, in worlds. It hardly matters: with the
+/// grid's average alone, beam search earns .5 +- .8 more of 38 (16 worlds, 400 steps).
 const POOLED_WORLDS: f64 = 16.0;
 
 /// The first prior of a filter.

@@ -13,6 +13,11 @@ use protocol::randomness::split_mix;
 /// Key of the hash values that stand for cells: the word `beam` in ASCII.
 const HASH_KEY: u64 = 0x6265_616d;
 
+/// The default width. With the known-model filter (40 wildfire worlds, 300 steps) widths 100 and 200
+/// earn .5 and .0 more than its 36.8 per step, +- .9 each, at 2 and 5 times the time. A greedy walk
+/// earns 8.1 +- .8 less than a width of 100 (16 worlds, 400 steps).
+pub const DEFAULT_WIDTH: usize = 50;
+
 /// Beam search of a given width. Ties are broken by a hash of the visited cells, which prefers no
 /// direction.
 #[derive(Debug)]
@@ -57,6 +62,12 @@ struct Candidate {
 struct Origin {
     state: u32,
     step: Move,
+}
+
+impl Default for BeamSearch {
+    fn default() -> Self {
+        Self::new(DEFAULT_WIDTH)
+    }
 }
 
 impl BeamSearch {
@@ -128,39 +139,12 @@ impl BeamSearch {
     fn expand(&mut self) {
         self.candidates.clear();
         self.seen.clear();
-        let n_words = self.words_per_state();
-        let cols = self.window.cols;
-        for (index, state) in self.beam.iter().enumerate() {
-            let visited = &self.visited[index * n_words..][..n_words];
+        for index in 0..self.beam.len() {
             for step in Move::ALL {
-                let (row, col) = self.window.after(step, state.row, state.col);
-                let cell = row as usize * cols + col as usize;
-                let is_new = visited[cell / 64] >> (cell % 64) & 1 == 0;
-                let (first, cell_hash) = (self.window.first[cell], self.cell_hashes[cell]);
-                let gain = if is_new {
-                    first
-                } else {
-                    self.window.again(first)
-                };
-                let hash = state.hash ^ if is_new { cell_hash } else { 0 };
-                let score = state.score + gain;
-                let state = State {
-                    row,
-                    col,
-                    score,
-                    hash,
-                };
-                let origin = Origin {
-                    state: index as u32,
-                    step,
-                };
-                let candidate = Candidate { state, origin };
-                match self
-                    .seen
-                    .find_or_insert(hash ^ cell_hash.rotate_left(32), self.candidates.len())
-                {
+                let (candidate, key) = self.successor(index, step);
+                match self.seen.find_or_insert(key, self.candidates.len()) {
                     None => self.candidates.push(candidate),
-                    Some(twin) if self.candidates[twin].state.score < score => {
+                    Some(twin) if self.candidates[twin].state.score < candidate.state.score => {
                         self.candidates[twin] = candidate;
                     }
                     Some(_) => {}
@@ -169,32 +153,57 @@ impl BeamSearch {
         }
     }
 
-    /// Makes the best candidates the beam.
-    fn select(&mut self, width: usize) {
+    /// The state after a move from a state of the beam, and its hash: that of cell and visited set.
+    #[inline]
+    fn successor(&self, index: usize, step: Move) -> (Candidate, u64) {
+        let before = self.beam[index];
+        let (row, col) = self.window.after(step, before.row, before.col);
+        let cell = self.window.index(row, col);
+        // 1 or 0, used as index and mask: what is random must not become a branch.
+        let again = self.visited[index * self.words_per_state() + cell / 64] >> (cell % 64) & 1;
+        let cell_hash = self.cell_hashes[cell];
+        let state = State {
+            row,
+            col,
+            score: before.score + self.window.gains[cell][again as usize],
+            hash: before.hash ^ (cell_hash & again.wrapping_sub(1)),
+        };
+        let origin = Origin {
+            state: index as u32,
+            step,
+        };
+        let key = state.hash ^ cell_hash.rotate_left(32);
+        (Candidate { state, origin }, key)
+    }
+
+    /// Finds the best candidates.
+    fn rank(&mut self, width: usize) {
         let rank = |(index, candidate): (usize, &Candidate)| {
             let State { score, hash, .. } = candidate.state;
-            // Descending, so that the best come first in ascending order of rank.
+            // The highest score gets the lowest rank.
             let rank = u64::from(!ordered_bits(score)) << 32 | hash >> 32;
             (rank, index as u32)
         };
         self.ranking.clear();
-        self.ranking
-            .extend(self.candidates.iter().enumerate().map(rank));
+        let ranked = self.candidates.iter().enumerate().map(rank);
+        self.ranking.extend(ranked);
         if self.ranking.len() > width {
             self.ranking.select_nth_unstable(width - 1);
             self.ranking.truncate(width);
         }
+    }
+
+    /// Makes the best candidates the beam.
+    fn select(&mut self, width: usize) {
+        self.rank(width);
         let n_words = self.words_per_state();
         self.next_beam.clear();
-        for (&(_, index), visited) in self
-            .ranking
-            .iter()
-            .zip(self.next_visited.chunks_exact_mut(n_words))
-        {
+        let visited = self.next_visited.chunks_exact_mut(n_words);
+        for (&(_, index), visited) in self.ranking.iter().zip(visited) {
             let Candidate { state, origin } = self.candidates[index as usize];
             let before = origin.state as usize * n_words;
             visited.copy_from_slice(&self.visited[before..][..n_words]);
-            let cell = state.row as usize * self.window.cols + state.col as usize;
+            let cell = self.window.index(state.row, state.col);
             visited[cell / 64] |= 1 << (cell % 64);
             self.next_beam.push(state);
             self.history.push(origin);
@@ -205,7 +214,8 @@ impl BeamSearch {
             state: 0,
             step: Move::Up,
         };
-        self.history.extend(std::iter::repeat_n(nowhere, n_missing));
+        let nowhere = std::iter::repeat_n(nowhere, n_missing);
+        self.history.extend(nowhere);
         std::mem::swap(&mut self.beam, &mut self.next_beam);
         std::mem::swap(&mut self.visited, &mut self.next_visited);
     }
@@ -284,5 +294,67 @@ impl SeenStates {
             }
             at = (at + 1) & mask;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::belief::Belief;
+    use crate::planner::{Objective, Target};
+    use protocol::grid::{Cell, Shape};
+    use protocol::path::fly;
+    use std::collections::HashSet;
+
+    /// Number of states in the beam after some moves, none of them left out.
+    fn n_states(shape: Shape, start: Cell, n_moves: usize) -> usize {
+        let belief = Belief::uniform(2, shape);
+        let values = Objective::new(Target::Coverage).values(&belief);
+        let mut search = BeamSearch::new(4096);
+        search.plan(&PlanningProblem {
+            start,
+            n_moves,
+            values: &values,
+            seed: 0,
+            step: 0,
+        });
+        search.beam.len()
+    }
+
+    #[test]
+    fn beginnings_with_one_end_and_one_set_of_cells_are_merged() {
+        let check = |height, width, row, col| {
+            let shape = Shape::new(height, width).expect("test shape");
+            let start = Cell { row, col };
+            let distinct = |code: u64| {
+                let moves: Vec<Move> = (0..6)
+                    .map(|t| Move::from_low_bits(code >> (2 * t)))
+                    .collect();
+                let mut flight = fly(shape, start, &moves);
+                flight.visited.sort_unstable();
+                (flight.end, flight.visited)
+            };
+            let expected: HashSet<_> = (0..4096).map(distinct).collect();
+            assert_eq!(n_states(shape, start, 6), expected.len());
+        };
+        check(1, 1, 0, 0);
+        check(2, 2, 1, 0);
+        check(3, 5, 0, 2);
+        check(13, 13, 6, 6);
+    }
+
+    #[test]
+    fn bits_order_as_numbers_do() {
+        let numbers = [
+            f32::NEG_INFINITY,
+            -2.0,
+            -1e-30,
+            0.0,
+            1e-30,
+            1.0,
+            3.0,
+            f32::INFINITY,
+        ];
+        assert!(numbers.map(ordered_bits).is_sorted());
     }
 }

@@ -15,10 +15,8 @@ pub(super) struct Window {
     pub cols: usize,
     /// Where the robot starts, in window coordinates.
     pub start: (usize, usize),
-    /// Score of the first visit of each cell, row-major.
-    pub first: Vec<f32>,
-    again_factor: f32,
-    again_offset: f32,
+    /// Score of the first visit of each cell, and of each later visit; row-major.
+    pub gains: Vec<[f32; 2]>,
 }
 
 impl Window {
@@ -40,15 +38,21 @@ impl Window {
         let bonus = values.coverage_bonus();
         let cells = values.value();
         let cells = cells.slice(ndarray::s![top..bottom, left..right]);
-        self.first.clear();
-        self.first.extend(cells.iter().map(|value| value + bonus));
         let again = if values.revisits() { 1.0 } else { 0.0 };
-        (self.again_factor, self.again_offset) = (again, -again * bonus);
+        let gains = |&value: &f32| [value + bonus, again * value];
+        self.gains.clear();
+        self.gains.extend(cells.iter().map(gains));
     }
 
     /// Number of cells.
     pub fn n_cells(&self) -> usize {
         self.rows * self.cols
+    }
+
+    /// Row-major index of a cell.
+    #[inline]
+    pub fn index(&self, row: u32, col: u32) -> usize {
+        row as usize * self.cols + col as usize
     }
 
     /// Where a move takes the robot; off the window it stays, as [`Move::apply`] has it on the grid.
@@ -60,11 +64,5 @@ impl Window {
             Move::Left => (row, col.saturating_sub(1)),
             Move::Right => (row, (col + 1).min(self.cols as u32 - 1)),
         }
-    }
-
-    /// Score of one more visit of a cell whose first visit is worth `first`.
-    #[inline]
-    pub fn again(&self, first: f32) -> f32 {
-        self.again_factor * first + self.again_offset
     }
 }
