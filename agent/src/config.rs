@@ -1,6 +1,7 @@
 //! The agent's settings: defaults or the paper's preset, then a TOML file, then flags.
 
 use crate::estimator::Prior;
+use crate::planner::beam::DEFAULT_WIDTH;
 use crate::planner::{BeamSearch, Integration, Planner, RandomWalk, Shooting};
 use crate::policy::{PlannerKind, Policy};
 use clap::{Args, ValueEnum};
@@ -99,7 +100,7 @@ pub enum ConfigError {
 impl Default for AgentConfig {
     fn default() -> Self {
         Self {
-            beam_width: 100,
+            beam_width: DEFAULT_WIDTH,
             shooting_samples: 2048,
             shooting_integration: Integration::ClampEachMove,
             prior: PriorKind::Simulated,
