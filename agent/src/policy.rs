@@ -132,11 +132,20 @@ impl Policy {
     }
 }
 
-/// The authors' objective for shooting; for beam search, which finds the cells that pay, no bonus.
+/// Worth of a distinct cell to beam search beside its probability: just enough that a robot in the
+/// middle of nothing goes somewhere else. Without it a clairvoyant robot stands still where nothing
+/// burns around it and earns 20.2 +- 8.1 instead of 43.6 +- 6.5 per step; with the filter it makes no
+/// difference (36.4 and 36.6; 8 training worlds, burn-in 25,000, 1,500 steps).
+const BEAM_BONUS: f32 = 0.02;
+
+/// The authors' objective for shooting; for beam search hardly any bonus.
 fn objective(planner: PlannerKind, target: Target) -> Objective {
     match planner {
         PlannerKind::Shooting => Objective::paper(target),
-        PlannerKind::Beam | PlannerKind::RandomWalk => Objective::new(target),
+        PlannerKind::Beam | PlannerKind::RandomWalk => Objective {
+            coverage_bonus: BEAM_BONUS,
+            ..Objective::new(target)
+        },
     }
 }
 

@@ -13,9 +13,9 @@ use protocol::randomness::split_mix;
 /// Key of the hash values that stand for cells: the word `beam` in ASCII.
 const HASH_KEY: u64 = 0x6265_616d;
 
-/// The default width. With the known-model filter (40 wildfire worlds, 300 steps) widths 100 and 200
-/// earn .5 and .0 more than its 36.8 per step, +- .9 each, at 2 and 5 times the time. A greedy walk
-/// earns 8.1 +- .8 less than a width of 100 (16 worlds, 400 steps).
+/// The default width. With the known-model filter a width of 100 earned 37.2 +- 2.2 per step on 40
+/// training worlds of 300 steps; widths 50 and 200 earned .5 +- .9 and .5 +- .8 less (paired), at 0.4
+/// and 2 times the time. A greedy walk earned 8.1 +- .8 less (16 worlds).
 pub const DEFAULT_WIDTH: usize = 50;
 
 /// Beam search of a given width. Ties are broken by a hash of the visited cells, which prefers no
