@@ -90,7 +90,8 @@ struct Server {
     resets: Resets,
     awaiting: Vec<(ActiveControl, Awaited)>,
     payload: Vec<u8>,
-    observers: (usize, usize),
+    /// Observers that were there at the last look.
+    observers: Vec<u128>,
     n_frames: u64,
     n_truths: u64,
     rate: Rate,
@@ -144,7 +145,7 @@ impl Server {
             resets,
             awaiting: Vec::new(),
             payload: Vec::new(),
-            observers: (0, 0),
+            observers: Vec::new(),
             n_frames: 0,
             n_truths: 0,
             rate: Rate {
@@ -306,8 +307,8 @@ impl Server {
 
     /// Shows every world to observers that have just come.
     fn greet_observers(&mut self) {
-        let observers = self.ports.observers();
-        let has_new = observers.0 > self.observers.0 || observers.1 > self.observers.1;
+        let observers = self.ports.observer_ids();
+        let has_new = observers.iter().any(|id| !self.observers.contains(id));
         self.observers = observers;
         if has_new {
             self.ports.connect_observers();
