@@ -30,6 +30,9 @@ const IDLE_TICK: Duration = Duration::from_millis(250);
 /// How often a busy server does: bounds how late a client's death is noticed.
 const BUSY_TICK: Duration = Duration::from_millis(50);
 
+/// How long a client may take to read the answer to its shutdown: the answer goes with the server.
+const FAREWELL: Duration = Duration::from_millis(500);
+
 /// Over how long the step rate is measured.
 const RATE_WINDOW: Duration = Duration::from_secs(1);
 
@@ -242,6 +245,7 @@ impl Server {
             }
             Outcome::Shutdown => {
                 self.send_reply(&request, &Reply::Done);
+                wait_until_taken(&request);
                 tracing::info!(client = client.pid, "a client asked to shut down");
                 self.is_over = true;
             }
@@ -389,6 +393,14 @@ impl Rate {
                 per_second,
             };
         }
+    }
+}
+
+/// Waits until a client has read its answer and let go of its request.
+fn wait_until_taken(request: &ActiveControl) {
+    let deadline = Instant::now() + FAREWELL;
+    while request.is_connected() && Instant::now() < deadline {
+        std::thread::sleep(Duration::from_millis(1));
     }
 }
 
