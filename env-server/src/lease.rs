@@ -49,7 +49,8 @@ pub struct Leases {
     /// The token that holds each world.
     holders: Vec<Option<u64>>,
     live: HashMap<u64, Lease>,
-    ended: VecDeque<u64>,
+    /// Tokens that have ended, each with its first world.
+    ended: VecDeque<(u64, usize)>,
 }
 
 /// What a client asks for.
@@ -146,7 +147,7 @@ impl Leases {
     pub fn renew(&mut self, now: Instant, token: u64, client: ClientId) -> Result<&Lease, Refusal> {
         let is_live = |lease: &&mut Lease| lease.client == client && now < lease.expires;
         if self.live.get_mut(&token).filter(is_live).is_none() {
-            let world = self.live.get(&token).map_or(0, |lease| lease.worlds.start);
+            let world = self.first_world(token).unwrap_or(0);
             return Err(self.not_held(token, client, world));
         }
         let lease = self.live.get_mut(&token).expect("invariant: found above");
@@ -186,12 +187,18 @@ impl Leases {
         Err(Refusal::new(Status::NoSuchWorld, self.holders.len() as u64))
     }
 
+    fn first_world(&self, token: u64) -> Option<usize> {
+        let live = self.live.get(&token).map(|lease| lease.worlds.start);
+        let mut ended = self.ended.iter().filter(|(ended, _)| *ended == token);
+        live.or_else(|| ended.next().map(|(_, world)| *world))
+    }
+
     fn not_held(&self, token: u64, client: ClientId, world: usize) -> Refusal {
         let live = self
             .live
             .get(&token)
             .is_some_and(|lease| lease.client == client && lease.worlds.contains(&world));
-        if live || self.ended.contains(&token) {
+        if live || self.ended.iter().any(|(ended, _)| *ended == token) {
             let holder = self.holder(world).filter(|holder| holder.token != token);
             return Refusal::new(
                 Status::LeaseLost,
@@ -225,7 +232,7 @@ impl Leases {
         if self.ended.len() == REMEMBERED {
             self.ended.pop_front();
         }
-        self.ended.push_back(token);
+        self.ended.push_back((token, lease.worlds.start));
         Some(lease)
     }
 
@@ -329,6 +336,24 @@ mod tests {
         leases
             .acquire(late, claim(2, 0..1, false), 12)
             .expect("free again");
+    }
+
+    #[test]
+    fn a_lost_lease_names_who_holds_its_own_worlds_now() {
+        let (mut leases, now) = (Leases::new(2), Instant::now());
+        leases
+            .acquire(now, claim(1, 0..1, false), 11)
+            .expect("free");
+        leases
+            .acquire(now, claim(2, 1..2, false), 12)
+            .expect("free");
+        leases
+            .acquire(now, claim(3, 1..2, true), 13)
+            .expect("takeover");
+        assert_eq!(
+            leases.renew(now, 12, client(2)).map(|_| ()),
+            Err(Refusal::new(Status::LeaseLost, 3))
+        );
     }
 
     #[test]
