@@ -15,11 +15,85 @@ pub const AGENT: &str = "emberwatch-agent";
 pub const TINY: &str = "--seeds 0..1 --steps 1 --height 4 --width 4 --moves 2 --burn-in 1 \
                     --policies coverage --baseline coverage";
 
+/// Flags, and the words of their refusal.
+const WRONG_SERVER_FLAGS: &str = r#"
+--instance a/b => instance name | "a/b"
+--worlds 0 => worlds: expected 1 to 1024, got 0
+--worlds 1025 => worlds: expected 1 to 1024, got 1025
+--worlds many => 'many' | --worlds
+--worlds 99999999999 => --worlds
+--height 0 => height and width in 1..=4096, got 0 x 64
+--width 4097 => height and width in 1..=4096, got 64 x 4097
+--moves 0 => moves: expected 1 to 4096, got 0
+--seed -1 => -1
+--seed 18446744073709551616 => --seed
+--burn-in 9999999999999 => burn_in: expected 0 to | 9999999999999
+--max-steps x => --max-steps | 'x'
+--coverage some => --coverage | path, full, client
+--start 1 => --start | expected corner, centre, random or ROW,COL
+--start 3,64 => start: expected a cell on the 64 x 64 grid, got (3, 64)
+--publish-truth maybe => --publish-truth | true, false
+--lease-millis 5 => lease_millis: expected 100 to 86400000, got 5
+--threads 257 => threads: expected 0 to 256, got 257
+--exit-with 0 => --exit-with 0: expected a running process
+--exit-with=-5 => --exit-with -5: expected a running process
+--exit-with 4194305 => --exit-with 4194305: expected a running process
+--model no/such.toml => model file no/such.toml: No such file
+--config no/such.toml => config file no/such.toml: No such file
+--config / => config file /: Is a directory
+--check --worlds 0 => worlds: expected 1 to 1024, got 0
+--bogus => --bogus
+dance => dance
+--worlds 1024 --height 4096 --width 4096 => shared memory: expected | MiB free | fewer worlds
+status --instance nobody => no server on instance "nobody"
+status --instance a/b => instance name | "a/b"
+stop --instance nobody => no server on instance "nobody"
+stop --instance a/b => instance name | "a/b"
+"#;
+
+/// The same for the agent.
+const WRONG_AGENT_FLAGS: &str = r#"
+run --instance nobody => no server on instance "nobody"
+run --instance a/b => instance name | "a/b"
+run --steps -1 => -1
+run --world x => --world | 'x'
+run --model no.toml => model file no.toml | No such file
+run --config no.toml => config file no.toml | No such file
+run --preset lab => --preset | default, paper
+run --prior none => --prior | simulated, initial, uniform
+run --beam-width 0 => beam_width: expected 1 to 10000, got 0
+run --shooting-samples 0 => shooting_samples: expected 1 to 1000000, got 0
+compare --seeds 8..0 => --seeds | FIRST below END
+compare --seeds 3 => --seeds | FIRST..END
+compare --seeds 0..100001 => --seeds | 100000
+compare --steps 0 => --steps | 1..=10000000
+compare --policies ash => policy: expected one of random_walk | got "ash"
+compare --policies coverage,coverage => each name once | got "coverage" twice
+compare --baseline ash => --baseline | expected one of | got "ash"
+compare --height 0 => height and width in 1..=4096, got 0 x 64
+compare --model no.toml => model file no.toml | No such file
+compare --server no/such => start no/such | No such file
+compare --instance nobody => no server on instance "nobody"
+compare --instance x --height 9 => --instance | --height
+compare TINY --csv /proc/no/file.csv => create /proc/no
+compare TINY --csv / => --csv: expected a file, got the folder /
+compare TINY --figures /proc/no => create /proc/no
+"#;
+
 /// Runs a program and checks that it refuses in one line that holds all these words.
 pub fn check(program: &str, arguments: &str, words: &[&str]) {
     let arguments: Vec<&str> = arguments.split_whitespace().collect();
     let ended = run(program, &arguments, LIMIT);
     assert_refusal(&format!("{program} {}", arguments.join(" ")), &ended, words);
+}
+
+/// Checks every line `flags => words | words`; `TINY` stands for [`TINY`].
+pub fn check_table(program: &str, table: &str) {
+    for line in table.trim().lines() {
+        let (flags, words) = line.split_once(" => ").expect("flags and words");
+        let words: Vec<&str> = words.split(" | ").collect();
+        check(program, &flags.replace("TINY", TINY), &words);
+    }
 }
 
 fn assert_refusal(what: &str, ended: &Ended, words: &[&str]) {
@@ -51,221 +125,47 @@ fn assert_refusal(what: &str, ended: &Ended, words: &[&str]) {
 
 #[test]
 fn wrong_flags_of_the_server_are_named() {
-    let check = |flags: &str, words: &[&str]| check(SERVER, flags, words);
-    check("--instance a/b", &["instance name", "\"a/b\""]);
-    check("--worlds 0", &["worlds: expected 1 to 1024, got 0"]);
-    check("--worlds 1025", &["worlds: expected 1 to 1024, got 1025"]);
-    check("--worlds many", &["'many'", "--worlds"]);
-    check("--worlds 99999999999", &["--worlds"]);
-    check("--height 0", &["height and width in 1..=4096, got 0 x 64"]);
-    check(
-        "--width 4097",
-        &["height and width in 1..=4096, got 64 x 4097"],
-    );
-    check("--moves 0", &["moves: expected 1 to 4096, got 0"]);
-    check("--seed -1", &["-1"]);
-    check("--seed 18446744073709551616", &["--seed"]);
-    check(
-        "--burn-in 9999999999999",
-        &["burn_in: expected 0 to", "9999999999999"],
-    );
-    check("--max-steps x", &["--max-steps", "'x'"]);
-    check("--coverage some", &["--coverage", "path, full, client"]);
-    check(
-        "--start 1",
-        &["--start", "expected corner, centre, random or ROW,COL"],
-    );
-    check(
-        "--start 3,64",
-        &["start: expected a cell on the 64 x 64 grid, got (3, 64)"],
-    );
-    check("--publish-truth maybe", &["--publish-truth", "true, false"]);
-    check(
-        "--lease-millis 5",
-        &["lease_millis: expected 100 to 86400000, got 5"],
-    );
-    check("--threads 257", &["threads: expected 0 to 256, got 257"]);
-    check(
-        "--exit-with 0",
-        &["--exit-with 0: expected a running process"],
-    );
-    check(
-        "--exit-with=-5",
-        &["--exit-with -5: expected a running process"],
-    );
-    check(
-        "--exit-with 4194305",
-        &["--exit-with 4194305: expected a running process"],
-    );
-    check(
-        "--model no/such.toml",
-        &["model file no/such.toml: No such file"],
-    );
-    check(
-        "--config no/such.toml",
-        &["config file no/such.toml: No such file"],
-    );
-    check("--config /", &["config file /: Is a directory"]);
-    check("--check --worlds 0", &["worlds: expected 1 to 1024, got 0"]);
-    check("--bogus", &["--bogus"]);
-    check("dance", &["dance"]);
-    let huge = "--worlds 1024 --height 4096 --width 4096";
-    check(
-        huge,
-        &["shared memory: expected", "MiB free", "fewer worlds"],
-    );
-    for command in ["status", "stop"] {
-        check(
-            &format!("{command} --instance nobody"),
-            &["no server on instance \"nobody\""],
-        );
-        check(
-            &format!("{command} --instance a/b"),
-            &["instance name", "\"a/b\""],
-        );
-    }
+    check_table(SERVER, WRONG_SERVER_FLAGS);
 }
 
 #[test]
 fn wrong_flags_of_the_agent_are_named() {
-    let check = |flags: &str, words: &[&str]| check(AGENT, flags, words);
-    check(
-        "run --instance nobody",
-        &["no server on instance \"nobody\""],
-    );
-    check("run --instance a/b", &["instance name", "\"a/b\""]);
-    check("run --steps -1", &["-1"]);
-    check("run --world x", &["--world", "'x'"]);
-    check(
-        "run --model no.toml",
-        &["model file no.toml", "No such file"],
-    );
-    check(
-        "run --config no.toml",
-        &["config file no.toml", "No such file"],
-    );
-    check("run --preset lab", &["--preset", "default, paper"]);
-    check(
-        "run --prior none",
-        &["--prior", "simulated, initial, uniform"],
-    );
-    check(
-        "run --beam-width 0",
-        &["beam_width: expected 1 to 10000, got 0"],
-    );
-    check(
-        "run --shooting-samples 0",
-        &["shooting_samples: expected 1 to 1000000, got 0"],
-    );
-    check("compare --seeds 8..0", &["--seeds", "FIRST below END"]);
-    check("compare --seeds 3", &["--seeds", "FIRST..END"]);
-    check("compare --seeds 0..100001", &["--seeds", "100000"]);
-    check("compare --steps 0", &["--steps", "1..=10000000"]);
-    check(
-        "compare --policies ash",
-        &["policy: expected one of random_walk", "got \"ash\""],
-    );
-    check(
-        "compare --policies coverage,coverage",
-        &["each name once", "got \"coverage\" twice"],
-    );
-    check(
-        "compare --baseline ash",
-        &["--baseline", "expected one of", "got \"ash\""],
-    );
-    check(
-        "compare --height 0",
-        &["height and width in 1..=4096, got 0 x 64"],
-    );
-    check(
-        "compare --model no.toml",
-        &["model file no.toml", "No such file"],
-    );
-    check(
-        "compare --server no/such",
-        &["start no/such", "No such file"],
-    );
-    check(
-        "compare --instance nobody",
-        &["no server on instance \"nobody\""],
-    );
-    check(
-        "compare --instance x --height 9",
-        &["--instance", "--height"],
-    );
-    check(
-        &format!("compare {TINY} --csv /proc/no/file.csv"),
-        &["create /proc/no"],
-    );
-    check(
-        &format!("compare {TINY} --csv /"),
-        &["--csv: expected a file, got the folder /"],
-    );
-    check(
-        &format!("compare {TINY} --figures /proc/no"),
-        &["create /proc/no"],
+    check_table(AGENT, WRONG_AGENT_FLAGS);
+}
+
+/// Runs an agent's commands against a server with these settings.
+fn check_against(settings: &str, table: &str) {
+    let server = Server::start(&format!("{SMALL} {settings}"));
+    let name = server.instance.name();
+    check_table(
+        AGENT,
+        &table.replace("SERVER", &format!("--instance {name}")),
     );
 }
 
 #[test]
 fn a_server_that_does_not_fit_is_refused_with_what_is_missing() {
-    let server = Server::start(&format!("{SMALL} --reveal-model false"));
-    let name = server.instance.name();
-    check(
-        AGENT,
-        &format!("run --instance {name} --world 1"),
-        &["no such world", "worlds 0 to 0"],
+    check_against(
+        "--reveal-model false",
+        "run SERVER --world 1 => no such world | worlds 0 to 0
+run SERVER => does not reveal its model | --model FILE
+compare SERVER --policies coverage => comparing needs the hidden states | --publish-truth",
     );
-    check(
-        AGENT,
-        &format!("run --instance {name}"),
-        &["does not reveal its model", "--model FILE"],
+    check_against(
+        "--reveal-model false --publish-truth",
+        "compare SERVER --policies coverage => comparing needs the model | --reveal-model true",
     );
-    let compare = format!("compare --instance {name} --policies coverage --baseline coverage");
-    check(
-        AGENT,
-        &compare,
-        &["comparing needs the hidden states", "--publish-truth"],
+    check_against(
+        "--publish-truth",
+        "compare SERVER --policies clairvoyant_beam => 2 worlds for these policies, it has 1
+compare SERVER --policies coverage --burn-in 7 => expected the running server's 20, got 7
+run SERVER --policy ash => policy: expected one of | got \"ash\"
+run SERVER --policy clairvoyant_beam => only `compare` has them",
     );
-    let server = Server::start(&format!("{SMALL} --reveal-model false --publish-truth"));
-    let name = server.instance.name();
-    let compare = format!("compare --instance {name} --policies coverage --baseline coverage");
-    check(
-        AGENT,
-        &compare,
-        &["comparing needs the model", "--reveal-model true"],
+    check_against(
+        "",
+        "run SERVER --policy oracle_beam => oracle_beam | --publish-truth",
     );
-    let server = Server::start(&format!("{SMALL} --publish-truth"));
-    let name = server.instance.name();
-    let scouts = format!("compare --instance {name} --policies clairvoyant_beam");
-    check(
-        AGENT,
-        &scouts,
-        &["2 worlds for these policies, it has 1", "--worlds 2"],
-    );
-    let burn_in = format!("compare --instance {name} --policies coverage --burn-in 7");
-    check(
-        AGENT,
-        &burn_in,
-        &["--burn-in: expected the running server's 20, got 7"],
-    );
-    let run = |policy: &str| format!("run --instance {name} --policy {policy}");
-    check(
-        AGENT,
-        &run("ash"),
-        &["policy: expected one of", "got \"ash\""],
-    );
-    check(
-        AGENT,
-        &run("clairvoyant_beam"),
-        &["only `compare` has them"],
-    );
-    let server = Server::start(SMALL);
-    let oracle = format!(
-        "run --instance {} --policy oracle_beam",
-        server.instance.name()
-    );
-    check(AGENT, &oracle, &["oracle_beam", "--publish-truth"]);
 }
 
 #[test]

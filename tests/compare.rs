@@ -52,37 +52,21 @@ fn compare_to(path: &Path, flags: &[&str]) -> Vec<Vec<String>> {
 #[test]
 fn a_comparison_writes_a_table_a_csv_file_and_figures() {
     let folder = TempDir::new().expect("a folder");
-    let (csv, figures) = (
-        folder.path().join("new/out.csv"),
-        folder.path().join("figures"),
-    );
+    let path = |name: &str| folder.path().join(name);
+    let (csv, figures) = (path("new/out.csv"), path("figures"));
     let places = format!("--csv {} --figures {}", csv.display(), figures.display());
     let ended = agent(&[WHAT, WORLDS, &places]);
     let rows = rows(&csv);
     // Eleven policies of the wildfire's ladder, two seeds each.
     assert_eq!(rows.len(), 11 * 2, "{rows:?}");
-    for policy in [
-        "random_walk",
-        "shooting_latent",
-        "beam_exploit",
-        "clairvoyant_beam",
-    ] {
-        assert!(ended.stdout.contains(policy), "{}", ended.stdout);
-        let seeds = rows
-            .iter()
-            .filter(|row| row[0] == policy)
-            .map(|row| &*row[2]);
-        assert_eq!(seeds.collect::<Vec<_>>(), ["3", "4"], "{policy}");
-    }
-    let fire = |seed: &'static str| {
-        rows.iter()
-            .filter(move |row| row[2] == seed)
-            .map(|row| &row[7])
-    };
-    for seed in ["3", "4"] {
-        assert!(
-            fire(seed).all(|cells| Some(cells) == fire(seed).next()),
-            "all met the same world"
+    for [first, second] in rows.as_chunks::<2>().0 {
+        assert!(ended.stdout.contains(&first[0]), "{}", ended.stdout);
+        assert_eq!((&first[0], &*first[2], &*second[2]), (&second[0], "3", "4"));
+        let fire_cells = [&first[7], &second[7]];
+        assert_eq!(
+            fire_cells,
+            [&rows[0][7], &rows[1][7]],
+            "all met the same worlds"
         );
     }
     for name in ["ladder.png", "rewards.png", "snapshot.png"] {
