@@ -3,173 +3,19 @@
 //!
 //! `cargo test -p tests -- --ignored` sends a million messages instead of twenty thousand.
 
+use crate::attacker::Attacker;
 use crate::harness::{PATIENCE, Paths, Server, claim, eventually, fly};
 use crate::wire::{Wire, answer, control_header, step_header};
 use agent::client::Client;
 use protocol::channels::Instance;
 use protocol::control::{MAX_CONTROL_BYTES, Reply, Request, WorldSeed};
-use protocol::message::{ControlRequest, FLAG_FULL_COVERAGE, Status, StepRequest, VERSION};
+use protocol::message::{Status, StepRequest};
 use protocol::path::path_to_bytes;
-use rand::RngExt;
-use rand::seq::IndexedRandom;
-use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::{Rng, SeedableRng};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Sender, channel};
 
 /// Three worlds: the first is the victim's, the second the attacker's, the third anybody's.
 const FLAGS: &str = "--height 5 --width 7 --moves 6 --burn-in 20 --worlds 3";
-
-/// A control request of each kind but shutdown and takeover, which every client may do.
-const TEMPLATES: [&str; 8] = [
-    r#"{"op":"hello","protocol":1,"client":"x"}"#,
-    r#"{"op":"acquire","first_world":1,"n_worlds":1}"#,
-    r#"{"op":"acquire","first_world":0,"n_worlds":2,"ttl_millis":100}"#,
-    r#"{"op":"renew","lease":LEASE}"#,
-    r#"{"op":"release","lease":LEASE}"#,
-    r#"{"op":"reset","lease":LEASE,"worlds":[{"world":1,"seed":3}]}"#,
-    r#"{"op":"reset","lease":LEASE,"worlds":[{"world":0},{"world":1},{"world":1}]}"#,
-    r#"{"op":"status"}"#,
-];
-
-/// A client that sends what no client should.
-struct Attacker {
-    wire: Wire,
-    rng: ChaCha8Rng,
-    /// Leases to try: none, its own, the victim's.
-    leases: Vec<u64>,
-    n_refused: u64,
-    n_accepted: u64,
-}
-
-impl Attacker {
-    fn new(instance: &Instance, stolen: u64, seed: u64) -> Self {
-        let wire = Wire::open(instance);
-        let own = wire.acquire(1, 1).lease;
-        Self {
-            wire,
-            rng: ChaCha8Rng::seed_from_u64(seed),
-            leases: vec![0, 1, own, own, own, stolen, u64::MAX],
-            n_refused: 0,
-            n_accepted: 0,
-        }
-    }
-
-    fn strike(&mut self) {
-        let status = match self.rng.random() {
-            true => self.strike_step(),
-            false => self.strike_control(),
-        };
-        match status {
-            None => {}
-            Some(0) => self.n_accepted += 1,
-            Some(code) => {
-                assert!(Status::try_from(code).is_ok(), "unknown status {code}");
-                self.n_refused += 1;
-            }
-        }
-    }
-
-    /// Returns the status, if it waits for the answer.
-    fn strike_step(&mut self) -> Option<u32> {
-        let (header, payload) = (self.step_request(), self.step_payload());
-        let pending = self.wire.send_step(header, &payload).expect("send");
-        if self.rng.random_ratio(1, 8) {
-            return None;
-        }
-        let (reply, payload) = answer(&pending, PATIENCE).expect("an answer");
-        assert_eq!(reply.sequence, header.sequence);
-        assert_eq!(payload.is_empty(), reply.status != 0);
-        Some(reply.status)
-    }
-
-    fn strike_control(&mut self) -> Option<u32> {
-        let header = ControlRequest {
-            version: self.number(VERSION),
-            reserved: self.rng.random(),
-            sequence: self.rng.random(),
-            listener_low: self.rng.random(),
-            listener_high: self.rng.random(),
-        };
-        let text = self.control_text();
-        let pending = self.wire.send_control(header, &text).expect("send");
-        if self.rng.random_ratio(1, 8) {
-            return None;
-        }
-        let (reply, payload) = answer(&pending, PATIENCE).expect("an answer");
-        assert_eq!(reply.sequence, header.sequence);
-        let parsed: Reply = serde_json::from_slice(&payload).expect("a reply");
-        if let Reply::Lease(lease) = &parsed {
-            self.leases[2] = lease.lease;
-        }
-        assert_eq!(parsed.status() as u32, reply.status);
-        Some(reply.status)
-    }
-
-    fn step_request(&mut self) -> StepRequest {
-        StepRequest {
-            version: self.number(VERSION),
-            operation: self.number(1),
-            lease: *self.leases.choose(&mut self.rng).expect("leases"),
-            sequence: self.rng.random(),
-            first_world: self.number(1),
-            n_worlds: self.number(1),
-            n_moves: self.number(6),
-            flags: self.number(0),
-            listener_low: self.rng.random(),
-            listener_high: self.rng.random(),
-            reserved: self.rng.random(),
-        }
-    }
-
-    /// Mostly the right number; else one that is near, huge or random.
-    fn number(&mut self, right: u32) -> u32 {
-        match self.rng.random_range(0..50) {
-            0 => right.wrapping_add(1),
-            1 => right.wrapping_sub(1),
-            2 => u32::MAX,
-            3 => self.rng.random(),
-            4 => FLAG_FULL_COVERAGE,
-            _ => right,
-        }
-    }
-
-    fn step_payload(&mut self) -> Vec<u8> {
-        match self.rng.random_range(0..4) {
-            0 => self.bytes(300),
-            1 => Vec::new(),
-            _ => (0..6).map(|_| self.rng.random_range(0..4)).collect(),
-        }
-    }
-
-    fn control_text(&mut self) -> Vec<u8> {
-        if self.rng.random_ratio(1, 4) {
-            return self.bytes(200);
-        }
-        let lease = self
-            .leases
-            .choose(&mut self.rng)
-            .expect("leases")
-            .to_string();
-        let template = TEMPLATES.choose(&mut self.rng).expect("templates");
-        let mut text = template.replace("LEASE", &lease).into_bytes();
-        for _ in 0..self.rng.random_range(0..4) {
-            let at = self.rng.random_range(0..text.len());
-            match self.rng.random_range(0..3) {
-                0 => text[at] = self.rng.random(),
-                1 => text.truncate(at.max(1)),
-                _ => text.insert(at, b"0123456789{}[]\",:-"[self.rng.random_range(0..18)]),
-            }
-        }
-        text
-    }
-
-    fn bytes(&mut self, most: usize) -> Vec<u8> {
-        let mut bytes = vec![0; self.rng.random_range(0..most)];
-        self.rng.fill_bytes(&mut bytes);
-        bytes
-    }
-}
 
 /// Another client: steps world 0 until told to stop; returns every answer's payload.
 fn live(instance: &Instance, tell_lease: &Sender<u64>, stop: &AtomicBool) -> Vec<Vec<u8>> {
@@ -200,6 +46,13 @@ fn assert_undisturbed(seen: &[Vec<u8>]) {
     }
 }
 
+fn resident_kibibytes(pid: u32) -> u64 {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).expect("its status");
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    let number = line.and_then(|line| line.split_whitespace().next()?.parse().ok());
+    number.expect("a number of KiB")
+}
+
 fn attack(n_messages: u64) {
     let server = Server::start(FLAGS);
     let (tell_lease, stolen) = channel();
@@ -208,9 +61,12 @@ fn attack(n_messages: u64) {
         let victim = scope.spawn(|| live(&server.instance, &tell_lease, &stop));
         let stolen = stolen.recv_timeout(PATIENCE).expect("a lease");
         let mut attacker = Attacker::new(&server.instance, stolen, 1);
-        for _ in 0..n_messages {
-            attacker.strike();
-        }
+        let mut strike = |n_messages| (0..n_messages).for_each(|_| attacker.strike());
+        strike(n_messages / 4);
+        let before = resident_kibibytes(server.program.pid());
+        strike(n_messages - n_messages / 4);
+        let growth = resident_kibibytes(server.program.pid()).saturating_sub(before);
+        assert!(growth < 8 << 10, "the server grew by {growth} KiB");
         stop.store(true, Ordering::Relaxed);
         let (refused, accepted) = (attacker.n_refused, attacker.n_accepted);
         assert!(refused > n_messages / 4, "{refused} refused: too tame");

@@ -5,6 +5,7 @@
 //! of facts. Each test has an instance, a folder and a deadline of its own. The long run of the
 //! hostile clients is `cargo test -p tests -- --ignored`.
 
+mod attacker;
 mod commands;
 mod compare;
 mod compliance;
