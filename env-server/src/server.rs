@@ -10,7 +10,7 @@ use protocol::control::Reply;
 use protocol::message::{ControlReply, FrameHeader, Status, TruthHeader, VERSION};
 use protocol::model::ModelError;
 use protocol::path::path_to_bytes;
-use protocol::wait::{poll_then_block, sleep_until_readable};
+use protocol::wait::{Waiter, sleep_until_readable};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use rayon::{ThreadPool, ThreadPoolBuilder};
@@ -84,6 +84,7 @@ pub fn serve(
 struct Server {
     simulator: Simulator,
     ports: Ports,
+    waiter: Waiter,
     clients: Clients,
     keeper: Option<Keeper>,
     janitor: Janitor,
@@ -138,6 +139,7 @@ impl Server {
         Ok(Self {
             simulator,
             ports,
+            waiter: Waiter::default(),
             clients: Clients::default(),
             keeper,
             janitor: Janitor::start(),
@@ -161,7 +163,7 @@ impl Server {
     /// Waits for something and handles it.
     fn turn(&mut self) -> Result<(), ServeError> {
         let woken = Cell::new(false);
-        let found = poll_then_block(
+        let found = self.waiter.wait(
             IDLE_TICK,
             || self.look(&woken),
             |limit| {

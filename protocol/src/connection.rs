@@ -11,7 +11,7 @@ use crate::message::split_step_payload;
 use crate::message::{
     ControlReply, ControlRequest, Header, Status, StepReply, StepRequest, StepResult, VERSION,
 };
-use crate::wait::{descriptor, poll_then_block, sleep_until_readable};
+use crate::wait::{Waiter, descriptor, sleep_until_readable};
 use iceoryx2::node::Node;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::Client;
@@ -98,6 +98,7 @@ struct Wake {
     server: Notifier<Ipc>,
     listener: Listener<Ipc>,
     server_process: OwnedFd,
+    waiter: Waiter,
     node: Node<Ipc>,
 }
 
@@ -150,6 +151,7 @@ impl Connection {
             server,
             listener,
             server_process,
+            waiter: Waiter::default(),
             node,
         };
         let info = shake_hands(&control, &mut wake, client, timeout)?;
@@ -290,7 +292,7 @@ impl Wake {
             None if gone.get() => Err(self.gone()),
             None => Ok(None),
         };
-        poll_then_block(timeout, poll, |remaining| {
+        self.waiter.wait(timeout, poll, |remaining| {
             gone.set(self.sleep(remaining.min(LONGEST_SLEEP))? || !pending.is_connected());
             Ok(())
         })

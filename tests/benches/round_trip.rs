@@ -86,7 +86,7 @@ impl Stepper {
     }
 
     fn report(&mut self, what: &str, n_steps: usize) {
-        (0..n_steps / 10).for_each(|_| drop(self.step()));
+        (0..n_steps / 10).for_each(|_| _ = self.step());
         let start = Instant::now();
         let times: Vec<(u64, u64)> = (0..n_steps).map(|_| self.step()).collect();
         let per_second =
@@ -123,7 +123,7 @@ impl std::fmt::Display for Spread {
 
 fn main() {
     let server = beside_this_program("emberwatch-server");
-    for n_worlds in [1, 64] {
+    for n_worlds in [1_u32, 64] {
         let name = format!("bench-{}-{n_worlds}", std::process::id());
         let arguments = [
             "--instance",
