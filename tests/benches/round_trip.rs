@@ -1,5 +1,5 @@
 //! Round trip of a step from a Rust client to a server process and back:
-//! `cargo bench -p tests --bench round_trip`.
+//! `cargo bench -p tests --bench round_trip`; arguments after `--` go to the server.
 //!
 //! Prints median and tail in microseconds with the simulation's own time subtracted, on a machine
 //! as it is and with three busy processes on top; then the processor time of an idle server. The peer
@@ -123,16 +123,23 @@ impl std::fmt::Display for Spread {
 
 fn main() {
     let server = beside_this_program("emberwatch-server");
+    // cargo adds `--bench` on its own.
+    let more: Vec<String> = std::env::args()
+        .skip(1)
+        .filter(|argument| argument != "--bench")
+        .collect();
     for n_worlds in [1_u32, 64] {
         let name = format!("bench-{}-{n_worlds}", std::process::id());
-        let arguments = [
+        let worlds = n_worlds.to_string();
+        let mut arguments = vec![
             "--instance",
             &name,
             "--worlds",
-            &n_worlds.to_string(),
+            &worlds,
             "--burn-in",
             "1000",
         ];
+        arguments.extend(more.iter().map(String::as_str));
         let running = Running::start(&server, &arguments);
         let instance = Instance::new(&name).expect("a plain name");
         let n_steps = N_STEPS / n_worlds.isqrt() as usize;
