@@ -7,6 +7,7 @@
 use crate::grid::{Cell, Shape};
 use ndarray::{Array1, Array2, Array4, Axis};
 use serde::{Deserialize, Serialize};
+use std::ops::RangeInclusive;
 use thiserror::Error;
 
 /// Most states, and most observations, of a model: 64.
@@ -14,6 +15,14 @@ pub const MAX_VALUES: usize = 64;
 
 /// Largest kernel side: 15 cells.
 pub const MAX_KERNEL_SIDE: usize = 15;
+
+/// Range of weights and biases that are not zero, and of the size of rewards: no sum or product of
+/// those overflows or vanishes in `f64`.
+const RANGE: RangeInclusive<f64> = 1e-100..=1e100;
+
+/// The least that the weights of a cell may sum to, as a share of the largest weight: the smallest
+/// normal `f32` is 1e-38, so that sums from 1e-30 on keep their precision in beliefs.
+const LEAST_SHARE: f64 = 1e-30;
 
 /// How far a probability distribution in a model file may be from summing to one.
 const SUM_TOLERANCE: f64 = 1e-6;
@@ -157,6 +166,21 @@ pub enum ModelError {
         /// The first such cell.
         cell: Cell,
     },
+    /// A cell whose transition weights can all be so small that eq. 3 divides noise by noise.
+    #[error(
+        "model {model:?} on a {shape} grid: transition weights of cell {cell} can sum to {share:e} of \
+         the largest weight, expected at least {LEAST_SHARE:e} whatever its neighbourhood"
+    )]
+    FaintWeight {
+        /// The model's name.
+        model: String,
+        /// The grid.
+        shape: Shape,
+        /// The first such cell.
+        cell: Cell,
+        /// What its weights can sum to, as a share of the largest weight.
+        share: f64,
+    },
 }
 
 impl Model {
@@ -198,14 +222,16 @@ impl Model {
         })
     }
 
-    /// Checks that eq. 3 never divides by zero on a grid, whatever the states.
+    /// Checks that eq. 3 never divides by zero on a grid, or by next to nothing, whatever the states.
     ///
     /// # Errors
-    /// [`ModelError::ZeroWeight`] names the first cell whose weights can sum to zero.
+    /// [`ModelError::ZeroWeight`] or [`ModelError::FaintWeight`] names the first cell where it can.
     pub fn check_on(&self, shape: Shape) -> Result<(), ModelError> {
         let column_sums = self.kernel.sum_axis(Axis(0));
         let least = column_sums.fold_axis(Axis(0), f64::INFINITY, |a, b| a.min(*b));
         let (kernel_height, kernel_width) = least.dim();
+        let largest = self.kernel.iter().chain(&self.bias).copied();
+        let largest = largest.fold(f64::MIN_POSITIVE, f64::max);
         // Cells further than a kernel from the edges are all alike: look at one of them.
         let distinct = |side: usize, kernel: usize| {
             (0..side).filter(move |&at| at <= kernel || at + kernel >= side)
@@ -218,11 +244,27 @@ impl Model {
                     (up..shape.height() + up).contains(&i)
                         && (left..shape.width() + left).contains(&j)
                 });
-                if self.bias.sum() + on_grid.map(|(_, weight)| weight).sum::<f64>() <= 0.0 {
-                    let (model, cell) = (self.name().into(), Cell { row, col });
-                    return Err(ModelError::ZeroWeight { model, shape, cell });
-                }
+                let sum = self.bias.sum() + on_grid.map(|(_, weight)| weight).sum::<f64>();
+                self.check_share(sum / largest, shape, Cell { row, col })?;
             }
+        }
+        Ok(())
+    }
+
+    /// Checks the least share of the largest weight that a cell's weights can sum to.
+    fn check_share(&self, share: f64, shape: Shape, cell: Cell) -> Result<(), ModelError> {
+        let model = || self.name().into();
+        if share <= 0.0 {
+            let model = model();
+            return Err(ModelError::ZeroWeight { model, shape, cell });
+        }
+        if share < LEAST_SHARE {
+            return Err(ModelError::FaintWeight {
+                model: model(),
+                shape,
+                cell,
+                share,
+            });
         }
         Ok(())
     }
@@ -294,7 +336,7 @@ impl Model {
 pub fn parse_color(text: &str) -> Option<[u8; 3]> {
     let digits = text
         .strip_prefix('#')
-        .filter(|digits| digits.len() == 6 && digits.is_ascii())?;
+        .filter(|digits| digits.len() == 6 && digits.bytes().all(|d| d.is_ascii_hexdigit()))?;
     let channel = |at: usize| u8::from_str_radix(&digits[at..at + 2], 16).ok();
     Some([channel(0)?, channel(2)?, channel(4)?])
 }
@@ -367,16 +409,27 @@ impl Checker<'_> {
     ) -> Result<Array1<f64>, ModelError> {
         for state in &file.states {
             let got = value(state);
+            let what = format!("state {:?}: {what}", state.name);
             if !got.is_finite() || got < least {
                 let expected = if least == 0.0 {
                     "a finite number >= 0"
                 } else {
                     "a finite number"
                 };
-                return self.wrong(format!("state {:?}: {what}", state.name), expected, got);
+                return self.wrong(what, expected, got);
             }
+            self.size(what, got, got == 0.0)?;
         }
         Ok(file.states.iter().map(value).collect())
+    }
+
+    /// Checks that a number is neither too small nor too large to compute with.
+    fn size(&self, what: String, got: f64, is_zero: bool) -> Result<(), ModelError> {
+        if is_zero || RANGE.contains(&got.abs()) {
+            return Ok(());
+        }
+        let expected = format!("0, or a size of {:e} to {:e}", RANGE.start(), RANGE.end());
+        self.wrong(what, &expected, format!("{got:e}"))
     }
 
     fn distribution(&self, what: &str, values: &[f64]) -> Result<(), ModelError> {
@@ -453,6 +506,7 @@ impl Checker<'_> {
                 if !weight.is_finite() || weight < 0.0 {
                     return self.wrong(entry.what(), "finite weights >= 0", weight);
                 }
+                self.size(entry.what(), weight, *value == 0.0 || entry.scale == 0.0)?;
                 weights.push((row, col, weight));
             }
         }
@@ -553,10 +607,47 @@ mod tests {
             |f| f.states[0].color = "red".into(),
             "expected #rrggbb, got red",
         );
+        check(|f| f.states[0].color = "#+1+2+3".into(), "got #+1+2+3");
         check(
             |f| f.kernel.push(f.kernel[0].clone()),
             "expected one entry for each pair of states, got two",
         );
+    }
+
+    #[test]
+    fn numbers_too_large_or_too_small_to_compute_with_are_rejected() {
+        let around = "0, or a size of 1e-100 to 1e100";
+        for (number, shown) in [(1e101, "e101"), (1e-320, "e-320")] {
+            check(|f| f.states[0].bias = number, around);
+            check(|f| f.states[2].reward = -number, shown);
+            check(|f| f.kernel[0].weights[1][1] = number, around);
+        }
+        // Each factor is in range, their product vanishes.
+        check(
+            |f| {
+                f.kernel[0].scale = 1e-99;
+                f.kernel[0].weights = vec![vec![1e-99; 3]; 3];
+            },
+            "kernel from \"normal\" to \"normal\": expected 0, or a size of",
+        );
+    }
+
+    #[test]
+    fn weights_that_can_vanish_beside_the_largest_are_rejected() {
+        let mut file = Model::wildfire().file;
+        for entry in file.kernel.iter_mut().filter(|e| e.from == "latent") {
+            entry.scale *= 1e-31;
+        }
+        let shape = Shape::new(4, 4).expect("test shape");
+        let error = Model::new(file.clone()).expect("valid until a grid is named");
+        let error = error.check_on(shape).expect_err("a cell among latent ones");
+        assert!(
+            matches!(error, ModelError::FaintWeight { share, .. } if share > 0.0),
+            "{error}"
+        );
+        file.states[0].bias = 1e-6;
+        let rescued = Model::new(file).expect("valid");
+        assert_eq!(rescued.check_on(shape), Ok(()));
     }
 
     #[test]
