@@ -88,7 +88,7 @@ pub struct Summary {
 /// [`RunError`]; a lost lease is one.
 pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
     let mut summary = Summary::default();
-    let mut attached = Attached::attach(mission)?;
+    let mut attached = Attached::attach(mission, mission.takeover)?;
     while !stop.load(Ordering::Relaxed) && (mission.steps == 0 || summary.steps < mission.steps) {
         match attached.step() {
             Ok(reward) => {
@@ -106,8 +106,10 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
             Err(error) => return Err(error),
         }
     }
-    attached.client.release()?;
-    Ok(summary)
+    match attached.client.release().map_err(RunError::from) {
+        Err(error) if !is_outage(&error) => Err(error),
+        _ => Ok(summary),
+    }
 }
 
 /// An agent at its world.
@@ -127,11 +129,11 @@ struct Report {
 
 impl Attached {
     /// Acquires the world where it stands and takes in its last frame.
-    fn attach(mission: &Mission) -> Result<Self, RunError> {
+    fn attach(mission: &Mission, takeover: bool) -> Result<Self, RunError> {
         let worlds = mission.world..mission.world + 1;
         let claim = Claim {
             worlds: worlds.clone(),
-            takeover: mission.takeover,
+            takeover,
             time_to_live: None,
         };
         let mut client = Client::acquire(&mission.instance, &claim)?;
@@ -261,14 +263,27 @@ fn open_truth(mission: &Mission, client: &Client) -> Result<TruthFeed, RunError>
 
 /// Attaches to a server that has come back; `None` if it is time to stop.
 fn attach_again(mission: &Mission, stop: &AtomicBool) -> Result<Option<Attached>, RunError> {
+    let mut takeover = mission.takeover;
     while !stop.load(Ordering::Relaxed) {
-        match Attached::attach(mission) {
+        match Attached::attach(mission, takeover) {
             Ok(attached) => return Ok(Some(attached)),
+            // The server did not end, it paused: our former connection holds the world still.
+            Err(error) if is_own_lease(&error) && !takeover => takeover = true,
             Err(error) if is_outage(&error) => std::thread::sleep(RETRY_INTERVAL),
             Err(error) => return Err(error),
         }
     }
     Ok(None)
+}
+
+/// Whether a world is taken by this very process.
+fn is_own_lease(error: &RunError) -> bool {
+    let own_pid = u64::from(std::process::id());
+    matches!(
+        error,
+        RunError::Connection(ConnectionError::Refused { status: Status::Busy, detail, .. })
+            if *detail == own_pid
+    )
 }
 
 /// Whether the server is away and may come back.

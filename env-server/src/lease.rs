@@ -32,6 +32,8 @@ pub struct Lease {
     /// It ends this long after its last use.
     pub time_to_live: Duration,
     expires: Instant,
+    /// Requests that wait for worlds to be reset; it cannot expire meanwhile.
+    n_waiting: u32,
 }
 
 /// Why a request may not act, as the wire says it.
@@ -49,7 +51,8 @@ pub struct Leases {
     /// The token that holds each world.
     holders: Vec<Option<u64>>,
     live: HashMap<u64, Lease>,
-    ended: VecDeque<u64>,
+    /// Tokens that have ended, each with its first world.
+    ended: VecDeque<(u64, usize)>,
 }
 
 /// What a client asks for.
@@ -69,6 +72,12 @@ impl Refusal {
     /// A refusal with its detail.
     pub fn new(status: Status, detail: u64) -> Self {
         Self { status, detail }
+    }
+}
+
+impl Lease {
+    fn has_expired(&self, now: Instant) -> bool {
+        self.n_waiting == 0 && self.expires <= now
     }
 }
 
@@ -114,6 +123,7 @@ impl Leases {
             worlds,
             time_to_live,
             expires: now + time_to_live,
+            n_waiting: 0,
         };
         Ok(self.live.entry(token).or_insert(lease))
     }
@@ -144,14 +154,29 @@ impl Leases {
     /// # Errors
     /// [`Status::NoLease`] or [`Status::LeaseLost`].
     pub fn renew(&mut self, now: Instant, token: u64, client: ClientId) -> Result<&Lease, Refusal> {
-        let is_live = |lease: &&mut Lease| lease.client == client && now < lease.expires;
+        let is_live = |lease: &&mut Lease| lease.client == client && !lease.has_expired(now);
         if self.live.get_mut(&token).filter(is_live).is_none() {
-            let world = self.live.get(&token).map_or(0, |lease| lease.worlds.start);
+            let world = self.first_world(token).unwrap_or(0);
             return Err(self.not_held(token, client, world));
         }
         let lease = self.live.get_mut(&token).expect("invariant: found above");
         lease.expires = now + lease.time_to_live;
         Ok(lease)
+    }
+
+    /// Keeps a lease from expiring while one more request waits for worlds to be reset.
+    pub fn begin_wait(&mut self, token: u64) {
+        if let Some(lease) = self.live.get_mut(&token) {
+            lease.n_waiting += 1;
+        }
+    }
+
+    /// Ends what [`Self::begin_wait`] began; the lease lives on from now.
+    pub fn end_wait(&mut self, now: Instant, token: u64) {
+        if let Some(lease) = self.live.get_mut(&token) {
+            lease.n_waiting = lease.n_waiting.saturating_sub(1);
+            lease.expires = now + lease.time_to_live;
+        }
     }
 
     /// Ends a lease; its worlds are free.
@@ -166,12 +191,21 @@ impl Leases {
 
     /// Ends the leases that have expired; returns them.
     pub fn expire(&mut self, now: Instant) -> Vec<Lease> {
-        self.end_where(|lease| lease.expires <= now)
+        self.end_where(|lease| lease.has_expired(now))
     }
 
     /// Ends the leases of a process that has died; returns them.
     pub fn end_of_process(&mut self, pid: u32) -> Vec<Lease> {
         self.end_where(|lease| lease.client.pid == pid)
+    }
+
+    /// The worlds of a lease that nobody took from it.
+    pub fn worlds_held(&self, token: u64) -> Vec<usize> {
+        let held = |world: &usize| self.holders[*world] == Some(token);
+        let lease = self.live.get(&token);
+        lease.map_or_else(Vec::new, |lease| {
+            lease.worlds.clone().filter(held).collect()
+        })
     }
 
     /// Who holds a world.
@@ -186,12 +220,18 @@ impl Leases {
         Err(Refusal::new(Status::NoSuchWorld, self.holders.len() as u64))
     }
 
+    fn first_world(&self, token: u64) -> Option<usize> {
+        let live = self.live.get(&token).map(|lease| lease.worlds.start);
+        let mut ended = self.ended.iter().filter(|(ended, _)| *ended == token);
+        live.or_else(|| ended.next().map(|(_, world)| *world))
+    }
+
     fn not_held(&self, token: u64, client: ClientId, world: usize) -> Refusal {
         let live = self
             .live
             .get(&token)
             .is_some_and(|lease| lease.client == client && lease.worlds.contains(&world));
-        if live || self.ended.contains(&token) {
+        if live || self.ended.iter().any(|(ended, _)| *ended == token) {
             let holder = self.holder(world).filter(|holder| holder.token != token);
             return Refusal::new(
                 Status::LeaseLost,
@@ -225,7 +265,7 @@ impl Leases {
         if self.ended.len() == REMEMBERED {
             self.ended.pop_front();
         }
-        self.ended.push_back(token);
+        self.ended.push_back((token, lease.worlds.start));
         Some(lease)
     }
 
@@ -329,6 +369,38 @@ mod tests {
         leases
             .acquire(late, claim(2, 0..1, false), 12)
             .expect("free again");
+    }
+
+    #[test]
+    fn a_lease_does_not_expire_while_its_client_waits() {
+        let (mut leases, now) = (Leases::new(1), Instant::now());
+        leases
+            .acquire(now, claim(1, 0..1, false), 11)
+            .expect("free");
+        leases.begin_wait(11);
+        let late = now + 9 * TTL;
+        assert!(leases.expire(late).is_empty());
+        leases.end_wait(late, 11);
+        assert_eq!(leases.use_lease(late, 11, client(1), &(0..1)), Ok(()));
+        assert_eq!(leases.expire(late + TTL).len(), 1);
+    }
+
+    #[test]
+    fn a_lost_lease_names_who_holds_its_own_worlds_now() {
+        let (mut leases, now) = (Leases::new(2), Instant::now());
+        leases
+            .acquire(now, claim(1, 0..1, false), 11)
+            .expect("free");
+        leases
+            .acquire(now, claim(2, 1..2, false), 12)
+            .expect("free");
+        leases
+            .acquire(now, claim(3, 1..2, true), 13)
+            .expect("takeover");
+        assert_eq!(
+            leases.renew(now, 12, client(2)).map(|_| ()),
+            Err(Refusal::new(Status::LeaseLost, 3))
+        );
     }
 
     #[test]

@@ -9,6 +9,7 @@ use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::server::Server;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{AllocationStrategy, CallbackProgression, PortFactory};
+use iceoryx2::service::dynamic_config::publish_subscribe::SubscriberDetails;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use protocol::channels::{
     Channel, ChannelError, FRAME_BUFFER, FrameService, Ipc, MAX_CLIENTS, MAX_OBSERVERS,
@@ -247,6 +248,22 @@ impl Ports {
             service.dynamic_config().number_of_subscribers()
         });
         (n_frames, n_truth)
+    }
+
+    /// Who observes frames or reads the truth.
+    pub fn observer_ids(&self) -> Vec<u128> {
+        let mut ids = Vec::new();
+        let mut note = |subscriber: &SubscriberDetails| {
+            ids.push(subscriber.subscriber_id.value());
+            CallbackProgression::Continue
+        };
+        self.frame_service
+            .dynamic_config()
+            .list_subscribers(&mut note);
+        if let Some(service) = &self.truth_service {
+            service.dynamic_config().list_subscribers(&mut note);
+        }
+        ids
     }
 
     /// Connects to observers that have come since.

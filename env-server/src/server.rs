@@ -30,6 +30,9 @@ const IDLE_TICK: Duration = Duration::from_millis(250);
 /// How often a busy server does: bounds how late a client's death is noticed.
 const BUSY_TICK: Duration = Duration::from_millis(50);
 
+/// How long a client may take to read the answer to its shutdown: the answer goes with the server.
+const FAREWELL: Duration = Duration::from_millis(500);
+
 /// Over how long the step rate is measured.
 const RATE_WINDOW: Duration = Duration::from_secs(1);
 
@@ -91,7 +94,8 @@ struct Server {
     resets: Resets,
     awaiting: Vec<(ActiveControl, Awaited)>,
     payload: Vec<u8>,
-    observers: (usize, usize),
+    /// Observers that were there at the last look.
+    observers: Vec<u128>,
     n_frames: u64,
     n_truths: u64,
     rate: Rate,
@@ -146,7 +150,7 @@ impl Server {
             resets,
             awaiting: Vec::new(),
             payload: Vec::new(),
-            observers: (0, 0),
+            observers: Vec::new(),
             n_frames: 0,
             n_truths: 0,
             rate: Rate {
@@ -243,6 +247,7 @@ impl Server {
             }
             Outcome::Shutdown => {
                 self.send_reply(&request, &Reply::Done);
+                wait_until_taken(&request);
                 tracing::info!(client = client.pid, "a client asked to shut down");
                 self.is_over = true;
             }
@@ -308,8 +313,8 @@ impl Server {
 
     /// Shows every world to observers that have just come.
     fn greet_observers(&mut self) {
-        let observers = self.ports.observers();
-        let has_new = observers.0 > self.observers.0 || observers.1 > self.observers.1;
+        let observers = self.ports.observer_ids();
+        let has_new = observers.iter().any(|id| !self.observers.contains(id));
         self.observers = observers;
         if has_new {
             self.ports.connect_observers();
@@ -390,6 +395,14 @@ impl Rate {
                 per_second,
             };
         }
+    }
+}
+
+/// Waits until a client has read its answer and let go of its request.
+fn wait_until_taken(request: &ActiveControl) {
+    let deadline = Instant::now() + FAREWELL;
+    while request.is_connected() && Instant::now() < deadline {
+        std::thread::sleep(Duration::from_millis(1));
     }
 }
 

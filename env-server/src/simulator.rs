@@ -56,8 +56,10 @@ enum Slot {
 /// An answer that waits until worlds have been reset.
 pub struct Awaited {
     worlds: Vec<usize>,
-    /// The lease to tell of; `None` tells of the worlds alone.
-    lease: Option<(u64, ClientId)>,
+    lease: u64,
+    client: ClientId,
+    /// Whether to tell of the lease, or of the worlds alone.
+    tells_lease: bool,
 }
 
 /// What the server itself knows and a status answer tells.
@@ -219,18 +221,21 @@ impl Simulator {
             .iter()
             .map(|&world| self.world_info(world))
             .collect();
-        let Some((token, client)) = awaited.lease else {
-            return Some(Reply::Reset { worlds });
-        };
         // Waiting is use: a burn-in longer than the lease must not end it.
-        Some(match self.leases.renew(now, token, client) {
-            Ok(lease) => Reply::Lease(LeaseInfo {
-                lease: token,
-                ttl_millis: lease.time_to_live.as_millis() as u64,
-                worlds,
-            }),
-            Err(lost) => refusal(lost),
-        })
+        self.leases.end_wait(now, awaited.lease);
+        if !awaited.tells_lease {
+            return Some(Reply::Reset { worlds });
+        }
+        Some(
+            match self.leases.renew(now, awaited.lease, awaited.client) {
+                Ok(lease) => Reply::Lease(LeaseInfo {
+                    lease: awaited.lease,
+                    ttl_millis: lease.time_to_live.as_millis() as u64,
+                    worlds,
+                }),
+                Err(lost) => refusal(lost),
+            },
+        )
     }
 
     /// The rules, for those who carry out resets.
@@ -421,20 +426,8 @@ impl Simulator {
                 )?
             }
             Request::Renew { lease } => {
-                let worlds = self
-                    .leases
-                    .renew(now, lease, client)
-                    .map_err(refusal)?
-                    .worlds
-                    .clone()
-                    .collect();
-                Outcome::Later(
-                    Vec::new(),
-                    Awaited {
-                        worlds,
-                        lease: Some((lease, client)),
-                    },
-                )
+                self.leases.renew(now, lease, client).map_err(refusal)?;
+                self.tell_lease(lease, client)
             }
             Request::Release { lease } => {
                 self.leases.release(now, lease, client).map_err(refusal)?;
@@ -453,20 +446,25 @@ impl Simulator {
 
     fn acquire(&mut self, now: Instant, claim: Claim) -> Result<Outcome, Reply> {
         let (token, client) = ((self.next_token)(), claim.client);
-        let worlds = self
-            .leases
-            .acquire(now, claim, token)
-            .map_err(refusal)?
-            .worlds
-            .clone()
-            .collect();
-        Ok(Outcome::Later(
-            Vec::new(),
-            Awaited {
-                worlds,
-                lease: Some((token, client)),
-            },
-        ))
+        self.leases.acquire(now, claim, token).map_err(refusal)?;
+        Ok(self.tell_lease(token, client))
+    }
+
+    /// An answer when its worlds are ready; the lease lives until then.
+    fn later(&mut self, orders: Vec<ResetOrder>, awaited: Awaited) -> Outcome {
+        self.leases.begin_wait(awaited.lease);
+        Outcome::Later(orders, awaited)
+    }
+
+    /// The worlds of a lease, once they are ready.
+    fn tell_lease(&mut self, lease: u64, client: ClientId) -> Outcome {
+        let awaited = Awaited {
+            worlds: self.leases.worlds_held(lease),
+            lease,
+            client,
+            tells_lease: true,
+        };
+        self.later(Vec::new(), awaited)
     }
 
     fn order_resets(
@@ -476,6 +474,9 @@ impl Simulator {
         lease: u64,
         worlds: &[WorldSeed],
     ) -> Result<Outcome, Reply> {
+        if worlds.is_empty() {
+            self.leases.renew(now, lease, client).map_err(refusal)?;
+        }
         for (index, WorldSeed { world, .. }) in worlds.iter().enumerate() {
             let range = self.range(*world, 1).map_err(refusal)?;
             self.leases
@@ -498,13 +499,13 @@ impl Simulator {
             .filter_map(|order| self.take_for_reset(order))
             .collect();
         let worlds = worlds.iter().map(|order| order.world as usize).collect();
-        Ok(Outcome::Later(
-            orders,
-            Awaited {
-                worlds,
-                lease: None,
-            },
-        ))
+        let awaited = Awaited {
+            worlds,
+            lease,
+            client,
+            tells_lease: false,
+        };
+        Ok(self.later(orders, awaited))
     }
 
     fn take_for_reset(&mut self, order: &WorldSeed) -> Option<ResetOrder> {

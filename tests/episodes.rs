@@ -1,0 +1,224 @@
+//! Resets, episode ends and coverage, as every client sees them.
+
+use crate::harness::{PATIENCE, SMALL, Server, eventually, fly, new_instance, reset};
+use crate::wire::{Wire, answer, control_header, step_header};
+use protocol::control::{Reply, Request, WorldInfo, WorldSeed};
+use protocol::message::{FLAG_FULL_COVERAGE, Operation, Status, StepRequest, split_step_payload};
+use protocol::{Connection, Coverage, Move, UNOBSERVED};
+use std::time::Duration;
+
+/// Moves of a path on a [`SMALL`] server.
+const N_MOVES: u32 = 6;
+
+/// Cells of a [`SMALL`] server.
+const N_CELLS: usize = 35;
+
+#[test]
+fn a_reset_starts_an_empty_frame_in_the_corner_and_answers_in_order() {
+    let server = Server::start(&format!("{SMALL} --worlds 3 --seed 7"));
+    let wire = Wire::open(&server.instance);
+    let lease = wire.acquire(0, 3);
+    assert_eq!(
+        lease.worlds.iter().map(|w| w.seed).collect::<Vec<_>>(),
+        [7, 8, 9]
+    );
+    let (lease, start) = (lease.lease, lease.worlds);
+    assert!(
+        start
+            .iter()
+            .all(|w| (w.step, w.episode, w.robot) == (0, 0, [0, 0]))
+    );
+    wire.step(step_header(lease, N_MOVES), &[3; 6]);
+    let order = |world, seed| WorldSeed { world, seed };
+    let worlds = vec![order(2, Some(0)), order(0, Some(u64::MAX))];
+    let Reply::Reset { worlds } = wire.ask(&Request::Reset { lease, worlds }) else {
+        panic!("expected a reset");
+    };
+    let expected = |world, seed| WorldInfo {
+        world,
+        step: 0,
+        seed,
+        episode: 1,
+        robot: [0, 0],
+    };
+    assert_eq!(worlds, [expected(2, 0), expected(0, u64::MAX)]);
+    let (result, frame) = server.observe(0);
+    assert_eq!(frame, vec![UNOBSERVED; N_CELLS]);
+    assert_eq!(
+        (result.coverage, result.reward, result.n_visited),
+        (Coverage::Empty as u32, 0.0, 0)
+    );
+}
+
+#[test]
+fn unseeded_resets_go_on_to_other_seeds_and_seeded_ones_repeat_every_byte() {
+    let server = Server::start(SMALL);
+    let mut client = server.acquire(0..1);
+    let unseeded = [WorldSeed {
+        world: 0,
+        seed: None,
+    }];
+    let seeds: Vec<u64> = (0..4)
+        .map(|_| client.reset(&unseeded).expect("reset")[0].seed)
+        .collect();
+    let mut distinct = seeds.clone();
+    distinct.sort_unstable();
+    distinct.dedup();
+    assert_eq!(distinct.len(), 4, "{seeds:?}");
+    assert!(
+        seeds.iter().all(|&seed| seed < 1 << 53 && seed != 0),
+        "{seeds:?}"
+    );
+    let mut run = |seed| {
+        reset(&mut client, seed);
+        let path = vec![
+            Move::Right,
+            Move::Down,
+            Move::Right,
+            Move::Down,
+            Move::Right,
+            Move::Up,
+        ];
+        let mut steps: Vec<_> = (0..20).map(|_| fly(&mut client, path.clone())).collect();
+        steps.iter_mut().for_each(|step| step.result.episode = 0);
+        steps
+    };
+    let (first, other, again) = (run(3), run(4), run(3));
+    assert_eq!(first, again);
+    assert_ne!(first, other);
+}
+
+#[test]
+fn an_episode_is_over_at_max_steps_until_it_is_reset() {
+    let server = Server::start(&format!("{SMALL} --max-steps 3 --worlds 2"));
+    let wire = Wire::open(&server.instance);
+    let lease = wire.acquire(0, 2).lease;
+    let step = || wire.step(step_header(lease, N_MOVES), &[3; 6]);
+    for k in 1..=3 {
+        let (reply, payload) = step();
+        let (results, _) = split_step_payload(&reply, &payload).expect("a whole payload");
+        let (truncated, terminated) = (results[0].truncated, results[0].terminated);
+        assert_eq!(
+            (results[0].step, truncated, terminated),
+            (k, u16::from(k == 3), 0)
+        );
+    }
+    let (reply, _) = step();
+    assert_eq!(
+        (Status::try_from(reply.status), reply.detail),
+        (Ok(Status::EpisodeOver), 0)
+    );
+    let both = StepRequest {
+        n_worlds: 2,
+        ..step_header(lease, N_MOVES)
+    };
+    let (reply, _) = wire.step(both, &[3; 12]);
+    assert_eq!(
+        (Status::try_from(reply.status), reply.detail),
+        (Ok(Status::EpisodeOver), 0)
+    );
+    assert_eq!(
+        server.status().worlds[1].info.step,
+        0,
+        "its neighbour was not stepped"
+    );
+    let worlds = vec![WorldSeed {
+        world: 0,
+        seed: None,
+    }];
+    wire.ask(&Request::Reset { lease, worlds });
+    assert_eq!(step().0.status, Status::Ok as u32);
+}
+
+#[test]
+fn coverage_is_what_the_server_says() {
+    for (rule, asks, expected) in [
+        ("path", false, Ok(Coverage::Path)),
+        ("path", true, Err(Status::NotPermitted)),
+        ("full", false, Ok(Coverage::Full)),
+        ("full", true, Ok(Coverage::Full)),
+        ("client", false, Ok(Coverage::Path)),
+        ("client", true, Ok(Coverage::Full)),
+    ] {
+        let server = Server::start(&format!("{SMALL} --coverage {rule}"));
+        let wire = Wire::open(&server.instance);
+        let header = StepRequest {
+            flags: u32::from(asks) * FLAG_FULL_COVERAGE,
+            ..step_header(wire.acquire(0, 1).lease, N_MOVES)
+        };
+        let (reply, payload) = wire.step(header, &[3, 3, 3, 1, 1, 2]);
+        let coverage = match expected {
+            Ok(coverage) => coverage,
+            Err(status) => {
+                assert_eq!(Status::try_from(reply.status), Ok(status), "{rule} {asks}");
+                continue;
+            }
+        };
+        let (results, frame) = split_step_payload(&reply, &payload).expect("a whole payload");
+        let n_seen = frame.iter().filter(|&&value| value != UNOBSERVED).count();
+        let n_cells = if coverage == Coverage::Full {
+            N_CELLS
+        } else {
+            6
+        };
+        let result = results[0];
+        assert_eq!(
+            (result.coverage, n_seen),
+            (coverage as u32, n_cells),
+            "{rule} {asks}"
+        );
+        assert_eq!(
+            result.n_visited, 6,
+            "a full frame does not change what is visited"
+        );
+    }
+}
+
+#[test]
+fn a_world_in_burn_in_is_resetting_and_answers_when_it_is_done() {
+    let server = Server::start_without_waiting(
+        &new_instance(),
+        &[
+            "--height",
+            "32",
+            "--width",
+            "32",
+            "--moves",
+            "6",
+            "--burn-in",
+            "60000",
+            "--worlds",
+            "1",
+        ],
+    );
+    let up = eventually(PATIENCE, || {
+        Connection::open(&server.instance, "tests", PATIENCE).is_ok()
+    });
+    assert!(up, "{}", server.program.stderr());
+    let wire = Wire::open(&server.instance);
+    let observe = StepRequest {
+        operation: Operation::Observe as u32,
+        ..step_header(0, 0)
+    };
+    assert_eq!(wire.step(observe, &[]).0.status, Status::Resetting as u32);
+    assert!(server.status().worlds[0].resetting);
+    let lease = wire.acquire(0, 1).lease;
+    assert!(
+        !server.status().worlds[0].resetting,
+        "acquiring waits for burn-in"
+    );
+    let worlds = vec![WorldSeed {
+        world: 0,
+        seed: Some(5),
+    }];
+    let text = serde_json::to_vec(&Request::Reset { lease, worlds }).expect("serialises");
+    let pending = wire.send_control(control_header(1), &text).expect("send");
+    let (reply, _) = wire.step(step_header(lease, N_MOVES), &[0; 6]);
+    let resetting = eventually(Duration::from_secs(1), || {
+        server.status().worlds[0].resetting || reply.status == Status::Resetting as u32
+    });
+    assert!(resetting, "{reply:?}");
+    let (header, _) = answer(&pending, PATIENCE).expect("an answer after burn-in");
+    assert_eq!(header.status, Status::Ok as u32);
+    assert_eq!(server.status().worlds[0].info.seed, 5);
+}

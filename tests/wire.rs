@@ -1,0 +1,175 @@
+//! The protocol byte by byte: headers and payloads as a client of another language, or a hostile
+//! one, sends them. Nothing is filled in and nothing is checked.
+
+use crate::harness::PATIENCE;
+use iceoryx2::node::Node;
+use iceoryx2::pending_response::PendingResponse;
+use iceoryx2::port::client::{Client, RequestSendError};
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::prelude::AllocationStrategy;
+use protocol::channels::{
+    Channel, ChannelError, Instance, Ipc, RequestResponse, Services, create_node, ipc_error,
+};
+use protocol::control::{LeaseInfo, Reply, Request};
+use protocol::message::{
+    ControlReply, ControlRequest, Header, Operation, Status, StepReply, StepRequest, VERSION,
+};
+use protocol::wait::poll_then_block;
+use std::time::Duration;
+
+/// An answer to a step: header and payload.
+pub type StepAnswer = (StepReply, Vec<u8>);
+
+/// An answer to a control request: header and payload.
+pub type ControlAnswer = (ControlReply, Vec<u8>);
+
+/// A request that waits for its answer.
+pub type Pending<Q, R> = PendingResponse<Ipc, [u8], Q, [u8], R>;
+
+/// A client without manners.
+pub struct Wire {
+    step: Client<Ipc, [u8], StepRequest, [u8], StepReply>,
+    control: Client<Ipc, [u8], ControlRequest, [u8], ControlReply>,
+    server: Notifier<Ipc>,
+    _node: Node<Ipc>,
+}
+
+impl Wire {
+    /// Opens both channels of an instance, without a handshake.
+    pub fn open(instance: &Instance) -> Self {
+        Self::try_open(instance).expect("open the channels")
+    }
+
+    /// As [`Self::open`], where it may fail.
+    pub fn try_open(instance: &Instance) -> Result<Self, ChannelError> {
+        let node = create_node()?;
+        let services = Services {
+            node: &node,
+            instance,
+        };
+        let step = client(&services.open_step()?)?;
+        let control = client(&services.open_control()?)?;
+        let wake = services.wake(Channel::WakeServer)?;
+        let server = wake.notifier_builder().create();
+        Ok(Self {
+            step,
+            control,
+            server: server.map_err(ipc_error("create a notifier"))?,
+            _node: node,
+        })
+    }
+
+    /// Sends a step request.
+    pub fn send_step(
+        &self,
+        header: StepRequest,
+        payload: &[u8],
+    ) -> Result<Pending<StepRequest, StepReply>, RequestSendError> {
+        let pending = send(&self.step, header, payload)?;
+        self.server.notify().expect("wake the server");
+        Ok(pending)
+    }
+
+    /// Sends a control request.
+    pub fn send_control(
+        &self,
+        header: ControlRequest,
+        payload: &[u8],
+    ) -> Result<Pending<ControlRequest, ControlReply>, RequestSendError> {
+        let pending = send(&self.control, header, payload)?;
+        self.server.notify().expect("wake the server");
+        Ok(pending)
+    }
+
+    /// Sends a step request and waits for its answer.
+    pub fn step(&self, header: StepRequest, payload: &[u8]) -> StepAnswer {
+        let pending = self.send_step(header, payload).expect("send a step");
+        answer(&pending, PATIENCE).expect("an answer to a step")
+    }
+
+    /// Sends bytes on `control` and waits for the answer.
+    pub fn control(&self, header: ControlRequest, payload: &[u8]) -> ControlAnswer {
+        let pending = self.send_control(header, payload).expect("send a request");
+        answer(&pending, PATIENCE).expect("an answer on control")
+    }
+
+    /// Sends a well-formed control request; the status in the header must be the reply's.
+    pub fn ask(&self, request: &Request) -> Reply {
+        let text = serde_json::to_vec(request).expect("requests serialise");
+        let (header, payload) = self.control(control_header(7), &text);
+        assert_eq!((header.version, header.sequence), (VERSION, 7));
+        let reply: Reply = serde_json::from_slice(&payload).expect("a reply");
+        assert_eq!(Status::try_from(header.status), Ok(reply.status()));
+        reply
+    }
+
+    /// Acquires worlds.
+    pub fn acquire(&self, first_world: u32, n_worlds: u32) -> LeaseInfo {
+        let request = Request::Acquire {
+            first_world,
+            n_worlds,
+            takeover: false,
+            ttl_millis: None,
+        };
+        match self.ask(&request) {
+            Reply::Lease(lease) => lease,
+            other => panic!("expected a lease, got {other:?}"),
+        }
+    }
+}
+
+/// The header of a correct step of world 0.
+pub fn step_header(lease: u64, n_moves: u32) -> StepRequest {
+    StepRequest {
+        version: VERSION,
+        operation: Operation::Step as u32,
+        lease,
+        sequence: 1,
+        n_worlds: 1,
+        n_moves,
+        ..StepRequest::default()
+    }
+}
+
+/// The header of a correct control request.
+pub fn control_header(sequence: u64) -> ControlRequest {
+    ControlRequest {
+        version: VERSION,
+        sequence,
+        ..ControlRequest::default()
+    }
+}
+
+/// Waits for an answer; `None` if none comes in time.
+pub fn answer<Q: Header, R: Header>(
+    pending: &Pending<Q, R>,
+    limit: Duration,
+) -> Option<(R, Vec<u8>)> {
+    let poll = || {
+        let response = pending.receive()?;
+        Ok(response.map(|response| (*response.user_header(), response.payload().to_vec())))
+    };
+    let block = |remaining: Duration| {
+        std::thread::sleep(remaining.min(Duration::from_micros(100)));
+        Ok::<_, iceoryx2::port::ReceiveError>(())
+    };
+    poll_then_block(limit, poll, block).expect("receive an answer")
+}
+
+fn client<Q: Header, R: Header>(
+    service: &RequestResponse<Q, R>,
+) -> Result<Client<Ipc, [u8], Q, [u8], R>, ChannelError> {
+    let builder = service.client_builder().initial_max_slice_len(4096);
+    let builder = builder.allocation_strategy(AllocationStrategy::PowerOfTwo);
+    builder.create().map_err(ipc_error("create a client"))
+}
+
+fn send<Q: Header, R: Header>(
+    client: &Client<Ipc, [u8], Q, [u8], R>,
+    header: Q,
+    payload: &[u8],
+) -> Result<Pending<Q, R>, RequestSendError> {
+    let mut request = client.loan_slice_uninit(payload.len())?;
+    *request.user_header_mut() = header;
+    request.write_from_slice(payload).send()
+}
