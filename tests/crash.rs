@@ -1,1 +1,259 @@
-//! .
+//! Agents that are killed or stopped in the middle of a step: the world stays exactly where it was.
+
+use crate::harness::{
+    PATIENCE, Paths, Program, Server, claim, eventually, fly, frames_until, status,
+};
+use crate::wire::{Wire, answer, step_header};
+use agent::client::{Client, Observation};
+use protocol::channels::Instance;
+use protocol::control::Request;
+use protocol::message::{FrameHeader, StepRequest, split_step_payload};
+use protocol::observer::{Observer, Sample};
+use protocol::path::path_from_bytes;
+use protocol::{Connection, Move};
+use rustix::process::Signal;
+use std::time::{Duration, Instant};
+
+/// A grid on which planning takes most of a step.
+const FLAGS: &str = "--height 12 --width 9 --moves 8 --burn-in 50";
+
+/// Cells of that grid.
+const N_CELLS: usize = 12 * 9;
+
+/// Noticing a dead holder must take less.
+const NOTICE: Duration = Duration::from_millis(100);
+
+/// An agent that acts without end, some tens of milliseconds a step.
+fn start_agent(instance: &Instance, flags: &[&str]) -> Program {
+    let common = ["run", "--instance", instance.name(), "--policy", "coverage"];
+    let slow = ["--shooting-samples", "100000"];
+    Program::start(
+        "emberwatch-agent",
+        &[&common[..], &slow[..], flags].concat(),
+    )
+}
+
+fn holder(server: &Server) -> Option<u32> {
+    server.status().worlds[0].holder_pid
+}
+
+/// Acquires as soon as the dead holder is noticed; returns how long that took from the kill.
+fn acquire_after(kill: Instant, connection: &mut Connection) -> Duration {
+    let request = Request::Acquire {
+        first_world: 0,
+        n_worlds: 1,
+        takeover: false,
+        ttl_millis: Some(100),
+    };
+    assert!(eventually(PATIENCE, || connection
+        .control(&request, PATIENCE)
+        .is_ok()));
+    kill.elapsed()
+}
+
+/// What a published frame says, as an answer to a step would.
+fn published(sample: &Sample<FrameHeader>) -> (Vec<u8>, Vec<Move>) {
+    let (frame, path) = sample.payload.split_at(N_CELLS);
+    (frame.to_vec(), path_from_bytes(path).expect("a path"))
+}
+
+#[test]
+fn a_killed_agents_world_is_free_at_once_and_goes_on_as_if_nothing_had_been() {
+    let server = Server::start(FLAGS);
+    let observer = Observer::frames(&server.instance).expect("observe");
+    let mut frames = frames_until(&observer, 0, 0);
+    let mut noticed = Vec::new();
+    for round in 1..=3 {
+        let mut next = server.connect();
+        let agent = start_agent(&server.instance, &[]);
+        frames.extend(frames_until(&observer, 0, 4 * round));
+        let kill = Instant::now();
+        agent.signal(Signal::KILL);
+        noticed.push(acquire_after(kill, &mut next));
+        while let Some(frame) = observer.try_receive().expect("receive") {
+            frames.push(frame);
+        }
+        let (result, frame) = server.observe(0);
+        let last = frames.last().expect("a frame");
+        assert_eq!((result, frame), (last.header.result, published(last).0));
+        assert!(
+            eventually(PATIENCE, || holder(&server).is_none()),
+            "our lease of 0.1 s ends"
+        );
+    }
+    noticed.sort_unstable();
+    assert!(noticed[1] < NOTICE, "median of {noticed:?}");
+    let mut survivor = server.acquire(0..1);
+    let mut undisturbed = replay(&frames);
+    for path in Paths::new(5).take(8, 10) {
+        assert_eq!(
+            fly(&mut survivor, path.clone()),
+            fly(&mut undisturbed.1, path)
+        );
+    }
+}
+
+/// Flies the published paths on a new server of the same seed, where nothing is killed.
+fn replay(frames: &[Sample<FrameHeader>]) -> (Server, Client) {
+    let server = Server::start(FLAGS);
+    let mut client = server.acquire(0..1);
+    let flown: Vec<_> = frames
+        .iter()
+        .filter(|frame| frame.header.n_moves > 0)
+        .collect();
+    for (index, sample) in flown.iter().enumerate() {
+        let (frame, path) = published(sample);
+        assert_eq!(
+            sample.header.result.step,
+            index as u64 + 1,
+            "a frame was missed"
+        );
+        let Observation {
+            result,
+            frame: seen,
+        } = fly(&mut client, path);
+        assert_eq!((result, seen.as_bytes()), (sample.header.result, &*frame));
+    }
+    (server, client)
+}
+
+#[test]
+fn a_stopped_agent_loses_its_lease_and_says_so_when_it_wakes() {
+    let server = Server::start(&format!("{FLAGS} --lease-millis 500"));
+    let agent = start_agent(&server.instance, &[]);
+    assert!(
+        eventually(PATIENCE, || holder(&server) == Some(agent.pid())),
+        "{}",
+        agent.stderr()
+    );
+    agent.signal(Signal::STOP);
+    let stop = Instant::now();
+    assert!(eventually(PATIENCE, || holder(&server).is_none()));
+    assert!(
+        stop.elapsed() < Duration::from_secs(2),
+        "{:?}",
+        stop.elapsed()
+    );
+    let mut next = server.acquire(0..1);
+    let before = next.observe(0..1).expect("observe");
+    agent.signal(Signal::CONT);
+    let ended = agent.wait(PATIENCE);
+    assert_eq!(ended.code, Some(3), "{}", ended.stderr);
+    let expected = format!("lease lost to pid {}", std::process::id());
+    assert!(ended.stderr.contains(&expected), "{}", ended.stderr);
+    assert_eq!(
+        next.observe(0..1).expect("observe"),
+        before,
+        "it stepped nothing"
+    );
+}
+
+#[test]
+fn an_agent_whose_world_is_taken_over_ends_with_code_3() {
+    let server = Server::start(FLAGS);
+    let first = start_agent(&server.instance, &[]);
+    assert!(
+        eventually(PATIENCE, || holder(&server) == Some(first.pid())),
+        "{}",
+        first.stderr()
+    );
+    let refused = start_agent(&server.instance, &[]).wait(PATIENCE);
+    assert_eq!(refused.code, Some(1));
+    let words = format!("busy: held by pid {}", first.pid());
+    assert!(refused.stderr.contains(&words), "{}", refused.stderr);
+    let second = start_agent(&server.instance, &["--takeover"]);
+    let ended = first.wait(PATIENCE);
+    assert_eq!(ended.code, Some(3), "{}", ended.stderr);
+    let words = format!("lease lost to pid {}", second.pid());
+    assert!(ended.stderr.contains(&words), "{}", ended.stderr);
+    second.signal(Signal::TERM);
+    let ended = second.wait(PATIENCE);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert_eq!(
+        holder(&server),
+        None,
+        "an agent that is told to stop releases its world"
+    );
+}
+
+#[test]
+fn agents_killed_one_after_the_other_change_no_world_and_use_up_no_limit() {
+    let flags = format!("{FLAGS} --coverage full");
+    let (server, undisturbed) = (Server::start(&flags), Server::start(&flags));
+    let mut before = 0;
+    for _ in 0..20 {
+        let flags = [
+            "run",
+            "--instance",
+            server.instance.name(),
+            "--policy",
+            "random_walk",
+        ];
+        let agent = Program::start("emberwatch-agent", &[&flags[..], &["--takeover"]].concat());
+        let acts = || server.observe(0).0.step > before;
+        assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
+        agent.signal(Signal::KILL);
+        agent.wait(PATIENCE);
+        before = server.observe(0).0.step;
+    }
+    let (result, frame) = server.observe(0);
+    assert_eq!(result.step, before);
+    let mut client = undisturbed.acquire(0..1);
+    for path in Paths::new(0).take(8, before as usize - 1) {
+        fly(&mut client, path);
+    }
+    let last = fly(&mut client, Paths::new(1).next(8));
+    assert_eq!(
+        (last.result.step, last.frame.as_bytes()),
+        (before, &*frame),
+        "a function of k"
+    );
+    let clients: Vec<_> = (0..16).map(|_| server.connect()).collect();
+    assert_eq!(clients.len(), 16);
+}
+
+#[test]
+fn a_step_whose_client_gave_up_waiting_is_made_once_and_its_answer_taken_for_no_other() {
+    let server = Server::start(FLAGS);
+    let wire = Wire::open(&server.instance);
+    let lease = wire.acquire(0, 1).lease;
+    server.program.signal(Signal::STOP);
+    let header = |sequence| StepRequest {
+        sequence,
+        ..step_header(lease, 8)
+    };
+    let pending = wire.send_step(header(1), &[3; 8]).expect("send");
+    assert!(
+        answer(&pending, Duration::from_millis(50)).is_none(),
+        "the server is stopped"
+    );
+    drop(pending);
+    server.program.signal(Signal::CONT);
+    for sequence in 2..10 {
+        let (reply, payload) = wire.step(header(sequence), &[1; 8]);
+        assert_eq!((reply.status, reply.sequence), (0, sequence));
+        let (results, _) = split_step_payload(&reply, &payload).expect("a whole payload");
+        assert!(
+            [sequence - 1, sequence].contains(&results[0].step),
+            "{:?}",
+            results[0]
+        );
+    }
+}
+
+#[test]
+fn the_private_server_of_a_comparison_ends_with_it() {
+    let flags = "compare --seeds 0..1 --steps 1000000 --height 5 --width 5 --moves 4 --burn-in 5 \
+                 --policies random_walk,coverage --baseline random_walk";
+    for signal in [Signal::KILL, Signal::INT] {
+        let flags: Vec<&str> = flags.split_whitespace().collect();
+        let agent = Program::start("emberwatch-agent", &flags);
+        let instance = Instance::new(&format!("private-{}", agent.pid())).expect("a plain name");
+        let acts = || status(&instance).is_ok_and(|status| status.n_steps > 10);
+        assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
+        agent.signal(signal);
+        agent.wait(PATIENCE);
+        let gone = || Client::acquire(&instance, &claim(0..1)).is_err();
+        assert!(eventually(Duration::from_secs(1), gone), "after {signal:?}");
+    }
+}

@@ -1,1 +1,152 @@
-//! .
+//! A world is a function of model, seed and k: nothing beside it, before it or around it counts.
+
+use crate::harness::{PATIENCE, Paths, Server, claim, fly, reset, takeover};
+use agent::client::{Client, Observation};
+use protocol::Move;
+use protocol::observer::Observer;
+
+/// Seeds, one world each.
+const N_SEEDS: u32 = 8;
+
+/// Steps flown on each world.
+const N_STEPS: usize = 12;
+
+/// Moves of a path.
+const N_MOVES: usize = 10;
+
+/// A grid on which a batch takes one thread.
+const SMALL: &str = "--height 9 --width 14 --burn-in 200";
+
+/// 8 x 128 x 128 cells: the size from which on a batch is stepped by several threads.
+const LARGE: &str = "--height 128 --width 128 --burn-in 3";
+
+/// What a world showed, step by step.
+type Trajectory = Vec<Observation>;
+
+fn start(flags: &str) -> Server {
+    Server::start(&format!("--moves 10 {flags}"))
+}
+
+fn paths(seed: u64) -> Vec<Vec<Move>> {
+    Paths::new(seed).take(N_MOVES, N_STEPS)
+}
+
+fn without_episode(mut observation: Observation) -> Observation {
+    observation.result.episode = 0;
+    observation
+}
+
+/// One world after the other on a server of one world, thread and client, and nobody looking.
+fn reference(size: &str) -> Vec<Trajectory> {
+    let server = start(&format!("{size} --worlds 1 --threads 1"));
+    let mut client = server.acquire(0..1);
+    (0..u64::from(N_SEEDS))
+        .map(|seed| {
+            reset(&mut client, seed);
+            let flights = paths(seed).into_iter();
+            flights
+                .map(|path| without_episode(fly(&mut client, path)))
+                .collect()
+        })
+        .collect()
+}
+
+/// All worlds at once.
+fn batches(client: &mut Client, steps: std::ops::Range<usize>, trajectories: &mut [Trajectory]) {
+    let all: Vec<Vec<Vec<Move>>> = (0..u64::from(N_SEEDS)).map(paths).collect();
+    for step in steps {
+        let batch: Vec<Vec<Move>> = all.iter().map(|paths| paths[step].clone()).collect();
+        let answer = client.step(0..N_SEEDS, &batch).expect("step");
+        for (trajectory, observation) in trajectories.iter_mut().zip(answer) {
+            trajectory.push(without_episode(observation));
+        }
+    }
+}
+
+fn check_batches(size: &str, flags: &str, n_observers: usize, expected: &[Trajectory]) {
+    let server = start(&format!("{size} --worlds {N_SEEDS} {flags}"));
+    let observers: Vec<_> = (0..n_observers)
+        .map(|_| Observer::frames(&server.instance).expect("observe"))
+        .collect();
+    let mut trajectories = vec![Vec::new(); N_SEEDS as usize];
+    batches(
+        &mut server.acquire(0..N_SEEDS),
+        0..N_STEPS,
+        &mut trajectories,
+    );
+    assert!(
+        trajectories == expected,
+        "{size} {flags}, {n_observers} observers"
+    );
+    for observer in observers {
+        assert!(observer.receive(PATIENCE).expect("receive").is_some());
+    }
+}
+
+#[test]
+fn worlds_do_not_depend_on_worlds_beside_them_observers_or_threads() {
+    let expected = reference(SMALL);
+    assert!(expected[0] != expected[1], "seeds tell worlds apart");
+    check_batches(SMALL, "--threads 1", 0, &expected);
+    check_batches(SMALL, "--threads 2 --publish-truth", 3, &expected);
+    let expected = reference(LARGE);
+    check_batches(LARGE, "--threads 1", 0, &expected);
+    check_batches(LARGE, "--threads 2", 3, &expected);
+}
+
+#[test]
+fn a_batch_equals_single_steps_in_any_order() {
+    let flags = format!("{SMALL} --worlds {N_SEEDS}");
+    let (together, apart) = (start(&flags), start(&flags));
+    let mut trajectories = vec![Vec::new(); N_SEEDS as usize];
+    batches(
+        &mut together.acquire(0..N_SEEDS),
+        0..N_STEPS,
+        &mut trajectories,
+    );
+    let mut client = apart.acquire(0..N_SEEDS);
+    for world in (0..N_SEEDS).rev() {
+        for (path, expected) in paths(world.into())
+            .iter()
+            .zip(&trajectories[world as usize])
+        {
+            let path = std::slice::from_ref(path);
+            let answer = client.step(world..world + 1, path).expect("step");
+            assert_eq!(answer, std::slice::from_ref(expected), "world {world}");
+        }
+    }
+}
+
+#[test]
+fn worlds_do_not_notice_who_acts_on_them() {
+    let expected = reference(SMALL);
+    let server = start(&format!("{SMALL} --worlds {N_SEEDS}"));
+    let mut trajectories = vec![Vec::new(); N_SEEDS as usize];
+    let mut first = server.acquire(0..N_SEEDS);
+    batches(&mut first, 0..4, &mut trajectories);
+    first.release().expect("release");
+    let mut second = server.acquire(0..N_SEEDS);
+    let claimed = Client::acquire(&server.instance, &claim(0..1));
+    assert!(claimed.is_err(), "a refused claim in between");
+    batches(&mut second, 4..8, &mut trajectories);
+    let mut third = Client::acquire(&server.instance, &takeover(0..N_SEEDS)).expect("take over");
+    let stale = second.step(0..1, &paths(99)[..1]);
+    assert!(stale.is_err(), "a lost lease steps nothing");
+    batches(&mut third, 8..N_STEPS, &mut trajectories);
+    assert!(trajectories == expected);
+}
+
+#[test]
+fn random_starts_and_paths_far_apart_leave_the_world_the_same() {
+    let flags = &format!("{SMALL} --coverage full");
+    let (corner, random) = (start(flags), start(&format!("{flags} --start random")));
+    let (mut one, mut other) = (corner.acquire(0..1), random.acquire(0..1));
+    for (mine, theirs) in paths(1).into_iter().zip(paths(2)) {
+        let (mine, theirs) = (fly(&mut one, mine), fly(&mut other, theirs));
+        assert_eq!(
+            mine.frame, theirs.frame,
+            "full frames show the world and its noise"
+        );
+        assert_eq!(mine.result.n_target_cells, theirs.result.n_target_cells);
+    }
+}

@@ -260,6 +260,11 @@ impl Paths {
         let moves = (0..n_moves).map(|_| Move::from_low_bits(self.0.random()));
         moves.collect()
     }
+
+    /// The next paths.
+    pub fn take(&mut self, n_moves: usize, n_paths: usize) -> Vec<Vec<Move>> {
+        (0..n_paths).map(|_| self.next(n_moves)).collect()
+    }
 }
 
 /// Starts world 0 and its neighbours anew with consecutive seeds.

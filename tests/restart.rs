@@ -1,1 +1,202 @@
-//! .
+//! Servers that end: by signal, by kill, and what their agents and successors make of it.
+
+use crate::harness::{
+    PATIENCE, Paths, Program, SMALL, Server, eventually, fly, new_instance, reset,
+};
+use iceoryx2::prelude::{CallbackProgression, Service};
+use protocol::channels::{Instance, Ipc, node_config};
+use protocol::connection::ConnectionError;
+use protocol::control::Request;
+use protocol::observer::Observer;
+use rustix::process::Signal;
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+fn start_agent(instance: &Instance) -> Program {
+    let flags = [
+        "run",
+        "--instance",
+        instance.name(),
+        "--policy",
+        "random_walk",
+    ];
+    Program::start("emberwatch-agent", &flags)
+}
+
+fn is_held_by(server: &Server, agent: &Program) -> bool {
+    server.status().worlds[0].holder_pid == Some(agent.pid())
+}
+
+#[test]
+fn an_agent_says_that_its_server_is_gone_and_goes_on_with_the_next() {
+    let instance = new_instance();
+    let server = Server::start_on(&instance, SMALL);
+    let agent = start_agent(&instance);
+    let acts = |server: &Server| is_held_by(server, &agent) && server.status().n_steps > 0;
+    assert!(eventually(PATIENCE, || acts(&server)), "{}", agent.stderr());
+    server.kill();
+    agent.wait_for_words(
+        "is gone; waiting for it to come back",
+        Duration::from_secs(1),
+    );
+    let server = Server::start_on(&instance, SMALL);
+    assert!(eventually(PATIENCE, || acts(&server)), "{}", agent.stderr());
+    let stopped = crate::harness::run(
+        "emberwatch-server",
+        &["stop", "--instance", instance.name()],
+        PATIENCE,
+    );
+    assert_eq!(stopped.code, Some(0), "{}", stopped.stderr);
+    agent.signal(Signal::TERM);
+    let ended = agent.wait(PATIENCE);
+    assert_eq!(
+        ended.code,
+        Some(0),
+        "an agent without a server stops when told: {}",
+        ended.stderr
+    );
+}
+
+#[test]
+fn an_agent_outlives_a_pause_of_its_server() {
+    let server = Server::start(SMALL);
+    let agent = start_agent(&server.instance);
+    assert!(
+        eventually(PATIENCE, || is_held_by(&server, &agent)),
+        "{}",
+        agent.stderr()
+    );
+    server.program.signal(Signal::STOP);
+    agent.wait_for_words("no answer to step", PATIENCE);
+    server.program.signal(Signal::CONT);
+    let before = server.status().n_steps;
+    let acts = || server.status().n_steps > before + 10;
+    assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
+    assert!(is_held_by(&server, &agent));
+}
+
+#[test]
+fn a_server_takes_the_place_of_a_killed_one_whose_client_stays() {
+    let instance = new_instance();
+    let first = Server::start_on(&instance, SMALL);
+    let mut client = first.acquire(0..1);
+    let step = fly(&mut client, Paths::new(0).next(6));
+    first.kill();
+    let second = Server::start_on(&instance, SMALL);
+    let refused = client.step(0..1, &[Paths::new(0).next(6)]);
+    assert!(
+        matches!(
+            refused,
+            Err(ConnectionError::ServerGone { .. } | ConnectionError::Refused { .. })
+        ),
+        "{refused:?}"
+    );
+    let mut next = second.acquire(0..1);
+    assert_eq!(
+        fly(&mut next, Paths::new(0).next(6)),
+        step,
+        "a new server starts from its seed"
+    );
+}
+
+#[test]
+fn a_client_that_waits_learns_at_once_that_its_server_was_killed() {
+    let flags = ["--height", "64", "--width", "64", "--burn-in", "0"];
+    let instance = new_instance();
+    let server = Server::start_with(&instance, &flags);
+    let mut connection = server.connect();
+    server.program.signal(Signal::STOP);
+    let waiting = std::thread::scope(|scope| {
+        let killer = scope.spawn(|| {
+            server.program.signal(Signal::KILL);
+            Instant::now()
+        });
+        let refused = connection.control(&Request::Status, PATIENCE);
+        assert!(
+            matches!(refused, Err(ConnectionError::ServerGone { .. })),
+            "{refused:?}"
+        );
+        killer.join().expect("the killing thread").elapsed()
+    });
+    assert!(waiting < Duration::from_secs(1), "{waiting:?}");
+}
+
+#[test]
+fn a_signal_ends_a_server_with_code_0() {
+    for (signal, burn_in) in [
+        (Signal::TERM, 0),
+        (Signal::INT, 0),
+        (Signal::TERM, 1u64 << 40),
+    ] {
+        let burn_in = burn_in.to_string();
+        let flags = ["--height", "40", "--width", "40", "--burn-in", &burn_in];
+        let server = Server::start_without_waiting(&new_instance(), &flags);
+        server.program.wait_for_words("serving", PATIENCE);
+        let agent = start_agent(&server.instance);
+        let attached = || server.status().n_clients > 1;
+        assert!(eventually(PATIENCE, attached), "{}", agent.stderr());
+        server.program.signal(signal);
+        let ended = server.program.wait(Duration::from_secs(1));
+        assert_eq!(ended.code, Some(0), "{signal:?}: {}", ended.stderr);
+    }
+}
+
+#[test]
+fn a_clean_stop_leaves_nothing_behind() {
+    let server = Server::start(&format!("{SMALL} --publish-truth --worlds 2"));
+    let instance = server.instance.clone();
+    let observer = Observer::frames(&instance).expect("observe");
+    let agent = start_agent(&instance);
+    assert!(
+        eventually(PATIENCE, || is_held_by(&server, &agent)),
+        "{}",
+        agent.stderr()
+    );
+    let mut client = server.acquire(1..2);
+    reset(&mut client, 3);
+    fly(&mut client, Paths::new(0).next(6));
+    let files = shared_files(&[server.program.pid(), agent.pid()]);
+    assert!(files.len() > 5, "{files:?}");
+    client.release().expect("release");
+    agent.signal(Signal::TERM);
+    assert_eq!(agent.wait(PATIENCE).code, Some(0));
+    drop(observer);
+    server.program.signal(Signal::TERM);
+    assert_eq!(server.program.wait(PATIENCE).code, Some(0));
+    let left: Vec<_> = files
+        .iter()
+        .filter_map(|path| Some((path, path.metadata().ok()?.len())))
+        .filter(|(_, length)| *length > 16)
+        .collect();
+    assert!(left.is_empty(), "{left:?}");
+    assert_eq!(services(&instance), Vec::<String>::new());
+}
+
+/// The files in shared memory that processes have mapped.
+fn shared_files(pids: &[u32]) -> BTreeSet<PathBuf> {
+    let maps = pids.iter().map(|pid| {
+        std::fs::read_to_string(format!("/proc/{pid}/maps")).expect("the process's maps")
+    });
+    let maps: String = maps.collect();
+    let paths = maps
+        .lines()
+        .filter_map(|line| line.split_whitespace().nth(5));
+    let shared = paths.filter(|path| path.starts_with("/dev/shm/"));
+    shared.map(PathBuf::from).collect()
+}
+
+/// The names of the instance's services that iceoryx2 still knows.
+fn services(instance: &Instance) -> Vec<String> {
+    let mut names = Vec::new();
+    let config = node_config().expect("the configuration");
+    let list = Ipc::list(&config, |details| {
+        let name = details.static_details.name().to_string();
+        if name.contains(&format!("/{}/", instance.name())) {
+            names.push(name);
+        }
+        CallbackProgression::Continue
+    });
+    list.expect("list the services");
+    names
+}

@@ -3,6 +3,7 @@
 use crate::config::Checked;
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::node::Node;
+use iceoryx2::port::ReceiveError;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::{ListenerKey, Notifier};
 use iceoryx2::port::publisher::Publisher;
@@ -160,23 +161,13 @@ impl Ports {
     }
 
     /// The next step request.
-    ///
-    /// # Errors
-    /// [`ChannelError::Ipc`].
-    pub fn receive_step(&self) -> Result<Option<ActiveStep>, ChannelError> {
-        self.step
-            .receive()
-            .map_err(ipc_error("receive a step request"))
+    pub fn receive_step(&self) -> Option<ActiveStep> {
+        received(self.step.receive())
     }
 
     /// The next control request.
-    ///
-    /// # Errors
-    /// [`ChannelError::Ipc`].
-    pub fn receive_control(&self) -> Result<Option<ActiveControl>, ChannelError> {
-        self.control
-            .receive()
-            .map_err(ipc_error("receive a control request"))
+    pub fn receive_control(&self) -> Option<ActiveControl> {
+        received(self.control.receive())
     }
 
     /// Sends an answer and wakes its client. A client that is gone or that holds back its answers
@@ -320,6 +311,15 @@ impl Ports {
             CallbackProgression::Stop
         });
     }
+}
+
+/// What was received. A failure is the affair of the client behind it, whose other requests wait for
+/// an answer still or whose memory is gone: it must not be the end of the server.
+fn received<T>(result: Result<Option<T>, ReceiveError>) -> Option<T> {
+    result.unwrap_or_else(|error| {
+        tracing::debug!(?error, "a request was not received");
+        None
+    })
 }
 
 fn taken<Q: Header, R: Header>(

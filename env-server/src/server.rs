@@ -169,7 +169,7 @@ impl Server {
         let woken = Cell::new(false);
         let found = self.waiter.wait(
             IDLE_TICK,
-            || self.look(&woken),
+            || Ok(self.look(&woken)),
             |limit| {
                 woken.set(self.sleep(limit)?);
                 Ok::<_, ServeError>(())
@@ -187,14 +187,14 @@ impl Server {
         Ok(())
     }
 
-    fn look(&self, woken: &Cell<bool>) -> Result<Option<Found>, ServeError> {
-        if let Some(request) = self.ports.receive_step()? {
-            return Ok(Some(Found::Step(request)));
+    fn look(&self, woken: &Cell<bool>) -> Option<Found> {
+        if let Some(request) = self.ports.receive_step() {
+            return Some(Found::Step(request));
         }
-        if let Some(request) = self.ports.receive_control()? {
-            return Ok(Some(Found::Control(request)));
+        if let Some(request) = self.ports.receive_control() {
+            return Some(Found::Control(request));
         }
-        Ok(woken.get().then_some(Found::Event))
+        woken.get().then_some(Found::Event)
     }
 
     /// Sleeps until a wake-up, a death or a finished reset; returns whether there was one.
@@ -282,6 +282,7 @@ impl Server {
     fn look_around(&mut self, now: Instant) {
         self.last_tick = now;
         self.take_resets(now);
+        self.forget_abandoned(now);
         self.bury_the_dead();
         self.is_over |= self.keeper.as_ref().is_some_and(Keeper::has_ended);
         for pid in self.simulator.expire(now) {
@@ -301,6 +302,19 @@ impl Server {
             self.publish(world..world + 1);
         }
         self.answer_awaiting(now);
+    }
+
+    /// Lets go of requests whose clients no longer wait: until then, iceoryx2 hands out none of the
+    /// same client's next ones.
+    fn forget_abandoned(&mut self, now: Instant) {
+        let simulator = &mut self.simulator;
+        self.awaiting.retain(|(request, awaited)| {
+            let is_awaited = request.is_connected();
+            if !is_awaited {
+                simulator.forget_awaited(now, awaited);
+            }
+            is_awaited
+        });
     }
 
     fn bury_the_dead(&mut self) {

@@ -238,6 +238,11 @@ impl Simulator {
         )
     }
 
+    /// Takes note that nobody waits for an answer any more.
+    pub fn forget_awaited(&mut self, now: Instant, awaited: &Awaited) {
+        self.leases.end_wait(now, awaited.lease);
+    }
+
     /// The rules, for those who carry out resets.
     pub fn rules(&self) -> &Rules {
         &self.rules
