@@ -13,11 +13,11 @@ use agent::run::{Mission, RunError, run};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
-use protocol::Model;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::message::Status;
 use protocol::program::stop_on_signals;
+use protocol::{Model, Shape};
 use std::io::Write;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -127,6 +127,7 @@ impl CompareCommand {
     /// Runs the comparison and writes what it gave.
     pub fn run(&self) -> Result<()> {
         let config = self.settings.effective()?;
+        self.make_places()?;
         let own = match &self.instance {
             Some(_) => None,
             None => Some(OwnServer::start(
@@ -151,7 +152,6 @@ impl CompareCommand {
         let results = self.compare(&mut arena, &comparison)?;
         write(&render_table(&results.runs, &self.baseline))?;
         if let Some(path) = &self.csv {
-            make_parent(path)?;
             write_csv(path, &results.runs)?;
         }
         if let Some(directory) = &self.figures {
@@ -183,8 +183,6 @@ impl CompareCommand {
         comparison: &Comparison,
         results: &Results,
     ) -> Result<()> {
-        std::fs::create_dir_all(directory)
-            .with_context(|| format!("create {}", directory.display()))?;
         let label = axis_label(arena.model());
         draw_ladder(&directory.join("ladder.png"), &results.runs, &label)?;
         let first = self.seeds.start;
@@ -203,6 +201,20 @@ impl CompareCommand {
         std::fs::write(&path, settings).with_context(|| format!("write {}", path.display()))
     }
 
+    /// Makes the folders of the files to come: better to fail before a long comparison than after.
+    fn make_places(&self) -> Result<()> {
+        if let Some(path) = &self.csv {
+            ensure!(
+                !path.is_dir(),
+                "--csv: expected a file, got the folder {}",
+                path.display()
+            );
+            let parent = path.parent().filter(|parent| *parent != Path::new(""));
+            parent.map_or(Ok(()), make_folder)?;
+        }
+        self.figures.as_deref().map_or(Ok(()), make_folder)
+    }
+
     fn policies(&self, model: &Model) -> Result<Vec<Policy>> {
         let named = |name: &String| Policy::named(name, model);
         let policies = match self.policies.as_slice() {
@@ -216,8 +228,9 @@ impl CompareCommand {
         ensure!(
             twice.is_none(),
             "policies: expected each name once, got {:?} twice",
-            twice.map(|(_, policy)| &policy.name)
+            twice.map_or("", |(_, policy)| &policy.name)
         );
+        named(&self.baseline).context("--baseline")?;
         Ok(policies)
     }
 
@@ -229,6 +242,7 @@ impl CompareCommand {
             read_model(Path::new(&self.model))?
         };
         self.policies(&model)?;
+        model.check_on(Shape::new(self.height, self.width)?)?;
         let batch = self.n_seeds().min(MAX_BATCH);
         let worlds = batch * if self.needs_scouts() { 2 } else { 1 } + 1;
         let burn_in = self.burn_in.unwrap_or(BENCHMARK_BURN_IN);
@@ -336,13 +350,8 @@ fn read_model(path: &Path) -> Result<Model> {
     Model::from_toml(&text).with_context(|| format!("model file {}", path.display()))
 }
 
-fn make_parent(path: &Path) -> Result<()> {
-    let parent = path
-        .parent()
-        .filter(|parent| !parent.as_os_str().is_empty());
-    parent.map_or(Ok(()), |parent| {
-        std::fs::create_dir_all(parent).with_context(|| format!("create {}", parent.display()))
-    })
+fn make_folder(path: &Path) -> Result<()> {
+    std::fs::create_dir_all(path).with_context(|| format!("create {}", path.display()))
 }
 
 fn write(text: &str) -> Result<()> {

@@ -46,7 +46,8 @@ impl Keeper {
     /// [`ServeError::NoKeeper`] if it is not there.
     pub fn watch(pid: i32) -> Result<Self, ServeError> {
         let open = |process| pidfd_open(process, PidfdFlags::empty());
-        let descriptor = Pid::from_raw(pid).ok_or(Errno::SRCH).and_then(open);
+        let process = (pid > 0).then(|| Pid::from_raw(pid)).flatten();
+        let descriptor = process.ok_or(Errno::SRCH).and_then(open);
         descriptor.map(Self).map_err(|errno| ServeError::NoKeeper {
             pid,
             problem: errno.to_string(),
