@@ -18,6 +18,7 @@ use protocol::path::{MoveError, path_from_bytes};
 use protocol::{Coverage, Move};
 use rayon::ThreadPool;
 use rayon::iter::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
+use rayon::slice::ParallelSlice;
 use std::ops::Range;
 use std::time::Instant;
 
@@ -58,7 +59,9 @@ pub struct ResetOrder {
 struct Batch {
     worlds: Range<usize>,
     coverage: Coverage,
-    paths: Vec<Vec<Move>>,
+    /// One path after the other.
+    moves: Vec<Move>,
+    n_moves: usize,
 }
 
 impl Simulator {
@@ -257,11 +260,11 @@ impl Simulator {
         let asks_full = request.flags & FLAG_FULL_COVERAGE != 0;
         let coverage = self.checked.config.coverage.coverage(asks_full);
         let coverage = coverage.map_err(|status| Refusal::new(status, 0))?;
-        let paths = moves.chunks(n_moves).map(<[Move]>::to_vec).collect();
         Ok(Batch {
             worlds,
             coverage,
-            paths,
+            moves,
+            n_moves,
         })
     }
 
@@ -280,16 +283,18 @@ impl Simulator {
 
     fn run(&mut self, batch: Batch) {
         let (rules, slots) = (&self.rules, &mut self.slots[batch.worlds.clone()]);
-        let step = |(slot, path): (&mut Slot, Vec<Move>)| {
+        let step = |(slot, path): (&mut Slot, &[Move])| {
             if let Slot::Ready(episode) = slot {
                 episode.step(rules, path, batch.coverage);
             }
         };
         if slots.len() * rules.shape.n_cells() >= PARALLEL_CELLS {
+            let paths = batch.moves.par_chunks(batch.n_moves);
             self.threads
-                .install(|| slots.par_iter_mut().zip(batch.paths).for_each(step));
+                .install(|| slots.par_iter_mut().zip(paths).for_each(step));
         } else {
-            slots.iter_mut().zip(batch.paths).for_each(step);
+            let paths = batch.moves.chunks(batch.n_moves);
+            slots.iter_mut().zip(paths).for_each(step);
         }
         self.n_steps += batch.worlds.len() as u64;
     }
