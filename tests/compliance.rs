@@ -318,7 +318,7 @@ fn a_step_answer_echoes_its_request_and_fits_its_payload() {
 #[test]
 fn a_client_that_shuts_the_server_down_is_answered() {
     let server = Server::start(SMALL);
-    let reply = Wire::open(&server.instance).ask(&Request::Shutdown);
+    let reply = Wire::open(&server.instance).ask(&Request::Shutdown {});
     assert_eq!(reply, Reply::Done);
     assert_eq!(server.program.wait(Duration::from_secs(1)).code, Some(0));
 }

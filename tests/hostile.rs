@@ -321,7 +321,7 @@ fn requests_that_wait_for_a_reset_and_are_given_up_do_not_wear_the_server_out() 
     let (mut bystander, mut watcher) = (server.acquire(0..1), server.connect());
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(1, 1).lease;
-    let mut is_resetting = || match watcher.control(&Request::Status, PATIENCE) {
+    let mut is_resetting = || match watcher.control(&Request::Status {}, PATIENCE) {
         Ok(Reply::Status(status)) => status.worlds[1].resetting,
         other => panic!("{other:?}: {}", server.program.stderr()),
     };

@@ -323,6 +323,12 @@ impl Server {
             tracing::info!(pid, n_leases, "a client ended");
             self.janitor.request();
         }
+        let n_leases = self
+            .simulator
+            .end_of_connections(&self.ports.client_nodes());
+        if n_leases > 0 {
+            tracing::info!(n_leases, "a connection was closed without a release");
+        }
     }
 
     /// Shows every world to observers that have just come.

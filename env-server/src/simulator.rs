@@ -19,6 +19,7 @@ use protocol::{Coverage, Move};
 use rayon::ThreadPool;
 use rayon::iter::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
 use rayon::slice::ParallelSlice;
+use std::collections::HashSet;
 use std::ops::Range;
 use std::time::Instant;
 
@@ -172,6 +173,11 @@ impl Simulator {
         self.leases.end_of_process(pid).len()
     }
 
+    /// Ends the leases of connections that were closed: of nodes that are not among these.
+    pub fn end_of_connections(&mut self, nodes: &HashSet<u128>) -> usize {
+        self.leases.end_of_nodes_except(nodes).len()
+    }
+
     /// The episode of a world that is not being reset.
     pub fn episode(&self, world: usize) -> Option<&Episode> {
         match self.slots.get(world)? {
@@ -257,6 +263,9 @@ impl Simulator {
         let moves = path_from_bytes(paths);
         let moves =
             moves.map_err(|MoveError { index, .. }| Refusal::new(Status::BadMove, index as u64))?;
+        if request.flags & !FLAG_FULL_COVERAGE != 0 {
+            return Err(Refusal::new(Status::UnknownFlags, request.flags.into()));
+        }
         let asks_full = request.flags & FLAG_FULL_COVERAGE != 0;
         let coverage = self.checked.config.coverage.coverage(asks_full);
         let coverage = coverage.map_err(|status| Refusal::new(status, 0))?;

@@ -231,7 +231,7 @@ impl Connection {
             },
         )?;
         refuse(WHAT, reply.status, reply.detail, None)?;
-        check_sequence(WHAT, reply.sequence, self.sequence)?;
+        check_answer(WHAT, reply.version, (reply.sequence, self.sequence))?;
         let (results, frames) = answer.map_err(|expected| ConnectionError::Garbled {
             what: WHAT,
             problem: format!("expected a payload of {expected} bytes"),
@@ -377,7 +377,7 @@ fn ask(
         wake.exchange(client, header, &text, WHAT, timeout, |reply, payload| {
             (*reply, payload.to_vec())
         })?;
-    check_sequence(WHAT, reply.sequence, sequence)?;
+    check_answer(WHAT, reply.version, (reply.sequence, sequence))?;
     let parsed = serde_json::from_slice(&payload);
     let message = match &parsed {
         Ok(Reply::Error {
@@ -424,12 +424,18 @@ fn refuse(
     }
 }
 
-fn check_sequence(what: &'static str, got: u64, expected: u64) -> Result<(), ConnectionError> {
-    if got == expected {
+/// Checks that an answer is of our version and to our request: `(got, expected)` sequence numbers.
+fn check_answer(
+    what: &'static str,
+    version: u32,
+    (got, expected): (u64, u64),
+) -> Result<(), ConnectionError> {
+    let problem = if version != VERSION {
+        format!("expected version {VERSION}, got {version}")
+    } else if got != expected {
+        format!("expected sequence number {expected}, got {got}")
+    } else {
         return Ok(());
-    }
-    Err(ConnectionError::Garbled {
-        what,
-        problem: format!("expected sequence number {expected}, got {got}"),
-    })
+    };
+    Err(ConnectionError::Garbled { what, problem })
 }

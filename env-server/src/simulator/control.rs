@@ -112,11 +112,11 @@ impl Simulator {
         surroundings: &Surroundings,
     ) -> Result<Outcome, Reply> {
         if version != VERSION {
-            return Err(Reply::refusal(Status::VersionMismatch, VERSION.into()));
+            return Err(mismatch(version));
         }
         Ok(match parse(text)? {
             Request::Hello { protocol, .. } if protocol != VERSION => {
-                return Err(Reply::refusal(Status::VersionMismatch, VERSION.into()));
+                return Err(mismatch(protocol));
             }
             Request::Hello { .. } => Outcome::Answer(Reply::Hello(Box::new(self.info()))),
             Request::Acquire {
@@ -146,8 +146,8 @@ impl Simulator {
                 Outcome::Answer(Reply::Done)
             }
             Request::Reset { lease, worlds } => self.order_resets(now, client, lease, &worlds)?,
-            Request::Status => Outcome::Answer(Reply::Status(self.status(surroundings))),
-            Request::Shutdown => Outcome::Shutdown,
+            Request::Status {} => Outcome::Answer(Reply::Status(self.status(surroundings))),
+            Request::Shutdown {} => Outcome::Shutdown,
         })
     }
 
@@ -310,6 +310,17 @@ fn parse(text: &[u8]) -> Result<Request, Reply> {
         )));
     }
     serde_json::from_slice(text).map_err(|error| malformed(error.to_string()))
+}
+
+/// The refusal of a client that speaks another version.
+fn mismatch(client: u32) -> Reply {
+    let (status, detail) = (Status::VersionMismatch, u64::from(VERSION));
+    let message = Status::version_mismatch(client, detail);
+    Reply::Error {
+        status,
+        detail,
+        message,
+    }
 }
 
 fn malformed(problem: String) -> Reply {

@@ -78,8 +78,8 @@ fn request() -> impl Strategy<Value = Request> {
         any::<u64>().prop_map(|lease| Request::Release { lease }),
         (any::<u64>(), vec(seed, 0..4))
             .prop_map(|(lease, worlds)| Request::Reset { lease, worlds }),
-        Just(Request::Status),
-        Just(Request::Shutdown),
+        Just(Request::Status {}),
+        Just(Request::Shutdown {}),
     ]
 }
 
