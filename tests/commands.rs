@@ -1,1 +1,204 @@
-//! .
+//! Wrong input to every command: an exit code, one line that says what was expected, no panic.
+
+use crate::harness::{Ended, SMALL, Server, run};
+use std::time::Duration;
+
+/// How long a refusal may take.
+pub const LIMIT: Duration = Duration::from_secs(10);
+
+/// The server's program.
+pub const SERVER: &str = "emberwatch-server";
+/// The agent's program.
+pub const AGENT: &str = "emberwatch-agent";
+
+/// A comparison of a moment, on worlds of its own.
+pub const TINY: &str = "--seeds 0..1 --steps 1 --height 4 --width 4 --moves 2 --burn-in 1 \
+                    --policies coverage --baseline coverage";
+
+/// Flags, and the words of their refusal.
+const WRONG_SERVER_FLAGS: &str = r#"
+--instance a/b => instance name | "a/b"
+--worlds 0 => worlds: expected 1 to 1024, got 0
+--worlds 1025 => worlds: expected 1 to 1024, got 1025
+--worlds many => 'many' | --worlds
+--worlds 99999999999 => --worlds
+--height 0 => height and width in 1..=4096, got 0 x 64
+--width 4097 => height and width in 1..=4096, got 64 x 4097
+--moves 0 => moves: expected 1 to 4096, got 0
+--seed -1 => -1
+--seed 18446744073709551616 => --seed
+--burn-in 9999999999999 => burn_in: expected 0 to | 9999999999999
+--max-steps x => --max-steps | 'x'
+--coverage some => --coverage | path, full, client
+--start 1 => --start | expected corner, centre, random or ROW,COL
+--start 3,64 => start: expected a cell on the 64 x 64 grid, got (3, 64)
+--publish-truth maybe => --publish-truth | true, false
+--lease-millis 5 => lease_millis: expected 100 to 86400000, got 5
+--threads 257 => threads: expected 0 to 256, got 257
+--exit-with 0 => --exit-with 0: expected a running process
+--exit-with=-5 => --exit-with -5: expected a running process
+--exit-with 4194305 => --exit-with 4194305: expected a running process
+--model no/such.toml => model file no/such.toml: No such file
+--config no/such.toml => config file no/such.toml: No such file
+--config / => config file /: Is a directory
+--check --worlds 0 => worlds: expected 1 to 1024, got 0
+--bogus => --bogus
+dance => dance
+--worlds 1024 --height 4096 --width 4096 => shared memory: expected | MiB free | fewer worlds
+status --instance nobody => no server on instance "nobody"
+status --instance a/b => instance name | "a/b"
+stop --instance nobody => no server on instance "nobody"
+stop --instance a/b => instance name | "a/b"
+"#;
+
+/// The same for the agent.
+const WRONG_AGENT_FLAGS: &str = r#"
+run --instance nobody => no server on instance "nobody"
+run --instance a/b => instance name | "a/b"
+run --steps -1 => -1
+run --world x => --world | 'x'
+run --model no.toml => model file no.toml | No such file
+run --config no.toml => config file no.toml | No such file
+run --preset lab => --preset | default, paper
+run --prior none => --prior | simulated, initial, uniform
+run --beam-width 0 => beam_width: expected 1 to 10000, got 0
+run --shooting-samples 0 => shooting_samples: expected 1 to 1000000, got 0
+compare --seeds 8..0 => --seeds | FIRST below END
+compare --seeds 3 => --seeds | FIRST..END
+compare --seeds 0..100001 => --seeds | 100000
+compare --steps 0 => --steps | 1..=10000000
+compare --policies ash => policy: expected one of random_walk | got "ash"
+compare --policies coverage,coverage => each name once | got "coverage" twice
+compare --baseline ash => --baseline | expected one of | got "ash"
+compare --height 0 => height and width in 1..=4096, got 0 x 64
+compare --model no.toml => model file no.toml | No such file
+compare --server no/such => start no/such | No such file
+compare --instance nobody => no server on instance "nobody"
+compare --instance x --height 9 => --instance | --height
+compare TINY --csv /proc/no/file.csv => create /proc/no
+compare TINY --csv / => --csv: expected a file, got the folder /
+compare TINY --figures /proc/no => create /proc/no
+"#;
+
+/// Runs a program and checks that it refuses in one line that holds all these words.
+pub fn check(program: &str, arguments: &str, words: &[&str]) {
+    let arguments: Vec<&str> = arguments.split_whitespace().collect();
+    let ended = run(program, &arguments, LIMIT);
+    assert_refusal(&format!("{program} {}", arguments.join(" ")), &ended, words);
+}
+
+/// Checks every line `flags => words | words`; `TINY` stands for [`TINY`].
+pub fn check_table(program: &str, table: &str) {
+    for line in table.trim().lines() {
+        let (flags, words) = line.split_once(" => ").expect("flags and words");
+        let words: Vec<&str> = words.split(" | ").collect();
+        check(program, &flags.replace("TINY", TINY), &words);
+    }
+}
+
+fn assert_refusal(what: &str, ended: &Ended, words: &[&str]) {
+    let Ended {
+        code,
+        stdout,
+        stderr,
+    } = ended;
+    assert!(
+        code.is_some_and(|code| code != 0),
+        "{what}: ended with {code:?}: {stderr}"
+    );
+    assert!(!stderr.contains("panicked"), "{what}: {stderr}");
+    assert_eq!(stdout, "", "{what}");
+    let is_error = |line: &&str| line.starts_with("error: ") || line.contains(" ERROR ");
+    let errors: Vec<&str> = stderr.lines().filter(is_error).collect();
+    assert_eq!(
+        errors.len(),
+        1,
+        "{what}: expected one line of error: {stderr}"
+    );
+    for word in words {
+        assert!(
+            stderr.contains(word),
+            "{what}: {stderr:?} does not say {word:?}"
+        );
+    }
+}
+
+#[test]
+fn wrong_flags_of_the_server_are_named() {
+    check_table(SERVER, WRONG_SERVER_FLAGS);
+}
+
+#[test]
+fn wrong_flags_of_the_agent_are_named() {
+    check_table(AGENT, WRONG_AGENT_FLAGS);
+}
+
+/// Runs an agent's commands against a server with these settings.
+fn check_against(settings: &str, table: &str) {
+    let server = Server::start(&format!("{SMALL} {settings}"));
+    let name = server.instance.name();
+    check_table(
+        AGENT,
+        &table.replace("SERVER", &format!("--instance {name}")),
+    );
+}
+
+#[test]
+fn a_server_that_does_not_fit_is_refused_with_what_is_missing() {
+    check_against(
+        "--reveal-model false",
+        "run SERVER --world 1 => no such world | worlds 0 to 0
+run SERVER => does not reveal its model | --model FILE
+compare SERVER --policies coverage => comparing needs the hidden states | --publish-truth",
+    );
+    check_against(
+        "--reveal-model false --publish-truth",
+        "compare SERVER --policies coverage => comparing needs the model | --reveal-model true",
+    );
+    check_against(
+        "--publish-truth",
+        "compare SERVER --policies clairvoyant_beam => 2 worlds for these policies, it has 1
+compare SERVER --policies coverage --burn-in 7 => expected the running server's 20, got 7
+run SERVER --policy ash => policy: expected one of | got \"ash\"
+run SERVER --policy clairvoyant_beam => only `compare` has them",
+    );
+    check_against(
+        "",
+        "run SERVER --policy oracle_beam => oracle_beam | --publish-truth",
+    );
+}
+
+#[test]
+fn a_second_server_on_an_instance_is_told_who_the_first_is() {
+    let server = Server::start(SMALL);
+    let words = format!("already running, as pid {}", server.program.pid());
+    check(
+        SERVER,
+        &format!("--instance {}", server.instance.name()),
+        &[&words],
+    );
+    assert_eq!(server.status().n_steps, 0, "the first lives on");
+}
+
+#[test]
+fn status_tells_people_and_programs_of_every_world() {
+    let server = Server::start(&format!("{SMALL} --worlds 2 --seed 40"));
+    let _client = server.acquire(1..2);
+    let name = server.instance.name();
+    let people = run(SERVER, &["status", "--instance", name], LIMIT);
+    assert_eq!(people.code, Some(0), "{}", people.stderr);
+    let holder = format!("pid {}", std::process::id());
+    assert!(
+        people.stdout.contains("41") && people.stdout.contains(&holder),
+        "{}",
+        people.stdout
+    );
+    let json = run(SERVER, &["status", "--json", "--instance", name], LIMIT);
+    let status: serde_json::Value = serde_json::from_str(&json.stdout).expect("JSON");
+    assert_eq!(status["pid"], server.program.pid());
+    assert_eq!(status["worlds"][1]["holder_pid"], std::process::id());
+    assert_eq!(status["worlds"][1]["seed"], 41);
+    let stop = run(SERVER, &["stop", "--instance", name], LIMIT);
+    assert_eq!(stop.code, Some(0), "{}", stop.stderr);
+    assert_eq!(server.program.wait(LIMIT).code, Some(0));
+}

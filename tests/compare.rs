@@ -1,1 +1,182 @@
-//! .
+//! `emberwatch-agent` from end to end: comparisons that repeat to the bit, and a second model.
+
+use crate::harness::{Ended, Server, repository, run};
+use protocol::{Dynamics, Model, Shape};
+use std::path::Path;
+use std::time::Duration;
+use tempfile::TempDir;
+
+const AGENT: &str = "emberwatch-agent";
+
+/// How long a small comparison may take.
+const LIMIT: Duration = Duration::from_secs(60);
+
+/// What is compared; the worlds come on top.
+const WHAT: &str = "compare --seeds 3..5 --steps 5 --shooting-samples 16 --beam-width 4";
+
+/// The worlds, as flags of the private server.
+const WORLDS: &str = "--height 6 --width 9 --moves 5 --burn-in 60";
+
+const HEADER: &str = "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
+                      mean_fire_cells,mean_plan_millis,brier";
+
+fn agent(arguments: &[&str]) -> Ended {
+    let words = arguments.iter().flat_map(|flags| flags.split_whitespace());
+    let ended = run(AGENT, &words.collect::<Vec<_>>(), LIMIT);
+    assert_eq!(ended.code, Some(0), "{arguments:?}: {}", ended.stderr);
+    assert!(!ended.stderr.contains("ERROR"), "{}", ended.stderr);
+    ended
+}
+
+/// The rows of a CSV file without the time that plans took; its header is checked.
+fn rows(path: &Path) -> Vec<Vec<String>> {
+    let text = std::fs::read_to_string(path).expect("the CSV file");
+    let mut lines = text.lines();
+    assert_eq!(lines.next(), Some(HEADER));
+    let rows = lines.map(|line| {
+        let mut fields: Vec<String> = line.split(',').map(String::from).collect();
+        assert_eq!(fields.len(), 10, "{line}");
+        let millis: f64 = fields.remove(8).parse().expect("a time");
+        assert!(millis >= 0.0);
+        fields
+    });
+    rows.collect()
+}
+
+fn compare_to(path: &Path, flags: &[&str]) -> Vec<Vec<String>> {
+    let csv = format!("--csv {}", path.display());
+    agent(&[&[WHAT, &csv], flags].concat());
+    rows(path)
+}
+
+#[test]
+fn a_comparison_writes_a_table_a_csv_file_and_figures() {
+    let folder = TempDir::new().expect("a folder");
+    let path = |name: &str| folder.path().join(name);
+    let (csv, figures) = (path("new/out.csv"), path("figures"));
+    let places = format!("--csv {} --figures {}", csv.display(), figures.display());
+    let ended = agent(&[WHAT, WORLDS, &places]);
+    let rows = rows(&csv);
+    // Eleven policies of the wildfire's ladder, two seeds each.
+    assert_eq!(rows.len(), 11 * 2, "{rows:?}");
+    for [first, second] in rows.as_chunks::<2>().0 {
+        assert!(ended.stdout.contains(&first[0]), "{}", ended.stdout);
+        assert_eq!((&first[0], &*first[2], &*second[2]), (&second[0], "3", "4"));
+        let fire_cells = [&first[7], &second[7]];
+        assert_eq!(
+            fire_cells,
+            [&rows[0][7], &rows[1][7]],
+            "all met the same worlds"
+        );
+    }
+    for name in ["ladder.png", "rewards.png", "snapshot.png"] {
+        let bytes = std::fs::read(figures.join(name)).expect(name);
+        assert!(
+            bytes.starts_with(b"\x89PNG\r\n\x1a\n") && bytes.len() > 1000,
+            "{name}"
+        );
+    }
+    let settings = std::fs::read_to_string(figures.join("agent.toml")).expect("the settings");
+    assert!(settings.contains("beam_width = 4"), "{settings}");
+}
+
+#[test]
+fn a_comparison_repeats_to_the_bit_on_any_server() {
+    let folder = TempDir::new().expect("a folder");
+    let path = |name: &str| folder.path().join(name);
+    let first = compare_to(&path("first.csv"), &[WORLDS]);
+    assert_eq!(compare_to(&path("again.csv"), &[WORLDS]), first);
+    let roomy = format!("{WORLDS} --publish-truth --coverage client --seed 77");
+    for n_worlds in [5, 2] {
+        let server = Server::start(&format!("{roomy} --worlds {n_worlds} --threads 2"));
+        let instance = format!("--instance {}", server.instance.name());
+        for round in ["one.csv", "two.csv"] {
+            assert_eq!(
+                compare_to(&path(round), &[&instance]),
+                first,
+                "{n_worlds} worlds"
+            );
+        }
+    }
+    let other_seed = compare_to(&path("seed.csv"), &[WORLDS, "--agent-seed 5"]);
+    assert_ne!(other_seed, first, "planners draw from the agent's seed");
+}
+
+#[test]
+fn runs_with_one_seed_act_alike() {
+    let flags = "--steps 20 --shooting-samples 32 --beam-width 5";
+    for policy in [
+        "random_walk",
+        "shooting_exploit",
+        "beam_exploit",
+        "oracle_beam",
+    ] {
+        let act = || {
+            let server = Server::start(&format!("{WORLDS} --publish-truth"));
+            let name = server.instance.name();
+            agent(&["run --instance", name, "--policy", policy, flags]);
+            (server.observe(0), server.status().worlds[0].holder_pid)
+        };
+        let (first, holder) = act();
+        assert_eq!((first.0.step, holder), (20, None), "{policy}");
+        assert_eq!(act().0, first, "{policy}");
+    }
+}
+
+#[test]
+fn a_second_model_runs_from_end_to_end() {
+    let folder = TempDir::new().expect("a folder");
+    let model = repository().join("config/models/road-ice.toml");
+    let worlds = "--height 8 --width 13 --moves 7 --burn-in 300";
+    let model = format!("--model {}", model.display());
+    let flags = format!("{worlds} {model}");
+    let server = Server::start(&flags);
+    let info = server.info();
+    assert_eq!(
+        (info.n_observations, info.observations),
+        (3, vec!["dark".into(), "shiny".into(), "white".into()])
+    );
+    let name = server.instance.name();
+    agent(&[
+        "run --steps 30 --beam-width 5 --policy beam_ice --instance",
+        name,
+    ]);
+    agent(&[
+        "run --steps 10 --shooting-samples 9 --policy shooting_gritted --instance",
+        name,
+    ]);
+    assert_eq!(server.observe(0).0.step, 40);
+    let figures = format!("--figures {}", folder.path().join("figures").display());
+    let rows = compare_to(&folder.path().join("ice.csv"), &[&flags, &figures]);
+    // Twelve policies: the ladder has one for each of three states beside the one that pays.
+    assert_eq!(rows.len(), 12 * 2, "{rows:?}");
+    assert!(folder.path().join("figures/snapshot.png").exists());
+    let hidden = Server::start(&format!("{flags} --reveal-model false"));
+    agent(&[
+        "run --steps 3 --beam-width 5",
+        &model,
+        "--instance",
+        hidden.instance.name(),
+    ]);
+}
+
+#[test]
+fn the_road_ice_model_keeps_all_its_states() {
+    let text = std::fs::read_to_string(repository().join("config/models/road-ice.toml"));
+    let model = Model::from_toml(&text.expect("the model file")).expect("a valid model");
+    let shape = Shape::new(24, 40).expect("a shape");
+    let dynamics = Dynamics::new(&model, shape).expect("a model that fits");
+    for seed in 0..4 {
+        let world = env_server::world::World::new(dynamics.clone(), seed, 5_000);
+        let mut counts = [0; 4];
+        world
+            .states()
+            .iter()
+            .for_each(|&state| counts[usize::from(state)] += 1);
+        // The least seen in 160 looks was 1 % of 960 cells.
+        assert!(
+            counts.iter().all(|&count| count >= 5),
+            "seed {seed}: {counts:?}"
+        );
+    }
+}

@@ -5,8 +5,8 @@ use crate::wire::{Wire, control_header, step_header};
 use protocol::Model;
 use protocol::control::{CoverageRule, Reply, Request};
 use protocol::message::Status::{
-    self, BadMove, Busy, LeaseLost, Malformed, NoLease, NoSuchWorld, NotPermitted,
-    UnknownOperation, VersionMismatch, WrongLength, WrongPathLength,
+    self, BadMove, LeaseLost, NoLease, NoSuchWorld, NotPermitted, UnknownOperation,
+    VersionMismatch, WrongLength, WrongPathLength,
 };
 use protocol::message::{
     ControlRequest, FLAG_FULL_COVERAGE, Operation, StepRequest, VERSION, split_step_payload,
@@ -147,128 +147,126 @@ fn a_hidden_model_is_not_in_the_handshake() {
     );
 }
 
-#[test]
-fn a_step_is_refused_for_one_reason_and_changes_nothing() {
-    let table = Table::lay();
-    let good = StepRequest {
-        sequence: 41,
-        ..step_header(table.our_lease, N_MOVES)
-    };
-    let path = [1; 6];
-    let check = |change: &dyn Fn(&mut StepRequest), paths: &[u8], status, detail| {
-        let mut header = good;
+/// Sends steps that are right but for one change, and checks that each is refused.
+struct Steps {
+    table: Table,
+    good: StepRequest,
+}
+
+impl Steps {
+    fn new() -> Self {
+        let table = Table::lay();
+        let good = StepRequest {
+            sequence: 41,
+            ..step_header(table.our_lease, N_MOVES)
+        };
+        Self { table, good }
+    }
+
+    fn check(&self, change: impl Fn(&mut StepRequest), status: Status, detail: u64) {
+        self.check_paths(change, &[1; 6], status, detail);
+    }
+
+    fn check_paths(
+        &self,
+        change: impl Fn(&mut StepRequest),
+        paths: &[u8],
+        status: Status,
+        detail: u64,
+    ) {
+        let mut header = self.good;
         change(&mut header);
-        table.refused_step(header, paths, status, detail);
-    };
-    check(&|h| h.version = 2, &path, VersionMismatch, 1);
-    check(&|h| h.version = 0, &path, VersionMismatch, 1);
-    check(&|h| h.operation = 0, &path, UnknownOperation, 0);
-    check(&|h| h.operation = 3, &path, UnknownOperation, 3);
+        self.table.refused_step(header, paths, status, detail);
+    }
+}
+
+#[test]
+fn a_step_of_wrong_numbers_is_refused_and_changes_nothing() {
+    let steps = Steps::new();
+    steps.check(|h| h.version = 2, VersionMismatch, 1);
+    steps.check(|h| h.version = 0, VersionMismatch, 1);
+    steps.check(|h| h.operation = 0, UnknownOperation, 0);
+    steps.check(|h| h.operation = 3, UnknownOperation, 3);
     for (first, n_worlds) in [(0, 0), (3, 1), (0, 4), (2, 2), (u32::MAX, 1), (1, u32::MAX)] {
         let range = |h: &mut StepRequest| (h.first_world, h.n_worlds) = (first, n_worlds);
-        check(&range, &path, NoSuchWorld, 3);
+        steps.check(range, NoSuchWorld, 3);
     }
-    check(&|h| h.n_moves = 5, &path, WrongPathLength, 6);
-    check(&|h| h.n_moves = u32::MAX, &path, WrongPathLength, 6);
-    check(&|_| (), &[1; 5], WrongLength, 6);
-    check(&|_| (), &[], WrongLength, 6);
-    check(&|h| h.n_worlds = 2, &path, WrongLength, 12);
-    check(&|_| (), &[1, 2, 3, 0, 1, 4], BadMove, 5);
-    check(&|_| (), &[255, 2, 3, 0, 1, 4], BadMove, 0);
-    check(&|h| h.flags = FLAG_FULL_COVERAGE, &path, NotPermitted, 0);
-    check(&|h| h.lease = 0, &path, NoLease, 0);
-    check(&|h| h.lease = u64::MAX, &path, NoLease, 0);
-    check(&|h| h.first_world = 2, &path, NoLease, 2);
-    let theirs = |h: &mut StepRequest| (h.first_world, h.lease) = (2, table.their_lease);
-    check(&theirs, &path, NoLease, 2);
-    check(&|h| h.n_worlds = 3, &[0; 18], NoLease, 2);
-    let us = u64::from(std::process::id());
-    check(&|h| h.lease = table.ended_lease, &path, LeaseLost, us);
-    check(
-        &|h| h.operation = Operation::Observe as u32,
-        &path,
-        WrongLength,
-        0,
-    );
+    steps.check(|h| h.n_moves = 5, WrongPathLength, 6);
+    steps.check(|h| h.n_moves = u32::MAX, WrongPathLength, 6);
+    steps.check(|h| h.flags = FLAG_FULL_COVERAGE, NotPermitted, 0);
+    steps.check(|h| h.n_worlds = 2, WrongLength, 12);
+    steps.check(|h| h.operation = Operation::Observe as u32, WrongLength, 0);
+    for length in [0, 1, 5, 7, 100] {
+        steps.check_paths(|_| (), &vec![1; length], WrongLength, 6);
+    }
+    steps.check_paths(|_| (), &[1, 2, 3, 0, 1, 4], BadMove, 5);
+    steps.check_paths(|_| (), &[255, 2, 3, 0, 1, 4], BadMove, 0);
 }
+
+#[test]
+fn a_step_without_a_lease_on_its_worlds_is_refused_and_changes_nothing() {
+    let steps = Steps::new();
+    let (theirs, ended) = (steps.table.their_lease, steps.table.ended_lease);
+    steps.check(|h| h.lease = 0, NoLease, 0);
+    steps.check(|h| h.lease = u64::MAX, NoLease, 0);
+    steps.check(|h| h.first_world = 2, NoLease, 2);
+    steps.check(|h| (h.first_world, h.lease) = (2, theirs), NoLease, 2);
+    steps.check_paths(|h| h.n_worlds = 3, &[0; 18], NoLease, 2);
+    let us = u64::from(std::process::id());
+    steps.check(|h| h.lease = ended, LeaseLost, us);
+}
+
+/// Requests, the status and detail of their refusal, and words of it. `OURS`, `THEIRS` and `ENDED`
+/// stand for leases, `US` for this process.
+const REFUSED: &str = r#"
+ => Malformed 0 malformed control message
+{ => Malformed 0 malformed control message
+[] => Malformed 0 malformed control message
+null => Malformed 0 malformed control message
+{"op":"dance"} => Malformed 0 dance
+{"op":"renew"} => Malformed 0 lease
+{"op":"renew","lease":-1} => Malformed 0 -1
+{"op":"renew","lease":1,"more":2} => Malformed 0 more
+{"op":"hello","protocol":2,"client":""} => VersionMismatch 1 version mismatch
+{"op":"acquire","first_world":0,"n_worlds":0} => NoSuchWorld 3 worlds 0 to 2
+{"op":"acquire","first_world":3,"n_worlds":1} => NoSuchWorld 3 worlds 0 to 2
+{"op":"acquire","first_world":0,"n_worlds":4} => NoSuchWorld 3 worlds 0 to 2
+{"op":"acquire","first_world":4294967295,"n_worlds":4294967295} => NoSuchWorld 3 worlds 0 to 2
+{"op":"acquire","first_world":4294967296,"n_worlds":1} => Malformed 0 4294967296
+{"op":"acquire","first_world":1,"n_worlds":2} => Busy US take the worlds over
+{"op":"renew","lease":12345} => NoLease 0 acquire it first
+{"op":"renew","lease":THEIRS} => NoLease 2 no lease on world 2
+{"op":"renew","lease":ENDED} => LeaseLost US lease lost
+{"op":"release","lease":12345} => NoLease 0 acquire it first
+{"op":"release","lease":THEIRS} => NoLease 2 no lease on world 2
+{"op":"release","lease":ENDED} => LeaseLost US lease lost
+{"op":"reset","lease":OURS,"worlds":[{"world":2}]} => NoLease 2 no lease on world 2
+{"op":"reset","lease":OURS,"worlds":[{"world":0},{"world":2}]} => NoLease 2 no lease on world 2
+{"op":"reset","lease":THEIRS,"worlds":[{"world":2}]} => NoLease 2 no lease on world 2
+{"op":"reset","lease":THEIRS,"worlds":[]} => NoLease 2 no lease on world 2
+{"op":"reset","lease":OURS,"worlds":[{"world":9}]} => NoSuchWorld 3 worlds 0 to 2
+{"op":"reset","lease":OURS,"worlds":[{"world":0},{"world":0}]} => Malformed 0 world 0 twice
+{"op":"reset","lease":ENDED,"worlds":[{"world":0}]} => LeaseLost US lease lost
+{"op":"reset","lease":OURS,"worlds":[{"world":0,"seed":1.5}]} => Malformed 0 1.5
+"#;
 
 #[test]
 fn a_control_request_is_refused_for_one_reason_and_changes_nothing() {
     let table = Table::lay();
-    let (ours, theirs, ended) = (table.our_lease, table.their_lease, table.ended_lease);
-    let us = u64::from(std::process::id());
-    let check = |text: &str, status, detail, words: &str| {
-        table.refused_control(text, status, detail, words);
-    };
-    for text in [
-        "",
-        "{",
-        "[]",
-        "null",
-        "\u{0}",
-        r#"{"op":"dance"}"#,
-        r#"{"op":"renew"}"#,
-    ] {
-        check(text, Malformed, 0, "malformed control message");
+    let refused = REFUSED
+        .replace("OURS", &table.our_lease.to_string())
+        .replace("THEIRS", &table.their_lease.to_string())
+        .replace("ENDED", &table.ended_lease.to_string())
+        .replace("US", &std::process::id().to_string());
+    for line in refused.lines().skip(1) {
+        let (text, refusal) = line.split_once(" => ").expect("request and refusal");
+        let mut refusal = refusal.splitn(3, ' ');
+        let mut next = || refusal.next().expect("status, detail and words");
+        let (name, detail) = (next(), next().parse().expect("a detail"));
+        let mut known = Status::ALL.into_iter();
+        let status = known.find(|status| format!("{status:?}") == name);
+        table.refused_control(text, status.expect(name), detail, next());
     }
-    check(r#"{"op":"renew","lease":-1}"#, Malformed, 0, "-1");
-    check(r#"{"op":"renew","lease":1,"more":2}"#, Malformed, 0, "more");
-    check(
-        r#"{"op":"hello","protocol":2,"client":""}"#,
-        VersionMismatch,
-        1,
-        "version mismatch",
-    );
-    for range in [(0, 0), (3, 1), (0, 4), (u32::MAX, u32::MAX)] {
-        let text = format!(
-            r#"{{"op":"acquire","first_world":{},"n_worlds":{}}}"#,
-            range.0, range.1
-        );
-        check(&text, NoSuchWorld, 3, "worlds 0 to 2");
-    }
-    check(
-        r#"{"op":"acquire","first_world":1,"n_worlds":2}"#,
-        Busy,
-        us,
-        "take the worlds over",
-    );
-    for op in ["renew", "release"] {
-        let text = |lease: u64| format!(r#"{{"op":"{op}","lease":{lease}}}"#);
-        check(&text(12345), NoLease, 0, "acquire it first");
-        check(&text(theirs), NoLease, 2, "no lease on world 2");
-        check(&text(ended), LeaseLost, us, "lease lost");
-    }
-    let reset = |lease: u64, worlds: &str| {
-        format!(r#"{{"op":"reset","lease":{lease},"worlds":[{worlds}]}}"#)
-    };
-    let (first, second) = (r#"{"world":0}"#, r#"{"world":2}"#);
-    check(&reset(ours, second), NoLease, 2, "no lease on world 2");
-    check(
-        &reset(ours, &format!("{first},{second}")),
-        NoLease,
-        2,
-        "no lease",
-    );
-    check(&reset(theirs, second), NoLease, 2, "no lease on world 2");
-    check(
-        &reset(ours, r#"{"world":9}"#),
-        NoSuchWorld,
-        3,
-        "worlds 0 to 2",
-    );
-    check(
-        &reset(ours, &format!("{first},{first}")),
-        Malformed,
-        0,
-        "world 0 twice",
-    );
-    check(&reset(ended, first), LeaseLost, us, "lease lost");
-    check(
-        &reset(ours, r#"{"world":0,"seed":1.5}"#),
-        Malformed,
-        0,
-        "1.5",
-    );
 }
 
 #[test]

@@ -4,8 +4,7 @@ use crate::harness::{PATIENCE, SMALL, Server, eventually, fly, new_instance, res
 use crate::wire::{Wire, answer, control_header, step_header};
 use protocol::control::{Reply, Request, WorldInfo, WorldSeed};
 use protocol::message::{FLAG_FULL_COVERAGE, Operation, Status, StepRequest, split_step_payload};
-use protocol::{Connection, Coverage, Move, UNOBSERVED};
-use std::time::Duration;
+use protocol::{Coverage, Move, UNOBSERVED};
 
 /// Moves of a path on a [`SMALL`] server.
 const N_MOVES: u32 = 6;
@@ -147,54 +146,24 @@ fn coverage_is_what_the_server_says() {
             ..step_header(wire.acquire(0, 1).lease, N_MOVES)
         };
         let (reply, payload) = wire.step(header, &[3, 3, 3, 1, 1, 2]);
-        let coverage = match expected {
-            Ok(coverage) => coverage,
-            Err(status) => {
-                assert_eq!(Status::try_from(reply.status), Ok(status), "{rule} {asks}");
-                continue;
-            }
-        };
+        let status = expected.err().unwrap_or(Status::Ok);
+        assert_eq!(Status::try_from(reply.status), Ok(status), "{rule} {asks}");
+        let Ok(coverage) = expected else { continue };
         let (results, frame) = split_step_payload(&reply, &payload).expect("a whole payload");
         let n_seen = frame.iter().filter(|&&value| value != UNOBSERVED).count();
-        let n_cells = if coverage == Coverage::Full {
-            N_CELLS
-        } else {
-            6
-        };
-        let result = results[0];
+        let is_full = coverage == Coverage::Full;
+        assert_eq!(n_seen, if is_full { N_CELLS } else { 6 }, "{rule} {asks}");
         assert_eq!(
-            (result.coverage, n_seen),
-            (coverage as u32, n_cells),
-            "{rule} {asks}"
-        );
-        assert_eq!(
-            result.n_visited, 6,
-            "a full frame does not change what is visited"
+            (results[0].coverage, results[0].n_visited),
+            (coverage as u32, 6)
         );
     }
 }
 
 #[test]
-fn a_world_in_burn_in_is_resetting_and_answers_when_it_is_done() {
-    let server = Server::start_without_waiting(
-        &new_instance(),
-        &[
-            "--height",
-            "32",
-            "--width",
-            "32",
-            "--moves",
-            "6",
-            "--burn-in",
-            "60000",
-            "--worlds",
-            "1",
-        ],
-    );
-    let up = eventually(PATIENCE, || {
-        Connection::open(&server.instance, "tests", PATIENCE).is_ok()
-    });
-    assert!(up, "{}", server.program.stderr());
+fn a_world_in_burn_in_takes_no_step_and_requests_for_it_wait() {
+    let flags = "--height 32 --width 32 --moves 6 --burn-in 100000";
+    let server = Server::start_in_burn_in(&new_instance(), flags);
     let wire = Wire::open(&server.instance);
     let observe = StepRequest {
         operation: Operation::Observe as u32,
@@ -203,22 +172,23 @@ fn a_world_in_burn_in_is_resetting_and_answers_when_it_is_done() {
     assert_eq!(wire.step(observe, &[]).0.status, Status::Resetting as u32);
     assert!(server.status().worlds[0].resetting);
     let lease = wire.acquire(0, 1).lease;
-    assert!(
-        !server.status().worlds[0].resetting,
-        "acquiring waits for burn-in"
-    );
-    let worlds = vec![WorldSeed {
-        world: 0,
-        seed: Some(5),
-    }];
-    let text = serde_json::to_vec(&Request::Reset { lease, worlds }).expect("serialises");
-    let pending = wire.send_control(control_header(1), &text).expect("send");
-    let (reply, _) = wire.step(step_header(lease, N_MOVES), &[0; 6]);
-    let resetting = eventually(Duration::from_secs(1), || {
-        server.status().worlds[0].resetting || reply.status == Status::Resetting as u32
+    let is_ready = !server.status().worlds[0].resetting;
+    assert!(is_ready, "acquiring waits for burn-in");
+    let reset = format!(r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":0,"seed":5}}]}}"#);
+    let pending = wire.send_control(control_header(1), reset.as_bytes());
+    let pending = pending.expect("send");
+    let refused = eventually(PATIENCE, || {
+        wire.step(step_header(lease, N_MOVES), &[0; 6]).0.status == Status::Resetting as u32
     });
-    assert!(resetting, "{reply:?}");
+    assert!(refused);
+    let twice = Wire::open(&server.instance).control(control_header(2), reset.as_bytes());
+    assert_eq!(
+        twice.0.status,
+        Status::NoLease as u32,
+        "and not by another client"
+    );
     let (header, _) = answer(&pending, PATIENCE).expect("an answer after burn-in");
     assert_eq!(header.status, Status::Ok as u32);
-    assert_eq!(server.status().worlds[0].info.seed, 5);
+    let info = server.status().worlds[0].info.clone();
+    assert_eq!((info.seed, info.step, info.episode), (5, 0, 1));
 }

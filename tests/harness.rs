@@ -153,6 +153,15 @@ impl Server {
         }
     }
 
+    /// Starts a server on an instance and waits until it answers; its worlds are in burn-in then.
+    pub fn start_in_burn_in(instance: &Instance, flags: &str) -> Self {
+        let flags: Vec<&str> = flags.split_whitespace().collect();
+        let server = Self::start_without_waiting(instance, &flags);
+        let answers = eventually(PATIENCE, || status(instance).is_ok());
+        assert!(answers, "{}", server.program.stderr());
+        server
+    }
+
     /// A new connection to it.
     pub fn connect(&self) -> Connection {
         Connection::open(&self.instance, "tests", PATIENCE).expect("connect")

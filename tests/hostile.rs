@@ -56,11 +56,9 @@ impl Attacker {
     }
 
     fn strike(&mut self) {
-        let is_step = self.rng.random();
-        let status = if is_step {
-            self.strike_step()
-        } else {
-            self.strike_control()
+        let status = match self.rng.random() {
+            true => self.strike_step(),
+            false => self.strike_control(),
         };
         match status {
             None => {}

@@ -74,7 +74,10 @@ fn a_takeover_ends_the_former_lease_and_leaves_the_world_where_it_was() {
         Status::LeaseLost,
         us(),
     );
-    assert_eq!(next.observe(0..1).expect("observe"), [last.clone()]);
+    assert_eq!(
+        next.observe(0..1).expect("observe"),
+        std::slice::from_ref(&last)
+    );
     assert_eq!(
         former.observe(0..1).expect("observing needs no lease"),
         [last]
@@ -178,10 +181,7 @@ fn a_client_may_ask_for_a_lease_of_its_own_length() {
 fn a_lease_outlives_a_burn_in_that_is_longer() {
     let flags = "--height 32 --width 32 --moves 6 --burn-in 100000 --lease-millis 100";
     let instance = new_instance();
-    let flags: Vec<&str> = flags.split(' ').collect();
-    let server = Server::start_without_waiting(&instance, &flags);
-    let up = || Connection::open(&instance, "tests", PATIENCE).is_ok();
-    assert!(eventually(PATIENCE, up), "{}", server.program.stderr());
+    let server = Server::start_in_burn_in(&instance, flags);
     let start = Instant::now();
     let mut client = server.acquire(0..1);
     let burn_in = start.elapsed();

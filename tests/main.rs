@@ -11,6 +11,7 @@ mod compliance;
 mod crash;
 mod determinism;
 mod episodes;
+mod files;
 mod frames;
 mod harness;
 mod hostile;

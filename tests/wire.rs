@@ -23,13 +23,16 @@ pub type StepAnswer = (StepReply, Vec<u8>);
 /// An answer to a control request: header and payload.
 pub type ControlAnswer = (ControlReply, Vec<u8>);
 
+/// A port that sends requests.
+type Requests<Q, R> = Client<Ipc, [u8], Q, [u8], R>;
+
 /// A request that waits for its answer.
 pub type Pending<Q, R> = PendingResponse<Ipc, [u8], Q, [u8], R>;
 
 /// A client without manners.
 pub struct Wire {
-    step: Client<Ipc, [u8], StepRequest, [u8], StepReply>,
-    control: Client<Ipc, [u8], ControlRequest, [u8], ControlReply>,
+    step: Requests<StepRequest, StepReply>,
+    control: Requests<ControlRequest, ControlReply>,
     server: Notifier<Ipc>,
     _node: Node<Ipc>,
 }
@@ -160,14 +163,14 @@ pub fn answer<Q: Header, R: Header>(
 
 fn client<Q: Header, R: Header>(
     service: &RequestResponse<Q, R>,
-) -> Result<Client<Ipc, [u8], Q, [u8], R>, ChannelError> {
+) -> Result<Requests<Q, R>, ChannelError> {
     let builder = service.client_builder().initial_max_slice_len(4096);
     let builder = builder.allocation_strategy(AllocationStrategy::PowerOfTwo);
     builder.create().map_err(ipc_error("create a client"))
 }
 
 fn send<Q: Header, R: Header>(
-    client: &Client<Ipc, [u8], Q, [u8], R>,
+    client: &Requests<Q, R>,
     header: Q,
     payload: &[u8],
 ) -> Result<Pending<Q, R>, RequestSendError> {

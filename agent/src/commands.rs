@@ -275,10 +275,11 @@ impl CompareCommand {
     }
 
     fn check_burn_in(&self, arena: &Arena) -> Result<()> {
-        let (asked, got) = (self.burn_in, arena.info().burn_in);
+        let got = arena.info().burn_in;
+        let asked = self.burn_in.unwrap_or(got);
         ensure!(
-            asked.is_none_or(|asked| asked == got),
-            "--burn-in: expected the running server's {got}, got {asked:?}"
+            asked == got,
+            "--burn-in: expected the running server's {got}, got {asked}"
         );
         Ok(())
     }
