@@ -5,7 +5,7 @@ use crate::wire::{Wire, control_header, step_header};
 use protocol::Model;
 use protocol::control::{CoverageRule, Reply, Request};
 use protocol::message::Status::{
-    self, BadMove, LeaseLost, NoLease, NoSuchWorld, NotPermitted, UnknownOperation,
+    self, BadMove, LeaseLost, NoLease, NoSuchWorld, NotPermitted, UnknownFlags, UnknownOperation,
     VersionMismatch, WrongLength, WrongPathLength,
 };
 use protocol::message::{
@@ -194,6 +194,7 @@ fn a_step_of_wrong_numbers_is_refused_and_changes_nothing() {
     steps.check(|h| h.n_moves = 5, WrongPathLength, 6);
     steps.check(|h| h.n_moves = u32::MAX, WrongPathLength, 6);
     steps.check(|h| h.flags = FLAG_FULL_COVERAGE, NotPermitted, 0);
+    steps.check(|h| h.flags = 6, UnknownFlags, 6);
     steps.check(|h| h.n_worlds = 2, WrongLength, 12);
     steps.check(|h| h.operation = Operation::Observe as u32, WrongLength, 0);
     for length in [0, 1, 5, 7, 100] {
