@@ -240,7 +240,7 @@ mod tests {
 
     fn rules(max_steps: u64, start: Start) -> Rules {
         let shape = Shape::new(12, 20).expect("test shape");
-        Rules::new(&Model::wildfire(), shape, 200, max_steps, start).expect("valid model")
+        Rules::new(&Model::wildfire(), shape, 2000, max_steps, start).expect("valid model")
     }
 
     fn path(bytes: &[u8]) -> Vec<Move> {
@@ -250,9 +250,12 @@ mod tests {
     #[test]
     fn reward_counts_distinct_visited_cells_on_fire_after_the_transition() {
         let rules = rules(0, Start::Centre);
-        let mut episode = Episode::new(&rules, 5);
+        let mut episode = Episode::new(&rules, 0);
         let mut total = 0;
-        for _ in 0..200 {
+        for step in 0..2000 {
+            if step % 50 == 0 {
+                episode.reset(&rules, step);
+            }
             let there_and_back = path(&[3, 3, 0, 1, 2, 2]);
             let flight = fly(rules.shape, episode.robot, &there_and_back);
             episode.step(&rules, &there_and_back, Coverage::Path);
