@@ -60,28 +60,34 @@ pub(crate) fn blend(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
     *lanes = states;
 }
 
-/// The high bit of every lane.
+/// The high bit of every lane, that of lane `8 w + b` at position `8 b + w`: an order that takes one
+/// shift a word, with no multiplication to gather its bits.
 #[inline]
 pub(crate) fn high_bits(lanes: &[u8; LANES]) -> u64 {
     let (words, _) = lanes.as_chunks();
-    let bits = words.iter().enumerate().map(|(index, word)| {
-        let high = (u64::from_le_bytes(*word) >> 7) & 0x0101_0101_0101_0101;
-        // The product gathers bit 8i of `high` in bit 56 + i.
-        let gathered = high.wrapping_mul(0x0102_0408_1020_4080) >> 56;
-        gathered << (8 * index)
-    });
+    let high = |word| u64::from_le_bytes(word) >> 7 & 0x0101_0101_0101_0101;
+    let bits = words
+        .iter()
+        .enumerate()
+        .map(|(index, word)| high(*word) << index);
     bits.fold(0, |all, bits| all | bits)
 }
 
-/// Writes `first` plus the position of each bit that is set; what follows in `to` is lost.
+/// The lane of a bit's position in [`high_bits`], and the position of a lane's bit.
+#[inline]
+pub(crate) fn transposed(at: u32) -> u32 {
+    at % 8 * 8 + at / 8
+}
+
+/// Writes `first` plus the lane of each bit of [`high_bits`] that is set; what follows in `to` is lost.
 ///
 /// Eight at a time, needed or not, as in simdjson's `flatten_bits`: a loop over the bits alone would
 /// mispredict its end in most chunks.
 #[inline]
-pub(crate) fn list_bits(mut bits: u64, first: u32, to: &mut [u32; LANES]) {
+pub(crate) fn list_lanes(mut bits: u64, first: u32, to: &mut [u32; LANES]) {
     for eight in to.as_chunks_mut::<8>().0 {
-        for position in eight {
-            *position = first + bits.trailing_zeros();
+        for lane in eight {
+            *lane = first + transposed(bits.trailing_zeros() % 64);
             bits &= bits.wrapping_sub(1);
         }
         if bits == 0 {
