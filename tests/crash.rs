@@ -1,11 +1,10 @@
 //! Agents that are killed or stopped in the middle of a step: the world stays exactly where it was.
 
-use crate::harness::{
-    PATIENCE, Paths, Program, Server, claim, eventually, fly, frames_until, status,
-};
+use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly, frames_until, status};
 use crate::wire::{Wire, answer, step_header};
 use agent::client::{Client, Observation};
-use protocol::channels::Instance;
+use protocol::channels::{ChannelError, Instance};
+use protocol::connection::ConnectionError;
 use protocol::control::Request;
 use protocol::message::{FrameHeader, StepRequest, split_step_payload};
 use protocol::observer::{Observer, Sample};
@@ -253,7 +252,13 @@ fn the_private_server_of_a_comparison_ends_with_it() {
         assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
         agent.signal(signal);
         agent.wait(PATIENCE);
-        let gone = || Client::acquire(&instance, &claim(0..1)).is_err();
+        let gone = || {
+            let error = status(&instance).err();
+            matches!(
+                error,
+                Some(ConnectionError::Channel(ChannelError::NoServer { .. }))
+            )
+        };
         assert!(eventually(Duration::from_secs(1), gone), "after {signal:?}");
     }
 }
