@@ -5,7 +5,7 @@ use crate::wire::{Wire, control_header, step_header};
 use protocol::Model;
 use protocol::control::{CoverageRule, Reply, Request};
 use protocol::message::Status::{
-    self, BadMove, LeaseLost, NoLease, NoSuchWorld, NotPermitted, UnknownOperation,
+    self, BadMove, LeaseLost, NoLease, NoSuchWorld, NotPermitted, UnknownFlags, UnknownOperation,
     VersionMismatch, WrongLength, WrongPathLength,
 };
 use protocol::message::{
@@ -194,6 +194,7 @@ fn a_step_of_wrong_numbers_is_refused_and_changes_nothing() {
     steps.check(|h| h.n_moves = 5, WrongPathLength, 6);
     steps.check(|h| h.n_moves = u32::MAX, WrongPathLength, 6);
     steps.check(|h| h.flags = FLAG_FULL_COVERAGE, NotPermitted, 0);
+    steps.check(|h| h.flags = 6, UnknownFlags, 6);
     steps.check(|h| h.n_worlds = 2, WrongLength, 12);
     steps.check(|h| h.operation = Operation::Observe as u32, WrongLength, 0);
     for length in [0, 1, 5, 7, 100] {
@@ -316,7 +317,7 @@ fn a_step_answer_echoes_its_request_and_fits_its_payload() {
 #[test]
 fn a_client_that_shuts_the_server_down_is_answered() {
     let server = Server::start(SMALL);
-    let reply = Wire::open(&server.instance).ask(&Request::Shutdown);
+    let reply = Wire::open(&server.instance).ask(&Request::Shutdown {});
     assert_eq!(reply, Reply::Done);
     assert_eq!(server.program.wait(Duration::from_secs(1)).code, Some(0));
 }

@@ -249,7 +249,7 @@ pub fn eventually(limit: Duration, mut holds: impl FnMut() -> bool) -> bool {
 /// The server's status, over a connection of its own.
 pub fn status(instance: &Instance) -> Result<ServerStatus, ConnectionError> {
     let mut connection = Connection::open(instance, "tests", PATIENCE)?;
-    match connection.control(&Request::Status, PATIENCE)? {
+    match connection.control(&Request::Status {}, PATIENCE)? {
         Reply::Status(status) => Ok(status),
         other => panic!("expected a status, got {other:?}"),
     }

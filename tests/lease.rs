@@ -179,7 +179,7 @@ fn a_client_may_ask_for_a_lease_of_its_own_length() {
 
 #[test]
 fn a_lease_outlives_a_burn_in_that_is_longer() {
-    let flags = "--height 32 --width 32 --moves 6 --burn-in 100000 --lease-millis 100";
+    let flags = "--height 32 --width 32 --moves 6 --burn-in 500000 --lease-millis 100";
     let instance = new_instance();
     let server = Server::start_in_burn_in(&instance, flags);
     let start = Instant::now();

@@ -112,7 +112,7 @@ fn a_client_that_waits_learns_at_once_that_its_server_was_killed() {
             server.program.signal(Signal::KILL);
             Instant::now()
         });
-        let refused = connection.control(&Request::Status, PATIENCE);
+        let refused = connection.control(&Request::Status {}, PATIENCE);
         assert!(
             matches!(refused, Err(ConnectionError::ServerGone { .. })),
             "{refused:?}"

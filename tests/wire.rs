@@ -14,7 +14,7 @@ use protocol::control::{LeaseInfo, Reply, Request};
 use protocol::message::{
     ControlReply, ControlRequest, Header, Operation, Status, StepReply, StepRequest, VERSION,
 };
-use protocol::wait::poll_then_block;
+use protocol::wait::Waiter;
 use std::time::Duration;
 
 /// An answer to a step: header and payload.
@@ -156,7 +156,9 @@ pub fn answer<Q: Header, R: Header>(
         std::thread::sleep(remaining.min(Duration::from_micros(100)));
         Ok::<_, iceoryx2::port::ReceiveError>(())
     };
-    poll_then_block(limit, poll, block).expect("receive an answer")
+    Waiter::default()
+        .wait(limit, poll, block)
+        .expect("receive an answer")
 }
 
 fn client<Q: Header, R: Header>(

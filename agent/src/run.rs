@@ -294,7 +294,6 @@ fn is_outage(error: &RunError) -> bool {
     match error {
         ConnectionError::ServerGone { .. } | ConnectionError::Timeout { .. } => true,
         ConnectionError::Channel(channel) => matches!(channel, ChannelError::NoServer { .. }),
-        ConnectionError::Refused { status, .. } => *status == Status::Stopping,
         _ => false,
     }
 }

@@ -113,8 +113,8 @@ impl Episode {
     }
 
     /// Flies a path and moves the world once; `coverage` says what the frame shows.
-    pub fn step(&mut self, rules: &Rules, path: Vec<Move>, coverage: Coverage) {
-        let flight = fly(rules.shape, self.robot, &path);
+    pub fn step(&mut self, rules: &Rules, path: &[Move], coverage: Coverage) {
+        let flight = fly(rules.shape, self.robot, path);
         self.world.advance();
         self.look(rules, &flight.visited, coverage);
         let states = self
@@ -142,7 +142,8 @@ impl Episode {
         };
         self.path_start = self.robot;
         self.robot = flight.end;
-        self.path = path;
+        self.path.clear();
+        self.path.extend_from_slice(path);
     }
 
     /// The last step's result, or the reset's.
@@ -239,7 +240,7 @@ mod tests {
 
     fn rules(max_steps: u64, start: Start) -> Rules {
         let shape = Shape::new(12, 20).expect("test shape");
-        Rules::new(&Model::wildfire(), shape, 200, max_steps, start).expect("valid model")
+        Rules::new(&Model::wildfire(), shape, 2000, max_steps, start).expect("valid model")
     }
 
     fn path(bytes: &[u8]) -> Vec<Move> {
@@ -249,12 +250,15 @@ mod tests {
     #[test]
     fn reward_counts_distinct_visited_cells_on_fire_after_the_transition() {
         let rules = rules(0, Start::Centre);
-        let mut episode = Episode::new(&rules, 5);
+        let mut episode = Episode::new(&rules, 0);
         let mut total = 0;
-        for _ in 0..200 {
+        for step in 0..2000 {
+            if step % 50 == 0 {
+                episode.reset(&rules, step);
+            }
             let there_and_back = path(&[3, 3, 0, 1, 2, 2]);
             let flight = fly(rules.shape, episode.robot, &there_and_back);
-            episode.step(&rules, there_and_back, Coverage::Path);
+            episode.step(&rules, &there_and_back, Coverage::Path);
             let states = episode.states();
             let fires = flight
                 .visited
@@ -277,12 +281,12 @@ mod tests {
     fn a_frame_shows_the_visited_cells_and_no_others() {
         let rules = rules(0, Start::Corner);
         let mut episode = Episode::new(&rules, 1);
-        episode.step(&rules, path(&[1, 3, 3]), Coverage::Path);
+        episode.step(&rules, &path(&[1, 3, 3]), Coverage::Path);
         let seen: Vec<usize> = episode.frame().observed().map(|(cell, _)| cell).collect();
         assert_eq!(seen, [20, 21, 22]);
         let masked = episode.frame().clone();
         let mut other = Episode::new(&rules, 1);
-        other.step(&rules, path(&[0, 0, 0]), Coverage::Full);
+        other.step(&rules, &path(&[0, 0, 0]), Coverage::Full);
         assert_eq!(other.frame().observed().count(), 240);
         for (cell, value) in masked.observed() {
             assert_eq!(
@@ -303,7 +307,7 @@ mod tests {
         let rules = rules(0, Start::Random);
         let mut episode = Episode::new(&rules, 9);
         let first = episode.clone();
-        episode.step(&rules, path(&[1, 1, 1]), Coverage::Path);
+        episode.step(&rules, &path(&[1, 1, 1]), Coverage::Path);
         for seed in [9, 10, 9] {
             episode.reset(&rules, seed);
             assert_eq!(episode.states(), Episode::new(&rules, seed).states());
@@ -321,7 +325,7 @@ mod tests {
         let mut episode = Episode::new(&rules, 1);
         for step in 1..=3 {
             assert!(!episode.is_over());
-            episode.step(&rules, path(&[1]), Coverage::Path);
+            episode.step(&rules, &path(&[1]), Coverage::Path);
             assert_eq!(episode.result().step, step);
             assert_eq!(episode.result().terminated, 0);
         }

@@ -1,10 +1,10 @@
 //! Who may act on which worlds, and until when. Pure: time and tokens come in as arguments.
 //!
-//! A lease covers consecutive worlds. It ends by release, by expiry, by its client's death or by a
-//! takeover; a world taken from a lease is lost to that lease for good, also when it is free again.
+//! A lease covers consecutive worlds. It ends by release, by expiry, with its client's connection or
+//! process, or by a takeover; a world taken from a lease is lost to that lease for good, also when it is free again.
 
 use protocol::message::Status;
-use std::collections::{HashMap, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
@@ -197,6 +197,11 @@ impl Leases {
     /// Ends the leases of a process that has died; returns them.
     pub fn end_of_process(&mut self, pid: u32) -> Vec<Lease> {
         self.end_where(|lease| lease.client.pid == pid)
+    }
+
+    /// Ends the leases of nodes that are not among these; returns them.
+    pub fn end_of_nodes_except(&mut self, nodes: &HashSet<u128>) -> Vec<Lease> {
+        self.end_where(|lease| !nodes.contains(&lease.client.node))
     }
 
     /// The worlds of a lease that nobody took from it.
@@ -419,6 +424,20 @@ mod tests {
         );
         assert_eq!(leases.release(now, 11, client(1)), Ok(()));
         assert!(leases.holder(0).is_none());
+    }
+
+    #[test]
+    fn a_closed_connection_holds_nothing() {
+        let (mut leases, now) = (Leases::new(2), Instant::now());
+        leases
+            .acquire(now, claim(1, 0..1, false), 11)
+            .expect("free");
+        leases
+            .acquire(now, claim(2, 1..2, false), 12)
+            .expect("free");
+        let open = HashSet::from([2]);
+        assert_eq!(leases.end_of_nodes_except(&open).len(), 1);
+        assert!(leases.holder(0).is_none() && leases.holder(1).is_some());
     }
 
     #[test]

@@ -155,7 +155,7 @@ fn clean(requests: &Receiver<()>) {
     ) {
         let state = node.try_cleanup_dead_nodes();
         if state.cleanups > 0 {
-            tracing::info!(
+            tracing::debug!(
                 n_processes = state.cleanups,
                 "cleared away what dead processes left"
             );

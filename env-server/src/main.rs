@@ -66,7 +66,7 @@ fn main() -> ExitCode {
 fn run(cli: &Cli) -> Result<()> {
     match &cli.command {
         Some(Command::Status(target)) => show_status(target),
-        Some(Command::Stop(target)) => ask(target, &Request::Shutdown).map(|_| ()),
+        Some(Command::Stop(target)) => ask(target, &Request::Shutdown {}).map(|_| ()),
         None => {
             let checked = cli.flags.effective()?.check()?;
             if cli.check {
@@ -82,7 +82,7 @@ fn run(cli: &Cli) -> Result<()> {
 }
 
 fn show_status(target: &Target) -> Result<()> {
-    match ask(target, &Request::Status)? {
+    match ask(target, &Request::Status {})? {
         Reply::Status(status) if target.json => {
             print(&(serde_json::to_string_pretty(&status)? + "\n"))
         }

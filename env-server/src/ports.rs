@@ -11,11 +11,12 @@ use iceoryx2::port::server::Server;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{AllocationStrategy, CallbackProgression, PortFactory};
 use iceoryx2::service::dynamic_config::publish_subscribe::SubscriberDetails;
+use iceoryx2::service::dynamic_config::request_response::ClientDetails;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use protocol::channels::{
-    Channel, ChannelError, FRAME_BUFFER, FrameService, Ipc, MAX_CLIENTS, MAX_OBSERVERS,
-    MAX_TRUTH_READERS, RequestResponse, Services, StepService, TRUTH_BUFFER, TruthService,
-    create_node, ipc_error,
+    Channel, ChannelError, ControlService, FRAME_BUFFER, FrameService, Ipc, MAX_CLIENTS,
+    MAX_OBSERVERS, MAX_TRUTH_READERS, RequestResponse, Services, StepService, TRUTH_BUFFER,
+    TruthService, create_node, ipc_error,
 };
 use protocol::connection::server_pid;
 use protocol::message::{
@@ -23,7 +24,7 @@ use protocol::message::{
     TruthHeader,
 };
 use protocol::wait::descriptor;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::os::fd::BorrowedFd;
 use thiserror::Error;
 
@@ -85,6 +86,7 @@ pub struct Ports {
     listener: Listener<Ipc>,
     notifier: Notifier<Ipc>,
     listeners: HashMap<u128, ListenerKey>,
+    control_service: ControlService,
     step_service: StepService,
     frame_service: FrameService,
     truth_service: Option<TruthService>,
@@ -153,6 +155,7 @@ impl Ports {
             listener: listener.map_err(ipc_error("create a listener"))?,
             notifier: notifier.map_err(ipc_error("create a notifier"))?,
             listeners: HashMap::new(),
+            control_service,
             step_service,
             frame_service,
             truth_service,
@@ -270,6 +273,20 @@ impl Ports {
     /// Clients connected to `step`.
     pub fn n_clients(&self) -> usize {
         self.step_service.dynamic_config().number_of_clients()
+    }
+
+    /// The nodes with an open connection.
+    pub fn client_nodes(&self) -> HashSet<u128> {
+        let mut nodes = HashSet::new();
+        let mut note = |client: &ClientDetails| {
+            nodes.insert(client.node_id.value());
+            CallbackProgression::Continue
+        };
+        self.control_service
+            .dynamic_config()
+            .list_clients(&mut note);
+        self.step_service.dynamic_config().list_clients(&mut note);
+        nodes
     }
 
     /// Takes note of wake-ups; returns whether there were any.

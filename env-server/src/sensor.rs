@@ -60,10 +60,9 @@ impl Sensor {
             let number = split_mix(key, cell as u64) >> 32;
             let of_state = &self.thresholds[usize::from(states[cell]) * self.n_observations..]
                 [..self.n_observations];
-            let reading = of_state
-                .iter()
-                .take_while(|threshold| number >= **threshold)
-                .count();
+            // All of them, in order or not: stopping at the first mispredicts at every latent cell.
+            let passed = of_state.iter().filter(|threshold| number >= **threshold);
+            let reading = passed.count();
             frame.observe(cell, reading as u8);
         }
     }

@@ -10,7 +10,7 @@ use protocol::control::Reply;
 use protocol::message::{ControlReply, FrameHeader, Status, TruthHeader, VERSION};
 use protocol::model::ModelError;
 use protocol::path::path_to_bytes;
-use protocol::wait::{poll_then_block, sleep_until_readable};
+use protocol::wait::{Waiter, sleep_until_readable};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use rayon::{ThreadPool, ThreadPoolBuilder};
@@ -87,6 +87,7 @@ pub fn serve(
 struct Server {
     simulator: Simulator,
     ports: Ports,
+    waiter: Waiter,
     clients: Clients,
     keeper: Option<Keeper>,
     janitor: Janitor,
@@ -142,6 +143,7 @@ impl Server {
         Ok(Self {
             simulator,
             ports,
+            waiter: Waiter::default(),
             clients: Clients::default(),
             keeper,
             janitor: Janitor::start(),
@@ -165,7 +167,7 @@ impl Server {
     /// Waits for something and handles it.
     fn turn(&mut self) -> Result<(), ServeError> {
         let woken = Cell::new(false);
-        let found = poll_then_block(
+        let found = self.waiter.wait(
             IDLE_TICK,
             || Ok(self.look(&woken)),
             |limit| {
@@ -320,6 +322,12 @@ impl Server {
             let n_leases = self.simulator.end_of_process(pid);
             tracing::info!(pid, n_leases, "a client ended");
             self.janitor.request();
+        }
+        let n_leases = self
+            .simulator
+            .end_of_connections(&self.ports.client_nodes());
+        if n_leases > 0 {
+            tracing::info!(n_leases, "a connection was closed without a release");
         }
     }
 

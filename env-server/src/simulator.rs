@@ -3,36 +3,29 @@
 //! Every request is checked whole before anything changes; a refusal changes nothing. What a client
 //! sends is bytes and numbers it chose freely: nothing here may panic on them.
 
+mod control;
+
+pub use control::{Awaited, Outcome, Surroundings};
+
 use crate::config::Checked;
 use crate::episode::{Episode, Rules};
-use crate::lease::{Claim, ClientId, Leases, Refusal};
-use protocol::channels::MAX_CLIENTS;
-use protocol::control::{
-    LeaseInfo, MAX_CONTROL_BYTES, Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldSeed,
-    WorldStatus,
-};
+use crate::lease::{ClientId, Leases, Refusal};
 use protocol::message::{
     FLAG_FULL_COVERAGE, Operation, Status, StepReply, StepRequest, StepResult, VERSION,
 };
 use protocol::model::ModelError;
 use protocol::path::{MoveError, path_from_bytes};
-use protocol::randomness::{Purpose, stream};
 use protocol::{Coverage, Move};
-use rand_chacha::rand_core::Rng;
 use rayon::ThreadPool;
 use rayon::iter::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
+use rayon::slice::ParallelSlice;
+use std::collections::HashSet;
 use std::ops::Range;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// Cells of a batch from which on it is stepped by several threads: below it, waking them (tens of
 /// microseconds) costs more than it saves at about 1 ns a cell.
 const PARALLEL_CELLS: usize = 1 << 17;
-
-/// Longest lease a client may ask for: a day.
-const LONGEST_LEASE: Duration = Duration::from_secs(86_400);
-
-/// Shortest lease a client may ask for.
-const SHORTEST_LEASE: Duration = Duration::from_millis(100);
 
 /// Worlds and leases.
 pub struct Simulator {
@@ -53,38 +46,6 @@ enum Slot {
     Resetting(StepResult),
 }
 
-/// An answer that waits until worlds have been reset.
-pub struct Awaited {
-    worlds: Vec<usize>,
-    lease: u64,
-    client: ClientId,
-    /// Whether to tell of the lease, or of the worlds alone.
-    tells_lease: bool,
-}
-
-/// What the server itself knows and a status answer tells.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Surroundings {
-    /// Time since the server started.
-    pub uptime: Duration,
-    /// World steps a second, lately.
-    pub steps_per_second: f64,
-    /// Clients on the step channel.
-    pub n_clients: usize,
-    /// Observers of frames.
-    pub n_observers: usize,
-}
-
-/// What a control request leads to.
-pub enum Outcome {
-    /// An answer now.
-    Answer(Reply),
-    /// Resets to carry out, and an answer when the worlds it names are ready.
-    Later(Vec<ResetOrder>, Awaited),
-    /// An answer now, then the end of the server.
-    Shutdown,
-}
-
 /// A world to reset, taken out of the simulator.
 pub struct ResetOrder {
     /// The world.
@@ -99,7 +60,9 @@ pub struct ResetOrder {
 struct Batch {
     worlds: Range<usize>,
     coverage: Coverage,
-    paths: Vec<Vec<Move>>,
+    /// One path after the other.
+    moves: Vec<Move>,
+    n_moves: usize,
 }
 
 impl Simulator {
@@ -186,61 +149,9 @@ impl Simulator {
         }
     }
 
-    /// Handles a control request.
-    pub fn control(
-        &mut self,
-        now: Instant,
-        client: ClientId,
-        version: u32,
-        text: &[u8],
-        surroundings: &Surroundings,
-    ) -> Outcome {
-        let outcome = self.try_control(now, client, version, text, surroundings);
-        outcome.unwrap_or_else(|reply| {
-            self.n_refused += 1;
-            Outcome::Answer(reply)
-        })
-    }
-
     /// Puts a world that was reset back.
     pub fn finish_reset(&mut self, world: usize, episode: Box<Episode>) {
         self.slots[world] = Slot::Ready(episode);
-    }
-
-    /// The answer to a request that had to wait, once its worlds are ready.
-    pub fn answer_awaited(&mut self, now: Instant, awaited: &Awaited) -> Option<Reply> {
-        if awaited
-            .worlds
-            .iter()
-            .any(|&world| self.episode(world).is_none())
-        {
-            return None;
-        }
-        let worlds = awaited
-            .worlds
-            .iter()
-            .map(|&world| self.world_info(world))
-            .collect();
-        // Waiting is use: a burn-in longer than the lease must not end it.
-        self.leases.end_wait(now, awaited.lease);
-        if !awaited.tells_lease {
-            return Some(Reply::Reset { worlds });
-        }
-        Some(
-            match self.leases.renew(now, awaited.lease, awaited.client) {
-                Ok(lease) => Reply::Lease(LeaseInfo {
-                    lease: awaited.lease,
-                    ttl_millis: lease.time_to_live.as_millis() as u64,
-                    worlds,
-                }),
-                Err(lost) => refusal(lost),
-            },
-        )
-    }
-
-    /// Takes note that nobody waits for an answer any more.
-    pub fn forget_awaited(&mut self, now: Instant, awaited: &Awaited) {
-        self.leases.end_wait(now, awaited.lease);
     }
 
     /// The rules, for those who carry out resets.
@@ -260,6 +171,11 @@ impl Simulator {
     /// Ends the leases of a process that has died; returns how many there were.
     pub fn end_of_process(&mut self, pid: u32) -> usize {
         self.leases.end_of_process(pid).len()
+    }
+
+    /// Ends the leases of connections that were closed: of nodes that are not among these.
+    pub fn end_of_connections(&mut self, nodes: &HashSet<u128>) -> usize {
+        self.leases.end_of_nodes_except(nodes).len()
     }
 
     /// The episode of a world that is not being reset.
@@ -347,14 +263,17 @@ impl Simulator {
         let moves = path_from_bytes(paths);
         let moves =
             moves.map_err(|MoveError { index, .. }| Refusal::new(Status::BadMove, index as u64))?;
+        if request.flags & !FLAG_FULL_COVERAGE != 0 {
+            return Err(Refusal::new(Status::UnknownFlags, request.flags.into()));
+        }
         let asks_full = request.flags & FLAG_FULL_COVERAGE != 0;
         let coverage = self.checked.config.coverage.coverage(asks_full);
         let coverage = coverage.map_err(|status| Refusal::new(status, 0))?;
-        let paths = moves.chunks(n_moves).map(<[Move]>::to_vec).collect();
         Ok(Batch {
             worlds,
             coverage,
-            paths,
+            moves,
+            n_moves,
         })
     }
 
@@ -373,16 +292,18 @@ impl Simulator {
 
     fn run(&mut self, batch: Batch) {
         let (rules, slots) = (&self.rules, &mut self.slots[batch.worlds.clone()]);
-        let step = |(slot, path): (&mut Slot, Vec<Move>)| {
+        let step = |(slot, path): (&mut Slot, &[Move])| {
             if let Slot::Ready(episode) = slot {
                 episode.step(rules, path, batch.coverage);
             }
         };
         if slots.len() * rules.shape.n_cells() >= PARALLEL_CELLS {
+            let paths = batch.moves.par_chunks(batch.n_moves);
             self.threads
-                .install(|| slots.par_iter_mut().zip(batch.paths).for_each(step));
+                .install(|| slots.par_iter_mut().zip(paths).for_each(step));
         } else {
-            slots.iter_mut().zip(batch.paths).for_each(step);
+            let paths = batch.moves.chunks(batch.n_moves);
+            slots.iter_mut().zip(paths).for_each(step);
         }
         self.n_steps += batch.worlds.len() as u64;
     }
@@ -395,232 +316,6 @@ impl Simulator {
             payload.extend_from_slice(episode.frame().as_bytes());
         }
     }
-
-    fn try_control(
-        &mut self,
-        now: Instant,
-        client: ClientId,
-        version: u32,
-        text: &[u8],
-        surroundings: &Surroundings,
-    ) -> Result<Outcome, Reply> {
-        if version != VERSION {
-            return Err(Reply::refusal(Status::VersionMismatch, VERSION.into()));
-        }
-        Ok(match parse(text)? {
-            Request::Hello { protocol, .. } if protocol != VERSION => {
-                return Err(Reply::refusal(Status::VersionMismatch, VERSION.into()));
-            }
-            Request::Hello { .. } => Outcome::Answer(Reply::Hello(Box::new(self.info()))),
-            Request::Acquire {
-                first_world,
-                n_worlds,
-                takeover,
-                ttl_millis,
-            } => {
-                let worlds = self.range(first_world, n_worlds).map_err(refusal)?;
-                let time_to_live = self.time_to_live(ttl_millis);
-                self.acquire(
-                    now,
-                    Claim {
-                        client,
-                        worlds,
-                        takeover,
-                        time_to_live,
-                    },
-                )?
-            }
-            Request::Renew { lease } => {
-                self.leases.renew(now, lease, client).map_err(refusal)?;
-                self.tell_lease(lease, client)
-            }
-            Request::Release { lease } => {
-                self.leases.release(now, lease, client).map_err(refusal)?;
-                Outcome::Answer(Reply::Done)
-            }
-            Request::Reset { lease, worlds } => self.order_resets(now, client, lease, &worlds)?,
-            Request::Status => Outcome::Answer(Reply::Status(self.status(surroundings))),
-            Request::Shutdown => Outcome::Shutdown,
-        })
-    }
-
-    fn time_to_live(&self, ttl_millis: Option<u64>) -> Duration {
-        let millis = ttl_millis.unwrap_or(self.checked.config.lease_millis);
-        Duration::from_millis(millis).clamp(SHORTEST_LEASE, LONGEST_LEASE)
-    }
-
-    fn acquire(&mut self, now: Instant, claim: Claim) -> Result<Outcome, Reply> {
-        let (token, client) = ((self.next_token)(), claim.client);
-        self.leases.acquire(now, claim, token).map_err(refusal)?;
-        Ok(self.tell_lease(token, client))
-    }
-
-    /// An answer when its worlds are ready; the lease lives until then.
-    fn later(&mut self, orders: Vec<ResetOrder>, awaited: Awaited) -> Outcome {
-        self.leases.begin_wait(awaited.lease);
-        Outcome::Later(orders, awaited)
-    }
-
-    /// The worlds of a lease, once they are ready.
-    fn tell_lease(&mut self, lease: u64, client: ClientId) -> Outcome {
-        let awaited = Awaited {
-            worlds: self.leases.worlds_held(lease),
-            lease,
-            client,
-            tells_lease: true,
-        };
-        self.later(Vec::new(), awaited)
-    }
-
-    fn order_resets(
-        &mut self,
-        now: Instant,
-        client: ClientId,
-        lease: u64,
-        worlds: &[WorldSeed],
-    ) -> Result<Outcome, Reply> {
-        if worlds.is_empty() {
-            self.leases.renew(now, lease, client).map_err(refusal)?;
-        }
-        for (index, WorldSeed { world, .. }) in worlds.iter().enumerate() {
-            let range = self.range(*world, 1).map_err(refusal)?;
-            self.leases
-                .use_lease(now, lease, client, &range)
-                .map_err(refusal)?;
-            if self.episode(range.start).is_none() {
-                return Err(Reply::refusal(Status::Resetting, (*world).into()));
-            }
-            if worlds[..index]
-                .iter()
-                .any(|earlier| earlier.world == *world)
-            {
-                return Err(malformed(format!(
-                    "reset: expected each world once, got world {world} twice"
-                )));
-            }
-        }
-        let orders = worlds
-            .iter()
-            .filter_map(|order| self.take_for_reset(order))
-            .collect();
-        let worlds = worlds.iter().map(|order| order.world as usize).collect();
-        let awaited = Awaited {
-            worlds,
-            lease,
-            client,
-            tells_lease: false,
-        };
-        Ok(self.later(orders, awaited))
-    }
-
-    fn take_for_reset(&mut self, order: &WorldSeed) -> Option<ResetOrder> {
-        let world = order.world as usize;
-        let last = *self.episode(world)?.result();
-        match std::mem::replace(&mut self.slots[world], Slot::Resetting(last)) {
-            Slot::Ready(episode) => Some(ResetOrder {
-                world,
-                episode: Some(episode),
-                seed: order.seed.unwrap_or_else(|| next_seed(&last)),
-            }),
-            Slot::Resetting(_) => None,
-        }
-    }
-
-    fn world_info(&self, world: usize) -> WorldInfo {
-        let result = match &self.slots[world] {
-            Slot::Ready(episode) => episode.result(),
-            Slot::Resetting(last) => last,
-        };
-        let StepResult {
-            step,
-            seed,
-            episode,
-            row,
-            col,
-            ..
-        } = *result;
-        WorldInfo {
-            world: world as u32,
-            step,
-            seed,
-            episode,
-            robot: [row, col],
-        }
-    }
-
-    fn info(&self) -> ServerInfo {
-        let (config, file) = (&self.checked.config, self.checked.model.file());
-        ServerInfo {
-            protocol: VERSION,
-            build: env!("CARGO_PKG_VERSION").into(),
-            pid: std::process::id(),
-            height: config.height,
-            width: config.width,
-            n_moves: config.moves,
-            n_worlds: config.worlds,
-            n_observations: file.observations.len(),
-            observations: file
-                .observations
-                .iter()
-                .map(|observation| observation.name.clone())
-                .collect(),
-            model: config
-                .reveal_model
-                .then(|| toml::to_string(file).expect("invariant: model files serialise")),
-            burn_in: config.burn_in,
-            max_steps: config.max_steps,
-            max_clients: MAX_CLIENTS,
-            coverage: config.coverage,
-            publish_truth: config.publish_truth,
-            lease_millis: config.lease_millis,
-        }
-    }
-
-    fn status(&self, surroundings: &Surroundings) -> ServerStatus {
-        let world_status = |world| WorldStatus {
-            info: self.world_info(world),
-            holder_pid: self.leases.holder(world).map(|lease| lease.client.pid),
-            resetting: self.episode(world).is_none(),
-        };
-        ServerStatus {
-            pid: std::process::id(),
-            uptime_millis: surroundings.uptime.as_millis() as u64,
-            n_steps: self.n_steps,
-            steps_per_second: surroundings.steps_per_second,
-            n_refused: self.n_refused,
-            n_clients: surroundings.n_clients,
-            n_observers: surroundings.n_observers,
-            worlds: (0..self.slots.len()).map(world_status).collect(),
-        }
-    }
-}
-
-fn parse(text: &[u8]) -> Result<Request, Reply> {
-    if text.len() > MAX_CONTROL_BYTES {
-        return Err(malformed(format!(
-            "expected at most {MAX_CONTROL_BYTES} bytes, got {}",
-            text.len()
-        )));
-    }
-    serde_json::from_slice(text).map_err(|error| malformed(error.to_string()))
-}
-
-fn malformed(problem: String) -> Reply {
-    let message = format!("{}: {problem}", Status::Malformed.explain(0));
-    Reply::Error {
-        status: Status::Malformed,
-        detail: 0,
-        message,
-    }
-}
-
-fn refusal(refusal: Refusal) -> Reply {
-    Reply::refusal(refusal.status, refusal.detail)
-}
-
-/// The seed after an episode whose reset names none; below 2^53, which every JSON reader holds.
-fn next_seed(last: &StepResult) -> u64 {
-    stream(last.seed, Purpose::Episode, last.episode).next_u64() >> 11
 }
 
 impl ResetOrder {

@@ -28,7 +28,7 @@ pub const MAX_OBSERVERS: usize = 16;
 pub const MAX_TRUTH_READERS: usize = 4;
 
 /// Frames that an observer may fall behind before it loses the oldest.
-pub const FRAME_BUFFER: usize = 16;
+pub const FRAME_BUFFER: usize = 64;
 
 /// Hidden states that a reader may fall behind: a batch of this many worlds is never lost.
 pub const TRUTH_BUFFER: usize = 128;

@@ -11,7 +11,7 @@ use crate::message::split_step_payload;
 use crate::message::{
     ControlReply, ControlRequest, Header, Status, StepReply, StepRequest, StepResult, VERSION,
 };
-use crate::wait::{descriptor, poll_then_block, sleep_until_readable};
+use crate::wait::{Waiter, descriptor, sleep_until_readable};
 use iceoryx2::node::Node;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::Client;
@@ -98,6 +98,7 @@ struct Wake {
     server: Notifier<Ipc>,
     listener: Listener<Ipc>,
     server_process: OwnedFd,
+    waiter: Waiter,
     node: Node<Ipc>,
 }
 
@@ -150,6 +151,7 @@ impl Connection {
             server,
             listener,
             server_process,
+            waiter: Waiter::default(),
             node,
         };
         let info = shake_hands(&control, &mut wake, client, timeout)?;
@@ -229,7 +231,7 @@ impl Connection {
             },
         )?;
         refuse(WHAT, reply.status, reply.detail, None)?;
-        check_sequence(WHAT, reply.sequence, self.sequence)?;
+        check_answer(WHAT, reply.version, (reply.sequence, self.sequence))?;
         let (results, frames) = answer.map_err(|expected| ConnectionError::Garbled {
             what: WHAT,
             problem: format!("expected a payload of {expected} bytes"),
@@ -290,7 +292,7 @@ impl Wake {
             None if gone.get() => Err(self.gone()),
             None => Ok(None),
         };
-        poll_then_block(timeout, poll, |remaining| {
+        self.waiter.wait(timeout, poll, |remaining| {
             gone.set(self.sleep(remaining.min(LONGEST_SLEEP))? || !pending.is_connected());
             Ok(())
         })
@@ -375,7 +377,7 @@ fn ask(
         wake.exchange(client, header, &text, WHAT, timeout, |reply, payload| {
             (*reply, payload.to_vec())
         })?;
-    check_sequence(WHAT, reply.sequence, sequence)?;
+    check_answer(WHAT, reply.version, (reply.sequence, sequence))?;
     let parsed = serde_json::from_slice(&payload);
     let message = match &parsed {
         Ok(Reply::Error {
@@ -422,12 +424,18 @@ fn refuse(
     }
 }
 
-fn check_sequence(what: &'static str, got: u64, expected: u64) -> Result<(), ConnectionError> {
-    if got == expected {
+/// Checks that an answer is of our version and to our request: `(got, expected)` sequence numbers.
+fn check_answer(
+    what: &'static str,
+    version: u32,
+    (got, expected): (u64, u64),
+) -> Result<(), ConnectionError> {
+    let problem = if version != VERSION {
+        format!("expected version {VERSION}, got {version}")
+    } else if got != expected {
+        format!("expected sequence number {expected}, got {got}")
+    } else {
         return Ok(());
-    }
-    Err(ConnectionError::Garbled {
-        what,
-        problem: format!("expected sequence number {expected}, got {got}"),
-    })
+    };
+    Err(ConnectionError::Garbled { what, problem })
 }

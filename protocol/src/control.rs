@@ -49,9 +49,10 @@ pub enum Request {
         worlds: Vec<WorldSeed>,
     },
     /// What is going on?
-    Status,
+    // Braces, so that unknown keys are refused here too.
+    Status {},
     /// Stop the server.
-    Shutdown,
+    Shutdown {},
 }
 
 /// A world to reset.
@@ -252,7 +253,7 @@ mod tests {
         assert_eq!(request, expected);
         assert_eq!(
             serde_json::from_str::<Request>(r#"{"op":"status"}"#).ok(),
-            Some(Request::Status)
+            Some(Request::Status {})
         );
         assert!(serde_json::from_str::<Request>(r#"{"op":"renew","lease":1,"extra":2}"#).is_err());
     }

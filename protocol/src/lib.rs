@@ -13,6 +13,7 @@ pub mod control;
 pub mod dynamics;
 pub mod frame;
 pub mod grid;
+mod lanes;
 pub mod message;
 mod mixture;
 pub mod model;

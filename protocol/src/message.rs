@@ -64,8 +64,8 @@ pub enum Status {
     EpisodeOver = 12,
     /// Full frames were asked of a server that gives none; detail: 0.
     NotPermitted = 13,
-    /// The server is shutting down; detail: 0.
-    Stopping = 14,
+    /// A flag that the server does not know; detail: the flags received.
+    UnknownFlags = 14,
 }
 
 /// A number that is no [`Status`] or no [`Operation`].
@@ -284,17 +284,22 @@ impl Status {
         Self::Resetting,
         Self::EpisodeOver,
         Self::NotPermitted,
-        Self::Stopping,
+        Self::UnknownFlags,
     ];
+
+    /// What to tell a client of another version.
+    pub fn version_mismatch(client: u32, server: u64) -> String {
+        format!(
+            "protocol version mismatch: the client speaks {client}, the server {server}; \
+             use a client and a server of one release"
+        )
+    }
 
     /// One sentence for people: what the status with this detail says and what to do.
     pub fn explain(self, detail: u64) -> String {
         match self {
             Self::Ok => "ok".into(),
-            Self::VersionMismatch => format!(
-                "protocol version mismatch: the client speaks {VERSION}, the server {detail}; \
-                 use a client and a server of one release"
-            ),
+            Self::VersionMismatch => Self::version_mismatch(VERSION, detail),
             Self::UnknownOperation => {
                 format!("operation: expected 1 (step) or 2 (observe), got {detail}")
             }
@@ -323,7 +328,9 @@ impl Status {
             Self::NotPermitted => {
                 "full frames need a server with coverage \"client\" or \"full\"".into()
             }
-            Self::Stopping => "the server is shutting down".into(),
+            Self::UnknownFlags => {
+                format!("flags: expected 0 or {FLAG_FULL_COVERAGE} (full coverage), got {detail}")
+            }
         }
     }
 }

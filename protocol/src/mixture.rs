@@ -4,8 +4,15 @@
 use crate::model::Model;
 
 /// Mark of a cell to be drawn again, and of what lies off the grid: who draws it as its parent is
-/// rejected.
+/// rejected. Odd, and its high bit is set, as in no state.
 pub(crate) const REJECTED: u8 = 255;
+
+/// Mark of a cell that the first byte left to the residual distribution. Even; high bit set.
+pub(crate) const ESCAPED: u8 = 254;
+
+/// Most rules of a [`Draw`]: 64 states have as many with a 3 x 3 kernel. The tables of more would not
+/// stay in any cache.
+const MOST_RULES: usize = 1 << 16;
 
 /// The weights of eq. 2 as a mixture over taps.
 #[derive(Debug, Clone)]
@@ -20,35 +27,38 @@ pub(crate) struct Mixture {
     total: f64,
 }
 
-/// A distribution over taps, and over outcomes given the tap and its parent.
-#[derive(Debug, Clone)]
+/// Draws of a tap and its outcome, from the residual distribution or from the whole.
+///
+/// Tap `t` has an interval as long as its probability, and each state of its parent divides it among
+/// the outcomes. All their ends together cut it into *rules*: pieces in which a parent's state
+/// leads to one outcome. So one draw, by an alias table (Walker 1977, Vose 1991), and two
+/// look-ups decide a cell. The wildfire has 53 rules in its residual distribution.
+#[derive(Debug)]
 pub(crate) struct Draw {
-    n_states: usize,
-    /// An alias table with a power of two of slots.
+    /// Two alias tables of one length, a power of two: the residual distribution, then the whole.
     slots: Vec<Slot>,
-    /// Low bits of the random number that decide within a slot.
-    slot_bits: u32,
-    /// Cumulative outcome probabilities in units of `2^-32`, a row for each tap and parent (the last
-    /// row of a tap for a parent off the grid), in each as many quadruples as hold S.
-    thresholds: Vec<[u32; 4]>,
-    quads: usize,
+    log_n_slots: u32,
+    /// Outcomes, in rows of a power of two.
+    outcomes: Vec<u8>,
+    /// What of a parent indexes a row; takes [`REJECTED`] to the row's end.
+    mask: u8,
 }
 
-/// A tap drawn.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Tap {
-    /// Where it reads, relative to a cell's home.
-    pub(crate) offset: u32,
-    /// The first row of its thresholds.
-    row: u32,
+/// A tap, and the outcome for whatever parent it meets.
+#[derive(Debug, Clone, Copy, Default)]
+struct Rule {
+    /// Where the tap reads, relative to a cell's home.
+    offset: u32,
+    /// The first of its row of outcomes.
+    outcomes: u32,
 }
 
 /// One slot of an alias table.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 struct Slot {
-    /// Below it the first tap is drawn, else the second.
+    /// Below it the first rule is drawn, else the second.
     threshold: u32,
-    taps: [Tap; 2],
+    rules: [Rule; 2],
 }
 
 impl Mixture {
@@ -105,6 +115,22 @@ impl Mixture {
         (0..self.n_states).map(likeliest).collect()
     }
 
+    /// For each state of the parent under a tap, where each outcome's part of the tap's interval ends;
+    /// `taken` has gone from the likeliest outcome's.
+    fn ends(&self, tap: usize, likeliest: &[usize], taken: f64) -> Vec<Vec<f64>> {
+        let of_parent = |(from, &likeliest): (usize, &usize)| {
+            let mut end = 0.0;
+            let weights = self.weights(tap, from).iter().enumerate();
+            let ends = weights.map(|(to, weight)| {
+                let taken = if to == likeliest { taken } else { 0.0 };
+                end += f64::max(weight / self.total - taken, 0.0);
+                end
+            });
+            ends.collect()
+        };
+        likeliest.iter().enumerate().map(of_parent).collect()
+    }
+
     /// `q`: how many of 256 byte values stand for each tap.
     pub(crate) fn fast_counts(&self, likeliest: &[usize]) -> Vec<usize> {
         let count = |tap| {
@@ -117,103 +143,110 @@ impl Mixture {
 }
 
 impl Draw {
-    /// The distribution of tap and outcome, less `counts[t] / 256` of "tap `t`, likeliest outcome". The
-    /// taps read at `offsets`.
+    /// The distribution of tap and outcome less `counts[t] / 256` of "tap `t`, likeliest outcome",
+    /// and the whole distribution; the taps read at `offsets`. `None` if the rules would be too many.
     pub(crate) fn new(
         mixture: &Mixture,
         offsets: &[usize],
         likeliest: &[usize],
         counts: &[usize],
-    ) -> Self {
-        let n_states = mixture.n_states;
-        let taken = |tap: usize| counts[tap] as f64 / 256.0;
-        let left = |(tap, most)| f64::max(most / mixture.total - taken(tap), 0.0);
-        let masses: Vec<f64> = mixture.most.iter().enumerate().map(left).collect();
-        let probability = |tap: usize, from: usize, to| {
-            let fast = f64::from(u8::from(to == likeliest[from])) * taken(tap);
-            let weight = mixture.weights(tap, from)[to] / mixture.total;
-            f64::max(weight - fast, 0.0) / masses[tap]
-        };
-        let quads = n_states.div_ceil(4);
-        // A parent off the grid keeps thresholds of zero: always rejected.
-        let mut thresholds = vec![[0; 4]; mixture.n_taps * (n_states + 1) * quads];
-        for (tap, rows) in thresholds.chunks_mut((n_states + 1) * quads).enumerate() {
-            for (from, row) in rows.chunks_mut(quads).take(n_states).enumerate() {
-                let outcomes = (0..n_states).map(|to| probability(tap, from, to));
-                cumulate(outcomes, row.as_flattened_mut());
+    ) -> Option<Self> {
+        let n_weights = mixture.weights.iter().filter(|&&w| w > 0.0).count();
+        if n_weights + mixture.n_taps > MOST_RULES {
+            return None;
+        }
+        let mut outcomes = Vec::new();
+        let [residual, whole] = [counts, &vec![0; counts.len()]].map(|counts| {
+            let mut rules = Vec::new();
+            for (tap, &offset) in offsets.iter().enumerate() {
+                let taken = counts[tap] as f64 / 256.0;
+                let ends = mixture.ends(tap, likeliest, taken);
+                let length = mixture.most[tap] / mixture.total - taken;
+                add_rules(&ends, length, offset, &mut rules, &mut outcomes);
             }
-        }
-        let slots = alias_table(&masses, &taps(offsets, n_states));
-        Self {
-            n_states,
-            slot_bits: 32 - slots.len().trailing_zeros(),
-            slots,
-            thresholds,
-            quads,
-        }
+            rules
+        });
+        let n_slots = residual.len().max(whole.len()).next_power_of_two();
+        let slots = [residual, whole].map(|rules| alias_table(&rules, n_slots));
+        Some(Self {
+            slots: slots.concat(),
+            log_n_slots: n_slots.trailing_zeros(),
+            outcomes,
+            mask: (row_length(mixture.n_states) - 1) as u8,
+        })
     }
 
-    pub(crate) fn tap(&self, random: u32) -> Tap {
-        let slot = &self.slots[(random >> self.slot_bits) as usize];
-        let within = random & ((1 << self.slot_bits) - 1);
-        slot.taps[usize::from(within >= slot.threshold)]
+    /// Draws again for the cell at `home` that bears `mark`: a state, or [`REJECTED`].
+    #[inline]
+    pub(crate) fn outcome(&self, mark: u8, random: u32, parents: &[u8], home: u32) -> u8 {
+        let table = usize::from(mark & 1) << self.log_n_slots;
+        let slot = &self.slots[(u64::from(random) << self.log_n_slots >> 32) as usize | table];
+        let within = random << self.log_n_slots;
+        let rule = slot.rules[usize::from(within >= slot.threshold)];
+        let parent = parents[(home + rule.offset) as usize];
+        self.outcomes[rule.outcomes as usize | usize::from(parent & self.mask)]
     }
+}
 
-    /// The number of thresholds passed: branch-free, as no outcome is predictable.
-    pub(crate) fn outcome(&self, tap: Tap, parent: u8, random: u32) -> u8 {
-        let row = tap.row as usize + usize::from(parent).min(self.n_states);
-        let passed = |quad: &[u32; 4]| quad.iter().map(|&t| u32::from(random >= t)).sum::<u32>();
-        let outcome = if self.quads == 1 {
-            passed(&self.thresholds[row])
-        } else {
-            let quads = &self.thresholds[row * self.quads..][..self.quads];
-            quads.iter().map(passed).sum()
+/// Room for an outcome of each state and of no parent.
+fn row_length(n_states: usize) -> usize {
+    (n_states + 1).next_power_of_two()
+}
+
+/// Cuts a tap's interval into rules with their lengths; appends their rows of outcomes.
+fn add_rules(
+    ends: &[Vec<f64>],
+    length: f64,
+    offset: usize,
+    rules: &mut Vec<(f64, Rule)>,
+    outcomes: &mut Vec<u8>,
+) {
+    let mut cuts = ends.concat();
+    cuts.push(length);
+    cuts.sort_by(f64::total_cmp);
+    let mut begin = 0.0;
+    for end in cuts {
+        if end <= begin {
+            continue;
+        }
+        let rule = Rule {
+            offset: offset as u32,
+            outcomes: outcomes.len() as u32,
         };
-        if (outcome as usize) < self.n_states {
-            outcome as u8
-        } else {
-            REJECTED
+        rules.push((end - begin, rule));
+        for ends in ends {
+            let outcome = ends.iter().position(|&of_outcome| end <= of_outcome);
+            outcomes.push(outcome.map_or(REJECTED, |outcome| outcome as u8));
         }
+        let end_of_row = rule.outcomes as usize + row_length(ends.len());
+        outcomes.resize(end_of_row, REJECTED);
+        begin = end;
     }
 }
 
-fn taps(offsets: &[usize], n_states: usize) -> Vec<Tap> {
-    let tap = |(tap, &offset): (usize, &usize)| Tap {
-        offset: offset as u32,
-        row: (tap * (n_states + 1)) as u32,
-    };
-    offsets.iter().enumerate().map(tap).collect()
-}
-
-/// Cumulative probabilities in units of `2^-32`; entries without a probability repeat the last sum.
-fn cumulate(mut probabilities: impl Iterator<Item = f64>, thresholds: &mut [u32]) {
-    let mut sum = 0.0;
-    for threshold in thresholds {
-        sum += probabilities.next().unwrap_or(0.0);
-        // Casts saturate: a probability of one loses 2^-32, and 0/0 becomes 0.
-        *threshold = (sum * 2f64.powi(32)) as u32;
-    }
-}
-
-/// The smallest alias table with a power of two of slots (Vose, IEEE TSE 17(9), 1991). The masses
-/// need not sum to one; if they sum to zero, the table must not be drawn from.
-fn alias_table(masses: &[f64], taps: &[Tap]) -> Vec<Slot> {
-    let n_slots = masses.len().next_power_of_two().max(2);
-    let unit = 2f64.powi(32) / n_slots as f64;
-    let per_slot = masses.iter().sum::<f64>() / n_slots as f64;
-    let mut left: Vec<f64> = masses.iter().map(|mass| mass / per_slot).collect();
+/// An alias table of the rules, which need not sum to one (Vose, IEEE TSE 17(9), 1991). If there are
+/// none, it must not be drawn from.
+fn alias_table(rules: &[(f64, Rule)], n_slots: usize) -> Vec<Slot> {
+    let per_slot = rules.iter().map(|(mass, _)| mass).sum::<f64>() / n_slots as f64;
+    let mut left: Vec<f64> = rules.iter().map(|(mass, _)| mass / per_slot).collect();
     left.resize(n_slots, 0.0);
     let (mut small, mut large): (Vec<usize>, Vec<usize>) =
-        (0..n_slots).partition(|&tap| left[tap] < 1.0);
-    let whole = |tap: usize| Slot {
+        (0..n_slots).partition(|&slot| left[slot] < 1.0);
+    let rule = |slot: usize| {
+        rules
+            .get(slot)
+            .or(rules.last())
+            .map_or_else(Rule::default, |r| r.1)
+    };
+    let whole = |slot| Slot {
         threshold: u32::MAX,
-        taps: [taps[tap.min(taps.len() - 1)]; 2],
+        rules: [rule(slot); 2],
     };
     let mut slots: Vec<Slot> = (0..n_slots).map(whole).collect();
     while let Some(&over) = large.last() {
         let Some(under) = small.pop() else { break };
-        slots[under].threshold = (left[under] * unit) as u32;
-        slots[under].taps[1] = taps[over];
+        slots[under].threshold = (left[under] * 2f64.powi(32)) as u32;
+        slots[under].rules[1] = rule(over);
         left[over] -= 1.0 - left[under];
         if left[over] < 1.0 {
             large.pop();

@@ -1,13 +1,17 @@
-//! The hidden Markov model on a grid: its parameters, their file format and their checks.
+//! The hidden Markov model on a grid: its parameters, for those who simulate and those who filter.
 //!
 //! Paper section II: states with the transition kernel `w` and bias `b` of eq. 2, and the observation
-//! matrix `O` of eq. 1. What the parameters do lives in [`crate::transition`] (on beliefs) and
-//! [`crate::dynamics`] (on realised states).
+//! matrix `O` of eq. 1. [`file`] is how people write a model. What the parameters do lives in
+//! [`crate::transition`] (on beliefs) and [`crate::dynamics`] (on realised states).
+
+mod check;
+pub mod file;
+
+pub use file::{KernelEntry, ModelError, ModelFile, ObservationEntry, StateEntry, parse_color};
 
 use crate::grid::{Cell, Shape};
+use check::Checker;
 use ndarray::{Array1, Array2, Array4, Axis};
-use serde::{Deserialize, Serialize};
-use thiserror::Error;
 
 /// Most states, and most observations, of a model: 64.
 pub const MAX_VALUES: usize = 64;
@@ -15,8 +19,9 @@ pub const MAX_VALUES: usize = 64;
 /// Largest kernel side: 15 cells.
 pub const MAX_KERNEL_SIDE: usize = 15;
 
-/// How far a probability distribution in a model file may be from summing to one.
-const SUM_TOLERANCE: f64 = 1e-6;
+/// The least that the weights of a cell may sum to, as a share of the largest weight: the smallest
+/// normal `f32` is 1e-38, so that sums from 1e-30 on keep their precision in beliefs.
+const LEAST_SHARE: f64 = 1e-30;
 
 const WILDFIRE: &str = include_str!("../../config/models/wildfire.toml");
 
@@ -29,134 +34,6 @@ pub struct Model {
     likelihood: Array2<f64>,
     initial: Array1<f64>,
     reward: Array1<f64>,
-}
-
-/// A model as written in TOML; [`Model::new`] checks it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ModelFile {
-    /// Name shown to people.
-    pub name: String,
-    /// Rows and columns of the transition kernel, both odd.
-    pub kernel_size: [usize; 2],
-    /// The states, in the order of their values.
-    pub states: Vec<StateEntry>,
-    /// The observations, in the order of their values.
-    pub observations: Vec<ObservationEntry>,
-    /// The blocks `w[to, from]` of the kernel that are not zero.
-    pub kernel: Vec<KernelEntry>,
-}
-
-/// One state of a model file.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct StateEntry {
-    /// Name, unique among the states.
-    pub name: String,
-    /// Colour in pictures, `#rrggbb`.
-    pub color: String,
-    /// Probability of this state in each cell at the start of burn-in.
-    pub initial: f64,
-    /// Reward for each distinct visited cell in this state.
-    #[serde(default)]
-    pub reward: f64,
-    /// The bias `b[to]` of eq. 2.
-    #[serde(default)]
-    pub bias: f64,
-    /// `P(y | this state)`, one entry per observation (eq. 1).
-    pub observed_as: Vec<f64>,
-}
-
-/// One observation of a model file.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ObservationEntry {
-    /// Name, unique among the observations.
-    pub name: String,
-    /// Colour in pictures, `#rrggbb`.
-    pub color: String,
-}
-
-/// One block `w[to, from]` of the kernel in a model file.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct KernelEntry {
-    /// Name of the state at k.
-    pub from: String,
-    /// Name of the state at k + 1.
-    pub to: String,
-    /// Factor on every weight.
-    #[serde(default = "one")]
-    pub scale: f64,
-    /// Weights `[row offset][column offset]`; the centre is the cell itself, rows grow downward.
-    pub weights: Vec<Vec<f64>>,
-}
-
-/// Why a model file was rejected.
-#[derive(Debug, Error, PartialEq)]
-#[non_exhaustive]
-pub enum ModelError {
-    /// Not TOML, or not of the model's form.
-    #[error("model file: {0}")]
-    Toml(String),
-    /// Too few or too many states or observations.
-    #[error("model {model:?}: expected {least} to {MAX_VALUES} {what}, got {got}")]
-    Count {
-        /// The model's name.
-        model: String,
-        /// `states` or `observations`.
-        what: &'static str,
-        /// Smallest number allowed.
-        least: usize,
-        /// Number in the file.
-        got: usize,
-    },
-    /// Two entries with one name.
-    #[error("model {model:?}: {what} name {name:?} stands twice")]
-    DuplicateName {
-        /// The model's name.
-        model: String,
-        /// `state` or `observation`.
-        what: &'static str,
-        /// The repeated name.
-        name: String,
-    },
-    /// A kernel entry that names a state the model lacks.
-    #[error("model {model:?}: kernel entry names state {name:?}, expected one of {known:?}")]
-    UnknownState {
-        /// The model's name.
-        model: String,
-        /// The name in the kernel entry.
-        name: String,
-        /// The model's states.
-        known: Vec<String>,
-    },
-    /// A number or a size that cannot be right.
-    #[error("model {model:?}: {what}: expected {expected}, got {got}")]
-    Value {
-        /// The model's name.
-        model: String,
-        /// Which entry.
-        what: String,
-        /// What it must be.
-        expected: String,
-        /// What it is.
-        got: String,
-    },
-    /// A cell whose transition weights can all be zero: eq. 3 would divide by zero.
-    #[error(
-        "model {model:?} on a {shape} grid: transition weights of cell {cell} can sum to zero, \
-         expected a positive sum whatever its neighbourhood: give the centre of the kernel a \
-         positive weight from every state, or give a state a bias"
-    )]
-    ZeroWeight {
-        /// The model's name.
-        model: String,
-        /// The grid.
-        shape: Shape,
-        /// The first such cell.
-        cell: Cell,
-    },
 }
 
 impl Model {
@@ -198,14 +75,16 @@ impl Model {
         })
     }
 
-    /// Checks that eq. 3 never divides by zero on a grid, whatever the states.
+    /// Checks that eq. 3 never divides by zero on a grid, or by next to nothing, whatever the states.
     ///
     /// # Errors
-    /// [`ModelError::ZeroWeight`] names the first cell whose weights can sum to zero.
+    /// [`ModelError::ZeroWeight`] or [`ModelError::FaintWeight`] names the first cell where it can.
     pub fn check_on(&self, shape: Shape) -> Result<(), ModelError> {
         let column_sums = self.kernel.sum_axis(Axis(0));
         let least = column_sums.fold_axis(Axis(0), f64::INFINITY, |a, b| a.min(*b));
         let (kernel_height, kernel_width) = least.dim();
+        let largest = self.kernel.iter().chain(&self.bias).copied();
+        let largest = largest.fold(f64::MIN_POSITIVE, f64::max);
         // Cells further than a kernel from the edges are all alike: look at one of them.
         let distinct = |side: usize, kernel: usize| {
             (0..side).filter(move |&at| at <= kernel || at + kernel >= side)
@@ -218,11 +97,27 @@ impl Model {
                     (up..shape.height() + up).contains(&i)
                         && (left..shape.width() + left).contains(&j)
                 });
-                if self.bias.sum() + on_grid.map(|(_, weight)| weight).sum::<f64>() <= 0.0 {
-                    let (model, cell) = (self.name().into(), Cell { row, col });
-                    return Err(ModelError::ZeroWeight { model, shape, cell });
-                }
+                let sum = self.bias.sum() + on_grid.map(|(_, weight)| weight).sum::<f64>();
+                self.check_share(sum / largest, shape, Cell { row, col })?;
             }
+        }
+        Ok(())
+    }
+
+    /// Checks the least share of the largest weight that a cell's weights can sum to.
+    fn check_share(&self, share: f64, shape: Shape, cell: Cell) -> Result<(), ModelError> {
+        let model = || self.name().into();
+        if share <= 0.0 {
+            let model = model();
+            return Err(ModelError::ZeroWeight { model, shape, cell });
+        }
+        if share < LEAST_SHARE {
+            return Err(ModelError::FaintWeight {
+                model: model(),
+                shape,
+                cell,
+                share,
+            });
         }
         Ok(())
     }
@@ -287,191 +182,6 @@ impl Model {
     /// The state of a name.
     pub fn state_named(&self, name: &str) -> Option<usize> {
         self.file.states.iter().position(|state| state.name == name)
-    }
-}
-
-/// Colour of a `#rrggbb` text as `[red, green, blue]`.
-pub fn parse_color(text: &str) -> Option<[u8; 3]> {
-    let digits = text
-        .strip_prefix('#')
-        .filter(|digits| digits.len() == 6 && digits.is_ascii())?;
-    let channel = |at: usize| u8::from_str_radix(&digits[at..at + 2], 16).ok();
-    Some([channel(0)?, channel(2)?, channel(4)?])
-}
-
-fn one() -> f64 {
-    1.0
-}
-
-/// The checks of [`Model::new`]; each returns what it checked.
-struct Checker<'a> {
-    model: &'a str,
-}
-
-impl Checker<'_> {
-    fn wrong<T>(&self, what: String, expected: &str, got: impl ToString) -> Result<T, ModelError> {
-        let (model, expected, got) = (self.model.into(), expected.into(), got.to_string());
-        Err(ModelError::Value {
-            model,
-            what,
-            expected,
-            got,
-        })
-    }
-
-    fn counts_and_names(&self, file: &ModelFile) -> Result<(), ModelError> {
-        let states: Vec<_> = file.states.iter().map(|s| (&s.name, &s.color)).collect();
-        let observations: Vec<_> = file
-            .observations
-            .iter()
-            .map(|o| (&o.name, &o.color))
-            .collect();
-        self.entries("state", "states", 2, &states)?;
-        self.entries("observation", "observations", 1, &observations)
-    }
-
-    fn entries(
-        &self,
-        what: &'static str,
-        plural: &'static str,
-        least: usize,
-        entries: &[(&String, &String)],
-    ) -> Result<(), ModelError> {
-        let got = entries.len();
-        if !(least..=MAX_VALUES).contains(&got) {
-            return Err(ModelError::Count {
-                model: self.model.into(),
-                what: plural,
-                least,
-                got,
-            });
-        }
-        for (index, &(name, color)) in entries.iter().enumerate() {
-            if entries[..index].iter().any(|(earlier, _)| *earlier == name) {
-                let (model, name) = (self.model.into(), name.clone());
-                return Err(ModelError::DuplicateName { model, what, name });
-            }
-            if parse_color(color).is_none() {
-                return self.wrong(format!("{what} {name:?}: color"), "#rrggbb", color);
-            }
-        }
-        Ok(())
-    }
-
-    fn per_state(
-        &self,
-        file: &ModelFile,
-        what: &str,
-        value: impl Fn(&StateEntry) -> f64,
-        least: f64,
-    ) -> Result<Array1<f64>, ModelError> {
-        for state in &file.states {
-            let got = value(state);
-            if !got.is_finite() || got < least {
-                let expected = if least == 0.0 {
-                    "a finite number >= 0"
-                } else {
-                    "a finite number"
-                };
-                return self.wrong(format!("state {:?}: {what}", state.name), expected, got);
-            }
-        }
-        Ok(file.states.iter().map(value).collect())
-    }
-
-    fn distribution(&self, what: &str, values: &[f64]) -> Result<(), ModelError> {
-        if values.iter().any(|v| !v.is_finite() || *v < 0.0) {
-            return self.wrong(what.into(), "probabilities >= 0", format!("{values:?}"));
-        }
-        let sum: f64 = values.iter().sum();
-        if (sum - 1.0).abs() > SUM_TOLERANCE {
-            return self.wrong(what.into(), "a sum of 1", sum);
-        }
-        Ok(())
-    }
-
-    fn likelihood(&self, file: &ModelFile) -> Result<Array2<f64>, ModelError> {
-        let n_observations = file.observations.len();
-        let mut likelihood = Array2::zeros((file.states.len(), n_observations));
-        for (state, mut row) in file.states.iter().zip(likelihood.rows_mut()) {
-            let what = format!("state {:?}: observed_as", state.name);
-            if state.observed_as.len() != n_observations {
-                let expected = format!("{n_observations} probabilities, one per observation");
-                return self.wrong(what, &expected, state.observed_as.len());
-            }
-            self.distribution(&what, &state.observed_as)?;
-            let sum: f64 = state.observed_as.iter().sum();
-            row.iter_mut()
-                .zip(&state.observed_as)
-                .for_each(|(to, p)| *to = p / sum);
-        }
-        Ok(likelihood)
-    }
-
-    fn kernel(&self, file: &ModelFile) -> Result<Array4<f64>, ModelError> {
-        let [height, width] = file.kernel_size;
-        let odd = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
-        if !odd(height) || !odd(width) {
-            let expected = format!("two odd numbers up to {MAX_KERNEL_SIDE}");
-            return self.wrong(
-                "kernel_size".into(),
-                &expected,
-                format!("{:?}", file.kernel_size),
-            );
-        }
-        let n_states = file.states.len();
-        let mut kernel = Array4::zeros((n_states, n_states, height, width));
-        let mut filled = Array2::from_elem((n_states, n_states), false);
-        for entry in &file.kernel {
-            let block = [self.state(file, &entry.to)?, self.state(file, &entry.from)?];
-            if std::mem::replace(&mut filled[block], true) {
-                return self.wrong(entry.what(), "one entry for each pair of states", "two");
-            }
-            for (row, col, weight) in self.weights(entry, file.kernel_size)? {
-                kernel[[block[0], block[1], row, col]] = weight;
-            }
-        }
-        Ok(kernel)
-    }
-
-    fn weights(
-        &self,
-        entry: &KernelEntry,
-        [height, width]: [usize; 2],
-    ) -> Result<Vec<(usize, usize, f64)>, ModelError> {
-        let is_block =
-            entry.weights.len() == height && entry.weights.iter().all(|row| row.len() == width);
-        if !is_block {
-            let got: Vec<usize> = entry.weights.iter().map(Vec::len).collect();
-            let expected = format!("{height} rows of {width} weights");
-            return self.wrong(entry.what(), &expected, format!("rows of {got:?}"));
-        }
-        let mut weights = Vec::with_capacity(height * width);
-        for (row, values) in entry.weights.iter().enumerate() {
-            for (col, value) in values.iter().enumerate() {
-                let weight = value * entry.scale;
-                if !weight.is_finite() || weight < 0.0 {
-                    return self.wrong(entry.what(), "finite weights >= 0", weight);
-                }
-                weights.push((row, col, weight));
-            }
-        }
-        Ok(weights)
-    }
-
-    fn state(&self, file: &ModelFile, name: &str) -> Result<usize, ModelError> {
-        let found = file.states.iter().position(|state| state.name == name);
-        found.ok_or_else(|| ModelError::UnknownState {
-            model: self.model.into(),
-            name: name.into(),
-            known: file.states.iter().map(|state| state.name.clone()).collect(),
-        })
-    }
-}
-
-impl KernelEntry {
-    fn what(&self) -> String {
-        format!("kernel from {:?} to {:?}", self.from, self.to)
     }
 }
 
@@ -553,10 +263,47 @@ mod tests {
             |f| f.states[0].color = "red".into(),
             "expected #rrggbb, got red",
         );
+        check(|f| f.states[0].color = "#+1+2+3".into(), "got #+1+2+3");
         check(
             |f| f.kernel.push(f.kernel[0].clone()),
             "expected one entry for each pair of states, got two",
         );
+    }
+
+    #[test]
+    fn numbers_too_large_or_too_small_to_compute_with_are_rejected() {
+        let around = "0, or a size of 1e-100 to 1e100";
+        for (number, shown) in [(1e101, "e101"), (1e-320, "e-320")] {
+            check(|f| f.states[0].bias = number, around);
+            check(|f| f.states[2].reward = -number, shown);
+            check(|f| f.kernel[0].weights[1][1] = number, around);
+        }
+        // Each factor is in range, their product vanishes.
+        check(
+            |f| {
+                f.kernel[0].scale = 1e-99;
+                f.kernel[0].weights = vec![vec![1e-99; 3]; 3];
+            },
+            "kernel from \"normal\" to \"normal\": expected 0, or a size of",
+        );
+    }
+
+    #[test]
+    fn weights_that_can_vanish_beside_the_largest_are_rejected() {
+        let mut file = Model::wildfire().file;
+        for entry in file.kernel.iter_mut().filter(|e| e.from == "latent") {
+            entry.scale *= 1e-31;
+        }
+        let shape = Shape::new(4, 4).expect("test shape");
+        let error = Model::new(file.clone()).expect("valid until a grid is named");
+        let error = error.check_on(shape).expect_err("a cell among latent ones");
+        assert!(
+            matches!(error, ModelError::FaintWeight { share, .. } if share > 0.0),
+            "{error}"
+        );
+        file.states[0].bias = 1e-6;
+        let rescued = Model::new(file).expect("valid");
+        assert_eq!(rescued.check_on(shape), Ok(()));
     }
 
     #[test]

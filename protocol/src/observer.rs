@@ -5,7 +5,7 @@ use crate::channels::{
     ipc_error,
 };
 use crate::message::{FrameHeader, Header, TruthHeader};
-use crate::wait::poll_then_block;
+use crate::wait::Waiter;
 use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
 use std::time::Duration;
@@ -26,6 +26,7 @@ pub struct Sample<H> {
 /// Reads one channel of an instance, before, while and after a server runs.
 pub struct Observer<H: Header> {
     subscriber: Subscriber<Ipc, [u8], H>,
+    waiter: Waiter,
     _node: Node<Ipc>,
 }
 
@@ -51,6 +52,7 @@ impl Observer<FrameHeader> {
         wake_server(&services)?;
         Ok(Self {
             subscriber,
+            waiter: Waiter::default(),
             _node: node,
         })
     }
@@ -77,6 +79,7 @@ impl Observer<TruthHeader> {
         wake_server(&services)?;
         Ok(Self {
             subscriber,
+            waiter: Waiter::default(),
             _node: node,
         })
     }
@@ -90,7 +93,7 @@ impl<H: Header> Observer<H> {
     /// [`ChannelError::Ipc`].
     pub fn receive(&self, timeout: Duration) -> Result<Option<Sample<H>>, ChannelError> {
         let poll = || self.try_receive();
-        poll_then_block(timeout, poll, |remaining| {
+        self.waiter.wait(timeout, poll, |remaining| {
             std::thread::sleep(remaining.min(LOOK_INTERVAL));
             Ok(())
         })

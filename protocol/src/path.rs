@@ -47,24 +47,13 @@ impl Move {
 
     /// The cell reached from `cell`; a move off the grid leaves the robot in place.
     pub fn apply(self, cell: Cell, shape: Shape) -> Cell {
-        let Cell { row, col } = cell;
-        match self {
-            Self::Up => Cell {
-                row: row.saturating_sub(1),
-                col,
-            },
-            Self::Down => Cell {
-                row: (row + 1).min(shape.height() - 1),
-                col,
-            },
-            Self::Left => Cell {
-                row,
-                col: col.saturating_sub(1),
-            },
-            Self::Right => Cell {
-                row,
-                col: (col + 1).min(shape.width() - 1),
-            },
+        // One more than the change of row and column. A table, as no branch on a move is predictable:
+        // 64 random moves took 0.4 us with a `match`.
+        const STEPS: [[usize; 2]; 4] = [[0, 1], [2, 1], [1, 0], [1, 2]];
+        let [down, right] = STEPS[self as usize];
+        Cell {
+            row: (cell.row + down).saturating_sub(1).min(shape.height() - 1),
+            col: (cell.col + right).saturating_sub(1).min(shape.width() - 1),
         }
     }
 
@@ -98,16 +87,19 @@ pub fn path_to_bytes(path: &[Move]) -> Vec<u8> {
 
 /// Flies a path from `start` (paper eq. 12, `z_{t+1} = z_t + v_t`, each move clamped to the grid).
 pub fn fly(shape: Shape, start: Cell, path: &[Move]) -> Flight {
-    let mut seen = vec![false; shape.n_cells()];
-    let mut visited = Vec::with_capacity(path.len());
-    let mut cell = start;
+    let mut seen = vec![0_u64; shape.n_cells().div_ceil(64)];
+    let mut visited = vec![0; path.len()];
+    let (mut n_visited, mut cell) = (0, start);
     for &step in path {
         cell = step.apply(cell, shape);
         let index = shape.index(cell);
-        if !std::mem::replace(&mut seen[index], true) {
-            visited.push(index);
-        }
+        // Branch-free: whether a random path has been here before is not predictable either.
+        let (word, bit) = (&mut seen[index / 64], index % 64);
+        visited[n_visited] = index;
+        n_visited += usize::from(*word >> bit & 1 == 0);
+        *word |= 1 << bit;
     }
+    visited.truncate(n_visited);
     Flight { visited, end: cell }
 }
 

@@ -93,8 +93,9 @@ fn wildfire_steps_are_drawn_from_phi() {
 }
 
 #[test]
-fn rows_longer_than_a_chunk_are_drawn_from_phi() {
+fn grids_of_several_chunks_and_bands_are_drawn_from_phi() {
     check(&Model::wildfire(), &random_states(3, 3, (3, 70)), 40_000);
+    check(&Model::wildfire(), &random_states(16, 3, (92, 91)), 2_000);
 }
 
 #[test]
@@ -104,7 +105,7 @@ fn random_models_are_drawn_from_phi() {
         &random_states(5, 4, (7, 5)),
         200_000,
     );
-    // More states than one quadruple of thresholds, and a kernel larger than the grid.
+    // A kernel larger than the grid.
     check(
         &random_model(6, 6, [3, 7]),
         &random_states(7, 6, (4, 3)),
@@ -114,6 +115,16 @@ fn random_models_are_drawn_from_phi() {
         &random_model(8, 2, [1, 1]),
         &random_states(9, 2, (2, 3)),
         100_000,
+    );
+}
+
+#[test]
+fn models_of_very_many_weights_are_drawn_from_phi() {
+    // 102,400 of them, too many for tables.
+    check(
+        &random_model(14, 64, [5, 5]),
+        &random_states(15, 64, (2, 2)),
+        20_000,
     );
 }
 
@@ -142,7 +153,7 @@ fn cells_that_reject_almost_every_parent_are_drawn_from_phi() {
 #[test]
 fn deterministic_models_move_as_they_must() {
     let weight = |to, from, row, _| f64::from(u8::from(row == 0 && to == from));
-    let shift_down = model(3, [3, 1], weight, |to| if to == 2 { 1e-300 } else { 0.0 });
+    let shift_down = model(3, [3, 1], weight, |to| if to == 2 { 1e-20 } else { 0.0 });
     let mut dynamics = Dynamics::new(&shift_down, shape(3, 2)).expect("a bias keeps row 0 alive");
     let mut states = ndarray::array![[0, 1], [1, 2], [2, 0]];
     dynamics.step(1, 0, &mut states);
@@ -189,10 +200,10 @@ fn hash_after(model: &Model, shape: Shape, n_steps: u64) -> u64 {
 fn a_trajectory_is_the_same_on_every_platform() {
     // Pinned at version 0.1.0: if one changes, so does every published seed.
     let wildfire = hash_after(&Model::wildfire(), shape(64, 64), 1000);
-    assert_eq!(wildfire, 0x85d3_5956_6503_4b3f);
+    assert_eq!(wildfire, 0x5b72_805c_3e44_c4a8);
     // Escapes, redraws and summed kernels all take part in this one.
     let random = hash_after(&random_model(4, 4, [5, 5]), shape(7, 5), 10_000);
-    assert_eq!(random, 0x52a6_2779_8a3f_8040);
+    assert_eq!(random, 0x4974_9562_5f3d_1a6d);
 }
 
 #[test]

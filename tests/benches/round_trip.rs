@@ -1,59 +1,212 @@
-//! Round trip of a step from a Rust client to a server process and back, the simulation's own time
-//! subtracted: `cargo bench -p tests --bench round_trip`.
+//! Round trip of a step from a Rust client to a server process and back:
+//! `cargo bench -p tests --bench round_trip`; arguments after `--` go to the server.
+//!
+//! Prints median and tail in microseconds with the simulation's own time subtracted, on a machine
+//! as it is and with three busy processes on top; then the processor time of an idle server. The peer
+//! to hold this against, Gymnasium's AsyncVectorEnv, is measured by `scripts/bench` in the same run.
 
-use agent::client::{Claim, Client};
-use protocol::Move;
+use protocol::Connection;
 use protocol::channels::Instance;
-use protocol::connection::ConnectionError;
 use protocol::control::{Reply, Request};
 use protocol::message::{Operation, StepRequest};
+use std::process::{Child, Command};
 use std::time::{Duration, Instant};
-fn main() {
-    let instance =
-        Instance::new(&std::env::args().nth(1).unwrap_or("default".into())).expect("name");
-    let mut connection =
-        protocol::Connection::open(&instance, "bench", Duration::from_secs(5)).expect("server");
-    let acquire = Request::Acquire {
-        first_world: 0,
-        n_worlds: 1,
-        takeover: false,
-        ttl_millis: None,
-    };
-    let Ok(Reply::Lease(lease)) = connection.control(&acquire, Duration::from_secs(20)) else {
-        panic!("no lease")
-    };
-    let n_moves = connection.info().n_moves;
-    let request = StepRequest {
-        operation: Operation::Step as u32,
-        lease: lease.lease,
-        n_worlds: 1,
-        n_moves: n_moves as u32,
-        ..StepRequest::default()
-    };
-    let path: Vec<u8> = (0..n_moves).map(|i| (i * 7 % 4) as u8).collect();
-    for _ in 0..3 {
-        let (mut total, mut sim) = (vec![], vec![]);
-        let t0 = Instant::now();
-        for _ in 0..100_000 {
-            let t = Instant::now();
-            let answer = connection
-                .step(request, &path, Duration::from_secs(5))
-                .expect("step");
-            let all = t.elapsed().as_nanos() as u64;
-            total.push(all - answer.reply.simulation_nanos.min(all));
-            sim.push(answer.reply.simulation_nanos);
-        }
-        let rate = 100_000.0 / t0.elapsed().as_secs_f64();
-        total.sort();
-        sim.sort();
-        let p = |v: &Vec<u64>, q: f64| v[(v.len() as f64 * q) as usize] as f64 / 1000.0;
-        println!(
-            "ipc p50 {:.2} p99 {:.2} p99.9 {:.2} us; simulation p50 {:.2} p99 {:.2} us; {rate:.0} steps/s",
-            p(&total, 0.5),
-            p(&total, 0.99),
-            p(&total, 0.999),
-            p(&sim, 0.5),
-            p(&sim, 0.99)
-        );
+
+const TIMEOUT: Duration = Duration::from_secs(20);
+const N_STEPS: usize = 50_000;
+
+/// A child process that is killed when it goes out of scope.
+struct Running(Child);
+
+impl Running {
+    fn start(program: &str, arguments: &[&str]) -> Self {
+        let child = Command::new(program)
+            .args(arguments)
+            .env("RUST_LOG", "warn")
+            .spawn();
+        Self(child.unwrap_or_else(|error| panic!("start {program}: {error}")))
     }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A connection with a lease on `n_worlds` worlds, and the request and paths of their step.
+struct Stepper {
+    connection: Connection,
+    request: StepRequest,
+    paths: Vec<u8>,
+}
+
+impl Stepper {
+    fn new(instance: &Instance, n_worlds: u32) -> Self {
+        let mut connection = connect(instance);
+        let acquire = Request::Acquire {
+            first_world: 0,
+            n_worlds,
+            takeover: true,
+            ttl_millis: None,
+        };
+        let lease = match connection.control(&acquire, TIMEOUT) {
+            Ok(Reply::Lease(lease)) => lease.lease,
+            other => panic!("acquire: {other:?}"),
+        };
+        let n_moves = connection.info().n_moves;
+        let operation = Operation::Step as u32;
+        let request = StepRequest {
+            operation,
+            lease,
+            n_worlds,
+            n_moves: n_moves as u32,
+            ..StepRequest::default()
+        };
+        let paths = (0..n_moves * n_worlds as usize)
+            .map(|at| (at * 7 % 4) as u8)
+            .collect();
+        Self {
+            connection,
+            request,
+            paths,
+        }
+    }
+
+    /// Nanoseconds of one round trip: all of it, and the simulation's share.
+    fn step(&mut self) -> (u64, u64) {
+        let start = Instant::now();
+        let answer = self
+            .connection
+            .step(self.request, &self.paths, TIMEOUT)
+            .expect("a step");
+        let total = start.elapsed().as_nanos() as u64;
+        (total, answer.reply.simulation_nanos.min(total))
+    }
+
+    fn report(&mut self, what: &str, n_steps: usize) {
+        (0..n_steps / 10).for_each(|_| _ = self.step());
+        let start = Instant::now();
+        let times: Vec<(u64, u64)> = (0..n_steps).map(|_| self.step()).collect();
+        let per_second =
+            n_steps as f64 * f64::from(self.request.n_worlds) / start.elapsed().as_secs_f64();
+        let wire = Spread::of(times.iter().map(|(total, simulation)| total - simulation));
+        let simulation = Spread::of(times.iter().map(|(_, simulation)| *simulation));
+        say(&format!(
+            "{what:<34} wire {wire}   simulation {simulation}   {per_second:>9.0} env-steps/s"
+        ));
+    }
+}
+
+/// Median, 99th and 99.9th percentile in microseconds.
+struct Spread([f64; 3]);
+
+impl Spread {
+    fn of(nanos: impl Iterator<Item = u64>) -> Self {
+        let mut nanos: Vec<u64> = nanos.collect();
+        nanos.sort_unstable();
+        let quantile = |q: f64| nanos[(nanos.len() as f64 * q) as usize] as f64 / 1000.0;
+        Self([quantile(0.5), quantile(0.99), quantile(0.999)])
+    }
+}
+
+impl std::fmt::Display for Spread {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(
+            f,
+            "p50 {:7.2} p99 {:7.2} p99.9 {:8.2} us",
+            self.0[0], self.0[1], self.0[2]
+        )
+    }
+}
+
+fn main() {
+    let server = beside_this_program("emberwatch-server");
+    // cargo adds `--bench` on its own.
+    let more: Vec<String> = std::env::args()
+        .skip(1)
+        .filter(|argument| argument != "--bench")
+        .collect();
+    for n_worlds in [1_u32, 64] {
+        let name = format!("bench-{}-{n_worlds}", std::process::id());
+        let worlds = n_worlds.to_string();
+        let mut arguments = vec![
+            "--instance",
+            &name,
+            "--worlds",
+            &worlds,
+            "--burn-in",
+            "1000",
+        ];
+        arguments.extend(more.iter().map(String::as_str));
+        let running = Running::start(&server, &arguments);
+        let instance = Instance::new(&name).expect("a plain name");
+        let n_steps = N_STEPS / n_worlds.isqrt() as usize;
+        let mut stepper = Stepper::new(&instance, n_worlds);
+        stepper.report(&format!("{n_worlds} world(s), as the machine is"), n_steps);
+        {
+            let busy = ["-c", "while :; do :; done"];
+            let _busy: Vec<Running> = (0..3).map(|_| Running::start("sh", &busy)).collect();
+            stepper.report(
+                &format!("{n_worlds} world(s), 3 busy processes"),
+                n_steps / 10,
+            );
+        }
+        drop(stepper);
+        report_idleness(&running);
+    }
+}
+
+fn report_idleness(server: &Running) {
+    let (pid, pause) = (server.0.id(), Duration::from_secs(5));
+    let before = processor_millis(pid);
+    std::thread::sleep(pause);
+    let share = (processor_millis(pid) - before) / pause.as_millis() as f64 * 100.0;
+    say(&format!(
+        "idle server: {share:.2} % of one core over {pause:?}"
+    ));
+}
+
+/// User and system time of a process, from its `stat` file, in which the kernel counts 1/100 s.
+fn processor_millis(pid: u32) -> f64 {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).expect("a running process");
+    let after_name = stat
+        .rsplit(')')
+        .next()
+        .expect("stat names the program in brackets");
+    let fields: Vec<&str> = after_name.split_whitespace().collect();
+    let ticks = |at: usize| fields[at].parse::<f64>().expect("stat holds numbers");
+    (ticks(11) + ticks(12)) * 10.0
+}
+
+fn connect(instance: &Instance) -> Connection {
+    let deadline = Instant::now() + TIMEOUT;
+    loop {
+        match Connection::open(instance, "round_trip", TIMEOUT) {
+            Ok(connection) => return connection,
+            Err(error) if Instant::now() > deadline => panic!("no server: {error}"),
+            Err(_) => std::thread::sleep(Duration::from_millis(10)),
+        }
+    }
+}
+
+fn beside_this_program(name: &str) -> String {
+    let program = std::env::current_exe().expect("this program has a path");
+    let directory = program
+        .ancestors()
+        .nth(2)
+        .expect("target/release/deps/round_trip");
+    let path = directory.join(name);
+    assert!(
+        path.exists(),
+        "expected {}: build it with `cargo build --release`",
+        path.display()
+    );
+    path.display().to_string()
+}
+
+#[expect(clippy::print_stdout, reason = "a benchmark's output")]
+fn say(line: &str) {
+    println!("{line}");
 }

@@ -1,0 +1,111 @@
+//! The server's work for one step request, without the channel: checks, paths, world transitions,
+//! sensor, results and frames.
+//!
+//! Peer: the authors' PyTorch environment takes 1.1 ms for one 64 x 64 step on one CPU thread.
+//! `cargo bench -p env-server --bench step -- --warm-up-time 0.5 --measurement-time 1`
+
+use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use env_server::config::ServerConfig;
+use env_server::lease::ClientId;
+use env_server::simulator::{Outcome, Simulator, Surroundings};
+use protocol::control::{Reply, Request};
+use protocol::message::{Operation, Status, StepRequest, VERSION};
+use protocol::randomness::split_mix;
+use rayon::ThreadPoolBuilder;
+use std::time::Instant;
+
+const CLIENT: ClientId = ClientId { node: 1, pid: 1 };
+
+/// A client's view of a simulator: a lease on every world, and the next request.
+struct Session {
+    simulator: Simulator,
+    request: StepRequest,
+    /// Many random paths: a robot that flew the same ever again would be easy to predict.
+    paths: Vec<Vec<u8>>,
+    payload: Vec<u8>,
+}
+
+impl Session {
+    /// Worlds at k = 0, on grids of 64 x 64, with paths of 64 moves.
+    fn new(n_worlds: u32) -> Self {
+        let config = ServerConfig {
+            worlds: n_worlds,
+            burn_in: 2_000,
+            ..ServerConfig::default()
+        };
+        let n_moves = config.moves as u32;
+        let checked = config.check().expect("bench settings");
+        let threads = ThreadPoolBuilder::new().num_threads(1).build();
+        let threads = threads.expect("bench threads");
+        let (mut simulator, orders) =
+            Simulator::new(checked, threads, Box::new(|| 1)).expect("bench model");
+        for order in orders {
+            let (world, episode) = order.carry_out(simulator.rules());
+            simulator.finish_reset(world, episode);
+        }
+        let request = StepRequest {
+            version: VERSION,
+            operation: Operation::Step as u32,
+            lease: acquire(&mut simulator, n_worlds),
+            n_worlds,
+            n_moves,
+            ..StepRequest::default()
+        };
+        let n_bytes = u64::from(n_worlds * n_moves);
+        let path = |key| (0..n_bytes).map(move |at| (split_mix(key, at) >> 62) as u8);
+        Self {
+            simulator,
+            request,
+            paths: (0..256).map(|key| path(key).collect()).collect(),
+            payload: Vec::new(),
+        }
+    }
+
+    /// One request; returns the size of the answer's payload.
+    fn step(&mut self) -> usize {
+        let path = &self.paths[self.request.sequence as usize % self.paths.len()];
+        let now = Instant::now();
+        let reply = self
+            .simulator
+            .step(now, CLIENT, &self.request, path, &mut self.payload);
+        assert_eq!(reply.status, Status::Ok as u32);
+        self.request.sequence += 1;
+        self.payload.len()
+    }
+}
+
+/// A lease on every world.
+fn acquire(simulator: &mut Simulator, n_worlds: u32) -> u64 {
+    let request = Request::Acquire {
+        first_world: 0,
+        n_worlds,
+        takeover: false,
+        ttl_millis: Some(3_600_000),
+    };
+    let text = serde_json::to_vec(&request).expect("requests serialise");
+    let now = Instant::now();
+    let Outcome::Later(_, awaited) =
+        simulator.control(now, CLIENT, VERSION, &text, &Surroundings::default())
+    else {
+        panic!("no lease");
+    };
+    match simulator.answer_awaited(now, &awaited) {
+        Some(Reply::Lease(lease)) => lease.lease,
+        _ => panic!("no lease"),
+    }
+}
+
+fn simulator_step(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("simulator_step");
+    for n_worlds in [1, 64] {
+        let mut session = Session::new(n_worlds);
+        group.throughput(Throughput::Elements(n_worlds.into()));
+        group.bench_function(format!("{n_worlds}"), |bencher| {
+            bencher.iter(|| session.step());
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, simulator_step);
+criterion_main!(benches);

@@ -1,0 +1,169 @@
+//! A model as people write it: the TOML form, and what can be wrong with it.
+
+use super::{LEAST_SHARE, MAX_VALUES};
+use crate::grid::{Cell, Shape};
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// A model as written in TOML; [`Model::new`] checks it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelFile {
+    /// Name shown to people.
+    pub name: String,
+    /// Rows and columns of the transition kernel, both odd.
+    pub kernel_size: [usize; 2],
+    /// The states, in the order of their values.
+    pub states: Vec<StateEntry>,
+    /// The observations, in the order of their values.
+    pub observations: Vec<ObservationEntry>,
+    /// The blocks `w[to, from]` of the kernel that are not zero.
+    pub kernel: Vec<KernelEntry>,
+}
+
+/// One state of a model file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StateEntry {
+    /// Name, unique among the states.
+    pub name: String,
+    /// Colour in pictures, `#rrggbb`.
+    pub color: String,
+    /// Probability of this state in each cell at the start of burn-in.
+    pub initial: f64,
+    /// Reward for each distinct visited cell in this state.
+    #[serde(default)]
+    pub reward: f64,
+    /// The bias `b[to]` of eq. 2.
+    #[serde(default)]
+    pub bias: f64,
+    /// `P(y | this state)`, one entry per observation (eq. 1).
+    pub observed_as: Vec<f64>,
+}
+
+/// One observation of a model file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ObservationEntry {
+    /// Name, unique among the observations.
+    pub name: String,
+    /// Colour in pictures, `#rrggbb`.
+    pub color: String,
+}
+
+/// One block `w[to, from]` of the kernel in a model file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct KernelEntry {
+    /// Name of the state at k.
+    pub from: String,
+    /// Name of the state at k + 1.
+    pub to: String,
+    /// Factor on every weight.
+    #[serde(default = "one")]
+    pub scale: f64,
+    /// Weights `[row offset][column offset]`; the centre is the cell itself, rows grow downward.
+    pub weights: Vec<Vec<f64>>,
+}
+
+/// Why a model file was rejected.
+#[derive(Debug, Error, PartialEq)]
+#[non_exhaustive]
+pub enum ModelError {
+    /// Not TOML, or not of the model's form.
+    #[error("model file: {0}")]
+    Toml(String),
+    /// Too few or too many states or observations.
+    #[error("model {model:?}: expected {least} to {MAX_VALUES} {what}, got {got}")]
+    Count {
+        /// The model's name.
+        model: String,
+        /// `states` or `observations`.
+        what: &'static str,
+        /// Smallest number allowed.
+        least: usize,
+        /// Number in the file.
+        got: usize,
+    },
+    /// Two entries with one name.
+    #[error("model {model:?}: {what} name {name:?} stands twice")]
+    DuplicateName {
+        /// The model's name.
+        model: String,
+        /// `state` or `observation`.
+        what: &'static str,
+        /// The repeated name.
+        name: String,
+    },
+    /// A kernel entry that names a state the model lacks.
+    #[error("model {model:?}: kernel entry names state {name:?}, expected one of {known:?}")]
+    UnknownState {
+        /// The model's name.
+        model: String,
+        /// The name in the kernel entry.
+        name: String,
+        /// The model's states.
+        known: Vec<String>,
+    },
+    /// A number or a size that cannot be right.
+    #[error("model {model:?}: {what}: expected {expected}, got {got}")]
+    Value {
+        /// The model's name.
+        model: String,
+        /// Which entry.
+        what: String,
+        /// What it must be.
+        expected: String,
+        /// What it is.
+        got: String,
+    },
+    /// A cell whose transition weights can all be zero: eq. 3 would divide by zero.
+    #[error(
+        "model {model:?} on a {shape} grid: transition weights of cell {cell} can sum to zero, \
+         expected a positive sum whatever its neighbourhood: give the centre of the kernel a \
+         positive weight from every state, or give a state a bias"
+    )]
+    ZeroWeight {
+        /// The model's name.
+        model: String,
+        /// The grid.
+        shape: Shape,
+        /// The first such cell.
+        cell: Cell,
+    },
+    /// A cell whose transition weights can all be so small that eq. 3 divides noise by noise.
+    #[error(
+        "model {model:?} on a {shape} grid: transition weights of cell {cell} can sum to {share:e} of \
+         the largest weight, expected at least {LEAST_SHARE:e} whatever its neighbourhood"
+    )]
+    FaintWeight {
+        /// The model's name.
+        model: String,
+        /// The grid.
+        shape: Shape,
+        /// The first such cell.
+        cell: Cell,
+        /// What its weights can sum to, as a share of the largest weight.
+        share: f64,
+    },
+}
+
+impl KernelEntry {
+    /// Names the entry in errors.
+    pub(super) fn what(&self) -> String {
+        format!("kernel from {:?} to {:?}", self.from, self.to)
+    }
+}
+
+/// Colour of a `#rrggbb` text as `[red, green, blue]`.
+pub fn parse_color(text: &str) -> Option<[u8; 3]> {
+    let digits = text
+        .strip_prefix('#')
+        .filter(|digits| digits.len() == 6 && digits.bytes().all(|d| d.is_ascii_hexdigit()))?;
+    let channel = |at: usize| u8::from_str_radix(&digits[at..at + 2], 16).ok();
+    Some([channel(0)?, channel(2)?, channel(4)?])
+}
+
+fn one() -> f64 {
+    1.0
+}

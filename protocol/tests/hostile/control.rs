@@ -1,0 +1,173 @@
+//! The JSON of the control channel.
+
+use crate::damage::{damage, damaged};
+use proptest::collection::vec;
+use proptest::prelude::*;
+use proptest::sample::select;
+use protocol::control::{
+    CoverageRule, LeaseInfo, Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldSeed,
+    WorldStatus,
+};
+use protocol::message::Status;
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..Default::default() })]
+
+    #[test]
+    fn control_messages_survive_json(request in request(), reply in reply()) {
+        let text = serde_json::to_vec(&request).expect("requests serialise");
+        prop_assert_eq!(serde_json::from_slice::<Request>(&text).ok(), Some(request));
+        let text = serde_json::to_vec(&reply).expect("replies serialise");
+        prop_assert_eq!(serde_json::from_slice::<Reply>(&text).ok(), Some(reply));
+    }
+
+    #[test]
+    fn any_bytes_are_a_control_message_or_an_error(bytes in vec(any::<u8>(), 0..200)) {
+        let _ = serde_json::from_slice::<Request>(&bytes);
+        let _ = serde_json::from_slice::<Reply>(&bytes);
+    }
+
+    #[test]
+    fn damaged_control_messages_are_read_or_refused(
+        request in request(),
+        reply in reply(),
+        damage in vec(damage(), 1..4),
+    ) {
+        for text in [serde_json::to_string(&request), serde_json::to_string(&reply)] {
+            let text = damage.iter().fold(text.expect("serialises"), damaged);
+            if let Ok(request) = serde_json::from_str::<Request>(&text) {
+                prop_assert!(serde_json::to_string(&request).is_ok());
+            }
+            let _ = serde_json::from_str::<Reply>(&text);
+        }
+    }
+}
+
+#[test]
+fn nesting_as_deep_as_a_message_can_be_is_refused() {
+    for (open, close) in [("[", "]"), (r#"{"a":"#, "}")] {
+        let deep = open.repeat(200_000) + &close.repeat(200_000);
+        let inside = format!(r#"{{"op":"reset","lease":1,"worlds":{deep}}}"#);
+        for text in [deep, inside] {
+            assert!(serde_json::from_str::<Request>(&text).is_err());
+            assert!(serde_json::from_str::<Reply>(&text).is_err());
+        }
+    }
+}
+
+fn request() -> impl Strategy<Value = Request> {
+    let seed =
+        (any::<u32>(), any::<Option<u64>>()).prop_map(|(world, seed)| WorldSeed { world, seed });
+    prop_oneof![
+        (any::<u32>(), ".*").prop_map(|(protocol, client)| Request::Hello { protocol, client }),
+        (
+            any::<u32>(),
+            any::<u32>(),
+            any::<bool>(),
+            any::<Option<u64>>()
+        )
+            .prop_map(
+                |(first_world, n_worlds, takeover, ttl_millis)| Request::Acquire {
+                    first_world,
+                    n_worlds,
+                    takeover,
+                    ttl_millis,
+                }
+            ),
+        any::<u64>().prop_map(|lease| Request::Renew { lease }),
+        any::<u64>().prop_map(|lease| Request::Release { lease }),
+        (any::<u64>(), vec(seed, 0..4))
+            .prop_map(|(lease, worlds)| Request::Reset { lease, worlds }),
+        Just(Request::Status {}),
+        Just(Request::Shutdown {}),
+    ]
+}
+
+fn world() -> impl Strategy<Value = WorldInfo> {
+    (any::<u32>(), any::<[u64; 3]>(), any::<[u32; 2]>()).prop_map(
+        |(world, [step, seed, episode], robot)| WorldInfo {
+            world,
+            step,
+            seed,
+            episode,
+            robot,
+        },
+    )
+}
+
+fn reply() -> impl Strategy<Value = Reply> {
+    prop_oneof![
+        server_info().prop_map(|info| Reply::Hello(Box::new(info))),
+        (any::<[u64; 2]>(), vec(world(), 0..4)).prop_map(|([lease, ttl_millis], worlds)| {
+            Reply::Lease(LeaseInfo {
+                lease,
+                ttl_millis,
+                worlds,
+            })
+        }),
+        Just(Reply::Done),
+        vec(world(), 0..4).prop_map(|worlds| Reply::Reset { worlds }),
+        server_status().prop_map(Reply::Status),
+        (select(Status::ALL.to_vec()), any::<u64>(), ".*").prop_map(|(status, detail, message)| {
+            Reply::Error {
+                status,
+                detail,
+                message,
+            }
+        }),
+    ]
+}
+
+fn server_info() -> impl Strategy<Value = ServerInfo> {
+    let rules = [CoverageRule::Path, CoverageRule::Full, CoverageRule::Client];
+    let numbers = (any::<[u32; 3]>(), any::<[usize; 5]>(), any::<[u64; 3]>());
+    let texts = (".*", vec(".*", 0..4), any::<Option<String>>());
+    (numbers, texts, select(rules.to_vec()), any::<bool>()).prop_map(
+        |((small, sizes, long), (build, observations, model), coverage, publish_truth)| {
+            ServerInfo {
+                protocol: small[0],
+                build,
+                pid: small[1],
+                height: sizes[0],
+                width: sizes[1],
+                n_moves: sizes[2],
+                n_worlds: small[2],
+                n_observations: sizes[3],
+                observations,
+                model,
+                burn_in: long[0],
+                max_steps: long[1],
+                max_clients: sizes[4],
+                coverage,
+                publish_truth,
+                lease_millis: long[2],
+            }
+        },
+    )
+}
+
+fn server_status() -> impl Strategy<Value = ServerStatus> {
+    let status =
+        (world(), any::<Option<u32>>(), any::<bool>()).prop_map(|(info, holder_pid, resetting)| {
+            WorldStatus {
+                info,
+                holder_pid,
+                resetting,
+            }
+        });
+    let numbers = (any::<u32>(), any::<[u64; 3]>(), any::<[usize; 2]>());
+    (numbers, 0.0..1e12f64, vec(status, 0..4)).prop_map(
+        |((pid, [uptime_millis, n_steps, n_refused], sizes), steps_per_second, worlds)| {
+            ServerStatus {
+                pid,
+                uptime_millis,
+                n_steps,
+                steps_per_second,
+                n_refused,
+                n_clients: sizes[0],
+                n_observers: sizes[1],
+                worlds,
+            }
+        },
+    )
+}

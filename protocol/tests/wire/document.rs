@@ -1,0 +1,177 @@
+//! Reads PROTOCOL.md: its tables, its fences and its worked example.
+
+/// The document.
+pub const PROTOCOL: &str = include_str!("../../../PROTOCOL.md");
+
+/// A struct, from the code or from a byte table.
+#[derive(Debug, PartialEq)]
+pub struct Layout {
+    pub name: &'static str,
+    pub type_name: &'static str,
+    pub size: usize,
+    pub alignment: usize,
+    pub fields: Vec<Field>,
+}
+
+/// A field, from the code or from a row of a byte table.
+#[derive(Debug, PartialEq)]
+pub struct Field {
+    pub name: String,
+    pub offset: usize,
+    pub size: usize,
+    pub of: String,
+}
+
+/// The cells of each row of the one table whose header line begins like this.
+pub fn rows_under(header: &str) -> Vec<Vec<String>> {
+    let (_, rest) = PROTOCOL.split_once(&format!("\n{header}")).expect(header);
+    assert!(!rest.contains(&format!("\n{header}")), "two {header}");
+    rows(rest)
+}
+
+/// The byte table of a struct, and its `struct` format.
+pub fn documented_struct(name: &'static str) -> (Layout, String) {
+    let start = format!("\n### {name}: `");
+    let (_, rest) = PROTOCOL.split_once(&start).expect(name);
+    let (heading, table) = rest.split_once('\n').expect("a table follows");
+    let parts: Vec<&'static str> = heading.split('`').collect();
+    let numbers: Vec<usize> = parts[1]
+        .split([' ', ','])
+        .filter_map(|word| word.parse().ok())
+        .collect();
+    let (_, table) = table.split_once("| offset |").expect("a byte table");
+    let field = |row: Vec<String>| Field {
+        offset: row[0].parse().expect("an offset"),
+        size: row[1].parse().expect("a size"),
+        of: row[2].clone(),
+        name: row[3].clone(),
+    };
+    let layout = Layout {
+        name,
+        type_name: parts[0],
+        size: numbers[0],
+        alignment: numbers[1],
+        fields: rows(table).into_iter().map(field).collect(),
+    };
+    (layout, parts[2].into())
+}
+
+/// The fenced blocks of a language: what follows the language on the fence's line, and the text.
+pub fn fences(language: &str) -> Vec<(&'static str, &'static str)> {
+    let blocks = PROTOCOL.split("\n```").skip(1).step_by(2);
+    blocks
+        .filter_map(|block| block.strip_prefix(language)?.split_once('\n'))
+        .collect()
+}
+
+/// The byte sizes that a Python `struct` format with `=` names.
+pub fn sizes_of_struct_format(format: &str) -> Vec<usize> {
+    let codes = format.strip_prefix('=').expect("standard sizes");
+    let mut count = None;
+    let mut sizes = Vec::new();
+    for code in codes.chars() {
+        let size = match code {
+            'H' => 2,
+            'I' => 4,
+            'Q' | 'd' => 8,
+            digit => {
+                count = Some(digit.to_digit(10).expect("a known code") as usize);
+                continue;
+            }
+        };
+        sizes.extend(vec![size; count.take().unwrap_or(1)]);
+    }
+    sizes
+}
+
+/// The sizes of a struct's numbers, nested structs and arrays laid out flat.
+pub fn scalar_sizes(layout: &Layout) -> Vec<usize> {
+    let of_field = |field: &Field| match field.of.as_str() {
+        "u16" => vec![2],
+        "u32" => vec![4],
+        "u64" | "f64" => vec![8],
+        "u64[2]" => vec![8, 8],
+        "StepResult" => scalar_sizes(&documented_struct("StepResult").0),
+        other => panic!("{other}: unknown type"),
+    };
+    layout.fields.iter().flat_map(of_field).collect()
+}
+
+/// The bytes of a worked example, after comparing each field's bytes with the value beside it.
+pub fn worked_example(name: &str, layouts: &[Layout]) -> Vec<u8> {
+    let blocks = fences("hex");
+    let (_, text) = blocks
+        .iter()
+        .find(|(title, _)| title.trim() == name)
+        .expect("a worked example");
+    let mut bytes: Vec<u8> = Vec::new();
+    let mut names = Vec::new();
+    for line in text.lines() {
+        let (hex, fields) = line.split_once("  | ").expect("hex | fields");
+        let (offset, hex) = hex.split_once("  ").expect("offset, hex");
+        assert_eq!(usize::from_str_radix(offset, 16), Ok(bytes.len()), "{line}");
+        let groups: Vec<Vec<u8>> = hex.split("  ").map(bytes_of_hex).collect();
+        let fields: Vec<(&str, &str)> = fields
+            .split(", ")
+            .map(|field| field.split_once(" = ").expect("name = value"))
+            .collect();
+        assert_eq!(groups.len(), fields.len(), "{line}");
+        for (group, (name, value)) in groups.iter().zip(fields) {
+            assert_eq!(shown(name, group), value, "{line}");
+            names.push(name);
+            bytes.extend(group);
+        }
+    }
+    let header = layouts.iter().filter(|layout| layout.name == name);
+    let result = layouts
+        .iter()
+        .filter(|layout| layout.name == "StepResult" && name == "StepReply");
+    let expected: Vec<&str> = header
+        .chain(result)
+        .flat_map(|layout| &layout.fields)
+        .flat_map(|field| vec![field.name.as_str(); if field.of == "u64[2]" { 2 } else { 1 }])
+        .collect();
+    assert_eq!(names[..expected.len()], expected[..], "fields of {name}");
+    bytes
+}
+
+/// A field's value as the worked example writes it.
+fn shown(name: &str, bytes: &[u8]) -> String {
+    let words = |word: fn(u8) -> String| {
+        let words: Vec<String> = bytes.iter().map(|byte| word(*byte)).collect();
+        words.join(" ")
+    };
+    match (name, bytes.len()) {
+        ("path", _) => words(|byte| ["up", "down", "left", "right"][usize::from(byte)].into()),
+        (row, _) if row.starts_with("frame row") => words(|byte| match byte {
+            255 => "-".into(),
+            value => value.to_string(),
+        }),
+        ("reward", 8) => f64::from_le_bytes(bytes.try_into().expect("eight bytes")).to_string(),
+        (_, length) => {
+            let mut wide = [0; 8];
+            wide[..length].copy_from_slice(bytes);
+            u64::from_le_bytes(wide).to_string()
+        }
+    }
+}
+
+fn bytes_of_hex(text: &str) -> Vec<u8> {
+    let byte = |word| u8::from_str_radix(word, 16).expect("hexadecimal");
+    text.split(' ').map(byte).collect()
+}
+
+/// The rows of a table whose header line has begun before `rest`.
+fn rows(rest: &str) -> Vec<Vec<String>> {
+    let lines = rest
+        .lines()
+        .skip(2)
+        .take_while(|line| line.starts_with('|'));
+    let cells = |line: &str| line.split('|').map(|cell| cell.trim().to_owned()).collect();
+    lines
+        .map(|line| {
+            let cells: Vec<String> = cells(line);
+            cells[1..cells.len() - 1].to_vec()
+        })
+        .collect()
+}

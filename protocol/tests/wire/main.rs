@@ -1,0 +1,285 @@
+//! PROTOCOL.md against the code: byte tables, codes, limits, JSON examples, and the worked example.
+
+mod document;
+
+use document::{Field, Layout, PROTOCOL, documented_struct, fences, rows_under};
+use iceoryx2::prelude::ZeroCopySend;
+use protocol::channels::{
+    FRAME_BUFFER, MAX_CLIENTS, MAX_NODES, MAX_OBSERVERS, MAX_TRUTH_READERS, TRUTH_BUFFER,
+};
+use protocol::control::{MAX_CONTROL_BYTES, Reply, Request};
+use protocol::grid::MAX_SIDE;
+use protocol::message::{
+    ControlReply, ControlRequest, FLAG_FULL_COVERAGE, FrameHeader, Operation, Status, StepReply,
+    StepRequest, StepResult, TruthHeader, VERSION, split_step_payload,
+};
+use protocol::path::{MAX_MOVES, path_from_bytes, path_to_bytes};
+use protocol::{Coverage, Frame, Move, Shape, UNOBSERVED};
+use serde_json::Value;
+use std::collections::BTreeSet;
+
+/// The layout of a struct; a field that is not listed does not compile.
+macro_rules! layout {
+    ($name:ident { $($field:ident),* $(,)? }) => {{
+        let $name { $($field),* } = $name::default();
+        Layout {
+            name: stringify!($name),
+            type_name: type_name::<$name>(),
+            size: size_of::<$name>(),
+            alignment: align_of::<$name>(),
+            fields: vec![$(Field {
+                name: stringify!($field).into(),
+                offset: std::mem::offset_of!($name, $field),
+                size: size_of_val(&$field),
+                of: type_of(&$field),
+            }),*],
+        }
+    }};
+}
+
+#[expect(unsafe_code, reason = "iceoryx2 marks the name unsafe to override")]
+fn type_name<T: ZeroCopySend>() -> &'static str {
+    // SAFETY: reads a constant.
+    unsafe { <T as ZeroCopySend>::type_name() }
+}
+
+/// The type of a field as PROTOCOL.md writes it.
+fn type_of<T>(_: &T) -> String {
+    match std::any::type_name::<T>() {
+        "[u64; 2]" => "u64[2]".into(),
+        name => name.rsplit("::").next().unwrap_or(name).into(),
+    }
+}
+
+fn layouts() -> Vec<Layout> {
+    vec![
+        layout!(StepRequest {
+            version,
+            operation,
+            lease,
+            sequence,
+            first_world,
+            n_worlds,
+            n_moves,
+            flags,
+            listener_low,
+            listener_high,
+            reserved,
+        }),
+        layout!(StepReply {
+            version,
+            status,
+            sequence,
+            first_world,
+            n_worlds,
+            height,
+            width,
+            simulation_nanos,
+            detail,
+            reserved,
+        }),
+        layout!(StepResult {
+            step,
+            seed,
+            episode,
+            reward,
+            n_target_cells,
+            n_visited,
+            n_hits,
+            row,
+            col,
+            coverage,
+            terminated,
+            truncated,
+            reserved,
+        }),
+        layout!(ControlRequest {
+            version,
+            reserved,
+            sequence,
+            listener_low,
+            listener_high,
+        }),
+        layout!(ControlReply {
+            version,
+            status,
+            sequence,
+        }),
+        layout!(FrameHeader {
+            version,
+            world,
+            sequence,
+            height,
+            width,
+            n_moves,
+            start_row,
+            start_col,
+            reserved,
+            result,
+        }),
+        layout!(TruthHeader {
+            version,
+            world,
+            sequence,
+            episode,
+            step,
+            seed,
+            height,
+            width,
+        }),
+    ]
+}
+
+#[test]
+fn every_header_is_laid_out_as_documented() {
+    let layouts = layouts();
+    assert_eq!(PROTOCOL.matches("\n### ").count(), layouts.len());
+    for layout in layouts {
+        let (documented, format) = documented_struct(layout.name);
+        assert_eq!(documented, layout, "PROTOCOL.md (left), code (right)");
+        assert_eq!(
+            document::sizes_of_struct_format(&format),
+            document::scalar_sizes(&documented),
+            "{}: struct {format}",
+            layout.name
+        );
+    }
+}
+
+#[test]
+fn every_status_is_documented_with_its_code() {
+    let documented: Vec<(String, u32)> = rows_under("| status | code |")
+        .into_iter()
+        .map(|row| (row[0].clone(), row[1].parse().expect("a code")))
+        .collect();
+    let known: Vec<(String, u32)> = Status::ALL
+        .into_iter()
+        .map(|status| (snake_case(&status), status as u32))
+        .collect();
+    assert_eq!(documented, known);
+}
+
+#[test]
+fn every_other_code_is_documented() {
+    let documented: BTreeSet<[String; 3]> = rows_under("| kind | name | code |")
+        .into_iter()
+        .map(|row| [row[0].clone(), row[1].clone(), row[2].clone()])
+        .collect();
+    let entry = |kind: &str, name: String, code: u32| [kind.into(), name, code.to_string()];
+    let operations = (0..=255).filter_map(|code| Operation::try_from(code).ok());
+    let coverages = (0..=255).filter_map(|code| Coverage::try_from(code).ok());
+    let known = operations
+        .map(|it| entry("operation", format!("{it:?}").to_lowercase(), it as u32))
+        .chain(
+            Move::ALL
+                .iter()
+                .map(|it| entry("move", format!("{it:?}").to_lowercase(), *it as u32)),
+        )
+        .chain(coverages.map(|it| entry("coverage", snake_case(&it), it as u32)));
+    assert_eq!(documented, known.collect());
+    for sentence in [
+        format!("The version is {VERSION}."),
+        format!("**{UNOBSERVED} where nothing was"),
+        format!("0, or {FLAG_FULL_COVERAGE}: observe every cell"),
+    ] {
+        assert!(PROTOCOL.contains(&sentence), "{sentence:?} is not there");
+    }
+}
+
+#[test]
+fn every_limit_is_documented() {
+    let documented: Vec<(String, usize)> = rows_under("| limit | value |")
+        .into_iter()
+        .map(|row| {
+            (
+                row[0].replace('`', ""),
+                row[1].parse().expect("a whole number"),
+            )
+        })
+        .collect();
+    let known = [
+        ("MAX_CLIENTS", MAX_CLIENTS),
+        ("MAX_OBSERVERS", MAX_OBSERVERS),
+        ("MAX_TRUTH_READERS", MAX_TRUTH_READERS),
+        ("FRAME_BUFFER", FRAME_BUFFER),
+        ("TRUTH_BUFFER", TRUTH_BUFFER),
+        ("MAX_NODES", MAX_NODES),
+        ("MAX_CONTROL_BYTES", MAX_CONTROL_BYTES),
+        ("MAX_MOVES", MAX_MOVES),
+        ("MAX_SIDE", MAX_SIDE),
+    ];
+    assert_eq!(
+        documented,
+        known.map(|(name, value)| (name.to_owned(), value))
+    );
+}
+
+#[test]
+fn every_control_message_has_an_example_that_round_trips() {
+    let (mut operations, mut replies) = (BTreeSet::new(), BTreeSet::new());
+    for line in fences("json").iter().flat_map(|(_, text)| text.lines()) {
+        let value: Value = serde_json::from_str(line).expect("examples are JSON");
+        let name = |key: &str| value.get(key).map(|name| name.to_string());
+        let again = match (name("op"), name("reply")) {
+            (Some(operation), None) => {
+                operations.insert(operation.replace('"', ""));
+                let request: Request = serde_json::from_str(line).expect(line);
+                serde_json::to_value(&request)
+            }
+            (None, Some(kind)) => {
+                replies.insert(kind.replace('"', ""));
+                let reply: Reply = serde_json::from_str(line).expect(line);
+                if let Reply::Error {
+                    status,
+                    detail,
+                    message,
+                } = &reply
+                {
+                    assert_eq!(*message, status.explain(*detail));
+                }
+                serde_json::to_value(&reply)
+            }
+            other => panic!("expected op or reply, got {other:?} in {line}"),
+        };
+        assert_eq!(again.expect("messages serialise"), value);
+    }
+    assert_eq!(operations, variants_of::<Request>("op"));
+    assert_eq!(replies, variants_of::<Reply>("reply"));
+}
+
+#[test]
+fn the_worked_example_decodes_to_what_stands_beside_it() {
+    let request = document::worked_example("StepRequest", &layouts());
+    let (header, path) = request.split_at(size_of::<StepRequest>());
+    let header: StepRequest = bytemuck::pod_read_unaligned(header);
+    assert_eq!(Operation::try_from(header.operation), Ok(Operation::Step));
+    let path = path_from_bytes(path).expect("a path");
+    assert_eq!(path, [Move::Down, Move::Right, Move::Right, Move::Down]);
+    assert_eq!(path_to_bytes(&path).len(), header.n_moves as usize);
+
+    let reply = document::worked_example("StepReply", &layouts());
+    let (header, payload) = reply.split_at(size_of::<StepReply>());
+    let header: StepReply = bytemuck::pod_read_unaligned(header);
+    assert_eq!(Status::try_from(header.status), Ok(Status::Ok));
+    let (results, frames) = split_step_payload(&header, payload).expect("the right length");
+    let shape = Shape::new(header.height as usize, header.width as usize).expect("a grid");
+    let frame = Frame::from_bytes(shape, 3, frames).expect("a frame");
+    let seen: Vec<(usize, u8)> = frame.observed().collect();
+    assert_eq!(seen, [(5, 0), (6, 2), (7, 2), (12, 1)]);
+    assert_eq!(results[0].n_visited as usize, seen.len());
+    assert_eq!(Coverage::try_from(results[0].coverage), Ok(Coverage::Path));
+}
+
+fn snake_case<T: serde::Serialize>(value: &T) -> String {
+    let text = serde_json::to_string(value).expect("codes serialise");
+    text.replace('"', "")
+}
+
+/// Every variant of a tagged enum, as serde lists them when it meets an unknown one.
+fn variants_of<T: serde::de::DeserializeOwned>(tag: &str) -> BTreeSet<String> {
+    let unknown = serde_json::from_str::<T>(&format!(r#"{{"{tag}":"?"}}"#));
+    let error = unknown.err().expect("no such variant").to_string();
+    let (_, known) = error.split_once("expected one of").expect("serde's words");
+    let names = known.split('`').skip(1).step_by(2);
+    names.map(str::to_owned).collect()
+}
