@@ -3,7 +3,7 @@
 use crate::belief::{Belief, BeliefError};
 use crate::config::AgentConfig;
 use crate::estimator::{Filter, ZeroEvidence};
-use crate::planner::{CellValues, Plan, Planner, PlanningProblem};
+use crate::planner::{CellValues, Objective, Plan, Planner, PlanningProblem};
 use crate::policy::{EstimatorKind, Policy};
 use protocol::model::ModelError;
 use protocol::{Cell, Frame, Grid, Model, Probabilities, Shape, Transition};
@@ -12,6 +12,7 @@ use thiserror::Error;
 /// A policy at work on one world.
 pub struct Agent {
     policy: Policy,
+    objective: Objective,
     estimator: Estimator,
     planner: Box<dyn Planner + Send>,
     n_moves: usize,
@@ -90,6 +91,7 @@ impl Agent {
         };
         Ok(Self {
             policy: policy.clone(),
+            objective: config.objective(policy),
             estimator,
             planner: config.planner(policy),
             n_moves: task.n_moves,
@@ -99,7 +101,7 @@ impl Agent {
 
     /// The path for step k -> k + 1, from where the robot is (paper eq. 15).
     pub fn plan(&mut self, robot: Cell, step: u64) -> Plan {
-        let values: CellValues = self.policy.objective.values(self.estimator.belief());
+        let values: CellValues = self.objective.values(self.estimator.belief());
         let problem = PlanningProblem {
             start: robot,
             n_moves: self.n_moves,

@@ -4,7 +4,7 @@
 //! *scouts* of the same seeds, kept one step ahead for clairvoyant policies (a world does not depend
 //! on the path, so a scout shows the future lawfully); and one *spare*, for full observations.
 
-use crate::client::{Claim, Client, Observation};
+use crate::client::{Claim, Client, Observation, server_info};
 use crate::truth::{TruthError, TruthFeed};
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
@@ -12,10 +12,14 @@ use protocol::control::{CoverageRule, ServerInfo, WorldSeed};
 use protocol::model::ModelError;
 use protocol::{Grid, Model, Move, Shape};
 use std::ops::Range;
+use std::time::Duration;
 use thiserror::Error;
 
 /// Most main worlds of a batch: with scouts and a spare, their hidden states fit a reader's buffer.
 pub const MAX_BATCH: u32 = 32;
+
+/// How long the lease on a comparison's worlds lives without use.
+const LEASE: Duration = Duration::from_secs(3600);
 
 /// Worlds of one server, held for a comparison.
 pub struct Arena {
@@ -73,7 +77,8 @@ impl Arena {
         let claim = Claim {
             worlds: 0..used + u32::from(spare.is_some()),
             takeover: false,
-            time_to_live: None,
+            // Simulating the prior may take long; closing the connection ends the lease all the same.
+            time_to_live: Some(LEASE),
         };
         let client = Client::acquire(instance, &claim)?;
         let info = client.info();
@@ -207,10 +212,4 @@ impl Arena {
     fn range(&self, worlds: &Range<u32>, seeds: &[u64]) -> Range<u32> {
         worlds.start..worlds.start + seeds.len() as u32
     }
-}
-
-fn server_info(instance: &Instance) -> Result<ServerInfo, ConnectionError> {
-    let connection =
-        protocol::Connection::open(instance, "emberwatch-agent", crate::client::STEP_TIMEOUT)?;
-    Ok(connection.info().clone())
 }

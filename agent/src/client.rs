@@ -9,6 +9,9 @@ use protocol::{Cell, Connection, Frame, Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
 
+/// How this program names itself to servers.
+const CLIENT_NAME: &str = concat!("emberwatch-agent ", env!("CARGO_PKG_VERSION"));
+
 /// How long a step may take.
 pub const STEP_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -59,15 +62,9 @@ impl Client {
     /// # Errors
     /// [`ConnectionError`]; a refusal names the holder of a world that is taken.
     pub fn acquire(instance: &Instance, claim: &Claim) -> Result<Self, ConnectionError> {
-        let name = concat!("emberwatch-agent ", env!("CARGO_PKG_VERSION"));
-        let mut connection = Connection::open(instance, name, CONTROL_TIMEOUT)?;
+        let mut connection = Connection::open(instance, CLIENT_NAME, CONTROL_TIMEOUT)?;
+        let shape = shape_of(connection.info())?;
         let lease = acquire(&mut connection, claim)?.lease;
-        let (height, width) = (connection.info().height, connection.info().width);
-        let shape = Shape::new(height, width);
-        let shape = shape.map_err(|error| ConnectionError::Garbled {
-            what: "hello",
-            problem: error.to_string(),
-        })?;
         Ok(Self {
             connection,
             lease,
@@ -192,6 +189,27 @@ impl Client {
         };
         answer.results.iter().zip(frames).map(observation).collect()
     }
+}
+
+/// What a server says of itself, from a connection of its own.
+///
+/// # Errors
+/// [`ConnectionError`].
+pub fn server_info(instance: &Instance) -> Result<ServerInfo, ConnectionError> {
+    let connection = Connection::open(instance, CLIENT_NAME, STEP_TIMEOUT)?;
+    Ok(connection.info().clone())
+}
+
+/// A server's grid.
+///
+/// # Errors
+/// [`ConnectionError::Garbled`] if it is none.
+pub fn shape_of(info: &ServerInfo) -> Result<Shape, ConnectionError> {
+    let shape = Shape::new(info.height, info.width);
+    shape.map_err(|error| ConnectionError::Garbled {
+        what: "hello",
+        problem: error.to_string(),
+    })
 }
 
 fn acquire(connection: &mut Connection, claim: &Claim) -> Result<LeaseInfo, ConnectionError> {

@@ -193,8 +193,9 @@ impl CompareCommand {
             &label,
             Some(&results.fire_cells),
         )?;
-        if let Some(moment) = &results.moment {
-            draw_moment(&directory.join("snapshot.png"), arena, moment)?;
+        match &results.moment {
+            Some(moment) => draw_moment(&directory.join("snapshot.png"), arena, moment)?,
+            None => tracing::warn!("no snapshot: no policy among these has a belief of its own"),
         }
         let settings = toml::to_string(&comparison.config)?;
         let path = directory.join("agent.toml");

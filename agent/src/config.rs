@@ -1,9 +1,10 @@
 //! The agent's settings: defaults or the paper's preset, then a TOML file, then flags.
 
+use crate::belief::EntropyKind;
 use crate::estimator::Prior;
 use crate::planner::beam::DEFAULT_WIDTH;
-use crate::planner::{BeamSearch, Integration, Planner, RandomWalk, Shooting};
-use crate::policy::{PlannerKind, Policy};
+use crate::planner::{BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target};
+use crate::policy::{BEAM_BONUS, PlannerKind, Policy};
 use clap::{Args, ValueEnum};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -19,12 +20,28 @@ pub struct AgentConfig {
     pub shooting_samples: usize,
     /// How shooting turns samples into positions: `clamp_each_move` or `clamp_sum`.
     pub shooting_integration: Integration,
+    /// What planners maximise.
+    pub objective: ObjectiveConfig,
     /// The known-model filter's first belief: `simulated`, `initial` or `uniform`.
     pub prior: PriorKind,
     /// Worlds simulated for the prior `simulated`, 1 to 10,000.
     pub prior_worlds: usize,
     /// Seed of planners and of the prior's worlds.
     pub seed: u64,
+}
+
+/// What planners maximise besides the target that a policy's name says (paper eqs. 13 to 15).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ObjectiveConfig {
+    /// Shooting's bonus for each distinct cell, 0 to 1000.
+    pub shooting_bonus: f32,
+    /// Beam search's bonus for each distinct cell, 0 to 1000.
+    pub beam_bonus: f32,
+    /// Entropy as the `mean` (the authors' code) or the `sum` (the paper) of its terms.
+    pub entropy: EntropyKind,
+    /// Whether a cell's value counts at every visit (the paper as printed).
+    pub revisits: bool,
 }
 
 /// The known-model filter's first belief.
@@ -83,6 +100,14 @@ pub enum ConfigError {
         /// What is wrong.
         problem: String,
     },
+    /// A bonus that is no number of a sensible size.
+    #[error("objective.{setting}: expected 0 to 1000, got {got}")]
+    Bonus {
+        /// Which setting.
+        setting: &'static str,
+        /// What it is.
+        got: f32,
+    },
     /// A setting out of its range.
     #[error("{setting}: expected {least} to {most}, got {got}")]
     Range {
@@ -103,9 +128,21 @@ impl Default for AgentConfig {
             beam_width: DEFAULT_WIDTH,
             shooting_samples: 2048,
             shooting_integration: Integration::ClampEachMove,
+            objective: ObjectiveConfig::default(),
             prior: PriorKind::Simulated,
             prior_worlds: 64,
             seed: 0,
+        }
+    }
+}
+
+impl Default for ObjectiveConfig {
+    fn default() -> Self {
+        Self {
+            shooting_bonus: 1.0,
+            beam_bonus: BEAM_BONUS,
+            entropy: EntropyKind::Mean,
+            revisits: false,
         }
     }
 }
@@ -128,6 +165,19 @@ impl AgentConfig {
         in_range("beam_width", self.beam_width, 10_000)?;
         in_range("shooting_samples", self.shooting_samples, 1_000_000)?;
         in_range("prior_worlds", self.prior_worlds, 10_000)?;
+        let ObjectiveConfig {
+            shooting_bonus,
+            beam_bonus,
+            ..
+        } = self.objective;
+        for (setting, got) in [
+            ("shooting_bonus", shooting_bonus),
+            ("beam_bonus", beam_bonus),
+        ] {
+            if !(0.0..=1000.0).contains(&got) {
+                return Err(ConfigError::Bonus { setting, got });
+            }
+        }
         Ok(self)
     }
 
@@ -140,6 +190,25 @@ impl AgentConfig {
             },
             PriorKind::Initial => Prior::Initial,
             PriorKind::Uniform => Prior::Uniform,
+        }
+    }
+
+    /// What a policy maximises under these settings. A policy without a bonus, such as
+    /// `shooting_exploit_only`, and coverage, which is nothing but the bonus, keep theirs.
+    pub fn objective(&self, policy: &Policy) -> Objective {
+        let own = policy.objective;
+        let settings = &self.objective;
+        let keeps = own.coverage_bonus == 0.0 || own.target == Target::Coverage;
+        let coverage_bonus = match policy.planner {
+            _ if keeps => own.coverage_bonus,
+            PlannerKind::Beam => settings.beam_bonus,
+            PlannerKind::Shooting | PlannerKind::RandomWalk => settings.shooting_bonus,
+        };
+        Objective {
+            target: own.target,
+            coverage_bonus,
+            entropy: settings.entropy,
+            revisits: settings.revisits,
         }
     }
 
@@ -222,6 +291,36 @@ mod tests {
             n_settings,
             "a setting is not listed"
         );
+    }
+
+    #[test]
+    fn settings_of_the_objective_reach_the_policies() {
+        let model = protocol::Model::wildfire();
+        let policy = |name| Policy::named(name, &model).expect("a known name");
+        let mut config = AgentConfig::default();
+        for policy in Policy::ladder(&model) {
+            assert_eq!(
+                config.objective(&policy).coverage_bonus,
+                policy.objective.coverage_bonus
+            );
+        }
+        config.objective.shooting_bonus = 3.0;
+        config.objective.revisits = true;
+        assert_eq!(
+            config.objective(&policy("shooting_explore")).coverage_bonus,
+            3.0
+        );
+        assert!(config.objective(&policy("beam_exploit")).revisits);
+        assert_eq!(
+            config
+                .objective(&policy("shooting_exploit_only"))
+                .coverage_bonus,
+            0.0
+        );
+        assert_eq!(config.objective(&policy("coverage")).coverage_bonus, 1.0);
+        config.objective.beam_bonus = f32::NAN;
+        let error = config.check().expect_err("no number").to_string();
+        assert_eq!(error, "objective.beam_bonus: expected 0 to 1000, got NaN");
     }
 
     #[test]

@@ -136,7 +136,7 @@ impl Policy {
 /// middle of nothing goes somewhere else. Without it a clairvoyant robot stands still where nothing
 /// burns around it and earns 20.2 +- 8.1 instead of 43.6 +- 6.5 per step; with the filter it makes no
 /// difference (36.4 and 36.6; 8 training worlds, burn-in 25,000, 1,500 steps).
-const BEAM_BONUS: f32 = 0.02;
+pub const BEAM_BONUS: f32 = 0.02;
 
 /// The authors' objective for shooting; for beam search hardly any bonus.
 fn objective(planner: PlannerKind, target: Target) -> Objective {

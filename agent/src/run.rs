@@ -1,13 +1,16 @@
 //! The agent's life on one world: attach, act, reconnect, leave.
 
 use crate::agent::{Agent, AgentError, Task};
-use crate::client::{Claim, Client, Observation};
+use crate::belief::Belief;
+use crate::client::{Claim, Client, Observation, server_info, shape_of};
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
+use crate::estimator::Prior;
 use crate::policy::{EstimatorKind, Policy, UnknownPolicy};
 use crate::truth::{TruthError, TruthFeed};
 use protocol::channels::{ChannelError, Instance};
 use protocol::connection::ConnectionError;
+use protocol::control::ServerInfo;
 use protocol::message::Status;
 use protocol::model::ModelError;
 use protocol::{Grid, Model};
@@ -131,19 +134,32 @@ impl Attached {
     /// Acquires the world where it stands and takes in its last frame.
     fn attach(mission: &Mission, takeover: bool) -> Result<Self, RunError> {
         let worlds = mission.world..mission.world + 1;
-        let claim = Claim {
-            worlds: worlds.clone(),
-            takeover,
-            time_to_live: None,
-        };
-        let mut client = Client::acquire(&mission.instance, &claim)?;
-        let model = model(mission, &client)?;
+        // What takes long is done before the lease begins to run.
+        let info = server_info(&mission.instance)?;
+        if mission.world >= info.n_worlds {
+            let (status, detail) = (Status::NoSuchWorld, info.n_worlds.into());
+            let message = status.explain(detail);
+            return Err(ConnectionError::Refused {
+                status,
+                detail,
+                message,
+            }
+            .into());
+        }
+        let model = model(mission, &info)?;
         let policy = Policy::named(&mission.policy, &model)?;
         if policy.estimator == EstimatorKind::NextTruth {
             return Err(RunError::Clairvoyant {
                 policy: policy.name,
             });
         }
+        let prior = prior(mission, &model, &policy, &info)?;
+        let claim = Claim {
+            worlds: worlds.clone(),
+            takeover,
+            time_to_live: None,
+        };
+        let mut client = Client::acquire(&mission.instance, &claim)?;
         let observation = client.observe(worlds)?.remove(0);
         let (seed, step) = (observation.result.seed, observation.result.step);
         tracing::info!(
@@ -153,11 +169,6 @@ impl Attached {
             policy = policy.name,
             "acting"
         );
-        let prior = mission.config.prior(client.info().burn_in).belief(
-            &model,
-            client.shape(),
-            mission.config.seed,
-        )?;
         let n_moves = client.info().n_moves;
         let seed = planner_seed(&mission.config, seed);
         let task = Task {
@@ -241,8 +252,22 @@ impl Report {
     }
 }
 
-fn model(mission: &Mission, client: &Client) -> Result<Model, RunError> {
-    match (&mission.model, &client.info().model) {
+/// The belief before the first frame: simulated only for those who filter.
+fn prior(
+    mission: &Mission,
+    model: &Model,
+    policy: &Policy,
+    info: &ServerInfo,
+) -> Result<Belief, RunError> {
+    let kind = match policy.estimator {
+        EstimatorKind::KnownModel => mission.config.prior(info.burn_in),
+        _ => Prior::Initial,
+    };
+    Ok(kind.belief(model, shape_of(info)?, mission.config.seed)?)
+}
+
+fn model(mission: &Mission, info: &ServerInfo) -> Result<Model, RunError> {
+    match (&mission.model, &info.model) {
         (Some(model), _) => Ok(model.clone()),
         (None, Some(text)) => Ok(Model::from_toml(text)?),
         (None, None) => Err(RunError::NoModel {
@@ -263,13 +288,16 @@ fn open_truth(mission: &Mission, client: &Client) -> Result<TruthFeed, RunError>
 
 /// Attaches to a server that has come back; `None` if it is time to stop.
 fn attach_again(mission: &Mission, stop: &AtomicBool) -> Result<Option<Attached>, RunError> {
-    let mut takeover = mission.takeover;
+    let mut takeover = false;
     while !stop.load(Ordering::Relaxed) {
         match Attached::attach(mission, takeover) {
             Ok(attached) => return Ok(Some(attached)),
             // The server did not end, it paused: our former connection holds the world still.
             Err(error) if is_own_lease(&error) && !takeover => takeover = true,
-            Err(error) if is_outage(&error) => std::thread::sleep(RETRY_INTERVAL),
+            Err(error) if is_outage(&error) => {
+                takeover = false;
+                std::thread::sleep(RETRY_INTERVAL);
+            }
             Err(error) => return Err(error),
         }
     }

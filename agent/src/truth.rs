@@ -72,7 +72,11 @@ impl TruthFeed {
         let deadline = Instant::now() + TIMEOUT;
         while let Some(missing) = states.iter().position(Option::is_none) {
             let left = deadline.saturating_duration_since(Instant::now());
-            let Some(sample) = self.observer.receive(left)? else {
+            let sample = match left {
+                Duration::ZERO => None,
+                left => self.observer.receive(left)?,
+            };
+            let Some(sample) = sample else {
                 return Err(TruthError::Missing {
                     world: worlds.start + missing as u32,
                     step,

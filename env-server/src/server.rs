@@ -5,7 +5,7 @@ use crate::liveness::{Clients, Janitor, Keeper};
 use crate::ports::{ActiveControl, ActiveStep, PortError, Ports};
 use crate::resets::Resets;
 use crate::simulator::{Awaited, Outcome, Simulator, Surroundings};
-use protocol::channels::{ChannelError, ipc_error};
+use protocol::channels::{ChannelError, FRAME_BUFFER, ipc_error};
 use protocol::control::Reply;
 use protocol::message::{ControlReply, FrameHeader, Status, TruthHeader, VERSION};
 use protocol::model::ModelError;
@@ -32,6 +32,12 @@ const BUSY_TICK: Duration = Duration::from_millis(50);
 
 /// How long a client may take to read the answer to its shutdown: the answer goes with the server.
 const FAREWELL: Duration = Duration::from_millis(500);
+
+/// One turn in this many looks for a control request before a step.
+const CONTROL_FIRST: u64 = 64;
+
+/// How often a server that is greeting observers shows them more.
+const GREETING_TICK: Duration = Duration::from_millis(5);
 
 /// Over how long the step rate is measured.
 const RATE_WINDOW: Duration = Duration::from_secs(1);
@@ -96,11 +102,14 @@ struct Server {
     payload: Vec<u8>,
     /// Observers that were there at the last look.
     observers: Vec<u128>,
+    /// Worlds that new observers have yet to be shown.
+    greeting: Range<usize>,
     n_frames: u64,
     n_truths: u64,
     rate: Rate,
     started: Instant,
     last_tick: Instant,
+    n_turns: u64,
     is_over: bool,
 }
 
@@ -151,6 +160,7 @@ impl Server {
             awaiting: Vec::new(),
             payload: Vec::new(),
             observers: Vec::new(),
+            greeting: 0..0,
             n_frames: 0,
             n_truths: 0,
             rate: Rate {
@@ -160,6 +170,7 @@ impl Server {
             },
             started: now,
             last_tick: now,
+            n_turns: 0,
             is_over: false,
         })
     }
@@ -167,8 +178,22 @@ impl Server {
     /// Waits for something and handles it.
     fn turn(&mut self) -> Result<(), ServeError> {
         let woken = Cell::new(false);
+        let is_greeting = !self.greeting.is_empty();
+        let tick = if is_greeting {
+            GREETING_TICK
+        } else {
+            IDLE_TICK
+        };
+        // Now and then control comes first, so that endless steps cannot keep it waiting.
+        self.n_turns = self.n_turns.wrapping_add(1);
+        if self.n_turns.is_multiple_of(CONTROL_FIRST)
+            && let Some(request) = self.ports.receive_control()
+        {
+            self.answer_control(Instant::now(), request);
+            return Ok(());
+        }
         let found = self.waiter.wait(
-            IDLE_TICK,
+            tick,
             || Ok(self.look(&woken)),
             |limit| {
                 woken.set(self.sleep(limit)?);
@@ -338,8 +363,13 @@ impl Server {
         self.observers = observers;
         if has_new {
             self.ports.connect_observers();
-            self.publish(self.simulator.worlds());
+            self.greeting = self.simulator.worlds();
         }
+        // In portions: more at once would run over the buffers of those who are greeted.
+        let portion =
+            self.greeting.start..self.greeting.end.min(self.greeting.start + FRAME_BUFFER);
+        self.greeting.start = portion.end;
+        self.publish(portion);
     }
 
     fn publish(&mut self, worlds: Range<usize>) {

@@ -18,7 +18,7 @@ pub trait Header: std::fmt::Debug + Default + Copy + ZeroCopySend {}
 impl<T: std::fmt::Debug + Default + Copy + ZeroCopySend> Header for T {}
 
 /// Set in [`StepRequest::flags`]: observe every cell, not only the path (needs a server whose
-/// coverage is `client`).
+/// coverage is `client` or `full`).
 pub const FLAG_FULL_COVERAGE: u32 = 1;
 
 /// What a step request asks for.
@@ -127,7 +127,7 @@ pub struct StepReply {
     pub height: u32,
     /// Grid width W.
     pub width: u32,
-    /// Time that simulating took, nanoseconds.
+    /// Time that the server worked on the request, nanoseconds: checks, simulation, copying.
     pub simulation_nanos: u64,
     /// See [`Status`].
     pub detail: u64,

@@ -240,6 +240,10 @@ mod tests {
             |f| f.kernel[0].weights[0][1] = -0.1,
             "kernel from \"normal\" to \"normal\": expected finite weights >= 0, got -0.",
         );
+        check(
+            |f| f.states[0].name = "explore".into(),
+            "state name: expected letters, digits, '-' and '_', and none of",
+        );
         check(|f| f.kernel[0].scale = f64::NAN, "got NaN");
         check(|f| f.kernel[0].to = "ash".into(), "names state \"ash\"");
         check(

@@ -74,10 +74,10 @@ pub fn model(n: usize) -> Model {
     let names = [
         "dry",
         "wet",
-        "black ice",
-        "packed snow",
+        "black_ice",
+        "packed_snow",
         "slush",
-        "salted, ploughed and gritted",
+        "salted_ploughed_and_gritted",
     ];
     let state = |index: usize| StateEntry {
         name: names[index].into(),

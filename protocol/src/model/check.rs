@@ -9,6 +9,9 @@ use std::ops::RangeInclusive;
 /// those overflows or vanishes in `f64`.
 const RANGE: RangeInclusive<f64> = 1e-100..=1e100;
 
+/// Words that policies are named with, as `shooting_explore` beside `shooting_<state>`.
+const RESERVED: [&str; 3] = ["exploit", "exploit_only", "explore"];
+
 /// How far a probability distribution in a model file may be from summing to one.
 const SUM_TOLERANCE: f64 = 1e-6;
 
@@ -36,6 +39,15 @@ impl Checker<'_> {
             .map(|o| (&o.name, &o.color))
             .collect();
         self.entries("state", "states", 2, &states)?;
+        for state in &file.states {
+            let (name, is_plain) = (&state.name, |c: char| {
+                c.is_ascii_alphanumeric() || "-_".contains(c)
+            });
+            if name.is_empty() || !name.chars().all(is_plain) || RESERVED.contains(&name.as_str()) {
+                let expected = format!("letters, digits, '-' and '_', and none of {RESERVED:?}");
+                return self.wrong("state name".into(), &expected, format!("{name:?}"));
+            }
+        }
         self.entries("observation", "observations", 1, &observations)
     }
 

@@ -25,7 +25,7 @@ pub struct ModelFile {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StateEntry {
-    /// Name, unique among the states.
+    /// Name, unique among the states: letters, digits, `-` and `_`.
     pub name: String,
     /// Colour in pictures, `#rrggbb`.
     pub color: String,
