@@ -1,7 +1,8 @@
 //! Who may act on which worlds, and until when. Pure: time and tokens come in as arguments.
 //!
 //! A lease covers consecutive worlds. It ends by release, by expiry, with its client's connection or
-//! process, or by a takeover; a world taken from a lease is lost to that lease for good, also when it is free again.
+//! process, or by a takeover; a world taken from a lease is lost to that lease for good, also when it
+//! is free again.
 
 use protocol::message::Status;
 use std::collections::{HashMap, HashSet, VecDeque};

@@ -9,6 +9,7 @@ pub mod episode;
 pub mod lease;
 pub mod liveness;
 pub mod ports;
+pub mod publications;
 pub mod resets;
 pub mod sensor;
 pub mod server;

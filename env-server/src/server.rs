@@ -3,13 +3,13 @@
 use crate::config::Checked;
 use crate::liveness::{Clients, Janitor, Keeper};
 use crate::ports::{ActiveControl, ActiveStep, PortError, Ports};
+use crate::publications::Publications;
 use crate::resets::Resets;
 use crate::simulator::{Awaited, Outcome, Simulator, Surroundings};
-use protocol::channels::{ChannelError, FRAME_BUFFER, ipc_error};
+use protocol::channels::{ChannelError, ipc_error};
 use protocol::control::Reply;
-use protocol::message::{ControlReply, FrameHeader, Status, TruthHeader, VERSION};
+use protocol::message::{ControlReply, Operation, Status, VERSION};
 use protocol::model::ModelError;
-use protocol::path::path_to_bytes;
 use protocol::wait::{Waiter, sleep_until_readable};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
@@ -101,11 +101,7 @@ struct Server {
     awaiting: Vec<(ActiveControl, Awaited)>,
     payload: Vec<u8>,
     /// Observers that were there at the last look.
-    observers: Vec<u128>,
-    /// Worlds that new observers have yet to be shown.
-    greeting: Range<usize>,
-    n_frames: u64,
-    n_truths: u64,
+    publications: Publications,
     rate: Rate,
     started: Instant,
     last_tick: Instant,
@@ -159,10 +155,7 @@ impl Server {
             resets,
             awaiting: Vec::new(),
             payload: Vec::new(),
-            observers: Vec::new(),
-            greeting: 0..0,
-            n_frames: 0,
-            n_truths: 0,
+            publications: Publications::default(),
             rate: Rate {
                 since: now,
                 n_steps: 0,
@@ -178,8 +171,7 @@ impl Server {
     /// Waits for something and handles it.
     fn turn(&mut self) -> Result<(), ServeError> {
         let woken = Cell::new(false);
-        let is_greeting = !self.greeting.is_empty();
-        let tick = if is_greeting {
+        let tick = if self.publications.is_greeting() {
             GREETING_TICK
         } else {
             IDLE_TICK
@@ -244,8 +236,9 @@ impl Server {
         reply.simulation_nanos = now.elapsed().as_nanos() as u64;
         let listener = listener_id(header.listener_low, header.listener_high);
         self.ports.answer(request, reply, &self.payload, listener);
-        if header.operation == protocol::message::Operation::Step as u32 {
-            self.publish(self.simulator.worlds_of(&reply));
+        if header.operation == Operation::Step as u32 {
+            let worlds = self.simulator.worlds_of(&reply);
+            self.publish(worlds);
         }
     }
 
@@ -303,6 +296,11 @@ impl Server {
         }
     }
 
+    fn publish(&mut self, worlds: Range<usize>) {
+        self.publications
+            .publish(&self.ports, &self.simulator, worlds);
+    }
+
     /// Everything that no request asks for.
     fn look_around(&mut self, now: Instant) {
         self.last_tick = now;
@@ -313,7 +311,7 @@ impl Server {
         for pid in self.simulator.expire(now) {
             tracing::warn!(pid, "a lease expired");
         }
-        self.greet_observers();
+        self.publications.greet(&self.ports, &self.simulator);
         self.rate.update(now, self.simulator.n_steps());
     }
 
@@ -354,83 +352,6 @@ impl Server {
         if n_leases > 0 {
             tracing::info!(n_leases, "a connection was closed without a release");
         }
-    }
-
-    /// Shows every world to observers that have just come.
-    fn greet_observers(&mut self) {
-        let observers = self.ports.observer_ids();
-        let has_new = observers.iter().any(|id| !self.observers.contains(id));
-        self.observers = observers;
-        if has_new {
-            self.ports.connect_observers();
-            self.greeting = self.simulator.worlds();
-        }
-        // In portions: more at once would run over the buffers of those who are greeted.
-        let portion =
-            self.greeting.start..self.greeting.end.min(self.greeting.start + FRAME_BUFFER);
-        self.greeting.start = portion.end;
-        self.publish(portion);
-    }
-
-    fn publish(&mut self, worlds: Range<usize>) {
-        let (n_observers, n_readers) = self.ports.observers();
-        if n_observers == 0 && n_readers == 0 {
-            return;
-        }
-        for world in worlds {
-            if n_readers > 0 {
-                self.publish_truth(world);
-            }
-            if n_observers > 0 {
-                self.publish_frame(world);
-            }
-        }
-    }
-
-    fn publish_frame(&mut self, world: usize) {
-        let Some(episode) = self.simulator.episode(world) else {
-            return;
-        };
-        let (height, width) = episode.states().dim();
-        let (start, path) = episode.path();
-        let header = FrameHeader {
-            version: VERSION,
-            world: world as u32,
-            sequence: self.n_frames,
-            height: height as u32,
-            width: width as u32,
-            n_moves: path.len() as u32,
-            start_row: start.row as u32,
-            start_col: start.col as u32,
-            reserved: 0,
-            result: *episode.result(),
-        };
-        self.ports
-            .publish_frame(header, episode.frame().as_bytes(), &path_to_bytes(path));
-        self.n_frames += 1;
-    }
-
-    fn publish_truth(&mut self, world: usize) {
-        let Some(episode) = self.simulator.episode(world) else {
-            return;
-        };
-        let (states, result) = (episode.states(), episode.result());
-        let (height, width) = states.dim();
-        let header = TruthHeader {
-            version: VERSION,
-            world: world as u32,
-            sequence: self.n_truths,
-            episode: result.episode,
-            step: result.step,
-            seed: result.seed,
-            height: height as u32,
-            width: width as u32,
-        };
-        self.ports.publish_truth(
-            header,
-            states.as_slice().expect("invariant: states are row-major"),
-        );
-        self.n_truths += 1;
     }
 }
 

@@ -1,0 +1,100 @@
+//! What observers get: every world after its step, and all worlds for those who have just come.
+
+use crate::episode::Episode;
+use crate::ports::Ports;
+use crate::simulator::Simulator;
+use protocol::channels::FRAME_BUFFER;
+use protocol::message::{FrameHeader, TruthHeader, VERSION};
+use protocol::path::path_to_bytes;
+use std::ops::Range;
+
+/// What has been published, and to whom.
+#[derive(Default)]
+pub struct Publications {
+    observers: Vec<u128>,
+    /// Worlds that new observers have yet to be shown.
+    greeting: Range<usize>,
+    n_frames: u64,
+    n_truths: u64,
+}
+
+impl Publications {
+    /// Whether there are observers who have yet to be shown worlds.
+    pub fn is_greeting(&self) -> bool {
+        !self.greeting.is_empty()
+    }
+
+    /// Shows every world to observers that have just come.
+    pub fn greet(&mut self, ports: &Ports, simulator: &Simulator) {
+        let observers = ports.observer_ids();
+        let has_new = observers.iter().any(|id| !self.observers.contains(id));
+        self.observers = observers;
+        if has_new {
+            ports.connect_observers();
+            self.greeting = simulator.worlds();
+        }
+        // In portions: more at once would run over the buffers of those who are greeted.
+        let portion =
+            self.greeting.start..self.greeting.end.min(self.greeting.start + FRAME_BUFFER);
+        self.greeting.start = portion.end;
+        self.publish(ports, simulator, portion);
+    }
+
+    /// Publishes worlds as they are to whoever observes; costs nothing where nobody does.
+    pub fn publish(&mut self, ports: &Ports, simulator: &Simulator, worlds: Range<usize>) {
+        let (n_observers, n_readers) = ports.observers();
+        if n_observers == 0 && n_readers == 0 {
+            return;
+        }
+        for world in worlds {
+            let Some(episode) = simulator.episode(world) else {
+                continue;
+            };
+            if n_readers > 0 {
+                self.publish_truth(ports, world, episode);
+            }
+            if n_observers > 0 {
+                self.publish_frame(ports, world, episode);
+            }
+        }
+    }
+
+    fn publish_frame(&mut self, ports: &Ports, world: usize, episode: &Episode) {
+        let (height, width) = episode.states().dim();
+        let (start, path) = episode.path();
+        let header = FrameHeader {
+            version: VERSION,
+            world: world as u32,
+            sequence: self.n_frames,
+            height: height as u32,
+            width: width as u32,
+            n_moves: path.len() as u32,
+            start_row: start.row as u32,
+            start_col: start.col as u32,
+            reserved: 0,
+            result: *episode.result(),
+        };
+        ports.publish_frame(header, episode.frame().as_bytes(), &path_to_bytes(path));
+        self.n_frames += 1;
+    }
+
+    fn publish_truth(&mut self, ports: &Ports, world: usize, episode: &Episode) {
+        let (states, result) = (episode.states(), episode.result());
+        let (height, width) = states.dim();
+        let header = TruthHeader {
+            version: VERSION,
+            world: world as u32,
+            sequence: self.n_truths,
+            episode: result.episode,
+            step: result.step,
+            seed: result.seed,
+            height: height as u32,
+            width: width as u32,
+        };
+        ports.publish_truth(
+            header,
+            states.as_slice().expect("invariant: states are row-major"),
+        );
+        self.n_truths += 1;
+    }
+}
