@@ -222,7 +222,7 @@ def test_an_impossible_frame_is_refused_whole() -> None:
     [
         (np.zeros((3, 2), np.uint8), r"expected shape \(2, 3\) and type uint8"),
         (np.zeros((2, 3), np.int64), "got .* int64"),
-        (np.array([[255, 0, 2], [1, 3, 9]], np.uint8), r"cell \(1, 1\): expected a value below 3"),
+        (np.array([[255, 0, 2], [1, 3, 0]], np.uint8), r"cell \(1, 1\): expected a value below 3"),
     ],
 )
 def test_wrong_frames_are_refused(frame: NDArray, expected: str) -> None:
@@ -239,6 +239,11 @@ def test_priors_off_the_simplex_are_refused_by_cell(value: float) -> None:
         Filter(WILDFIRE, prior=prior)
 
 
+def test_a_sum_of_one_is_not_enough_for_a_prior() -> None:
+    with pytest.raises(ValueError, match=r"prior: cell \(0, 0\): expected probabilities >= 0"):
+        Filter(WILDFIRE, prior=np.array([[[1.5]], [[-0.5]], [[0.0]]]))
+
+
 def test_priors_of_another_shape_are_refused() -> None:
     for shape in ((2, 4, 4), (4, 4), (3, 0, 4)):
         with pytest.raises(ValueError, match=r"expected shape \(3, H, W\)"):
@@ -247,8 +252,9 @@ def test_priors_of_another_shape_are_refused() -> None:
         Transition(WILDFIRE, height=2, width=2).apply(np.ones((3, 2, 3)))
 
 
-def test_the_filter_keeps_its_own_belief() -> None:
-    prior = uniform_prior(WILDFIRE, height=2, width=2).astype(np.float32)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_filter_keeps_its_own_belief(dtype: type[np.floating]) -> None:
+    prior = uniform_prior(WILDFIRE, height=2, width=2).astype(dtype)
     filter = Filter(WILDFIRE, prior=prior)
     prior[:] = 0
     filter.belief[:] = 0
