@@ -1,0 +1,239 @@
+"""The Bayes filter for a known model, in numpy (paper section III.A, masked as in section III.C).
+
+A frame turns the predictor ``u_k`` into the posterior ``p_k`` (eq. 5); the transition turns that
+into the next predictor ``u_{k+1} = Phi(p_k)`` (eq. 6). Cells are treated as independent given the
+frames, so this is an approximation even with the true model. `emberwatch.wrappers.Belief` runs it
+beside an environment.
+
+Beliefs have shape (S, H, W): one probability per state and cell, a distribution in each cell.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.model import Model
+
+UNOBSERVED = 255
+"""Value of a frame's cell where nothing was observed."""
+
+_SUM_TOLERANCE = 5e-5  # of a cell's probabilities, as the Rust agent's: 400 float32 roundings
+
+
+class ZeroEvidenceError(ValueError):
+    """A frame that the belief holds impossible."""
+
+    def __init__(self, *, cell: tuple[int, int], observed: int, belief: tuple[float, ...]) -> None:
+        """Names the first such cell (row, column), the value seen and the belief before it."""
+        super().__init__(
+            f"frame: cell {cell}: expected an observation that the belief {list(belief)} allows, "
+            f"got {observed}"
+        )
+        self.cell = cell
+        self.observed = observed
+        self.belief = belief
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """For pickle, which repeats positional arguments only."""
+        return (_zero_evidence, (self.cell, self.observed, self.belief))
+
+
+class Filter:
+    """Filter of one world: `correct` with each frame, and `predict` for each step of the world."""
+
+    def __init__(self, model: Model, *, prior: NDArray[np.floating]) -> None:
+        """A filter that believes the prior.
+
+        Args:
+            model: The world's model.
+            prior: Predictor ``u_0``, shape (S, H, W); each cell sums to one within 5e-5, and is
+                divided by its sum.
+
+        Raises:
+            ValueError: The prior is of another shape, or a cell is no distribution.
+            ModelError: On the prior's grid the transition could divide by zero.
+        """
+        self._belief = _distribution(prior, n_states=model.n_states)
+        _, height, width = self._belief.shape
+        self._transition = Transition(model, height=height, width=width)
+        self._likelihood = np.ascontiguousarray(model.observation_matrix)
+
+    @property
+    def belief(self) -> NDArray[np.float64]:
+        """A copy, shape (S, H, W): the posterior after `correct`, the predictor after `predict`."""
+        return self._belief.copy()
+
+    def correct(self, frame: NDArray[np.uint8]) -> None:
+        """Bayes' rule on the observed cells (eq. 5); the others keep their belief.
+
+        ``p = B(y) u / (b(y)' u)`` with ``b(y)`` the column of the observation matrix for ``y``, and
+        ``B(y)`` the diagonal matrix of it.
+
+        Args:
+            frame: Observed values below O, 255 where nothing was observed; shape (H, W).
+
+        Raises:
+            ZeroEvidenceError: Where ``b(y)' u = 0``; the belief is then as it was.
+            ValueError: The frame is of another grid or type, or holds a value that is neither.
+        """
+        if frame.shape != self._belief.shape[1:] or frame.dtype != np.uint8:
+            expected = f"shape {self._belief.shape[1:]} and type uint8"
+            raise ValueError(f"frame: expected {expected}, got {frame.shape} and {frame.dtype}")
+        values = frame.ravel()
+        cells = np.flatnonzero(values != UNOBSERVED)
+        observed = values[cells]
+        n_observations = self._likelihood.shape[1]
+        if (observed >= n_observations).any():
+            index = int(cells[np.argmax(observed >= n_observations)])
+            expected = f"a value below {n_observations}, or {UNOBSERVED}"
+            raise ValueError(
+                f"frame: cell {self._cell(index)}: expected {expected}, got {values[index]}"
+            )
+        belief = self._belief.reshape(len(self._belief), -1)
+        prior = belief[:, cells]
+        joint = prior * self._likelihood[:, observed]
+        evidence = joint.sum(axis=0)
+        if not evidence.all():
+            first = int(np.argmin(evidence))
+            raise ZeroEvidenceError(
+                cell=self._cell(int(cells[first])),
+                observed=int(observed[first]),
+                belief=tuple(prior[:, first].tolist()),
+            )
+        belief[:, cells] = joint / evidence
+
+    def predict(self) -> None:
+        """The predictor of the next step, ``u_{k+1} = Phi(p_k)`` (eq. 6)."""
+        self._belief = self._transition.apply(self._belief)
+
+    def entropy(self) -> NDArray[np.float64]:
+        """Shannon entropy of each cell in nats (eq. 14), shape (H, W), 0 to log S."""
+        return entropy(self._belief)
+
+    def _cell(self, index: int) -> tuple[int, int]:
+        return divmod(index, self._belief.shape[2])
+
+
+class Transition:
+    """The operator ``Phi`` on beliefs (eqs. 2-4) for one model on one grid.
+
+    ``phi[m, i, j] = b[m] + sum_n sum_{a,c} w[m, n, a, c] x[n, i + a - A, j + c - C]`` with
+    (A, C) the centre of the kernel and ``x`` zero outside the grid (eq. 2), then divided by its sum
+    over ``m`` (eq. 3).
+
+    It keeps work space: share none between threads. The belief lies in rows with a margin of
+    zeros, end to end, so that a neighbour is a shifted slice. Taps that weigh alike for all next
+    states are added up before they are multiplied, and those without weight are left out.
+    """
+
+    def __init__(self, model: Model, *, height: int, width: int) -> None:
+        """Lays out a model's operator for a grid, both sides in cells and at least 1.
+
+        Raises:
+            ModelError: On this grid eq. 3 could divide by zero.
+        """
+        model.check_on(height=height, width=width)
+        n_states, _, kernel_height, kernel_width = model.kernel.shape
+        self._shape = (n_states, height, width)
+        self._stride = width + kernel_width - 1
+        self._length = (height - 1) * self._stride + width
+        largest = max(model.kernel.max(), model.bias.max())  # a common factor, which eq. 3 cancels
+        self._groups = [_taps_that_weigh_alike(w / largest) for w in model.kernel.swapaxes(0, 1)]
+        self._bias = (model.bias / largest)[:, None]
+        top, left = kernel_height // 2, kernel_width // 2
+        self._planes = np.zeros((n_states, height + kernel_height - 1, self._stride))
+        self._inside = self._planes[:, top : top + height, left : left + width]
+        self._sums = np.empty((max(len(taps) for _, taps in self._groups), self._length))
+
+    def apply(self, belief: NDArray[np.float64]) -> NDArray[np.float64]:
+        """``Phi(belief)``, a new array; both of shape (S, H, W), each cell's sum is one.
+
+        Raises:
+            ValueError: The belief is of another shape.
+        """
+        if belief.shape != self._shape:
+            raise ValueError(f"belief: expected shape {self._shape}, got {belief.shape}")
+        n_states, height, width = self._shape
+        self._inside[:] = belief
+        out = np.empty((n_states, height * self._stride))
+        weights = out[:, : self._length]
+        weights[:] = self._bias
+        for plane, (columns, groups) in zip(self._planes, self._groups, strict=True):
+            for total, group in zip(self._sums, groups, strict=False):
+                self._add_up(plane.ravel(), group, total)
+            weights += columns @ self._sums[: len(groups)]
+        on_grid = out.reshape(n_states, height, self._stride)[:, :, :width]
+        return np.divide(on_grid, on_grid.sum(axis=0), out=np.empty(self._shape))
+
+    def _add_up(
+        self, plane: NDArray[np.float64], taps: list[tuple[int, int]], total: NDArray[np.float64]
+    ) -> None:
+        starts = [row * self._stride + col for row, col in taps]
+        first, *rest = (plane[start : start + self._length] for start in starts)
+        total[:] = first
+        for tap in rest:
+            total += tap
+
+
+def initial_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
+    """The model's distribution at the start of the burn-in in every cell, shape (S, H, W)."""
+    return np.tile(model.initial[:, None, None], (1, height, width))
+
+
+def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float64]:
+    """Every state equally likely in every cell, shape (S, H, W): the authors' demonstration."""
+    return np.full((model.n_states, height, width), 1.0 / model.n_states)
+
+
+def entropy(belief: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shannon entropy of each cell in nats (eq. 14), with ``0 log 0 = 0``.
+
+    Args:
+        belief: Shape (S, H, W), each cell a distribution.
+
+    Returns:
+        Shape (H, W), 0 to log S.
+    """
+    logarithm = np.log(belief, out=np.zeros_like(belief), where=belief > 0.0)
+    return np.maximum(0.0, 0.0 - (belief * logarithm).sum(axis=0))
+
+
+def _taps_that_weigh_alike(
+    kernel: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], list[list[tuple[int, int]]]]:
+    """Taps (row, col) of one state by the weights they share, and those weights (S, groups).
+
+    Args:
+        kernel: Weights of this state for each next one, shape (S, KH, KW).
+    """
+    groups: dict[tuple[float, ...], list[tuple[int, int]]] = {}
+    for row, col in np.ndindex(*kernel.shape[1:]):
+        column = tuple(kernel[:, row, col].tolist())
+        if any(column):
+            groups.setdefault(column, []).append((row, col))
+    columns = np.array(list(groups), dtype=np.float64).reshape(len(groups), len(kernel))
+    return np.ascontiguousarray(columns.T), list(groups.values())
+
+
+def _distribution(prior: NDArray[np.floating], *, n_states: int) -> NDArray[np.float64]:
+    """A copy of the prior, each cell's sum exactly one."""
+    belief = np.array(prior, dtype=np.float64, order="C")
+    if belief.ndim != 3 or belief.shape[0] != n_states or not belief.size:
+        raise ValueError(f"prior: expected shape ({n_states}, H, W), got {belief.shape}")
+    total = belief.sum(axis=0)
+    fine = (np.abs(total - 1.0) <= _SUM_TOLERANCE) & (belief >= 0.0).all(axis=0)
+    if not fine.all():
+        row, col = (int(i) for i in np.argwhere(~fine)[0])
+        got = belief[:, row, col].tolist()
+        raise ValueError(
+            f"prior: cell ({row}, {col}): expected probabilities >= 0 with sum 1, got {got}"
+        )
+    belief /= total
+    return belief
+
+
+def _zero_evidence(
+    cell: tuple[int, int], observed: int, belief: tuple[float, ...]
+) -> ZeroEvidenceError:
+    return ZeroEvidenceError(cell=cell, observed=observed, belief=belief)

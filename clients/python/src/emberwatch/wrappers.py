@@ -1,0 +1,290 @@
+"""`Belief`: what the known-model filter makes of the frames, as the observation.
+
+A frame shows a path; the belief is what all frames so far say about every cell. For learning
+without memory, the belief is the better observation. Also `simulated_prior`, what can be known
+about a world before its first frame.
+"""
+
+from __future__ import annotations
+
+import functools
+import subprocess
+import tempfile
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal, SupportsFloat, cast
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.core import ActType
+from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import NDArray
+
+from emberwatch.belief import Filter, initial_prior, uniform_prior
+from emberwatch.model import Model
+
+PriorKind = Literal["simulated", "initial", "uniform"]
+"""A prior by name, see `Belief`."""
+
+_SIMULATION_TIMEOUT_SECONDS = 1800.0  # 64 worlds of 512 x 512 cells take minutes
+
+
+class PriorError(RuntimeError):
+    """The program that simulates priors failed, or wrote something else."""
+
+
+class Belief(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArgs):
+    """Runs the known-model filter beside an environment and observes its belief.
+
+    For single environments in which one step is one step of the world, such as Emberwatch's own:
+    wrap those of a vector one by one. `terminated` and `truncated` pass through; only `reset`
+    begins a new belief.
+
+    ## Observations
+    After `reset`, the prior about ``X_0``, the world after its burn-in. A step moves the world from
+    ``X_k`` to ``X_{k+1}`` and its frame shows ``X_{k+1}``: the filter predicts, then corrects, and
+    the observation is the posterior about ``X_{k+1}`` given all frames (eqs. 5 and 6). The Rust
+    agent's filter does the same; its planner then looks one step further ahead, at the predictor
+    of what the next path will meet: `emberwatch.belief.Transition` makes it from this observation.
+
+    - ``dtype="float32"``: `Box` of 0 to 1, shape (S, H, W), each cell's sum one.
+    - ``dtype="uint8"``: the same times 255, rounded, shape (H, W, S): an image for convolutional
+      policies, as of Stable-Baselines3.
+    - ``keep=True``: a `Dict` of the original observations (a lone frame as ``"frame"``) and
+      ``"belief"``.
+
+    ## Priors
+    - ``"simulated"``: how often each cell of 64 simulated worlds is in each state after the
+      burn-in. Needs the program ``emberwatch-agent`` and some seconds, once per process and model.
+    - ``"initial"``: the model's initial distribution, right for worlds without burn-in.
+    - ``"uniform"``: every state equally likely.
+    - An array of shape (S, H, W), each cell's sum one.
+    - ``None``: ``"simulated"`` if the environment has a burn-in, else ``"initial"``.
+
+    ## Version history
+    - v1: first version.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, ActType],
+        *,
+        keep: bool = False,
+        dtype: Literal["float32", "uint8"] = "float32",
+        prior: PriorKind | NDArray[np.floating] | None = None,
+        model: Model | str | PathLike[str] | None = None,
+    ) -> None:
+        """Wraps an environment.
+
+        Args:
+            env: Observes the frame, a `Box` of shape (H, W, 1) and type uint8, or a `Dict` with
+                ``"frame"``. ``env.unwrapped`` has ``model``, a `Model` or None, and ``burn_in``.
+            keep: Whether the original observations stay beside the belief.
+            dtype: Type and layout of the belief.
+            prior: The belief about ``X_0``.
+            model: The world's model, or the path of its file, for servers that do not reveal it.
+
+        Raises:
+            ValueError: No model is known, or an argument or the environment is of another form.
+            ModelError: The model cannot run on the environment's grid.
+            PriorError: The prior could not be simulated.
+        """
+        RecordConstructorArgs.__init__(self, keep=keep, dtype=dtype, prior=prior, model=model)
+        gymnasium.Wrapper.__init__(self, env)  # pyright: ignore[reportUnknownMemberType]
+        if dtype not in ("float32", "uint8"):
+            raise ValueError(f"dtype: expected 'float32' or 'uint8', got {dtype!r}")
+        self._keep, self._dtype = keep, dtype
+        self._model = _model_of(env, model)
+        original = _spaces_of(env.observation_space)
+        height, width = _grid_of(original)
+        self._prior = _prior_of(env, prior, self._model, height=height, width=width)
+        Filter(self._model, prior=self._prior)  # refuses what does not fit, now
+        self._filter: Filter | None = None
+        self.observation_space = self._space(original, height, width)
+
+    @property
+    def filter(self) -> Filter:
+        """The filter of the current episode, for its entropy or its belief in double precision.
+
+        Raises:
+            ResetNeeded: There is no episode yet.
+        """
+        if self._filter is None:
+            raise gymnasium.error.ResetNeeded("Belief: call reset before anything else")
+        return self._filter
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins a new episode; observes the prior."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._filter = Filter(self._model, prior=self._prior)
+        self._filter.correct(_frame_of(observation))  # empty, unless the server says otherwise
+        return self._observe(observation), info
+
+    def step(self, action: ActType) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Steps the world; observes the posterior.
+
+        Raises:
+            ZeroEvidenceError: The frame cannot be, given the model and the prior.
+        """
+        belief = self.filter
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        belief.predict()
+        belief.correct(_frame_of(observation))
+        return self._observe(observation), reward, terminated, truncated, info
+
+    def _observe(self, observation: Any) -> Any:
+        belief: NDArray[Any] = self.filter.belief
+        if self._dtype == "uint8":
+            image = np.rint(255.0 * belief).astype(np.uint8)
+            belief = np.ascontiguousarray(image.transpose(1, 2, 0))
+        else:
+            belief = belief.astype(np.float32)
+        if not self._keep:
+            return belief
+        return {**_parts_of(observation), "belief": belief}
+
+    def _space(
+        self, original: dict[str, spaces.Space[Any]], height: int, width: int
+    ) -> spaces.Space[Any]:
+        if self._dtype == "uint8":
+            image = (height, width, self._model.n_states)
+            belief = spaces.Box(0, 255, image, np.uint8)
+        else:
+            planes = (self._model.n_states, height, width)
+            belief = spaces.Box(0.0, 1.0, planes, np.float32)
+        if not self._keep:
+            return belief
+        return spaces.Dict({**original, "belief": belief})
+
+
+@functools.lru_cache(maxsize=8)
+def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> NDArray[np.floating]:
+    """How often each cell of 64 simulated worlds is in each state after the burn-in.
+
+    Runs ``emberwatch-agent prior``, whose worlds do not depend on any environment's seed. The same
+    array again for the same arguments, so it cannot be written to.
+
+    Args:
+        model: The worlds' model.
+        height: Grid height, cells.
+        width: Grid width, cells.
+        burn_in: Steps from the initial distribution, at least 0.
+
+    Returns:
+        Shape (S, H, W), each cell's sum one, read-only.
+
+    Raises:
+        PriorError: The program failed, or wrote something else.
+    """
+    from emberwatch.programs import find
+
+    with tempfile.TemporaryDirectory(prefix="emberwatch-prior-") as directory:
+        file, out = Path(directory, "model.toml"), Path(directory, "prior.npy")
+        file.write_text(model.toml, "utf-8")
+        command = [str(find("emberwatch-agent")), "prior", "--model", str(file)]
+        command += ["--height", str(height), "--width", str(width)]
+        command += ["--burn-in", str(burn_in), "--out", str(out)]
+        _run(command)
+        try:
+            with out.open("rb") as stream:
+                prior: NDArray[np.floating] = np.lib.format.read_array(stream)
+        except (OSError, ValueError) as error:
+            raise PriorError(f"emberwatch-agent prior: expected an .npy file: {error}") from error
+    expected = (model.n_states, height, width)
+    if prior.shape != expected:
+        raise PriorError(f"emberwatch-agent prior: expected shape {expected}, got {prior.shape}")
+    prior.flags.writeable = False
+    return prior
+
+
+def _run(command: list[str]) -> None:
+    try:
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            stdin=subprocess.DEVNULL,
+            timeout=_SIMULATION_TIMEOUT_SECONDS,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise PriorError(f"emberwatch-agent prior: expected an end, got {error}") from error
+    if done.returncode != 0:
+        raise PriorError(
+            f"emberwatch-agent prior: expected success, got exit code {done.returncode}: "
+            f"{done.stderr.strip()[-1000:]}"
+        )
+
+
+def _model_of(env: gymnasium.Env[Any, Any], model: Model | str | PathLike[str] | None) -> Model:
+    if isinstance(model, Model):
+        return model
+    if model is not None:
+        return Model.read(model)
+    revealed = getattr(env.unwrapped, "model", None)
+    if not isinstance(revealed, Model):
+        raise ValueError(
+            "Belief: expected the world's model, got none: the server does not reveal it "
+            "(--reveal-model false); pass model=, a Model or the path of its file"
+        )
+    return revealed
+
+
+def _spaces_of(space: spaces.Space[Any]) -> dict[str, spaces.Space[Any]]:
+    """The observation's parts: those of a `Dict`, or a lone frame."""
+    if isinstance(space, spaces.Dict):
+        parts = cast("spaces.Dict", space).spaces  # pyright: ignore[reportUnknownMemberType]
+        return dict(parts)
+    return {"frame": space}
+
+
+def _parts_of(observation: Any) -> dict[str, Any]:
+    if isinstance(observation, dict):
+        return cast("dict[str, Any]", observation)
+    return {"frame": observation}
+
+
+def _grid_of(parts: dict[str, spaces.Space[Any]]) -> tuple[int, int]:
+    """Height and width of the frame."""
+    match parts.get("frame"):
+        case spaces.Box(shape=(height, width, 1), dtype=np.dtypes.UInt8DType()):
+            return height, width
+        case _:
+            expected = "a frame of shape (H, W, 1) and type uint8, alone or as 'frame' of a Dict"
+            raise ValueError(f"Belief: expected observations of {expected}, got {parts}")
+
+
+def _prior_of(
+    env: gymnasium.Env[Any, Any],
+    prior: PriorKind | NDArray[np.floating] | None,
+    model: Model,
+    *,
+    height: int,
+    width: int,
+) -> NDArray[np.floating]:
+    burn_in = int(getattr(env.unwrapped, "burn_in", 0))
+    if prior is None:
+        prior = "simulated" if burn_in > 0 else "initial"
+    if not isinstance(prior, str):
+        if prior.shape != (model.n_states, height, width):
+            expected = (model.n_states, height, width)
+            raise ValueError(f"prior: expected shape {expected}, got {prior.shape}")
+        return prior
+    match prior:
+        case "simulated":
+            return simulated_prior(model, height=height, width=width, burn_in=burn_in)
+        case "initial":
+            return initial_prior(model, height=height, width=width)
+        case "uniform":
+            return uniform_prior(model, height=height, width=width)
+        case _:
+            expected = "'simulated', 'initial', 'uniform' or an array"
+            raise ValueError(f"prior: expected {expected}, got {prior!r}")
+
+
+def _frame_of(observation: Any) -> NDArray[np.uint8]:
+    """The frame, shape (H, W)."""
+    return _parts_of(observation)["frame"][:, :, 0]

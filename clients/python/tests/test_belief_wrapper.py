@@ -1,0 +1,217 @@
+"""The wrapper that observes beliefs, on a stub of the environment."""
+
+import json
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+
+from emberwatch.belief import Filter, ZeroEvidenceError, initial_prior, uniform_prior
+from emberwatch.model import Model, ModelError
+from emberwatch.wrappers import Belief, PriorError, simulated_prior
+
+WILDFIRE = Model.wildfire()
+SHAPE = (4, 6)
+GRID = {"height": 4, "width": 6}
+
+AGENT = """#!{python}
+import json, sys
+import numpy as np
+arguments = dict(zip(sys.argv[2::2], sys.argv[3::2]))
+text = open(arguments["--model"]).read()
+with open("{log}", "a") as log:
+    print(json.dumps([sys.argv[1], text, arguments["--burn-in"]]), file=log)
+shape = 3, int(arguments["--height"]), int(arguments["--width"])
+{body}
+"""
+WRITES = 'np.save(arguments["--out"], np.full(shape, 1 / 3, np.float32))'
+
+
+class Stub(gymnasium.Env[Any, Any]):
+    """Frames at random; ``parts`` makes them part of a Dict."""
+
+    def __init__(self, *, parts: bool = False, model: Model | None = WILDFIRE, burn_in: int = 0):
+        self.model, self.burn_in, self.parts = model, burn_in, parts
+        self.action_space = spaces.MultiDiscrete([4] * 5)
+        frame = spaces.Box(0, 255, (*SHAPE, 1), np.uint8)
+        self.observation_space: spaces.Space[Any] = frame
+        if parts:
+            self.observation_space = spaces.Dict({"frame": frame, "robot": spaces.Discrete(24)})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        return self.observe(np.full(SHAPE, 255, np.uint8)), {}
+
+    def step(self, action: Any) -> Any:
+        self.frame = self.np_random.integers(0, 3, SHAPE).astype(np.uint8)
+        self.frame[self.np_random.random(SHAPE) < 0.7] = 255
+        return self.observe(self.frame), 0.0, False, False, {}
+
+    def observe(self, frame: NDArray[np.uint8]) -> Any:
+        image = frame[:, :, None]
+        return {"frame": image, "robot": np.int64(3)} if self.parts else image
+
+
+gymnasium.register("test/Stub-v0", entry_point=f"{__name__}:Stub")
+
+
+@pytest.fixture
+def agent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    """Puts a script in the agent's place; returns how to write it and a list of its calls."""
+    programs = types.ModuleType("emberwatch.programs")
+    script, log = tmp_path / "emberwatch-agent", tmp_path / "calls"
+
+    def install(body: str = WRITES) -> None:
+        script.write_text(AGENT.format(python=sys.executable, log=log, body=body))
+        script.chmod(0o755)
+
+    def find(name: str) -> Path:
+        assert name == "emberwatch-agent"
+        return script
+
+    monkeypatch.setattr(programs, "find", find, raising=False)
+    monkeypatch.setitem(sys.modules, "emberwatch.programs", programs)
+    simulated_prior.cache_clear()
+    install()
+    calls = lambda: [json.loads(line) for line in log.read_text().splitlines()]  # noqa: E731
+    yield types.SimpleNamespace(install=install, calls=calls)
+    simulated_prior.cache_clear()
+
+
+def test_a_reset_observes_the_prior_and_a_step_the_posterior() -> None:
+    stub = Stub()
+    env = Belief(stub)
+    expected = Filter(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID))
+    for seed in (1, 2):
+        observation, _ = env.reset(seed=seed)
+        expected = Filter(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID))
+        assert (observation == expected.belief.astype(np.float32)).all()
+        for _ in range(4):
+            observation, *_ = env.step(env.action_space.sample())
+            expected.predict()
+            expected.correct(stub.frame)
+            assert observation.dtype == np.float32
+            assert (observation == expected.belief.astype(np.float32)).all()
+            assert (env.filter.belief == expected.belief).all()
+
+
+@pytest.mark.parametrize("parts", [False, True])
+@pytest.mark.parametrize("keep", [False, True])
+@pytest.mark.parametrize("dtype", ["float32", "uint8"])
+def test_it_passes_the_environment_checker(parts: bool, keep: bool, dtype: Any) -> None:
+    env = gymnasium.make("test/Stub-v0", parts=parts)
+    check_env(Belief(env, keep=keep, dtype=dtype), skip_render_check=True)
+
+
+def test_kept_observations_stay_beside_the_belief() -> None:
+    for parts, names in ((False, {"frame", "belief"}), (True, {"frame", "robot", "belief"})):
+        env = Belief(Stub(parts=parts), keep=True)
+        env.reset(seed=0)
+        observation, *_ = env.step(None)
+        assert set(observation) == set(env.observation_space.spaces) == names
+        assert (observation["frame"][:, :, 0] == env.unwrapped.frame).all()
+        assert observation in env.observation_space
+
+
+def test_images_are_beliefs_in_256_steps_channels_last() -> None:
+    envs = [Belief(Stub(), dtype=dtype) for dtype in ("uint8", "float32")]
+    for env in envs:
+        env.reset(seed=0)
+    image, planes = (env.step(None)[0] for env in envs)
+    assert image.shape == (*SHAPE, 3) and image.dtype == np.uint8
+    assert np.abs(image.transpose(2, 0, 1) / 255 - planes).max() <= 0.5 / 255 + 1e-6
+    assert image.max() > 200
+
+
+def test_a_spec_makes_the_same_environment() -> None:
+    stub, prior = gymnasium.make("test/Stub-v0"), uniform_prior(WILDFIRE, **GRID)
+    env = Belief(stub, keep=True, dtype="uint8", prior=prior, model=WILDFIRE)
+    again = gymnasium.make(env.spec)
+    assert again.observation_space == env.observation_space
+    assert (again.reset(seed=3)[0]["belief"] == env.reset(seed=3)[0]["belief"]).all()
+    named = Belief(gymnasium.make("test/Stub-v0"), prior="uniform")
+    text = named.spec.to_json()
+    remade = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(text))
+    assert (remade.reset()[0] == named.reset()[0]).all()
+
+
+def test_priors_by_name_and_by_array() -> None:
+    given = np.moveaxis(np.random.default_rng(0).dirichlet(np.ones(3), SHAPE), -1, 0)
+    initial, uniform = initial_prior(WILDFIRE, **GRID), uniform_prior(WILDFIRE, **GRID)
+    for prior, expected in (("initial", initial), ("uniform", uniform), (given, given)):
+        observation, _ = Belief(Stub(burn_in=9), prior=prior).reset()
+        np.testing.assert_allclose(observation, expected, rtol=0, atol=1e-6)
+    for prior, expected in (("flat", "got 'flat'"), (given[:, :, 1:], "got .3, 4, 5.")):
+        with pytest.raises(ValueError, match=f"prior: expected .*{expected}"):
+            Belief(Stub(), prior=prior)
+    with pytest.raises(ValueError, match=r"prior: cell \(0, 0\)"):
+        Belief(Stub(), prior=given * 2)
+
+
+def test_a_burn_in_is_simulated_once(agent: Any) -> None:
+    observations = [Belief(Stub(burn_in=50)).reset()[0] for _ in range(2)]
+    assert all(np.allclose(observation, 1 / 3) for observation in observations)
+    assert agent.calls() == [["prior", WILDFIRE.toml, "50"]]
+    Belief(Stub(burn_in=51))
+    Belief(Stub(), prior="simulated")
+    assert [call[2] for call in agent.calls()] == ["50", "51", "0"]
+    with pytest.raises(ValueError, match="read-only"):
+        simulated_prior(WILDFIRE, **GRID, burn_in=51)[:] = 0
+
+
+@pytest.mark.parametrize(
+    ("body", "expected"),
+    [
+        ("sys.exit('no such model')", "exit code 1: no such model"),
+        ("", "expected an .npy file"),
+        ("open(arguments['--out'], 'w').write('prior')", "expected an .npy file"),
+        (WRITES.replace("shape", "shape[1:]", 1), r"expected shape \(3, 4, 6\), got \(4, 6\)"),
+    ],
+)
+def test_a_failed_simulation_is_told(agent: Any, body: str, expected: str) -> None:
+    agent.install(body)
+    with pytest.raises(PriorError, match=expected):
+        Belief(Stub(burn_in=1))
+
+
+def test_a_hidden_model_must_be_given(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="does not reveal it .* pass model="):
+        Belief(Stub(model=None))
+    file = tmp_path / "model.toml"
+    file.write_text(WILDFIRE.toml)
+    for model in (WILDFIRE, file, str(file)):
+        assert Belief(Stub(model=None), model=model).reset()[0].shape == (3, *SHAPE)
+    file.write_text("")
+    with pytest.raises(ModelError, match="model.toml"):
+        Belief(Stub(), model=file)
+
+
+def test_other_environments_are_refused() -> None:
+    with pytest.raises(ValueError, match="a frame of shape"):
+        Belief(gymnasium.make("CartPole-v1"), model=WILDFIRE)
+    with pytest.raises(ValueError, match="dtype: expected 'float32' or 'uint8'"):
+        Belief(Stub(), dtype="float64")
+
+
+def test_a_step_needs_a_reset() -> None:
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        Belief(Stub()).step(None)
+
+
+def test_an_impossible_frame_is_an_error() -> None:
+    # Every cell is normal, stays so and never looks otherwise.
+    text = WILDFIRE.toml.replace("[0.98, 0.01, 0.01]", "[1.0, 0.0, 0.0]", 1)
+    model = Model.from_toml(text.replace("scale = 0.00008", "scale = 0"))
+    prior = np.zeros((3, *SHAPE))
+    prior[0] = 1
+    env = Belief(Stub(), model=model, prior=prior)
+    env.reset(seed=0)
+    with pytest.raises(ZeroEvidenceError):
+        env.step(None)
