@@ -55,6 +55,18 @@ def test_the_path_is_a_line_and_ends_in_the_robot() -> None:
     assert pixel(without, 40, 20) == FIRE and pixel(without, 20, 20) == NORMAL
 
 
+def test_a_path_may_begin_in_the_corner() -> None:
+    frame = np.zeros((4, 4), np.uint8)
+    image = draw(frame=frame, robot=(3, 3), path=[(0, 0), (0, 1)], scale=4)
+    assert pixel(image, 0, 0) == WHITE and pixel(image, 3, 3) == DARK
+
+
+def test_odd_pictures_repeat_their_last_row_and_column() -> None:
+    image = draw(frame=np.full((3, 3), 2, np.uint8), robot=(0, 0), path=None, scale=15)
+    assert image.shape == (46, 46, 3)
+    assert pixel(image, 45, 45) == pixel(image, 45, 0) == FIRE
+
+
 def test_small_cells_are_tinted_where_visited() -> None:
     wide = np.full((2, 40), 255, np.uint8)
     wide[0] = 2
@@ -183,6 +195,8 @@ def test_tall_grids_take_half_the_lines() -> None:
     assert len(lines) == 21
     assert lines[0].startswith("\x1b[38;2;255;255;255;48;2;200;55;27m▀")
     assert lines[-1] == "\x1b[38;2;48;48;48;49m▀▀▀\x1b[0m"
+    even = text(frame=tall[:40], robot=(0, 0), path=None, color=True).split("\n")
+    assert even == lines[:20]
 
 
 @pytest.fixture
