@@ -1,0 +1,52 @@
+"""Emberwatch: explore a wildfire that a robot only partly sees, over shared memory.
+
+Importing this package registers its environments with Gymnasium:
+
+    import gymnasium, emberwatch
+    env = gymnasium.make("emberwatch/Wildfire-v0")
+
+Without Gymnasium, `connect` talks to a running server and `observe` reads what it publishes.
+"""
+
+from gymnasium.envs.registration import register
+
+from emberwatch.client import Client, Lease, ServerInfo, ServerStatus, WorldInfo, connect
+from emberwatch.env import WildfireEnv
+from emberwatch.moves_env import WildfireMovesEnv
+from emberwatch.observer import Frame, Observer, Truth, TruthReader, observe
+from emberwatch.vector_env import WildfireVectorEnv
+from emberwatch.wire import StepAnswer, StepResult
+
+__all__ = [
+    "Client",
+    "Frame",
+    "Lease",
+    "Observer",
+    "ServerInfo",
+    "ServerStatus",
+    "StepAnswer",
+    "StepResult",
+    "Truth",
+    "TruthReader",
+    "WildfireEnv",
+    "WildfireMovesEnv",
+    "WildfireVectorEnv",
+    "WorldInfo",
+    "connect",
+    "observe",
+]
+
+#: Steps after which an episode is truncated, unless `gymnasium.make` is told otherwise.
+MAX_EPISODE_STEPS = 1000
+
+register(  # pyright: ignore[reportUnknownMemberType]
+    "emberwatch/Wildfire-v0",
+    entry_point="emberwatch.env:WildfireEnv",
+    vector_entry_point="emberwatch.vector_env:WildfireVectorEnv",
+    max_episode_steps=MAX_EPISODE_STEPS,
+)
+register(  # pyright: ignore[reportUnknownMemberType]
+    "emberwatch/WildfireMoves-v0",
+    entry_point="emberwatch.moves_env:WildfireMovesEnv",
+    max_episode_steps=64 * MAX_EPISODE_STEPS,
+)

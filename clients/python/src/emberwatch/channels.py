@@ -1,0 +1,201 @@
+"""Where channels live and how they are opened (PROTOCOL.md section 1).
+
+The only module, with `ports` and `observer`, that knows iceoryx2.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import os
+import re
+import stat
+import weakref
+from pathlib import Path
+from typing import Any, Final
+
+from emberwatch import wire
+from emberwatch.errors import ChannelError, ClosedError, ForkedError, SettingError
+
+_INSTANCE: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
+
+#: iceoryx2 carries no types.
+iox2: Final[Any] = importlib.import_module("iceoryx2")
+
+_BYTES: Final[Any] = iox2.Slice[ctypes.c_uint8]
+
+iox2.set_log_level(iox2.LogLevel.Fatal)
+
+
+class Node:
+    """One connection's place in shared memory: a node, and everything made from it.
+
+    iceoryx2 does not survive `fork`: there, everything of the parent is left alone for good, and
+    using it raises `ForkedError`.
+    """
+
+    def __init__(self, instance: str) -> None:
+        """Joins the channels of an instance.
+
+        Raises:
+            SettingError: If the instance's name is not 1 to 64 of `A-Z a-z 0-9 - _`.
+            ChannelError: If the directory of the channels is not safe, or iceoryx2 fails.
+        """
+        if not _INSTANCE.fullmatch(instance):
+            raise SettingError(
+                f"instance: expected 1 to 64 characters out of A-Z a-z 0-9 - _, got {instance!r}"
+            )
+        self.instance: Final = instance
+        self._held: list[Any] = []
+        self._usable = True
+        self._forked = False
+        builder = iox2.NodeBuilder.new().signal_handling_mode(iox2.SignalHandlingMode.Disabled)
+        with guard("create a node"):
+            self.node: Any = builder.config(_config()).create(iox2.ServiceType.Ipc)
+        self.keep(self.node)
+        _nodes.add(self)
+
+    def keep(self, port: Any) -> Any:
+        """Remembers something of iceoryx2's, to be closed, or left alone, with this node."""
+        self._held.append(port)
+        return port
+
+    def check(self) -> None:
+        """Raises unless the connection may be used: not closed, not inherited through `fork`."""
+        if self._usable:
+            return
+        if self._forked:
+            raise ForkedError(
+                f"the connection to instance {self.instance!r} belongs to the process that forked "
+                "this one; open a new one here (for environments: make them in the child)"
+            )
+        raise ClosedError(f"the connection to instance {self.instance!r} is closed")
+
+    def close(self) -> None:
+        """Leaves the channels. Again is fine; in a forked child it does nothing."""
+        if not self._usable:
+            return
+        self._usable = False
+        _nodes.discard(self)
+        # The youngest first: ports before the node that they were made from.
+        while self._held:
+            self._held.pop()
+        self.node = None
+
+    def open_request_response(
+        self, service: str, request: type[wire.Header], reply: type[wire.Header]
+    ) -> Any:
+        """Opens a service that its server has made; `None` if there is none.
+
+        Raises:
+            ChannelError: If it exists but does not fit.
+        """
+        builder = self.node.service_builder(self._name(service)).request_response(_BYTES, _BYTES)
+        builder = builder.request_header(request).response_header(reply)
+        try:
+            return self.keep(builder.open())
+        except iox2.RequestResponseOpenError as error:
+            if "DoesNotExist" in str(error):
+                return None
+            raise ChannelError(f"open {service} on instance {self.instance!r}: {error}") from None
+
+    def open_publications(
+        self, service: str, header: type[wire.Header], readers: int, buffer: int
+    ) -> Any:
+        """Opens or creates `frames` or `truth`.
+
+        Raises:
+            ChannelError: If iceoryx2 fails.
+        """
+        builder = self.node.service_builder(self._name(service)).publish_subscribe(_BYTES)
+        builder = builder.user_header(header).max_publishers(1).max_subscribers(readers)
+        builder = builder.max_nodes(wire.MAX_NODES).history_size(1)
+        builder = builder.subscriber_max_buffer_size(buffer).subscriber_max_borrowed_samples(1)
+        with guard(f"open {service} on instance {self.instance!r}"):
+            return self.keep(builder.enable_safe_overflow(True).open_or_create())
+
+    def open_wake(self, service: str) -> Any:
+        """Opens or creates an event service.
+
+        Raises:
+            ChannelError: If iceoryx2 fails.
+        """
+        builder = self.node.service_builder(self._name(service)).event()
+        builder = builder.max_listeners(wire.MAX_NODES).max_notifiers(wire.MAX_NODES)
+        with guard(f"open {service} on instance {self.instance!r}"):
+            return self.keep(builder.max_nodes(wire.MAX_NODES).open_or_create())
+
+    def clean_up(self) -> None:
+        """Removes what dead processes left behind."""
+        self.node.try_cleanup_dead_nodes()
+
+    def abandon(self) -> None:
+        """In a forked child: nothing of the parent's may be dropped here, so all of it leaks."""
+        self._usable, self._forked = False, True
+        for port in self._held:
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(port))
+
+    def _name(self, service: str) -> Any:
+        return iox2.ServiceName.new(f"emberwatch/v{wire.VERSION}/{self.instance}/{service}")
+
+
+class guard:
+    """Turns iceoryx2's errors into a `ChannelError` that says what was attempted."""
+
+    def __init__(self, what: str) -> None:
+        """Names the attempt."""
+        self._what = what
+
+    def __enter__(self) -> None:
+        """Begins the attempt."""
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """Ends it."""
+        if error is not None and isinstance(error, Exception):
+            if isinstance(error, ChannelError):
+                return
+            raise ChannelError(f"{self._what}: {error}") from None
+
+
+def directory() -> Path:
+    """The directory of this user's channels."""
+    return Path(f"/tmp/emberwatch-{os.getuid()}")
+
+
+def _config() -> Any:
+    config = iox2.config.default()
+    config.global_cfg.root_path = iox2.Path.new(f"{_own_directory(directory())}/")
+    config.global_cfg.prefix = iox2.FileName.new(f"emberwatch_{os.getuid()}_")
+    return config
+
+
+def _own_directory(path: Path) -> Path:
+    """Creates the directory, mode 0700, or checks that it is ours and only ours to write."""
+    try:
+        path.mkdir(mode=0o700)
+    except FileExistsError:
+        pass
+    except OSError as error:
+        raise ChannelError(f"create {path}: {error.strerror}") from None
+    found = path.lstat()
+    if (
+        not stat.S_ISDIR(found.st_mode)
+        or found.st_uid != os.getuid()
+        or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    ):
+        raise ChannelError(
+            f"{path}: expected a directory that belongs to this user and that others cannot "
+            f"write to, got mode {stat.filemode(found.st_mode)} of user {found.st_uid}"
+        )
+    return path
+
+
+_nodes: weakref.WeakSet[Node] = weakref.WeakSet()
+
+
+def _abandon_all() -> None:
+    for node in list(_nodes):
+        node.abandon()
+
+
+os.register_at_fork(after_in_child=_abandon_all)

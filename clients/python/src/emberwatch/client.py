@@ -1,0 +1,480 @@
+"""A connection to a server: handshake, leases, steps.
+
+`connect` gives a `Client`, its `acquire` a `Lease`, and that one's `step` a `StepAnswer`.
+Every call has a timeout in seconds; everything returned is a copy.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from importlib.metadata import PackageNotFoundError, version
+from types import TracebackType
+from typing import Any, Final, Self, TypeVar, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from emberwatch import wire
+from emberwatch.channels import Node
+from emberwatch.errors import GarbledAnswerError, InvalidActionError, refusal
+from emberwatch.ports import Bell, RequestPort
+from emberwatch.wire import StepAnswer
+
+#: Default timeout of a step, seconds.
+STEP_TIMEOUT: Final = 5.0
+
+#: Default timeout of what may wait for a burn-in, seconds.
+RESET_TIMEOUT: Final = 120.0
+
+_Record = TypeVar("_Record")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServerInfo:
+    """What a server says of itself (PROTOCOL.md section 6, `hello`)."""
+
+    protocol: int
+    build: str
+    pid: int
+    height: int
+    width: int
+    n_moves: int
+    n_worlds: int
+    n_observations: int
+    observations: tuple[str, ...]
+    #: The model as TOML text; None if the server hides it.
+    model: str | None
+    burn_in: int
+    #: Steps until an episode is truncated; 0: never.
+    max_steps: int
+    max_clients: int
+    #: Which cells a step observes: "path", "full" or "client" (as the step asks).
+    coverage: str
+    publish_truth: bool
+    lease_millis: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorldInfo:
+    """Where one world stands."""
+
+    world: int
+    step: int
+    seed: int
+    episode: int
+    robot: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorldStatus:
+    """One world in a `ServerStatus`."""
+
+    world: int
+    step: int
+    seed: int
+    episode: int
+    robot: tuple[int, int]
+    #: The process that holds it, if any.
+    holder_pid: int | None
+    #: Whether it is in its burn-in.
+    resetting: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServerStatus:
+    """What is going on at a server."""
+
+    pid: int
+    uptime_millis: int
+    n_steps: int
+    steps_per_second: float
+    n_refused: int
+    n_clients: int
+    n_observers: int
+    worlds: tuple[WorldStatus, ...]
+
+
+class Client:
+    """A connection to one server. Make it with `connect`; close it, or use it in a `with`."""
+
+    def __init__(self, instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> None:
+        """Connects and shakes hands; see `connect`."""
+        self._node = Node(instance)
+        self._sequence = 0
+        try:
+            self._node.clean_up()
+            self._bell = Bell(self._node)
+            self._control = RequestPort(
+                self._bell,
+                "control",
+                (wire.ControlRequest, wire.ControlReply),
+                slice_len=4096,
+                grows=True,
+            )
+            self.info: Final = self._shake_hands(timeout)
+            self._bell.watch(self.info.pid)
+            self._step = RequestPort(
+                self._bell,
+                "step",
+                (wire.StepRequest, wire.StepReply),
+                slice_len=self.info.n_worlds * self.info.n_moves,
+                grows=False,
+            )
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def instance(self) -> str:
+        """The instance's name."""
+        return self._node.instance
+
+    def acquire(
+        self,
+        first_world: int = 0,
+        n_worlds: int = 1,
+        *,
+        takeover: bool = False,
+        ttl: float | None = None,
+        timeout: float = RESET_TIMEOUT,
+    ) -> Lease:
+        """Gets the right to act on consecutive worlds, once they are out of their burn-in.
+
+        To resume what another agent left, go on from `lease.observe()`: it has k, the robot's
+        cell and the last frame. To start anew, `lease.reset()`.
+
+        Args:
+            first_world: The first world.
+            n_worlds: How many.
+            takeover: Take them from whoever holds them.
+            ttl: The lease ends this long after its last use, seconds; None: the server's default.
+            timeout: How long to wait for the answer, seconds.
+
+        Raises:
+            BusyError: If somebody else holds one of them.
+            NoSuchWorldError: If the server has no such worlds.
+        """
+        request = {
+            "op": "acquire",
+            "first_world": first_world,
+            "n_worlds": n_worlds,
+            "takeover": takeover,
+            "ttl_millis": None if ttl is None else round(ttl * 1000),
+        }
+        reply = self.control(request, timeout=timeout)
+        return Lease(self, reply, range(first_world, first_world + n_worlds))
+
+    def observe(
+        self, first_world: int = 0, n_worlds: int = 1, *, timeout: float = STEP_TIMEOUT
+    ) -> StepAnswer:
+        """The last results and frames again. Needs no lease and changes nothing."""
+        return self.exchange(wire.OBSERVE, 0, first_world, n_worlds, 0, b"", timeout=timeout)
+
+    def status(self, *, timeout: float = STEP_TIMEOUT) -> ServerStatus:
+        """What is going on."""
+        reply = self.control({"op": "status"}, timeout=timeout)
+        worlds = tuple(_record(WorldStatus, world) for world in _list(reply, "worlds"))
+        return _record(ServerStatus, {**reply, "worlds": worlds})
+
+    def shutdown(self, *, timeout: float = STEP_TIMEOUT) -> None:
+        """Stops the server, for everybody."""
+        self.control({"op": "shutdown"}, timeout=timeout)
+
+    def close(self) -> None:
+        """Closes the connection; its leases end. Again is fine."""
+        for name in ("_step", "_control", "_bell"):
+            part = getattr(self, name, None)
+            if part is not None:
+                part.close()
+        self._node.close()
+
+    def __enter__(self) -> Self:
+        """Returns itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Closes the connection."""
+        self.close()
+
+    def control(self, request: Mapping[str, Any], *, timeout: float) -> dict[str, Any]:
+        """Asks on `control` (PROTOCOL.md section 6) and returns the reply's keys.
+
+        Raises:
+            RefusedError: One of its subclasses, if the server refuses.
+            RequestTimeoutError, ServerGoneError, GarbledAnswerError: If there is no good answer.
+        """
+        self._node.check()
+        self._sequence += 1
+        return ask(self._control, self._bell, self._sequence, request, timeout)
+
+    def exchange(
+        self,
+        operation: int,
+        lease: int,
+        first_world: int,
+        n_worlds: int,
+        flags: int,
+        paths: bytes,
+        *,
+        timeout: float,
+    ) -> StepAnswer:
+        """Sends one request on `step` as it is; `Lease.step` and `observe` are easier.
+
+        Raises:
+            RefusedError: One of its subclasses, if the server refuses.
+            RequestTimeoutError, ServerGoneError, GarbledAnswerError: If there is no good answer.
+        """
+        self._node.check()
+        self._sequence += 1
+        header = wire.STEP_REQUEST.pack(
+            wire.VERSION,
+            operation,
+            lease,
+            self._sequence,
+            first_world,
+            n_worlds,
+            self.info.n_moves if operation == wire.STEP else 0,
+            flags,
+            self._bell.listener_low,
+            self._bell.listener_high,
+            0,
+        )
+        reply, payload = self._step.exchange(header, paths, "a step", timeout)
+        if reply.status != 0:
+            raise refusal(reply.status, reply.detail)
+        wire.check_answer("answer to step", reply, self._sequence)
+        return StepAnswer(reply, payload, self.info.n_observations)
+
+    def _shake_hands(self, timeout: float) -> ServerInfo:
+        hello = {
+            "op": "hello",
+            "protocol": wire.VERSION,
+            "client": f"emberwatch-python {_release()}",
+        }
+        reply = self.control(hello, timeout=timeout)
+        reply["observations"] = tuple(_list(reply, "observations"))
+        return _record(ServerInfo, reply)
+
+
+class Lease:
+    """The right to act on consecutive worlds. Ends by `release`, or leaving its `with`."""
+
+    def __init__(self, client: Client, reply: Mapping[str, Any], worlds: range) -> None:
+        """Made by `Client.acquire`."""
+        self.client: Final = client
+        #: The server's number for it.
+        self.number: Final = int(reply["lease"])
+        #: It ends so many seconds after its last use.
+        self.ttl: Final = reply["ttl_millis"] / 1000
+        #: The worlds it covers.
+        self.worlds: Final = worlds
+        #: Where they stood when it was given.
+        self.start: Final = tuple(_record(WorldInfo, world) for world in _list(reply, "worlds"))
+        self._is_over = False
+
+    def step(
+        self,
+        paths: ArrayLike,
+        *,
+        worlds: range | None = None,
+        full: bool = False,
+        timeout: float = STEP_TIMEOUT,
+    ) -> StepAnswer:
+        """Flies one path in each world and moves the worlds from k to k + 1.
+
+        Args:
+            paths: Moves, integers: 0 up, 1 down, 2 left, 3 right; `(n_worlds, T)`, or `(T,)` for
+                one world.
+            worlds: Only these, consecutive; None: all of the lease.
+            full: Observe every cell; needs a server with coverage "client" or "full".
+            timeout: How long to wait for the answer, seconds.
+
+        Raises:
+            InvalidActionError: If the paths are not of that shape, type and range; nothing is sent.
+            LeaseLostError: If the lease ended or a world was taken over.
+            EpisodeOverError: If a world's episode was truncated: reset it.
+        """
+        chosen = self.worlds if worlds is None else worlds
+        moves = as_moves(paths, len(chosen), self.client.info.n_moves)
+        return self.step_moves(moves, chosen, full=full, timeout=timeout)
+
+    def step_moves(
+        self, moves: NDArray[np.uint8], worlds: range, *, full: bool, timeout: float
+    ) -> StepAnswer:
+        """The same for moves that `as_moves` has checked."""
+        return self.client.exchange(
+            wire.STEP,
+            self.number,
+            worlds.start,
+            len(worlds),
+            wire.FULL_COVERAGE if full else 0,
+            moves.tobytes(),
+            timeout=timeout,
+        )
+
+    def observe(self, *, timeout: float = STEP_TIMEOUT) -> StepAnswer:
+        """The last results and frames of its worlds again."""
+        return self.client.observe(self.worlds.start, len(self.worlds), timeout=timeout)
+
+    def reset(
+        self,
+        seeds: Iterable[int | None] | None = None,
+        *,
+        worlds: Sequence[int] | None = None,
+        timeout: float = RESET_TIMEOUT,
+    ) -> tuple[WorldInfo, ...]:
+        """Begins new episodes: burn-in, k = 0, the robot at its start, empty frames.
+
+        Args:
+            seeds: One per world; None: the server derives the next from the world's last.
+            worlds: Only these worlds; None: all of the lease.
+            timeout: How long to wait for the burn-ins, seconds.
+
+        Returns:
+            Where the worlds stand, in the order asked.
+
+        Raises:
+            LeaseLostError: If the lease ended or a world was taken over.
+        """
+        chosen = list(self.worlds if worlds is None else worlds)
+        given = [None] * len(chosen) if seeds is None else list(seeds)
+        if len(given) != len(chosen):
+            raise InvalidActionError(f"seeds: expected {len(chosen)}, got {len(given)}")
+        pairs = [
+            {"world": world, "seed": None if seed is None else int(seed)}
+            for world, seed in zip(chosen, given, strict=True)
+        ]
+        request = {"op": "reset", "lease": self.number, "worlds": pairs}
+        reply = self.client.control(request, timeout=timeout)
+        return tuple(_record(WorldInfo, world) for world in _list(reply, "worlds"))
+
+    def renew(self, *, timeout: float = RESET_TIMEOUT) -> None:
+        """Starts the lease's clock again without acting."""
+        self.client.control({"op": "renew", "lease": self.number}, timeout=timeout)
+
+    def release(self, *, timeout: float = STEP_TIMEOUT) -> None:
+        """Gives the worlds back. Again is fine."""
+        if not self._is_over:
+            self._is_over = True
+            self.client.control({"op": "release", "lease": self.number}, timeout=timeout)
+
+    def __enter__(self) -> Self:
+        """Returns itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Releases it; after an error, without a second one."""
+        if kind is None:
+            self.release()
+            return
+        try:
+            self.release()
+        except Exception:
+            pass  # the first error says more
+
+
+def connect(instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> Client:
+    """Connects to a running server.
+
+    Args:
+        instance: The server's instance name.
+        timeout: How long the handshake may take, seconds.
+
+    Raises:
+        NoServerError: If nobody serves the instance.
+        VersionMismatchError: If the server speaks another protocol version.
+        RequestTimeoutError: If it does not answer.
+        ChannelError: If the channels cannot be opened, also when there are too many clients.
+    """
+    return Client(instance, timeout=timeout)
+
+
+def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]:
+    """Checks paths, `(n_worlds, T)` or for one world `(T,)`, and makes them bytes.
+
+    Raises:
+        InvalidActionError: Naming what was expected and what was got.
+    """
+    given = np.asarray(paths)
+    if given.shape != (n_worlds, n_moves) and (n_worlds != 1 or given.shape != (n_moves,)):
+        one = f" or ({n_moves},)" if n_worlds == 1 else ""
+        raise InvalidActionError(
+            f"action: expected shape ({n_worlds}, {n_moves}){one}, got {given.shape}"
+        )
+    if given.dtype.kind not in "iu":
+        raise InvalidActionError(f"action: expected integers, got {given.dtype}")
+    if (given & ~3).any():
+        where = tuple(int(i) for i in np.argwhere(given & ~3)[0])
+        raise InvalidActionError(
+            f"action: expected moves 0 to {wire.N_MOVES - 1}, got {given[where]} at {where}"
+        )
+    return given.astype(np.uint8)
+
+
+def ask(
+    port: RequestPort[wire.ControlReply],
+    bell: Bell,
+    sequence: int,
+    request: Mapping[str, Any],
+    timeout: float,
+) -> dict[str, Any]:
+    """One JSON request and its reply, on `control` or a channel like it.
+
+    Raises:
+        RefusedError: One of its subclasses, if it is refused.
+        RequestTimeoutError, ServerGoneError, GarbledAnswerError: If there is no good answer.
+    """
+    what = f"{request['op']!r}"
+    header = wire.CONTROL_REQUEST.pack(
+        wire.VERSION, 0, sequence, bell.listener_low, bell.listener_high
+    )
+    head, payload = port.exchange(header, json.dumps(request).encode(), what, timeout)
+    try:
+        reply = json.loads(payload)
+    except ValueError as error:
+        raise GarbledAnswerError(f"answer to {what}: expected JSON, got {error}") from None
+    if not isinstance(reply, dict):
+        raise GarbledAnswerError(f"answer to {what}: expected an object, got {reply!r}")
+    keys = cast("dict[str, Any]", reply)
+    if head.status != 0:
+        raise refusal(head.status, int(keys.get("detail", 0)), keys.get("message"))
+    wire.check_answer(f"answer to {what}", head, sequence)
+    return keys
+
+
+def _list(reply: Mapping[str, Any], key: str) -> list[Any]:
+    found = reply.get(key)
+    if not isinstance(found, list):
+        raise GarbledAnswerError(f"reply: expected a list {key!r}, got {found!r}")
+    return cast("list[Any]", found)
+
+
+def _record(kind: type[_Record], keys: Mapping[str, Any]) -> _Record:
+    """A record from a reply; keys that this release does not know are ignored."""
+    names = [field.name for field in fields(kind)]  # pyright: ignore[reportArgumentType]
+    missing = [name for name in names if name not in keys]
+    if missing:
+        raise GarbledAnswerError(f"reply: expected a key {missing[0]!r}, got {sorted(keys)}")
+    values = {name: keys[name] for name in names}
+    if "robot" in values:
+        values["robot"] = tuple(values["robot"])
+    return kind(**values)
+
+
+def _release() -> str:
+    try:
+        return version("emberwatch")
+    except PackageNotFoundError:
+        return "(not installed)"

@@ -1,0 +1,165 @@
+"""`emberwatch/Wildfire-v0`: one step flies one path."""
+
+from __future__ import annotations
+
+from typing import Any, Unpack
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from emberwatch.base import WorldEnv
+from emberwatch.client import as_moves
+from emberwatch.observations import Observations, Parts
+from emberwatch.session import Settings, WorldArguments
+from emberwatch.view import fly
+from emberwatch.wire import StepAnswer
+
+
+class WildfireEnv(WorldEnv):
+    """A robot explores a wildfire of which it sees only the cells that it flies over.
+
+    ## Description
+
+    A hidden Markov model spreads a fire over a grid of H x W cells, each normal, latent or on
+    fire. In each step the robot flies a path of T moves; then the whole world moves once, and the
+    cells visited are observed, with errors: a latent cell mostly looks normal. Where to fly next
+    must be decided from what was seen before. The model is that of Yoon et al., *Estimation and
+    Planning of Exploration Over Grid Map Using A Spatiotemporal Model with Incomplete State
+    Observations*, equations 2 to 4; any other model file runs as well.
+
+    The world is simulated by `emberwatch-server`: a private one, started at the first reset and
+    stopped with the environment, or with `instance` a running one, beside other agents.
+
+    ## Action Space
+
+    `MultiDiscrete([4] * T)`: a path, move by move: 0 up (row - 1), 1 down (row + 1), 2 left
+    (column - 1), 3 right (column + 1). A move off the grid leaves the robot where it is.
+
+    ## Observation Space
+
+    `observation` names the parts: a sequence makes a flat `Dict` of them, one name alone that
+    part as it is.
+
+    | part | space | meaning |
+    |---|---|---|
+    | `frame` | `Box(0, 255, (H, W, 1), uint8)` | what was observed; 255 where nothing was |
+    | `robot` | `MultiDiscrete([H, W])` | the robot's row and column |
+    | `age` | `Box(0, 255, (H, W, 1), uint8)` | steps since a cell was seen; 255: never, or as many |
+
+    ## Rewards
+
+    The number of distinct cells visited that burn after the world moved (in general the sum of
+    the model's rewards). The start cell counts only if it is flown over again.
+
+    ## Starting State
+
+    The world after `burn_in` steps from the model's initial distribution, a pure function of the
+    seed: `reset(seed=s)` begins the same episode here, in the vector environment and in Rust. A
+    reset without a seed draws the next one from `np_random`. The robot is at `start`, and nothing
+    has been observed. `reset(options={"resume": True})` does not begin anew but goes on from
+    where the world stands, such as after another agent.
+
+    ## Episode End
+
+    Never `terminated`. `truncated` after `max_episode_steps` (1,000 unless `gymnasium.make` is
+    told otherwise), or after the running server's own `--max-steps`.
+
+    ## Information
+
+    `step` (k), `n_target_cells` (cells burning on the whole grid), `n_visited` (distinct cells
+    visited), `n_hits` (of these, burning), and with `truth=True` the hidden `truth`, `(H, W)`
+    uint8. They are for reports and pictures: a learner that uses them cheats.
+
+    ## Arguments
+
+    All by keyword, through `gymnasium.make("emberwatch/Wildfire-v0", ...)`:
+
+    * `observation`: parts of the observation; `("frame", "robot")` by default.
+    * `instance`: attach to this running server; None: a private one.
+    * `world`: which of its worlds (0).
+    * `takeover`: take the world from whoever holds it (False).
+    * `model`: path of a model file (`"wildfire"`); `height`, `width` (64), `n_moves` (64, T),
+      `burn_in` (10,000), `start` (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the
+      private server. With `instance` they may be left out, or must agree.
+    * `truth`: reveal the hidden states in `info` and pictures (False).
+    * `timeout`: how long to wait for a step, seconds (5).
+    * `render_mode`: `"rgb_array"`, `"human"` (a window, or the terminal) or `"ansi"`.
+
+    ## Vectorized environment
+
+    `gymnasium.make_vec("emberwatch/Wildfire-v0", num_envs=64)` is `WildfireVectorEnv`: one
+    message steps all worlds.
+
+    ## Version History
+
+    * v0: the first.
+    """
+
+    def __init__(
+        self,
+        *,
+        observation: Parts = ("frame", "robot"),
+        render_mode: str | None = None,
+        **world: Unpack[WorldArguments],
+    ) -> None:
+        """Checks the arguments; see the class. Nothing is started before the first reset.
+
+        Raises:
+            SettingError: If an argument is impossible or contradicts the running server.
+            NoServerError: If nobody serves `instance`.
+        """
+        settings = Settings(**world)
+        super().__init__(settings, render_mode, reveals=settings.truth)
+        self._observations = Observations(observation, self._shape)
+        self.observation_space = self._observations.space
+        self.action_space = spaces.MultiDiscrete([4] * self._shape.n_moves)
+        self._answer: StepAnswer | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins an episode; see the class, *Starting State*.
+
+        Raises:
+            BusyError: If another client holds the world of a running server.
+            SettingError: If an option is unknown.
+        """
+        self._answer = self._begin(seed, options)
+        self._observations.began([0])
+        return self._seen(self._answer)
+
+    def step(
+        self, action: NDArray[np.integer[Any]]
+    ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Flies a path of T moves.
+
+        Raises:
+            InvalidActionError: If it is not `(T,)` integers in 0 to 3. Nothing is sent.
+            LeaseLostError: If another client took the world over.
+            ServerGoneError, RequestTimeoutError: If the server does not answer.
+        """
+        moves = as_moves(action, 1, self._shape.n_moves)
+        before, answer = self._answer, self._session.step(moves)
+        self._answer = answer
+        self._observations.note(answer, 0)
+        if self.render_mode is not None and before is not None:
+            start = before.result()
+            self._path = fly((start.row, start.col), moves.reshape(-1), self._shape)
+        result = answer.result()
+        observation, info = self._seen(answer)
+        return observation, result.reward, bool(result.terminated), bool(result.truncated), info
+
+    def _seen(self, answer: StepAnswer) -> tuple[Any, dict[str, Any]]:
+        result = answer.result()
+        info = self._describe(answer, result)
+        if self.render_mode == "human":
+            self._draw()
+        return self._observations.one(answer.frames[0], result.row, result.col), info
+
+    def _draw(self) -> Any:
+        if self._answer is None:
+            return None
+        result = self._answer.result()
+        robot = (result.row, result.col)
+        return self._view.draw(self._answer.frames[0], robot, self._path, self._truth)

@@ -1,0 +1,259 @@
+"""Observers: read what happens on an instance, before, while and after a server runs.
+
+Such as `for frame in emberwatch.observe("lab", timeout=10): print(frame.result.reward)`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch import wire
+from emberwatch.channels import Node, guard
+from emberwatch.errors import GarbledAnswerError, SettingError
+from emberwatch.wire import StepResult
+
+#: How long to sleep between two looks, seconds: publishing wakes nobody.
+_LOOK: Final = 200e-6
+
+#: How long to look and yield before the first sleep, seconds.
+_YIELD: Final = 50e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Frame:
+    """A published frame, copied.
+
+    Attributes:
+        world: The world.
+        result: The step's result.
+        frame: What was seen, `(H, W)`: an observation, or 255 where nothing was seen.
+        path: The moves flown, `(n_moves,)`; empty after a reset.
+        start: Where the path began, `(row, col)`.
+        n_lost: Samples that this observer missed since the last one it got.
+    """
+
+    world: int
+    result: StepResult
+    frame: NDArray[np.uint8]
+    path: NDArray[np.uint8]
+    start: tuple[int, int]
+    n_lost: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Truth:
+    """Published hidden states, copied. For evaluation and pictures, never for learners.
+
+    Attributes:
+        world: The world.
+        episode: Resets of the world since the server started.
+        step: k of the states.
+        seed: Seed of the episode.
+        states: The hidden states, `(H, W)`.
+        n_lost: Samples that this reader missed since the last one it got.
+    """
+
+    world: int
+    episode: int
+    step: int
+    seed: int
+    states: NDArray[np.uint8]
+    n_lost: int
+
+
+class _Reader:
+    """A subscriber of one channel."""
+
+    def __init__(
+        self, instance: str, service: str, header: type[wire.Header], limits: tuple[int, int]
+    ) -> None:
+        self._header = header
+        self._next: int | None = None
+        self._node = Node(instance)
+        try:
+            self._node.clean_up()
+            readers, buffer = limits
+            factory = self._node.open_publications(service, header, readers, buffer)
+            with guard(f"read {service} (are there more than {readers} readers?)"):
+                port = factory.subscriber_builder().buffer_size(buffer).create()
+                self._subscriber: Any = self._node.keep(port)
+                wake = self._node.keep(self._node.open_wake("wake-server").notifier_builder())
+                self._node.keep(wake.create()).notify()
+        except BaseException:
+            self._node.close()
+            raise
+
+    @property
+    def instance(self) -> str:
+        """The instance's name."""
+        return self._node.instance
+
+    def close(self) -> None:
+        """Stops reading. Again is fine."""
+        self._subscriber = None
+        self._node.close()
+
+    def __enter__(self) -> Self:
+        """Returns itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Stops reading."""
+        self.close()
+
+    def _sample(self, timeout: float) -> tuple[Any, bytearray, int] | None:
+        """Header, payload and number of lost samples; `None` if nothing comes in time."""
+        self._node.check()
+        start = time.perf_counter()
+        while True:
+            with guard("receive a sample"):
+                sample = self._subscriber.receive()
+            if sample is not None:
+                break
+            waited = time.perf_counter() - start
+            if waited >= timeout:
+                return None
+            if waited < _YIELD:
+                os.sched_yield()
+            else:
+                time.sleep(min(_LOOK, timeout - waited))
+        size = ctypes.sizeof(self._header)
+        header: Any = self._header.from_buffer_copy(ctypes.string_at(sample.user_header_ptr, size))
+        if header.version != wire.VERSION:
+            raise GarbledAnswerError(
+                f"sample: expected version {wire.VERSION}, got {header.version}"
+            )
+        payload = bytearray(ctypes.string_at(sample.payload_ptr, sample.payload().len()))
+        # A smaller number than expected is a new server's.
+        lost = 0 if self._next is None else max(0, header.sequence - self._next)
+        self._next = header.sequence + 1
+        return header, payload, lost
+
+
+class Observer(_Reader):
+    """Reads the frames of an instance; iterate over it. Never slows the server."""
+
+    def __init__(
+        self, instance: str = "default", *, world: int | None = None, timeout: float | None = None
+    ) -> None:
+        """Subscribes; see `observe`."""
+        super().__init__(
+            instance, "frames", wire.FrameHeader, (wire.MAX_OBSERVERS, wire.FRAME_BUFFER)
+        )
+        self._world = world
+        self._timeout = timeout
+
+    def receive(self, timeout: float) -> Frame | None:
+        """The next frame; `None` if none comes within so many seconds.
+
+        Raises:
+            GarbledAnswerError: If what comes makes no sense.
+        """
+        deadline = time.perf_counter() + timeout
+        n_lost = 0
+        while True:
+            sample = self._sample(max(0.0, deadline - time.perf_counter()))
+            if sample is None:
+                return None
+            header, payload, lost = sample
+            n_lost += lost
+            if self._world is None or header.world == self._world:
+                return _frame(header, payload, n_lost)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yields frames as they come, until none comes for `timeout`; without one, for ever."""
+        while True:
+            # In portions, so that Ctrl-C is heard and time does not overflow.
+            frame = self.receive(3600.0 if self._timeout is None else self._timeout)
+            if frame is not None:
+                yield frame
+            elif self._timeout is not None:
+                return
+
+
+class TruthReader(_Reader):
+    """Reads the hidden states of an instance whose server publishes them."""
+
+    def __init__(self, instance: str = "default") -> None:
+        """Subscribes.
+
+        Raises:
+            ChannelError: If iceoryx2 fails, also when there are more than 4 readers.
+        """
+        super().__init__(
+            instance, "truth", wire.TruthHeader, (wire.MAX_TRUTH_READERS, wire.TRUTH_BUFFER)
+        )
+
+    def receive(self, timeout: float) -> Truth | None:
+        """The next hidden states; `None` if none come within so many seconds.
+
+        Raises:
+            GarbledAnswerError: If what comes makes no sense.
+        """
+        sample = self._sample(timeout)
+        if sample is None:
+            return None
+        header, payload, n_lost = sample
+        _check_length(len(payload), header.height * header.width)
+        return Truth(
+            world=header.world,
+            episode=header.episode,
+            step=header.step,
+            seed=header.seed,
+            states=np.frombuffer(payload, np.uint8).reshape(header.height, header.width),
+            n_lost=n_lost,
+        )
+
+
+def observe(
+    instance: str = "default", *, world: int | None = None, timeout: float | None = None
+) -> Observer:
+    """Observes an instance: an iterator of frames, also a context manager.
+
+    The server publishes every world's current frame as soon as an observer comes. Repeats are
+    possible: same episode, same step.
+
+    Args:
+        instance: The instance's name; its server may start later.
+        world: Only this world; None: all.
+        timeout: Iteration ends when no frame comes for so many seconds; None: never.
+
+    Raises:
+        SettingError: If a value is impossible.
+        ChannelError: If iceoryx2 fails, also when there are more than 16 observers.
+    """
+    if timeout is not None and not timeout >= 0:
+        raise SettingError(f"timeout: expected seconds, at least 0, or None, got {timeout}")
+    return Observer(instance, world=world, timeout=timeout)
+
+
+def _frame(header: Any, payload: bytearray, n_lost: int) -> Frame:
+    n_cells = header.height * header.width
+    _check_length(len(payload), n_cells + header.n_moves)
+    return Frame(
+        world=header.world,
+        result=StepResult(*wire.RESULT.unpack(bytes(header.result))),
+        frame=np.frombuffer(payload, np.uint8, n_cells).reshape(header.height, header.width),
+        path=np.frombuffer(payload, np.uint8, offset=n_cells),
+        start=(header.start_row, header.start_col),
+        n_lost=n_lost,
+    )
+
+
+def _check_length(got: int, expected: int) -> None:
+    if got != expected:
+        raise GarbledAnswerError(f"sample: expected {expected} bytes, got {got}")

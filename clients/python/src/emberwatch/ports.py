@@ -1,0 +1,250 @@
+"""Requests and answers: one at a time, each with a deadline. Nothing returned is shared memory.
+
+The wait is PROTOCOL.md section 8's: look for about 5 us, look and yield until 50 us, then sleep
+on the listener that the server wakes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import select
+import time
+from typing import Any, Final, Generic, TypeVar
+
+from emberwatch import wire
+from emberwatch.channels import Node, guard, iox2
+from emberwatch.errors import (
+    ChannelError,
+    NoServerError,
+    RequestTimeoutError,
+    ServerGoneError,
+)
+
+Reply = TypeVar("Reply", bound=wire.Header)
+
+#: Looks at the answer before the processor is offered to others: about 5 us.
+_SPINS: Final = 12
+
+#: How long to look and yield before sleeping, seconds.
+_YIELD: Final = 45e-6
+
+#: A yield that takes longer went to a process that never sleeps, seconds.
+_LONG_YIELD: Final = 200e-6
+
+#: How long not to yield after that, seconds.
+_CONTENDED: Final = 0.1
+
+#: Longest sleep between two looks: bounds what a lost wake-up or a dead server can cost.
+_SLEEP: Final = iox2.Duration.from_millis(50)
+
+#: How often to look for dead processes while the server's pid is not known, seconds.
+_CLEAN_UP: Final = 0.2
+
+#: How long a server may take to let go of a request that was given up, seconds.
+_LET_GO: Final = 0.5
+
+
+class Bell:
+    """Waking, both ways, and the life of the process that answers."""
+
+    def __init__(self, node: Node, server: str = "wake-server") -> None:
+        """Opens the wake services; `server` is that of the process that answers.
+
+        Raises:
+            ChannelError: If iceoryx2 fails.
+        """
+        self.node: Final = node
+        with guard("open the wake services (are there more than 64 processes?)"):
+            notifier = node.open_wake(server).notifier_builder().create()
+            listener = node.open_wake("wake-client").listener_builder().create()
+        self.ring: Any = node.keep(notifier).notify
+        self._listener: Any = node.keep(listener)
+        identity = int(listener.id.value)
+        self.listener_low: Final = identity & (2**64 - 1)
+        self.listener_high: Final = identity >> 64
+        self._process: int | None = None
+        self._poll = select.poll()
+        self._contended_until = 0.0
+        self._next_clean_up = 0.0
+
+    def watch(self, pid: int) -> None:
+        """From now on the end of this process is noticed while waiting.
+
+        Raises:
+            ServerGoneError: If it has ended already.
+        """
+        try:
+            self._process = os.pidfd_open(pid)
+        except ProcessLookupError:
+            raise self.gone() from None
+        self._poll.register(self._process, select.POLLIN)
+
+    def close(self) -> None:
+        """Stops watching and waking."""
+        if self._process is not None:
+            os.close(self._process)
+            self._process = None
+        self.ring = self._listener = None
+
+    def gone(self) -> ServerGoneError:
+        """The error of a server that has ended; clears away what it left."""
+        self.node.clean_up()
+        return ServerGoneError(f"the server on instance {self.node.instance!r} is gone")
+
+    def wait(self, pending: Any, what: str, timeout: float) -> Any:
+        """The answer to a request.
+
+        Raises:
+            RequestTimeoutError: If none comes in time.
+            ServerGoneError: If none can come any more.
+        """
+        receive = pending.receive
+        for _ in range(_SPINS):
+            response = receive()
+            if response is not None:
+                return response
+        start = now = time.perf_counter()
+        while now - start < _YIELD and now >= self._contended_until:
+            os.sched_yield()
+            response = receive()
+            if response is not None:
+                return response
+            before, now = now, time.perf_counter()
+            if now - before > _LONG_YIELD:
+                self._contended_until = now + _CONTENDED
+        return self._sleep(pending, what, timeout, start)
+
+    def _sleep(self, pending: Any, what: str, timeout: float, start: float) -> Any:
+        while True:
+            has_ended = self._has_ended(pending)
+            # In this order: an answer may have come just before the end.
+            response = pending.receive()
+            if response is not None:
+                return response
+            if has_ended:
+                raise self.gone()
+            remaining = start + timeout - time.perf_counter()
+            if remaining <= 0:
+                raise RequestTimeoutError(
+                    f"no answer to {what} from instance {self.node.instance!r} within {timeout} s"
+                )
+            # Drained first: what is left from earlier answers must not end the sleep at once.
+            if self._listener.try_wait():
+                continue
+            longest = _SLEEP if remaining > 0.05 else iox2.Duration.from_secs_f64(remaining)
+            try:
+                self._listener.timed_wait(longest)
+            except iox2.ListenerWaitError as error:
+                if "Interrupt" not in str(error):
+                    raise ChannelError(f"wait for the server: {error}") from None
+
+    def _has_ended(self, pending: Any) -> bool:
+        if self._process is not None:
+            return bool(self._poll.poll(0)) or not pending.is_connected
+        if time.perf_counter() >= self._next_clean_up:
+            self.node.clean_up()
+            self._next_clean_up = time.perf_counter() + _CLEAN_UP
+        return not pending.is_connected
+
+
+class RequestPort(Generic[Reply]):
+    """One request-response channel of a server."""
+
+    def __init__(
+        self,
+        bell: Bell,
+        service: str,
+        headers: tuple[type[wire.Header], type[Reply]],
+        *,
+        slice_len: int,
+        grows: bool,
+    ) -> None:
+        """Opens a client port.
+
+        Args:
+            bell: How to wake the server and be woken.
+            service: The service's name below the instance.
+            headers: Types of the headers of requests and replies.
+            slice_len: Longest payload of a request, bytes; with `grows`, to begin with.
+            grows: Whether longer ones get more memory.
+
+        Raises:
+            NoServerError: If nobody serves it.
+            ChannelError: If iceoryx2 fails, also when there are too many clients.
+        """
+        self._bell = bell
+        self._request, self._reply = headers
+        self._request_bytes = ctypes.sizeof(self._request)
+        self._reply_bytes = ctypes.sizeof(self._reply)
+        node = bell.node
+        factory = node.open_request_response(service, *headers)
+        if factory is None or factory.dynamic_config.number_of_servers == 0:
+            raise no_server(node.instance)
+        builder = factory.client_builder().initial_max_slice_len(max(slice_len, 1))
+        growth = iox2.AllocationStrategy.PowerOfTwo if grows else iox2.AllocationStrategy.Static
+        with guard(f"create a {service} client (are there more than 16 clients?)"):
+            self._client: Any = node.keep(builder.allocation_strategy(growth).create())
+
+    def close(self) -> None:
+        """Lets go of the port; closing the node closes it."""
+        self._client = None
+
+    def exchange(
+        self, header: bytes, payload: bytes, what: str, timeout: float
+    ) -> tuple[Reply, bytearray]:
+        """Sends one request and returns the header and payload of its answer, copied.
+
+        Raises:
+            RequestTimeoutError: If no answer comes in time.
+            ServerGoneError: If the server has ended.
+            ForkedError, ClosedError: If the connection may not be used here.
+            ChannelError: If iceoryx2 fails.
+        """
+        self._bell.node.check()
+        pending = self._send(header, payload)
+        if pending.number_of_server_connections == 0:
+            raise self._bell.gone()
+        self._bell.ring()
+        response = self._bell.wait(pending, what, timeout)
+        reply = self._reply.from_buffer_copy(
+            ctypes.string_at(response.user_header_ptr, self._reply_bytes)
+        )
+        length = response.payload().len()
+        return reply, bytearray(_array(length).from_address(response.payload_ptr))
+
+    def _send(self, header: bytes, payload: bytes) -> Any:
+        give_up = time.perf_counter() + _LET_GO
+        while True:
+            try:
+                request = self._client.loan_slice_uninit(len(payload))
+                ctypes.memmove(request.user_header_ptr, header, self._request_bytes)
+                ctypes.memmove(request.payload_ptr, payload, len(payload))
+                return request.assume_init().send()
+            except iox2.RequestSendError as error:
+                # A request that was given up is in the server's hands for a moment still.
+                if time.perf_counter() > give_up:
+                    raise ChannelError(f"send a request: {error}") from None
+                time.sleep(0.005)
+            except iox2.LoanError as error:
+                raise ChannelError(f"send a request of {len(payload)} bytes: {error}") from None
+
+
+def no_server(instance: str) -> NoServerError:
+    """The error of an instance that nobody serves."""
+    return NoServerError(
+        f"no server on instance {instance!r}: start one with "
+        f"`emberwatch-server --instance {instance}`"
+    )
+
+
+_ARRAYS: dict[int, Any] = {}
+
+
+def _array(length: int) -> Any:
+    """The ctypes array of so many bytes; making the type anew would cost 5 us a message."""
+    if length not in _ARRAYS:
+        if len(_ARRAYS) > 256:
+            _ARRAYS.clear()
+        _ARRAYS[length] = ctypes.c_uint8 * length
+    return _ARRAYS[length]

@@ -1,0 +1,307 @@
+"""`gymnasium.make_vec("emberwatch/Wildfire-v0")`: one message steps all worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Final, Unpack, cast
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from emberwatch.base import wants_to_resume
+from emberwatch.client import as_moves
+from emberwatch.errors import SettingError
+from emberwatch.model import Model
+from emberwatch.observations import Observations, Parts
+from emberwatch.session import Session, Settings, WorldArguments, draw_seed
+from emberwatch.view import RENDER_FPS, RENDER_MODES, View, fly
+from emberwatch.wire import RESULT_DTYPE, StepAnswer
+
+#: Fields of a result that become `info`, as in the single environment.
+_REPORTED: Final = ("step", "n_target_cells", "n_visited", "n_hits")
+
+
+class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
+    """Many worlds of `WildfireEnv`, stepped together.
+
+    Observations, rewards, ends and infos are those of Gymnasium's `SyncVectorEnv` over the single
+    environment with the same seeds, field by field, in all three autoreset modes; world i of
+    `reset(seed=s)` has seed s + i. `options={"reset_mask": mask}` resets some of the worlds.
+
+    Arguments are those of `WildfireEnv`, and:
+
+    * `num_envs`: number of worlds.
+    * `max_episode_steps`: truncate after so many steps; None: never.
+    * `autoreset_mode`: a `gymnasium.vector.AutoresetMode`; `NEXT_STEP` by default.
+    * `world`: the first world; the others follow.
+    """
+
+    def __init__(
+        self,
+        *,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        observation: Parts = ("frame", "robot"),
+        render_mode: str | None = None,
+        **world: Unpack[WorldArguments],
+    ) -> None:
+        """Checks the arguments. Nothing is started before the first reset.
+
+        Raises:
+            SettingError: If an argument is impossible or contradicts the running server.
+            NoServerError: If nobody serves `instance`.
+        """
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise SettingError(
+                f"max_episode_steps: expected at least 1 or None, got {max_episode_steps}"
+            )
+        settings = Settings(n_worlds=num_envs, **world)
+        self._mode = AutoresetMode(autoreset_mode)
+        self._session = Session(settings)
+        shape = self._session.shape
+        self._observations = Observations(observation, shape, num_envs)
+        self._views = [View(render_mode, shape, self._session.model) for _ in range(num_envs)]
+        self._max_steps = max_episode_steps
+        self.metadata = {
+            "render_modes": list(RENDER_MODES),
+            "render_fps": RENDER_FPS,
+            "autoreset_mode": self._mode,
+        }
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.single_observation_space = self._observations.space
+        self.observation_space = batch_space(self._observations.space, num_envs)
+        self.single_action_space = spaces.MultiDiscrete([4] * shape.n_moves)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._generators: list[np.random.Generator | None] = [None] * num_envs
+        self._frames = np.zeros((num_envs, shape.height, shape.width), np.uint8)
+        self._results = np.zeros(num_envs, RESULT_DTYPE)
+        self._elapsed = np.zeros(num_envs, np.int64)
+        self._over = np.zeros(num_envs, np.bool_)
+        self._truths: NDArray[np.uint8] | None = None
+        self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
+
+    @property
+    def model(self) -> Model | None:
+        """The model behind the worlds; None if a running server hides it."""
+        return self._session.model
+
+    @property
+    def burn_in(self) -> int:
+        """Steps that the worlds are simulated before k = 0."""
+        return self._session.burn_in
+
+    @property
+    def instance(self) -> str:
+        """The server's instance name, once the environment has been reset."""
+        return self._session.instance
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins episodes in all worlds, or in those of `options["reset_mask"]`.
+
+        Args:
+            seed: For world 0, the others follow; or one per world; None: each world's own
+                generator goes on.
+            options: `reset_mask`, `(num_envs,)` booleans, at least one true; or `resume`, see
+                `WildfireEnv`.
+
+        Raises:
+            SettingError: If an option or the number of seeds is wrong.
+            BusyError: If another client holds a world of a running server.
+        """
+        rest = dict(options or {})
+        mask = self._check_mask(rest.pop("reset_mask", None))
+        seeds = self._check_seeds(seed)
+        if wants_to_resume(rest, seed):
+            self._take(self._session.resume(), range(self.num_envs))
+            self._began(range(self.num_envs))
+        else:
+            self._restart([int(index) for index in np.flatnonzero(mask)], seeds)
+        return self._seen(), self._infos(mask)
+
+    def step(
+        self, actions: NDArray[np.integer[Any]]
+    ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Flies one path in each world.
+
+        Raises:
+            InvalidActionError: If it is not `(num_envs, T)` integers in 0 to 3. Nothing is sent.
+            gymnasium.error.ResetNeeded: In mode `DISABLED`, if an episode is over.
+            LeaseLostError: If another client took a world over.
+            ServerGoneError, RequestTimeoutError: If the server does not answer.
+        """
+        moves = as_moves(actions, self.num_envs, self._session.shape.n_moves)
+        moves = moves.reshape(self.num_envs, -1)
+        over = self._over
+        if not over.any():
+            self._fly(moves, range(self.num_envs))
+        elif self._mode is AutoresetMode.NEXT_STEP:
+            for run in _runs(~over):
+                self._fly(moves, run)
+            self._restart([int(index) for index in np.flatnonzero(over)], [None] * self.num_envs)
+        else:
+            raise gymnasium.error.ResetNeeded(
+                f"worlds {np.flatnonzero(over).tolist()}: the episode is over; reset with "
+                "options={'reset_mask': ...}"
+            )
+        flown = ~over if over.any() else np.ones(self.num_envs, np.bool_)
+        return self._outcome(flown)
+
+    def render(self) -> tuple[Any, ...]:
+        """The picture of each world, as `WildfireEnv.render` draws it."""
+        return tuple(self._draw(index) for index in range(self.num_envs))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Gives the worlds back; a private server stops."""
+        self._session.close()
+        for view in self._views:
+            view.close()
+
+    def _fly(self, moves: NDArray[np.uint8], run: range) -> None:
+        """Steps consecutive worlds."""
+        before = self._results
+        answer = self._session.step(moves[run.start : run.stop], run)
+        self._take(answer, run)
+        self._observations.note(answer, run.start)
+        self._elapsed[run.start : run.stop] += 1
+        if self.render_mode is not None:
+            for index in run:
+                start = (int(before["row"][index]), int(before["col"][index]))
+                self._paths[index] = fly(start, moves[index], self._session.shape)
+
+    def _restart(self, indices: list[int], seeds: Sequence[int | None]) -> None:
+        """Begins episodes in some worlds."""
+        chosen: list[int] = []
+        for index in indices:
+            seed, generator = seeds[index], self._generators[index]
+            if seed is not None or generator is None:
+                generator, _ = seeding.np_random(seed)
+                self._generators[index] = generator
+            chosen.append(draw_seed(generator) if seed is None else seed)
+        self._take(self._session.reset(indices, chosen), range(self.num_envs))
+        self._began(indices)
+
+    def _began(self, indices: Sequence[int]) -> None:
+        chosen = list(indices)
+        self._elapsed[chosen] = 0
+        self._over = self._over.copy()
+        self._over[chosen] = False
+        self._observations.began(chosen)
+        for index in chosen:
+            self._paths[index] = None
+
+    def _take(self, answer: StepAnswer, run: range) -> None:
+        """Takes over an answer. What was handed out before is never written to."""
+        if len(run) == self.num_envs:
+            self._frames, self._results = answer.frames, answer.results
+        else:
+            self._frames, self._results = self._frames.copy(), self._results.copy()
+            self._frames[run.start : run.stop] = answer.frames
+            self._results[run.start : run.stop] = answer.results
+        if self._session.settings.truth:
+            truths = self._session.truth(answer)
+            if self._truths is None or len(run) == self.num_envs:
+                self._truths = truths
+            else:
+                self._truths = self._truths.copy()
+                self._truths[run.start : run.stop] = truths
+
+    def _outcome(
+        self, flown: NDArray[np.bool_]
+    ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """What `step` returns; worlds that began anew in this step earned nothing."""
+        rewards = np.where(flown, self._results["reward"], 0.0)
+        terminations = flown & (self._results["terminated"] != 0)
+        truncations = flown & (self._results["truncated"] != 0)
+        if self._max_steps is not None:
+            truncations |= flown & (self._elapsed >= self._max_steps)
+        over = terminations | truncations
+        infos: dict[str, Any] = {}
+        if self._mode is AutoresetMode.SAME_STEP and over.any():
+            infos = self._final(over)
+            self._restart([int(index) for index in np.flatnonzero(over)], [None] * self.num_envs)
+        else:
+            self._over = over
+        infos |= self._infos(np.ones(self.num_envs, np.bool_))
+        return self._seen(), rewards, terminations, truncations, infos
+
+    def _final(self, over: NDArray[np.bool_]) -> dict[str, Any]:
+        """The last observations and infos of episodes that end in this step."""
+        observations = np.full(self.num_envs, None, dtype=object)
+        for index in np.flatnonzero(over):
+            row, col = int(self._results["row"][index]), int(self._results["col"][index])
+            observations[index] = self._observations.one(self._frames[index], row, col, int(index))
+        return {
+            "final_obs": observations,
+            "_final_obs": over.copy(),
+            "final_info": self._infos(over),
+            "_final_info": over.copy(),
+        }
+
+    def _infos(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
+        """The infos of some worlds, zero for the others, as Gymnasium stacks them."""
+        infos: dict[str, Any] = {}
+        for name in _REPORTED:
+            infos[name] = np.where(mask, self._results[name], 0).astype(np.int64)
+            infos[f"_{name}"] = mask.copy()
+        if self._truths is not None:
+            infos["truth"] = np.where(mask[:, np.newaxis, np.newaxis], self._truths, np.uint8(0))
+            infos["_truth"] = mask.copy()
+        return infos
+
+    def _seen(self) -> Any:
+        robots = np.stack((self._results["row"], self._results["col"]), axis=1).astype(np.int64)
+        if self.render_mode == "human":
+            for index in range(self.num_envs):
+                self._draw(index)
+        return self._observations.all(self._frames, robots)
+
+    def _draw(self, index: int) -> Any:
+        robot = (int(self._results["row"][index]), int(self._results["col"][index]))
+        truth = None if self._truths is None else self._truths[index]
+        return self._views[index].draw(self._frames[index], robot, self._paths[index], truth)
+
+    def _check_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int):
+            return [seed + index for index in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise SettingError(f"seed: expected {self.num_envs} seeds, got {len(seed)}")
+        return seed
+
+    def _check_mask(self, mask: object) -> NDArray[np.bool_]:
+        if mask is None:
+            return np.ones(self.num_envs, np.bool_)
+        shape = (self.num_envs,)
+        if not isinstance(mask, np.ndarray):
+            raise SettingError(f"reset_mask: expected an array {shape} of bool, got {type(mask)}")
+        array = cast("NDArray[Any]", mask)
+        if array.dtype != np.bool_ or array.shape != shape or not array.any():
+            raise SettingError(
+                f"reset_mask: expected an array {shape} of bool with at least one True, "
+                f"got {array.dtype} {array.shape}"
+            )
+        return array
+
+
+def _runs(mask: NDArray[np.bool_]) -> Iterator[range]:
+    """The runs of consecutive true entries."""
+    start = None
+    for index, is_true in enumerate([*mask.tolist(), False]):
+        if is_true and start is None:
+            start = index
+        elif not is_true and start is not None:
+            yield range(start, index)
+            start = None

@@ -1,0 +1,84 @@
+"""The picture of an environment in its render mode."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from emberwatch.errors import SettingError
+from emberwatch.model import Model
+from emberwatch.render import Palette, Screen, ansi, rgb_array
+from emberwatch.session import Shape
+
+#: The render modes of every environment here.
+RENDER_MODES: Final = ("human", "rgb_array", "ansi")
+
+#: Pictures a second of a film, or of a window that is not driven faster.
+RENDER_FPS: Final = 10
+
+#: Row and column that each move adds.
+_DIRECTIONS: Final[tuple[tuple[int, int], ...]] = ((-1, 0), (1, 0), (0, -1), (0, 1))
+
+
+class View:
+    """Draws one world: the frame, the path flown, the robot, and the truth where it is known."""
+
+    def __init__(self, render_mode: str | None, shape: Shape, model: Model | None) -> None:
+        """Chooses the mode.
+
+        Raises:
+            SettingError: If there is no such mode.
+        """
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise SettingError(
+                f"render_mode: expected None or one of {', '.join(RENDER_MODES)}, "
+                f"got {render_mode!r}"
+            )
+        self.mode: Final = render_mode
+        self._shape = shape
+        self._palette = Palette.of(shape.n_observations if model is None else model)
+        self._screen: Screen | None = None
+
+    def draw(
+        self,
+        frame: NDArray[np.uint8],
+        robot: tuple[int, int],
+        path: NDArray[np.intp] | None,
+        truth: NDArray[np.uint8] | None,
+    ) -> Any:
+        """An image, a text, or `None` after showing it to a human, as the mode has it."""
+        parts: dict[str, Any] = {
+            "frame": frame,
+            "path": path,
+            "robot": robot,
+            "truth": truth,
+            "palette": self._palette,
+        }
+        if self.mode == "rgb_array":
+            return rgb_array(**parts)
+        if self.mode == "ansi":
+            return ansi(**parts)
+        if self._screen is None:
+            self._screen = Screen(fps=RENDER_FPS)
+        self._screen.show(**parts)
+        return None
+
+    def close(self) -> None:
+        """Closes the window, if there is one. Again is fine."""
+        if self._screen is not None:
+            self._screen.close()
+            self._screen = None
+
+
+def fly(start: tuple[int, int], moves: ArrayLike, shape: Shape) -> NDArray[np.intp]:
+    """The cells of a path after each move, `(n_moves, 2)`: a move off the grid stays in place."""
+    row, col = start
+    cells: list[tuple[int, int]] = []
+    for move in np.asarray(moves).tolist():
+        down, right = _DIRECTIONS[move]
+        row = min(max(row + down, 0), shape.height - 1)
+        col = min(max(col + right, 0), shape.width - 1)
+        cells.append((row, col))
+    return np.array(cells, np.intp).reshape(-1, 2)
