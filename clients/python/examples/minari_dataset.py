@@ -23,8 +23,11 @@ def main() -> None:
     os.environ["MINARI_DATASETS_PATH"] = args.folder or tempfile.mkdtemp(prefix="emberwatch-")
     import minari  # reads that variable
 
+    # Without JPEG, which would change the values: a frame holds codes, not shades.
     env = minari.DataCollector(
-        gymnasium.make("emberwatch/Wildfire-v0", max_episode_steps=args.steps)
+        gymnasium.make("emberwatch/Wildfire-v0", max_episode_steps=args.steps),
+        data_format="arrow",
+        jpeg_encoding=False,
     )
     env.action_space.seed(0)
     for episode in range(args.episodes):
