@@ -8,17 +8,23 @@ Importing this package registers its environments with Gymnasium:
 Without Gymnasium, `connect` talks to a running server and `observe` reads what it publishes.
 """
 
-from gymnasium.envs.registration import register
+from gymnasium.envs.registration import register  # pyright: ignore[reportUnknownVariableType]
 
-from emberwatch.client import Client, Lease, ServerInfo, ServerStatus, WorldInfo, connect
+from emberwatch.client import Client, Lease, connect
+from emberwatch.decisions import Decisions
 from emberwatch.env import WildfireEnv
 from emberwatch.moves_env import WildfireMovesEnv
 from emberwatch.observer import Frame, Observer, Truth, TruthReader, observe
+from emberwatch.objective_env import WildfireObjectiveEnv
+from emberwatch.replies import Decision, DecisionsInfo, ServerInfo, ServerStatus, WorldInfo
 from emberwatch.vector_env import WildfireVectorEnv
 from emberwatch.wire import StepAnswer, StepResult
 
 __all__ = [
     "Client",
+    "Decision",
+    "Decisions",
+    "DecisionsInfo",
     "Frame",
     "Lease",
     "Observer",
@@ -30,6 +36,7 @@ __all__ = [
     "TruthReader",
     "WildfireEnv",
     "WildfireMovesEnv",
+    "WildfireObjectiveEnv",
     "WildfireVectorEnv",
     "WorldInfo",
     "connect",
@@ -39,14 +46,19 @@ __all__ = [
 #: Steps after which an episode is truncated, unless `gymnasium.make` is told otherwise.
 MAX_EPISODE_STEPS = 1000
 
-register(  # pyright: ignore[reportUnknownMemberType]
+register(
     "emberwatch/Wildfire-v0",
     entry_point="emberwatch.env:WildfireEnv",
     vector_entry_point="emberwatch.vector_env:WildfireVectorEnv",
     max_episode_steps=MAX_EPISODE_STEPS,
 )
-register(  # pyright: ignore[reportUnknownMemberType]
+register(
     "emberwatch/WildfireMoves-v0",
     entry_point="emberwatch.moves_env:WildfireMovesEnv",
     max_episode_steps=64 * MAX_EPISODE_STEPS,
+)
+register(
+    "emberwatch/WildfireObjective-v0",
+    entry_point="emberwatch.objective_env:WildfireObjectiveEnv",
+    max_episode_steps=MAX_EPISODE_STEPS,
 )

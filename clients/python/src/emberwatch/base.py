@@ -50,10 +50,8 @@ class WorldEnv(gymnasium.Env[Any, Any]):
 
     def render(self) -> Any:
         """Draws the last frame, path and robot, beside the truth when that is revealed."""
-        if self.render_mode is None or not self._session.is_open:
-            gymnasium.logger.warn(
-                "render: nothing to draw; give a render_mode to gymnasium.make and reset first"
-            )
+        if self.render_mode is None:
+            gymnasium.logger.warn("render: expected a render_mode, given to gymnasium.make")
             return None
         return None if self.render_mode == "human" else self._draw()
 

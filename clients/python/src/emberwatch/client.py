@@ -6,20 +6,19 @@ Every call has a timeout in seconds; everything returned is a copy.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
 from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
-from typing import Any, Final, Self, TypeVar, cast
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
 from emberwatch.channels import Node
-from emberwatch.errors import GarbledAnswerError, InvalidActionError, refusal
+from emberwatch.errors import InvalidActionError, refusal
 from emberwatch.ports import Bell, RequestPort
+from emberwatch.replies import ServerInfo, ServerStatus, WorldInfo, WorldStatus, ask, items, record
 from emberwatch.wire import StepAnswer
 
 #: Default timeout of a step, seconds.
@@ -27,73 +26,6 @@ STEP_TIMEOUT: Final = 5.0
 
 #: Default timeout of what may wait for a burn-in, seconds.
 RESET_TIMEOUT: Final = 120.0
-
-_Record = TypeVar("_Record")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ServerInfo:
-    """What a server says of itself (PROTOCOL.md section 6, `hello`)."""
-
-    protocol: int
-    build: str
-    pid: int
-    height: int
-    width: int
-    n_moves: int
-    n_worlds: int
-    n_observations: int
-    observations: tuple[str, ...]
-    #: The model as TOML text; None if the server hides it.
-    model: str | None
-    burn_in: int
-    #: Steps until an episode is truncated; 0: never.
-    max_steps: int
-    max_clients: int
-    #: Which cells a step observes: "path", "full" or "client" (as the step asks).
-    coverage: str
-    publish_truth: bool
-    lease_millis: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorldInfo:
-    """Where one world stands."""
-
-    world: int
-    step: int
-    seed: int
-    episode: int
-    robot: tuple[int, int]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorldStatus:
-    """One world in a `ServerStatus`."""
-
-    world: int
-    step: int
-    seed: int
-    episode: int
-    robot: tuple[int, int]
-    #: The process that holds it, if any.
-    holder_pid: int | None
-    #: Whether it is in its burn-in.
-    resetting: bool
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ServerStatus:
-    """What is going on at a server."""
-
-    pid: int
-    uptime_millis: int
-    n_steps: int
-    steps_per_second: float
-    n_refused: int
-    n_clients: int
-    n_observers: int
-    worlds: tuple[WorldStatus, ...]
 
 
 class Client:
@@ -175,8 +107,8 @@ class Client:
     def status(self, *, timeout: float = STEP_TIMEOUT) -> ServerStatus:
         """What is going on."""
         reply = self.control({"op": "status"}, timeout=timeout)
-        worlds = tuple(_record(WorldStatus, world) for world in _list(reply, "worlds"))
-        return _record(ServerStatus, {**reply, "worlds": worlds})
+        worlds = tuple(record(WorldStatus, world) for world in items(reply, "worlds"))
+        return record(ServerStatus, {**reply, "worlds": worlds})
 
     def shutdown(self, *, timeout: float = STEP_TIMEOUT) -> None:
         """Stops the server, for everybody."""
@@ -259,8 +191,7 @@ class Client:
             "client": f"emberwatch-python {_release()}",
         }
         reply = self.control(hello, timeout=timeout)
-        reply["observations"] = tuple(_list(reply, "observations"))
-        return _record(ServerInfo, reply)
+        return record(ServerInfo, reply)
 
 
 class Lease:
@@ -276,7 +207,7 @@ class Lease:
         #: The worlds it covers.
         self.worlds: Final = worlds
         #: Where they stood when it was given.
-        self.start: Final = tuple(_record(WorldInfo, world) for world in _list(reply, "worlds"))
+        self.start: Final = tuple(record(WorldInfo, world) for world in items(reply, "worlds"))
         self._is_over = False
 
     def step(
@@ -353,7 +284,7 @@ class Lease:
         ]
         request = {"op": "reset", "lease": self.number, "worlds": pairs}
         reply = self.client.control(request, timeout=timeout)
-        return tuple(_record(WorldInfo, world) for world in _list(reply, "worlds"))
+        return tuple(record(WorldInfo, world) for world in items(reply, "worlds"))
 
     def renew(self, *, timeout: float = RESET_TIMEOUT) -> None:
         """Starts the lease's clock again without acting."""
@@ -421,56 +352,6 @@ def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]
             f"action: expected moves 0 to {wire.N_MOVES - 1}, got {given[where]} at {where}"
         )
     return given.astype(np.uint8)
-
-
-def ask(
-    port: RequestPort[wire.ControlReply],
-    bell: Bell,
-    sequence: int,
-    request: Mapping[str, Any],
-    timeout: float,
-) -> dict[str, Any]:
-    """One JSON request and its reply, on `control` or a channel like it.
-
-    Raises:
-        RefusedError: One of its subclasses, if it is refused.
-        RequestTimeoutError, ServerGoneError, GarbledAnswerError: If there is no good answer.
-    """
-    what = f"{request['op']!r}"
-    header = wire.CONTROL_REQUEST.pack(
-        wire.VERSION, 0, sequence, bell.listener_low, bell.listener_high
-    )
-    head, payload = port.exchange(header, json.dumps(request).encode(), what, timeout)
-    try:
-        reply = json.loads(payload)
-    except ValueError as error:
-        raise GarbledAnswerError(f"answer to {what}: expected JSON, got {error}") from None
-    if not isinstance(reply, dict):
-        raise GarbledAnswerError(f"answer to {what}: expected an object, got {reply!r}")
-    keys = cast("dict[str, Any]", reply)
-    if head.status != 0:
-        raise refusal(head.status, int(keys.get("detail", 0)), keys.get("message"))
-    wire.check_answer(f"answer to {what}", head, sequence)
-    return keys
-
-
-def _list(reply: Mapping[str, Any], key: str) -> list[Any]:
-    found = reply.get(key)
-    if not isinstance(found, list):
-        raise GarbledAnswerError(f"reply: expected a list {key!r}, got {found!r}")
-    return cast("list[Any]", found)
-
-
-def _record(kind: type[_Record], keys: Mapping[str, Any]) -> _Record:
-    """A record from a reply; keys that this release does not know are ignored."""
-    names = [field.name for field in fields(kind)]  # pyright: ignore[reportArgumentType]
-    missing = [name for name in names if name not in keys]
-    if missing:
-        raise GarbledAnswerError(f"reply: expected a key {missing[0]!r}, got {sorted(keys)}")
-    values = {name: keys[name] for name in names}
-    if "robot" in values:
-        values["robot"] = tuple(values["robot"])
-    return kind(**values)
 
 
 def _release() -> str:

@@ -153,6 +153,18 @@ class UnknownFlagsError(RefusedError):
     name = "unknown_flags"
 
 
+class BadObjectiveError(RefusedError):
+    """An objective that the agent does not have. `detail`: how many it has."""
+
+    name = "bad_objective"
+
+
+class AgentEndsError(RefusedError):
+    """The agent that serves decisions ends: told so, its server is gone, or it failed."""
+
+    name = "agent_ends"
+
+
 #: The error of each status code, from code 1.
 REFUSALS: tuple[type[RefusedError], ...] = (
     VersionMismatchError,
@@ -169,6 +181,8 @@ REFUSALS: tuple[type[RefusedError], ...] = (
     EpisodeOverError,
     NotPermittedError,
     UnknownFlagsError,
+    BadObjectiveError,
+    AgentEndsError,
 )
 
 

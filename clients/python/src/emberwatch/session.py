@@ -173,7 +173,7 @@ class Session:
         settings = self.settings
         try:
             if settings.instance is None:
-                client = self._launch(0 if seed is None else seed % 2**64)
+                client = self.launch(0 if seed is None else seed % 2**64)
             else:
                 client = Client(settings.instance, timeout=settings.timeout)
             self._client = client
@@ -213,7 +213,12 @@ class Session:
             raise ClosedError("the environment is closed: reset it first")
         return self._lease
 
-    def _launch(self, seed: int) -> Client:
+    def launch(self, seed: int) -> Client:
+        """Starts the private server, with this seed for world 0; `close` stops it.
+
+        Raises:
+            LaunchError: If it does not start, with its own words.
+        """
         instance = unused_instance()
         settings = self.settings
         shape = self.shape
