@@ -15,9 +15,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import emberwatch  # noqa: F401  (registers the environments)
 import gymnasium
 import numpy as np
+
+import emberwatch  # noqa: F401  (registers the environments)
 
 NO_END = 2**31 - 1
 
@@ -63,7 +64,7 @@ class Row:
         rates = [self.n_envs * 1e6 / mean for mean in means]
         print(
             f"{self.name:42} p50 {_spread(p50s)}  p99 {_spread(p99s)} us  "
-            f"{statistics.median(rates):9,.0f} env-steps/s ({min(rates):,.0f} to {max(rates):,.0f})",
+            f"{statistics.median(rates):9,.0f} ({min(rates):,.0f} to {max(rates):,.0f}) env-steps/s",
             flush=True,
         )
 

@@ -14,12 +14,13 @@ import random
 import time
 from typing import Any
 
-import emberwatch  # noqa: F401  (registers the environments)
 import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
+
+import emberwatch  # noqa: F401  (registers the environments)
 
 
 def parse() -> argparse.Namespace:

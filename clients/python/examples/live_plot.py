@@ -10,9 +10,10 @@ import argparse
 import subprocess
 from collections import deque
 
-import emberwatch
 import matplotlib
 import numpy as np
+
+import emberwatch
 from emberwatch.programs import Program, find, unused_instance
 
 

@@ -9,8 +9,9 @@ import argparse
 import os
 import tempfile
 
-import emberwatch  # noqa: F401  (registers the environments)
 import gymnasium
+
+import emberwatch  # noqa: F401  (registers the environments)
 
 
 def main() -> None:

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import argparse
 
-import emberwatch  # noqa: F401  (registers the environments)
 import gymnasium
 from stable_baselines3 import DQN
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
+
+import emberwatch  # noqa: F401  (registers the environments)
 
 
 def main() -> None:

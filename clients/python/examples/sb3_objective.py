@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import argparse
 
-import emberwatch  # noqa: F401  (registers the environments)
 import gymnasium
 import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
+
+import emberwatch  # noqa: F401  (registers the environments)
 
 
 def mean_reward(env: gymnasium.Env, choose, seed: int, n_steps: int) -> float:

@@ -10,8 +10,9 @@ from __future__ import annotations
 import argparse
 import subprocess
 
-import emberwatch
 import numpy as np
+
+import emberwatch
 from emberwatch.programs import Program, find, unused_instance
 
 

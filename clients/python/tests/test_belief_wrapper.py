@@ -121,6 +121,7 @@ def test_the_belief_follows_the_steps_of_the_world(monkeypatch: pytest.MonkeyPat
         assert (env.filter.belief == expected.belief).all()
 
 
+@pytest.mark.filterwarnings("ignore:.*different from the unwrapped version")
 @pytest.mark.parametrize("parts", [False, True])
 @pytest.mark.parametrize("keep", [False, True])
 @pytest.mark.parametrize("dtype", ["float32", "uint8"])

@@ -14,8 +14,8 @@ from emberwatch.client import Client, Lease, connect
 from emberwatch.decisions import Decisions
 from emberwatch.env import WildfireEnv
 from emberwatch.moves_env import WildfireMovesEnv
-from emberwatch.observer import Frame, Observer, Truth, TruthReader, observe
 from emberwatch.objective_env import WildfireObjectiveEnv
+from emberwatch.observer import Frame, Observer, Truth, TruthReader, observe
 from emberwatch.replies import Decision, DecisionsInfo, ServerInfo, ServerStatus, WorldInfo
 from emberwatch.vector_env import WildfireVectorEnv
 from emberwatch.wire import StepAnswer, StepResult

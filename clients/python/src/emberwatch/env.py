@@ -45,7 +45,7 @@ class WildfireEnv(WorldEnv):
     |---|---|---|
     | `frame` | `Box(0, 255, (H, W, 1), uint8)` | what was observed; 255 where nothing was |
     | `robot` | `MultiDiscrete([H, W])` | the robot's row and column |
-    | `age` | `Box(0, 255, (H, W, 1), uint8)` | steps since a cell was seen; 255: never, or as many |
+    | `age` | `Box(0, 255, (H, W, 1), uint8)` | steps since a cell was seen; 255: never, or more |
 
     ## Rewards
 
