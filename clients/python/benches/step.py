@@ -64,7 +64,7 @@ class Row:
         rates = [self.n_envs * 1e6 / mean for mean in means]
         print(
             f"{self.name:42} p50 {_spread(p50s)}  p99 {_spread(p99s)} us  "
-            f"{statistics.median(rates):9,.0f} ({min(rates):,.0f} to {max(rates):,.0f}) env-steps/s",
+            f"{statistics.median(rates):9,.0f} ({min(rates):,.0f} to {max(rates):,.0f}) steps/s",
             flush=True,
         )
 
