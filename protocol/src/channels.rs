@@ -45,7 +45,7 @@ pub type RequestResponse<Q, R> = request_response::PortFactory<Ipc, [u8], Q, [u8
 /// The `step` service.
 pub type StepService = RequestResponse<StepRequest, StepReply>;
 
-/// The `control` service.
+/// A service of JSON messages: `control`, or the decisions of a world.
 pub type ControlService = RequestResponse<ControlRequest, ControlReply>;
 
 /// The `frames` service.
@@ -84,6 +84,17 @@ pub enum ChannelError {
         /// The instance.
         instance: String,
     },
+    /// No agent takes decisions for the world.
+    #[error(
+        "no agent serves decisions of world {world} on instance {instance:?}: start one with \
+         `emberwatch-agent serve-decisions --instance {instance} --world {world}`"
+    )]
+    NoAgent {
+        /// The instance.
+        instance: String,
+        /// The world.
+        world: u32,
+    },
     /// iceoryx2 refused.
     #[error("{what}: iceoryx2 says {problem}")]
     Ipc {
@@ -109,6 +120,10 @@ pub enum Channel {
     WakeServer,
     /// Wakes clients, event.
     WakeClient,
+    /// Decisions for a world, answered by its agent, request-response.
+    Decisions(u32),
+    /// Wakes the agent that answers a world's decisions, event.
+    WakeAgent(u32),
 }
 
 impl Instance {
@@ -142,17 +157,30 @@ impl Instance {
             instance: self.0.clone(),
         }
     }
+
+    /// The error for a channel whose requests nobody answers.
+    fn nobody_answers(&self, channel: Channel) -> ChannelError {
+        match channel {
+            Channel::Decisions(world) => ChannelError::NoAgent {
+                instance: self.0.clone(),
+                world,
+            },
+            _ => self.no_server(),
+        }
+    }
 }
 
 impl Channel {
-    fn name(self) -> &'static str {
+    fn name(self) -> String {
         match self {
-            Self::Step => "step",
-            Self::Control => "control",
-            Self::Frames => "frames",
-            Self::Truth => "truth",
-            Self::WakeServer => "wake-server",
-            Self::WakeClient => "wake-client",
+            Self::Step => "step".into(),
+            Self::Control => "control".into(),
+            Self::Frames => "frames".into(),
+            Self::Truth => "truth".into(),
+            Self::WakeServer => "wake-server".into(),
+            Self::WakeClient => "wake-client".into(),
+            Self::Decisions(world) => format!("decisions-{world}"),
+            Self::WakeAgent(world) => format!("wake-agent-{world}"),
         }
     }
 }
@@ -243,6 +271,22 @@ impl Services<'_> {
         self.open(Channel::Control)
     }
 
+    /// The service of a world's decisions, created if need be; for the agent.
+    ///
+    /// # Errors
+    /// As [`Self::create_step`].
+    pub fn create_decisions(&self, world: u32) -> Result<ControlService, ChannelError> {
+        self.create(Channel::Decisions(world))
+    }
+
+    /// The service of a world's decisions, which a running agent answers.
+    ///
+    /// # Errors
+    /// [`ChannelError::NoAgent`] if there is none.
+    pub fn open_decisions(&self, world: u32) -> Result<ControlService, ChannelError> {
+        self.open(Channel::Decisions(world))
+    }
+
     /// The `frames` service; observers may create it before the server starts.
     ///
     /// # Errors
@@ -295,7 +339,7 @@ impl Services<'_> {
             .map_err(ipc_error("open the truth channel"))
     }
 
-    /// One of the two wake services.
+    /// A wake service.
     ///
     /// # Errors
     /// [`ChannelError::Ipc`].
@@ -342,13 +386,13 @@ impl Services<'_> {
             .builder::<Q, R>(channel)
             .open()
             .map_err(|error| match error {
-                RequestResponseOpenError::DoesNotExist => self.instance.no_server(),
+                RequestResponseOpenError::DoesNotExist => self.instance.nobody_answers(channel),
                 other => ipc_error("open a request channel")(other),
             })?;
         if service.dynamic_config().number_of_servers() > 0 {
             Ok(service)
         } else {
-            Err(self.instance.no_server())
+            Err(self.instance.nobody_answers(channel))
         }
     }
 
