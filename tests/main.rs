@@ -10,6 +10,7 @@ mod commands;
 mod compare;
 mod compliance;
 mod crash;
+mod decision_ends;
 mod decisions;
 mod determinism;
 mod episodes;

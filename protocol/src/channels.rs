@@ -1,4 +1,4 @@
-//! The channels of one instance: names, node configuration, services and their limits.
+//! The channels of one instance: names, services and their limits.
 //!
 //! All channels of an instance live under `emberwatch/v1/<instance>/`, in a directory and under a
 //! prefix of the user's own, so that users never meet and no stray configuration file is read.
@@ -6,17 +6,15 @@
 use crate::message::{
     ControlReply, ControlRequest, FrameHeader, Header, StepReply, StepRequest, TruthHeader,
 };
-use iceoryx2::node::{Node, NodeBuilder};
-use iceoryx2::prelude::{Config, FileName, Path, SemanticString, ServiceName};
-use iceoryx2::prelude::{SignalHandlingMode, ipc};
+use iceoryx2::node::Node;
+use iceoryx2::prelude::{ServiceName, ipc};
 use iceoryx2::service::builder::request_response as request_response_builder;
 use iceoryx2::service::builder::request_response::RequestResponseOpenError;
 use iceoryx2::service::port_factory::{PortFactory, event, publish_subscribe, request_response};
 use std::fmt::Debug;
-use std::fs::DirBuilder;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
-use std::path::PathBuf;
 use thiserror::Error;
+
+pub use crate::node::{channel_directory, create_node, node_config};
 
 /// Most clients at a time on each of `step` and `control`.
 pub const MAX_CLIENTS: usize = 16;
@@ -183,43 +181,6 @@ impl Channel {
             Self::WakeAgent(world) => format!("wake-agent-{world}"),
         }
     }
-}
-
-/// Makes this process known to iceoryx2, under the user's own directory and prefix.
-///
-/// # Errors
-/// [`ChannelError`] if the directory is somebody else's or the node cannot be created.
-pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
-    iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
-    let node = NodeBuilder::new()
-        .config(&node_config()?)
-        .signal_handling_mode(SignalHandlingMode::Disabled);
-    node.create().map_err(ipc_error("create a node"))
-}
-
-/// The directory of this user's channel files: `/tmp/emberwatch-<uid>/`.
-pub fn channel_directory() -> PathBuf {
-    PathBuf::from(format!(
-        "/tmp/emberwatch-{}/",
-        rustix::process::getuid().as_raw()
-    ))
-}
-
-/// iceoryx2's configuration: its defaults, the user's own directory and prefix.
-///
-/// # Errors
-/// [`ChannelError::Directory`] if the directory cannot be made or is somebody else's.
-pub fn node_config() -> Result<Config, ChannelError> {
-    let directory = channel_directory();
-    own_directory(&directory)?;
-    let path = Path::new(directory.as_os_str().as_encoded_bytes())
-        .map_err(ipc_error("set the root path"))?;
-    let prefix = format!("emberwatch_{}_", rustix::process::getuid().as_raw());
-    let prefix = FileName::new(prefix.as_bytes()).map_err(ipc_error("set the prefix"))?;
-    let mut config = Config::default();
-    config.global.set_root_path(&path);
-    config.global.prefix = prefix;
-    Ok(config)
 }
 
 /// Adds context to an error of iceoryx2.
@@ -410,28 +371,6 @@ impl Services<'_> {
     }
 }
 
-/// Makes the directory, for this user alone, or checks that it is this user's.
-fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
-    let wrong = |problem: String| ChannelError::Directory {
-        path: path.display().to_string(),
-        problem,
-    };
-    match DirBuilder::new().mode(0o700).create(path) {
-        Ok(()) => return Ok(()),
-        Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
-        Err(error) => return Err(wrong(error.to_string())),
-    }
-    let bare = path.components().as_path(); // without the trailing slash, so that a link is seen
-    let found = std::fs::symlink_metadata(bare).map_err(|error| wrong(error.to_string()))?;
-    let mine = found.is_dir() && found.uid() == rustix::process::getuid().as_raw();
-    if mine && found.mode() & 0o022 == 0 {
-        return Ok(());
-    }
-    Err(wrong(
-        "expected a directory that belongs to this user and that others cannot write to".into(),
-    ))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -444,16 +383,5 @@ mod tests {
         for bad in ["", "a b", "../x", "é", &"x".repeat(65)] {
             assert!(Instance::new(bad).is_err(), "{bad:?}");
         }
-    }
-
-    #[test]
-    fn a_directory_that_others_may_write_to_is_refused() {
-        use std::os::unix::fs::PermissionsExt;
-        let path = std::env::temp_dir().join(format!("emberwatch-test-{}", std::process::id()));
-        own_directory(&path).expect("a new directory");
-        own_directory(&path).expect("the same again");
-        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o777)).expect("chmod");
-        assert!(own_directory(&path).is_err());
-        std::fs::remove_dir(&path).expect("clean up");
     }
 }

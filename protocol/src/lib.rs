@@ -19,6 +19,7 @@ mod lanes;
 pub mod message;
 mod mixture;
 pub mod model;
+mod node;
 pub mod observer;
 pub mod path;
 pub mod program;

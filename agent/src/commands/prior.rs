@@ -30,7 +30,7 @@ pub struct PriorCommand {
     /// Worlds simulated
     #[arg(long, default_value_t = Prior::N_WORLDS as u64, value_parser = clap::value_parser!(u64).range(1..=10_000))]
     worlds: u64,
-    /// Seed of these worlds
+    /// Seed of these worlds: `--agent-seed` of an agent with the same belief
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Where to: NumPy's .npy, 32-bit floats of shape [states, height, width]
