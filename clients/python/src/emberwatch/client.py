@@ -407,7 +407,10 @@ def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]
     Raises:
         InvalidActionError: Naming what was expected and what was got.
     """
-    given = np.asarray(paths)
+    try:
+        given = np.asarray(paths)
+    except (ValueError, OverflowError) as error:
+        raise InvalidActionError(f"action: expected an array of moves, got {error}") from None
     if given.shape != (n_worlds, n_moves) and (n_worlds != 1 or given.shape != (n_moves,)):
         one = f" or ({n_moves},)" if n_worlds == 1 else ""
         raise InvalidActionError(
@@ -415,8 +418,8 @@ def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]
         )
     if given.dtype.kind not in "iu":
         raise InvalidActionError(f"action: expected integers, got {given.dtype}")
-    if (given & ~3).any():
-        where = tuple(int(i) for i in np.argwhere(given & ~3)[0])
+    if given.max(initial=0) >= wire.N_MOVES or given.min(initial=0) < 0:
+        where = tuple(int(i) for i in np.argwhere((given < 0) | (given >= wire.N_MOVES))[0])
         raise InvalidActionError(
             f"action: expected moves 0 to {wire.N_MOVES - 1}, got {given[where]} at {where}"
         )
