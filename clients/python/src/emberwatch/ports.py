@@ -203,15 +203,19 @@ class RequestPort(Generic[Reply]):
         """
         self._bell.node.check()
         pending = self._send(header, payload)
-        if pending.number_of_server_connections == 0:
-            raise self._bell.gone()
-        self._bell.ring()
-        response = self._bell.wait(pending, what, timeout)
-        reply = self._reply.from_buffer_copy(
-            ctypes.string_at(response.user_header_ptr, self._reply_bytes)
-        )
-        length = response.payload().len()
-        return reply, bytearray(_array(length).from_address(response.payload_ptr))
+        try:
+            if pending.number_of_server_connections == 0:
+                raise self._bell.gone()
+            self._bell.ring()
+            response = self._bell.wait(pending, what, timeout)
+            reply = self._reply.from_buffer_copy(
+                ctypes.string_at(response.user_header_ptr, self._reply_bytes)
+            )
+            length = response.payload().len()
+            return reply, bytearray(_array(length).from_address(response.payload_ptr))
+        finally:
+            # The traceback of an error keeps `pending` alive, but the next request needs its place.
+            pending.delete()
 
     def _send(self, header: bytes, payload: bytes) -> Any:
         give_up = time.perf_counter() + _LET_GO
