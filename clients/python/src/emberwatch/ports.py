@@ -87,6 +87,10 @@ class Bell:
             self._process = None
         self.ring = self._listener = None
 
+    def has_ended(self) -> bool:
+        """Whether the process that is watched has ended."""
+        return self._process is not None and bool(self._poll.poll(0))
+
     def gone(self) -> ServerGoneError:
         """The error of a server that has ended; clears away what it left."""
         self.node.clean_up()
@@ -117,12 +121,12 @@ class Bell:
 
     def _sleep(self, pending: Any, what: str, timeout: float, start: float) -> Any:
         while True:
-            has_ended = self._has_ended(pending)
+            is_gone = self._is_gone(pending)
             # In this order: an answer may have come just before the end.
             response = pending.receive()
             if response is not None:
                 return response
-            if has_ended:
+            if is_gone:
                 raise self.gone()
             remaining = start + timeout - time.perf_counter()
             if remaining <= 0:
@@ -139,9 +143,9 @@ class Bell:
                 if "Interrupt" not in str(error):
                     raise ChannelError(f"wait for the server: {error}") from None
 
-    def _has_ended(self, pending: Any) -> bool:
+    def _is_gone(self, pending: Any) -> bool:
         if self._process is not None:
-            return bool(self._poll.poll(0)) or not pending.is_connected
+            return self.has_ended() or not pending.is_connected
         if time.perf_counter() >= self._next_clean_up:
             self.node.clean_up()
             self._next_clean_up = time.perf_counter() + _CLEAN_UP
@@ -202,6 +206,9 @@ class RequestPort(Generic[Reply]):
             ChannelError: If iceoryx2 fails.
         """
         self._bell.node.check()
+        if self._bell.has_ended():
+            # A new server on the instance would take the request, but knows nothing of it.
+            raise self._bell.gone()
         pending = self._send(header, payload)
         try:
             if pending.number_of_server_connections == 0:
