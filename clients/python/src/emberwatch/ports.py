@@ -19,6 +19,7 @@ from emberwatch.errors import (
     NoServerError,
     RequestTimeoutError,
     ServerGoneError,
+    VersionMismatchError,
 )
 
 Reply = TypeVar("Reply", bound=wire.Header)
@@ -175,6 +176,7 @@ class RequestPort(Generic[Reply]):
 
         Raises:
             NoServerError: If nobody serves it.
+            VersionMismatchError: If somebody does, but in another protocol version.
             ChannelError: If iceoryx2 fails, also when there are too many clients.
         """
         self._bell = bell
@@ -184,7 +186,7 @@ class RequestPort(Generic[Reply]):
         node = bell.node
         factory = node.open_request_response(service, *headers)
         if factory is None or factory.dynamic_config.number_of_servers == 0:
-            raise no_server(node.instance)
+            raise no_server(node, service)
         builder = factory.client_builder().initial_max_slice_len(max(slice_len, 1))
         growth = iox2.AllocationStrategy.PowerOfTwo if grows else iox2.AllocationStrategy.Static
         with guard(f"create a {service} client (are there more than 16 clients?)"):
@@ -241,11 +243,18 @@ class RequestPort(Generic[Reply]):
                 raise ChannelError(f"send a request of {len(payload)} bytes: {error}") from None
 
 
-def no_server(instance: str) -> NoServerError:
-    """The error of an instance that nobody serves."""
+def no_server(node: Node, service: str) -> NoServerError | VersionMismatchError:
+    """The error of an instance that nobody serves, or only in another protocol version."""
+    version = node.other_version(service)
+    if version is not None:
+        return VersionMismatchError(
+            f"protocol version mismatch: the client speaks {wire.VERSION}, the server {version}; "
+            "use a client and a server of one release",
+            version,
+        )
     return NoServerError(
-        f"no server on instance {instance!r}: start one with "
-        f"`emberwatch-server --instance {instance}`"
+        f"no server on instance {node.instance!r}: start one with "
+        f"`emberwatch-server --instance {node.instance}`"
     )
 
 
