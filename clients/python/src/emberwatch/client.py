@@ -499,9 +499,12 @@ def _record(kind: type[_Record], keys: Any) -> _Record:
 
 @cache
 def _types(kind: type[Any]) -> dict[str, Any]:
-    """What each field of a record may be: lists are tuples of anything."""
-    hints = get_type_hints(kind)
-    return {name: tuple if get_origin(hint) is tuple else hint for name, hint in hints.items()}
+    """What each field of a record may be: a tuple of anything, and any number for a float."""
+    wider = {float: int | float}
+    return {
+        name: tuple if get_origin(hint) is tuple else wider.get(hint, hint)
+        for name, hint in get_type_hints(kind).items()
+    }
 
 
 def _release() -> str:
