@@ -33,8 +33,8 @@ def server() -> Iterator[Callable[..., Server]]:
     """Starts a small server, `server(worlds=3, coverage="client")`, that ends with the test."""
     with ExitStack() as stack:
 
-        def start(instance: str | None = None, **settings: object) -> Server:
-            started = Server(instance or unused_instance(), SMALL | settings)
+        def start(instance: str | None = None, *, ready: bool = True, **settings: object) -> Server:
+            started = Server(instance or unused_instance(), SMALL | settings, ready=ready)
             stack.callback(started.close)
             return started
 

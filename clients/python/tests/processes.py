@@ -22,8 +22,8 @@ SMALL = {"height": 5, "width": 7, "moves": 6, "burn_in": 20}
 class Server:
     """A running server and the connections to it."""
 
-    def __init__(self, instance: str, settings: dict[str, object]) -> None:
-        """Starts it and waits until its worlds are ready."""
+    def __init__(self, instance: str, settings: dict[str, object], *, ready: bool) -> None:
+        """Starts it and waits until it answers and, if asked, until its worlds are ready."""
         self.instance = instance
         arguments = {"instance": instance, **settings}
         flags = [f"--{name.replace('_', '-')}={value}" for name, value in arguments.items()]
@@ -33,7 +33,7 @@ class Server:
         self._held.callback(self.wake_up)
         try:
             self._client = self.program.wait_for(self.connect)
-            assert eventually(lambda: not any(w.resetting for w in self.status().worlds))
+            assert not ready or eventually(self._is_ready)
         except BaseException:
             self.close()
             raise
@@ -45,6 +45,9 @@ class Server:
     def status(self) -> ServerStatus:
         """What is going on at it; over a connection of its own, which counts as a client."""
         return self._client.status(timeout=PATIENCE)
+
+    def _is_ready(self) -> bool:
+        return not any(world.resetting for world in self.status().worlds)
 
     def signal(self, number: int) -> None:
         """Sends it a signal."""
