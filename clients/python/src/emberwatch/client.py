@@ -18,7 +18,16 @@ from emberwatch import wire
 from emberwatch.channels import Node
 from emberwatch.errors import InvalidActionError, refusal
 from emberwatch.ports import Bell, RequestPort
-from emberwatch.replies import ServerInfo, ServerStatus, WorldInfo, WorldStatus, ask, items, record
+from emberwatch.replies import (
+    Grant,
+    ServerInfo,
+    ServerStatus,
+    WorldInfo,
+    WorldStatus,
+    ask,
+    record,
+    records,
+)
 from emberwatch.wire import StepAnswer
 
 #: Default timeout of a step, seconds.
@@ -96,7 +105,8 @@ class Client:
             "ttl_millis": None if ttl is None else round(ttl * 1000),
         }
         reply = self.control(request, timeout=timeout)
-        return Lease(self, reply, range(first_world, first_world + n_worlds))
+        worlds = range(first_world, first_world + n_worlds)
+        return Lease(self, record(Grant, reply), records(WorldInfo, reply), worlds)
 
     def observe(
         self, first_world: int = 0, n_worlds: int = 1, *, timeout: float = STEP_TIMEOUT
@@ -107,7 +117,7 @@ class Client:
     def status(self, *, timeout: float = STEP_TIMEOUT) -> ServerStatus:
         """What is going on."""
         reply = self.control({"op": "status"}, timeout=timeout)
-        worlds = tuple(record(WorldStatus, world) for world in items(reply, "worlds"))
+        worlds = records(WorldStatus, reply)
         return record(ServerStatus, {**reply, "worlds": worlds})
 
     def shutdown(self, *, timeout: float = STEP_TIMEOUT) -> None:
@@ -182,6 +192,7 @@ class Client:
         if reply.status != 0:
             raise refusal(reply.status, reply.detail)
         wire.check_answer("answer to step", reply, self._sequence)
+        wire.check_worlds(reply, (first_world, n_worlds, self.info.height, self.info.width))
         return StepAnswer(reply, payload, self.info.n_observations)
 
     def _shake_hands(self, timeout: float) -> ServerInfo:
@@ -197,17 +208,19 @@ class Client:
 class Lease:
     """The right to act on consecutive worlds. Ends by `release`, or leaving its `with`."""
 
-    def __init__(self, client: Client, reply: Mapping[str, Any], worlds: range) -> None:
+    def __init__(
+        self, client: Client, grant: Grant, start: tuple[WorldInfo, ...], worlds: range
+    ) -> None:
         """Made by `Client.acquire`."""
         self.client: Final = client
         #: The server's number for it.
-        self.number: Final = int(reply["lease"])
+        self.number: Final = grant.lease
         #: It ends so many seconds after its last use.
-        self.ttl: Final = reply["ttl_millis"] / 1000
+        self.ttl: Final = grant.ttl_millis / 1000
         #: The worlds it covers.
         self.worlds: Final = worlds
         #: Where they stood when it was given.
-        self.start: Final = tuple(record(WorldInfo, world) for world in items(reply, "worlds"))
+        self.start: Final = start
         self._is_over = False
 
     def step(
@@ -283,8 +296,7 @@ class Lease:
             for world, seed in zip(chosen, given, strict=True)
         ]
         request = {"op": "reset", "lease": self.number, "worlds": pairs}
-        reply = self.client.control(request, timeout=timeout)
-        return tuple(record(WorldInfo, world) for world in items(reply, "worlds"))
+        return records(WorldInfo, self.client.control(request, timeout=timeout))
 
     def renew(self, *, timeout: float = RESET_TIMEOUT) -> None:
         """Starts the lease's clock again without acting."""
@@ -338,7 +350,10 @@ def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]
     Raises:
         InvalidActionError: Naming what was expected and what was got.
     """
-    given = np.asarray(paths)
+    try:
+        given = np.asarray(paths)
+    except (ValueError, OverflowError) as error:
+        raise InvalidActionError(f"action: expected an array of moves, got {error}") from None
     if given.shape != (n_worlds, n_moves) and (n_worlds != 1 or given.shape != (n_moves,)):
         one = f" or ({n_moves},)" if n_worlds == 1 else ""
         raise InvalidActionError(
@@ -346,8 +361,8 @@ def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]
         )
     if given.dtype.kind not in "iu":
         raise InvalidActionError(f"action: expected integers, got {given.dtype}")
-    if (given & ~3).any():
-        where = tuple(int(i) for i in np.argwhere(given & ~3)[0])
+    if given.max(initial=0) >= wire.N_MOVES or given.min(initial=0) < 0:
+        where = tuple(int(i) for i in np.argwhere((given < 0) | (given >= wire.N_MOVES))[0])
         raise InvalidActionError(
             f"action: expected moves 0 to {wire.N_MOVES - 1}, got {given[where]} at {where}"
         )

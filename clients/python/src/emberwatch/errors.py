@@ -197,12 +197,16 @@ def refusal(code: int, detail: int, message: str | None = None) -> RefusedError:
 
 
 def _explain(kind: type[RefusedError], detail: int) -> str:
+    """The server's sentence: on `step` it sends only the code."""
     if kind is LeaseLostError and detail == 0:
         return "lease lost: it expired or was released; acquire the worlds again"
+    if kind is NoSuchWorldError:
+        return f"no such world: the server has worlds 0 to {max(detail - 1, 0)}"
     sentences = {
-        "version_mismatch": "version mismatch: the client speaks 1, the server {}; "
-        "use client and server of one release",
-        "no_such_world": "no such world: the server has {} worlds",
+        "version_mismatch": "protocol version mismatch: the server speaks {}; "
+        "use a client and a server of one release",
+        "unknown_operation": "operation: expected 1 (step) or 2 (observe), got {}",
+        "malformed": "malformed control message",
         "wrong_length": "wrong payload length: expected {} bytes",
         "wrong_path_length": "wrong path length: the server flies {} moves a step",
         "bad_move": "byte {} of the paths: expected a move in 0..=3",
@@ -212,5 +216,8 @@ def _explain(kind: type[RefusedError], detail: int) -> str:
         "resetting": "world {} is being reset; wait for the answer to the reset",
         "episode_over": "world {} was truncated: reset it first",
         "not_permitted": 'full frames need a server with coverage "client" or "full"',
+        "unknown_flags": "flags: expected 0 or 1 (full coverage), got {}",
+        "bad_objective": "objective: expected one below {}",
+        "agent_ends": "the agent ends",
     }
-    return sentences.get(kind.name, kind.name.replace("_", " ") + " (detail {})").format(detail)
+    return sentences[kind.name].format(detail)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, TypeVar, cast
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, TypeVar, cast, get_origin, get_type_hints
 
 from emberwatch import wire
 from emberwatch.errors import GarbledAnswerError, refusal
@@ -80,6 +81,14 @@ class ServerStatus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Grant:
+    """The reply to `acquire`, without its worlds."""
+
+    lease: int
+    ttl_millis: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DecisionsInfo:
     """What an agent that serves decisions says of itself."""
 
@@ -143,41 +152,59 @@ def ask(
     head, payload = port.exchange(header, json.dumps(request).encode(), what, timeout)
     try:
         reply = json.loads(payload)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise GarbledAnswerError(f"answer to {what}: expected JSON, got {error}") from None
     if not isinstance(reply, dict):
         raise GarbledAnswerError(f"answer to {what}: expected an object, got {reply!r}")
     keys = cast("dict[str, Any]", reply)
     if head.status != 0:
-        raise refusal(head.status, int(keys.get("detail", 0)), keys.get("message"))
+        detail, message = keys.get("detail"), keys.get("message")
+        raise refusal(
+            head.status,
+            detail if isinstance(detail, int) else 0,
+            message if isinstance(message, str) else None,
+        )
     wire.check_answer(f"answer to {what}", head, sequence)
     return keys
 
 
-def items(reply: Mapping[str, Any], key: str) -> list[Any]:
-    """The list under a key of a reply.
+def records(kind: type[_Record], reply: Mapping[str, Any]) -> tuple[_Record, ...]:
+    """The records of a reply's worlds.
 
     Raises:
-        GarbledAnswerError: If there is none.
+        GarbledAnswerError: If one is missing or of another type.
     """
-    found = reply.get(key)
-    if not isinstance(found, list):
-        raise GarbledAnswerError(f"reply: expected a list {key!r}, got {found!r}")
-    return cast("list[Any]", found)
+    worlds = reply.get("worlds")
+    if not isinstance(worlds, list):
+        raise GarbledAnswerError(f"reply: expected a list 'worlds', got {worlds!r}")
+    return tuple(record(kind, world) for world in cast("list[Any]", worlds))
 
 
-def record(kind: type[_Record], keys: Mapping[str, Any]) -> _Record:
+def record(kind: type[_Record], keys: Any) -> _Record:
     """A record from a reply; keys that this release does not know are ignored.
 
     Raises:
-        GarbledAnswerError: Naming a key that is missing.
+        GarbledAnswerError: Naming what is missing or of another type.
     """
-    names = [field.name for field in fields(kind)]  # pyright: ignore[reportArgumentType]
-    missing = [name for name in names if name not in keys]
-    if missing:
-        raise GarbledAnswerError(f"reply: expected a key {missing[0]!r}, got {sorted(keys)}")
-    values = {name: keys[name] for name in names}
-    for name, value in values.items():
-        if isinstance(value, list):
-            values[name] = tuple(cast("list[Any]", value))
+    if not isinstance(keys, Mapping):
+        raise GarbledAnswerError(f"reply: expected an object, got {keys!r}")
+    given = cast("Mapping[str, Any]", keys)
+    values: dict[str, Any] = {}
+    for name, types in _types(kind).items():
+        if name not in given:
+            raise GarbledAnswerError(f"reply: expected a key {name!r}, got {sorted(given)}")
+        value = tuple(given[name]) if isinstance(given[name], list) else given[name]
+        if not isinstance(value, types):
+            raise GarbledAnswerError(f"reply: expected another {name!r}, got {value!r}")
+        values[name] = value
     return kind(**values)
+
+
+@cache
+def _types(kind: type[Any]) -> dict[str, Any]:
+    """What each field of a record may be: a tuple of anything, and any number for a float."""
+    wider = {float: int | float}
+    return {
+        name: tuple if get_origin(hint) is tuple else wider.get(hint, hint)
+        for name, hint in get_type_hints(kind).items()
+    }
