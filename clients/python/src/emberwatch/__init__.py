@@ -8,7 +8,7 @@ Importing this package registers its environments with Gymnasium:
 Without Gymnasium, `connect` talks to a running server and `observe` reads what it publishes.
 """
 
-from gymnasium.envs.registration import register
+import gymnasium
 
 from emberwatch.client import Client, Lease, ServerInfo, ServerStatus, WorldInfo, connect
 from emberwatch.env import WildfireEnv
@@ -39,13 +39,13 @@ __all__ = [
 #: Steps after which an episode is truncated, unless `gymnasium.make` is told otherwise.
 MAX_EPISODE_STEPS = 1000
 
-register(  # pyright: ignore[reportUnknownMemberType]
+gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
     "emberwatch/Wildfire-v0",
     entry_point="emberwatch.env:WildfireEnv",
     vector_entry_point="emberwatch.vector_env:WildfireVectorEnv",
     max_episode_steps=MAX_EPISODE_STEPS,
 )
-register(  # pyright: ignore[reportUnknownMemberType]
+gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
     "emberwatch/WildfireMoves-v0",
     entry_point="emberwatch.moves_env:WildfireMovesEnv",
     max_episode_steps=64 * MAX_EPISODE_STEPS,
