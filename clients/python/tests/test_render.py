@@ -1,0 +1,264 @@
+"""Pictures: cells keep their colours, marks stand out, sizes stay, screens are what there is."""
+
+import logging
+import re
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from emberwatch.model import Model
+from emberwatch.render import Palette, Screen, ansi, rgb_array
+
+WILDFIRE = Palette.of(Model.wildfire())
+NORMAL, LATENT, FIRE = WILDFIRE.observations
+DARK, WHITE = (0x14, 0x14, 0x14), (255, 255, 255)
+FRAME = np.array([[0, 255, 255], [2, 1, 255]], np.uint8)
+TRUTH = np.array([[0, 1, 2], [2, 1, 0]], np.uint8)
+PATH = [(0, 0), (1, 0), (1, 1)]
+
+
+def pixel(image: NDArray[np.uint8], row: int, col: int) -> tuple[int, ...]:
+    return tuple(image[row, col].tolist())
+
+
+def draw(**changes: Any) -> NDArray[np.uint8]:
+    usual = {"frame": FRAME, "robot": (1, 1), "palette": WILDFIRE, "path": PATH, "scale": 40}
+    return rgb_array(**{**usual, **changes})
+
+
+def text(**changes: Any) -> str:
+    usual = {"frame": FRAME, "robot": (1, 1), "palette": WILDFIRE, "path": PATH, "color": False}
+    return ansi(**{**usual, **changes})
+
+
+def test_cells_are_squares_of_their_colour() -> None:
+    image = draw()
+    assert image.shape == (80, 120, 3) and image.dtype == np.uint8
+    for row, col, color in ((0, 0, NORMAL), (1, 0, FIRE), (1, 1, LATENT), (0, 2, None)):
+        for down, right in ((0, 0), (0, 39), (39, 0), (39, 39)):
+            at = 40 * row + down, 40 * col + right
+            assert pixel(image, *at) == (color or WILDFIRE.unobserved)
+
+
+def test_the_path_is_a_line_and_ends_in_the_robot() -> None:
+    image = draw()
+    assert pixel(image, 40, 20) == DARK  # between the first two cells
+    assert pixel(image, 20, 20) == WHITE  # where it begins
+    assert pixel(image, 60, 60) == DARK  # the robot's dot
+    assert {DARK, WHITE} <= {pixel(image, 60, col) for col in range(45, 60)}  # and its ring
+    without = draw(path=None)
+    assert pixel(without, 40, 20) == FIRE and pixel(without, 20, 20) == NORMAL
+
+
+def test_a_path_may_begin_in_the_corner() -> None:
+    frame = np.zeros((4, 4), np.uint8)
+    image = draw(frame=frame, robot=(3, 3), path=[(0, 0), (0, 1)], scale=4)
+    assert pixel(image, 0, 0) == WHITE and pixel(image, 3, 3) == DARK
+
+
+def test_odd_pictures_repeat_their_last_row_and_column() -> None:
+    image = draw(frame=np.full((3, 3), 2, np.uint8), robot=(0, 0), path=None, scale=15)
+    assert image.shape == (46, 46, 3)
+    assert pixel(image, 45, 45) == pixel(image, 45, 0) == FIRE
+
+
+def test_small_cells_are_tinted_where_visited() -> None:
+    wide = np.full((2, 40), 255, np.uint8)
+    wide[0] = 2
+    image = draw(frame=wide, robot=(1, 39), path=[(0, 0), (0, 1)], scale=2)
+    tinted, plain = pixel(image, 0, 0), pixel(image, 0, 6)
+    assert plain == FIRE
+    assert all(t > p for t, p in zip(tinted, plain, strict=True)) and tinted != WHITE
+
+
+def test_the_truth_stands_beside_or_below() -> None:
+    image = draw(truth=TRUTH)
+    assert image.shape == (80, 120 + 8 + 120, 3)
+    assert pixel(image, 5, 128 + 45) == LATENT and pixel(image, 5, 128 + 85) == FIRE
+    assert pixel(image, 5, 124) == (0xB4, 0xB4, 0xB4)
+    wide = np.zeros((2, 6), np.uint8)
+    assert draw(frame=wide, truth=wide, scale=10).shape == (20 + 8 + 20, 60, 3)
+
+
+@pytest.mark.parametrize(
+    ("grid", "panel", "both"),
+    [
+        ((64, 64), (512, 512), (512, 1032)),
+        ((7, 5), (518, 370), (518, 748)),
+        ((128, 40), (512, 160), (512, 328)),
+        ((40, 128), (160, 512), (328, 512)),
+        ((1, 1), (512, 512), (512, 1032)),
+        ((600, 601), (600, 602), (600, 1210)),
+    ],
+)
+def test_panels_are_about_512_pixels_and_even(
+    grid: tuple[int, int], panel: tuple[int, int], both: tuple[int, int]
+) -> None:
+    frame = np.full(grid, 255, np.uint8)
+    assert draw(frame=frame, robot=(0, 0), path=None, scale=None).shape[:2] == panel
+    truth = np.zeros(grid, np.uint8)
+    assert draw(frame=frame, robot=(0, 0), path=None, truth=truth, scale=None).shape[:2] == both
+
+
+@settings(deadline=None)
+@given(
+    st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    st.integers(1, 17),
+    st.integers(0, 2**32),
+    st.booleans(),
+)
+def test_sizes_depend_on_the_grid_only(
+    grid: tuple[int, int], scale: int, key: int, with_truth: bool
+) -> None:
+    rng = np.random.default_rng(key)
+    moves = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])[rng.integers(0, 4, 30)]
+    cells = [np.array([rng.integers(side) for side in grid])]
+    for move in moves:
+        cells.append(np.clip(cells[-1] + move, 0, np.array(grid) - 1))
+    frame = rng.choice(np.array([0, 1, 2, 255], np.uint8), grid)
+    truth = rng.integers(0, 3, grid).astype(np.uint8) if with_truth else None
+    robot = (int(cells[-1][0]), int(cells[-1][1]))
+    full = draw(frame=frame, robot=robot, path=np.array(cells), truth=truth, scale=scale)
+    unobserved = np.full(grid, 255, np.uint8)
+    empty = draw(frame=unobserved, robot=(0, 0), path=None, truth=truth, scale=scale)
+    assert full.shape == empty.shape
+    assert full.shape[0] % 2 == full.shape[1] % 2 == 0
+
+
+def test_drawing_changes_no_argument() -> None:
+    frame, truth, path = FRAME.copy(), TRUTH.copy(), np.array(PATH)
+    draw(frame=frame, truth=truth, path=path, scale=2)
+    text(frame=frame, truth=truth, path=path, color=True)
+    assert (frame == FRAME).all() and (truth == TRUTH).all() and (path == PATH).all()
+
+
+@pytest.mark.parametrize("picture", [draw, text])
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"frame": FRAME[0]}, r"frame: expected shape \(H, W\)"),
+        ({"truth": TRUTH[:1]}, r"truth: expected shape \(2, 3\), got \(1, 3\)"),
+        ({"robot": (2, 0)}, r"robot: expected cells of a \(2, 3\) grid, got \(2, 0\)"),
+        ({"path": [(0, 0), (-1, 0)]}, r"path: expected cells .* got \(-1, 0\)"),
+        ({"path": [(0, 0), (1, 1)]}, "path: expected neighbours"),
+        ({"frame": FRAME + np.uint8(3)}, "expected values out of .0, 1, 2, 255., got 3"),
+        ({"truth": TRUTH + np.uint8(3)}, "expected values out of .0, 1, 2., got 3"),
+    ],
+)
+def test_what_does_not_fit_is_refused(picture: Any, changes: Any, expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
+        picture(**changes)
+    with pytest.raises(ValueError, match="scale: expected at least 1 pixel, got 0"):
+        draw(scale=0)
+
+
+def test_a_palette_keeps_grey_and_path_apart_from_the_model() -> None:
+    assert (WILDFIRE.unobserved, WILDFIRE.path) == ((0x30,) * 3, DARK)
+    toml = Model.wildfire().toml
+    dark = Model.from_toml(re.sub(r"#\w{6}\"", '#202028"', toml))
+    assert Palette.of(dark).unobserved == (0x60,) * 3
+    assert Palette.of(dark).path == WHITE
+
+
+def test_a_hidden_model_has_colours_too() -> None:
+    palette = Palette.of(3)
+    assert palette.observations == WILDFIRE.observations
+    draw(palette=palette, truth=TRUTH + np.uint8(60))
+    assert len(set(Palette.of(8).observations)) == 8
+
+
+def test_ascii_shows_values_path_and_robot() -> None:
+    assert text().split("\n") == ["0*. .", "2*1@."]
+    assert text(truth=TRUTH).split("\n") == ["0*. .   0 1 2", "2*1@.   2 1@0"]
+    assert text(path=None).isascii()
+    many = Palette.of(64)
+    assert text(palette=many, frame=FRAME + np.uint8(10), path=None).startswith("A 9 9")
+
+
+def test_colours_are_written_where_they_change() -> None:
+    grey, normal = "48;2;48;48;48m", "48;2;59;110;165m"
+    first, second = text(color=True).split("\n")
+    assert first == f"\x1b[38;2;255;255;255;{normal}··\x1b[38;2;255;255;255;{grey}    \x1b[0m"
+    assert second.count("\x1b") == 4 and "()" in second
+    assert text(color=True, truth=TRUTH).count("()") == 2
+
+
+def test_tall_grids_take_half_the_lines() -> None:
+    tall = np.full((41, 3), 255, np.uint8)
+    tall[1] = 2
+    lines = text(frame=tall, robot=(0, 0), path=None, color=True).split("\n")
+    assert len(lines) == 21
+    assert lines[0].startswith("\x1b[38;2;255;255;255;48;2;200;55;27m▀")
+    assert lines[-1] == "\x1b[38;2;48;48;48;49m▀▀▀\x1b[0m"
+    even = text(frame=tall[:40], robot=(0, 0), path=None, color=True).split("\n")
+    assert even == lines[:20]
+
+
+@pytest.fixture
+def headless(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def test_a_window_shows_the_picture(headless: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    pygame = pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    screen = Screen(title="test")
+    assert screen.kind == "window"
+    for image in (draw(), draw(truth=TRUTH)):
+        screen.show(image)
+        shown = pygame.surfarray.array3d(pygame.display.get_surface()).transpose(1, 0, 2)
+        assert (shown == image).all()
+    with pytest.raises(TypeError, match="expected an array"):
+        screen.show("picture")
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    screen.show(draw())
+    assert screen.kind == "nothing" and not pygame.display.get_init()
+    screen.show(draw())
+    screen.close()
+    screen.close()
+
+
+def test_a_terminal_shows_the_text_in_place(
+    headless: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    screen = Screen()
+    assert screen.kind == "terminal"
+    screen.show("first")
+    screen.show("second")
+    with pytest.raises(TypeError, match="expected a text"):
+        screen.show(draw())
+    screen.close()
+    screen.show("third")
+    shown = "\x1b[2J\x1b[Hfirst\x1b[K\n\x1b[J\x1b[Hsecond\x1b[K\n\x1b[J"
+    assert capsys.readouterr().out == shown
+
+
+def test_nowhere_to_show_is_said_once(headless: None, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        screen = Screen(fps=0.001)
+        screen.show("picture")
+        screen.show(draw())
+        screen.close()
+    assert screen.kind == "nothing"
+    assert [record.message for record in caplog.records] == [
+        "render_mode 'human' shows nothing: there is no display with pygame installed, and the "
+        "output is no terminal; use 'rgb_array' or 'ansi' to get pictures"
+    ]
+
+
+def test_pictures_keep_their_pace(headless: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[float] = []
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setattr("time.sleep", waits.append)
+    monkeypatch.setattr("time.monotonic", lambda: 50.0)
+    screen = Screen(fps=4.0)
+    for _ in range(3):
+        screen.show("picture")
+    assert waits == [0.0, 0.25, 0.5]
