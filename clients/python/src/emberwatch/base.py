@@ -14,6 +14,10 @@ from emberwatch.session import Session, Settings, draw_seed
 from emberwatch.view import RENDER_FPS, RENDER_MODES, View
 from emberwatch.wire import StepAnswer, StepResult
 
+NOTHING_TO_DRAW: Final = (
+    "render: nothing to draw; give a render_mode to gymnasium.make and reset first"
+)
+
 
 class WorldEnv(gymnasium.Env[Any, Any]):
     """One world of a private or a running server."""
@@ -51,9 +55,7 @@ class WorldEnv(gymnasium.Env[Any, Any]):
     def render(self) -> Any:
         """Draws the last frame, path and robot, beside the truth when that is revealed."""
         if self.render_mode is None or not self._session.is_open:
-            gymnasium.logger.warn(
-                "render: nothing to draw; give a render_mode to gymnasium.make and reset first"
-            )
+            gymnasium.logger.warn(NOTHING_TO_DRAW)
             return None
         return None if self.render_mode == "human" else self._draw()
 
