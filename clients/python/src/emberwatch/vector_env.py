@@ -169,8 +169,13 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         flown = ~over if over.any() else np.ones(self.num_envs, np.bool_)
         return self._outcome(flown)
 
-    def render(self) -> tuple[Any, ...]:
+    def render(self) -> tuple[Any, ...] | None:
         """The picture of each world, as `WildfireEnv.render` draws it."""
+        if self.render_mode is None or not self._session.is_open:
+            gymnasium.logger.warn(NOTHING_TO_DRAW)
+            return None
+        if self.render_mode == "human":
+            return (None,) * self.num_envs
         return tuple(self._draw(index) for index in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -208,7 +213,7 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         self._elapsed[chosen] = 0
         self._over = self._over.copy()
         self._over[chosen] = False
-        self._observations.began(chosen)
+        self._observations.began(chosen, self._frames)
         for index in chosen:
             self._paths[index] = None
 
@@ -252,7 +257,8 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         observations = np.full(self.num_envs, None, dtype=object)
         for index in np.flatnonzero(over):
             row, col = int(self._results["row"][index]), int(self._results["col"][index])
-            observations[index] = self._observations.one(self._frames[index], row, col, int(index))
+            frame = self._frames[index].copy()
+            observations[index] = self._observations.one(frame, row, col, int(index))
         return {
             "final_obs": observations,
             "_final_obs": over.copy(),
@@ -276,7 +282,9 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         if self.render_mode == "human":
             for index in range(self.num_envs):
                 self._draw(index)
-        return self._observations.all(self._frames, robots)
+        # Pictures come from the frames that the learner, who may write to his, does not have.
+        frames = self._frames if self.render_mode is None else self._frames.copy()
+        return self._observations.all(frames, robots)
 
     def _draw(self, index: int) -> Any:
         robot = (int(self._results["row"][index]), int(self._results["col"][index]))
