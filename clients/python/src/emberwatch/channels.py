@@ -99,6 +99,15 @@ class Node:
                 return None
             raise ChannelError(f"open {service} on instance {self.instance!r}: {error}") from None
 
+    def other_version(self, service: str) -> int | None:
+        """The protocol version of a server on the instance that speaks another one, if any."""
+        with guard("list the services"):
+            services = iox2.Service.list(_config(), iox2.ServiceType.Ipc)
+        pattern = re.compile(rf"emberwatch/v(\d+)/{self.instance}/{service}")
+        found = (pattern.fullmatch(details.name().to_string()) for details in services)
+        versions = {int(match[1]) for match in found if match}
+        return max(versions - {wire.VERSION}, default=None)
+
     def open_publications(
         self, service: str, header: type[wire.Header], readers: int, buffer: int
     ) -> Any:

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
-from typing import Any, Final, Self, TypeVar, cast
+from typing import Any, Final, Self, TypeVar, cast, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -96,6 +97,14 @@ class ServerStatus:
     worlds: tuple[WorldStatus, ...]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Grant:
+    """The reply to `acquire`, without its worlds."""
+
+    lease: int
+    ttl_millis: int
+
+
 class Client:
     """A connection to one server. Make it with `connect`; close it, or use it in a `with`."""
 
@@ -164,7 +173,8 @@ class Client:
             "ttl_millis": None if ttl is None else round(ttl * 1000),
         }
         reply = self.control(request, timeout=timeout)
-        return Lease(self, reply, range(first_world, first_world + n_worlds))
+        worlds = range(first_world, first_world + n_worlds)
+        return Lease(self, _record(_Grant, reply), _records(WorldInfo, reply), worlds)
 
     def observe(
         self, first_world: int = 0, n_worlds: int = 1, *, timeout: float = STEP_TIMEOUT
@@ -175,7 +185,7 @@ class Client:
     def status(self, *, timeout: float = STEP_TIMEOUT) -> ServerStatus:
         """What is going on."""
         reply = self.control({"op": "status"}, timeout=timeout)
-        worlds = tuple(_record(WorldStatus, world) for world in _list(reply, "worlds"))
+        worlds = _records(WorldStatus, reply)
         return _record(ServerStatus, {**reply, "worlds": worlds})
 
     def shutdown(self, *, timeout: float = STEP_TIMEOUT) -> None:
@@ -250,6 +260,7 @@ class Client:
         if reply.status != 0:
             raise refusal(reply.status, reply.detail)
         wire.check_answer("answer to step", reply, self._sequence)
+        wire.check_worlds(reply, (first_world, n_worlds, self.info.height, self.info.width))
         return StepAnswer(reply, payload, self.info.n_observations)
 
     def _shake_hands(self, timeout: float) -> ServerInfo:
@@ -259,24 +270,25 @@ class Client:
             "client": f"emberwatch-python {_release()}",
         }
         reply = self.control(hello, timeout=timeout)
-        reply["observations"] = tuple(_list(reply, "observations"))
         return _record(ServerInfo, reply)
 
 
 class Lease:
     """The right to act on consecutive worlds. Ends by `release`, or leaving its `with`."""
 
-    def __init__(self, client: Client, reply: Mapping[str, Any], worlds: range) -> None:
+    def __init__(
+        self, client: Client, grant: _Grant, start: tuple[WorldInfo, ...], worlds: range
+    ) -> None:
         """Made by `Client.acquire`."""
         self.client: Final = client
         #: The server's number for it.
-        self.number: Final = int(reply["lease"])
+        self.number: Final = grant.lease
         #: It ends so many seconds after its last use.
-        self.ttl: Final = reply["ttl_millis"] / 1000
+        self.ttl: Final = grant.ttl_millis / 1000
         #: The worlds it covers.
         self.worlds: Final = worlds
         #: Where they stood when it was given.
-        self.start: Final = tuple(_record(WorldInfo, world) for world in _list(reply, "worlds"))
+        self.start: Final = start
         self._is_over = False
 
     def step(
@@ -352,8 +364,7 @@ class Lease:
             for world, seed in zip(chosen, given, strict=True)
         ]
         request = {"op": "reset", "lease": self.number, "worlds": pairs}
-        reply = self.client.control(request, timeout=timeout)
-        return tuple(_record(WorldInfo, world) for world in _list(reply, "worlds"))
+        return _records(WorldInfo, self.client.control(request, timeout=timeout))
 
     def renew(self, *, timeout: float = RESET_TIMEOUT) -> None:
         """Starts the lease's clock again without acting."""
@@ -407,7 +418,10 @@ def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]
     Raises:
         InvalidActionError: Naming what was expected and what was got.
     """
-    given = np.asarray(paths)
+    try:
+        given = np.asarray(paths)
+    except (ValueError, OverflowError) as error:
+        raise InvalidActionError(f"action: expected an array of moves, got {error}") from None
     if given.shape != (n_worlds, n_moves) and (n_worlds != 1 or given.shape != (n_moves,)):
         one = f" or ({n_moves},)" if n_worlds == 1 else ""
         raise InvalidActionError(
@@ -415,8 +429,8 @@ def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]
         )
     if given.dtype.kind not in "iu":
         raise InvalidActionError(f"action: expected integers, got {given.dtype}")
-    if (given & ~3).any():
-        where = tuple(int(i) for i in np.argwhere(given & ~3)[0])
+    if given.max(initial=0) >= wire.N_MOVES or given.min(initial=0) < 0:
+        where = tuple(int(i) for i in np.argwhere((given < 0) | (given >= wire.N_MOVES))[0])
         raise InvalidActionError(
             f"action: expected moves 0 to {wire.N_MOVES - 1}, got {given[where]} at {where}"
         )
@@ -443,34 +457,51 @@ def ask(
     head, payload = port.exchange(header, json.dumps(request).encode(), what, timeout)
     try:
         reply = json.loads(payload)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise GarbledAnswerError(f"answer to {what}: expected JSON, got {error}") from None
     if not isinstance(reply, dict):
         raise GarbledAnswerError(f"answer to {what}: expected an object, got {reply!r}")
     keys = cast("dict[str, Any]", reply)
     if head.status != 0:
-        raise refusal(head.status, int(keys.get("detail", 0)), keys.get("message"))
+        detail, message = keys.get("detail"), keys.get("message")
+        raise refusal(
+            head.status,
+            detail if isinstance(detail, int) else 0,
+            message if isinstance(message, str) else None,
+        )
     wire.check_answer(f"answer to {what}", head, sequence)
     return keys
 
 
-def _list(reply: Mapping[str, Any], key: str) -> list[Any]:
-    found = reply.get(key)
-    if not isinstance(found, list):
-        raise GarbledAnswerError(f"reply: expected a list {key!r}, got {found!r}")
-    return cast("list[Any]", found)
+def _records(kind: type[_Record], reply: Mapping[str, Any]) -> tuple[_Record, ...]:
+    """The records of a reply's worlds."""
+    worlds = reply.get("worlds")
+    if not isinstance(worlds, list):
+        raise GarbledAnswerError(f"reply: expected a list 'worlds', got {worlds!r}")
+    return tuple(_record(kind, world) for world in cast("list[Any]", worlds))
 
 
-def _record(kind: type[_Record], keys: Mapping[str, Any]) -> _Record:
+def _record(kind: type[_Record], keys: Any) -> _Record:
     """A record from a reply; keys that this release does not know are ignored."""
-    names = [field.name for field in fields(kind)]  # pyright: ignore[reportArgumentType]
-    missing = [name for name in names if name not in keys]
-    if missing:
-        raise GarbledAnswerError(f"reply: expected a key {missing[0]!r}, got {sorted(keys)}")
-    values = {name: keys[name] for name in names}
-    if "robot" in values:
-        values["robot"] = tuple(values["robot"])
+    if not isinstance(keys, Mapping):
+        raise GarbledAnswerError(f"reply: expected an object, got {keys!r}")
+    given = cast("Mapping[str, Any]", keys)
+    values: dict[str, Any] = {}
+    for name, types in _types(kind).items():
+        if name not in given:
+            raise GarbledAnswerError(f"reply: expected a key {name!r}, got {sorted(given)}")
+        value = tuple(given[name]) if isinstance(given[name], list) else given[name]
+        if not isinstance(value, types):
+            raise GarbledAnswerError(f"reply: expected another {name!r}, got {value!r}")
+        values[name] = value
     return kind(**values)
+
+
+@cache
+def _types(kind: type[Any]) -> dict[str, Any]:
+    """What each field of a record may be: lists are tuples of anything."""
+    hints = get_type_hints(kind)
+    return {name: tuple if get_origin(hint) is tuple else hint for name, hint in hints.items()}
 
 
 def _release() -> str:

@@ -207,16 +207,7 @@ class TruthReader(_Reader):
         sample = self._sample(timeout)
         if sample is None:
             return None
-        header, payload, n_lost = sample
-        _check_length(len(payload), header.height * header.width)
-        return Truth(
-            world=header.world,
-            episode=header.episode,
-            step=header.step,
-            seed=header.seed,
-            states=np.frombuffer(payload, np.uint8).reshape(header.height, header.width),
-            n_lost=n_lost,
-        )
+        return _truth(*sample)
 
 
 def observe(
@@ -250,6 +241,18 @@ def _frame(header: Any, payload: bytearray, n_lost: int) -> Frame:
         frame=np.frombuffer(payload, np.uint8, n_cells).reshape(header.height, header.width),
         path=np.frombuffer(payload, np.uint8, offset=n_cells),
         start=(header.start_row, header.start_col),
+        n_lost=n_lost,
+    )
+
+
+def _truth(header: Any, payload: bytearray, n_lost: int) -> Truth:
+    _check_length(len(payload), header.height * header.width)
+    return Truth(
+        world=header.world,
+        episode=header.episode,
+        step=header.step,
+        seed=header.seed,
+        states=np.frombuffer(payload, np.uint8).reshape(header.height, header.width),
         n_lost=n_lost,
     )
 

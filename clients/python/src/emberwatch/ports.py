@@ -19,6 +19,7 @@ from emberwatch.errors import (
     NoServerError,
     RequestTimeoutError,
     ServerGoneError,
+    VersionMismatchError,
 )
 
 Reply = TypeVar("Reply", bound=wire.Header)
@@ -87,6 +88,10 @@ class Bell:
             self._process = None
         self.ring = self._listener = None
 
+    def has_ended(self) -> bool:
+        """Whether the process that is watched has ended."""
+        return self._process is not None and bool(self._poll.poll(0))
+
     def gone(self) -> ServerGoneError:
         """The error of a server that has ended; clears away what it left."""
         self.node.clean_up()
@@ -117,12 +122,12 @@ class Bell:
 
     def _sleep(self, pending: Any, what: str, timeout: float, start: float) -> Any:
         while True:
-            has_ended = self._has_ended(pending)
+            is_gone = self._is_gone(pending)
             # In this order: an answer may have come just before the end.
             response = pending.receive()
             if response is not None:
                 return response
-            if has_ended:
+            if is_gone:
                 raise self.gone()
             remaining = start + timeout - time.perf_counter()
             if remaining <= 0:
@@ -139,9 +144,9 @@ class Bell:
                 if "Interrupt" not in str(error):
                     raise ChannelError(f"wait for the server: {error}") from None
 
-    def _has_ended(self, pending: Any) -> bool:
+    def _is_gone(self, pending: Any) -> bool:
         if self._process is not None:
-            return bool(self._poll.poll(0)) or not pending.is_connected
+            return self.has_ended() or not pending.is_connected
         if time.perf_counter() >= self._next_clean_up:
             self.node.clean_up()
             self._next_clean_up = time.perf_counter() + _CLEAN_UP
@@ -171,6 +176,7 @@ class RequestPort(Generic[Reply]):
 
         Raises:
             NoServerError: If nobody serves it.
+            VersionMismatchError: If somebody does, but in another protocol version.
             ChannelError: If iceoryx2 fails, also when there are too many clients.
         """
         self._bell = bell
@@ -180,7 +186,7 @@ class RequestPort(Generic[Reply]):
         node = bell.node
         factory = node.open_request_response(service, *headers)
         if factory is None or factory.dynamic_config.number_of_servers == 0:
-            raise no_server(node.instance)
+            raise no_server(node, service)
         builder = factory.client_builder().initial_max_slice_len(max(slice_len, 1))
         growth = iox2.AllocationStrategy.PowerOfTwo if grows else iox2.AllocationStrategy.Static
         with guard(f"create a {service} client (are there more than 16 clients?)"):
@@ -202,16 +208,23 @@ class RequestPort(Generic[Reply]):
             ChannelError: If iceoryx2 fails.
         """
         self._bell.node.check()
-        pending = self._send(header, payload)
-        if pending.number_of_server_connections == 0:
+        if self._bell.has_ended():
+            # A new server on the instance would take the request, but knows nothing of it.
             raise self._bell.gone()
-        self._bell.ring()
-        response = self._bell.wait(pending, what, timeout)
-        reply = self._reply.from_buffer_copy(
-            ctypes.string_at(response.user_header_ptr, self._reply_bytes)
-        )
-        length = response.payload().len()
-        return reply, bytearray(_array(length).from_address(response.payload_ptr))
+        pending = self._send(header, payload)
+        try:
+            if pending.number_of_server_connections == 0:
+                raise self._bell.gone()
+            self._bell.ring()
+            response = self._bell.wait(pending, what, timeout)
+            reply = self._reply.from_buffer_copy(
+                ctypes.string_at(response.user_header_ptr, self._reply_bytes)
+            )
+            length = response.payload().len()
+            return reply, bytearray(_array(length).from_address(response.payload_ptr))
+        finally:
+            # The traceback of an error keeps `pending` alive, but the next request needs its place.
+            pending.delete()
 
     def _send(self, header: bytes, payload: bytes) -> Any:
         give_up = time.perf_counter() + _LET_GO
@@ -230,11 +243,18 @@ class RequestPort(Generic[Reply]):
                 raise ChannelError(f"send a request of {len(payload)} bytes: {error}") from None
 
 
-def no_server(instance: str) -> NoServerError:
-    """The error of an instance that nobody serves."""
+def no_server(node: Node, service: str) -> NoServerError | VersionMismatchError:
+    """The error of an instance that nobody serves, or only in another protocol version."""
+    version = node.other_version(service)
+    if version is not None:
+        return VersionMismatchError(
+            f"protocol version mismatch: the client speaks {wire.VERSION}, the server {version}; "
+            "use a client and a server of one release",
+            version,
+        )
     return NoServerError(
-        f"no server on instance {instance!r}: start one with "
-        f"`emberwatch-server --instance {instance}`"
+        f"no server on instance {node.instance!r}: start one with "
+        f"`emberwatch-server --instance {node.instance}`"
     )
 
 

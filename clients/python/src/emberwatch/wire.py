@@ -207,6 +207,10 @@ class StepAnswer:
             GarbledAnswerError: If its length or a value of a frame is impossible.
         """
         n_worlds, height, width = reply.n_worlds, reply.height, reply.width
+        if not n_worlds * height * width:
+            raise GarbledAnswerError(
+                f"answer to step: expected worlds, got {n_worlds} of {height} x {width} cells"
+            )
         expected = n_worlds * (RESULT.size + height * width)
         if len(payload) != expected:
             raise GarbledAnswerError(
@@ -240,6 +244,19 @@ def check_frame(values: NDArray[np.uint8], n_observations: int) -> None:
     if highest > n_observations:
         raise GarbledAnswerError(
             f"frame: expected observations below {n_observations} or 255, got {highest - 1}"
+        )
+
+
+def check_worlds(reply: StepReply, expected: tuple[int, int, int, int]) -> None:
+    """Refuses an answer about other worlds, or of another size: first, number, height, width.
+
+    Raises:
+        GarbledAnswerError: Naming both.
+    """
+    got = (reply.first_world, reply.n_worlds, reply.height, reply.width)
+    if got != expected:
+        raise GarbledAnswerError(
+            f"answer to step: expected first world, worlds, height, width {expected}, got {got}"
         )
 
 
