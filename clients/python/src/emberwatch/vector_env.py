@@ -42,6 +42,7 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
     * `max_episode_steps`: truncate after so many steps; None or -1: never.
     * `autoreset_mode`: a `gymnasium.vector.AutoresetMode`; `NEXT_STEP` by default.
     * `world`: the first world; the others follow.
+    * `render_mode`: `"human"` shows the first world only.
     """
 
     def __init__(
@@ -280,8 +281,7 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
     def _seen(self) -> Any:
         robots = np.stack((self._results["row"], self._results["col"]), axis=1).astype(np.int64)
         if self.render_mode == "human":
-            for index in range(self.num_envs):
-                self._draw(index)
+            self._draw(0)
         # Pictures come from the frames that the learner, who may write to his, does not have.
         frames = self._frames if self.render_mode is None else self._frames.copy()
         return self._observations.all(frames, robots)
