@@ -38,6 +38,9 @@ from emberwatch.wire import StepAnswer
 _LEASE: Final = 3600.0
 _PRIVATE_LEASE: Final = 86400.0
 
+#: How long a private server may take to answer that it ends, seconds.
+_FAREWELL: Final = 0.5
+
 #: Longest side of a grid and longest path of any server (PROTOCOL.md section 1).
 _MAX_SIDE: Final = 4096
 _MAX_MOVES: Final = 4096
@@ -241,11 +244,14 @@ class Session:
         self._is_lost = False
         if truth is not None:
             truth.close()
-        if lease is not None and program is None:
-            try:
+        try:
+            if program is not None and client is not None:
+                # A server asked ends at once, one that gets a signal when it next looks around.
+                client.shutdown(timeout=min(self.settings.timeout, _FAREWELL))
+            elif lease is not None:
                 lease.release(timeout=self.settings.timeout)
-            except EmberwatchError:
-                pass  # lost, or the server is gone: nothing is held any more
+        except EmberwatchError:
+            pass  # lost, or the server is gone: nothing is held any more
         if client is not None:
             client.close()
         if program is not None:
