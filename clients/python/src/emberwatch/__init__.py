@@ -8,7 +8,7 @@ Importing this package registers its environments with Gymnasium:
 Without Gymnasium, `connect` talks to a running server and `observe` reads what it publishes.
 """
 
-from gymnasium.envs.registration import register  # pyright: ignore[reportUnknownVariableType]
+import gymnasium
 
 from emberwatch.client import Client, Lease, connect
 from emberwatch.decisions import Decisions
@@ -46,18 +46,18 @@ __all__ = [
 #: Steps after which an episode is truncated, unless `gymnasium.make` is told otherwise.
 MAX_EPISODE_STEPS = 1000
 
-register(
+gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
     "emberwatch/Wildfire-v0",
     entry_point="emberwatch.env:WildfireEnv",
     vector_entry_point="emberwatch.vector_env:WildfireVectorEnv",
     max_episode_steps=MAX_EPISODE_STEPS,
 )
-register(
+gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
     "emberwatch/WildfireMoves-v0",
     entry_point="emberwatch.moves_env:WildfireMovesEnv",
     max_episode_steps=64 * MAX_EPISODE_STEPS,
 )
-register(
+gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
     "emberwatch/WildfireObjective-v0",
     entry_point="emberwatch.objective_env:WildfireObjectiveEnv",
     max_episode_steps=MAX_EPISODE_STEPS,

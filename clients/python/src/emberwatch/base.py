@@ -14,6 +14,10 @@ from emberwatch.session import Session, Settings, draw_seed
 from emberwatch.view import RENDER_FPS, RENDER_MODES, View
 from emberwatch.wire import StepAnswer, StepResult
 
+NOTHING_TO_DRAW: Final = (
+    "render: nothing to draw; give a render_mode to gymnasium.make and reset first"
+)
+
 
 class WorldEnv(gymnasium.Env[Any, Any]):
     """One world of a private or a running server."""
@@ -50,8 +54,8 @@ class WorldEnv(gymnasium.Env[Any, Any]):
 
     def render(self) -> Any:
         """Draws the last frame, path and robot, beside the truth when that is revealed."""
-        if self.render_mode is None:
-            gymnasium.logger.warn("render: expected a render_mode, given to gymnasium.make")
+        if self.render_mode is None or not self._is_open():
+            gymnasium.logger.warn(NOTHING_TO_DRAW)
             return None
         return None if self.render_mode == "human" else self._draw()
 
@@ -59,6 +63,10 @@ class WorldEnv(gymnasium.Env[Any, Any]):
         """Gives the world back; a private server stops. Again is fine."""
         self._session.close()
         self._view.close()
+
+    def _is_open(self) -> bool:
+        """Whether there has been a reset since it was made or closed."""
+        return self._session.is_open
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None) -> StepAnswer:
         """Begins an episode, or goes on from where the world stands."""

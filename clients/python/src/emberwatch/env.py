@@ -13,7 +13,7 @@ from emberwatch.client import as_moves
 from emberwatch.observations import Observations, Parts
 from emberwatch.session import Settings, WorldArguments
 from emberwatch.view import fly
-from emberwatch.wire import StepAnswer
+from emberwatch.wire import StepAnswer, StepResult
 
 
 class WildfireEnv(WorldEnv):
@@ -45,7 +45,7 @@ class WildfireEnv(WorldEnv):
     |---|---|---|
     | `frame` | `Box(0, 255, (H, W, 1), uint8)` | what was observed; 255 where nothing was |
     | `robot` | `MultiDiscrete([H, W])` | the robot's row and column |
-    | `age` | `Box(0, 255, (H, W, 1), uint8)` | steps since a cell was seen; 255: never, or more |
+    | `age` | `Box(0, 255, (H, W, 1), uint8)` | steps since it was seen; 255: never, or as many |
 
     ## Rewards
 
@@ -125,9 +125,9 @@ class WildfireEnv(WorldEnv):
             BusyError: If another client holds the world of a running server.
             SettingError: If an option is unknown.
         """
-        self._answer = self._begin(seed, options)
-        self._observations.began([0])
-        return self._seen(self._answer)
+        self._answer = answer = self._begin(seed, options)
+        self._observations.began([0], answer.frames)
+        return self._seen(answer, answer.result())
 
     def step(
         self, action: NDArray[np.integer[Any]]
@@ -143,19 +143,22 @@ class WildfireEnv(WorldEnv):
         before, answer = self._answer, self._session.step(moves)
         self._answer = answer
         self._observations.note(answer, 0)
+        result = answer.result()
         if self.render_mode is not None and before is not None:
             start = before.result()
             self._path = fly((start.row, start.col), moves.reshape(-1), self._shape)
-        result = answer.result()
-        observation, info = self._seen(answer)
+        observation, info = self._seen(answer, result)
         return observation, result.reward, bool(result.terminated), bool(result.truncated), info
 
-    def _seen(self, answer: StepAnswer) -> tuple[Any, dict[str, Any]]:
-        result = answer.result()
+    def _seen(self, answer: StepAnswer, result: StepResult) -> tuple[Any, dict[str, Any]]:
         info = self._describe(answer, result)
+        frame = answer.frames[0]
+        if self.render_mode is not None:
+            # Pictures come from the frame that the learner, who may write to his, does not have.
+            frame = frame.copy()
         if self.render_mode == "human":
             self._draw()
-        return self._observations.one(answer.frames[0], result.row, result.col), info
+        return self._observations.one(frame, result.row, result.col), info
 
     def _draw(self) -> Any:
         if self._answer is None:

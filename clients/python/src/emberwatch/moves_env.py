@@ -108,7 +108,8 @@ class WildfireMovesEnv(WorldEnv):
         # Frames and ages change with each path only.
         self._observations = Observations(("frame", "robot", "age"), shape)
         image = self._observations.spaces["frame"]
-        known = self._observations.spaces | {
+        known: dict[str, spaces.Space[Any]] = {
+            **self._observations.spaces,
             "visited": image,
             "move": spaces.Discrete(shape.n_moves),
         }
@@ -131,7 +132,7 @@ class WildfireMovesEnv(WorldEnv):
             SettingError: If an option is unknown.
         """
         answer = self._begin(seed, options)
-        self._observations.began([0])
+        self._observations.began([0], answer.frames)
         self._begin_path(answer)
         return self._seen(answer)
 

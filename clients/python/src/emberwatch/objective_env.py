@@ -182,6 +182,9 @@ class WildfireObjectiveEnv(WorldEnv):
             agent.stop()
         super().close()
 
+    def _is_open(self) -> bool:
+        return self._decisions is not None
+
     def _open(self, seed: int | None) -> Decisions:
         """Starts what is missing: server, agent, readers."""
         if self._decisions is not None:

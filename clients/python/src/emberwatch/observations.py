@@ -47,10 +47,17 @@ class Observations:
         self.has_age: Final = "age" in self._names
         self._ages = np.full((n_worlds, shape.height, shape.width), MAX_AGE, np.uint8)
 
-    def began(self, indices: Sequence[int]) -> None:
-        """Forgets the ages of worlds whose episode has begun."""
+    def began(self, indices: Sequence[int], frames: NDArray[np.uint8]) -> None:
+        """Forgets the ages of worlds whose episode has begun, or been resumed with a frame.
+
+        Args:
+            indices: The worlds.
+            frames: The frames of all worlds, `(n_worlds, H, W)`.
+        """
         if self.has_age:
-            self._ages[list(indices)] = MAX_AGE
+            chosen = list(indices)
+            is_seen = frames[chosen] != wire.UNOBSERVED
+            self._ages[chosen] = np.where(is_seen, np.uint8(0), np.uint8(MAX_AGE))
 
     def note(self, answer: StepAnswer, first: int) -> None:
         """Keeps ages up to date: one more step in the worlds of an answer."""

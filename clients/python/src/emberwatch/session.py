@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import time
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch import wire
-from emberwatch.client import RESET_TIMEOUT, STEP_TIMEOUT, Client, Lease
+from emberwatch.client import RESET_TIMEOUT, STEP_TIMEOUT, Client, Lease, ServerInfo
 from emberwatch.errors import (
     ClosedError,
     EmberwatchError,
@@ -33,8 +34,16 @@ from emberwatch.programs import Program, unused_instance
 from emberwatch.wire import StepAnswer
 
 #: A lease of an environment ends this long after its last use, seconds: learners may think long,
-#: and a dead holder is noticed at once anyway.
+#: and a dead holder is noticed at once anyway. Of a private server nobody else wants the worlds.
 _LEASE: Final = 3600.0
+_PRIVATE_LEASE: Final = 86400.0
+
+#: How long a private server may take to answer that it ends, seconds.
+_FAREWELL: Final = 0.5
+
+#: Longest side of a grid and longest path of any server (PROTOCOL.md section 1).
+_MAX_SIDE: Final = 4096
+_MAX_MOVES: Final = 4096
 
 #: Seeds drawn for resets stay below this, which every JSON reader holds (PROTOCOL.md section 2).
 SEEDS: Final = 2**53
@@ -60,7 +69,6 @@ class WorldArguments(TypedDict, total=False):
 class Settings:
     """The same with defaults. None: the default, or for a running server whatever it has."""
 
-    n_worlds: int = 1
     instance: str | None = None
     world: int = 0
     takeover: bool = False
@@ -87,7 +95,7 @@ class Shape:
 class Session:
     """Consecutive worlds, under a lease. Opens itself at the first reset."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, n_worlds: int = 1) -> None:
         """Checks the settings, with the running server if one is named.
 
         Raises:
@@ -95,19 +103,24 @@ class Session:
             NoServerError: If the named instance has no server.
         """
         self.settings: Final = settings
+        self.n_worlds: Final = n_worlds
         self._client: Client | None = None
         self._lease: Lease | None = None
         self._program: Program | None = None
         self._truth: _Truth | None = None
-        _check_positive("n_worlds", settings.n_worlds)
-        if settings.truth and settings.n_worlds > wire.TRUTH_BUFFER:
+        #: Whether a step has timed out, so that the worlds may stand elsewhere than thought.
+        self._is_lost = False
+        if not settings.timeout > 0:
+            raise SettingError(f"timeout: expected seconds above 0, got {settings.timeout}")
+        if settings.truth and n_worlds > wire.TRUTH_BUFFER:
             raise SettingError(
-                f"truth: expected at most {wire.TRUTH_BUFFER} worlds, got {settings.n_worlds}"
+                f"truth: expected at most {wire.TRUTH_BUFFER} worlds, got {n_worlds}"
             )
         if settings.instance is None:
             self.model, self.shape, self.burn_in = _private(settings)
         else:
-            self.model, self.shape, self.burn_in = _attached(settings, settings.instance)
+            with Client(settings.instance, timeout=settings.timeout) as client:
+                self.model, self.shape, self.burn_in = _attached(settings, n_worlds, client.info)
 
     @property
     def instance(self) -> str:
@@ -129,17 +142,35 @@ class Session:
         return self.settings.instance is None
 
     def resume(self) -> StepAnswer:
-        """Goes on from where the worlds stand, such as after another agent."""
+        """Goes on from where the worlds stand, such as after another agent.
+
+        Raises:
+            LeaseLostError, ServerGoneError: The session is closed then; another try opens anew.
+        """
         self.open(None)
-        return self._opened().observe(timeout=self.settings.timeout)
+        try:
+            return self._observe()
+        except (LeaseLostError, ServerGoneError):
+            self.close()
+            raise
 
     def reset(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
-        """Begins new episodes in some of the worlds, counted from 0; returns how all stand."""
+        """Begins new episodes in some of the worlds, counted from 0; returns how all stand.
+
+        Raises:
+            SettingError: If a seed does not fit into 64 bits.
+            LeaseLostError, ServerGoneError: The session is closed then; another try opens anew.
+        """
+        if max(seeds) >= 2**64:
+            raise SettingError(f"seed: expected less than 2**64, got {max(seeds)}")
         self.open(seeds[0] - indices[0])
         lease = self._opened()
-        worlds = [lease.worlds[index] for index in indices]
-        lease.reset(seeds, worlds=worlds)
-        return lease.observe(timeout=self.settings.timeout)
+        try:
+            lease.reset(seeds, worlds=[lease.worlds[index] for index in indices])
+            return self._observe()
+        except (LeaseLostError, ServerGoneError):
+            self.close()
+            raise
 
     def step(self, moves: NDArray[np.uint8], indices: range | None = None) -> StepAnswer:
         """Flies checked paths in all worlds, or some consecutive ones.
@@ -147,13 +178,23 @@ class Session:
         Raises:
             LeaseLostError: If another client took a world over; the session is closed then.
             ServerGoneError: If the server has ended; the session is closed then.
+            RequestTimeoutError: If no answer comes in time. The worlds may have moved: reset or
+                resume next.
         """
         lease = self._opened()
+        if self._is_lost:
+            raise ClosedError(
+                "an earlier step timed out, and the world may have moved: reset, or go on from "
+                "where it stands with reset(options={'resume': True})"
+            )
         worlds = lease.worlds if indices is None else lease.worlds[indices.start : indices.stop]
         try:
             return lease.step_moves(moves, worlds, full=False, timeout=self.settings.timeout)
         except (LeaseLostError, ServerGoneError):
             self.close()
+            raise
+        except RequestTimeoutError:
+            self._is_lost = True
             raise
 
     def truth(self, answer: StepAnswer) -> NDArray[np.uint8]:
@@ -167,25 +208,29 @@ class Session:
         return self._truth.states(answer, self.settings.timeout)
 
     def open(self, seed: int | None) -> None:
-        """Connects and acquires the worlds; a private server starts with `seed` for world 0."""
+        """Connects and acquires the worlds; a private server starts with `seed` for world 0.
+
+        Raises:
+            SettingError: If the named server is no longer as it was when this was made.
+        """
         if self._lease is not None:
             return
         settings = self.settings
         try:
             if settings.instance is None:
-                client = self.launch(0 if seed is None else seed % 2**64)
+                self._client = client = self.launch(0 if seed is None else seed % 2**64)
             else:
-                client = Client(settings.instance, timeout=settings.timeout)
-            self._client = client
+                self._client = client = Client(settings.instance, timeout=settings.timeout)
+                self._check_unchanged(client)
             self._lease = client.acquire(
                 settings.world,
-                settings.n_worlds,
+                self.n_worlds,
                 takeover=settings.takeover,
-                ttl=_LEASE,
+                ttl=_PRIVATE_LEASE if self.is_private else _LEASE,
                 timeout=RESET_TIMEOUT,
             )
             if settings.truth:
-                self._truth = _Truth(client.instance, settings, self.shape)
+                self._truth = _Truth(client.instance, settings, self.n_worlds, self.shape)
         except BaseException:
             self.close()
             raise
@@ -196,13 +241,17 @@ class Session:
         client, self._client = self._client, None
         program, self._program = self._program, None
         truth, self._truth = self._truth, None
+        self._is_lost = False
         if truth is not None:
             truth.close()
-        if lease is not None and program is None:
-            try:
+        try:
+            if program is not None and client is not None:
+                # A server asked ends at once, one that gets a signal when it next looks around.
+                client.shutdown(timeout=min(self.settings.timeout, _FAREWELL))
+            elif lease is not None:
                 lease.release(timeout=self.settings.timeout)
-            except EmberwatchError:
-                pass  # lost, or the server is gone: nothing is held any more
+        except EmberwatchError:
+            pass  # lost, or the server is gone: nothing is held any more
         if client is not None:
             client.close()
         if program is not None:
@@ -212,6 +261,20 @@ class Session:
         if self._lease is None:
             raise ClosedError("the environment is closed: reset it first")
         return self._lease
+
+    def _observe(self) -> StepAnswer:
+        answer = self._opened().observe(timeout=self.settings.timeout)
+        self._is_lost = False
+        return answer
+
+    def _check_unchanged(self, client: Client) -> None:
+        """Another server may serve the instance by now."""
+        model, shape, burn_in = _attached(self.settings, self.n_worlds, client.info)
+        if (shape, burn_in, _text(model)) != (self.shape, self.burn_in, _text(self.model)):
+            raise SettingError(
+                f"instance {client.instance!r}: expected the server as it was when the environment "
+                f"was made, {self.shape}, got {shape} or another model: make the environment anew"
+            )
 
     def launch(self, seed: int) -> Client:
         """Starts the private server, with this seed for world 0; `close` stops it.
@@ -224,7 +287,7 @@ class Session:
         shape = self.shape
         arguments = {
             "instance": instance,
-            "worlds": settings.world + settings.n_worlds,
+            "worlds": self.n_worlds,
             "model": _model_argument(settings),
             "height": shape.height,
             "width": shape.width,
@@ -237,16 +300,17 @@ class Session:
         self._program = Program(
             "emberwatch-server", [f"--{flag}={value}" for flag, value in arguments.items()]
         )
+        # For environments that nobody closes. Does nothing where it has been stopped before.
+        weakref.finalize(self, self._program.stop)
         return self._program.wait_for(lambda: Client(instance, timeout=settings.timeout))
 
 
 class _Truth:
     """The newest hidden states of each world of a session."""
 
-    def __init__(self, instance: str, settings: Settings, shape: Shape) -> None:
+    def __init__(self, instance: str, settings: Settings, n_worlds: int, shape: Shape) -> None:
         self._reader = TruthReader(instance)
         self._first = settings.world
-        n_worlds = settings.n_worlds
         self._moments: list[tuple[int, int]] = [(-1, -1)] * n_worlds
         self._states = np.zeros((n_worlds, shape.height, shape.width), np.uint8)
 
@@ -279,14 +343,17 @@ def draw_seed(generator: np.random.Generator) -> int:
 
 
 def _private(settings: Settings) -> tuple[Model, Shape, int]:
-    if settings.takeover:
-        raise SettingError("takeover: expected instance=..., a running server to attach to")
+    if settings.takeover or settings.world != 0:
+        raise SettingError(
+            "takeover, world: expected instance=..., a running server to attach to; a private "
+            f"server has its own worlds, got world {settings.world}"
+        )
     named = _model_argument(settings)
     model = Model.wildfire() if named == "wildfire" else Model.read(Path(named))
     shape = Shape(
-        height=_check_positive("height", settings.height, 64),
-        width=_check_positive("width", settings.width, 64),
-        n_moves=_check_positive("n_moves", settings.n_moves, 64),
+        height=check_count("height", settings.height, 64, _MAX_SIDE),
+        width=check_count("width", settings.width, 64, _MAX_SIDE),
+        n_moves=check_count("n_moves", settings.n_moves, 64, _MAX_MOVES),
         n_observations=len(model.observation_names),
     )
     burn_in = 10_000 if settings.burn_in is None else settings.burn_in
@@ -295,23 +362,24 @@ def _private(settings: Settings) -> tuple[Model, Shape, int]:
     return model, shape, burn_in
 
 
-def _attached(settings: Settings, instance: str) -> tuple[Model | None, Shape, int]:
-    with Client(instance, timeout=settings.timeout) as client:
-        info = client.info
-    if settings.model is not None or settings.start is not None:
-        raise SettingError(f"model, start: the server on instance {instance!r} has its own; omit")
+def _attached(
+    settings: Settings, n_worlds: int, info: ServerInfo
+) -> tuple[Model | None, Shape, int]:
+    for name in ("model", "start"):
+        if getattr(settings, name) is not None:
+            raise SettingError(f"{name}: expected None, as the running server has its own")
     for name in ("height", "width", "n_moves", "burn_in"):
         asked, has = getattr(settings, name), getattr(info, name)
         if asked is not None and asked != has:
             raise SettingError(f"{name}: expected {has}, as the server has, or None, got {asked}")
-    last = settings.world + settings.n_worlds
-    if settings.world < 0 or last > info.n_worlds:
+    last = settings.world + n_worlds - 1
+    if settings.world < 0 or last >= info.n_worlds:
         raise SettingError(
             f"world: expected worlds within 0 to {info.n_worlds - 1}, "
-            f"got {settings.world} to {last - 1}"
+            f"got {settings.world} to {last}"
         )
     if settings.truth and not info.publish_truth:
-        raise SettingError("truth: expected a server started with --publish-truth")
+        raise SettingError("truth: expected a server started with --publish-truth, got one without")
     shape = Shape(
         height=info.height,
         width=info.width,
@@ -326,9 +394,18 @@ def _model_argument(settings: Settings) -> str:
     return "wildfire" if settings.model is None else os.fspath(settings.model)
 
 
-def _check_positive(name: str, value: int | None, default: int = 1) -> int:
+def _text(model: Model | None) -> str | None:
+    return None if model is None else model.toml
+
+
+def check_count(name: str, value: int | None, default: int, highest: int) -> int:
+    """A keyword that counts something, or its default.
+
+    Raises:
+        SettingError: If it is not within 1 to `highest`.
+    """
     if value is None:
         return default
-    if value < 1:
-        raise SettingError(f"{name}: expected at least 1, got {value}")
+    if not 1 <= value <= highest or int(value) != value:
+        raise SettingError(f"{name}: expected an integer within 1 to {highest}, got {value}")
     return value

@@ -13,14 +13,17 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from emberwatch.base import wants_to_resume
+from emberwatch.base import NOTHING_TO_DRAW, wants_to_resume
 from emberwatch.client import as_moves
 from emberwatch.errors import SettingError
 from emberwatch.model import Model
 from emberwatch.observations import Observations, Parts
-from emberwatch.session import Session, Settings, WorldArguments, draw_seed
+from emberwatch.session import Session, Settings, WorldArguments, check_count, draw_seed
 from emberwatch.view import RENDER_FPS, RENDER_MODES, View, fly
 from emberwatch.wire import RESULT_DTYPE, StepAnswer
+
+#: Most worlds of any server.
+_MAX_WORLDS: Final = 1024
 
 #: Fields of a result that become `info`, as in the single environment.
 _REPORTED: Final = ("step", "n_target_cells", "n_visited", "n_hits")
@@ -36,9 +39,10 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
     Arguments are those of `WildfireEnv`, and:
 
     * `num_envs`: number of worlds.
-    * `max_episode_steps`: truncate after so many steps; None: never.
+    * `max_episode_steps`: truncate after so many steps; None or -1: never.
     * `autoreset_mode`: a `gymnasium.vector.AutoresetMode`; `NEXT_STEP` by default.
     * `world`: the first world; the others follow.
+    * `render_mode`: `"human"` shows the first world only.
     """
 
     def __init__(
@@ -57,13 +61,15 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
             SettingError: If an argument is impossible or contradicts the running server.
             NoServerError: If nobody serves `instance`.
         """
+        if max_episode_steps == -1:  # what Gymnasium's own `make` takes for no limit
+            max_episode_steps = None
         if max_episode_steps is not None and max_episode_steps < 1:
             raise SettingError(
                 f"max_episode_steps: expected at least 1 or None, got {max_episode_steps}"
             )
-        settings = Settings(n_worlds=num_envs, **world)
+        check_count("num_envs", num_envs, 1, _MAX_WORLDS)
         self._mode = AutoresetMode(autoreset_mode)
-        self._session = Session(settings)
+        self._session = Session(Settings(**world), num_envs)
         shape = self._session.shape
         self._observations = Observations(observation, shape, num_envs)
         self._views = [View(render_mode, shape, self._session.model) for _ in range(num_envs)]
@@ -118,16 +124,22 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
 
         Raises:
             SettingError: If an option or the number of seeds is wrong.
+            gymnasium.error.ResetNeeded: If only some worlds are reset before all were.
             BusyError: If another client holds a world of a running server.
         """
         rest = dict(options or {})
         mask = self._check_mask(rest.pop("reset_mask", None))
         seeds = self._check_seeds(seed)
-        if wants_to_resume(rest, seed):
+        resumes = wants_to_resume(rest, seed)
+        if not mask.all() and not self._session.is_open:
+            raise gymnasium.error.ResetNeeded("reset_mask: expected a reset of all worlds before")
+        self.closed = False
+        chosen = [int(index) for index in np.flatnonzero(mask)]
+        if resumes:
             self._take(self._session.resume(), range(self.num_envs))
-            self._began(range(self.num_envs))
+            self._began(chosen)
         else:
-            self._restart([int(index) for index in np.flatnonzero(mask)], seeds)
+            self._restart(chosen, seeds)
         return self._seen(), self._infos(mask)
 
     def step(
@@ -158,8 +170,13 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         flown = ~over if over.any() else np.ones(self.num_envs, np.bool_)
         return self._outcome(flown)
 
-    def render(self) -> tuple[Any, ...]:
+    def render(self) -> tuple[Any, ...] | None:
         """The picture of each world, as `WildfireEnv.render` draws it."""
+        if self.render_mode is None or not self._session.is_open:
+            gymnasium.logger.warn(NOTHING_TO_DRAW)
+            return None
+        if self.render_mode == "human":
+            return (None,) * self.num_envs
         return tuple(self._draw(index) for index in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -197,7 +214,7 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         self._elapsed[chosen] = 0
         self._over = self._over.copy()
         self._over[chosen] = False
-        self._observations.began(chosen)
+        self._observations.began(chosen, self._frames)
         for index in chosen:
             self._paths[index] = None
 
@@ -241,7 +258,8 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         observations = np.full(self.num_envs, None, dtype=object)
         for index in np.flatnonzero(over):
             row, col = int(self._results["row"][index]), int(self._results["col"][index])
-            observations[index] = self._observations.one(self._frames[index], row, col, int(index))
+            frame = self._frames[index].copy()
+            observations[index] = self._observations.one(frame, row, col, int(index))
         return {
             "final_obs": observations,
             "_final_obs": over.copy(),
@@ -263,9 +281,10 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
     def _seen(self) -> Any:
         robots = np.stack((self._results["row"], self._results["col"]), axis=1).astype(np.int64)
         if self.render_mode == "human":
-            for index in range(self.num_envs):
-                self._draw(index)
-        return self._observations.all(self._frames, robots)
+            self._draw(0)
+        # Pictures come from the frames that the learner, who may write to his, does not have.
+        frames = self._frames if self.render_mode is None else self._frames.copy()
+        return self._observations.all(frames, robots)
 
     def _draw(self, index: int) -> Any:
         robot = (int(self._results["row"][index]), int(self._results["col"][index]))
@@ -275,8 +294,8 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
     def _check_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        if isinstance(seed, int):
-            return [seed + index for index in range(self.num_envs)]
+        if isinstance(seed, int | np.integer):
+            return [int(seed) + index for index in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise SettingError(f"seed: expected {self.num_envs} seeds, got {len(seed)}")
         return seed

@@ -77,7 +77,7 @@ def fly(start: tuple[int, int], moves: ArrayLike, shape: Shape) -> NDArray[np.in
     row, col = start
     cells: list[tuple[int, int]] = []
     for move in np.asarray(moves).tolist():
-        down, right = _DIRECTIONS[move]
+        down, right = _DIRECTIONS[int(move)]
         row = min(max(row + down, 0), shape.height - 1)
         col = min(max(col + right, 0), shape.width - 1)
         cells.append((row, col))
