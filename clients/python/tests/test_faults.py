@@ -225,6 +225,7 @@ def test_a_killed_client_frees_its_worlds_at_once(server: Start, script: Run) ->
     code = (
         "import sys; from emberwatch import connect\n"
         "lease = connect(sys.argv[1]).acquire(ttl=3600)\n"
+        "lease.step([3] * 6)\n"
         "print('held', flush=True)\n"
         "while True: lease.step([3] * 6)"
     )
