@@ -63,6 +63,28 @@ run --preset lab => --preset | default, paper
 run --prior none => --prior | simulated, initial, uniform
 run --beam-width 0 => beam_width: expected 1 to 10000, got 0
 run --shooting-samples 0 => shooting_samples: expected 1 to 1000000, got 0
+serve-decisions --instance nobody => no server on instance "nobody"
+serve-decisions --instance a/b => instance name | "a/b"
+serve-decisions --world x => --world | 'x'
+serve-decisions --planner random_walk => --planner | beam, shooting
+serve-decisions --planner => --planner | beam, shooting
+serve-decisions --model no.toml => model file no.toml | No such file
+serve-decisions --config no.toml => config file no.toml | No such file
+serve-decisions --preset paper --config config/agent.toml => expected no file beside --preset paper
+serve-decisions --beam-width 10001 => beam_width: expected 1 to 10000, got 10001
+serve-decisions --exit-with 0 => --exit-with 0: expected a running process
+serve-decisions --exit-with 4194305 => --exit-with 4194305: expected a running process
+serve-decisions --policy beam_fire => --policy
+prior => --model | --height | --width | --burn-in | --out
+prior --model ash --height 4 --width 4 --burn-in 1 --out o => model file ash: No such file
+prior --model wildfire --height 4 --width 4 --burn-in 1 --out / => --out: expected a file, got /
+prior --model wildfire --height 4 --width 4 --burn-in 1 --out /dev/null => --out: expected a file, got /dev/null
+prior --model wildfire --height 4 --width 4 --burn-in 1 --out /no/such/p.npy => --out: expected a file in a folder that can be written to
+prior --model wildfire --height 4 --width 4 --burn-in 1 --out /proc/p.npy => /proc/p.npy
+prior --model wildfire --height 0 --width 4 --burn-in 1 --out o => height and width in 1..=4096, got 0 x 4
+prior --model wildfire --height 4 --width 4 --burn-in 1 --out o --worlds 0 => --worlds | 1..=10000
+prior --model wildfire --height 4 --width 4 --burn-in=-1 --out o => -1
+prior --model wildfire --height 4 --width 4 --burn-in 1 --out o --seed x => --seed | 'x'
 compare --seeds 8..0 => --seeds | FIRST below END
 compare --seeds 3 => --seeds | FIRST..END
 compare --seeds 0..100001 => --seeds | 100000

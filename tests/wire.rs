@@ -24,7 +24,7 @@ pub type StepAnswer = (StepReply, Vec<u8>);
 pub type ControlAnswer = (ControlReply, Vec<u8>);
 
 /// A port that sends requests.
-type Requests<Q, R> = Client<Ipc, [u8], Q, [u8], R>;
+pub type Requests<Q, R> = Client<Ipc, [u8], Q, [u8], R>;
 
 /// A request that waits for its answer.
 pub type Pending<Q, R> = PendingResponse<Ipc, [u8], Q, [u8], R>;
@@ -161,7 +161,8 @@ pub fn answer<Q: Header, R: Header>(
         .expect("receive an answer")
 }
 
-fn client<Q: Header, R: Header>(
+/// A port of a service; nobody is greeted.
+pub fn client<Q: Header, R: Header>(
     service: &RequestResponse<Q, R>,
 ) -> Result<Requests<Q, R>, ChannelError> {
     let builder = service.client_builder().initial_max_slice_len(4096);
@@ -169,7 +170,8 @@ fn client<Q: Header, R: Header>(
     builder.create().map_err(ipc_error("create a client"))
 }
 
-fn send<Q: Header, R: Header>(
+/// Sends a request and wakes nobody.
+pub fn send<Q: Header, R: Header>(
     client: &Requests<Q, R>,
     header: Q,
     payload: &[u8],

@@ -101,7 +101,12 @@ impl Agent {
 
     /// The path for step k -> k + 1, from where the robot is (paper eq. 15).
     pub fn plan(&mut self, robot: Cell, step: u64) -> Plan {
-        let values: CellValues = self.objective.values(self.estimator.belief());
+        self.plan_for(self.objective, robot, step)
+    }
+
+    /// As [`Self::plan`], for an objective other than the policy's.
+    pub fn plan_for(&mut self, objective: Objective, robot: Cell, step: u64) -> Plan {
+        let values: CellValues = objective.values(self.estimator.belief());
         let problem = PlanningProblem {
             start: robot,
             n_moves: self.n_moves,

@@ -7,6 +7,7 @@ use protocol::message::{FLAG_FULL_COVERAGE, Operation, StepRequest, StepResult};
 use protocol::path::path_to_bytes;
 use protocol::{Cell, Connection, Frame, Move, Shape};
 use std::ops::Range;
+use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 /// How this program names itself to servers.
@@ -135,6 +136,28 @@ impl Client {
             Reply::Reset { worlds } => Ok(worlds),
             other => Err(unexpected("reset", &other)),
         }
+    }
+
+    /// Extends the lease without acting.
+    ///
+    /// # Errors
+    /// [`ConnectionError`].
+    pub fn renew(&mut self) -> Result<(), ConnectionError> {
+        let request = Request::Renew { lease: self.lease };
+        self.connection.control(&request, STEP_TIMEOUT).map(|_| ())
+    }
+
+    /// The server's process: readable when it has ended.
+    pub fn server_process(&self) -> BorrowedFd<'_> {
+        self.connection.server_process()
+    }
+
+    /// Looks whether the server lives, without asking it.
+    ///
+    /// # Errors
+    /// [`ConnectionError::ServerGone`].
+    pub fn check_server(&self) -> Result<(), ConnectionError> {
+        self.connection.check_server()
     }
 
     /// Gives the worlds back.

@@ -1,8 +1,15 @@
 //! The subcommands: flags in, library calls, files and tables out.
 
+mod decisions;
+mod prior;
+
+pub use decisions::ServeDecisionsCommand;
+pub use prior::PriorCommand;
+
 use agent::arena::{Arena, MAX_BATCH};
 use agent::compare::{Comparison, Moment, Results, compare};
 use agent::config::AgentFlags;
+use agent::decisions::DecisionsError;
 use agent::launch::OwnServer;
 use agent::policy::Policy;
 use agent::report::{
@@ -237,11 +244,7 @@ impl CompareCommand {
 
     fn server_arguments(&self) -> Result<Vec<String>> {
         // Names that cannot be right are refused before a server is started for them.
-        let model = if self.model == "wildfire" {
-            Model::wildfire()
-        } else {
-            read_model(Path::new(&self.model))?
-        };
+        let model = model_named(&self.model)?;
         self.policies(&model)?;
         model.check_on(Shape::new(self.height, self.width)?)?;
         let batch = self.n_seeds().min(MAX_BATCH);
@@ -288,7 +291,11 @@ impl CompareCommand {
 
 /// Where results go wrong for a reason that callers may want to tell apart, a code of its own.
 pub fn exit_code(error: &anyhow::Error) -> ExitCode {
-    match error.downcast_ref::<RunError>() {
+    let served = match error.downcast_ref::<DecisionsError>() {
+        Some(DecisionsError::Run(error)) => Some(error),
+        _ => None,
+    };
+    match served.or_else(|| error.downcast_ref::<RunError>()) {
         Some(RunError::Connection(ConnectionError::Refused {
             status: Status::LeaseLost,
             ..
@@ -344,6 +351,14 @@ fn parse_seeds(text: &str) -> Result<Range<u64>, String> {
         return Ok(seeds);
     }
     Err(format!("expected 1 to {MAX_SEEDS} seeds, FIRST below END"))
+}
+
+/// A built-in model, or that of a file.
+fn model_named(name: &str) -> Result<Model> {
+    if name == "wildfire" {
+        return Ok(Model::wildfire());
+    }
+    read_model(Path::new(name))
 }
 
 fn read_model(path: &Path) -> Result<Model> {

@@ -9,12 +9,15 @@ pub mod belief;
 pub mod client;
 pub mod compare;
 pub mod config;
+pub mod decider;
+pub mod decisions;
 pub mod estimator;
 pub mod launch;
 pub mod planner;
 pub mod policy;
 pub mod report;
 pub mod run;
+pub mod summary;
 pub mod truth;
 
 pub use belief::{Belief, EntropyKind};

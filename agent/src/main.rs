@@ -1,4 +1,5 @@
-//! `emberwatch-agent`: acts on a server's world, or compares ways to act.
+//! `emberwatch-agent`: acts on a server's world, for itself or for a learner outside, or
+//! compares ways to act.
 
 mod commands;
 
@@ -17,6 +18,10 @@ struct Cli {
 enum Command {
     /// Act on one world of a running server
     Run(commands::RunCommand),
+    /// Take decisions for one world from a learner outside, and do the rest
+    ServeDecisions(commands::ServeDecisionsCommand),
+    /// Write a filter's first belief to a file
+    Prior(commands::PriorCommand),
     /// Compare policies on the same worlds: table, CSV and figures
     Compare(commands::CompareCommand),
 }
@@ -25,6 +30,8 @@ fn main() -> ExitCode {
     protocol::program::start_logging();
     let result = match &Cli::parse().command {
         Command::Run(command) => command.run(),
+        Command::ServeDecisions(command) => command.run(),
+        Command::Prior(command) => command.run(),
         Command::Compare(command) => command.run(),
     };
     match result {

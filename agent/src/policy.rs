@@ -61,6 +61,17 @@ impl EstimatorKind {
     }
 }
 
+impl PlannerKind {
+    /// Its name in commands and messages.
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::RandomWalk => "random_walk",
+            Self::Shooting => "shooting",
+            Self::Beam => "beam",
+        }
+    }
+}
+
 impl Policy {
     /// The policy of a name under a model.
     ///
@@ -121,6 +132,21 @@ impl Policy {
                 }
             }
         })
+    }
+
+    /// What a high-level decision chooses among (the paper's actions `a_k`): the probability of each
+    /// state in the model's order, then `entropy`; each named by its target, with the bonus of
+    /// `shooting_*` and `beam_*`.
+    pub fn choices(planner: PlannerKind, model: &Model) -> Vec<Self> {
+        let choice = |name: &str, target| Self {
+            name: name.into(),
+            estimator: EstimatorKind::KnownModel,
+            planner,
+            objective: objective(planner, target),
+        };
+        let states = model.file().states.iter().enumerate();
+        let states = states.map(|(state, entry)| choice(&entry.name, Target::State(state)));
+        states.chain([choice("entropy", Target::Entropy)]).collect()
     }
 
     /// The benchmark's ladder under a model, from the least to the most informed.
@@ -220,6 +246,25 @@ mod tests {
                 error.contains("shooting_latent") && error.ends_with(&format!("got {wrong:?}")),
                 "{error}"
             );
+        }
+    }
+
+    #[test]
+    fn choices_are_the_policies_of_their_planner() {
+        let model = Model::wildfire();
+        for (family, planner) in [
+            ("beam", PlannerKind::Beam),
+            ("shooting", PlannerKind::Shooting),
+        ] {
+            let choices = Policy::choices(planner, &model);
+            let names = ["normal", "latent", "fire", "explore"];
+            assert_eq!(choices.len(), names.len());
+            for (choice, name) in choices.iter().zip(names) {
+                let named = Policy::named(&format!("{family}_{name}"), &model).expect("known");
+                assert_eq!(choice.objective, named.objective, "{name}");
+                assert_eq!(choice.planner, named.planner);
+                assert_eq!(choice.estimator, named.estimator);
+            }
         }
     }
 

@@ -68,6 +68,14 @@ pub enum RunError {
         /// The instance.
         instance: String,
     },
+    /// A model of other observations than the server's.
+    #[error("model: expected the server's {expected} observations, got {got}")]
+    OtherModel {
+        /// The server's number of observations.
+        expected: usize,
+        /// The model's.
+        got: usize,
+    },
     /// A policy that only `compare` can feed.
     #[error("policy {policy:?} needs worlds that run one step ahead: only `compare` has them")]
     Clairvoyant {
@@ -135,18 +143,7 @@ impl Attached {
     fn attach(mission: &Mission, takeover: bool) -> Result<Self, RunError> {
         let worlds = mission.world..mission.world + 1;
         // What takes long is done before the lease begins to run.
-        let info = server_info(&mission.instance)?;
-        if mission.world >= info.n_worlds {
-            let (status, detail) = (Status::NoSuchWorld, info.n_worlds.into());
-            let message = status.explain(detail);
-            return Err(ConnectionError::Refused {
-                status,
-                detail,
-                message,
-            }
-            .into());
-        }
-        let model = model(mission, &info)?;
+        let (info, model) = prepare(&mission.instance, mission.world, mission.model.as_ref())?;
         let policy = Policy::named(&mission.policy, &model)?;
         if policy.estimator == EstimatorKind::NextTruth {
             return Err(RunError::Clairvoyant {
@@ -266,14 +263,39 @@ fn prior(
     Ok(kind.belief(model, shape_of(info)?, mission.config.seed)?)
 }
 
-fn model(mission: &Mission, info: &ServerInfo) -> Result<Model, RunError> {
-    match (&mission.model, &info.model) {
-        (Some(model), _) => Ok(model.clone()),
-        (None, Some(text)) => Ok(Model::from_toml(text)?),
-        (None, None) => Err(RunError::NoModel {
-            instance: mission.instance.name().into(),
-        }),
+/// What a server says of itself, and its model, or the one given; checks that it has the world.
+///
+/// # Errors
+/// [`RunError`].
+pub fn prepare(
+    instance: &Instance,
+    world: u32,
+    model: Option<&Model>,
+) -> Result<(ServerInfo, Model), RunError> {
+    let info = server_info(instance)?;
+    if world >= info.n_worlds {
+        let (status, detail) = (Status::NoSuchWorld, info.n_worlds.into());
+        let message = status.explain(detail);
+        return Err(ConnectionError::Refused {
+            status,
+            detail,
+            message,
+        }
+        .into());
     }
+    let model = match (model, &info.model) {
+        (Some(model), _) => model.clone(),
+        (None, Some(text)) => Model::from_toml(text)?,
+        (None, None) => {
+            let instance = instance.name().into();
+            return Err(RunError::NoModel { instance });
+        }
+    };
+    let (expected, got) = (info.n_observations, model.file().observations.len());
+    if got != expected {
+        return Err(RunError::OtherModel { expected, got });
+    }
+    Ok((info, model))
 }
 
 fn open_truth(mission: &Mission, client: &Client) -> Result<TruthFeed, RunError> {
@@ -315,7 +337,7 @@ fn is_own_lease(error: &RunError) -> bool {
 }
 
 /// Whether the server is away and may come back.
-fn is_outage(error: &RunError) -> bool {
+pub fn is_outage(error: &RunError) -> bool {
     let RunError::Connection(error) = error else {
         return false;
     };

@@ -1,4 +1,4 @@
-//! What holds for every planner and filter, on random problems.
+//! What holds for every planner, filter and summary, on random problems.
 
 use agent::belief::Belief;
 use agent::estimator::Filter;
@@ -6,6 +6,7 @@ use agent::planner::{
     BeamSearch, CellValues, Integration, Objective, Plan, Planner, PlanningProblem, RandomWalk,
     Shooting, Target,
 };
+use agent::summary::{N_BLOCKS, summarise, summary_length};
 use proptest::prelude::*;
 use protocol::frame::{Frame, UNOBSERVED};
 use protocol::grid::{Cell, Probabilities, Shape};
@@ -124,6 +125,49 @@ fn assert_close(a: f32, b: f32) {
         (a - b).abs() <= 1e-5 * b.abs().max(1.0),
         "{a}, expected {b}"
     );
+}
+
+/// A belief of random numbers on a grid of random sides, and a robot on it.
+fn beliefs(n_states: usize) -> impl Strategy<Value = (Belief, Cell, usize)> {
+    let sides = (1..=20_usize, 1..=20_usize);
+    let sized = sides.prop_flat_map(|(height, width)| {
+        let robot = (0..height, 0..width);
+        (Just((height, width)), robot, 0..=30_usize, any::<u64>())
+    });
+    sized.prop_map(move |((height, width), (row, col), n_moves, seed)| {
+        let numbers = Probabilities::from_shape_fn((n_states, height, width), |(m, row, col)| {
+            let index = (m * height + row) * width + col;
+            (split_mix(seed, index as u64) % 4) as f32 + if m == 0 { 0.5 } else { 0.0 }
+        });
+        let sums = numbers.sum_axis(ndarray::Axis(0));
+        let belief = Belief::from_probabilities(numbers / &sums).expect("on the simplex");
+        (belief, Cell { row, col }, n_moves)
+    })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..Default::default() })]
+
+    #[test]
+    fn a_summary_is_of_its_models_length_and_from_0_to_1(
+        (belief, robot, n_moves) in (1..5_usize).prop_flat_map(beliefs),
+    ) {
+        let n_states = belief.n_states();
+        let summary = summarise(&belief, robot, n_moves);
+        prop_assert_eq!(summary.len(), summary_length(n_states));
+        prop_assert!(summary.iter().all(|number| (0.0..=1.0).contains(number)));
+        // The states' means sum to one: over the grid, near the robot and in each block.
+        let (n_layers, n_blocks) = (n_states + 1, N_BLOCKS * N_BLOCKS);
+        let sums = |first: usize, stride: usize| -> f32 {
+            summary[first..].iter().step_by(stride).take(n_states).sum()
+        };
+        let firsts = [(0, 1), (n_layers, 1)].into_iter();
+        let blocks = (0..n_blocks).map(|block| (2 * n_layers + block, n_blocks));
+        for (first, stride) in firsts.chain(blocks) {
+            let sum = sums(first, stride);
+            prop_assert!((sum - 1.0).abs() < 1e-4, "{} at {}", sum, first);
+        }
+    }
 }
 
 proptest! {

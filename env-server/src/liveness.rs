@@ -2,12 +2,10 @@
 //! away what dead processes left in shared memory.
 
 use crate::lease::ClientId;
-use crate::server::ServeError;
 use iceoryx2::prelude::PayloadHeader;
 use iceoryx2::service::header::request_response::RequestHeader;
 use protocol::channels::{Ipc, create_node};
 use protocol::wait::sleep_until_readable;
-use rustix::io::Errno;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use std::collections::HashMap;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -34,35 +32,6 @@ pub struct Clients {
 pub struct Janitor {
     requests: Option<Sender<()>>,
     thread: Option<JoinHandle<()>>,
-}
-
-/// The process that a private server ends with.
-pub struct Keeper(OwnedFd);
-
-impl Keeper {
-    /// Watches a process.
-    ///
-    /// # Errors
-    /// [`ServeError::NoKeeper`] if it is not there.
-    pub fn watch(pid: i32) -> Result<Self, ServeError> {
-        let open = |process| pidfd_open(process, PidfdFlags::empty());
-        let process = (pid > 0).then(|| Pid::from_raw(pid)).flatten();
-        let descriptor = process.ok_or(Errno::SRCH).and_then(open);
-        descriptor.map(Self).map_err(|errno| ServeError::NoKeeper {
-            pid,
-            problem: errno.to_string(),
-        })
-    }
-
-    /// Readable when it has ended.
-    pub fn descriptor(&self) -> BorrowedFd<'_> {
-        self.0.as_fd()
-    }
-
-    /// Whether it has ended.
-    pub fn has_ended(&self) -> bool {
-        sleep_until_readable(&[self.descriptor()], Duration::ZERO).is_ok_and(|ended| ended[0])
-    }
 }
 
 impl Clients {

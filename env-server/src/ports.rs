@@ -1,15 +1,12 @@
 //! The server's ends of the channels.
 
 use crate::config::Checked;
-use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::node::Node;
-use iceoryx2::port::ReceiveError;
 use iceoryx2::port::listener::Listener;
-use iceoryx2::port::notifier::{ListenerKey, Notifier};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::server::Server;
 use iceoryx2::port::update_connections::UpdateConnections;
-use iceoryx2::prelude::{AllocationStrategy, CallbackProgression, PortFactory};
+use iceoryx2::prelude::{CallbackProgression, PortFactory};
 use iceoryx2::service::dynamic_config::publish_subscribe::SubscriberDetails;
 use iceoryx2::service::dynamic_config::request_response::ClientDetails;
 use iceoryx2::service::port_factory::server::ServerCreateError;
@@ -18,27 +15,17 @@ use protocol::channels::{
     MAX_OBSERVERS, MAX_TRUTH_READERS, RequestResponse, Services, StepService, TRUTH_BUFFER,
     TruthService, create_node, ipc_error,
 };
-use protocol::connection::server_pid;
-use protocol::message::{
-    ControlReply, ControlRequest, FrameHeader, Header, RESULT_BYTES, StepReply, StepRequest,
-    TruthHeader,
+use protocol::message::{FrameHeader, Header, RESULT_BYTES, StepReply, StepRequest, TruthHeader};
+use protocol::responder::{
+    Active, ActiveControl, Answers, ControlServer, control_server, holder, received,
 };
-use protocol::wait::descriptor;
-use std::collections::{HashMap, HashSet};
+use protocol::wait::{descriptor, drain};
+use std::collections::HashSet;
 use std::os::fd::BorrowedFd;
 use thiserror::Error;
 
 /// A request on `step` that waits for its answer.
-pub type ActiveStep = ActiveRequest<Ipc, [u8], StepRequest, [u8], StepReply>;
-
-/// A request on `control` that waits for its answer.
-pub type ActiveControl = ActiveRequest<Ipc, [u8], ControlRequest, [u8], ControlReply>;
-
-/// Length that control answers may have before their segment grows, bytes.
-const CONTROL_SLICE: usize = 16_384;
-
-/// Listeners remembered before the table is started afresh.
-const MAX_KNOWN_LISTENERS: usize = 1024;
+pub type ActiveStep = Active<StepRequest, StepReply>;
 
 /// Bytes that iceoryx2 adds to each message, at most.
 const MESSAGE_OVERHEAD: usize = 512;
@@ -80,12 +67,11 @@ pub enum PortError {
 /// All ports of a server.
 pub struct Ports {
     step: Server<Ipc, [u8], StepRequest, [u8], StepReply>,
-    control: Server<Ipc, [u8], ControlRequest, [u8], ControlReply>,
+    control: ControlServer,
     frames: Publisher<Ipc, [u8], FrameHeader>,
     truth: Option<Publisher<Ipc, [u8], TruthHeader>>,
     listener: Listener<Ipc>,
-    notifier: Notifier<Ipc>,
-    listeners: HashMap<u128, ListenerKey>,
+    answers: Answers,
     control_service: ControlService,
     step_service: StepService,
     frame_service: FrameService,
@@ -107,12 +93,7 @@ impl Ports {
             instance: &checked.instance,
         };
         let (control_service, step_service) = (services.create_control()?, services.create_step()?);
-        let control = control_service
-            .server_builder()
-            .initial_max_slice_len(CONTROL_SLICE);
-        let control = control
-            .allocation_strategy(AllocationStrategy::PowerOfTwo)
-            .create();
+        let control = control_server(&control_service);
         let control = control.map_err(|error| taken(checked, &control_service, error))?;
         let step = step_service
             .server_builder()
@@ -143,18 +124,13 @@ impl Ports {
             .wake(Channel::WakeServer)?
             .listener_builder()
             .create();
-        let notifier = services
-            .wake(Channel::WakeClient)?
-            .notifier_builder()
-            .create();
         Ok(Self {
             step,
             control,
             frames,
             truth: truth.transpose()?,
             listener: listener.map_err(ipc_error("create a listener"))?,
-            notifier: notifier.map_err(ipc_error("create a notifier"))?,
-            listeners: HashMap::new(),
+            answers: Answers::new(&services)?,
             control_service,
             step_service,
             frame_service,
@@ -173,29 +149,9 @@ impl Ports {
         received(self.control.receive())
     }
 
-    /// Sends an answer and wakes its client. A client that is gone or that holds back its answers
-    /// loses this one: that is its own affair.
-    pub fn answer<Q: Header, R: Header>(
-        &mut self,
-        request: &ActiveRequest<Ipc, [u8], Q, [u8], R>,
-        header: R,
-        payload: &[u8],
-        listener: u128,
-    ) {
-        let sent = request
-            .loan_slice_uninit(payload.len())
-            .map_err(|error| format!("{error:?}"))
-            .and_then(|mut response| {
-                *response.user_header_mut() = header;
-                response
-                    .write_from_slice(payload)
-                    .send()
-                    .map_err(|error| format!("{error:?}"))
-            });
-        match sent {
-            Ok(()) => self.wake(listener),
-            Err(problem) => tracing::debug!(problem, "an answer was not taken"),
-        }
+    /// Sends answers to requests of both kinds.
+    pub fn answers(&mut self) -> &mut Answers {
+        &mut self.answers
     }
 
     /// Publishes a frame and the path that was flown, if anybody observes.
@@ -294,49 +250,13 @@ impl Ports {
     /// # Errors
     /// [`ChannelError::Ipc`].
     pub fn drain(&self) -> Result<bool, ChannelError> {
-        let drained = self
-            .listener
-            .try_wait(|_| {})
-            .map_err(ipc_error("drain wake-ups"))?;
-        Ok(drained > 0)
+        drain(&self.listener)
     }
 
     /// Readable while there are wake-ups.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         descriptor(&self.listener)
     }
-
-    fn wake(&mut self, listener: u128) {
-        let known = self
-            .listeners
-            .get(&listener)
-            .is_some_and(|key| self.notifier.notify_single_listener(key).is_ok());
-        if listener == 0 || known {
-            return;
-        }
-        if self.listeners.len() == MAX_KNOWN_LISTENERS {
-            self.listeners.clear();
-        }
-        self.listeners.remove(&listener);
-        let listeners = &mut self.listeners;
-        self.notifier.for_each_listener(|one, details| {
-            if details.listener_id.value() != listener {
-                return CallbackProgression::Continue;
-            }
-            listeners.insert(listener, one.listener_key());
-            let _ = one.notify();
-            CallbackProgression::Stop
-        });
-    }
-}
-
-/// What was received. A failure is the affair of the client behind it, whose other requests wait for
-/// an answer still or whose memory is gone: it must not be the end of the server.
-fn received<T>(result: Result<Option<T>, ReceiveError>) -> Option<T> {
-    result.unwrap_or_else(|error| {
-        tracing::debug!(?error, "a request was not received");
-        None
-    })
 }
 
 fn taken<Q: Header, R: Header>(
@@ -344,12 +264,12 @@ fn taken<Q: Header, R: Header>(
     service: &RequestResponse<Q, R>,
     error: ServerCreateError,
 ) -> PortError {
-    match (error, server_pid(service)) {
-        (ServerCreateError::ExceedsMaxSupportedServers, Some(pid)) => PortError::AlreadyRunning {
+    match holder(service, &error) {
+        Some(pid) => PortError::AlreadyRunning {
             instance: checked.instance.name().into(),
             pid,
         },
-        (other, _) => ipc_error("create a server")(other).into(),
+        None => ipc_error("create a server")(error).into(),
     }
 }
 

@@ -1,15 +1,17 @@
 //! The loop: receive, check the lease, step, answer, publish.
 
 use crate::config::Checked;
-use crate::liveness::{Clients, Janitor, Keeper};
-use crate::ports::{ActiveControl, ActiveStep, PortError, Ports};
+use crate::liveness::{Clients, Janitor};
+use crate::ports::{ActiveStep, PortError, Ports};
 use crate::publications::Publications;
 use crate::resets::Resets;
 use crate::simulator::{Awaited, Outcome, Simulator, Surroundings};
 use protocol::channels::{ChannelError, ipc_error};
 use protocol::control::Reply;
-use protocol::message::{ControlReply, Operation, Status, VERSION};
+use protocol::message::{Operation, Status};
 use protocol::model::ModelError;
+use protocol::program::{Keeper, NoKeeper};
+use protocol::responder::{ActiveControl, listener_id, wait_until_taken};
 use protocol::wait::{Waiter, sleep_until_readable};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
@@ -29,9 +31,6 @@ const IDLE_TICK: Duration = Duration::from_millis(250);
 
 /// How often a busy server does: bounds how late a client's death is noticed.
 const BUSY_TICK: Duration = Duration::from_millis(50);
-
-/// How long a client may take to read the answer to its shutdown: the answer goes with the server.
-const FAREWELL: Duration = Duration::from_millis(500);
 
 /// One turn in this many looks for a control request before a step.
 const CONTROL_FIRST: u64 = 64;
@@ -56,13 +55,8 @@ pub enum ServeError {
     #[error(transparent)]
     Model(#[from] ModelError),
     /// The process to end with is not there.
-    #[error("--exit-with {pid}: expected a running process, got {problem}")]
-    NoKeeper {
-        /// The process.
-        pid: i32,
-        /// The system's reason.
-        problem: String,
-    },
+    #[error(transparent)]
+    Keeper(#[from] NoKeeper),
     /// Threads could not be started.
     #[error("start {n_threads} threads: {problem}")]
     Threads {
@@ -235,7 +229,9 @@ impl Server {
                 .step(now, client, &header, request.payload(), &mut self.payload);
         reply.simulation_nanos = now.elapsed().as_nanos() as u64;
         let listener = listener_id(header.listener_low, header.listener_high);
-        self.ports.answer(request, reply, &self.payload, listener);
+        self.ports
+            .answers()
+            .send(request, reply, &self.payload, listener);
         if header.operation == Operation::Step as u32 {
             let worlds = self.simulator.worlds_of(&reply);
             self.publish(worlds);
@@ -265,7 +261,7 @@ impl Server {
             }
             Outcome::Shutdown => {
                 self.send_reply(&request, &Reply::Done);
-                wait_until_taken(&request);
+                wait_until_taken(&[request]);
                 tracing::info!(client = client.pid, "a client asked to shut down");
                 self.is_over = true;
             }
@@ -273,18 +269,12 @@ impl Server {
     }
 
     fn send_reply(&mut self, request: &ActiveControl, reply: &Reply) {
-        let header = request.user_header();
-        let answer = ControlReply {
-            version: VERSION,
-            status: reply.status() as u32,
-            sequence: header.sequence,
-        };
-        let listener = listener_id(header.listener_low, header.listener_high);
-        let text = serde_json::to_vec(reply).expect("invariant: replies serialise");
         if reply.status() != Status::Ok {
             tracing::debug!(status = ?reply.status(), "refused a control request");
         }
-        self.ports.answer(request, answer, &text, listener);
+        self.ports
+            .answers()
+            .send_json(request, reply.status(), reply);
     }
 
     fn answer_awaiting(&mut self, now: Instant) {
@@ -367,18 +357,6 @@ impl Rate {
             };
         }
     }
-}
-
-/// Waits until a client has read its answer and let go of its request.
-fn wait_until_taken(request: &ActiveControl) {
-    let deadline = Instant::now() + FAREWELL;
-    while request.is_connected() && Instant::now() < deadline {
-        std::thread::sleep(Duration::from_millis(1));
-    }
-}
-
-fn listener_id(low: u64, high: u64) -> u128 {
-    u128::from(low) | u128::from(high) << 64
 }
 
 fn threads(n_threads: usize) -> Result<ThreadPool, ServeError> {

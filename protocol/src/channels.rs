@@ -1,4 +1,4 @@
-//! The channels of one instance: names, node configuration, services and their limits.
+//! The channels of one instance: names, services and their limits.
 //!
 //! All channels of an instance live under `emberwatch/v1/<instance>/`, in a directory and under a
 //! prefix of the user's own, so that users never meet and no stray configuration file is read.
@@ -6,17 +6,15 @@
 use crate::message::{
     ControlReply, ControlRequest, FrameHeader, Header, StepReply, StepRequest, TruthHeader,
 };
-use iceoryx2::node::{Node, NodeBuilder};
-use iceoryx2::prelude::{Config, FileName, Path, SemanticString, ServiceName};
-use iceoryx2::prelude::{SignalHandlingMode, ipc};
+use iceoryx2::node::Node;
+use iceoryx2::prelude::{ServiceName, ipc};
 use iceoryx2::service::builder::request_response as request_response_builder;
 use iceoryx2::service::builder::request_response::RequestResponseOpenError;
 use iceoryx2::service::port_factory::{PortFactory, event, publish_subscribe, request_response};
 use std::fmt::Debug;
-use std::fs::DirBuilder;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
-use std::path::PathBuf;
 use thiserror::Error;
+
+pub use crate::node::{channel_directory, create_node, node_config};
 
 /// Most clients at a time on each of `step` and `control`.
 pub const MAX_CLIENTS: usize = 16;
@@ -45,7 +43,7 @@ pub type RequestResponse<Q, R> = request_response::PortFactory<Ipc, [u8], Q, [u8
 /// The `step` service.
 pub type StepService = RequestResponse<StepRequest, StepReply>;
 
-/// The `control` service.
+/// A service of JSON messages: `control`, or the decisions of a world.
 pub type ControlService = RequestResponse<ControlRequest, ControlReply>;
 
 /// The `frames` service.
@@ -84,6 +82,17 @@ pub enum ChannelError {
         /// The instance.
         instance: String,
     },
+    /// No agent takes decisions for the world.
+    #[error(
+        "no agent serves decisions of world {world} on instance {instance:?}: start one with \
+         `emberwatch-agent serve-decisions --instance {instance} --world {world}`"
+    )]
+    NoAgent {
+        /// The instance.
+        instance: String,
+        /// The world.
+        world: u32,
+    },
     /// iceoryx2 refused.
     #[error("{what}: iceoryx2 says {problem}")]
     Ipc {
@@ -109,6 +118,10 @@ pub enum Channel {
     WakeServer,
     /// Wakes clients, event.
     WakeClient,
+    /// Decisions for a world, answered by its agent, request-response.
+    Decisions(u32),
+    /// Wakes the agent that answers a world's decisions, event.
+    WakeAgent(u32),
 }
 
 impl Instance {
@@ -142,56 +155,32 @@ impl Instance {
             instance: self.0.clone(),
         }
     }
-}
 
-impl Channel {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Step => "step",
-            Self::Control => "control",
-            Self::Frames => "frames",
-            Self::Truth => "truth",
-            Self::WakeServer => "wake-server",
-            Self::WakeClient => "wake-client",
+    /// The error for a channel whose requests nobody answers.
+    fn nobody_answers(&self, channel: Channel) -> ChannelError {
+        match channel {
+            Channel::Decisions(world) => ChannelError::NoAgent {
+                instance: self.0.clone(),
+                world,
+            },
+            _ => self.no_server(),
         }
     }
 }
 
-/// Makes this process known to iceoryx2, under the user's own directory and prefix.
-///
-/// # Errors
-/// [`ChannelError`] if the directory is somebody else's or the node cannot be created.
-pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
-    iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
-    let node = NodeBuilder::new()
-        .config(&node_config()?)
-        .signal_handling_mode(SignalHandlingMode::Disabled);
-    node.create().map_err(ipc_error("create a node"))
-}
-
-/// The directory of this user's channel files: `/tmp/emberwatch-<uid>/`.
-pub fn channel_directory() -> PathBuf {
-    PathBuf::from(format!(
-        "/tmp/emberwatch-{}/",
-        rustix::process::getuid().as_raw()
-    ))
-}
-
-/// iceoryx2's configuration: its defaults, the user's own directory and prefix.
-///
-/// # Errors
-/// [`ChannelError::Directory`] if the directory cannot be made or is somebody else's.
-pub fn node_config() -> Result<Config, ChannelError> {
-    let directory = channel_directory();
-    own_directory(&directory)?;
-    let path = Path::new(directory.as_os_str().as_encoded_bytes())
-        .map_err(ipc_error("set the root path"))?;
-    let prefix = format!("emberwatch_{}_", rustix::process::getuid().as_raw());
-    let prefix = FileName::new(prefix.as_bytes()).map_err(ipc_error("set the prefix"))?;
-    let mut config = Config::default();
-    config.global.set_root_path(&path);
-    config.global.prefix = prefix;
-    Ok(config)
+impl Channel {
+    fn name(self) -> String {
+        match self {
+            Self::Step => "step".into(),
+            Self::Control => "control".into(),
+            Self::Frames => "frames".into(),
+            Self::Truth => "truth".into(),
+            Self::WakeServer => "wake-server".into(),
+            Self::WakeClient => "wake-client".into(),
+            Self::Decisions(world) => format!("decisions-{world}"),
+            Self::WakeAgent(world) => format!("wake-agent-{world}"),
+        }
+    }
 }
 
 /// Adds context to an error of iceoryx2.
@@ -241,6 +230,22 @@ impl Services<'_> {
     /// [`ChannelError::NoServer`] if there is none.
     pub fn open_control(&self) -> Result<ControlService, ChannelError> {
         self.open(Channel::Control)
+    }
+
+    /// The service of a world's decisions, created if need be; for the agent.
+    ///
+    /// # Errors
+    /// As [`Self::create_step`].
+    pub fn create_decisions(&self, world: u32) -> Result<ControlService, ChannelError> {
+        self.create(Channel::Decisions(world))
+    }
+
+    /// The service of a world's decisions, which a running agent answers.
+    ///
+    /// # Errors
+    /// [`ChannelError::NoAgent`] if there is none.
+    pub fn open_decisions(&self, world: u32) -> Result<ControlService, ChannelError> {
+        self.open(Channel::Decisions(world))
     }
 
     /// The `frames` service; observers may create it before the server starts.
@@ -295,7 +300,7 @@ impl Services<'_> {
             .map_err(ipc_error("open the truth channel"))
     }
 
-    /// One of the two wake services.
+    /// A wake service.
     ///
     /// # Errors
     /// [`ChannelError::Ipc`].
@@ -342,13 +347,13 @@ impl Services<'_> {
             .builder::<Q, R>(channel)
             .open()
             .map_err(|error| match error {
-                RequestResponseOpenError::DoesNotExist => self.instance.no_server(),
+                RequestResponseOpenError::DoesNotExist => self.instance.nobody_answers(channel),
                 other => ipc_error("open a request channel")(other),
             })?;
         if service.dynamic_config().number_of_servers() > 0 {
             Ok(service)
         } else {
-            Err(self.instance.no_server())
+            Err(self.instance.nobody_answers(channel))
         }
     }
 
@@ -366,28 +371,6 @@ impl Services<'_> {
     }
 }
 
-/// Makes the directory, for this user alone, or checks that it is this user's.
-fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
-    let wrong = |problem: String| ChannelError::Directory {
-        path: path.display().to_string(),
-        problem,
-    };
-    match DirBuilder::new().mode(0o700).create(path) {
-        Ok(()) => return Ok(()),
-        Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
-        Err(error) => return Err(wrong(error.to_string())),
-    }
-    let bare = path.components().as_path(); // without the trailing slash, so that a link is seen
-    let found = std::fs::symlink_metadata(bare).map_err(|error| wrong(error.to_string()))?;
-    let mine = found.is_dir() && found.uid() == rustix::process::getuid().as_raw();
-    if mine && found.mode() & 0o022 == 0 {
-        return Ok(());
-    }
-    Err(wrong(
-        "expected a directory that belongs to this user and that others cannot write to".into(),
-    ))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -400,16 +383,5 @@ mod tests {
         for bad in ["", "a b", "../x", "é", &"x".repeat(65)] {
             assert!(Instance::new(bad).is_err(), "{bad:?}");
         }
-    }
-
-    #[test]
-    fn a_directory_that_others_may_write_to_is_refused() {
-        use std::os::unix::fs::PermissionsExt;
-        let path = std::env::temp_dir().join(format!("emberwatch-test-{}", std::process::id()));
-        own_directory(&path).expect("a new directory");
-        own_directory(&path).expect("the same again");
-        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o777)).expect("chmod");
-        assert!(own_directory(&path).is_err());
-        std::fs::remove_dir(&path).expect("clean up");
     }
 }

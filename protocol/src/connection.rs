@@ -11,7 +11,7 @@ use crate::message::split_step_payload;
 use crate::message::{
     ControlReply, ControlRequest, Header, Status, StepReply, StepRequest, StepResult, VERSION,
 };
-use crate::wait::{Waiter, descriptor, sleep_until_readable};
+use crate::wait::{Waiter, descriptor, drain, is_readable, sleep_until_readable};
 use iceoryx2::node::Node;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::Client;
@@ -19,7 +19,7 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::prelude::{AllocationStrategy, CallbackProgression, PortFactory};
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
-use std::os::fd::{AsFd, OwnedFd};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::Duration;
 use thiserror::Error;
 
@@ -177,6 +177,22 @@ impl Connection {
         &self.info
     }
 
+    /// The server's process: readable when it has ended.
+    pub fn server_process(&self) -> BorrowedFd<'_> {
+        self.wake.server_process.as_fd()
+    }
+
+    /// Looks whether the server lives, without asking it.
+    ///
+    /// # Errors
+    /// [`ConnectionError::ServerGone`] if its process has ended.
+    pub fn check_server(&self) -> Result<(), ConnectionError> {
+        if is_readable(self.server_process()) {
+            return Err(self.wake.gone());
+        }
+        Ok(())
+    }
+
     /// Asks on the control channel.
     ///
     /// # Errors
@@ -300,11 +316,7 @@ impl Wake {
 
     /// Sleeps until woken; returns whether the server has ended.
     fn sleep(&self, timeout: Duration) -> Result<bool, ChannelError> {
-        let drained = self
-            .listener
-            .try_wait(|_| {})
-            .map_err(ipc_error("drain wake-ups"))?;
-        if drained > 0 {
+        if drain(&self.listener)? {
             return Ok(false);
         }
         let descriptors = [descriptor(&self.listener), self.server_process.as_fd()];
@@ -326,8 +338,7 @@ impl Wake {
 fn server_process<Q: Header, R: Header>(service: &RequestResponse<Q, R>) -> Option<OwnedFd> {
     let pid = Pid::from_raw(server_pid(service)?)?;
     let process = pidfd_open(pid, PidfdFlags::empty()).ok()?;
-    let ended = sleep_until_readable(&[process.as_fd()], Duration::ZERO).ok()?;
-    (!ended[0]).then_some(process)
+    (!is_readable(process.as_fd())).then_some(process)
 }
 
 /// The process id of the service's server, running or dead.

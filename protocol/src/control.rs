@@ -2,6 +2,7 @@
 
 use crate::frame::Coverage;
 use crate::message::Status;
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// Longest control message accepted: 1 MiB.
@@ -200,6 +201,21 @@ pub struct WorldStatus {
     pub holder_pid: Option<u32>,
     /// Whether it is being reset.
     pub resetting: bool,
+}
+
+/// Reads a request in JSON.
+///
+/// # Errors
+/// What is wrong with it: the message of a refusal as [`Status::Malformed`].
+pub fn parse<T: DeserializeOwned>(text: &[u8]) -> Result<T, String> {
+    let malformed = |problem: String| format!("{}: {problem}", Status::Malformed.explain(0));
+    if text.len() > MAX_CONTROL_BYTES {
+        let got = text.len();
+        return Err(malformed(format!(
+            "expected at most {MAX_CONTROL_BYTES} bytes, got {got}"
+        )));
+    }
+    serde_json::from_slice(text).map_err(|error| malformed(error.to_string()))
 }
 
 impl Reply {

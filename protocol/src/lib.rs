@@ -2,14 +2,16 @@
 //! wire.
 //!
 //! Read [`grid`], [`model`], [`dynamics`] (the world) and [`transition`] (beliefs) for the model of
-//! the paper; [`path`] and [`frame`] for what a robot does and sees; [`message`] and [`control`] for
-//! what travels; [`channels`], [`connection`], [`observer`] and [`wait`] for how. PROTOCOL.md says
+//! the paper; [`path`] and [`frame`] for what a robot does and sees; [`message`], [`control`] and
+//! [`decisions`] for what travels; [`channels`], [`connection`], [`responder`], [`observer`] and
+//! [`wait`] for how. PROTOCOL.md says
 //! the same for other languages. Words: a *world* is the hidden state of one grid; a *step* `k` flies
 //! one path and moves the world once; a *frame* is what was seen; a *lease* is the right to act.
 
 pub mod channels;
 pub mod connection;
 pub mod control;
+pub mod decisions;
 pub mod dynamics;
 pub mod frame;
 pub mod grid;
@@ -17,10 +19,12 @@ mod lanes;
 pub mod message;
 mod mixture;
 pub mod model;
+mod node;
 pub mod observer;
 pub mod path;
 pub mod program;
 pub mod randomness;
+pub mod responder;
 pub mod transition;
 pub mod wait;
 

@@ -66,6 +66,10 @@ pub enum Status {
     NotPermitted = 13,
     /// A flag that the server does not know; detail: the flags received.
     UnknownFlags = 14,
+    /// Not an objective of the agent's; detail: number of objectives.
+    BadObjective = 15,
+    /// The agent that was asked ends: it was told to, or cannot go on; detail: 0.
+    AgentEnds = 16,
 }
 
 /// A number that is no [`Status`] or no [`Operation`].
@@ -269,7 +273,7 @@ impl TryFrom<u32> for Operation {
 
 impl Status {
     /// Every status, in the order of its code.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 17] = [
         Self::Ok,
         Self::VersionMismatch,
         Self::UnknownOperation,
@@ -285,6 +289,8 @@ impl Status {
         Self::EpisodeOver,
         Self::NotPermitted,
         Self::UnknownFlags,
+        Self::BadObjective,
+        Self::AgentEnds,
     ];
 
     /// What to tell a client of another version.
@@ -331,6 +337,8 @@ impl Status {
             Self::UnknownFlags => {
                 format!("flags: expected 0 or {FLAG_FULL_COVERAGE} (full coverage), got {detail}")
             }
+            Self::BadObjective => format!("objective: expected 0 to {}", detail.saturating_sub(1)),
+            Self::AgentEnds => "the agent ends".into(),
         }
     }
 }
@@ -382,10 +390,10 @@ mod tests {
             assert_eq!(Status::try_from(code as u32), Ok(status));
         }
         assert_eq!(
-            Status::try_from(15),
+            Status::try_from(17),
             Err(UnknownCode {
                 what: "status",
-                value: 15
+                value: 17
             })
         );
     }

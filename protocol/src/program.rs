@@ -1,10 +1,54 @@
-//! What every program does when it starts: log to standard error, stop on signals.
+//! What every program does when it starts: log to standard error, stop on signals or with another
+//! process.
 
+use crate::wait::is_readable;
+use rustix::io::Errno;
+use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use std::io::IsTerminal;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use thiserror::Error;
 use tracing_subscriber::EnvFilter;
+
+/// The process that a private program ends with.
+#[derive(Debug)]
+pub struct Keeper(OwnedFd);
+
+/// The process to end with is not there.
+#[derive(Debug, Error, PartialEq, Eq)]
+#[error("--exit-with {pid}: expected a running process, got {problem}")]
+pub struct NoKeeper {
+    pid: i32,
+    problem: String,
+}
+
+impl Keeper {
+    /// Watches a process.
+    ///
+    /// # Errors
+    /// [`NoKeeper`] if it is not there.
+    pub fn watch(pid: i32) -> Result<Self, NoKeeper> {
+        let open = |process| pidfd_open(process, PidfdFlags::empty());
+        let process = (pid > 0).then(|| Pid::from_raw(pid)).flatten();
+        let descriptor = process.ok_or(Errno::SRCH).and_then(open);
+        descriptor.map(Self).map_err(|errno| NoKeeper {
+            pid,
+            problem: errno.to_string(),
+        })
+    }
+
+    /// Readable when it has ended.
+    pub fn descriptor(&self) -> BorrowedFd<'_> {
+        self.0.as_fd()
+    }
+
+    /// Whether it has ended.
+    pub fn has_ended(&self) -> bool {
+        is_readable(self.descriptor())
+    }
+}
 
 /// Logs to standard error, at `info` unless `RUST_LOG` says otherwise.
 pub fn start_logging() {

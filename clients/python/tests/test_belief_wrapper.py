@@ -102,6 +102,26 @@ def test_a_reset_observes_the_prior_and_a_step_the_posterior() -> None:
             assert (env.filter.belief == expected.belief).all()
 
 
+def test_the_belief_follows_the_steps_of_the_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    stub, frame = Stub(), np.full((*SHAPE, 1), 255, np.uint8)
+    frame[1, 2] = 2
+    steps = iter([5, 5, 6, 6, 9])
+    monkeypatch.setattr(stub, "reset", lambda **_: (frame, {"step": next(steps)}))
+    monkeypatch.setattr(stub, "step", lambda _: (frame, 0.0, False, False, {"step": next(steps)}))
+    env = Belief(stub)
+    env.reset()
+    expected = Filter(WILDFIRE, prior=initial_prior(WILDFIRE, **GRID))
+    expected.correct(frame[:, :, 0])  # a resumed episode begins with its last frame
+    for n_predictions in (0, 1, 0, 3):
+        env.step(None)
+        for _ in range(n_predictions):
+            expected.predict()
+        if n_predictions:
+            expected.correct(frame[:, :, 0])
+        assert (env.filter.belief == expected.belief).all()
+
+
+@pytest.mark.filterwarnings("ignore:.*different from the unwrapped version")
 @pytest.mark.parametrize("parts", [False, True])
 @pytest.mark.parametrize("keep", [False, True])
 @pytest.mark.parametrize("dtype", ["float32", "uint8"])

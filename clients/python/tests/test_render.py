@@ -55,6 +55,12 @@ def test_the_path_is_a_line_and_ends_in_the_robot() -> None:
     assert pixel(without, 40, 20) == FIRE and pixel(without, 20, 20) == NORMAL
 
 
+def test_a_path_over_unseen_cells_is_light() -> None:
+    unseen = np.full((2, 3), 255, np.uint8)
+    assert pixel(draw(frame=unseen), 40, 20) == WHITE
+    assert pixel(draw(frame=unseen), 40, 12) == WILDFIRE.unobserved
+
+
 def test_a_path_may_begin_in_the_corner() -> None:
     frame = np.zeros((4, 4), np.uint8)
     image = draw(frame=frame, robot=(3, 3), path=[(0, 0), (0, 1)], scale=4)
@@ -197,6 +203,12 @@ def test_tall_grids_take_half_the_lines() -> None:
     assert lines[-1] == "\x1b[38;2;48;48;48;49m▀▀▀\x1b[0m"
     even = text(frame=tall[:40], robot=(0, 0), path=None, color=True).split("\n")
     assert even == lines[:20]
+    flown = text(frame=tall, robot=(0, 0), path=[(0, 1)], color=True).split("\n")[0]
+    tint = round(48 * 0.55 + 255 * 0.45)
+    assert f"\x1b[38;2;{tint};{tint};{tint};48;2;200;55;27m▀" in flown
+
+
+PARTS: dict[str, Any] = {"frame": FRAME, "robot": (1, 1), "palette": WILDFIRE, "path": PATH}
 
 
 @pytest.fixture
@@ -210,16 +222,14 @@ def test_a_window_shows_the_picture(headless: None, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     screen = Screen(title="test")
     assert screen.kind == "window"
-    for image in (draw(), draw(truth=TRUTH)):
-        screen.show(image)
+    for parts in (PARTS, PARTS | {"truth": TRUTH}):
+        screen.show(**parts)
         shown = pygame.surfarray.array3d(pygame.display.get_surface()).transpose(1, 0, 2)
-        assert (shown == image).all()
-    with pytest.raises(TypeError, match="expected an array"):
-        screen.show("picture")
+        assert (shown == rgb_array(**parts)).all()
     pygame.event.post(pygame.event.Event(pygame.QUIT))
-    screen.show(draw())
+    screen.show(**PARTS)
     assert screen.kind == "nothing" and not pygame.display.get_init()
-    screen.show(draw())
+    screen.show(**PARTS)
     screen.close()
     screen.close()
 
@@ -230,23 +240,24 @@ def test_a_terminal_shows_the_text_in_place(
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     screen = Screen()
     assert screen.kind == "terminal"
-    screen.show("first")
-    screen.show("second")
-    with pytest.raises(TypeError, match="expected a text"):
-        screen.show(draw())
+    screen.show(**PARTS)
+    screen.show(**PARTS, truth=TRUTH)
     screen.close()
-    screen.show("third")
-    shown = "\x1b[2J\x1b[Hfirst\x1b[K\n\x1b[J\x1b[Hsecond\x1b[K\n\x1b[J"
+    screen.show(**PARTS)
+    first, second = ansi(**PARTS), ansi(**PARTS, truth=TRUTH)
+    shown = f"\x1b[2J\x1b[H{first}\x1b[K\n\x1b[J\x1b[H{second}\x1b[K\n\x1b[J"
     assert capsys.readouterr().out == shown
 
 
-def test_nowhere_to_show_is_said_once(headless: None, caplog: pytest.LogCaptureFixture) -> None:
+def test_nowhere_to_show_is_said_once(
+    headless: None, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
     with caplog.at_level(logging.WARNING):
         screen = Screen(fps=0.001)
-        screen.show("picture")
-        screen.show(draw())
+        screen.show(**PARTS)
+        screen.show(**PARTS)
         screen.close()
-    assert screen.kind == "nothing"
+    assert screen.kind == "nothing" and capsys.readouterr().out == ""
     assert [record.message for record in caplog.records] == [
         "render_mode 'human' shows nothing: there is no display with pygame installed, and the "
         "output is no terminal; use 'rgb_array' or 'ansi' to get pictures"
@@ -260,5 +271,5 @@ def test_pictures_keep_their_pace(headless: None, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("time.monotonic", lambda: 50.0)
     screen = Screen(fps=4.0)
     for _ in range(3):
-        screen.show("picture")
+        screen.show(**PARTS)
     assert waits == [0.0, 0.25, 0.5]

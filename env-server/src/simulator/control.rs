@@ -4,8 +4,7 @@ use super::{ResetOrder, Simulator, Slot};
 use crate::lease::{Claim, ClientId, Refusal};
 use protocol::channels::MAX_CLIENTS;
 use protocol::control::{
-    LeaseInfo, MAX_CONTROL_BYTES, Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldSeed,
-    WorldStatus,
+    LeaseInfo, Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldSeed, WorldStatus, parse,
 };
 use protocol::message::{Status, StepResult, VERSION};
 use protocol::randomness::{Purpose, stream};
@@ -114,7 +113,7 @@ impl Simulator {
         if version != VERSION {
             return Err(mismatch(version));
         }
-        Ok(match parse(text)? {
+        Ok(match parse(text).map_err(malformed)? {
             Request::Hello { protocol, .. } if protocol != VERSION => {
                 return Err(mismatch(protocol));
             }
@@ -202,7 +201,8 @@ impl Simulator {
                 .any(|earlier| earlier.world == *world)
             {
                 return Err(malformed(format!(
-                    "reset: expected each world once, got world {world} twice"
+                    "{}: reset: expected each world once, got world {world} twice",
+                    Status::Malformed.explain(0)
                 )));
             }
         }
@@ -302,16 +302,6 @@ impl Simulator {
     }
 }
 
-fn parse(text: &[u8]) -> Result<Request, Reply> {
-    if text.len() > MAX_CONTROL_BYTES {
-        return Err(malformed(format!(
-            "expected at most {MAX_CONTROL_BYTES} bytes, got {}",
-            text.len()
-        )));
-    }
-    serde_json::from_slice(text).map_err(|error| malformed(error.to_string()))
-}
-
 /// The refusal of a client that speaks another version.
 fn mismatch(client: u32) -> Reply {
     let (status, detail) = (Status::VersionMismatch, u64::from(VERSION));
@@ -323,8 +313,7 @@ fn mismatch(client: u32) -> Reply {
     }
 }
 
-fn malformed(problem: String) -> Reply {
-    let message = format!("{}: {problem}", Status::Malformed.explain(0));
+fn malformed(message: String) -> Reply {
     Reply::Error {
         status: Status::Malformed,
         detail: 0,

@@ -1,4 +1,4 @@
-//! The JSON of the control channel.
+//! The JSON of the control channel and of decisions.
 
 use crate::damage::{damage, damaged};
 use proptest::collection::vec;
@@ -8,6 +8,7 @@ use protocol::control::{
     CoverageRule, LeaseInfo, Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldSeed,
     WorldStatus,
 };
+use protocol::decisions::{self, Decision};
 use protocol::message::Status;
 
 proptest! {
@@ -25,6 +26,20 @@ proptest! {
     fn any_bytes_are_a_control_message_or_an_error(bytes in vec(any::<u8>(), 0..200)) {
         let _ = serde_json::from_slice::<Request>(&bytes);
         let _ = serde_json::from_slice::<Reply>(&bytes);
+        let _ = serde_json::from_slice::<decisions::Request>(&bytes);
+        let _ = serde_json::from_slice::<decisions::Reply>(&bytes);
+    }
+
+    #[test]
+    fn decisions_survive_json_and_damage(
+        decision in decision(),
+        damage in vec(damage(), 1..4),
+    ) {
+        let reply = decisions::Reply::Decision(decision);
+        let text = serde_json::to_string(&reply).expect("replies serialise");
+        prop_assert_eq!(serde_json::from_str::<decisions::Reply>(&text).ok(), Some(reply));
+        let text = damage.iter().fold(text, damaged);
+        let _ = serde_json::from_str::<decisions::Reply>(&text);
     }
 
     #[test]
@@ -53,6 +68,36 @@ fn nesting_as_deep_as_a_message_can_be_is_refused() {
             assert!(serde_json::from_str::<Reply>(&text).is_err());
         }
     }
+}
+
+fn decision() -> impl Strategy<Value = Decision> {
+    let numbers = (any::<[u64; 3]>(), any::<[u32; 5]>(), any::<[bool; 2]>());
+    let others = (
+        any::<Option<u64>>(),
+        -1e9..1e9_f64,
+        vec(0.0..=1.0_f32, 0..80),
+    );
+    (numbers, others).prop_map(
+        |(
+            ([step, seed, episode], counts, [terminated, truncated]),
+            (objective, reward, summary),
+        )| {
+            Decision {
+                step,
+                reward,
+                n_target_cells: counts[0],
+                n_visited: counts[1],
+                n_hits: counts[2],
+                robot: [counts[3], counts[4]],
+                terminated,
+                truncated,
+                seed,
+                episode,
+                objective,
+                summary,
+            }
+        },
+    )
 }
 
 fn request() -> impl Strategy<Value = Request> {

@@ -5,9 +5,11 @@ mod document;
 use document::{Field, Layout, PROTOCOL, documented_struct, fences, rows_under};
 use iceoryx2::prelude::ZeroCopySend;
 use protocol::channels::{
-    FRAME_BUFFER, MAX_CLIENTS, MAX_NODES, MAX_OBSERVERS, MAX_TRUTH_READERS, TRUTH_BUFFER,
+    Channel, FRAME_BUFFER, Instance, MAX_CLIENTS, MAX_NODES, MAX_OBSERVERS, MAX_TRUTH_READERS,
+    TRUTH_BUFFER,
 };
 use protocol::control::{MAX_CONTROL_BYTES, Reply, Request};
+use protocol::decisions;
 use protocol::grid::MAX_SIDE;
 use protocol::message::{
     ControlReply, ControlRequest, FLAG_FULL_COVERAGE, FrameHeader, Operation, Status, StepReply,
@@ -217,7 +219,7 @@ fn every_limit_is_documented() {
 #[test]
 fn every_control_message_has_an_example_that_round_trips() {
     let (mut operations, mut replies) = (BTreeSet::new(), BTreeSet::new());
-    for line in fences("json").iter().flat_map(|(_, text)| text.lines()) {
+    for line in lines_of_fences("") {
         let value: Value = serde_json::from_str(line).expect("examples are JSON");
         let name = |key: &str| value.get(key).map(|name| name.to_string());
         let again = match (name("op"), name("reply")) {
@@ -248,6 +250,58 @@ fn every_control_message_has_an_example_that_round_trips() {
 }
 
 #[test]
+fn every_message_of_decisions_has_an_example_that_round_trips() {
+    let (mut operations, mut replies) = (BTreeSet::new(), BTreeSet::new());
+    for line in lines_of_fences(" decisions") {
+        let value: Value = serde_json::from_str(line).expect("examples are JSON");
+        let again = if let Some(operation) = value.get("op") {
+            operations.insert(operation.as_str().expect("a name").to_owned());
+            let request: decisions::Request = serde_json::from_str(line).expect(line);
+            serde_json::to_string(&request)
+        } else {
+            replies.insert(value["reply"].as_str().expect("op or reply").to_owned());
+            let reply: decisions::Reply = serde_json::from_str(line).expect(line);
+            if let decisions::Reply::Error {
+                status,
+                detail,
+                message,
+            } = &reply
+            {
+                assert!(message.starts_with(&status.explain(*detail)), "{message}");
+            }
+            serde_json::to_string(&reply)
+        };
+        // As text: JSON knows no 32-bit floats.
+        let again: Value = serde_json::from_str(&again.expect("serialises")).expect("JSON");
+        assert_eq!(again, value);
+    }
+    assert_eq!(operations, variants_of::<decisions::Request>("op"));
+    assert_eq!(replies, variants_of::<decisions::Reply>("reply"));
+}
+
+#[test]
+fn every_service_is_documented() {
+    let documented: BTreeSet<String> = rows_under("| service | pattern |")
+        .into_iter()
+        .map(|row| row[0].replace('`', "").replace("<world>", "7"))
+        .collect();
+    let instance = Instance::new("x").expect("a plain name");
+    let known = [
+        Channel::Step,
+        Channel::Control,
+        Channel::Frames,
+        Channel::Truth,
+        Channel::WakeServer,
+        Channel::WakeClient,
+        Channel::Decisions(7),
+        Channel::WakeAgent(7),
+    ];
+    let names = known.map(|channel| instance.service_name(channel).to_string());
+    let known = names.map(|name| name.replace("emberwatch/v1/x/", ""));
+    assert_eq!(documented, BTreeSet::from(known));
+}
+
+#[test]
 fn the_worked_example_decodes_to_what_stands_beside_it() {
     let request = document::worked_example("StepRequest", &layouts());
     let (header, path) = request.split_at(size_of::<StepRequest>());
@@ -268,6 +322,13 @@ fn the_worked_example_decodes_to_what_stands_beside_it() {
     assert_eq!(seen, [(5, 0), (6, 2), (7, 2), (12, 1)]);
     assert_eq!(results[0].n_visited as usize, seen.len());
     assert_eq!(Coverage::try_from(results[0].coverage), Ok(Coverage::Path));
+}
+
+/// The lines of the JSON examples with this behind `json`.
+fn lines_of_fences(title: &str) -> Vec<&'static str> {
+    let fences = fences("json").into_iter();
+    let titled = fences.filter(|(found, _)| *found == title);
+    titled.flat_map(|(_, text)| text.lines()).collect()
 }
 
 fn snake_case<T: serde::Serialize>(value: &T) -> String {

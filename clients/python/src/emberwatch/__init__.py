@@ -10,15 +10,21 @@ Without Gymnasium, `connect` talks to a running server and `observe` reads what 
 
 import gymnasium
 
-from emberwatch.client import Client, Lease, ServerInfo, ServerStatus, WorldInfo, connect
+from emberwatch.client import Client, Lease, connect
+from emberwatch.decisions import Decisions
 from emberwatch.env import WildfireEnv
 from emberwatch.moves_env import WildfireMovesEnv
+from emberwatch.objective_env import WildfireObjectiveEnv
 from emberwatch.observer import Frame, Observer, Truth, TruthReader, observe
+from emberwatch.replies import Decision, DecisionsInfo, ServerInfo, ServerStatus, WorldInfo
 from emberwatch.vector_env import WildfireVectorEnv
 from emberwatch.wire import StepAnswer, StepResult
 
 __all__ = [
     "Client",
+    "Decision",
+    "Decisions",
+    "DecisionsInfo",
     "Frame",
     "Lease",
     "Observer",
@@ -30,6 +36,7 @@ __all__ = [
     "TruthReader",
     "WildfireEnv",
     "WildfireMovesEnv",
+    "WildfireObjectiveEnv",
     "WildfireVectorEnv",
     "WorldInfo",
     "connect",
@@ -49,4 +56,9 @@ gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
     "emberwatch/WildfireMoves-v0",
     entry_point="emberwatch.moves_env:WildfireMovesEnv",
     max_episode_steps=64 * MAX_EPISODE_STEPS,
+)
+gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
+    "emberwatch/WildfireObjective-v0",
+    entry_point="emberwatch.objective_env:WildfireObjectiveEnv",
+    max_episode_steps=MAX_EPISODE_STEPS,
 )

@@ -54,7 +54,7 @@ class WorldEnv(gymnasium.Env[Any, Any]):
 
     def render(self) -> Any:
         """Draws the last frame, path and robot, beside the truth when that is revealed."""
-        if self.render_mode is None or not self._session.is_open:
+        if self.render_mode is None or not self._is_open():
             gymnasium.logger.warn(NOTHING_TO_DRAW)
             return None
         return None if self.render_mode == "human" else self._draw()
@@ -63,6 +63,10 @@ class WorldEnv(gymnasium.Env[Any, Any]):
         """Gives the world back; a private server stops. Again is fine."""
         self._session.close()
         self._view.close()
+
+    def _is_open(self) -> bool:
+        """Whether there has been a reset since it was made or closed."""
+        return self._session.is_open
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None) -> StepAnswer:
         """Begins an episode, or goes on from where the world stands."""

@@ -6,21 +6,28 @@ Every call has a timeout in seconds; everything returned is a copy.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
-from typing import Any, Final, Self, TypeVar, cast, get_origin, get_type_hints
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
 from emberwatch.channels import Node
-from emberwatch.errors import GarbledAnswerError, InvalidActionError, refusal
+from emberwatch.errors import InvalidActionError, refusal
 from emberwatch.ports import Bell, RequestPort
+from emberwatch.replies import (
+    Grant,
+    ServerInfo,
+    ServerStatus,
+    WorldInfo,
+    WorldStatus,
+    ask,
+    record,
+    records,
+)
 from emberwatch.wire import StepAnswer
 
 #: Default timeout of a step, seconds.
@@ -28,81 +35,6 @@ STEP_TIMEOUT: Final = 5.0
 
 #: Default timeout of what may wait for a burn-in, seconds.
 RESET_TIMEOUT: Final = 120.0
-
-_Record = TypeVar("_Record")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ServerInfo:
-    """What a server says of itself (PROTOCOL.md section 6, `hello`)."""
-
-    protocol: int
-    build: str
-    pid: int
-    height: int
-    width: int
-    n_moves: int
-    n_worlds: int
-    n_observations: int
-    observations: tuple[str, ...]
-    #: The model as TOML text; None if the server hides it.
-    model: str | None
-    burn_in: int
-    #: Steps until an episode is truncated; 0: never.
-    max_steps: int
-    max_clients: int
-    #: Which cells a step observes: "path", "full" or "client" (as the step asks).
-    coverage: str
-    publish_truth: bool
-    lease_millis: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorldInfo:
-    """Where one world stands."""
-
-    world: int
-    step: int
-    seed: int
-    episode: int
-    robot: tuple[int, int]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorldStatus:
-    """One world in a `ServerStatus`."""
-
-    world: int
-    step: int
-    seed: int
-    episode: int
-    robot: tuple[int, int]
-    #: The process that holds it, if any.
-    holder_pid: int | None
-    #: Whether it is in its burn-in.
-    resetting: bool
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ServerStatus:
-    """What is going on at a server."""
-
-    pid: int
-    uptime_millis: int
-    n_steps: int
-    steps_per_second: float
-    n_refused: int
-    n_clients: int
-    n_observers: int
-    worlds: tuple[WorldStatus, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Grant:
-    """The reply to `acquire`, without its worlds."""
-
-    lease: int
-    ttl_millis: int
 
 
 class Client:
@@ -174,7 +106,7 @@ class Client:
         }
         reply = self.control(request, timeout=timeout)
         worlds = range(first_world, first_world + n_worlds)
-        return Lease(self, _record(_Grant, reply), _records(WorldInfo, reply), worlds)
+        return Lease(self, record(Grant, reply), records(WorldInfo, reply), worlds)
 
     def observe(
         self, first_world: int = 0, n_worlds: int = 1, *, timeout: float = STEP_TIMEOUT
@@ -185,8 +117,8 @@ class Client:
     def status(self, *, timeout: float = STEP_TIMEOUT) -> ServerStatus:
         """What is going on."""
         reply = self.control({"op": "status"}, timeout=timeout)
-        worlds = _records(WorldStatus, reply)
-        return _record(ServerStatus, {**reply, "worlds": worlds})
+        worlds = records(WorldStatus, reply)
+        return record(ServerStatus, {**reply, "worlds": worlds})
 
     def shutdown(self, *, timeout: float = STEP_TIMEOUT) -> None:
         """Stops the server, for everybody."""
@@ -270,14 +202,14 @@ class Client:
             "client": f"emberwatch-python {_release()}",
         }
         reply = self.control(hello, timeout=timeout)
-        return _record(ServerInfo, reply)
+        return record(ServerInfo, reply)
 
 
 class Lease:
     """The right to act on consecutive worlds. Ends by `release`, or leaving its `with`."""
 
     def __init__(
-        self, client: Client, grant: _Grant, start: tuple[WorldInfo, ...], worlds: range
+        self, client: Client, grant: Grant, start: tuple[WorldInfo, ...], worlds: range
     ) -> None:
         """Made by `Client.acquire`."""
         self.client: Final = client
@@ -364,7 +296,7 @@ class Lease:
             for world, seed in zip(chosen, given, strict=True)
         ]
         request = {"op": "reset", "lease": self.number, "worlds": pairs}
-        return _records(WorldInfo, self.client.control(request, timeout=timeout))
+        return records(WorldInfo, self.client.control(request, timeout=timeout))
 
     def renew(self, *, timeout: float = RESET_TIMEOUT) -> None:
         """Starts the lease's clock again without acting."""
@@ -435,73 +367,6 @@ def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]
             f"action: expected moves 0 to {wire.N_MOVES - 1}, got {given[where]} at {where}"
         )
     return given.astype(np.uint8)
-
-
-def ask(
-    port: RequestPort[wire.ControlReply],
-    bell: Bell,
-    sequence: int,
-    request: Mapping[str, Any],
-    timeout: float,
-) -> dict[str, Any]:
-    """One JSON request and its reply, on `control` or a channel like it.
-
-    Raises:
-        RefusedError: One of its subclasses, if it is refused.
-        RequestTimeoutError, ServerGoneError, GarbledAnswerError: If there is no good answer.
-    """
-    what = f"{request['op']!r}"
-    header = wire.CONTROL_REQUEST.pack(
-        wire.VERSION, 0, sequence, bell.listener_low, bell.listener_high
-    )
-    head, payload = port.exchange(header, json.dumps(request).encode(), what, timeout)
-    try:
-        reply = json.loads(payload)
-    except (ValueError, RecursionError) as error:
-        raise GarbledAnswerError(f"answer to {what}: expected JSON, got {error}") from None
-    if not isinstance(reply, dict):
-        raise GarbledAnswerError(f"answer to {what}: expected an object, got {reply!r}")
-    keys = cast("dict[str, Any]", reply)
-    if head.status != 0:
-        detail, message = keys.get("detail"), keys.get("message")
-        raise refusal(
-            head.status,
-            detail if isinstance(detail, int) else 0,
-            message if isinstance(message, str) else None,
-        )
-    wire.check_answer(f"answer to {what}", head, sequence)
-    return keys
-
-
-def _records(kind: type[_Record], reply: Mapping[str, Any]) -> tuple[_Record, ...]:
-    """The records of a reply's worlds."""
-    worlds = reply.get("worlds")
-    if not isinstance(worlds, list):
-        raise GarbledAnswerError(f"reply: expected a list 'worlds', got {worlds!r}")
-    return tuple(_record(kind, world) for world in cast("list[Any]", worlds))
-
-
-def _record(kind: type[_Record], keys: Any) -> _Record:
-    """A record from a reply; keys that this release does not know are ignored."""
-    if not isinstance(keys, Mapping):
-        raise GarbledAnswerError(f"reply: expected an object, got {keys!r}")
-    given = cast("Mapping[str, Any]", keys)
-    values: dict[str, Any] = {}
-    for name, types in _types(kind).items():
-        if name not in given:
-            raise GarbledAnswerError(f"reply: expected a key {name!r}, got {sorted(given)}")
-        value = tuple(given[name]) if isinstance(given[name], list) else given[name]
-        if not isinstance(value, types):
-            raise GarbledAnswerError(f"reply: expected another {name!r}, got {value!r}")
-        values[name] = value
-    return kind(**values)
-
-
-@cache
-def _types(kind: type[Any]) -> dict[str, Any]:
-    """What each field of a record may be: lists are tuples of anything."""
-    hints = get_type_hints(kind)
-    return {name: tuple if get_origin(hint) is tuple else hint for name, hint in hints.items()}
 
 
 def _release() -> str:

@@ -153,6 +153,18 @@ class UnknownFlagsError(RefusedError):
     name = "unknown_flags"
 
 
+class BadObjectiveError(RefusedError):
+    """An objective that the agent does not have. `detail`: how many it has."""
+
+    name = "bad_objective"
+
+
+class AgentEndsError(RefusedError):
+    """The agent that serves decisions ends: told so, its server is gone, or it failed."""
+
+    name = "agent_ends"
+
+
 #: The error of each status code, from code 1.
 REFUSALS: tuple[type[RefusedError], ...] = (
     VersionMismatchError,
@@ -169,6 +181,8 @@ REFUSALS: tuple[type[RefusedError], ...] = (
     EpisodeOverError,
     NotPermittedError,
     UnknownFlagsError,
+    BadObjectiveError,
+    AgentEndsError,
 )
 
 
@@ -183,12 +197,16 @@ def refusal(code: int, detail: int, message: str | None = None) -> RefusedError:
 
 
 def _explain(kind: type[RefusedError], detail: int) -> str:
+    """The server's sentence: on `step` it sends only the code."""
     if kind is LeaseLostError and detail == 0:
         return "lease lost: it expired or was released; acquire the worlds again"
+    if kind is NoSuchWorldError:
+        return f"no such world: the server has worlds 0 to {max(detail - 1, 0)}"
     sentences = {
-        "version_mismatch": "version mismatch: the client speaks 1, the server {}; "
-        "use client and server of one release",
-        "no_such_world": "no such world: the server has {} worlds",
+        "version_mismatch": "protocol version mismatch: the server speaks {}; "
+        "use a client and a server of one release",
+        "unknown_operation": "operation: expected 1 (step) or 2 (observe), got {}",
+        "malformed": "malformed control message",
         "wrong_length": "wrong payload length: expected {} bytes",
         "wrong_path_length": "wrong path length: the server flies {} moves a step",
         "bad_move": "byte {} of the paths: expected a move in 0..=3",
@@ -198,5 +216,8 @@ def _explain(kind: type[RefusedError], detail: int) -> str:
         "resetting": "world {} is being reset; wait for the answer to the reset",
         "episode_over": "world {} was truncated: reset it first",
         "not_permitted": 'full frames need a server with coverage "client" or "full"',
+        "unknown_flags": "flags: expected 0 or 1 (full coverage), got {}",
+        "bad_objective": "objective: expected one below {}",
+        "agent_ends": "the agent ends",
     }
-    return sentences.get(kind.name, kind.name.replace("_", " ") + " (detail {})").format(detail)
+    return sentences[kind.name].format(detail)

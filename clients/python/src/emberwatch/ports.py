@@ -49,15 +49,16 @@ _LET_GO: Final = 0.5
 class Bell:
     """Waking, both ways, and the life of the process that answers."""
 
-    def __init__(self, node: Node, server: str = "wake-server") -> None:
-        """Opens the wake services; `server` is that of the process that answers.
+    def __init__(self, node: Node, wake: str = "wake-server", who: str = "server") -> None:
+        """Opens the wake services: `wake` is that of the process that answers, `who` it is.
 
         Raises:
             ChannelError: If iceoryx2 fails.
         """
         self.node: Final = node
+        self._who = who
         with guard("open the wake services (are there more than 64 processes?)"):
-            notifier = node.open_wake(server).notifier_builder().create()
+            notifier = node.open_wake(wake).notifier_builder().create()
             listener = node.open_wake("wake-client").listener_builder().create()
         self.ring: Any = node.keep(notifier).notify
         self._listener: Any = node.keep(listener)
@@ -93,9 +94,9 @@ class Bell:
         return self._process is not None and bool(self._poll.poll(0))
 
     def gone(self) -> ServerGoneError:
-        """The error of a server that has ended; clears away what it left."""
+        """The error of a process that has ended; clears away what it left."""
         self.node.clean_up()
-        return ServerGoneError(f"the server on instance {self.node.instance!r} is gone")
+        return ServerGoneError(f"the {self._who} on instance {self.node.instance!r} is gone")
 
     def wait(self, pending: Any, what: str, timeout: float) -> Any:
         """The answer to a request.

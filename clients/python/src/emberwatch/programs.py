@@ -22,7 +22,7 @@ from emberwatch.errors import EmberwatchError, LaunchError, NoServerError, Reque
 _Connection = TypeVar("_Connection")
 
 #: How long a program may take until it answers, seconds.
-_START_TIMEOUT: Final = 20.0
+START_TIMEOUT: Final = 20.0
 
 #: How long it may take to stop before it is killed, seconds.
 _STOP_TIMEOUT: Final = 3.0
@@ -86,13 +86,15 @@ class Program:
             raise LaunchError(f"start {command[0]}: {error.strerror}") from None
         _programs.add(self)
 
-    def wait_for(self, connect: Callable[[], _Connection]) -> _Connection:
+    def wait_for(
+        self, connect: Callable[[], _Connection], timeout: float = START_TIMEOUT
+    ) -> _Connection:
         """Connects to it, again and again until it answers.
 
         Raises:
-            LaunchError: If it ends first, with its own words, or does not answer within 20 s.
+            LaunchError: If it ends first, with its own words, or does not answer in time.
         """
-        deadline = time.monotonic() + _START_TIMEOUT
+        deadline, pause = time.monotonic() + timeout, 0.002
         while True:
             try:
                 return connect()
@@ -106,9 +108,10 @@ class Program:
                 if time.monotonic() > deadline:
                     self.stop()
                     raise LaunchError(
-                        f"{self._name} did not answer within {_START_TIMEOUT} s: {error}"
+                        f"{self._name} did not answer within {timeout} s: {error}"
                     ) from None
-                time.sleep(0.002)
+                time.sleep(pause)
+                pause = min(2 * pause, 0.03)
             except EmberwatchError:
                 self.stop()
                 raise

@@ -1,25 +1,31 @@
 """Pictures of one world: what was seen along the path, beside the truth where it is known.
 
-`rgb_array` and `ansi` are pure: arrays in, a picture or a text out; `emberwatch.screen` shows them.
-Colours are the model's; the path is dark or white, whichever is further from them, and the robot a
-ring of both: lightness tells them apart, in grey and under every colour blindness.
+`rgb_array` and `ansi` are pure: arrays in, a picture or a text out. `Screen` shows either to
+people, for ``render_mode="human"``. The path is dark or light, whichever is further from the
+colours below it, and the robot a ring of both.
 """
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import io
 import itertools
+import logging
+import os
+import sys
+import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Self
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.belief import UNOBSERVED
-from emberwatch.model import MAX_VALUES, Color, Model
-from emberwatch.screen import Screen as Screen
+from emberwatch.palette import DARK, LIGHT, mark_on
+from emberwatch.palette import Palette as Palette
 
-_WHITE, _INK, _EDGE = (255, 255, 255), (0x14, 0x14, 0x14), (0xB4, 0xB4, 0xB4)
+_EDGE = (0xB4, 0xB4, 0xB4)
 _LONG_SIDE = 512  # pixels of a panel, about, unless a scale is given
 _GAP = 8  # pixels between panels
 _LEAST_LINE_SCALE = 4  # pixels a cell needs to show its colour beside a line
@@ -28,60 +34,11 @@ _TINT = 0.45  # share of white in visited cells too small for a line
 _LEAST_RADIUS, _MOST_RADIUS = 6.0, 14.0  # pixels of the robot's mark
 _MOST_WIDE_ROWS = 32  # rows that fit a terminal at one line each
 _SYMBOLS = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz+/"
-# The wildfire model's three, then from Okabe and Ito (2008), with a brown for their orange.
-_COLORS = ("3B6EA5", "E3B23C", "C8371B", "009E73", "CC79A7", "56B4E9", "8C510A", "F0E442")
-_GREYS = (0x30, 0x60, 0x98, 0xE2)  # for what was not observed, the preferred one first
-_APART = 3 * 60 * 60  # squared distance at which colours are told apart, as in the Rust figures
+
+_LOG = logging.getLogger(__name__)
 
 Cells = NDArray[np.integer] | Sequence[tuple[int, int]]
 """Visited cells (row, column) in order, shape (n, 2); each a neighbour of the last, or the same."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Palette:
-    """Colours of states, of observations, and of cells where nothing was observed."""
-
-    states: tuple[Color, ...]
-    """By state."""
-    observations: tuple[Color, ...]
-    """By observed value."""
-    unobserved: Color
-    """A grey unlike the others, dark if it can be."""
-    path: Color
-    """Dark or white, whichever is further from the observations."""
-
-    @classmethod
-    def of(cls, source: Model | int) -> Self:
-        """The model's colours, or for a hidden model eight others in turn, by its observations."""
-        if isinstance(source, Model):
-            states, observations = source.state_colors, source.observation_colors
-        else:
-            states = tuple(_color(i) for i in range(MAX_VALUES))  # however many there may be
-            observations = states[:source]
-        lights = [_luminance(color) for color in observations]
-        is_light = min(lights) * max(lights) > _luminance(_INK) * _luminance(_WHITE)
-        return cls(
-            states=states,
-            observations=observations,
-            unobserved=_grey_unlike((*states, *observations)),
-            path=_INK if is_light else _WHITE,
-        )
-
-    def paint_frame(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Colours (H, W, 3) of a frame (H, W).
-
-        Raises:
-            ValueError: A value is neither an observation nor 255.
-        """
-        return _paint(frame, {**dict(enumerate(self.observations)), UNOBSERVED: self.unobserved})
-
-    def paint_truth(self, truth: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Colours (H, W, 3) of hidden states (H, W).
-
-        Raises:
-            ValueError: A value is no state.
-        """
-        return _paint(truth, dict(enumerate(self.states)))
 
 
 def rgb_array(
@@ -120,11 +77,12 @@ def rgb_array(
         raise ValueError(f"scale: expected at least 1 pixel, got {scale}")
     colors = palette.paint_frame(frame)
     if scale < _LEAST_LINE_SCALE:
-        rows, cols = cells.T
-        colors[rows, cols] = np.rint(colors[rows, cols] * (1 - _TINT) + 255 * _TINT)
-    panels = [_enlarge(colors, scale)]
-    if scale >= _LEAST_LINE_SCALE:
-        _draw_path(panels[0], cells, scale, palette.path)
+        panels = [_enlarge(_tinted(colors, cells), scale)]
+    else:
+        seen = (frame != UNOBSERVED)[:, :, None]
+        line = np.where(seen, palette.path, mark_on(palette.unobserved)).astype(np.uint8)
+        panels = [_enlarge(colors, scale)]
+        _draw_path(panels[0], cells, line, scale)
     if truth is not None:
         panels.append(_enlarge(palette.paint_truth(truth), scale))
     for panel in panels:
@@ -144,25 +102,107 @@ def ansi(
     """Draws the same for a terminal, the truth at the right, without a line break at the end.
 
     In colour (24 bits), a cell is two characters, or on grids of more than 32 rows half of one,
-    which shows the path only by what was observed. Without colour it is two ASCII characters: the
-    value as ``0-9A-Za-z+/``, or ``.`` where nothing was observed, then ``@`` for the robot, ``*``
-    for the path or a space. The other arguments are those of `rgb_array`.
+    which tints the path. Without colour it is two ASCII characters: the value as ``0-9A-Za-z+/``,
+    or ``.`` where nothing was observed, then ``@`` for the robot, ``*`` for the path or a space.
+    The other arguments are those of `rgb_array`.
 
     Raises:
         ValueError: An argument is of another shape, leaves the grid or the palette.
     """
-    seen = _marks(frame.shape, _check(frame, robot, path, truth), robot)
-    grids = [(frame, palette.paint_frame(frame), seen)]
+    cells = _check(frame, robot, path, truth)
+    grids = [(frame, palette.paint_frame(frame), cells)]
     if truth is not None:
-        unseen = _marks(frame.shape, np.empty((0, 2), dtype=np.intp), robot)
-        grids.append((truth, palette.paint_truth(truth), unseen))
+        grids.append((truth, palette.paint_truth(truth), cells[:0]))
     if not color:
-        panels = [_ascii_lines(values, marks) for values, _, marks in grids]
+        panels = [_ascii_lines(values, _marks(values, at, robot)) for values, _, at in grids]
     elif len(frame) <= _MOST_WIDE_ROWS:
-        panels = [_wide_lines(colors, marks) for _, colors, marks in grids]
+        panels = [_wide_lines(colors, _marks(values, at, robot)) for values, colors, at in grids]
     else:
-        panels = [_half_lines(colors, robot) for _, colors, _ in grids]
+        panels = [_half_lines(_tinted(colors, at), robot) for _, colors, at in grids]
     return "\n".join("  ".join(lines).rstrip(" ") for lines in zip(*panels, strict=True))
+
+
+class Screen:
+    """Shows pictures to people: in a window, else in the terminal, else not at all.
+
+    A window needs pygame and a display (``DISPLAY``, ``WAYLAND_DISPLAY`` or ``SDL_VIDEODRIVER``);
+    pygame has one per process. Without it, the standard output must be a terminal. Without either,
+    a warning is logged once and nothing is shown. Closing the window ends only the show.
+    """
+
+    def __init__(self, *, title: str = "Emberwatch", fps: float = 0.0) -> None:
+        """Finds out where to show; opens nothing yet.
+
+        Args:
+            title: The window's.
+            fps: Most pictures a second, by waiting; 0 does not wait.
+        """
+        self._title, self._fps = title, fps
+        self._next: float | None = None
+        self._window: Any = None
+        self._pygame = _pygame_with_display()
+        self._kind: Literal["window", "terminal", "nothing"] = "window"
+        if self._pygame is None:
+            self._kind = "terminal" if sys.stdout.isatty() else "nothing"
+        if self._kind == "nothing":
+            _LOG.warning(
+                "render_mode 'human' shows nothing: there is no display with pygame installed, and "
+                "the output is no terminal; use 'rgb_array' or 'ansi' to get pictures"
+            )
+
+    @property
+    def kind(self) -> Literal["window", "terminal", "nothing"]:
+        """Where pictures go."""
+        return self._kind
+
+    def show(
+        self,
+        *,
+        frame: NDArray[np.uint8],
+        robot: tuple[int, int],
+        palette: Palette,
+        path: Cells | None = None,
+        truth: NDArray[np.uint8] | None = None,
+    ) -> None:
+        """Draws what `rgb_array` or `ansi` draws from the same, in place of the last picture.
+
+        Raises:
+            ValueError: An argument is of another shape, leaves the grid or the palette.
+        """
+        if self._kind == "window":
+            self._show_in_window(
+                rgb_array(frame=frame, robot=robot, palette=palette, path=path, truth=truth)
+            )
+        elif self._kind == "terminal":
+            picture = ansi(frame=frame, robot=robot, palette=palette, path=path, truth=truth)
+            clear = "\x1b[2J" if self._next is None else ""
+            sys.stdout.write(f"{clear}\x1b[H{picture}\x1b[K\n\x1b[J")
+            sys.stdout.flush()
+        self._pace()
+
+    def close(self) -> None:
+        """Closes the window, if there is one; later pictures are not shown. May be called again."""
+        if self._window is not None:
+            self._pygame.display.quit()
+        self._window, self._kind = None, "nothing"
+
+    def _show_in_window(self, image: NDArray[np.uint8]) -> None:
+        pygame, (height, width, _) = self._pygame, image.shape
+        if self._window is None or self._window.get_size() != (width, height):
+            self._window = pygame.display.set_mode((width, height))
+            pygame.display.set_caption(self._title)
+        surface = pygame.image.frombuffer(image.tobytes(), (width, height), "RGB")
+        self._window.blit(surface, (0, 0))
+        pygame.display.flip()
+        if any(event.type == pygame.QUIT for event in pygame.event.get()):
+            self.close()
+
+    def _pace(self) -> None:
+        now = time.monotonic()
+        at = now if self._next is None else max(now, self._next)
+        if self._kind != "nothing":
+            time.sleep(at - now)
+            self._next = at + (1.0 / self._fps if self._fps > 0.0 else 0.0)
 
 
 def _check(
@@ -190,59 +230,40 @@ def _check(
     return cells
 
 
-def _paint(values: NDArray[np.uint8], colors: dict[int, Color]) -> NDArray[np.uint8]:
-    table = np.zeros((256, 3), dtype=np.uint8)
-    for value, color in colors.items():
-        table[value] = color
-    unknown = np.isin(values, list(colors), invert=True)
-    if unknown.any():
-        got = int(values[unknown][0])
-        raise ValueError(f"picture: expected values out of {sorted(colors)}, got {got}")
-    return table[values]
-
-
-def _color(index: int) -> Color:
-    red, green, blue = bytes.fromhex(_COLORS[index % len(_COLORS)])
-    return red, green, blue
-
-
-def _grey_unlike(colors: tuple[Color, ...]) -> Color:
-    """The first grey that is well apart from all colours, else the one furthest from them."""
-
-    def nearest(grey: int) -> int:
-        return min((sum((c - grey) ** 2 for c in color) for color in colors), default=_APART)
-
-    grey = next((g for g in _GREYS if nearest(g) >= _APART), max(_GREYS, key=nearest))
-    return grey, grey, grey
-
-
-def _luminance(color: Color) -> float:
-    """What contrast ratios are made of, as the Web Content Accessibility Guidelines 2.1 do."""
-    red, green, blue = ((channel / 255.0) ** 2.2 for channel in color)
-    return 0.05 + 0.2126 * red + 0.7152 * green + 0.0722 * blue
+def _tinted(colors: NDArray[np.uint8], cells: NDArray[np.intp]) -> NDArray[np.uint8]:
+    tinted, (rows, cols) = colors.copy(), cells.T
+    tinted[rows, cols] = np.rint(colors[rows, cols] * (1 - _TINT) + 255 * _TINT)
+    return tinted
 
 
 def _enlarge(colors: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
     return colors.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
-def _draw_path(image: NDArray[np.uint8], cells: NDArray[np.intp], scale: int, color: Color) -> None:
-    """A line through the cells' middles, and a square where it begins."""
+def _draw_path(
+    image: NDArray[np.uint8], cells: NDArray[np.intp], colors: NDArray[np.uint8], scale: int
+) -> None:
+    """A line through the cells' middles in each cell's colour, and a square where it begins."""
     if not len(cells):
         return
     line = min(6, scale // 4)
     rim = 0 if scale < _LEAST_RIM_SCALE else max(1, line // 3)
-    other = _INK if color == _WHITE else _WHITE
+    is_dark = colors[:, :, :1] == DARK[0]
+    ink = _enlarge(colors, scale)
+    other = _enlarge(np.where(is_dark, LIGHT, DARK).astype(np.uint8), scale)
     middles = cells * scale + (scale - line) // 2
-    for grow, ink in ((rim, other), (0, color)):
-        for ends in zip(middles, middles[1:], strict=False):
-            top, left = np.minimum(*ends) - grow
+    legs = list(zip(middles, middles[1:], strict=False))
+    begin = (middles[0], middles[0])
+    for drawn, grow, source in (
+        (legs, rim, other),
+        (legs, 0, ink),
+        ([begin], rim + 2, ink),
+        ([begin], rim + 1, other),
+    ):
+        for ends in drawn:
+            top, left = np.maximum(np.minimum(*ends) - grow, 0)
             bottom, right = np.maximum(*ends) + line + grow
-            image[top:bottom, left:right] = ink
-    row, col = middles[0]
-    for grow, ink in ((rim + 2, color), (rim + 1, other)):
-        top, left = max(0, row - grow), max(0, col - grow)
-        image[top : row + line + grow, left : col + line + grow] = ink
+            image[top:bottom, left:right] = source[top:bottom, left:right]
 
 
 def _draw_robot(image: NDArray[np.uint8], robot: tuple[int, int], scale: int) -> None:
@@ -253,7 +274,7 @@ def _draw_robot(image: NDArray[np.uint8], robot: tuple[int, int], scale: int) ->
     window = image[top : int(row + radius) + 2, left : int(col + radius) + 2]
     rows, cols = np.ogrid[: window.shape[0], : window.shape[1]]
     distance = np.hypot(rows + top - row, cols + left - col)
-    for share, color in ((1.0, _WHITE), (0.8, _INK), (0.55, _WHITE), (0.3, _INK)):
+    for share, color in ((1.0, LIGHT), (0.8, DARK), (0.55, LIGHT), (0.3, DARK)):
         window[distance <= radius * share] = color
 
 
@@ -268,9 +289,9 @@ def _join(panels: list[NDArray[np.uint8]], *, axis: int) -> NDArray[np.uint8]:
 
 
 def _marks(
-    shape: tuple[int, ...], cells: NDArray[np.intp], robot: tuple[int, int]
+    values: NDArray[np.uint8], cells: NDArray[np.intp], robot: tuple[int, int]
 ) -> NDArray[np.str_]:
-    marks = np.full(shape, " ")
+    marks = np.full(values.shape, " ")
     marks[tuple(cells.T)] = "*"
     marks[tuple(robot)] = "@"
     return marks
@@ -289,7 +310,7 @@ def _wide_lines(colors: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator[
     for line, line_marks in zip(colors.tolist(), marks.tolist(), strict=True):
         cells: list[tuple[str, str]] = []
         for (red, green, blue), mark in zip(line, line_marks, strict=True):
-            ink = 0 if _luminance((red, green, blue)) > 0.23 else 255
+            ink, _, _ = mark_on((red, green, blue))
             cells.append((f"38;2;{ink};{ink};{ink};48;2;{red};{green};{blue}", wide[mark]))
         yield _styled(cells)
 
@@ -297,7 +318,7 @@ def _wide_lines(colors: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator[
 def _half_lines(colors: NDArray[np.uint8], robot: tuple[int, int]) -> Iterator[str]:
     """Lines of cells half a character high: the upper one in front, the lower one behind it."""
     colors = colors.copy()
-    colors[tuple(robot)] = _WHITE
+    colors[tuple(robot)] = LIGHT
     for row in range(0, len(colors), 2):
         cells: list[tuple[str, str]] = []
         for col, (red, green, blue) in enumerate(colors[row].tolist()):
@@ -313,3 +334,19 @@ def _styled(cells: list[tuple[str, str]]) -> str:
     runs = itertools.groupby(cells, key=lambda cell: cell[0])
     texts = (f"\x1b[{style}m" + "".join(text for _, text in run) for style, run in runs)
     return "".join(texts) + "\x1b[0m"
+
+
+def _pygame_with_display() -> Any:
+    """Pygame with its display ready, or None."""
+    if not any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")):
+        return None
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # it greets
+            pygame = importlib.import_module("pygame")
+    except ImportError:
+        return None
+    try:
+        pygame.display.init()
+    except pygame.error:
+        return None
+    return pygame

@@ -218,7 +218,7 @@ class Session:
         settings = self.settings
         try:
             if settings.instance is None:
-                self._client = client = self._launch(0 if seed is None else seed % 2**64)
+                self._client = client = self.launch(0 if seed is None else seed % 2**64)
             else:
                 self._client = client = Client(settings.instance, timeout=settings.timeout)
                 self._check_unchanged(client)
@@ -276,7 +276,12 @@ class Session:
                 f"was made, {self.shape}, got {shape} or another model: make the environment anew"
             )
 
-    def _launch(self, seed: int) -> Client:
+    def launch(self, seed: int) -> Client:
+        """Starts the private server, with this seed for world 0; `close` stops it.
+
+        Raises:
+            LaunchError: If it does not start, with its own words.
+        """
         instance = unused_instance()
         settings = self.settings
         shape = self.shape

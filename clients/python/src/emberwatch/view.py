@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from emberwatch.errors import SettingError
 from emberwatch.model import Model
-from emberwatch.render import Palette, ansi, rgb_array
-from emberwatch.screen import Screen
+from emberwatch.render import Palette, Screen, ansi, rgb_array
 from emberwatch.session import Shape
 
 #: The render modes of every environment here.
@@ -63,8 +62,7 @@ class View:
             return ansi(**parts)
         if self._screen is None:
             self._screen = Screen(fps=RENDER_FPS)
-        if self._screen.kind != "nothing":
-            self._screen.show((rgb_array if self._screen.kind == "window" else ansi)(**parts))
+        self._screen.show(**parts)
         return None
 
     def close(self) -> None:

@@ -37,9 +37,11 @@ class PriorError(RuntimeError):
 class Belief(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArgs):
     """Runs the known-model filter beside an environment and observes its belief.
 
-    For single environments in which one step is one step of the world, such as Emberwatch's own:
-    wrap those of a vector one by one. `terminated` and `truncated` pass through; only `reset`
-    begins a new belief.
+    For single environments: wrap those of a vector one by one. `terminated` and `truncated` pass
+    through; only `reset` begins a new belief. Where ``info["step"]`` tells the world's k, as in
+    Emberwatch's own environments, the belief follows it: a step that only flies a move changes
+    nothing, and one that flies several paths predicts as often, though it sees the last frame only.
+    Elsewhere, a step is taken for one of the world.
 
     ## Observations
     After `reset`, the prior about ``X_0``, the world after its burn-in. A step moves the world from
@@ -101,6 +103,7 @@ class Belief(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArg
         self._prior = _prior_of(env, prior, self._model, height=height, width=width)
         Filter(self._model, prior=self._prior)  # refuses what does not fit, now
         self._filter: Filter | None = None
+        self._step = 0
         self.observation_space = self._space(original, height, width)
 
     @property
@@ -119,8 +122,9 @@ class Belief(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArg
     ) -> tuple[Any, dict[str, Any]]:
         """Begins a new episode; observes the prior."""
         observation, info = self.env.reset(seed=seed, options=options)
+        self._step = int(info.get("step", 0))
         self._filter = Filter(self._model, prior=self._prior)
-        self._filter.correct(_frame_of(observation))  # empty, unless the server says otherwise
+        self._filter.correct(_frame_of(observation))  # empty, but where an episode is resumed
         return self._observe(observation), info
 
     def step(self, action: ActType) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -131,8 +135,11 @@ class Belief(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArg
         """
         belief = self.filter
         observation, reward, terminated, truncated, info = self.env.step(action)
-        belief.predict()
-        belief.correct(_frame_of(observation))
+        before, self._step = self._step, int(info.get("step", self._step + 1))
+        for _ in range(before, self._step):
+            belief.predict()
+        if self._step > before:
+            belief.correct(_frame_of(observation))
         return self._observe(observation), reward, terminated, truncated, info
 
     def _observe(self, observation: Any) -> Any:

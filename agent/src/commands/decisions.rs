@@ -1,0 +1,67 @@
+//! `serve-decisions`: a learner outside decides, this program estimates, plans and steps.
+
+use super::read_model;
+use agent::config::AgentFlags;
+use agent::decider::Assignment;
+use agent::decisions::serve_decisions;
+use agent::policy::PlannerKind;
+use anyhow::{Context, Result};
+use clap::{Args, ValueEnum};
+use protocol::channels::Instance;
+use protocol::program::stop_on_signals;
+use std::path::PathBuf;
+
+/// Take decisions for one world from a learner outside.
+#[derive(Args)]
+pub struct ServeDecisionsCommand {
+    /// The server's instance name
+    #[arg(long, default_value = "default")]
+    instance: String,
+    /// The world to act on
+    #[arg(long, default_value_t = 0)]
+    world: u32,
+    /// Take the world from its holder
+    #[arg(long)]
+    takeover: bool,
+    /// What plans a path for the objective decided
+    #[arg(long, default_value = "beam")]
+    planner: PlannerName,
+    /// The model file, where the server does not reveal its model
+    #[arg(long, value_name = "FILE")]
+    model: Option<PathBuf>,
+    /// End when this process ends
+    #[arg(long, value_name = "PID")]
+    exit_with: Option<i32>,
+    #[command(flatten)]
+    settings: AgentFlags,
+}
+
+/// The planners that have an objective.
+#[derive(Clone, Copy, ValueEnum)]
+enum PlannerName {
+    /// Beam search
+    Beam,
+    /// The best of many random paths
+    Shooting,
+}
+
+impl ServeDecisionsCommand {
+    /// Serves to the end.
+    pub fn run(&self) -> Result<()> {
+        let model = self.model.as_deref().map(read_model).transpose()?;
+        let task = Assignment {
+            instance: Instance::new(&self.instance)?,
+            world: self.world,
+            takeover: self.takeover,
+            planner: match self.planner {
+                PlannerName::Beam => PlannerKind::Beam,
+                PlannerName::Shooting => PlannerKind::Shooting,
+            },
+            config: self.settings.effective()?,
+        };
+        let stop = stop_on_signals().context("handle signals")?;
+        serve_decisions(&task, model.as_ref(), self.exit_with, &stop)?;
+        tracing::info!("done");
+        Ok(())
+    }
+}

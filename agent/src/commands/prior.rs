@@ -1,0 +1,98 @@
+//! `prior`: a filter's first belief as a file, for filters in other languages.
+
+use super::model_named;
+use agent::Belief;
+use agent::estimator::Prior;
+use anyhow::{Context, Result, ensure};
+use clap::Args;
+use ndarray_npy::WriteNpyExt;
+use protocol::Shape;
+use rustix::fs::{Access, access};
+use std::ffi::OsString;
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+/// Write a filter's first belief to a file.
+#[derive(Args)]
+pub struct PriorCommand {
+    /// `wildfire` or a model file
+    #[arg(long)]
+    model: String,
+    /// Grid height in cells
+    #[arg(long)]
+    height: usize,
+    /// Grid width in cells
+    #[arg(long)]
+    width: usize,
+    /// The server's burn-in: steps simulated from the initial distribution
+    #[arg(long, value_parser = clap::value_parser!(u64).range(0..=1 << 40))]
+    burn_in: u64,
+    /// Worlds simulated
+    #[arg(long, default_value_t = Prior::N_WORLDS as u64, value_parser = clap::value_parser!(u64).range(1..=10_000))]
+    worlds: u64,
+    /// Seed of these worlds: `--agent-seed` of an agent with the same belief
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Where to: NumPy's .npy, 32-bit floats of shape [states, height, width]
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+}
+
+impl PriorCommand {
+    /// Simulates and writes.
+    pub fn run(&self) -> Result<()> {
+        let model = model_named(&self.model)?;
+        let shape = Shape::new(self.height, self.width)?;
+        check_place(&self.out)?;
+        let prior = Prior::Simulated {
+            n_worlds: self.worlds as usize,
+            burn_in: self.burn_in,
+        };
+        let belief = prior.belief(&model, shape, self.seed)?;
+        write_whole(&self.out, &belief)?;
+        let shape = belief.probabilities().shape();
+        tracing::info!(?shape, file = %self.out.display(), "written");
+        Ok(())
+    }
+}
+
+/// Checks that the file can be written: better to fail before a long simulation than after.
+fn check_place(path: &Path) -> Result<()> {
+    let place = path.display();
+    // What is neither a file nor missing, such as a device, must not be replaced by one.
+    let free = path.metadata().map_or(true, |found| found.is_file());
+    ensure!(
+        free && path.file_name().is_some(),
+        "--out: expected a file, got {place}"
+    );
+    let folder = folder_of(path);
+    ensure!(
+        folder.is_dir() && access(folder, Access::WRITE_OK).is_ok(),
+        "--out: expected a file in a folder that can be written to, got {place}"
+    );
+    Ok(())
+}
+
+/// Writes to a file beside it, then renames: whoever reads finds all or nothing.
+fn write_whole(path: &Path, belief: &Belief) -> Result<()> {
+    let mut name = path.file_name().map_or_else(OsString::new, OsString::from);
+    name.push(format!(".{}", std::process::id()));
+    let beside = folder_of(path).join(name);
+    let written = File::create(&beside)
+        .context("create it")
+        .and_then(|file| {
+            belief.probabilities().write_npy(&file)?;
+            file.sync_all().context("write it")
+        })
+        .and_then(|()| std::fs::rename(&beside, path).context("rename it"));
+    if written.is_err() {
+        // The first error is the one to tell.
+        let _ = std::fs::remove_file(&beside);
+    }
+    written.with_context(|| format!("write {}", path.display()))
+}
+
+fn folder_of(path: &Path) -> &Path {
+    let parent = path.parent().filter(|parent| *parent != Path::new(""));
+    parent.unwrap_or(Path::new("."))
+}

@@ -1,0 +1,254 @@
+//! The agent's side of one decision: plan for the objective asked, step, correct, predict.
+//!
+//! What [`crate::run`] does with an objective of its own, one step at a time.
+
+use crate::agent::{Agent, Task};
+use crate::belief::Belief;
+use crate::client::{Claim, Client, Observation};
+use crate::compare::planner_seed;
+use crate::config::AgentConfig;
+use crate::planner::Objective;
+use crate::policy::{PlannerKind, Policy};
+use crate::run::RunError;
+use crate::summary::{summarise, summary_names};
+use protocol::Model;
+use protocol::channels::Instance;
+use protocol::control::WorldSeed;
+use protocol::decisions::{AgentInfo, Decision};
+use protocol::message::VERSION;
+use std::os::fd::BorrowedFd;
+use std::time::{Duration, Instant};
+
+/// A lease is renewed when this part of its life has passed without use.
+const RENEW_AFTER: u32 = 3;
+
+/// Which world to decide for, and how.
+#[derive(Debug, Clone)]
+pub struct Assignment {
+    /// The server.
+    pub instance: Instance,
+    /// The world.
+    pub world: u32,
+    /// Take the world from its holder.
+    pub takeover: bool,
+    /// What plans: beam search or shooting.
+    pub planner: PlannerKind,
+    /// Settings of planners and estimators.
+    pub config: AgentConfig,
+}
+
+/// A world, the belief about it, and the objectives that a decision chooses among.
+pub struct Decider {
+    client: Client,
+    model: Model,
+    prior: Belief,
+    config: AgentConfig,
+    choices: Vec<Policy>,
+    agent: Agent,
+    observation: Observation,
+    last: Decision,
+    last_use: Instant,
+    info: AgentInfo,
+}
+
+impl Decider {
+    /// Acquires the world where it stands and takes in its last frame.
+    ///
+    /// # Errors
+    /// [`RunError`]; a refusal names the holder of a world that is taken.
+    pub fn attach(task: &Assignment, model: Model, prior: Belief) -> Result<Self, RunError> {
+        let claim = Claim {
+            worlds: task.world..task.world + 1,
+            takeover: task.takeover,
+            time_to_live: None,
+        };
+        let mut client = Client::acquire(&task.instance, &claim)?;
+        let last_use = Instant::now();
+        let choices = Policy::choices(task.planner, &model);
+        let observation = observe(&mut client)?;
+        let agent = agent(
+            &client,
+            &model,
+            &prior,
+            &task.config,
+            &choices,
+            &observation,
+        )?;
+        let info = agent_info(task, &model, &choices, &client);
+        let last = decision(&agent, &observation, &client, None);
+        Ok(Self {
+            client,
+            model,
+            prior,
+            config: task.config.clone(),
+            choices,
+            agent,
+            observation,
+            last,
+            last_use,
+            info,
+        })
+    }
+
+    /// What it says of itself.
+    pub fn info(&self) -> &AgentInfo {
+        &self.info
+    }
+
+    /// Where the world and the belief stand.
+    pub fn last(&self) -> &Decision {
+        &self.last
+    }
+
+    /// Starts a new episode with a new belief.
+    ///
+    /// # Errors
+    /// [`RunError`]; after a refusal everything is as it was.
+    pub fn reset(&mut self, seed: Option<u64>) -> Result<&Decision, RunError> {
+        let world = self.client.worlds().start;
+        self.client.reset(&[WorldSeed { world, seed }])?;
+        self.last_use = Instant::now();
+        self.observation = observe(&mut self.client)?;
+        self.agent = agent(
+            &self.client,
+            &self.model,
+            &self.prior,
+            &self.config,
+            &self.choices,
+            &self.observation,
+        )?;
+        self.last = decision(&self.agent, &self.observation, &self.client, None);
+        Ok(&self.last)
+    }
+
+    /// Plans, flies, corrects, predicts; `None` if there is no such objective.
+    ///
+    /// # Errors
+    /// [`RunError`]; after a refusal everything is as it was.
+    pub fn decide(&mut self, objective: u64) -> Result<Option<&Decision>, RunError> {
+        let Some(target) = self.objective(objective) else {
+            return Ok(None);
+        };
+        let (robot, step) = (self.observation.robot(), self.observation.result.step);
+        let plan = self.agent.plan_for(target, robot, step);
+        let worlds = self.client.worlds();
+        self.observation = self.client.step(worlds, &[plan.moves])?.remove(0);
+        self.last_use = Instant::now();
+        self.agent.correct(&self.observation.frame, None)?;
+        self.agent.predict();
+        self.last = decision(
+            &self.agent,
+            &self.observation,
+            &self.client,
+            Some(objective),
+        );
+        Ok(Some(&self.last))
+    }
+
+    /// How long until the lease wants to be renewed.
+    pub fn until_renewal(&self) -> Duration {
+        let lease = Duration::from_millis(self.client.info().lease_millis);
+        (lease / RENEW_AFTER).saturating_sub(self.last_use.elapsed())
+    }
+
+    /// Checks that the server lives; renews the lease if it is time.
+    ///
+    /// # Errors
+    /// [`RunError::Connection`]: the server is gone, or the lease is lost.
+    pub fn keep_alive(&mut self) -> Result<(), RunError> {
+        self.client.check_server()?;
+        if self.until_renewal().is_zero() {
+            self.client.renew()?;
+            self.last_use = Instant::now();
+        }
+        Ok(())
+    }
+
+    /// The server's process: readable when it has ended.
+    pub fn server_process(&self) -> BorrowedFd<'_> {
+        self.client.server_process()
+    }
+
+    /// Gives the world back.
+    ///
+    /// # Errors
+    /// [`RunError::Connection`].
+    pub fn release(self) -> Result<(), RunError> {
+        Ok(self.client.release()?)
+    }
+
+    fn objective(&self, index: u64) -> Option<Objective> {
+        let choice = self.choices.get(usize::try_from(index).ok()?)?;
+        Some(self.config.objective(choice))
+    }
+}
+
+fn observe(client: &mut Client) -> Result<Observation, RunError> {
+    Ok(client.observe(client.worlds())?.remove(0))
+}
+
+/// An agent that has taken in the world's last frame.
+fn agent(
+    client: &Client,
+    model: &Model,
+    prior: &Belief,
+    config: &AgentConfig,
+    choices: &[Policy],
+    observation: &Observation,
+) -> Result<Agent, RunError> {
+    let task = Task {
+        model,
+        shape: client.shape(),
+        n_moves: client.info().n_moves,
+        prior,
+        seed: planner_seed(config, observation.result.seed),
+    };
+    // Any choice will do: each has the same estimator and planner.
+    let mut agent = Agent::new(&choices[0], config, task)?;
+    agent.correct(&observation.frame, None)?;
+    agent.predict();
+    Ok(agent)
+}
+
+fn decision(
+    agent: &Agent,
+    observation: &Observation,
+    client: &Client,
+    objective: Option<u64>,
+) -> Decision {
+    let result = &observation.result;
+    Decision {
+        step: result.step,
+        reward: result.reward,
+        n_target_cells: result.n_target_cells,
+        n_visited: result.n_visited,
+        n_hits: result.n_hits,
+        robot: [result.row, result.col],
+        terminated: result.terminated != 0,
+        truncated: result.truncated != 0,
+        seed: result.seed,
+        episode: result.episode,
+        objective,
+        summary: summarise(agent.belief(), observation.robot(), client.info().n_moves),
+    }
+}
+
+fn agent_info(task: &Assignment, model: &Model, choices: &[Policy], client: &Client) -> AgentInfo {
+    let server = client.info();
+    let states = model.file().states.iter();
+    AgentInfo {
+        protocol: VERSION,
+        build: env!("CARGO_PKG_VERSION").into(),
+        pid: std::process::id(),
+        instance: task.instance.name().into(),
+        world: task.world,
+        height: server.height,
+        width: server.width,
+        n_moves: server.n_moves,
+        max_steps: server.max_steps,
+        states: states.map(|state| state.name.clone()).collect(),
+        objectives: choices.iter().map(|choice| choice.name.clone()).collect(),
+        planner: task.planner.label().into(),
+        summary: summary_names(model),
+    }
+}

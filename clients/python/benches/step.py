@@ -1,0 +1,165 @@
+"""How fast the environments step, beside peers in the same run.
+
+Each row's rounds take turns with the others', so that a noisy machine is noisy for all. Peers:
+Gymnasium's `AsyncVectorEnv(shared_memory=True)` around an environment with the same spaces that
+simulates nothing, and EnvPool's CartPole where its wheel installs (in process, 4 numbers a step).
+Prints p50 and p99 with their least and greatest over rounds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import emberwatch  # noqa: F401  (registers the environments)
+
+NO_END = 2**31 - 1
+
+
+class Trivial(gymnasium.Env[Any, Any]):
+    """The spaces of `Wildfire-v0` without a simulation."""
+
+    def __init__(self) -> None:
+        frame = gymnasium.spaces.Box(0, 255, (64, 64, 1), np.uint8)
+        robot = gymnasium.spaces.MultiDiscrete([64, 64])
+        self.observation_space = gymnasium.spaces.Dict({"frame": frame, "robot": robot})
+        self.action_space = gymnasium.spaces.MultiDiscrete([4] * 64)
+        self._seen = {"frame": np.full((64, 64, 1), 255, np.uint8), "robot": np.zeros(2, np.int64)}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return self._seen, {}
+
+    def step(self, action: Any) -> Any:
+        return self._seen, 0.0, False, False, {}
+
+
+class Row:
+    """One environment, stepped in rounds."""
+
+    def __init__(self, name: str, envs: Any, actions: Any, n_envs: int) -> None:
+        self.name, self.envs, self.actions, self.n_envs = name, envs, actions, n_envs
+        self.rounds: list[tuple[float, float, float]] = []
+
+    def go(self, n_steps: int) -> None:
+        """One round: p50 and p99 of a step, and the mean, microseconds."""
+        micros: list[float] = []
+        for _ in range(n_steps):
+            start = time.perf_counter()
+            self.envs.step(self.actions)
+            micros.append((time.perf_counter() - start) * 1e6)
+        p50, p99 = np.percentile(micros, (50, 99))
+        self.rounds.append((float(p50), float(p99), statistics.fmean(micros)))
+
+    def report(self) -> None:
+        """Prints the medians over rounds."""
+        p50s, p99s, means = zip(*self.rounds, strict=True)
+        rates = [self.n_envs * 1e6 / mean for mean in means]
+        print(
+            f"{self.name:42} p50 {_spread(p50s)}  p99 {_spread(p99s)} us  "
+            f"{statistics.median(rates):9,.0f} ({min(rates):,.0f} to {max(rates):,.0f}) steps/s",
+            flush=True,
+        )
+
+
+def _spread(values: Any) -> str:
+    return f"{statistics.median(values):8.1f} ({min(values):.1f} to {max(values):.1f})"
+
+
+def emberwatch_row(n_envs: int) -> Row:
+    """Wildfire-v0, the simulation included: single, or the vector environment."""
+    if n_envs == 1:
+        env = gymnasium.make("emberwatch/Wildfire-v0", max_episode_steps=NO_END)
+        env.reset(seed=0)
+        return Row("emberwatch, env.step", env, env.action_space.sample(), 1)
+    envs = gymnasium.make_vec(
+        "emberwatch/Wildfire-v0", num_envs=n_envs, max_episode_steps=NO_END, burn_in=1000
+    )
+    envs.reset(seed=0)
+    return Row(f"emberwatch, {n_envs} worlds", envs, envs.action_space.sample(), n_envs)
+
+
+def async_row(n_envs: int) -> Row:
+    """Gymnasium's worker processes around nothing."""
+    envs = gymnasium.vector.AsyncVectorEnv([Trivial] * n_envs, shared_memory=True)
+    envs.reset(seed=0)
+    return Row(f"AsyncVectorEnv, {n_envs} trivial", envs, envs.action_space.sample(), n_envs)
+
+
+def envpool_row(n_envs: int) -> Row | None:
+    """EnvPool's CartPole; `None` where it is not installed or does not run."""
+    try:
+        import envpool
+
+        envs = envpool.make_gymnasium("CartPole-v1", num_envs=n_envs, num_threads=2)
+        envs.reset()
+    except Exception as problem:
+        print(f"EnvPool skipped: {type(problem).__name__}: {problem}")
+        return None
+    return Row(f"EnvPool CartPole, {n_envs}", envs, np.zeros(n_envs, np.int32), n_envs)
+
+
+def race(makers: list[Callable[[int], Row | None]], n_envs: int, n_steps: int, rounds: int) -> None:
+    """Lets rows of the same size take turns."""
+    rows = [row for row in (maker(n_envs) for maker in makers) if row is not None]
+    for row in rows:
+        row.go(n_steps // 10)
+        row.rounds.clear()
+    for _ in range(rounds):
+        for row in rows:
+            row.go(n_steps)
+    for row in rows:
+        row.report()
+        row.envs.close()
+
+
+def spin() -> None:
+    """A process that never sleeps."""
+    while True:
+        pass
+
+
+def start_up(n: int) -> None:
+    """From `gymnasium.make` to the first step, with a private server."""
+    seconds: list[float] = []
+    for seed in range(n):
+        start = time.perf_counter()
+        env = gymnasium.make("emberwatch/Wildfire-v0")
+        env.reset(seed=seed)
+        env.step(env.action_space.sample())
+        seconds.append(time.perf_counter() - start)
+        env.close()
+    print(
+        f"from make to the first step, burn-in included: {statistics.median(seconds):.3f} s "
+        f"({min(seconds):.3f} to {max(seconds):.3f})"
+    )
+
+
+def main() -> None:
+    """Prints all rows."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=5)
+    args = parser.parse_args()
+    start_up(5)
+    race([emberwatch_row, async_row, envpool_row], 1, 4000, args.rounds)
+    race([emberwatch_row, async_row, envpool_row], 64, 200, args.rounds)
+    print("beside three busy processes:")
+    context = multiprocessing.get_context("spawn")
+    busy = [context.Process(target=spin, daemon=True) for _ in range(3)]
+    for process in busy:
+        process.start()
+    time.sleep(1)
+    race([emberwatch_row, async_row], 1, 1000, args.rounds)
+    for process in busy:
+        process.kill()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,43 @@
+"""Runs every example in short form. `scripts/test --all` installs what they need."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parent
+
+#: Each example, short arguments, and a line that it must print.
+EXAMPLES = [
+    ("dqn.py", "--total-steps 3000 --report-every 1000", r"moves 3000  reward per path \d"),
+    ("sb3_moves.py", "--total-steps 600", r"reward of an episode of 50 paths: \d"),
+    (
+        "sb3_objective.py",
+        "--total-steps 500 --evaluation-steps 50",
+        r"always fire +[1-9]\S* fires found a step\n(.*\n)*PPO +\d",
+    ),
+    ("rllib_ppo.py", "--iterations 1 --batch 500", r"iteration 0: 500\S* steps, reward of an epi"),
+    ("minari_dataset.py", "--episodes 2 --steps 20", r"2 episodes, 40 steps"),
+    ("swap.py", "--steps 50", r"Python takes over\n(.*\n)*.*code 3 .*\n.*second Rust agent flew"),
+    ("live_plot.py", "--private --frames 60 --out OUT/plot.png", ""),
+]
+
+
+@pytest.mark.parametrize(("name", "arguments", "line"), EXAMPLES, ids=[e[0] for e in EXAMPLES])
+def test_an_example_runs(name: str, arguments: str, line: str, tmp_path: Path) -> None:
+    command = [sys.executable, str(FOLDER / name)]
+    command += arguments.replace("OUT", str(tmp_path)).split()
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert re.search(line, done.stdout), done.stdout
+    if "OUT" in arguments:
+        assert (tmp_path / "plot.png").stat().st_size > 10_000
+
+
+def test_every_example_is_run() -> None:
+    files = {path.name for path in FOLDER.glob("*.py")} - {Path(__file__).name}
+    assert files == {name for name, _, _ in EXAMPLES}

@@ -1,0 +1,272 @@
+"""`emberwatch/WildfireObjective-v0`: one step chooses what the next path is for."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, Unpack
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from emberwatch.base import WorldEnv, wants_to_resume
+from emberwatch.client import RESET_TIMEOUT
+from emberwatch.decisions import Decisions
+from emberwatch.errors import (
+    AgentEndsError,
+    ClosedError,
+    InvalidActionError,
+    LeaseLostError,
+    RequestTimeoutError,
+    ServerGoneError,
+    SettingError,
+)
+from emberwatch.observer import Frame, Observer, TruthReader
+from emberwatch.programs import Program
+from emberwatch.replies import Decision
+from emberwatch.session import Settings, WorldArguments, draw_seed
+from emberwatch.view import fly
+
+
+class WildfireObjectiveEnv(WorldEnv):
+    """The paper's high-level decision: what the next path of the robot is for.
+
+    ## Description
+
+    The world is that of `WildfireEnv`. An `emberwatch-agent` keeps the belief about it with the
+    known-model filter, and plans each path for the objective chosen; a learner here takes the
+    place of the paper's deep Q-network (section III.E), with everything else kept.
+
+    ## Action Space
+
+    `Discrete(S + 1)`: the path is planned for the probability of this state of the model's S
+    (wildfire: 0 normal, 1 latent, 2 fire), or S for the entropy of the belief.
+
+    ## Observation Space
+
+    `Box(0, 1, (18 (S + 1) + 2,), float32)`: a summary of the belief that the next plan will use,
+    in place of the paper's h_k. It is as long for every grid; PROTOCOL.md section 13 says what
+    each number is, and `summary_names` names them.
+
+    ## Rewards
+
+    As `WildfireEnv`.
+
+    ## Starting State
+
+    As `WildfireEnv`, with the belief that the world's burn-in leaves one with (`prior`).
+
+    ## Episode End
+
+    As `WildfireEnv`.
+
+    ## Information
+
+    As `WildfireEnv`.
+
+    ## Arguments
+
+    As `WildfireEnv` without `observation`, and
+
+    * `planner`: `"beam"` (beam search, the default) or `"shooting"` (the paper's).
+    * `prior`: `"simulated"` (the default; takes a second to start), `"initial"` or `"uniform"`.
+    * `agent`: `"own"` starts an agent on the world; `"running"` uses one that serves decisions
+      already, for `world` of `instance`.
+
+    ## Version History
+
+    * v0: the first.
+    """
+
+    def __init__(
+        self,
+        *,
+        planner: Literal["beam", "shooting"] = "beam",
+        prior: Literal["simulated", "initial", "uniform"] = "simulated",
+        agent: Literal["own", "running"] = "own",
+        render_mode: str | None = None,
+        **world: Unpack[WorldArguments],
+    ) -> None:
+        """Checks the arguments; see the class. Nothing is started before the first reset.
+
+        Raises:
+            SettingError: If an argument is impossible or contradicts the running server.
+            NoServerError: If nobody serves `instance`.
+        """
+        _check_choice("planner", planner, ("beam", "shooting"))
+        _check_choice("prior", prior, ("simulated", "initial", "uniform"))
+        _check_choice("agent", agent, ("own", "running"))
+        settings = Settings(**world)
+        if agent == "running" and settings.instance is None:
+            raise SettingError("agent='running': expected instance=..., where it runs")
+        super().__init__(settings, render_mode, reveals=settings.truth)
+        if self.model is None:
+            raise SettingError("instance: expected a server that reveals its model")
+        self._arguments = {"planner": planner, "prior": prior}
+        self._agent: Program | None = None
+        self._owns_agent = agent == "own"
+        self._decisions: Decisions | None = None
+        self._frames: Observer | None = None
+        self._truths: TruthReader | None = None
+        self._frame: Frame | None = None
+        n_objectives = self.model.n_states + 1
+        self.action_space = spaces.Discrete(n_objectives)
+        self.observation_space = spaces.Box(0.0, 1.0, (18 * n_objectives + 2,), np.float32)
+
+    @property
+    def instance(self) -> str:
+        """The server's instance name, once the environment has been reset."""
+        return self._opened().info.instance
+
+    @property
+    def objectives(self) -> tuple[str, ...]:
+        """What each action plans for, once the environment has been reset."""
+        return self._opened().info.objectives
+
+    @property
+    def summary_names(self) -> tuple[str, ...]:
+        """What each number of an observation is, once the environment has been reset."""
+        return self._opened().info.summary
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begins an episode; see `WildfireEnv`.
+
+        Raises:
+            BusyError: If another client holds the world of a running server.
+            SettingError: If an option is unknown.
+        """
+        super(WorldEnv, self).reset(seed=seed)
+        resume = wants_to_resume(options, seed)
+        world_seed = draw_seed(self.np_random) if seed is None and not resume else seed
+        decisions = self._open(world_seed)
+        decision = decisions.last() if resume else decisions.reset(world_seed)
+        self._path = None
+        return self._seen(decision)
+
+    def step(
+        self, action: np.integer[Any] | int
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Plans and flies a path for an objective.
+
+        Raises:
+            InvalidActionError: If it is not an integer in 0 to S. Nothing is sent.
+            LeaseLostError: If another client took the world over.
+            ServerGoneError, AgentEndsError, RequestTimeoutError: If there is no answer.
+        """
+        given = np.asarray(action)
+        n_objectives = len(self._opened().info.objectives)
+        is_integer = given.size == 1 and given.dtype.kind in "iu"
+        if not is_integer or not 0 <= int(given.item()) < n_objectives:
+            raise InvalidActionError(
+                f"action: expected one integer, 0 to {n_objectives - 1}, got {action!r}"
+            )
+        try:
+            timeout = max(10.0, self._session.settings.timeout)
+            decision = self._opened().decide(int(given.item()), timeout=timeout)
+        except (LeaseLostError, AgentEndsError, ServerGoneError):
+            self.close()
+            raise
+        observation, info = self._seen(decision)
+        return observation, decision.reward, decision.terminated, decision.truncated, info
+
+    def close(self) -> None:
+        """Ends the agent and the private server, if they are its own. Again is fine."""
+        readers, self._frames, self._truths = (self._frames, self._truths), None, None
+        for part in (*readers, self._decisions):
+            if part is not None:
+                part.close()
+        self._decisions = None
+        agent, self._agent = self._agent, None
+        if agent is not None:
+            agent.stop()
+        super().close()
+
+    def _is_open(self) -> bool:
+        return self._decisions is not None
+
+    def _open(self, seed: int | None) -> Decisions:
+        """Starts what is missing: server, agent, readers."""
+        if self._decisions is not None:
+            return self._decisions
+        settings = self._session.settings
+        try:
+            instance = settings.instance
+            if instance is None:
+                with self._session.launch(0 if seed is None else seed) as client:
+                    instance = client.instance
+            if self.render_mode is not None:
+                self._frames = Observer(instance, world=settings.world)
+            if self._reveals:
+                self._truths = TruthReader(instance)
+            self._decisions = self._start_agent(instance)
+        except BaseException:
+            self.close()
+            raise
+        return self._decisions
+
+    def _start_agent(self, instance: str) -> Decisions:
+        settings = self._session.settings
+
+        def connect() -> Decisions:
+            return Decisions(instance, settings.world, timeout=settings.timeout)
+
+        if not self._owns_agent:
+            return connect()
+        flags = self._arguments | {"instance": instance, "world": str(settings.world)}
+        command = ["serve-decisions", *(f"--{flag}={value}" for flag, value in flags.items())]
+        if settings.takeover:
+            command.append("--takeover")
+        self._agent = Program("emberwatch-agent", command)
+        return self._agent.wait_for(connect, RESET_TIMEOUT)
+
+    def _opened(self) -> Decisions:
+        if self._decisions is None:
+            raise ClosedError("the environment is closed: reset it first")
+        return self._decisions
+
+    def _seen(self, decision: Decision) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        info: dict[str, Any] = {
+            "step": decision.step,
+            "n_target_cells": decision.n_target_cells,
+            "n_visited": decision.n_visited,
+            "n_hits": decision.n_hits,
+        }
+        moment = (decision.episode, decision.step)
+        if self._truths is not None:
+            info["truth"] = self._truth = self._await_truth(self._truths, moment)
+        if self._frames is not None:
+            self._frame = frame = self._await_frame(self._frames, moment)
+            self._path = fly(frame.start, frame.path, self._shape) if len(frame.path) else None
+        if self.render_mode == "human":
+            self._draw()
+        return np.array(decision.summary, np.float32), info
+
+    def _await_frame(self, reader: Observer, moment: tuple[int, int]) -> Frame:
+        """The published frame of a moment: `(episode, step)`."""
+        while True:
+            frame = reader.receive(self._session.settings.timeout)
+            if frame is None:
+                raise RequestTimeoutError("no frame was published in time")
+            if (frame.result.episode, frame.result.step) == moment:
+                return frame
+
+    def _await_truth(self, reader: TruthReader, moment: tuple[int, int]) -> NDArray[np.uint8]:
+        while True:
+            truth = reader.receive(self._session.settings.timeout)
+            if truth is None:
+                raise RequestTimeoutError("no hidden states were published in time")
+            is_ours = truth.world == self._session.settings.world
+            if is_ours and (truth.episode, truth.step) == moment:
+                return truth.states
+
+    def _draw(self) -> Any:
+        if self._frame is None:
+            return None
+        robot = (self._frame.result.row, self._frame.result.col)
+        return self._view.draw(self._frame.frame, robot, self._path, self._truth)
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise SettingError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")

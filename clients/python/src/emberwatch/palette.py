@@ -1,0 +1,116 @@
+"""The colours of pictures: the model's own, and marks that stand out from them.
+
+Lightness tells marks from cells, so that they can be told apart in grey and under every colour
+blindness.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.belief import UNOBSERVED
+from emberwatch.model import MAX_VALUES, Color, Model
+
+DARK: Final[Color] = (0x14, 0x14, 0x14)
+"""Marks on light cells."""
+
+LIGHT: Final[Color] = (0xFF, 0xFF, 0xFF)
+"""Marks on dark cells."""
+
+# The wildfire model's three, then from Okabe and Ito (2008), with a brown for their orange.
+_COLORS = ("3B6EA5", "E3B23C", "C8371B", "009E73", "CC79A7", "56B4E9", "8C510A", "F0E442")
+_GREYS = (0x30, 0x60, 0x98, 0xE2)  # for what was not observed, the preferred one first
+_APART = 3 * 60 * 60  # squared distance at which colours are told apart, as in the Rust figures
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Palette:
+    """Colours of states, of observations, and of cells where nothing was observed."""
+
+    states: tuple[Color, ...]
+    """By state."""
+    observations: tuple[Color, ...]
+    """By observed value."""
+    unobserved: Color
+    """A grey unlike the others, dark if it can be."""
+    path: Color
+    """Of a path over observed cells: dark or light, whichever is further from all of them."""
+
+    @classmethod
+    def of(cls, source: Model | int) -> Self:
+        """The model's colours, or eight others in turn for a hidden model.
+
+        Args:
+            source: The model, or its number of observations, 1 to 64.
+        """
+        if isinstance(source, Model):
+            states, observations = source.state_colors, source.observation_colors
+        else:
+            states = tuple(_color(i) for i in range(MAX_VALUES))  # however many there may be
+            observations = states[:source]
+        return cls(
+            states=states,
+            observations=observations,
+            unobserved=_grey_unlike((*states, *observations)),
+            path=mark_on(*observations),
+        )
+
+    def paint_frame(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Colours (H, W, 3) of a frame (H, W).
+
+        Raises:
+            ValueError: A value is neither an observation nor 255.
+        """
+        return _paint(frame, {**dict(enumerate(self.observations)), UNOBSERVED: self.unobserved})
+
+    def paint_truth(self, truth: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Colours (H, W, 3) of hidden states (H, W).
+
+        Raises:
+            ValueError: A value is no state.
+        """
+        return _paint(truth, dict(enumerate(self.states)))
+
+
+def mark_on(*colors: Color) -> Color:
+    """Dark or light: the one with more contrast to the colour that it has least contrast to.
+
+    Contrast ratios and luminances are those of the Web Content Accessibility Guidelines 2.1.
+    """
+    lights = [_luminance(color) for color in colors]
+    return DARK if min(lights) * max(lights) > _luminance(DARK) * _luminance(LIGHT) else LIGHT
+
+
+def _luminance(color: Color) -> float:
+    red, green, blue = ((channel / 255.0) ** 2.2 for channel in color)
+    return 0.05 + 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+def _paint(values: NDArray[np.uint8], colors: dict[int, Color]) -> NDArray[np.uint8]:
+    table = np.zeros((256, 3), dtype=np.uint8)
+    for value, color in colors.items():
+        table[value] = color
+    unknown = np.isin(values, list(colors), invert=True)
+    if unknown.any():
+        got = int(values[unknown][0])
+        raise ValueError(f"picture: expected values out of {sorted(colors)}, got {got}")
+    return table[values]
+
+
+def _color(index: int) -> Color:
+    red, green, blue = bytes.fromhex(_COLORS[index % len(_COLORS)])
+    return red, green, blue
+
+
+def _grey_unlike(colors: tuple[Color, ...]) -> Color:
+    """The first grey that is well apart from all colours, else the one furthest from them."""
+
+    def nearest(grey: int) -> int:
+        return min(sum((channel - grey) ** 2 for channel in color) for color in colors)
+
+    grey = next((g for g in _GREYS if nearest(g) >= _APART), max(_GREYS, key=nearest))
+    return grey, grey, grey

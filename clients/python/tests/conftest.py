@@ -1,0 +1,54 @@
+"""A deadline for each test; servers and scripts that end with it."""
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from types import FrameType
+
+import pytest
+from processes import SMALL, Script, Server
+
+from emberwatch.programs import unused_instance
+
+#: A whole test, seconds.
+DEADLINE = 90
+
+
+@pytest.fixture(autouse=True)
+def deadline() -> Iterator[None]:
+    """A test that hangs fails."""
+
+    def late(_number: int, _frame: FrameType | None) -> None:
+        raise TimeoutError(f"still running after {DEADLINE} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(DEADLINE)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture
+def server() -> Iterator[Callable[..., Server]]:
+    """Starts a small server, `server(worlds=3, coverage="client")`, that ends with the test."""
+    with ExitStack() as stack:
+
+        def start(instance: str | None = None, *, ready: bool = True, **settings: object) -> Server:
+            started = Server(instance or unused_instance(), SMALL | settings, ready=ready)
+            stack.callback(started.close)
+            return started
+
+        yield start
+
+
+@pytest.fixture
+def script() -> Iterator[Callable[..., Script]]:
+    """Runs Python code in a process of its own, `script(code, argument)`."""
+    with ExitStack() as stack:
+
+        def start(code: str, *arguments: object) -> Script:
+            started = Script(code, *arguments)
+            stack.callback(started.close)
+            return started
+
+        yield start

@@ -1,0 +1,140 @@
+"""Servers and scripts as child processes: on instances of their own, with deadlines."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+
+from emberwatch.client import Client, ServerStatus
+from emberwatch.programs import Program
+
+#: How long anything may take that should take milliseconds, seconds.
+PATIENCE = 20.0
+
+#: A small, quick server: 5 x 7 cells, 6 moves, 20 steps of burn-in.
+SMALL = {"height": 5, "width": 7, "moves": 6, "burn_in": 20}
+
+
+class Server:
+    """A running server and the connections to it."""
+
+    def __init__(self, instance: str, settings: dict[str, object], *, ready: bool) -> None:
+        """Starts it and waits until it answers and, if asked, until its worlds are ready."""
+        self.instance = instance
+        arguments = {"instance": instance, **settings}
+        flags = [f"--{name.replace('_', '-')}={value}" for name, value in arguments.items()]
+        self.program = Program("emberwatch-server", flags)
+        self._held = ExitStack()
+        self._held.callback(self.program.stop)
+        self._held.callback(self.wake_up)
+        try:
+            self._client = self.program.wait_for(self.connect)
+            assert not ready or eventually(self._is_ready)
+        except BaseException:
+            self.close()
+            raise
+
+    def connect(self) -> Client:
+        """A connection that the end of the test closes."""
+        return self._held.enter_context(Client(self.instance))
+
+    def status(self) -> ServerStatus:
+        """What is going on at it; over a connection of its own, which counts as a client."""
+        return self._client.status(timeout=PATIENCE)
+
+    def _is_ready(self) -> bool:
+        return not any(world.resetting for world in self.status().worlds)
+
+    def signal(self, number: int) -> None:
+        """Sends it a signal."""
+        os.kill(self.program.pid, number)
+
+    def stop(self) -> None:
+        """Pauses it; returns when it no longer runs."""
+        self.signal(signal.SIGSTOP)
+        assert eventually(lambda: _state(self.program.pid) == "T")
+
+    def wake_up(self) -> None:
+        """Lets it go on, if it still runs."""
+        if is_running(self.program.pid):
+            self.signal(signal.SIGCONT)
+
+    def kill(self) -> None:
+        """Ends it as no handler can prevent; returns when it has ended."""
+        self.signal(signal.SIGKILL)
+        assert eventually(lambda: not is_running(self.program.pid))
+
+    def close(self) -> None:
+        """Closes the connections and stops it."""
+        self._held.close()
+
+
+class Script:
+    """A Python process that runs some code; killed at the end."""
+
+    def __init__(self, code: str, *arguments: object) -> None:
+        """Starts it; `sys.argv[1:]` are the arguments."""
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", code, *map(str, arguments)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        self.pid = self._process.pid
+
+    def line(self) -> str:
+        """The next line that it prints."""
+        late = threading.Timer(PATIENCE, self._process.kill)
+        late.start()
+        line = self._process.stdout.readline()
+        late.cancel()
+        assert line, self._process.stderr.read()
+        return line.strip()
+
+    def say(self, text: str = "") -> None:
+        """Sends it a line."""
+        self._process.stdin.write(f"{text}\n")
+        self._process.stdin.flush()
+
+    def signal(self, number: int) -> None:
+        """Sends a signal to it and its process group, as a terminal does."""
+        os.killpg(self.pid, number)
+
+    def end(self) -> tuple[int, str, str]:
+        """Waits for its end: exit code, and what else it printed."""
+        out, err = self._process.communicate(timeout=PATIENCE)
+        return self._process.returncode, out, err
+
+    def close(self) -> None:
+        """Kills it."""
+        self._process.kill()
+        self._process.communicate()
+
+
+def eventually(holds: Callable[[], bool], limit: float = PATIENCE) -> bool:
+    """Looks every millisecond until something holds; whether it did in time."""
+    end = time.monotonic() + limit
+    while not holds():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.001)
+    return True
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process has not ended; one that nobody has waited for yet has."""
+    return _state(pid) not in ("", "Z", "X")
+
+
+def _state(pid: int) -> str:
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return ""

@@ -1,0 +1,626 @@
+"""A client and a running server: handshake, leases, steps, refusals, fork and Ctrl-C."""
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from processes import PATIENCE, Script, Server, eventually, is_running
+
+from emberwatch import channels, errors, wire
+from emberwatch.client import connect
+from emberwatch.errors import InvalidActionError
+
+Start = Callable[..., Server]
+Run = Callable[..., Script]
+
+US = os.getpid()
+
+
+def paths(n_worlds: int, seed: int = 0) -> NDArray[np.int64]:
+    return np.random.default_rng(seed).integers(0, 4, (n_worlds, 6))
+
+
+def refused(call: Callable[[], object], kind: type[errors.RefusedError], detail: int) -> str:
+    """Checks the refusal; returns its sentence."""
+    with pytest.raises(kind) as raised:
+        call()
+    assert type(raised.value) is kind
+    assert (raised.value.name, raised.value.detail) == (kind.name, detail)
+    assert " " in str(raised.value)
+    return str(raised.value)
+
+
+def test_a_handshake_tells_what_the_server_is(server: Start) -> None:
+    settings = {"worlds": 3, "max_steps": 9, "coverage": "client", "lease_millis": 1234}
+    started = server(**settings, publish_truth="true")
+    info = connect(started.instance).info
+    assert (info.protocol, info.pid) == (wire.VERSION, started.program.pid)
+    assert (info.height, info.width, info.n_moves, info.n_worlds) == (5, 7, 6, 3)
+    assert (info.burn_in, info.max_steps, info.lease_millis) == (20, 9, 1234)
+    assert (info.coverage, info.publish_truth, info.max_clients) == ("client", True, 16)
+    assert info.observations == ("normal", "latent", "fire")
+    assert info.model is not None and "kernel" in info.model
+
+
+def test_a_hidden_model_is_none(server: Start) -> None:
+    assert server(reveal_model="false").connect().info.model is None
+
+
+def test_a_step_moves_the_robot_and_the_world(server: Start) -> None:
+    lease = server(seed=11).connect().acquire()
+    (start,) = lease.start
+    assert (start.step, start.seed, start.robot) == (0, 11, (0, 0))
+    # up (off the grid), down, down, right, right, left
+    answer = lease.step([0, 1, 1, 3, 3, 2])
+    result = answer.result()
+    assert (result.step, result.seed, result.row, result.col) == (1, 11, 2, 1)
+    assert (answer.first_world, answer.frames.shape) == (0, (1, 5, 7))
+    visited = {(0, 0), (1, 0), (2, 0), (2, 1), (2, 2)}
+    seen = {(int(row), int(col)) for row, col in np.argwhere(answer.frames[0] != 255)}
+    assert seen == visited and result.n_visited == 5
+    assert (result.coverage, result.terminated, result.truncated) == (1, 0, 0)
+    assert answer.simulation_nanos > 0
+
+
+def test_paths_may_be_integers_of_any_type(server: Start) -> None:
+    lease = server(worlds=2).connect().acquire(0, 2)
+    given = [paths(2).astype(kind) for kind in ("i1", "u1", "i2", "u4", "i8", "u8")]
+    for k, moves in enumerate([*given, paths(2).tolist(), tuple(map(tuple, paths(2)))], start=1):
+        assert lease.step(moves).result(1).step == k
+
+
+def test_a_batch_equals_single_steps(server: Start) -> None:
+    together = server(worlds=3, seed=5).connect().acquire(0, 3)
+    alone = server(worlds=3, seed=5).connect().acquire(0, 3)
+    for k in range(10):
+        moves = paths(3, seed=k)
+        batch = together.step(moves)
+        for world in range(3):
+            single = alone.step(moves[world], worlds=range(world, world + 1))
+            assert single.first_world == world
+            assert single.result() == batch.result(world)
+            assert (single.frames[0] == batch.frames[world]).all()
+    assert [tuple(record)[:-1] for record in batch.results] == [batch.result(i) for i in range(3)]
+
+
+def test_observing_repeats_the_last_answer(server: Start) -> None:
+    started = server(worlds=3)
+    lease = started.connect().acquire(1, 2)
+    answer = lease.step(paths(2))
+    for again in (lease.observe(), started.connect().observe(1, 2)):
+        assert (again.results == answer.results).all()
+        assert (again.frames == answer.frames).all()
+    before = started.connect().observe(0)
+    assert before.result().step == 0 and (before.frames == 255).all()
+
+
+def test_an_answer_is_a_copy(server: Start) -> None:
+    lease = server().connect().acquire()
+    first = lease.step([1] * 6)
+    kept = first.frames.copy()
+    lease.step([3] * 6)
+    assert (first.frames == kept).all()
+    first.frames[:] = 0
+    assert (lease.observe().frames != 0).any()
+
+
+def test_a_full_frame_is_seen_when_asked_for(server: Start) -> None:
+    lease = server(coverage="client").connect().acquire()
+    assert (lease.step(paths(1)).frames == 255).any()
+    full = lease.step(paths(1), full=True)
+    assert (full.frames != 255).all() and full.result().coverage == 2
+
+
+def test_a_reset_begins_the_episode_of_its_seed(server: Start) -> None:
+    lease = server(worlds=3).connect().acquire(0, 3)
+    lease.step(paths(3))
+    worlds = lease.reset([7, 2**64 - 1, None])
+    assert [(w.world, w.step, w.episode, w.robot) for w in worlds] == [
+        (i, 0, 1, (0, 0)) for i in range(3)
+    ]
+    assert [w.seed for w in worlds][:2] == [7, 2**64 - 1] and worlds[2].seed < 2**53
+    first = lease.step(paths(3))
+    again = lease.reset([7], worlds=[0])
+    assert [w.world for w in again] == [0]
+    assert (lease.step(paths(3)[0], worlds=range(1)).frames[0] == first.frames[0]).all()
+    with pytest.raises(InvalidActionError, match="expected 3, got 2"):
+        lease.reset([1, 2])
+
+
+def test_the_next_client_goes_on_where_the_last_stopped(server: Start) -> None:
+    started = server(worlds=2)
+    with started.connect() as client, client.acquire(1) as lease:
+        for k in range(3):
+            last = lease.step(paths(1, seed=k))
+    with started.connect().acquire(1) as lease:
+        (start,) = lease.start
+        result = last.result()
+        assert (start.step, start.robot) == (3, (result.row, result.col))
+        resumed = lease.observe()
+        assert resumed.result() == result and (resumed.frames == last.frames).all()
+        assert lease.step(paths(1)).result().step == 4
+
+
+def test_a_takeover_ends_the_lease_of_the_former_holder(server: Start, script: Run) -> None:
+    started = server()
+    lease = started.connect().acquire()
+    last = lease.step(paths(1))
+    other = script(
+        "import sys; from emberwatch import connect\n"
+        "lease = connect(sys.argv[1]).acquire(takeover=True)\n"
+        "print(lease.start[0].step, flush=True); input()",
+        started.instance,
+    )
+    assert other.line() == "1"
+    assert started.status().worlds[0].holder_pid == other.pid
+    for call in (lambda: lease.step(paths(1)), lambda: lease.reset(), lease.renew):
+        assert f"pid {other.pid}" in refused(call, errors.LeaseLostError, other.pid)
+    assert lease.observe().result() == last.result()
+    with pytest.raises(errors.BusyError) as busy:
+        started.connect().acquire()
+    assert busy.value.detail == other.pid
+
+
+def test_a_released_world_is_free(server: Start) -> None:
+    started = server()
+    client = started.connect()
+    lease = client.acquire()
+    assert started.status().worlds[0].holder_pid == US
+    lease.release()
+    lease.release()
+    assert started.status().worlds[0].holder_pid is None
+    refused(lambda: lease.step(paths(1)), errors.LeaseLostError, 0)
+    with started.connect().acquire() as lease:
+        lease.step(paths(1))
+    assert started.status().worlds[0].holder_pid is None
+
+
+def test_leaving_a_with_keeps_the_first_error(server: Start) -> None:
+    started = server()
+    with pytest.raises(ZeroDivisionError), started.connect() as client, client.acquire():
+        client.close()
+        raise ZeroDivisionError
+
+
+def test_closing_a_client_frees_its_worlds(server: Start) -> None:
+    started = server()
+    client = started.connect()
+    client.acquire()
+    client.close()
+    assert eventually(lambda: started.status().worlds[0].holder_pid is None)
+
+
+def test_an_unused_lease_expires_and_a_renewed_one_does_not(server: Start) -> None:
+    started = server(worlds=2)
+    used, unused = started.connect().acquire(0, ttl=1.0), started.connect().acquire(1, ttl=0.1)
+    assert (used.ttl, unused.ttl) == (1.0, 0.1)
+
+    def expired() -> bool:
+        used.renew()
+        return started.status().worlds[1].holder_pid is None
+
+    assert eventually(expired)
+    sentence = refused(lambda: unused.step(paths(1)), errors.LeaseLostError, 0)
+    assert "expired" in sentence
+    assert used.step(paths(1)).result().step == 1
+    assert eventually(lambda: started.status().worlds[0].holder_pid is None)
+
+
+def test_status_counts(server: Start) -> None:
+    started = server(worlds=2)
+    lease = started.connect().acquire(1)
+    lease.step(paths(1))
+    refused(lambda: started.connect().acquire(1), errors.BusyError, US)
+    status = started.status()
+    assert status.pid == started.program.pid and status.uptime_millis > 0
+    assert (status.n_steps, status.n_refused, status.n_clients) == (1, 1, 3)
+    assert [(w.step, w.holder_pid, w.resetting) for w in status.worlds] == [
+        (0, None, False),
+        (1, US, False),
+    ]
+
+
+def test_shutdown_ends_the_server(server: Start) -> None:
+    started = server()
+    client = started.connect()
+    client.shutdown()
+    assert eventually(lambda: not is_running(started.program.pid))
+    with pytest.raises(errors.ServerGoneError, match=started.instance):
+        client.status()
+    with pytest.raises(errors.NoServerError):
+        connect(started.instance)
+
+
+def test_a_client_of_an_ended_server_does_not_ask_the_next(server: Start) -> None:
+    first = server()
+    client = first.connect()
+    lease = client.acquire()
+    first.kill()
+    second = server(first.instance, height=3, seed=9)
+    for call in (client.observe, client.status, lambda: lease.step(paths(1)), lease.renew):
+        with pytest.raises(errors.ServerGoneError):
+            call()
+    assert second.status().n_refused == 0
+    assert connect(first.instance).info.height == 3
+
+
+class Table:
+    """A server of three worlds, truncated after two steps; world 2 is another client's."""
+
+    def __init__(self, server: Start) -> None:
+        self.server = server(worlds=3, max_steps=2)
+        self.client = self.server.connect()
+        self.lease = self.client.acquire(0, 2)
+        self.theirs = self.server.connect().acquire(2)
+
+    def exchange(self, **changes: int) -> None:
+        """Sends a step of world 0, right but for the changes."""
+        fields = {"operation": 1, "lease": self.lease.number, "first_world": 0, "n_worlds": 1}
+        fields |= {"flags": 0} | changes
+        payload = bytes([1] * fields.pop("bytes", 6))
+        self.client.exchange(**fields, paths=payload, timeout=PATIENCE)
+
+    def control(self, **request: object) -> None:
+        self.client.control(request, timeout=PATIENCE)
+
+
+def test_each_refusal_of_a_step_has_its_exception(server: Start) -> None:
+    table = Table(server)
+    step = table.exchange
+    refused(lambda: step(operation=7), errors.UnknownOperationError, 7)
+    refused(lambda: step(first_world=3), errors.NoSuchWorldError, 3)
+    refused(lambda: step(n_worlds=0), errors.NoSuchWorldError, 3)
+    refused(lambda: step(n_worlds=2), errors.WrongLengthError, 12)
+    refused(lambda: step(bytes=5), errors.WrongLengthError, 6)
+    refused(lambda: step(flags=4), errors.UnknownFlagsError, 4)
+    refused(lambda: step(flags=1), errors.NotPermittedError, 0)
+    refused(lambda: step(lease=99), errors.NoLeaseError, 0)
+    refused(lambda: step(first_world=2), errors.NoLeaseError, 2)
+    sentence = refused(lambda: step(lease=0), errors.NoLeaseError, 0)
+    assert sentence == "no lease on world 0: acquire it first"
+    moves = np.full(6, 9, np.uint8)
+    call = table.lease.step_moves
+    refused(lambda: call(moves, range(1), full=False, timeout=PATIENCE), errors.BadMoveError, 0)
+    table.lease.step(paths(2))
+    table.lease.step(paths(2))
+    refused(lambda: table.lease.step(paths(2)), errors.EpisodeOverError, 0)
+    status = table.server.status()
+    assert (status.n_refused, status.n_steps) == (12, 4)
+
+
+def test_a_world_in_its_burn_in_is_refused_and_waited_for(server: Start) -> None:
+    started = server(ready=False, worlds=2, burn_in=10**12)
+    client = started.connect()
+    refused(lambda: client.observe(1), errors.ResettingError, 1)
+    assert [world.resetting for world in started.status().worlds] == [True, True]
+    with pytest.raises(errors.RequestTimeoutError):
+        client.acquire(timeout=0.05)
+    assert client.status().n_refused == 1
+
+
+def test_each_refusal_on_control_has_its_exception(server: Start) -> None:
+    table = Table(server)
+    ask, number = table.control, table.lease.number
+    refused(lambda: ask(op="dance"), errors.MalformedError, 0)
+    refused(lambda: ask(op="renew", lease=-1), errors.MalformedError, 0)
+    refused(lambda: ask(op="hello", protocol=2, client=""), errors.VersionMismatchError, 1)
+    refused(lambda: table.client.acquire(0, 4), errors.NoSuchWorldError, 3)
+    refused(lambda: table.client.acquire(2), errors.BusyError, US)
+    refused(lambda: ask(op="renew", lease=5), errors.NoLeaseError, 0)
+    refused(lambda: ask(op="release", lease=table.theirs.number), errors.NoLeaseError, 2)
+    refused(lambda: table.lease.reset([1], worlds=[2]), errors.NoLeaseError, 2)
+    ended = table.client.acquire(0, 2)
+    refused(lambda: ask(op="renew", lease=number), errors.LeaseLostError, US)
+    ended.release()
+    refused(lambda: ask(op="renew", lease=ended.number), errors.LeaseLostError, 0)
+    assert table.server.status().n_refused == 10
+
+
+def test_a_refusal_says_the_same_on_both_channels(server: Start) -> None:
+    table = Table(server)
+    for kind, detail, step, control in (
+        (errors.NoSuchWorldError, 3, {"first_world": 9}, {"op": "acquire", "first_world": 9}),
+        (errors.NoLeaseError, 0, {"lease": 99}, {"op": "renew", "lease": 99}),
+    ):
+        if control["op"] == "acquire":
+            control["n_worlds"] = 1
+        words = refused(lambda step=step: table.exchange(**step), kind, detail)
+        assert refused(lambda control=control: table.control(**control), kind, detail) == words
+
+
+def test_a_refused_client_goes_on(server: Start) -> None:
+    table = Table(server)
+    for _ in range(20):
+        refused(lambda: table.exchange(operation=9), errors.UnknownOperationError, 9)
+    assert table.lease.step(paths(2)).result().step == 1
+
+
+WRONG_ACTIONS = [
+    ([1] * 5, "shape"),
+    ([1] * 7, "shape"),
+    ([], "shape"),
+    (3, "shape"),
+    (None, "shape"),
+    ("123456", "shape"),
+    (np.zeros((1, 6, 1), int), "shape"),
+    (np.zeros((2, 6), int), "shape"),
+    ([[1, 2], [3]], "array"),
+    (np.zeros(6), "integers, got float64"),
+    (np.zeros(6, bool), "integers, got bool"),
+    (np.zeros(6, object), "integers, got object"),
+    ([1, 1, 1, 1, 1, 1j], "integers, got complex"),
+    (["up"] * 6, "integers, got <U2"),
+    ([0, 1, 2, 3, 4, 0], r"0 to 3, got 4 at \(4,\)"),
+    ([[0, 1, 2, 3, 0, -1]], r"0 to 3, got -1 at \(0, 5\)"),
+    (np.full(6, 255, np.uint8), "got 255"),
+    (np.full(6, 2**64 - 1, np.uint64), f"got {2**64 - 1}"),
+    ([2**70] * 6, "integers, got object"),
+]
+
+
+def test_a_wrong_action_is_named_and_never_sent(server: Start) -> None:
+    started = server()
+    lease = started.connect().acquire()
+    for action, words in WRONG_ACTIONS:
+        with pytest.raises(InvalidActionError, match=words):
+            lease.step(action)
+    status = started.status()
+    assert (status.n_steps, status.n_refused) == (0, 0)
+    assert lease.step([3] * 6).result().step == 1
+
+
+def test_wrong_actions_of_many_worlds_are_named(server: Start) -> None:
+    started = server(worlds=2)
+    lease = started.connect().acquire(0, 2)
+    for action, words in (
+        (np.zeros(6, int), r"expected shape \(2, 6\), got \(6,\)"),
+        (np.zeros((3, 6), int), r"expected shape \(2, 6\), got \(3, 6\)"),
+        ([[0] * 6, [0, 0, 7, 0, 0, 0]], r"got 7 at \(1, 2\)"),
+    ):
+        with pytest.raises(InvalidActionError, match=words):
+            lease.step(action)
+    assert started.status().n_steps == 0
+
+
+def test_every_call_has_a_timeout(server: Start) -> None:
+    started = server()
+    client = started.connect()
+    lease = client.acquire()
+    started.stop()
+    for call in (
+        lambda: lease.step([3] * 6, timeout=0.05),
+        lambda: lease.observe(timeout=0.05),
+        lambda: client.status(timeout=0.05),
+        lambda: lease.reset(timeout=0.05),
+        lambda: lease.renew(timeout=0.05),
+        lambda: client.acquire(timeout=0.05),
+        lambda: lease.release(timeout=0.05),
+        lambda: connect(started.instance, timeout=0.05),
+    ):
+        start = time.monotonic()
+        with pytest.raises(errors.RequestTimeoutError, match=r"within 0\.05 s") as raised:
+            call()
+        assert started.instance in str(raised.value)
+        assert 0.05 <= time.monotonic() - start < 2.0
+    started.wake_up()
+    assert client.observe().result().step == 0
+
+
+def test_closing_again_is_fine_and_a_closed_client_says_so(server: Start) -> None:
+    client = server().connect()
+    lease = client.acquire()
+    for _ in range(3):
+        client.close()
+    for call in (client.status, client.observe, client.acquire, lambda: lease.step([3] * 6)):
+        with pytest.raises(errors.ClosedError, match="closed"):
+            call()
+    for call in (lease.observe, lease.reset, lease.renew, lease.release):
+        with pytest.raises(errors.ClosedError, match="closed"):
+            call()
+
+
+FORK = """
+import multiprocessing, os, sys, threading
+from emberwatch.client import Client
+from emberwatch.errors import ForkedError
+from emberwatch.observer import observe
+from emberwatch.programs import Program, unused_instance
+
+how, instance = sys.argv[1], unused_instance()
+small = "--height=5 --width=7 --moves=6 --burn-in=20".split()
+program = Program("emberwatch-server", [f"--instance={instance}", *small])
+client = program.wait_for(lambda: Client(instance))
+lease, observer = client.acquire(), observe(instance, timeout=0)
+lease.step([3] * 6)
+
+def child():
+    for call in (client.status, client.observe, lease.release, lambda: lease.step([3] * 6),
+                 lambda: observer.receive(0)):
+        try:
+            call()
+        except ForkedError as error:
+            assert "fork" in str(error) and "open a new one" in str(error)
+        else:
+            os._exit(9)
+    client.close()
+    observer.close()
+    program.stop()
+    with Client(instance) as own:
+        assert own.observe().result().step == 1
+    if how == "sys.exit":
+        sys.exit(5)
+    if how == "os._exit":
+        os._exit(5)
+    if how == "exception":
+        raise SystemError(5)
+
+if how == "multiprocessing":
+    process = multiprocessing.get_context("fork").Process(target=child)
+    process.start()
+    process.join()
+    code = process.exitcode
+else:
+    pid = os.fork()
+    if pid == 0:
+        child()
+        sys.exit(9)
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+assert lease.step([3] * 6).result().step == 2
+assert observer.receive(5) is not None
+print("child", code)
+"""
+
+
+@pytest.mark.parametrize(
+    "how, code",
+    [("sys.exit", 5), ("os._exit", 5), ("exception", 1), ("multiprocessing", 0)],
+)
+def test_a_forked_child_is_refused_and_its_parent_goes_on(script: Run, how: str, code: int) -> None:
+    ended, out, err = script(FORK, how).end()
+    assert (ended, out) == (0, f"child {code}\n"), err
+
+
+def interrupt(started: Server) -> tuple[threading.Thread, list[float]]:
+    """Sends this process Ctrl-C once it sleeps on the answer of a stopped server."""
+    sent: list[float] = []
+    main = f"/proc/{US}/task/{threading.main_thread().native_id}/stat"
+
+    def run() -> None:
+        asleep = 0
+
+        def is_asleep() -> bool:
+            nonlocal asleep
+            asleep = (
+                asleep + 1 if Path(main).read_text().rpartition(")")[2].split()[0] == "S" else 0
+            )
+            return asleep > 20
+
+        eventually(is_asleep)
+        sent.append(time.monotonic())
+        os.kill(US, signal.SIGINT)
+
+    return threading.Thread(target=run), sent
+
+
+def test_ctrl_c_ends_a_blocked_step_and_the_client_goes_on(server: Start) -> None:
+    started = server()
+    client = started.connect()
+    lease = client.acquire()
+    waited = []
+    for k in range(3):
+        started.stop()
+        thread, sent = interrupt(started)
+        with pytest.raises(KeyboardInterrupt) as raised:
+            thread.start()
+            lease.step([3] * 6, timeout=PATIENCE)
+        waited.append(time.monotonic() - sent[0])
+        thread.join()
+        started.wake_up()
+        # `raised` still holds the traceback, as an `except` block does.
+        before = client.observe().result().step
+        assert raised is not None
+        assert lease.step([3] * 6).result().step == before + 1, k
+    assert min(waited) < 0.25, waited
+
+
+def test_a_client_may_be_used_while_its_error_is_handled(server: Start) -> None:
+    started = server()
+    client = started.connect()
+    lease = client.acquire()
+    started.stop()
+    try:
+        lease.step([3] * 6, timeout=0.05)
+    except errors.RequestTimeoutError:
+        started.wake_up()
+        assert client.observe().result().step in (0, 1)
+        assert client.status().pid == started.program.pid
+
+
+def test_a_seventeenth_client_is_told_the_limit_and_others_go_on(server: Start) -> None:
+    started = server()
+    clients = [started.connect() for _ in range(15)]
+    with pytest.raises(errors.ChannelError, match="more than 16 clients"):
+        started.connect()
+    assert clients[-1].acquire().step([3] * 6).result().step == 1
+    clients[0].close()
+    assert eventually(lambda: _connects(started))
+
+
+def _connects(started: Server) -> bool:
+    try:
+        started.connect()
+    except errors.ChannelError:
+        return False
+    return True
+
+
+def test_without_a_server_the_instance_and_the_remedy_are_named() -> None:
+    with pytest.raises(errors.NoServerError) as raised:
+        connect("nobody-here")
+    assert "'nobody-here'" in str(raised.value)
+    assert "emberwatch-server --instance nobody-here" in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "a b", ".", "ä", "x" * 65, "a\n", "a\0"])
+def test_a_bad_instance_name_is_refused(name: str) -> None:
+    with pytest.raises(errors.SettingError, match="instance: expected 1 to 64 characters"):
+        connect(name)
+
+
+def test_the_longest_instance_name_is_served(server: Start) -> None:
+    name = f"python-{US}-".ljust(64, "x")
+    assert server(name).connect().instance == name
+
+
+@pytest.mark.parametrize("mode", [0o720, 0o702, 0o777])
+def test_a_directory_that_others_can_write_to_is_refused(
+    mode: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tmp_path.chmod(mode)
+    _refuses(tmp_path, "others cannot write to", monkeypatch)
+
+
+def test_a_directory_that_is_a_link_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "real").mkdir(mode=0o700)
+    (tmp_path / "link").symlink_to("real")
+    _refuses(tmp_path / "link", "expected a directory", monkeypatch)
+
+
+def test_a_file_in_place_of_the_directory_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch(mode=0o600)
+    _refuses(tmp_path / "file", "expected a directory", monkeypatch)
+    _refuses(tmp_path / "file/below", "create", monkeypatch)
+
+
+def test_a_directory_of_another_user_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    owner = tmp_path.stat().st_uid
+    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+    _refuses(tmp_path, "belongs to this user", monkeypatch)
+
+
+def test_the_directory_is_created_for_this_user_alone(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        place = channels._own_directory(tmp_path / "new")
+    finally:
+        os.umask(before)
+    assert place.stat().st_mode & 0o777 == 0o700
+
+
+def _refuses(place: Path, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(channels, "directory", lambda: place)
+    with pytest.raises(errors.ChannelError, match=words) as raised:
+        connect("default")
+    assert str(place) in str(raised.value)

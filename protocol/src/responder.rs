@@ -1,0 +1,256 @@
+//! The answering side of a request channel: take a request, send its answer, wake the one client.
+//!
+//! [`Answers`] is what the server needs on each of its channels; a [`Responder`] is all that an agent
+//! needs on its one, the decisions of a world.
+
+use crate::channels::{
+    Channel, ChannelError, ControlService, Instance, Ipc, RequestResponse, Services, create_node,
+    ipc_error,
+};
+use crate::connection::server_pid;
+use crate::message::{ControlReply, ControlRequest, Header, Status, VERSION};
+use crate::wait::{descriptor, drain};
+use iceoryx2::active_request::ActiveRequest;
+use iceoryx2::node::Node;
+use iceoryx2::port::ReceiveError;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::{ListenerKey, Notifier};
+use iceoryx2::port::server::Server;
+use iceoryx2::prelude::{AllocationStrategy, CallbackProgression};
+use iceoryx2::service::port_factory::server::ServerCreateError;
+use serde::Serialize;
+use std::collections::HashMap;
+use std::os::fd::BorrowedFd;
+use std::time::{Duration, Instant};
+use thiserror::Error;
+
+/// Length that answers in JSON may have before their segment grows, bytes.
+const JSON_SLICE: usize = 16_384;
+
+/// Listeners remembered before the table is started afresh.
+const MAX_KNOWN_LISTENERS: usize = 1024;
+
+/// How long clients may take to read an answer that ends with its sender.
+const FAREWELL: Duration = Duration::from_millis(500);
+
+/// A request that waits for its answer.
+pub type Active<Q, R> = ActiveRequest<Ipc, [u8], Q, [u8], R>;
+
+/// A request in JSON that waits for its answer.
+pub type ActiveControl = Active<ControlRequest, ControlReply>;
+
+/// The answering port of a service of JSON messages.
+pub type ControlServer = Server<Ipc, [u8], ControlRequest, [u8], ControlReply>;
+
+/// Sends answers and wakes the clients that wait for them.
+#[derive(Debug)]
+pub struct Answers {
+    notifier: Notifier<Ipc>,
+    listeners: HashMap<u128, ListenerKey>,
+}
+
+/// The one that answers the decisions of a world.
+#[derive(Debug)]
+pub struct Responder {
+    server: ControlServer,
+    answers: Answers,
+    listener: Listener<Ipc>,
+    _node: Node<Ipc>,
+}
+
+/// Why decisions cannot be answered.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ResponderError {
+    /// Another agent does.
+    #[error(
+        "decisions of world {world} on instance {instance:?} are served already, by pid {pid}: \
+         shut it down first"
+    )]
+    Taken {
+        /// The instance.
+        instance: String,
+        /// The world.
+        world: u32,
+        /// The other agent's process.
+        pid: i32,
+    },
+    /// A channel could not be made.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+}
+
+impl Answers {
+    /// Sends answers to clients of an instance.
+    ///
+    /// # Errors
+    /// [`ChannelError::Ipc`].
+    pub fn new(services: &Services<'_>) -> Result<Self, ChannelError> {
+        let wake = services.wake(Channel::WakeClient)?;
+        let notifier = wake.notifier_builder().create();
+        Ok(Self {
+            notifier: notifier.map_err(ipc_error("create a notifier"))?,
+            listeners: HashMap::new(),
+        })
+    }
+
+    /// Sends an answer and wakes its client. A client that is gone or that holds back its answers
+    /// loses this one: that is its own affair.
+    pub fn send<Q: Header, R: Header>(
+        &mut self,
+        request: &Active<Q, R>,
+        header: R,
+        payload: &[u8],
+        listener: u128,
+    ) {
+        let sent = request
+            .loan_slice_uninit(payload.len())
+            .map_err(|error| format!("{error:?}"))
+            .and_then(|mut response| {
+                *response.user_header_mut() = header;
+                response
+                    .write_from_slice(payload)
+                    .send()
+                    .map_err(|error| format!("{error:?}"))
+            });
+        match sent {
+            Ok(()) => self.wake(listener),
+            Err(problem) => tracing::debug!(problem, "an answer was not taken"),
+        }
+    }
+
+    /// As [`Self::send`], in JSON.
+    pub fn send_json(&mut self, request: &ActiveControl, status: Status, reply: &impl Serialize) {
+        let asked = request.user_header();
+        let header = ControlReply {
+            version: VERSION,
+            status: status as u32,
+            sequence: asked.sequence,
+        };
+        let listener = listener_id(asked.listener_low, asked.listener_high);
+        let text = serde_json::to_vec(reply).expect("invariant: replies serialise");
+        self.send(request, header, &text, listener);
+    }
+
+    fn wake(&mut self, listener: u128) {
+        let known = self
+            .listeners
+            .get(&listener)
+            .is_some_and(|key| self.notifier.notify_single_listener(key).is_ok());
+        if listener == 0 || known {
+            return;
+        }
+        if self.listeners.len() == MAX_KNOWN_LISTENERS {
+            self.listeners.clear();
+        }
+        self.listeners.remove(&listener);
+        let listeners = &mut self.listeners;
+        self.notifier.for_each_listener(|one, details| {
+            if details.listener_id.value() != listener {
+                return CallbackProgression::Continue;
+            }
+            listeners.insert(listener, one.listener_key());
+            let _ = one.notify();
+            CallbackProgression::Stop
+        });
+    }
+}
+
+impl Responder {
+    /// Takes the place of the one that answers a world's decisions, after clearing away what a dead one
+    /// left.
+    ///
+    /// # Errors
+    /// [`ResponderError`].
+    pub fn open(instance: &Instance, world: u32) -> Result<Self, ResponderError> {
+        let node = create_node()?;
+        node.try_cleanup_dead_nodes();
+        let services = Services {
+            node: &node,
+            instance,
+        };
+        let service = services.create_decisions(world)?;
+        let server = control_server(&service).map_err(|error| match holder(&service, &error) {
+            Some(pid) => ResponderError::Taken {
+                instance: instance.name().into(),
+                world,
+                pid,
+            },
+            None => ipc_error("create a server")(error).into(),
+        })?;
+        let wake = services.wake(Channel::WakeAgent(world))?;
+        let listener = wake.listener_builder().create();
+        Ok(Self {
+            server,
+            answers: Answers::new(&services)?,
+            listener: listener.map_err(ipc_error("create a listener"))?,
+            _node: node,
+        })
+    }
+
+    /// The next request.
+    pub fn receive(&self) -> Option<ActiveControl> {
+        received(self.server.receive())
+    }
+
+    /// Answers a request.
+    pub fn answer(&mut self, request: &ActiveControl, status: Status, reply: &impl Serialize) {
+        self.answers.send_json(request, status, reply);
+    }
+
+    /// Takes note of wake-ups; returns whether there were any.
+    ///
+    /// # Errors
+    /// [`ChannelError::Ipc`].
+    pub fn drain(&self) -> Result<bool, ChannelError> {
+        drain(&self.listener)
+    }
+
+    /// Readable while there are wake-ups.
+    pub fn descriptor(&self) -> BorrowedFd<'_> {
+        descriptor(&self.listener)
+    }
+}
+
+/// What was received. A failure is the affair of the client behind it, whose other requests wait for
+/// an answer still or whose memory is gone: it must not be the end of the server.
+pub fn received<T>(result: Result<Option<T>, ReceiveError>) -> Option<T> {
+    result.unwrap_or_else(|error| {
+        tracing::debug!(?error, "a request was not received");
+        None
+    })
+}
+
+/// The answering port of a service of JSON messages, for answers of any length.
+///
+/// # Errors
+/// iceoryx2's; [`holder`] tells whether another process has the port.
+pub fn control_server(service: &ControlService) -> Result<ControlServer, ServerCreateError> {
+    let builder = service.server_builder().initial_max_slice_len(JSON_SLICE);
+    builder
+        .allocation_strategy(AllocationStrategy::PowerOfTwo)
+        .create()
+}
+
+/// The process that has a service's one answering port, if this is why another could not be created.
+pub fn holder<Q: Header, R: Header>(
+    service: &RequestResponse<Q, R>,
+    error: &ServerCreateError,
+) -> Option<i32> {
+    (*error == ServerCreateError::ExceedsMaxSupportedServers)
+        .then(|| server_pid(service))
+        .flatten()
+}
+
+/// A listener's id from the two halves in a request's header.
+pub fn listener_id(low: u64, high: u64) -> u128 {
+    u128::from(low) | u128::from(high) << 64
+}
+
+/// Waits, not for long, until clients have read their answers and let go of their requests.
+pub fn wait_until_taken<Q: Header, R: Header>(requests: &[Active<Q, R>]) {
+    let deadline = Instant::now() + FAREWELL;
+    while requests.iter().any(Active::is_connected) && Instant::now() < deadline {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}

@@ -1,0 +1,207 @@
+//! How agents that serve decisions begin, keep their world and end; and learners that are killed.
+
+use crate::harness::{PATIENCE, Program, SMALL, Server, eventually, takeover};
+use crate::learner::{Learner, refusal, reply_to, start_agent, start_with_learner};
+use crate::wire::control_header;
+use agent::client::Client;
+use protocol::channels::{ChannelError, Instance};
+use protocol::decisions::{Reply, Request};
+use protocol::message::Status;
+use rustix::process::Signal;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// Names the instance to the child of a test.
+const CHILD: &str = "EMBERWATCH_TEST_CHILD";
+
+fn holder(server: &Server) -> Option<u32> {
+    server.status().worlds[0].holder_pid
+}
+
+#[test]
+fn a_second_agent_is_refused_whatever_it_asks_for() {
+    let server = Server::start(SMALL);
+    let (agent, learner) = start_with_learner(&server.instance, "");
+    let words = format!("served already, by pid {}", agent.pid());
+    for flags in ["", "--takeover"] {
+        let second = start_agent(&server.instance, flags).wait(PATIENCE);
+        assert_eq!(second.code, Some(1), "{}", second.stderr);
+        assert!(second.stderr.contains(&words), "{}", second.stderr);
+    }
+    learner.decide(2);
+    agent.signal(Signal::KILL);
+    agent.wait(PATIENCE);
+    let (_agent, next) = start_with_learner(&server.instance, "");
+    assert_eq!(
+        next.last().step,
+        1,
+        "the next goes on where the first was killed"
+    );
+    assert_eq!(next.decide(2).step, 2);
+}
+
+#[test]
+fn a_lease_does_not_expire_while_nobody_decides() {
+    let server = Server::start(&format!("{SMALL} --lease-millis 300"));
+    let (agent, learner) = start_with_learner(&server.instance, "");
+    let start = Instant::now();
+    while start.elapsed() < Duration::from_secs(1) {
+        assert_eq!(holder(&server), Some(agent.pid()));
+        learner.last();
+    }
+    std::thread::sleep(Duration::from_secs(1));
+    assert_eq!(learner.decide(2).step, 1, "{}", agent.stderr());
+}
+
+#[test]
+fn an_agent_that_is_told_to_end_releases_its_world_first() {
+    let server = Server::start(SMALL);
+    let (agent, learner) = start_with_learner(&server.instance, "");
+    assert_eq!(learner.ask(&Request::Shutdown {}), Reply::Done);
+    assert_eq!(holder(&server), None);
+    drop(learner);
+    assert_eq!(agent.wait(PATIENCE).code, Some(0));
+    for signal in [Signal::TERM, Signal::INT] {
+        let (agent, _learner) = start_with_learner(&server.instance, "");
+        agent.signal(signal);
+        let ended = agent.wait(Duration::from_secs(2));
+        assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+        assert_eq!(holder(&server), None);
+    }
+    let error = Learner::try_open(&server.instance).err();
+    assert!(
+        matches!(error, Some(ChannelError::NoAgent { world: 0, .. })),
+        "{error:?}"
+    );
+}
+
+#[test]
+fn an_agent_ends_with_the_process_that_it_was_started_for() {
+    let server = Server::start(SMALL);
+    let keeper = Command::new("sleep").arg("60").spawn();
+    let mut keeper = keeper.expect("start a keeper");
+    let (agent, _learner) =
+        start_with_learner(&server.instance, &format!("--exit-with {}", keeper.id()));
+    keeper.kill().expect("kill the keeper");
+    let ended = agent.wait(Duration::from_secs(2));
+    keeper.wait().expect("wait for the keeper");
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert_eq!(holder(&server), None);
+}
+
+#[test]
+fn an_agent_whose_server_is_killed_says_so_and_ends() {
+    for decides in [false, true] {
+        let server = Server::start(SMALL);
+        let (agent, learner) = start_with_learner(&server.instance, "");
+        learner.reset(3);
+        if decides {
+            server.program.signal(Signal::STOP);
+            let header = control_header(1);
+            let pending = learner.send(header, br#"{"op":"decide","objective":2}"#);
+            server.kill();
+            let (status, _, message) = refusal(reply_to(&pending, header));
+            assert_eq!(status, Status::AgentEnds);
+            assert!(
+                message.starts_with("the agent ends: the server"),
+                "{message}"
+            );
+        } else {
+            server.kill();
+        }
+        drop(learner);
+        let ended = agent.wait(PATIENCE);
+        assert_eq!(ended.code, Some(1), "{}", ended.stderr);
+        assert!(ended.stderr.contains("is gone"), "{}", ended.stderr);
+    }
+}
+
+#[test]
+fn an_agent_whose_world_is_taken_says_so_and_ends_with_code_3() {
+    let server = Server::start(&format!("{SMALL} --lease-millis 3000"));
+    for decides in [true, false] {
+        let (agent, learner) = start_with_learner(&server.instance, "--takeover");
+        learner.decide(2);
+        let before = server.observe(0).0;
+        let _thief = Client::acquire(&server.instance, &takeover(0..1)).expect("take over");
+        if decides {
+            let (status, detail, _) = learner.refused(&Request::Decide { objective: 2 });
+            assert_eq!(status, Status::LeaseLost);
+            assert_eq!(detail, u64::from(std::process::id()));
+        }
+        drop(learner);
+        let ended = agent.wait(PATIENCE);
+        assert_eq!(ended.code, Some(3), "{}", ended.stderr);
+        assert!(
+            ended.stderr.contains("lease lost to pid"),
+            "{}",
+            ended.stderr
+        );
+        assert_eq!(server.observe(0).0, before, "it stepped nothing");
+    }
+}
+
+#[test]
+fn a_world_goes_from_agent_to_agent_in_the_middle_of_an_episode() {
+    let server = Server::start(SMALL);
+    let name = server.instance.name();
+    let flags = ["run", "--instance", name, "--policy", "random_walk"];
+    let first = Program::start("emberwatch-agent", &flags);
+    let acts = || server.observe(0).0.step > 3;
+    assert!(eventually(PATIENCE, acts), "{}", first.stderr());
+    let refused = start_agent(&server.instance, "").wait(PATIENCE);
+    let words = format!("busy: held by pid {}", first.pid());
+    assert!(refused.stderr.contains(&words), "{}", refused.stderr);
+    let (_agent, learner) = start_with_learner(&server.instance, "--takeover");
+    assert_eq!(first.wait(PATIENCE).code, Some(3));
+    let (result, _) = server.observe(0);
+    let last = learner.last();
+    assert_eq!((last.step, last.reward), (result.step, result.reward));
+    assert_eq!(last.objective, None);
+    assert_eq!(learner.decide(3).step, result.step + 1);
+}
+
+#[test]
+fn killed_learners_disturb_nobody_and_use_up_no_limit() {
+    let server = Server::start(SMALL);
+    let (agent, learner) = start_with_learner(&server.instance, "");
+    for _ in 0..20 {
+        let before = learner.last().step;
+        let mut child = start_child(&server.instance);
+        let decides = eventually(PATIENCE, || learner.last().step > before + 2);
+        child.kill().expect("kill the learner");
+        child.wait().expect("wait for it");
+        assert!(decides, "{}", agent.stderr());
+    }
+    let connects = || Learner::try_open(&server.instance).is_ok();
+    assert!(eventually(PATIENCE, connects), "{}", agent.stderr());
+    let before = learner.last().step;
+    assert_eq!(learner.decide(2).step, before + 1);
+}
+
+/// This program again, as a learner that decides without end.
+fn start_child(instance: &Instance) -> std::process::Child {
+    let mut command = Command::new(std::env::current_exe().expect("this program"));
+    let test = "decision_ends::a_learner_to_be_killed";
+    command.args(["--exact", test, "--ignored"]);
+    command.env(CHILD, instance.name()).stdout(Stdio::null());
+    command.spawn().expect("start a learner")
+}
+
+#[test]
+#[ignore = "the child of another test"]
+fn a_learner_to_be_killed() {
+    let Ok(name) = std::env::var(CHILD) else {
+        return;
+    };
+    let instance = Instance::new(&name).expect("a plain name");
+    let mut learner = None;
+    eventually(PATIENCE, || {
+        learner = Learner::try_open(&instance).ok();
+        learner.is_some()
+    });
+    let learner = learner.expect("connected");
+    loop {
+        learner.decide(2);
+    }
+}

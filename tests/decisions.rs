@@ -1,0 +1,289 @@
+//! Agents that take decisions from a learner outside: same worlds, same plans, clear refusals.
+
+use crate::harness::{PATIENCE, SMALL, Server, frames_until, new_instance, run};
+use crate::learner::{Learner, decision, refusal, start_agent, start_with_learner};
+use crate::wire::control_header;
+use protocol::channels::ChannelError;
+use protocol::decisions::{Decision, Reply, Request};
+use protocol::message::{ControlRequest, Status};
+use protocol::observer::Observer;
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+use rustix::process::Signal;
+
+/// A world in which something burns.
+const BURNING: &str = "--height 32 --width 24 --moves 24 --burn-in 10000";
+
+/// What does not depend on what the learner decided before the reset.
+fn comparable(decision: Decision) -> Decision {
+    Decision {
+        episode: 0,
+        ..decision
+    }
+}
+
+fn episode(learner: &Learner, seed: u64, objectives: &[u64]) -> Vec<Decision> {
+    let first = learner.reset(seed);
+    let others = objectives
+        .iter()
+        .map(|&objective| learner.decide(objective));
+    let all = [first].into_iter().chain(others);
+    all.map(comparable).collect()
+}
+
+#[test]
+fn hello_tells_what_can_be_decided() {
+    let server = Server::start(&format!("{SMALL} --max-steps 9"));
+    let (agent, learner) = start_with_learner(&server.instance, "");
+    let info = learner.hello();
+    assert_eq!((info.height, info.width, info.n_moves), (5, 7, 6));
+    assert_eq!((info.protocol, info.world, info.max_steps), (1, 0, 9));
+    assert_eq!(
+        (info.pid, &*info.instance),
+        (agent.pid(), server.instance.name())
+    );
+    assert_eq!(info.states, ["normal", "latent", "fire"]);
+    assert_eq!(info.objectives, ["normal", "latent", "fire", "entropy"]);
+    assert_eq!(info.planner, "beam");
+    assert_eq!(info.summary.len(), learner.last().summary.len());
+    assert_eq!(server.status().worlds[0].holder_pid, Some(agent.pid()));
+}
+
+#[test]
+fn a_decision_is_the_step_that_an_agent_of_that_objective_makes() {
+    let flags = format!("{BURNING} --seed 2");
+    let (server, other) = (Server::start(&flags), Server::start(&flags));
+    let observer = Observer::frames(&server.instance).expect("observe");
+    frames_until(&observer, 0, 0);
+    let name = server.instance.name();
+    let policy = ["--policy", "beam_fire", "--steps", "30"];
+    let ran = run(
+        "emberwatch-agent",
+        &[&["run", "--instance", name], &policy[..]].concat(),
+        PATIENCE,
+    );
+    assert_eq!(ran.code, Some(0), "{}", ran.stderr);
+    let flown: Vec<_> = frames_until(&observer, 0, 30)
+        .iter()
+        .filter(|sample| sample.header.n_moves > 0)
+        .map(|sample| sample.header.result)
+        .collect();
+    assert!(flown.iter().any(|result| result.reward > 0.0));
+    let (_agent, learner) = start_with_learner(&other.instance, "");
+    for seed in [None, Some(2)] {
+        if let Some(seed) = seed {
+            learner.reset(seed);
+        }
+        for result in &flown {
+            let made = learner.decide(2);
+            assert_eq!(
+                (made.step, made.reward, made.n_hits, made.robot),
+                (
+                    result.step,
+                    result.reward,
+                    result.n_hits,
+                    [result.row, result.col]
+                )
+            );
+            assert_eq!(made.objective, Some(2));
+            assert!(
+                made.summary
+                    .iter()
+                    .all(|number| (0.0..=1.0).contains(number))
+            );
+        }
+    }
+}
+
+#[test]
+fn the_same_seed_and_objectives_give_the_same_decisions() {
+    let server = Server::start(BURNING);
+    let objectives = [2, 3, 0, 1, 2, 2, 3];
+    for planner in ["beam", "shooting"] {
+        let (agent, learner) = start_with_learner(
+            &server.instance,
+            &format!("--planner {planner} --shooting-samples 64"),
+        );
+        assert_eq!(learner.hello().planner, planner);
+        let first = episode(&learner, 7, &objectives);
+        assert_eq!(first[0].step, 0);
+        assert_eq!((first[0].objective, first[0].reward), (None, 0.0));
+        episode(&learner, 8, &[3, 3]);
+        assert_eq!(episode(&learner, 7, &objectives), first);
+        assert_ne!(episode(&learner, 7, &[3; 7]), first);
+        agent.signal(Signal::TERM);
+        assert_eq!(agent.wait(PATIENCE).code, Some(0));
+    }
+    let (_agent, learner) = start_with_learner(&server.instance, "--agent-seed 1");
+    learner.reset(1);
+    let unseeded = decision(learner.ask(&Request::Reset { seed: None }));
+    assert_ne!(unseeded.seed, 1);
+}
+
+#[test]
+fn what_is_no_decision_is_refused_and_changes_nothing() {
+    let server = Server::start(BURNING);
+    let (_agent, learner) = start_with_learner(&server.instance, "");
+    learner.reset(3);
+    let before = learner.decide(2);
+    let (status, detail, message) = learner.refused(&Request::Decide { objective: 4 });
+    assert_eq!((status, detail), (Status::BadObjective, 4));
+    assert_eq!(message, "objective: expected 0 to 3, got 4");
+    let most = Request::Decide {
+        objective: u64::MAX,
+    };
+    assert_eq!(learner.refused(&most).0, Status::BadObjective);
+    for text in [
+        "",
+        "{}",
+        "[]",
+        "null",
+        r#"{"op":"dance"}"#,
+        r#"{"op":"decide"}"#,
+        r#"{"op":"decide","objective":-1}"#,
+        r#"{"op":"decide","objective":1.5}"#,
+        r#"{"op":"decide","objective":"fire"}"#,
+        r#"{"op":"decide","objective":2,"objective":2}"#,
+        r#"{"op":"decide","objective":2,"more":1}"#,
+        r#"{"op":"last","more":1}"#,
+        r#"{"op":"shutdown","now":true}"#,
+        r#"{"op":"reset","seed":-1}"#,
+        r#"{"op":"reset","seed":18446744073709551616}"#,
+        r#"{"op":"hello","protocol":1}"#,
+        r#"{"op":"hello","protocol":"1","client":"x"}"#,
+    ] {
+        let (status, detail, message) =
+            refusal(learner.exchange(control_header(1), text.as_bytes()));
+        assert_eq!((status, detail), (Status::Malformed, 0), "{text}");
+        assert!(
+            message.starts_with("malformed control message: "),
+            "{message}"
+        );
+    }
+    let hello = br#"{"op":"hello","protocol":2,"client":"x"}"#;
+    assert_mismatch(learner.exchange(control_header(1), hello));
+    let header = ControlRequest {
+        version: 9,
+        ..control_header(1)
+    };
+    assert_mismatch(learner.exchange(header, br#"{"op":"last"}"#));
+    assert_eq!(learner.last(), before);
+    assert_eq!(server.observe(0).0.step, 1);
+}
+
+fn assert_mismatch(reply: Reply) {
+    let (status, detail, message) = refusal(reply);
+    assert_eq!((status, detail), (Status::VersionMismatch, 1), "{message}");
+}
+
+#[test]
+fn random_and_oversized_messages_are_refused_and_change_nothing() {
+    let server = Server::start(SMALL);
+    let (agent, learner) = start_with_learner(&server.instance, "");
+    learner.reset(3);
+    let before = learner.decide(2);
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    for _ in 0..3000 {
+        let mut bytes = vec![0; rng.random_range(0..200)];
+        rng.fill_bytes(&mut bytes);
+        let header = ControlRequest {
+            version: if rng.random_ratio(1, 9) {
+                rng.random()
+            } else {
+                1
+            },
+            reserved: rng.random(),
+            sequence: rng.random(),
+            listener_low: rng.random(),
+            listener_high: rng.random(),
+        };
+        if rng.random_ratio(1, 9) {
+            drop(learner.send(header, &bytes));
+        } else {
+            refusal(learner.exchange(header, &bytes));
+        }
+    }
+    for length in [4097, 100_000, (1 << 20) + 1] {
+        let reply = learner.exchange(control_header(1), &vec![b' '; length]);
+        assert_eq!(refusal(reply).0, Status::Malformed, "{length}");
+    }
+    let nested = "[".repeat(100_000);
+    refusal(learner.exchange(control_header(1), nested.as_bytes()));
+    assert_eq!(learner.last(), before, "{}", agent.stderr());
+}
+
+#[test]
+fn after_a_timeout_last_tells_whether_the_decision_was_made() {
+    let server = Server::start(SMALL);
+    let (_agent, learner) = start_with_learner(&server.instance, "");
+    let before = learner.reset(3);
+    server.program.signal(Signal::STOP);
+    drop(learner.send(control_header(1), br#"{"op":"decide","objective":2}"#));
+    server.program.signal(Signal::CONT);
+    let last = learner.last();
+    // Given up before or after the agent took it.
+    assert!(
+        last == before || (last.step, last.objective) == (1, Some(2)),
+        "{last:?}"
+    );
+    let next = learner.decide(2);
+    assert_eq!(next.step, last.step + 1);
+    assert_eq!(learner.last(), next);
+}
+
+#[test]
+fn a_truncated_episode_is_over_until_the_next_reset() {
+    let server = Server::start(&format!("{SMALL} --max-steps 2"));
+    let (_agent, learner) = start_with_learner(&server.instance, "");
+    learner.reset(3);
+    assert!(!learner.decide(2).truncated);
+    let last = learner.decide(2);
+    assert!(last.truncated && !last.terminated);
+    let (status, detail, message) = learner.refused(&Request::Decide { objective: 2 });
+    assert_eq!((status, detail), (Status::EpisodeOver, 0), "{message}");
+    assert_eq!(learner.last(), last);
+    assert_eq!(learner.reset(3).step, 0);
+    assert_eq!(learner.decide(2).step, 1);
+}
+
+#[test]
+fn a_model_that_is_not_the_servers_is_refused() {
+    let server = Server::start(&format!("{SMALL} --reveal-model false"));
+    let check = |flags: &str, words: &str| {
+        let ended = start_agent(&server.instance, flags).wait(PATIENCE);
+        assert_eq!(ended.code, Some(1), "{}", ended.stderr);
+        assert!(ended.stderr.contains(words), "{}", ended.stderr);
+    };
+    check("", "does not reveal its model: expected --model FILE");
+    check("--world 1", "no such world: the server has worlds 0 to 0");
+    let folder = tempfile::TempDir::new().expect("a folder");
+    let path = folder.path().join("blind.toml");
+    std::fs::write(&path, model_of_two_observations()).expect("write a model");
+    let flag = format!("--model {}", path.display());
+    check(&flag, "model: expected the server's 3 observations, got 2");
+}
+
+/// The wildfire, as a sensor sees it that takes smoke for nothing.
+fn model_of_two_observations() -> String {
+    let mut file = protocol::Model::wildfire().file().clone();
+    file.observations.remove(1);
+    for state in &mut file.states {
+        let smoke = state.observed_as.remove(1);
+        state.observed_as[0] += smoke;
+    }
+    toml::to_string(&file).expect("models serialise")
+}
+
+#[test]
+fn nobody_to_decide_for_is_told_from_no_server() {
+    let server = Server::start(SMALL);
+    let error = Learner::try_open(&server.instance).err().expect("no agent");
+    let words = format!("serve-decisions --instance {}", server.instance.name());
+    assert!(error.to_string().contains(&words), "{error}");
+    let error = Learner::try_open(&new_instance()).err();
+    assert!(
+        matches!(error, Some(ChannelError::NoAgent { .. })),
+        "{error:?}"
+    );
+}
