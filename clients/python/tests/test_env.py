@@ -12,23 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import emberwatch
 import gymnasium
 import numpy as np
 import pytest
-from emberwatch.errors import (
-    BusyError,
-    ClosedError,
-    EpisodeOverError,
-    ForkedError,
-    InvalidActionError,
-    LeaseLostError,
-    NoServerError,
-    RequestTimeoutError,
-    ServerGoneError,
-    SettingError,
-)
-from emberwatch.programs import find
 from environments import (
     LIVELY,
     MOVES,
@@ -44,6 +30,21 @@ from environments import (
 )
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv
+
+import emberwatch
+from emberwatch.errors import (
+    BusyError,
+    ClosedError,
+    EpisodeOverError,
+    ForkedError,
+    InvalidActionError,
+    LeaseLostError,
+    NoServerError,
+    RequestTimeoutError,
+    ServerGoneError,
+    SettingError,
+)
+from emberwatch.programs import find
 
 PARTS = ["frame", "robot", "age"]
 

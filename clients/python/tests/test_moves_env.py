@@ -8,15 +8,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from emberwatch.errors import (
-    BusyError,
-    ClosedError,
-    EpisodeOverError,
-    InvalidActionError,
-    RequestTimeoutError,
-    ServerGoneError,
-    SettingError,
-)
 from environments import (
     MOVES,
     SMALL,
@@ -29,6 +20,16 @@ from environments import (
 )
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv
+
+from emberwatch.errors import (
+    BusyError,
+    ClosedError,
+    EpisodeOverError,
+    InvalidActionError,
+    RequestTimeoutError,
+    ServerGoneError,
+    SettingError,
+)
 
 PARTS = ("frame", "robot", "age", "visited", "move")
 

@@ -9,10 +9,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import emberwatch
 import gymnasium
 import numpy as np
 import pytest
+from environments import WILDFIRE, actions, assert_same, make, make_vec, no_warnings, serving
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+
+import emberwatch
 from emberwatch.errors import (
     BusyError,
     InvalidActionError,
@@ -21,8 +24,6 @@ from emberwatch.errors import (
     ServerGoneError,
     SettingError,
 )
-from environments import WILDFIRE, actions, assert_same, make, make_vec, no_warnings, serving
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 PARTS = ("frame", "robot", "age")
 
