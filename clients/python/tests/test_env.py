@@ -176,6 +176,32 @@ def test_truth_shows_the_states_that_paid() -> None:
     env.close()
 
 
+def test_busy_neighbours_do_not_crowd_the_truth_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    with (
+        serving(worlds=41, publish_truth=True) as instance,
+        emberwatch.connect(instance) as client,
+        client.acquire(1, 40) as neighbours,
+    ):
+        env = make(instance=instance, truth=True, timeout=2)
+        env.reset(seed=1)
+        session = env.unwrapped._session
+        step = session.step
+
+        def step_and_be_late(moves: Any) -> Any:
+            answer = step(moves)
+            for _ in range(5):  # 200 samples, of which a reader keeps 128
+                neighbours.step(np.zeros((40, 4), int))
+            return answer
+
+        monkeypatch.setattr(session, "step", step_and_be_late)
+        private = make(truth=True)
+        private.reset(seed=1)
+        for action in actions(private, 3):
+            assert_same(env.step(action), private.step(action))
+        env.close()
+        private.close()
+
+
 def test_what_was_returned_is_never_changed() -> None:
     env = make(observation=PARTS, truth=True)
     before = rollout(env, 10, seed=1)
