@@ -202,6 +202,16 @@ def test_busy_neighbours_do_not_crowd_the_truth_out(monkeypatch: pytest.MonkeyPa
         private.close()
 
 
+def test_the_truth_is_found_among_many_worlds() -> None:
+    with serving(worlds=300, publish_truth=True) as instance:
+        for world in (5, 299):
+            env = make(instance=instance, world=world, truth=True, timeout=2)
+            assert_same(env.reset(seed=1)[1]["truth"], env.reset(seed=1)[1]["truth"])
+            env.close()
+            env.reset(options={"resume": True})
+            env.close()
+
+
 def test_what_was_returned_is_never_changed() -> None:
     env = make(observation=PARTS, truth=True)
     before = rollout(env, 10, seed=1)

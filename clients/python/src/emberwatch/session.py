@@ -41,7 +41,7 @@ _PRIVATE_LEASE: Final = 86400.0
 #: How long a private server may take to answer that it ends, seconds.
 _FAREWELL: Final = 0.5
 
-#: How long to wait for hidden states where some were lost, before they are asked for anew, seconds.
+#: How long to wait for hidden states before they are asked for anew the first time, seconds.
 _PATIENCE: Final = 0.02
 
 #: Longest side of a grid and longest path of any server (PROTOCOL.md section 1).
@@ -323,20 +323,19 @@ class _Truth:
         results = [answer.result(index) for index in range(len(answer.frames))]
         wanted = [(result.episode, result.step) for result in results]
         last = first + len(wanted)
-        begin = asked = time.perf_counter()
-        n_lost = 0
+        begin = time.perf_counter()
+        patience = _PATIENCE
         while self._moments[first:last] != wanted:
-            now = time.perf_counter()
-            if n_lost and now - asked > _PATIENCE:
+            waited = time.perf_counter() - begin
+            if waited > timeout:
+                raise RequestTimeoutError(f"no hidden states within {timeout} s")
+            if waited > patience:
                 # Others' worlds may have crowded ours out: a new reader is shown all anew.
                 self._reader.close()
                 self._reader = TruthReader(self._reader.instance)
-                asked, n_lost = now, 0
-            if now - begin > timeout:
-                raise RequestTimeoutError(f"no hidden states within {timeout} s")
+                patience = waited + 2 * patience
             truth = self._reader.receive(min(timeout, _PATIENCE))
             if truth is not None:
-                n_lost += truth.n_lost
                 self._take(truth)
         return self._states[first:last].copy()
 
