@@ -323,19 +323,21 @@ class _Truth:
         results = [answer.result(index) for index in range(len(answer.frames))]
         wanted = [(result.episode, result.step) for result in results]
         last = first + len(wanted)
-        begin = time.perf_counter()
-        patience = _PATIENCE
+        begin = asked = time.perf_counter()
+        n_asked = n_lost = 0
         while self._moments[first:last] != wanted:
-            waited = time.perf_counter() - begin
-            if waited > timeout:
+            now = time.perf_counter()
+            if now - begin > timeout:
                 raise RequestTimeoutError(f"no hidden states within {timeout} s")
-            if waited > patience:
-                # Others' worlds may have crowded ours out: a new reader is shown all anew.
+            # Others' worlds may have crowded ours out: a new reader is shown all anew. Where it
+            # missed nothing, they may just take longer.
+            if now - asked > (_PATIENCE if n_lost else _PATIENCE * 2**n_asked):
                 self._reader.close()
                 self._reader = TruthReader(self._reader.instance)
-                patience = waited + 2 * patience
+                asked, n_asked, n_lost = now, n_asked + 1, 0
             truth = self._reader.receive(min(timeout, _PATIENCE))
             if truth is not None:
+                n_lost += truth.n_lost
                 self._take(truth)
         return self._states[first:last].copy()
 
