@@ -29,7 +29,7 @@ from emberwatch.errors import (
     SettingError,
 )
 from emberwatch.model import Model
-from emberwatch.observer import TruthReader
+from emberwatch.observer import Truth, TruthReader
 from emberwatch.programs import Program, unused_instance
 from emberwatch.wire import StepAnswer
 
@@ -40,6 +40,9 @@ _PRIVATE_LEASE: Final = 86400.0
 
 #: How long a private server may take to answer that it ends, seconds.
 _FAREWELL: Final = 0.5
+
+#: How long to wait for hidden states before they are asked for anew the first time, seconds.
+_PATIENCE: Final = 0.02
 
 #: Longest side of a grid and longest path of any server (PROTOCOL.md section 1).
 _MAX_SIDE: Final = 4096
@@ -320,21 +323,34 @@ class _Truth:
         results = [answer.result(index) for index in range(len(answer.frames))]
         wanted = [(result.episode, result.step) for result in results]
         last = first + len(wanted)
-        deadline = time.perf_counter() + timeout
+        begin = asked = time.perf_counter()
+        n_asked = n_lost = 0
         while self._moments[first:last] != wanted:
-            truth = self._reader.receive(max(0.0, deadline - time.perf_counter()))
-            if truth is None:
+            now = time.perf_counter()
+            if now - begin > timeout:
                 raise RequestTimeoutError(f"no hidden states within {timeout} s")
-            index = truth.world - self._first
-            if 0 <= index < len(self._moments):
-                if truth.states.shape != self._states.shape[1:]:
-                    raise GarbledAnswerError(f"truth: got a grid of {truth.states.shape}")
-                self._moments[index] = (truth.episode, truth.step)
-                self._states[index] = truth.states
+            # Others' worlds may have crowded ours out: a new reader is shown all anew. Where it
+            # missed nothing, they may just take longer.
+            if now - asked > (_PATIENCE if n_lost else _PATIENCE * 2**n_asked):
+                self._reader.close()
+                self._reader = TruthReader(self._reader.instance)
+                asked, n_asked, n_lost = now, n_asked + 1, 0
+            truth = self._reader.receive(min(timeout, _PATIENCE))
+            if truth is not None:
+                n_lost += truth.n_lost
+                self._take(truth)
         return self._states[first:last].copy()
 
     def close(self) -> None:
         self._reader.close()
+
+    def _take(self, truth: Truth) -> None:
+        index = truth.world - self._first
+        if 0 <= index < len(self._moments):
+            if truth.states.shape != self._states.shape[1:]:
+                raise GarbledAnswerError(f"truth: got a grid of {truth.states.shape}")
+            self._moments[index] = (truth.episode, truth.step)
+            self._states[index] = truth.states
 
 
 def draw_seed(generator: np.random.Generator) -> int:

@@ -61,6 +61,7 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
             SettingError: If an argument is impossible or contradicts the running server.
             NoServerError: If nobody serves `instance`.
         """
+        self.closed = True  # until it is made: Gymnasium 1.2 closes what failed to be made, too
         if max_episode_steps == -1:  # what Gymnasium's own `make` takes for no limit
             max_episode_steps = None
         if max_episode_steps is not None and max_episode_steps < 1:
@@ -92,6 +93,7 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         self._over = np.zeros(num_envs, np.bool_)
         self._truths: NDArray[np.uint8] | None = None
         self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
+        self.closed = False
 
     @property
     def model(self) -> Model | None:

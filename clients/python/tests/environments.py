@@ -1,0 +1,98 @@
+"""What the tests of the environments share: small worlds, servers, comparisons."""
+
+import contextlib
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import emberwatch
+from emberwatch.errors import EmberwatchError
+from emberwatch.programs import Program, unused_instance
+
+WILDFIRE = "emberwatch/Wildfire-v0"
+MOVES = "emberwatch/WildfireMoves-v0"
+
+#: Of its worlds every seed and every step looks different.
+LIVELY = str(Path(__file__).with_name("lively.toml"))
+
+#: Keywords of a small world behind a private server.
+SMALL: dict[str, Any] = {"height": 7, "width": 5, "n_moves": 4, "burn_in": 50, "model": LIVELY}
+
+
+@contextlib.contextmanager
+def serving(**flags: object) -> Iterator[str]:
+    """A running server of `SMALL` worlds, by its instance name; `flags` as on its command line."""
+    instance = str(flags.setdefault("instance", unused_instance()))
+    small = {"height": 7, "width": 5, "moves": 4, "burn_in": 50, "model": LIVELY, "threads": 1}
+    arguments = [
+        f"--{name.replace('_', '-')}={str(value).lower() if isinstance(value, bool) else value}"
+        for name, value in {**small, **flags}.items()
+    ]
+    server = Program("emberwatch-server", arguments)
+    try:
+        server.wait_for(lambda: emberwatch.connect(instance)).close()
+        yield instance
+        # Sooner than a signal; a test may have ended it already.
+        with contextlib.suppress(EmberwatchError), emberwatch.connect(instance) as client:
+            client.shutdown()
+    finally:
+        server.stop()
+
+
+def make(name: str = WILDFIRE, **keywords: Any) -> gymnasium.Env[Any, Any]:
+    """`gymnasium.make` of a small world, or with `instance` of a running server's."""
+    return gymnasium.make(name, **_small(keywords))
+
+
+def make_vec(n_worlds: int, **keywords: Any) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
+    """`gymnasium.make_vec` of small worlds, or with `instance` of a running server's."""
+    return gymnasium.make_vec(WILDFIRE, num_envs=n_worlds, **_small(keywords))
+
+
+def _small(keywords: dict[str, Any]) -> dict[str, Any]:
+    return keywords if keywords.get("instance") is not None else {**SMALL, **keywords}
+
+
+@contextlib.contextmanager
+def no_warnings() -> Iterator[None]:
+    """Warnings are errors; Gymnasium's logger warns that way too."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+def actions(env: Any, n_steps: int, seed: int = 0) -> list[Any]:
+    """Random actions of an environment, the same for the same seed."""
+    env.action_space.seed(seed)
+    return [env.action_space.sample() for _ in range(n_steps)]
+
+
+def rollout(env: Any, n_steps: int, *, seed: int | None, actions_seed: int = 0) -> list[Any]:
+    """What a reset and so many random steps return."""
+    return [env.reset(seed=seed), *map(env.step, actions(env, n_steps, actions_seed))]
+
+
+def assert_same(left: object, right: object, where: str = "") -> None:
+    """Equal in every field: types, keys, dtypes, shapes and values."""
+    assert type(left) is type(right), f"{where}: {type(left)} and {type(right)}"
+    if isinstance(left, Mapping) and isinstance(right, Mapping):
+        assert set(left) == set(right), f"{where}: {sorted(left)} and {sorted(right)}"
+        for key in left:
+            assert_same(left[key], right[key], f"{where}[{key!r}]")
+    elif isinstance(left, np.ndarray) and isinstance(right, np.ndarray):
+        assert left.dtype == right.dtype, f"{where}: {left.dtype} and {right.dtype}"
+        assert left.shape == right.shape, f"{where}: {left.shape} and {right.shape}"
+        if left.dtype == object:
+            assert_same(list(left.flat), list(right.flat), where)
+        else:
+            assert np.array_equal(left, right), f"{where}:\n{left}\nand\n{right}"
+    elif isinstance(left, Sequence) and isinstance(right, Sequence) and not isinstance(left, str):
+        assert len(left) == len(right), f"{where}: {len(left)} and {len(right)} items"
+        for index, (one, other) in enumerate(zip(left, right, strict=True)):
+            assert_same(one, other, f"{where}[{index}]")
+    else:
+        assert left == right, f"{where}: {left} and {right}"

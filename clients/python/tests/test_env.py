@@ -1,0 +1,852 @@
+"""`emberwatch/Wildfire-v0`: Gymnasium's own checks, seeds, options, faults, wrappers."""
+
+import copy
+import gc
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from environments import (
+    LIVELY,
+    MOVES,
+    SMALL,
+    WILDFIRE,
+    actions,
+    assert_same,
+    make,
+    make_vec,
+    no_warnings,
+    rollout,
+    serving,
+)
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AsyncVectorEnv
+
+import emberwatch
+from emberwatch.errors import (
+    BusyError,
+    ClosedError,
+    EpisodeOverError,
+    ForkedError,
+    InvalidActionError,
+    LeaseLostError,
+    NoServerError,
+    RequestTimeoutError,
+    ServerGoneError,
+    SettingError,
+)
+from emberwatch.programs import find
+
+PARTS = ["frame", "robot", "age"]
+
+
+@pytest.fixture(autouse=True)
+def headless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows open in memory."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setenv("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+
+
+def private_pid(env: Any) -> int:
+    with emberwatch.connect(env.unwrapped.instance) as client:
+        return client.info.pid
+
+
+def has_ended(pid: int) -> bool:
+    """Whether a process is gone, or soon is."""
+    deadline = time.monotonic() + 3
+    while time.monotonic() < deadline:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except FileNotFoundError:
+            return True
+        if state == "Z":
+            return True
+        time.sleep(0.01)
+    return False
+
+
+# Gymnasium's checks
+
+
+@pytest.mark.parametrize(
+    "keywords",
+    [
+        {},
+        *({"observation": part} for part in PARTS),
+        {"observation": ["frame"]},
+        {"observation": ("age", "robot", "frame")},
+        {"truth": True},
+        {"start": "centre"},
+        {"start": "random"},
+        {"start": "2,3"},
+        {"n_moves": 1, "height": 1, "width": 1},
+        {"burn_in": 0, "model": None},
+        *({"render_mode": mode} for mode in ("human", "rgb_array", "ansi")),
+    ],
+    ids=str,
+)
+def test_gymnasium_finds_no_fault(keywords: dict[str, Any]) -> None:
+    renders = "render_mode" in keywords
+    with no_warnings():
+        env = make(**keywords)
+        check_env(env.unwrapped, skip_render_check=not renders)
+        env.close()
+
+
+def test_gymnasium_finds_no_fault_in_an_attached_one() -> None:
+    with serving() as instance, no_warnings():
+        env = make(instance=instance)
+        # Its check keeps several environments of one id; a running server's world has one holder.
+        env.unwrapped.spec = None
+        check_env(env.unwrapped, skip_render_check=True)
+        env.close()
+
+
+def test_each_step_is_within_the_passive_checks_of_make() -> None:
+    with no_warnings():
+        env = make(truth=True, observation=PARTS)
+        for transition in rollout(env, 30, seed=1):
+            assert transition[0] in env.observation_space
+        env.close()
+
+
+def test_rewards_and_ends_are_plain_python() -> None:
+    env = make()
+    env.reset(seed=1)
+    _, reward, terminated, truncated, info = env.step([0, 1, 2, 3])
+    assert [type(value) for value in (reward, terminated, truncated)] == [float, bool, bool]
+    assert info["step"] == 1 and type(info["step"]) is int
+    assert set(info) == {"step", "n_target_cells", "n_visited", "n_hits"}
+    env.close()
+
+
+def test_an_empty_observation_begins_an_episode() -> None:
+    env = make(observation=PARTS, start="2,3")
+    observation, info = env.reset(seed=4)
+    assert (observation["frame"] == 255).all() and (observation["age"] == 255).all()
+    assert observation["robot"].tolist() == [2, 3]
+    assert info["step"] == info["n_visited"] == info["n_hits"] == 0
+    env.close()
+
+
+def test_the_robot_flies_and_sees_its_path() -> None:
+    env = make(observation=PARTS, start="2,3")
+    env.reset(seed=4)
+    observation, reward, _, _, info = env.step(np.array([0, 3, 3, 1]))
+    seen = np.argwhere(observation["frame"][..., 0] != 255).tolist()
+    assert seen == [[1, 3], [1, 4], [2, 4]]  # the last move but one left the grid
+    assert observation["robot"].tolist() == [2, 4]
+    assert info["n_visited"] == 3 and reward == info["n_hits"]
+    env.close()
+
+
+def test_ages_count_the_steps_since_a_cell_was_seen() -> None:
+    env = make(observation=("frame", "age"))
+    env.reset(seed=4)
+    expected = np.full((7, 5, 1), 255)
+    for action in actions(env, 300):
+        observation = env.step(action)[0]
+        expected = np.minimum(expected + 1, 255)
+        expected[observation["frame"] != 255] = 0
+        assert (observation["age"] == expected).all()
+    assert (env.reset()[0]["age"] == 255).all()
+    env.close()
+
+
+def test_truth_shows_the_states_that_paid() -> None:
+    env = make(truth=True)
+    env.reset(seed=3)
+    for action in actions(env, 20):
+        observation, reward, _, _, info = env.step(action)
+        truth = info["truth"]
+        assert truth.shape == (7, 5) and truth.dtype == np.uint8
+        visited = observation["frame"][..., 0] != 255
+        assert reward == (truth[visited] == 2).sum()
+        assert info["n_target_cells"] == (truth == 2).sum()
+    env.close()
+
+
+def test_busy_neighbours_do_not_crowd_the_truth_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    with (
+        serving(worlds=41, publish_truth=True) as instance,
+        emberwatch.connect(instance) as client,
+        client.acquire(1, 40) as neighbours,
+    ):
+        env = make(instance=instance, truth=True, timeout=2)
+        env.reset(seed=1)
+        session = env.unwrapped._session
+        step = session.step
+
+        def step_and_be_late(moves: Any) -> Any:
+            answer = step(moves)
+            for _ in range(5):  # 200 samples, of which a reader keeps 128
+                neighbours.step(np.zeros((40, 4), int))
+            return answer
+
+        monkeypatch.setattr(session, "step", step_and_be_late)
+        private = make(truth=True)
+        private.reset(seed=1)
+        for action in actions(private, 3):
+            assert_same(env.step(action), private.step(action))
+        env.close()
+        private.close()
+
+
+def test_the_truth_is_found_among_many_worlds() -> None:
+    with serving(worlds=300, publish_truth=True) as instance:
+        for world in (5, 299):
+            env = make(instance=instance, world=world, truth=True, timeout=2)
+            assert_same(env.reset(seed=1)[1]["truth"], env.reset(seed=1)[1]["truth"])
+            env.close()
+            env.reset(options={"resume": True})
+            env.close()
+
+
+def test_what_was_returned_is_never_changed() -> None:
+    env = make(observation=PARTS, truth=True)
+    before = rollout(env, 10, seed=1)
+    kept = copy.deepcopy(before)
+    rollout(env, 10, seed=2, actions_seed=2)
+    assert_same(before, kept)
+    env.close()
+
+
+def test_pictures_are_not_the_learners_to_change() -> None:
+    env = make(render_mode="rgb_array")
+    env.reset(seed=1)
+    observation = env.step([1, 1, 3, 3])[0]
+    picture = env.render()
+    observation["frame"][:] = 0
+    assert (env.render() == picture).all()
+    env.close()
+
+
+# Seeds
+
+
+def test_the_same_seed_and_actions_give_the_same_episode() -> None:
+    one, other = make(observation=PARTS), make(observation=PARTS)
+    for seed in (0, 1, 2**40):
+        assert_same(rollout(one, 8, seed=seed), rollout(other, 8, seed=seed))
+    # Unseeded resets go on alike, too.
+    assert_same(rollout(one, 8, seed=None), rollout(other, 8, seed=None))
+    one.close()
+    other.close()
+
+
+def test_other_seeds_give_other_episodes() -> None:
+    env = make(truth=True)
+    truths = [env.reset(seed=seed)[1]["truth"].tobytes() for seed in range(8)]
+    assert len(set(truths)) == 8
+    env.close()
+
+
+def test_seed_zero_is_a_seed() -> None:
+    one, other = make(truth=True), make(truth=True)
+    one.reset(seed=5)
+    assert_same(one.reset(seed=0), other.reset(seed=0))
+    assert one.unwrapped.np_random_seed == 0
+    one.close()
+    other.close()
+
+
+def test_a_seeded_reset_can_be_repeated() -> None:
+    env = make(truth=True)
+    first = env.reset(seed=7)
+    assert_same(env.reset(seed=7), first)
+    env.step([0, 0, 0, 0])
+    assert_same(env.reset(seed=7), first)
+    env.close()
+
+
+def test_unseeded_resets_after_a_seeded_one_are_reproducible_and_differ() -> None:
+    env = make(truth=True)
+    series = []
+    for _ in range(2):
+        env.reset(seed=11)
+        series.append([env.reset() for _ in range(4)])
+    assert_same(series[0], series[1])
+    assert len({info["truth"].tobytes() for _, info in series[0]}) == 4
+    env.close()
+
+
+def test_an_environment_never_seeded_is_random() -> None:
+    truths = set()
+    for _ in range(2):
+        env = make(truth=True)
+        truths |= {env.reset()[1]["truth"].tobytes() for _ in range(2)}
+        env.close()
+    assert len(truths) == 4
+
+
+def test_private_attached_and_vector_worlds_are_the_same() -> None:
+    private = make(truth=True, observation=PARTS)
+    expected = rollout(private, 10, seed=1234)
+    paths = actions(private, 10)
+    private.close()
+    with serving(publish_truth=True, worlds=3, seed=99) as instance:
+        attached = make(instance=instance, world=1, truth=True, observation=PARTS)
+        assert_same(rollout(attached, 10, seed=1234), expected)
+        attached.close()
+    vector = make_vec(3, truth=True, observation=PARTS)
+    got = [vector.reset(seed=[3, 1234, 4])]
+    got += [vector.step(np.stack([path[::-1], path, path])) for path in paths]
+    for theirs, ours in zip(got, expected, strict=True):
+        for part in PARTS:
+            assert_same(theirs[0][part][1], ours[0][part])
+        for key, value in ours[-1].items():
+            assert (theirs[-1][key][1] == value).all()
+        if len(ours) == 5:
+            assert [array[1] for array in theirs[1:4]] == list(ours[1:4])
+    vector.close()
+
+
+def test_rust_and_python_see_the_same_frames() -> None:
+    n_steps = 12
+    with serving(seed=321) as instance, emberwatch.observe(instance) as observer:
+        command = [str(find("emberwatch-agent")), "run", "--instance", instance, "--world", "0"]
+        command += ["--steps", str(n_steps), "--policy", "random_walk"]
+        subprocess.run(command, check=True, capture_output=True, timeout=30)
+        frames: dict[int, emberwatch.Frame] = {}
+        while len(frames) <= n_steps:
+            frame = observer.receive(5)
+            assert frame is not None and frame.n_lost == 0
+            frames[frame.result.step] = frame
+    seeds = {frame.result.seed for frame in frames.values()}
+    assert len(seeds) == 1
+    env = make()
+    env.reset(seed=seeds.pop())
+    for step in range(1, n_steps + 1):
+        observation, reward, _, _, info = env.step(frames[step].path)
+        theirs = frames[step].result
+        assert observation["frame"].tobytes() == frames[step].frame.tobytes()
+        assert observation["robot"].tolist() == [theirs.row, theirs.col]
+        assert reward == theirs.reward
+        assert info["n_target_cells"] == theirs.n_target_cells
+    env.close()
+
+
+def test_seeds_are_checked() -> None:
+    env = make()
+    with pytest.raises(gymnasium.error.Error, match="greater or equal"):
+        env.reset(seed=-1)
+    with pytest.raises(SettingError, match=r"seed: expected less than 2\*\*64, got 18446744073709"):
+        env.reset(seed=2**64)
+    env.reset(seed=2**64 - 1)
+    env.close()
+
+
+# Actions
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([0, 1, 2], r"expected shape \(1, 4\) or \(4,\), got \(3,\)"),
+        ([[0, 1, 2, 3]] * 2, r"expected shape .* got \(2, 4\)"),
+        (3, r"got \(\)"),
+        ([0, 1, 2, 4], r"expected moves 0 to 3, got 4 at \(3,\)"),
+        ([0, -1, 2, 3], r"got -1 at \(1,\)"),
+        ([0.0, 1.0, 2.0, 3.0], "expected integers, got float64"),
+        ([True, False, True, False], "expected integers, got bool"),
+        (np.array(["0", "1", "2", "3"]), "expected integers"),
+        (None, "expected shape"),
+    ],
+    ids=str,
+)
+def test_a_wrong_action_is_named_and_not_sent(action: object, message: str) -> None:
+    env = make().unwrapped
+    env.reset(seed=1)
+    with pytest.raises(InvalidActionError, match=message):
+        env.step(action)
+    assert env.step([0, 1, 2, 3])[4]["step"] == 1
+    env.close()
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.int32, np.uint8, np.int8, list, tuple])
+def test_actions_come_as_any_integers(kind: Any) -> None:
+    env = make()
+    env.reset(seed=1)
+    moves = [1, 1, 3, 3]
+    action = kind(moves) if kind in (list, tuple) else np.array(moves, kind)
+    assert env.step(action)[0]["robot"].tolist() == [2, 2]
+    env.close()
+
+
+# Ends and options
+
+
+def test_an_episode_is_truncated_after_max_episode_steps() -> None:
+    env = make(max_episode_steps=3)
+    ends = [transition[3] for transition in rollout(env, 3, seed=1)[1:]]
+    assert ends == [False, False, True]
+    env.close()
+    assert gymnasium.spec(WILDFIRE).max_episode_steps == 1000
+
+
+def test_a_server_may_truncate_earlier() -> None:
+    with serving(max_steps=2) as instance:
+        env = make(instance=instance)
+        ends = [transition[2:4] for transition in rollout(env, 2, seed=1)[1:]]
+        assert ends == [(False, False), (False, True)]
+        with pytest.raises(EpisodeOverError):
+            env.step([0, 0, 0, 0])
+        assert env.reset()[1]["step"] == 0
+        assert env.step([0, 0, 0, 0])[4]["step"] == 1
+        env.close()
+
+
+def test_resume_goes_on_where_another_agent_stopped() -> None:
+    with serving() as instance:
+        command = [str(find("emberwatch-agent")), "run", "--instance", instance]
+        command += ["--steps", "5", "--policy", "random_walk"]
+        subprocess.run(command, check=True, capture_output=True, timeout=30)
+        with emberwatch.connect(instance) as client:
+            left = client.observe()
+        env = make(instance=instance, observation=PARTS, max_episode_steps=3)
+        observation, info = env.reset(options={"resume": True})
+        assert info["step"] == 5
+        assert observation["frame"].tobytes() == left.frames.tobytes()
+        assert observation["robot"].tolist() == [left.result().row, left.result().col]
+        seen = observation["frame"] != 255
+        assert (observation["age"] == np.where(seen, 0, 255)).all()
+        # The time limit counts the environment's own steps.
+        steps = [env.step(action) for action in actions(env, 3)]
+        assert [step[4]["step"] for step in steps] == [6, 7, 8]
+        assert [step[3] for step in steps] == [False, False, True]
+        assert env.reset(seed=1)[1]["step"] == 0
+        env.close()
+
+
+def test_resume_of_a_private_world_is_where_it_stands() -> None:
+    env = make()
+    assert env.reset(options={"resume": True})[1]["step"] == 0
+    last = env.step([1, 1, 1, 1])
+    observation, info = env.reset(options={"resume": True})
+    assert_same(observation, last[0])
+    assert_same(info, last[4])
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"options": {"rewind": True}}, "options: expected 'resume', got 'rewind'"),
+        ({"seed": 3, "options": {"resume": True}}, "expected no seed with resume=True"),
+    ],
+    ids=str,
+)
+def test_wrong_options_are_named(keywords: dict[str, Any], message: str) -> None:
+    env = make()
+    env.reset(seed=1)
+    with pytest.raises(SettingError, match=message):
+        env.reset(**keywords)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"observation": ()}, r"expected one or several of frame, robot, age, got \(\)"),
+        ({"observation": "image"}, "got 'image'"),
+        ({"observation": ["frame", "frame"]}, "observation"),
+        ({"observation": ["frame", "visited"]}, "observation"),
+        ({"height": 0}, "height: expected an integer within 1 to 4096, got 0"),
+        ({"width": 4097}, "width: expected .* got 4097"),
+        ({"n_moves": 2.5}, "n_moves: expected .* got 2.5"),
+        ({"burn_in": -1}, "burn_in: expected steps, at least 0, got -1"),
+        ({"timeout": 0}, "timeout: expected seconds above 0, got 0"),
+        ({"timeout": float("nan")}, "timeout: .* got nan"),
+        ({"world": 1}, "expected instance=..., .* got world 1"),
+        ({"takeover": True}, "expected instance=..."),
+        ({"instance": "no spaces"}, "got 'no spaces'"),
+    ],
+    ids=str,
+)
+def test_impossible_keywords_are_named_by_make(keywords: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        make(**keywords)
+
+
+def test_an_unknown_render_mode_is_named() -> None:
+    with pytest.raises(SettingError, match=r"expected None or one of human, .*, got 'film'"):
+        emberwatch.WildfireEnv(render_mode="film")
+
+
+@pytest.mark.parametrize("keyword", ["hight", "n_worlds", "num_envs"])
+def test_an_unknown_keyword_is_named(keyword: str) -> None:
+    with pytest.raises(TypeError, match=keyword):
+        make(**{keyword: 2})
+
+
+def test_a_missing_model_is_named_by_make() -> None:
+    with pytest.raises(Exception, match=r"nowhere\.toml"):
+        make(model="nowhere.toml")
+
+
+def test_what_the_server_refuses_to_start_with_is_told() -> None:
+    env = make(start="9,9")
+    with pytest.raises(emberwatch.errors.LaunchError, match="start"):
+        env.reset()
+    env.close()
+
+
+# A running server
+
+
+@pytest.fixture(scope="module")
+def lab() -> Iterator[str]:
+    with serving(worlds=2) as instance:
+        yield instance
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"height": 8}, "height: expected 7, as the server has, or None, got 8"),
+        ({"width": 8}, "width: expected 5, .* got 8"),
+        ({"n_moves": 5}, "n_moves: expected 4, .* got 5"),
+        ({"burn_in": 51}, "burn_in: expected 50, .* got 51"),
+        ({"model": "wildfire"}, "model: expected None"),
+        ({"start": "corner"}, "start: expected None"),
+        ({"world": 2}, "world: expected worlds within 0 to 1, got 2 to 2"),
+        ({"world": -1}, "world: expected .* got -1 to -1"),
+        ({"truth": True}, "truth: expected a server started with --publish-truth"),
+    ],
+    ids=str,
+)
+def test_settings_must_be_those_of_the_server(
+    lab: str, keywords: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(SettingError, match=message):
+        make(instance=lab, **keywords)
+
+
+def test_settings_may_agree_with_the_server(lab: str) -> None:
+    env = make(instance=lab, height=7, width=5, n_moves=4, burn_in=50)
+    assert env.unwrapped.model is not None and env.unwrapped.model.name == "lively"
+    assert env.unwrapped.burn_in == 50
+    env.reset()
+    assert env.unwrapped.instance == lab
+    env.close()
+
+
+def test_a_hidden_model_is_none() -> None:
+    with serving(reveal_model=False) as instance:
+        env = make(instance=instance, render_mode="ansi")
+        assert env.unwrapped.model is None
+        env.reset(seed=1)
+        assert env.render()
+        env.close()
+
+
+def test_nobody_serving_is_told_by_make() -> None:
+    with pytest.raises(NoServerError, match="emberwatch-server --instance nobody"):
+        make(instance="nobody")
+
+
+def test_a_second_environment_on_a_world_names_the_holder() -> None:
+    with serving(worlds=2) as instance:
+        first, second = make(instance=instance), make(instance=instance)
+        first.reset(seed=1)
+        with pytest.raises(BusyError, match=f"held by pid {os.getpid()}") as caught:
+            second.reset()
+        assert caught.value.detail == os.getpid()
+        beside = make(instance=instance, world=1)
+        beside.reset(seed=1)
+        first.step([0, 0, 0, 0])
+        first.close()
+        assert second.reset(options={"resume": True})[1]["step"] == 1
+        second.close()
+        beside.close()
+
+
+def test_takeover_takes_the_world_and_its_step() -> None:
+    with serving() as instance:
+        loser = make(instance=instance)
+        winner = make(instance=instance, takeover=True)
+        loser.reset(seed=1)
+        loser.step([1, 1, 1, 1])
+        observation, info = winner.reset(options={"resume": True})
+        assert info["step"] == 1 and observation["robot"].tolist() == [4, 0]
+        with pytest.raises(LeaseLostError) as caught:
+            loser.step([1, 1, 1, 1])
+        assert caught.value.detail == os.getpid()
+        with pytest.raises(ClosedError, match="reset it first"):
+            loser.step([1, 1, 1, 1])
+        with pytest.raises(BusyError):
+            loser.reset()
+        assert winner.step([1, 1, 1, 1])[4]["step"] == 2
+        winner.close()
+        loser.reset(seed=1)
+        loser.close()
+
+
+def test_takeover_while_the_loser_resets() -> None:
+    with serving() as instance:
+        loser = make(instance=instance)
+        winner = make(instance=instance, takeover=True)
+        loser.reset(seed=1)
+        winner.reset(seed=2)
+        with pytest.raises(LeaseLostError):
+            loser.reset(seed=3)
+        winner.close()
+        assert loser.reset(seed=3)[1]["step"] == 0
+        loser.close()
+
+
+def test_another_server_of_other_size_is_refused() -> None:
+    with serving() as instance:
+        env = make(instance=instance)
+        env.reset()
+    with pytest.raises(ServerGoneError):
+        env.step([0, 0, 0, 0])
+    with serving(instance=instance):
+        env.reset(seed=1)
+        env.step([0, 0, 0, 0])
+    with pytest.raises(ServerGoneError):
+        env.reset()
+    with serving(instance=instance, width=6), pytest.raises(SettingError, match="width=6"):
+        env.reset()
+    with serving(instance=instance, model="wildfire"), pytest.raises(SettingError, match="model"):
+        env.reset()
+    env.close()
+
+
+# Life and death
+
+
+def test_close_twice_is_fine_and_reset_opens_again() -> None:
+    env = make()
+    env.close()
+    first = env.reset(seed=3)
+    pid = private_pid(env)
+    env.close()
+    env.close()
+    assert has_ended(pid)
+    with pytest.raises(ClosedError, match="reset it first"):
+        env.step([0, 0, 0, 0])
+    assert_same(env.reset(seed=3), first)
+    assert private_pid(env) != pid
+    env.close()
+
+
+def test_nothing_starts_before_the_first_reset() -> None:
+    env = make()
+    with pytest.raises(ClosedError):
+        _ = env.unwrapped.instance
+    with pytest.raises(ClosedError):
+        env.unwrapped.step([0, 0, 0, 0])
+    env.close()
+
+
+def test_a_private_server_ends_with_its_forgotten_environment() -> None:
+    env = make()
+    env.reset()
+    pid = private_pid(env)
+    del env
+    gc.collect()
+    assert has_ended(pid)
+
+
+@pytest.mark.parametrize("call", ["step", "reset"])
+def test_a_killed_private_server_is_replaced_by_the_next_reset(call: str) -> None:
+    env = make()
+    expected = rollout(env, 5, seed=3)
+    os.kill(private_pid(env), signal.SIGKILL)
+    begin = time.monotonic()
+    with pytest.raises(ServerGoneError):
+        env.step([0, 0, 0, 0]) if call == "step" else env.reset()
+    assert time.monotonic() - begin < 0.5
+    assert_same(rollout(env, 5, seed=3), expected)
+    env.close()
+
+
+def test_a_stopped_server_times_out_and_resume_finds_the_step() -> None:
+    env = make(timeout=0.2)
+    env.reset(seed=1)
+    pid = private_pid(env)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        with pytest.raises(RequestTimeoutError):
+            env.step([1, 1, 3, 3])
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    with pytest.raises(ClosedError, match="timed out"):
+        env.step([1, 1, 3, 3])
+    for _ in range(100):  # the server takes a moment to let go of the request given up
+        observation, info = env.reset(options={"resume": True})
+        assert observation["robot"].tolist() == ([2, 2] if info["step"] else [0, 0])
+    assert env.step([0, 0, 0, 0])[4]["step"] == info["step"] + 1
+    env.close()
+
+
+def test_a_forked_child_makes_its_own_connection() -> None:
+    env = make()
+    expected = rollout(env, 3, seed=5)
+    pid = private_pid(env)
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        words = "nothing"
+        try:
+            try:
+                env.step([0, 0, 0, 0])
+            except ForkedError as error:
+                words = f"{error}"
+            env.close()
+            assert_same(rollout(env, 3, seed=5), expected)
+            env.close()
+            words += "; the same"
+        except BaseException as error:
+            words += f"; {error!r}"
+        finally:
+            os.write(write, words.encode())
+            os._exit(0)
+    os.close(write)
+    with os.fdopen(read) as pipe:
+        words = pipe.read()
+    os.waitpid(child, 0)
+    assert "belongs to the process that forked" in words and words.endswith("; the same")
+    # The parent's is unharmed.
+    assert private_pid(env) == pid
+    assert env.step([0, 0, 0, 0])[4]["step"] == 4
+    env.close()
+
+
+# Gymnasium's registry, vectorizers and wrappers
+
+
+def test_make_imports_the_package_by_name() -> None:
+    code = (
+        "import gymnasium\n"
+        "env = gymnasium.make('emberwatch:emberwatch/Wildfire-v0', height=7, width=5, burn_in=0)\n"
+        "env.reset(seed=1)\n"
+        "print(env.unwrapped.observation_space)\n"
+    )
+    command = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert "Box(0, 255, (7, 5, 1), uint8)" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("name", [WILDFIRE, MOVES])
+def test_an_environment_can_be_made_again_from_its_spec(name: str) -> None:
+    env = make(name, observation=("frame", "robot"), max_episode_steps=5)
+    expected = rollout(env, 5, seed=8)
+    assert env.spec is not None
+    text = env.spec.to_json()
+    specs = [
+        env.spec,
+        pickle.loads(pickle.dumps(env.spec)),
+        gymnasium.envs.registration.EnvSpec.from_json(text),
+    ]
+    env.close()
+    for spec in specs:
+        again = gymnasium.make(spec)
+        assert_same(rollout(again, 5, seed=8), expected)
+        again.close()
+    gymnasium.spec(name).to_json()
+
+
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_async_vector_env_runs_a_server_in_each_worker(context: str) -> None:
+    single = make()
+    expected = rollout(single, 3, seed=21)
+    paths = actions(single, 3)
+    single.close()
+    vector = AsyncVectorEnv([_make_small] * 2, context=context)
+    try:
+        observations = [vector.reset(seed=[21, 22])[0]]
+        observations += [vector.step(np.stack([path, path]))[0] for path in paths]
+    finally:
+        vector.close()
+    for theirs, ours in zip(observations, expected, strict=True):
+        assert_same(theirs["frame"][0], ours[0]["frame"])
+
+
+def _make_small() -> gymnasium.Env[Any, Any]:
+    return gymnasium.make(WILDFIRE, **SMALL)
+
+
+def test_async_vector_env_attaches_its_workers() -> None:
+    with serving(worlds=2, publish_truth=True) as instance:
+        makers = [
+            lambda world=world: gymnasium.make(WILDFIRE, instance=instance, world=world)
+            for world in range(2)
+        ]
+        vector = AsyncVectorEnv(makers, context="fork")
+        try:
+            vector.reset(seed=1)
+            _, _, _, _, infos = vector.step(vector.action_space.sample())
+            assert infos["step"].tolist() == [1, 1]
+        finally:
+            vector.close()
+
+
+def test_videos_and_statistics_are_recorded(tmp_path: Path) -> None:
+    pytest.importorskip("moviepy")
+    env = make(render_mode="rgb_array", max_episode_steps=4)
+    env = gymnasium.wrappers.RecordEpisodeStatistics(
+        gymnasium.wrappers.RecordVideo(env, str(tmp_path / "videos"), disable_logger=True)
+    )
+    transitions = rollout(env, 4, seed=1)
+    env.close()
+    rewards = [transition[1] for transition in transitions[1:]]
+    episode = transitions[-1][4]["episode"]
+    assert (episode["r"], episode["l"]) == (pytest.approx(sum(rewards)), 4)
+    assert [path.suffix for path in (tmp_path / "videos").iterdir()] == [".mp4"]
+
+
+@pytest.mark.parametrize("observation", ["frame", "robot", ("frame", "robot", "age")], ids=str)
+def test_observations_can_be_flattened_and_stacked(observation: Any) -> None:
+    env = gymnasium.wrappers.FlattenObservation(make(observation=observation))
+    for transition in rollout(env, 3, seed=1):
+        assert transition[0] in env.observation_space
+    env.close()
+    stack = gymnasium.wrappers.FrameStackObservation(make(observation=observation), 3)
+    for transition in rollout(stack, 4, seed=1):
+        assert transition[0] in stack.observation_space
+    stack.close()
+
+
+@pytest.mark.parametrize("truth", [False, True])
+def test_pictures_are_drawn_in_each_mode(truth: bool) -> None:
+    for mode, kind in (("rgb_array", np.ndarray), ("ansi", str), ("human", type(None))):
+        env = make(render_mode=mode, truth=truth)
+        env.reset(seed=1)
+        first = env.render()
+        env.step([1, 1, 3, 3])
+        second = env.render()
+        assert isinstance(first, kind) and isinstance(second, kind)
+        if mode != "human":
+            assert not np.array_equal(first, second)
+        env.close()
+
+
+def test_without_a_render_mode_nothing_is_drawn_with_a_word() -> None:
+    env = make().unwrapped
+    env.reset(seed=1)
+    with pytest.warns(UserWarning, match="nothing to draw; give a render_mode"):
+        assert env.render() is None
+    env.close()
+
+
+def test_the_time_from_make_to_the_first_step_is_short(capsys: pytest.CaptureFixture[str]) -> None:
+    begin = time.perf_counter()
+    env = gymnasium.make(WILDFIRE, model=LIVELY)
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    elapsed = time.perf_counter() - begin
+    env.close()
+    with capsys.disabled():
+        print(f" [make to first step: {elapsed:.3f} s]", end="")

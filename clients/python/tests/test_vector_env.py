@@ -1,0 +1,564 @@
+"""`WildfireVectorEnv` against Gymnasium's `SyncVectorEnv` of single environments."""
+
+import copy
+import gc
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from environments import WILDFIRE, actions, assert_same, make, make_vec, no_warnings, serving
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+
+import emberwatch
+from emberwatch.errors import (
+    BusyError,
+    InvalidActionError,
+    LeaseLostError,
+    RequestTimeoutError,
+    ServerGoneError,
+    SettingError,
+)
+
+PARTS = ("frame", "robot", "age")
+
+Vector = VectorEnv[Any, Any, Any]
+
+
+@pytest.fixture(autouse=True)
+def headless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows open in memory."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+def sync_of(n_worlds: int, mode: AutoresetMode, **keywords: Any) -> Vector:
+    """The same worlds as single environments; with `instance` the worlds of a server in turn."""
+
+    def maker(world: int) -> Callable[[], gymnasium.Env[Any, Any]]:
+        place = {} if keywords.get("instance") is None else {"world": world}
+        return lambda: make(**{**keywords, **place})
+
+    return SyncVectorEnv([maker(world) for world in range(n_worlds)], autoreset_mode=mode)
+
+
+def pair(n_worlds: int, mode: AutoresetMode, **keywords: Any) -> tuple[Vector, Vector]:
+    ours = make_vec(n_worlds, autoreset_mode=mode, **keywords)
+    return ours, sync_of(n_worlds, mode, **keywords)
+
+
+def assert_same_flight(ours: Vector, theirs: Vector, n_steps: int, seed: Any) -> None:
+    """Both return the same, in every field, from a reset on."""
+    assert_same(ours.reset(seed=seed), theirs.reset(seed=seed), "reset")
+    assert_same_steps(ours, theirs, n_steps)
+
+
+def assert_same_steps(ours: Vector, theirs: Vector, n_steps: int) -> int:
+    """The same for steps; returns how many episodes ended."""
+    n_ends = 0
+    for step, action in enumerate(actions(theirs, n_steps)):
+        left, right = ours.step(action), theirs.step(action)
+        assert_same(left, right, f"step {step}")
+        n_ends += int((left[2] | left[3]).sum())
+    return n_ends
+
+
+# Against SyncVectorEnv
+
+
+@pytest.mark.parametrize("observation", [*PARTS, ("frame", "robot"), PARTS], ids=str)
+@pytest.mark.parametrize("mode", AutoresetMode, ids=str)
+def test_every_field_is_that_of_single_environments(mode: AutoresetMode, observation: Any) -> None:
+    ours, theirs = pair(3, mode, observation=observation, truth=True)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert ours.single_observation_space == theirs.single_observation_space
+    assert ours.single_action_space == theirs.single_action_space
+    assert ours.metadata == theirs.metadata
+    assert_same_flight(ours, theirs, 6, seed=17)
+    # Without a seed, each world's own generator goes on.
+    assert_same_flight(ours, theirs, 2, seed=None)
+    ours.close()
+    theirs.close()
+
+
+@pytest.mark.parametrize("truth", [False, True])
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=str)
+def test_episodes_end_and_begin_anew_as_in_single_environments(
+    mode: AutoresetMode, truth: bool
+) -> None:
+    ours, theirs = pair(4, mode, observation=PARTS, truth=truth, max_episode_steps=3)
+    assert_same_flight(ours, theirs, 2, seed=0)
+    # Some begin anew in between, so that episodes end at different times.
+    for mask in ([True, False, True, False], [False, False, True, False]):
+        for env_seed in (5, [7, None, 8, None], None):
+            left = ours.reset(seed=env_seed, options={"reset_mask": np.array(mask)})
+            right = theirs.reset(seed=env_seed, options={"reset_mask": np.array(mask)})
+            assert_same(left, right, "masked reset")
+            assert_same_steps(ours, theirs, 1)
+    assert assert_same_steps(ours, theirs, 14) > 8
+    ours.close()
+    theirs.close()
+
+
+def test_disabled_autoreset_leaves_resets_to_the_caller() -> None:
+    ours, theirs = pair(3, AutoresetMode.DISABLED, observation=PARTS, max_episode_steps=2)
+    assert_same_flight(ours, theirs, 1, seed=3)
+    mask = np.array([False, True, False])
+    assert_same(
+        ours.reset(options={"reset_mask": mask}), theirs.reset(options={"reset_mask": mask})
+    )
+    action = actions(theirs, 1)[0]
+    left, right = ours.step(action), theirs.step(action)
+    assert_same(left, right)
+    assert left[3].tolist() == [True, False, True]
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"worlds \[0, 2\]: the episode is over"):
+        ours.step(action)
+    over = left[3]
+    assert_same(
+        ours.reset(options={"reset_mask": over.copy()}),
+        theirs.reset(options={"reset_mask": over.copy()}),
+    )
+    assert_same(ours.step(action), theirs.step(action))
+    ours.close()
+    theirs.close()
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=str)
+def test_worlds_of_running_servers_are_the_same_too(mode: AutoresetMode) -> None:
+    # The servers truncate by themselves, and the vector's worlds begin at 2 of theirs.
+    flags = {"publish_truth": True, "max_steps": 3}
+    with serving(worlds=5, seed=40, **flags) as one, serving(worlds=3, seed=9, **flags) as other:
+        ours = make_vec(3, instance=one, world=2, truth=True, autoreset_mode=mode)
+        theirs = sync_of(3, mode, instance=other, truth=True)
+        assert_same_flight(ours, theirs, 2, seed=6)
+        mask = np.array([False, True, False])
+        options = [{"reset_mask": mask}, {"reset_mask": mask}]
+        assert_same(ours.reset(options=options[0]), theirs.reset(options=options[1]))
+        assert assert_same_steps(ours, theirs, 8) > 4
+        with emberwatch.connect(one) as client:
+            holders = [world.holder_pid for world in client.status().worlds]
+        assert holders == [None, None, os.getpid(), os.getpid(), os.getpid()]
+        ours.close()
+        theirs.close()
+
+
+@pytest.mark.parametrize(
+    "seed", [0, 2**40, [5, None, 0], (1, 2, 3), None, np.int64(4)], ids=lambda seed: repr(seed)
+)
+def test_seeds_are_those_of_single_environments(seed: Any) -> None:
+    ours, theirs = pair(3, AutoresetMode.NEXT_STEP, truth=True)
+    assert_same(ours.reset(seed=1), theirs.reset(seed=1))
+    plain = int(seed) if isinstance(seed, np.integer) else seed
+    assert_same(ours.reset(seed=seed), theirs.reset(seed=plain))
+    # The generators go on alike.
+    for _ in range(2):
+        assert_same(ours.reset(), theirs.reset())
+    ours.close()
+    theirs.close()
+
+
+def test_an_environment_never_seeded_is_random() -> None:
+    truths = set()
+    for _ in range(2):
+        env = make_vec(2, truth=True)
+        truths |= {truth.tobytes() for truth in env.reset()[1]["truth"]}
+        env.close()
+    assert len(truths) == 4
+
+
+def test_many_worlds_take_staggered_ends() -> None:
+    ours, theirs = pair(9, AutoresetMode.NEXT_STEP, max_episode_steps=4)
+    assert_same(ours.reset(seed=2), theirs.reset(seed=2))
+    masks = np.random.default_rng(3)
+    for _ in range(3):
+        assert_same_steps(ours, theirs, 1)
+        mask = masks.random(9) < 0.5
+        assert_same(
+            ours.reset(options={"reset_mask": mask.copy()}),
+            theirs.reset(options={"reset_mask": mask.copy()}),
+        )
+    assert assert_same_steps(ours, theirs, 15) > 20
+    ours.close()
+    theirs.close()
+
+
+# reset
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"reset_mask": [True, False]}, r"expected an array \(2,\) of bool, got <class 'list'>"),
+        ({"reset_mask": np.array([1, 0])}, r"expected an array \(2,\) of bool .* got int64 \(2,\)"),
+        ({"reset_mask": np.array([True])}, r"expected an array \(2,\) of bool .* got bool \(1,\)"),
+        ({"reset_mask": np.zeros(2, bool)}, "with at least one True"),
+        ({"mask": np.ones(2, bool)}, "options: expected 'resume', got 'mask'"),
+    ],
+    ids=str,
+)
+def test_a_wrong_reset_mask_is_named(options: dict[str, Any], message: str) -> None:
+    env = make_vec(2)
+    env.reset(seed=1)
+    with pytest.raises(SettingError, match=message):
+        env.reset(options=options)
+    env.close()
+
+
+def test_a_reset_mask_is_left_as_it_was() -> None:
+    env = make_vec(2)
+    env.reset(seed=1)
+    options = {"reset_mask": np.array([True, False])}
+    infos = env.reset(options=options)[1]
+    assert options["reset_mask"].tolist() == [True, False]
+    infos["_step"][:] = False
+    assert options["reset_mask"].tolist() == [True, False]
+    env.close()
+
+
+def test_the_first_reset_is_of_all_worlds() -> None:
+    env = make_vec(2)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset of all worlds before"):
+        env.reset(options={"reset_mask": np.array([True, False])})
+    env.close()
+
+
+@pytest.mark.parametrize("seed", [[1], [1, 2, 3], []], ids=str)
+def test_a_wrong_number_of_seeds_is_named(seed: list[int]) -> None:
+    env = make_vec(2)
+    with pytest.raises(SettingError, match=f"seed: expected 2 seeds, got {len(seed)}"):
+        env.reset(seed=seed)
+    env.close()
+
+
+def test_resume_goes_on_where_the_worlds_stand() -> None:
+    with serving(worlds=3) as instance:
+        first = make_vec(3, instance=instance, observation=PARTS)
+        first.reset(seed=1)
+        last = [first.step(action) for action in actions(first, 3)][-1]
+        first.close()
+        second = make_vec(3, instance=instance, observation=PARTS, max_episode_steps=2)
+        observations, infos = second.reset(options={"resume": True})
+        assert_same(infos, last[4])
+        for part in ("frame", "robot"):
+            assert_same(observations[part], last[0][part])
+        expected = np.where(observations["frame"] != 255, 0, 255)
+        assert (observations["age"] == expected).all()
+        truncations = [second.step(action)[3] for action in actions(second, 2)]
+        assert np.array(truncations).tolist() == [[False] * 3, [True] * 3]
+        second.close()
+
+
+# step
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros((2, 3), int), r"expected shape \(2, 4\), got \(2, 3\)"),
+        (np.zeros((1, 4), int), r"expected shape \(2, 4\), got \(1, 4\)"),
+        (np.zeros(4, int), r"expected shape \(2, 4\), got \(4,\)"),
+        (np.full((2, 4), 4), r"expected moves 0 to 3, got 4 at \(0, 0\)"),
+        (np.zeros((2, 4)), "expected integers, got float64"),
+    ],
+    ids=str,
+)
+def test_wrong_actions_are_named_and_not_sent(action: Any, message: str) -> None:
+    env = make_vec(2)
+    env.reset(seed=1)
+    with pytest.raises(InvalidActionError, match=message):
+        env.step(action)
+    assert env.step(np.zeros((2, 4), int))[4]["step"].tolist() == [1, 1]
+    env.close()
+
+
+@pytest.mark.parametrize("mode", AutoresetMode, ids=str)
+def test_what_was_returned_is_never_changed(mode: AutoresetMode) -> None:
+    env = make_vec(3, observation=PARTS, truth=True, max_episode_steps=3, autoreset_mode=mode)
+    returned = [env.reset(seed=1)]
+    kept: list[Any] = []
+    for step, action in enumerate(actions(env, 12)):
+        if mode is AutoresetMode.DISABLED and step % 3 == 0:
+            returned.append(env.reset())
+        elif step == 2:
+            returned.append(env.reset(options={"reset_mask": np.array([False, True, False])}))
+        returned.append(env.step(action))
+        kept.append(copy.deepcopy(returned[-1]))
+    assert_same([value for value in returned if len(value) == 5], kept)
+    env.close()
+
+
+def test_what_was_returned_may_be_written_to() -> None:
+    ours, theirs = pair(2, AutoresetMode.NEXT_STEP, observation=PARTS, max_episode_steps=2)
+    _spoil(ours.reset(seed=4))
+    theirs.reset(seed=4)
+    for action in actions(theirs, 7):
+        left = ours.step(action)
+        assert_same(left, theirs.step(action))
+        _spoil(left)
+    ours.close()
+    theirs.close()
+
+
+def _spoil(value: Any) -> None:
+    if isinstance(value, np.ndarray):
+        value[:] = 1
+    elif isinstance(value, dict):
+        for part in value.values():
+            _spoil(part)
+    else:
+        for part in value:
+            _spoil(part)
+
+
+# Keywords and the registry
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"max_episode_steps": 0}, "max_episode_steps: expected at least 1 or None, got 0"),
+        ({"autoreset_mode": "sometimes"}, "sometimes"),
+        ({"n_worlds": 0}, "num_envs: expected an integer within 1 to 1024, got 0"),
+        ({"n_worlds": 1025}, "num_envs: .* got 1025"),
+        ({"n_worlds": 129, "truth": True}, "truth: expected at most 128 worlds, got 129"),
+        ({"observation": "smoke"}, "observation: .* got 'smoke'"),
+        ({"world": 2}, "expected instance=..., .* got world 2"),
+    ],
+    ids=str,
+)
+def test_impossible_keywords_are_named(keywords: dict[str, Any], message: str) -> None:
+    with no_warnings(), pytest.raises(ValueError, match=message):
+        make_vec(**{"n_worlds": 2, **keywords})
+    gc.collect()
+
+
+def test_worlds_that_a_server_does_not_have_are_named() -> None:
+    with serving(worlds=3) as instance:
+        with pytest.raises(SettingError, match="expected worlds within 0 to 2, got 1 to 3"):
+            make_vec(3, instance=instance, world=1)
+        one, other = make_vec(2, instance=instance), make_vec(2, instance=instance, world=1)
+        one.reset(seed=1)
+        with pytest.raises(BusyError, match=f"pid {os.getpid()}"):
+            other.reset(seed=1)
+        one.close()
+        other.reset(seed=1)
+        other.close()
+
+
+def test_the_registry_sets_spec_and_metadata() -> None:
+    with no_warnings():
+        env = make_vec(3)
+    assert isinstance(env, emberwatch.WildfireVectorEnv)
+    assert env.spec is not None and env.spec.id == WILDFIRE
+    assert env.spec.kwargs["num_envs"] == 3
+    assert env.spec.kwargs["vectorization_mode"] == "vector_entry_point"
+    assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    assert env.num_envs == 3 and "Wildfire-v0, num_envs=3" in repr(env)
+    env.reset(seed=1)
+    again = gymnasium.make_vec(env.spec)
+    assert_same(again.reset(seed=1), env.reset(seed=1))
+    again.close()
+    env.close()
+
+
+def test_the_registrys_time_limit_holds_unless_another_is_given() -> None:
+    def n_steps_of(**keywords: Any) -> int:
+        env = make_vec(1, **keywords)
+        env.reset(seed=1)
+        still = np.zeros((1, 4), int)
+        taken = next((n for n in range(1, 1101) if env.step(still)[3][0]), 0)
+        env.close()
+        return taken
+
+    assert [n_steps_of(), n_steps_of(max_episode_steps=7)] == [1000, 7]
+    assert [n_steps_of(max_episode_steps=endless) for endless in (None, -1)] == [0, 0]
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_gymnasiums_own_vectorizers_work(mode: str) -> None:
+    ours = make_vec(2)
+    theirs = make_vec(2, vectorization_mode=mode)
+    assert_same_flight(ours, theirs, 3, seed=2)
+    ours.close()
+    theirs.close()
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=str)
+def test_statistics_are_those_of_single_environments(mode: AutoresetMode) -> None:
+    ours, theirs = pair(2, mode, max_episode_steps=4)
+    with no_warnings():
+        ours = gymnasium.wrappers.vector.RecordEpisodeStatistics(ours)
+        theirs = gymnasium.wrappers.vector.RecordEpisodeStatistics(theirs)
+    ours.reset(seed=1)
+    theirs.reset(seed=1)
+    n_ends = 0
+    for action in actions(theirs, 11):
+        left, right = ours.step(action)[4], theirs.step(action)[4]
+        if "episode" in right:
+            n_ends += 1
+            for key in ("r", "l"):
+                assert_same(left["episode"][key], right["episode"][key])
+    assert n_ends == 2
+    ours.close()
+    theirs.close()
+
+
+def test_vector_wrappers_work() -> None:
+    env = gymnasium.wrappers.vector.FlattenObservation(make_vec(2, observation=PARTS))
+    for observation in (env.reset(seed=1)[0], env.step(env.action_space.sample())[0]):
+        assert observation in env.observation_space
+    env.close()
+    recorder = gymnasium.wrappers.vector.DictInfoToList(make_vec(2))
+    assert [info["step"] for info in recorder.reset(seed=1)[1]] == [0, 0]
+    recorder.close()
+
+
+# Pictures
+
+
+def test_pictures_are_those_of_single_environments() -> None:
+    ours = make_vec(3, render_mode="rgb_array", truth=True, max_episode_steps=3)
+    theirs = sync_of(
+        3, AutoresetMode.NEXT_STEP, render_mode="rgb_array", truth=True, max_episode_steps=3
+    )
+    ours.reset(seed=1)
+    theirs.reset(seed=1)
+    assert_same(ours.render(), theirs.render())
+    mask = np.array([False, True, False])
+    for step, action in enumerate(actions(theirs, 8)):
+        if step == 1:
+            ours.reset(options={"reset_mask": mask.copy()})
+            theirs.reset(options={"reset_mask": mask.copy()})
+        ours.step(action)
+        theirs.step(action)
+        assert_same(ours.render(), theirs.render(), f"step {step}")
+    ours.close()
+    theirs.close()
+
+
+def test_videos_are_recorded(tmp_path: Path) -> None:
+    pytest.importorskip("moviepy")
+    folder = tmp_path / "videos"
+    env = gymnasium.wrappers.vector.RecordVideo(
+        make_vec(2, render_mode="rgb_array", max_episode_steps=4),
+        str(folder),
+        video_length=3,
+        disable_logger=True,
+    )
+    env.reset(seed=1)
+    for action in actions(env, 5):
+        env.step(action)
+    env.close()
+    assert {path.suffix for path in folder.iterdir()} == {".mp4"}
+
+
+def test_texts_and_windows_are_shown() -> None:
+    with no_warnings():
+        env = make_vec(2, render_mode="ansi")
+        env.reset(seed=1)
+        texts = env.render()
+        assert texts is not None and [type(text) for text in texts] == [str, str]
+        env.close()
+        env = make_vec(2, render_mode="human")
+        env.reset(seed=1)
+        env.step(np.zeros((2, 4), int))
+        assert env.render() == (None, None)
+        env.close()
+
+
+def test_without_a_render_mode_nothing_is_drawn_with_a_word() -> None:
+    env = make_vec(2)
+    env.reset(seed=1)
+    with pytest.warns(UserWarning, match="nothing to draw; give a render_mode"):
+        assert env.render() is None
+    env.close()
+
+
+# Life and death
+
+
+@pytest.fixture
+def flying() -> Iterator[Vector]:
+    env = make_vec(2, timeout=0.2)
+    env.reset(seed=1)
+    env.step(np.ones((2, 4), int))
+    yield env
+    env.close()
+
+
+def private_pid(env: Any) -> int:
+    with emberwatch.connect(env.unwrapped.instance) as client:
+        return client.info.pid
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_close_twice_is_fine_and_reset_opens_again() -> None:
+    env = make_vec(2)
+    env.close()
+    for _ in range(2):
+        env.reset(seed=1)
+        env.step(np.zeros((2, 4), int))
+        pid = private_pid(env)
+        env.close()
+        env.close()
+        assert not is_running(pid)
+
+
+def test_a_private_server_ends_with_its_forgotten_environment() -> None:
+    env = make_vec(2)
+    env.reset(seed=1)
+    pid = private_pid(env)
+    del env
+    gc.collect()
+    assert not is_running(pid)
+
+
+def test_a_killed_private_server_is_replaced_by_the_next_reset(flying: Vector) -> None:
+    expected = flying.reset(seed=5)
+    os.kill(private_pid(flying), signal.SIGKILL)
+    begin = time.monotonic()
+    with pytest.raises(ServerGoneError):
+        flying.step(np.zeros((2, 4), int))
+    assert time.monotonic() - begin < 0.5
+    assert_same(flying.reset(seed=5), expected)
+    assert flying.step(np.zeros((2, 4), int))[4]["step"].tolist() == [1, 1]
+
+
+def test_a_stopped_server_times_out_and_resume_goes_on(flying: Vector) -> None:
+    pid = private_pid(flying)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        with pytest.raises(RequestTimeoutError):
+            flying.step(np.zeros((2, 4), int))
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    with pytest.raises(emberwatch.errors.ClosedError, match="timed out"):
+        flying.step(np.zeros((2, 4), int))
+    infos = flying.reset(options={"resume": True})[1]
+    after = flying.step(np.zeros((2, 4), int))[4]
+    assert (after["step"] == infos["step"] + 1).all()
+
+
+def test_a_takeover_of_one_world_is_told_to_all() -> None:
+    with serving(worlds=3) as instance:
+        env = make_vec(3, instance=instance)
+        env.reset(seed=1)
+        thief = make(instance=instance, world=1, takeover=True)
+        thief.reset(options={"resume": True})
+        with pytest.raises(LeaseLostError) as caught:
+            env.step(np.zeros((3, 4), int))
+        assert caught.value.detail == os.getpid()
+        thief.close()
+        assert env.reset(seed=1)[1]["step"].tolist() == [0, 0, 0]
+        env.close()
