@@ -22,7 +22,7 @@ from emberwatch.errors import EmberwatchError, LaunchError, NoServerError, Reque
 _Connection = TypeVar("_Connection")
 
 #: How long a program may take until it answers, seconds.
-START_TIMEOUT: Final = 20.0
+_START_TIMEOUT: Final = 20.0
 
 #: How long it may take to stop before it is killed, seconds.
 _STOP_TIMEOUT: Final = 3.0
@@ -87,13 +87,14 @@ class Program:
         _programs.add(self)
 
     def wait_for(
-        self, connect: Callable[[], _Connection], timeout: float = START_TIMEOUT
+        self, connect: Callable[[], _Connection], timeout: float | None = None
     ) -> _Connection:
-        """Connects to it, again and again until it answers.
+        """Connects to it, again and again until it answers, for 20 s unless told otherwise.
 
         Raises:
             LaunchError: If it ends first, with its own words, or does not answer in time.
         """
+        timeout = _START_TIMEOUT if timeout is None else timeout
         deadline, pause = time.monotonic() + timeout, 0.002
         while True:
             try:
