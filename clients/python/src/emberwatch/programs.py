@@ -17,7 +17,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Final, TypeVar
 
-from emberwatch.errors import EmberwatchError, LaunchError, NoServerError, RequestTimeoutError
+from emberwatch.errors import (
+    EmberwatchError,
+    LaunchError,
+    NoServerError,
+    RequestTimeoutError,
+    ServerGoneError,
+)
 
 _Connection = TypeVar("_Connection")
 
@@ -99,7 +105,7 @@ class Program:
         while True:
             try:
                 return connect()
-            except (NoServerError, RequestTimeoutError) as error:
+            except (NoServerError, ServerGoneError, RequestTimeoutError) as error:
                 if self._process.poll() is not None:
                     code, words = self._process.returncode, self.words()
                     self.stop()
