@@ -1,8 +1,8 @@
 //! The real processes together: `emberwatch-server` and `emberwatch-agent` as a user runs them.
 //!
 //! `cargo build --workspace` first: cargo does not build another package's programs for a test.
-//! `harness` runs programs, `wire` speaks the protocol byte by byte; every other module is a group
-//! of facts. Each test has an instance, a folder and a deadline of its own. The long run of the
+//! `harness` runs programs, `wire` speaks the protocol byte by byte, `python` lets the Python package
+//! speak it; every other module is a group of facts. Each test has an instance, a folder and a deadline of its own. The long run of the
 //! hostile clients is `cargo test -p tests -- --ignored`.
 
 mod attacker;
@@ -17,5 +17,6 @@ mod frames;
 mod harness;
 mod hostile;
 mod lease;
+mod python;
 mod restart;
 mod wire;
