@@ -412,6 +412,42 @@ def test_every_call_has_a_timeout(server: Start) -> None:
     assert client.observe().result().step == 0
 
 
+@pytest.mark.parametrize("timeout", [0, -1, float("nan"), -float("inf")])
+def test_a_timeout_that_is_no_time_has_passed_already(server: Start, timeout: float) -> None:
+    started = server()
+    client = started.connect()
+    started.stop()
+    with pytest.raises(errors.RequestTimeoutError):
+        client.observe(timeout=timeout)
+    started.wake_up()
+    assert client.observe(timeout=float("inf")).result().step == 0
+
+
+def test_a_signal_that_is_handled_does_not_end_a_step(server: Start) -> None:
+    started = server()
+    lease = started.connect().acquire()
+    caught: list[int] = []
+    before = signal.signal(signal.SIGUSR1, lambda number, _: caught.append(number))
+
+    def disturb() -> None:
+        for _ in range(5):
+            n_caught = len(caught)
+            os.kill(US, signal.SIGUSR1)
+            eventually(lambda: len(caught) > n_caught)  # noqa: B023
+            asleep()
+        started.wake_up()
+
+    started.stop()
+    thread = threading.Thread(target=disturb)
+    thread.start()
+    try:
+        assert lease.step([3] * 6, timeout=PATIENCE).result().step == 1
+    finally:
+        thread.join()
+        signal.signal(signal.SIGUSR1, before)
+    assert len(caught) == 5
+
+
 def test_closing_again_is_fine_and_a_closed_client_says_so(server: Start) -> None:
     client = server().connect()
     lease = client.acquire()
@@ -486,22 +522,26 @@ def test_a_forked_child_is_refused_and_its_parent_goes_on(script: Run, how: str,
     assert (ended, out) == (0, f"child {code}\n"), err
 
 
-def interrupt(started: Server) -> tuple[threading.Thread, list[float]]:
-    """Sends this process Ctrl-C once it sleeps on the answer of a stopped server."""
+def asleep() -> None:
+    """Waits until the main thread sleeps, as it does on the answer of a stopped server."""
+    place = Path(f"/proc/{US}/task/{threading.main_thread().native_id}/stat")
+    looks = 0
+
+    def is_asleep() -> bool:
+        nonlocal looks
+        sleeps = place.read_text().rpartition(")")[2].split()[0] == "S"
+        looks = looks + 1 if sleeps else 0
+        return looks > 20
+
+    assert eventually(is_asleep)
+
+
+def interrupt() -> tuple[threading.Thread, list[float]]:
+    """A thread that sends this process Ctrl-C once it sleeps, and when it did."""
     sent: list[float] = []
-    main = f"/proc/{US}/task/{threading.main_thread().native_id}/stat"
 
     def run() -> None:
-        asleep = 0
-
-        def is_asleep() -> bool:
-            nonlocal asleep
-            asleep = (
-                asleep + 1 if Path(main).read_text().rpartition(")")[2].split()[0] == "S" else 0
-            )
-            return asleep > 20
-
-        eventually(is_asleep)
+        asleep()
         sent.append(time.monotonic())
         os.kill(US, signal.SIGINT)
 
@@ -515,7 +555,7 @@ def test_ctrl_c_ends_a_blocked_step_and_the_client_goes_on(server: Start) -> Non
     waited = []
     for k in range(3):
         started.stop()
-        thread, sent = interrupt(started)
+        thread, sent = interrupt()
         with pytest.raises(KeyboardInterrupt) as raised:
             thread.start()
             lease.step([3] * 6, timeout=PATIENCE)

@@ -101,17 +101,32 @@ def test_what_a_slow_observer_misses_is_counted(server: Start) -> None:
     started = server()
     lease = started.connect().acquire()
     with observe(started.instance) as slow, observe(started.instance) as quick:
-        frames_until(slow, 0)
-        n_samples = len(frames_until(quick, 0))
-        for k in range(1, 2 * wire.FRAME_BUFFER + 1):
+        lease.step(paths(0))
+        frames_until(slow, 1), frames_until(quick, 1)
+        n_published = 0
+        for k in range(2, 2 * wire.FRAME_BUFFER + 1):
             lease.step(paths(k))
-            n_samples += len(frames_until(quick, k))
+            n_published += len(frames_until(quick, k))
         frames = frames_until(slow, 2 * wire.FRAME_BUFFER)
     assert len(frames) == wire.FRAME_BUFFER, "the newest are kept"
-    assert frames[0].n_lost >= wire.FRAME_BUFFER
+    assert frames[0].n_lost == n_published - wire.FRAME_BUFFER
     assert sum(frame.n_lost for frame in frames[1:]) == 0
     steps = [frame.result.step for frame in frames]
     assert steps == list(range(wire.FRAME_BUFFER + 1, 2 * wire.FRAME_BUFFER + 1))
+
+
+def test_losses_among_other_worlds_are_counted(server: Start) -> None:
+    started = server(worlds=2)
+    lease = started.connect().acquire(0, 2)
+    with observe(started.instance, world=1) as observer:
+        frames_until(observer, 0, world=1)
+        for k in range(wire.FRAME_BUFFER):
+            lease.step(paths(k, 2))
+        # World 0 is published first, so that the gap ends at a sample of the other world.
+        frames = frames_until(observer, wire.FRAME_BUFFER, world=1)
+    assert len(frames) == wire.FRAME_BUFFER // 2
+    assert frames[0].n_lost >= wire.FRAME_BUFFER
+    assert sum(frame.n_lost for frame in frames[1:]) == 0
 
 
 def test_an_observer_comes_before_the_server_and_stays_for_the_next(server: Start) -> None:

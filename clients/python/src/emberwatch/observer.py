@@ -125,7 +125,7 @@ class _Reader:
             if sample is not None:
                 break
             waited = time.perf_counter() - start
-            if waited >= timeout:
+            if not waited < timeout:
                 return None
             if waited < _YIELD:
                 os.sched_yield()

@@ -131,7 +131,8 @@ class Bell:
             if is_gone:
                 raise self.gone()
             remaining = start + timeout - time.perf_counter()
-            if remaining <= 0:
+            # Not "<=": "not a number" would end the process inside iceoryx2.
+            if not remaining > 0:
                 raise RequestTimeoutError(
                     f"no answer to {what} from instance {self.node.instance!r} within {timeout} s"
                 )
