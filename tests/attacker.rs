@@ -1,7 +1,7 @@
 //! A client that sends what no client should: random numbers, random bytes, mutated requests.
 
 use crate::harness::PATIENCE;
-use crate::wire::{Wire, answer};
+use crate::wire::{RawClient, Wire, answer};
 use protocol::channels::Instance;
 use protocol::control::Reply;
 use protocol::message::{ControlRequest, FLAG_FULL_COVERAGE, Status, StepRequest, VERSION};

@@ -1,9 +1,12 @@
-//! What every client may rely on: the handshake, echoes, and refusals that change nothing.
+//! What every client may rely on: the handshake, echoes, and refusals that change nothing. One suite,
+//! through the Rust crate and through the Python package.
 
 use crate::harness::{SMALL, Server};
-use crate::wire::{Wire, control_header, step_header};
+use crate::python::PythonWire;
+use crate::wire::{RawClient, Wire, control_header, step_header};
 use protocol::Model;
-use protocol::control::{CoverageRule, Reply, Request};
+use protocol::channels::Instance;
+use protocol::control::{CoverageRule, Reply, Request, ServerInfo};
 use protocol::message::Status::{
     self, BadMove, LeaseLost, NoLease, NoSuchWorld, NotPermitted, UnknownFlags, UnknownOperation,
     VersionMismatch, WrongLength, WrongPathLength,
@@ -19,20 +22,68 @@ const N_MOVES: u32 = 6;
 /// Cells of a [`SMALL`] server.
 const N_CELLS: usize = 35;
 
+/// Whose bytes are sent.
+#[derive(Clone, Copy)]
+enum Client {
+    Rust,
+    Python,
+}
+
+impl Client {
+    /// Opens both channels of an instance, without a handshake.
+    fn open(self, instance: &Instance) -> Box<dyn RawClient> {
+        match self {
+            Self::Rust => Box::new(Wire::open(instance)),
+            Self::Python => Box::new(PythonWire::open(instance)),
+        }
+    }
+}
+
+/// Makes a test of each fact and client.
+macro_rules! suite {
+    ($($fact:ident),* $(,)?) => {
+        mod rust {
+            $(#[test]
+            fn $fact() {
+                super::$fact(super::Client::Rust);
+            })*
+        }
+
+        mod python {
+            $(#[test]
+            #[ignore = "needs Python: scripts/test runs it"]
+            fn $fact() {
+                super::$fact(super::Client::Python);
+            })*
+        }
+    };
+}
+
+suite! {
+    a_handshake_tells_everything_a_client_needs,
+    a_hidden_model_is_not_in_the_handshake,
+    a_step_of_wrong_numbers_is_refused_and_changes_nothing,
+    a_step_without_a_lease_on_its_worlds_is_refused_and_changes_nothing,
+    a_control_request_is_refused_for_one_reason_and_changes_nothing,
+    another_version_is_refused_with_both_versions_and_what_to_do,
+    a_step_answer_echoes_its_request_and_fits_its_payload,
+    a_client_that_shuts_the_server_down_is_answered,
+}
+
 /// Three worlds: two held by one client, one by another.
 struct Table {
     server: Server,
-    ours: Wire,
-    theirs: Wire,
+    ours: Box<dyn RawClient>,
+    theirs: Box<dyn RawClient>,
     our_lease: u64,
     their_lease: u64,
     ended_lease: u64,
 }
 
 impl Table {
-    fn lay() -> Self {
+    fn lay(client: Client) -> Self {
         let server = Server::start(&format!("{SMALL} --worlds 3"));
-        let (ours, theirs) = (Wire::open(&server.instance), Wire::open(&server.instance));
+        let (ours, theirs) = (client.open(&server.instance), client.open(&server.instance));
         let ended_lease = ours.acquire(0, 1).lease;
         assert_eq!(
             ours.ask(&Request::Release { lease: ended_lease }),
@@ -110,12 +161,11 @@ impl Table {
     }
 }
 
-#[test]
-fn a_handshake_tells_everything_a_client_needs() {
+fn a_handshake_tells_everything_a_client_needs(client: Client) {
     let flags = "--height 5 --width 7 --moves 6 --burn-in 20 --worlds 3 --max-steps 9 \
                  --coverage client --lease-millis 1234 --publish-truth";
     let server = Server::start(flags);
-    let info = server.info();
+    let info = hello(&*client.open(&server.instance));
     assert_eq!((info.protocol, info.pid), (VERSION, server.program.pid()));
     assert_eq!(
         (info.height, info.width, info.n_moves, info.n_worlds),
@@ -135,11 +185,23 @@ fn a_handshake_tells_everything_a_client_needs() {
     assert_eq!(model, Ok(Model::wildfire()));
 }
 
-#[test]
-fn a_hidden_model_is_not_in_the_handshake() {
+fn hello(client: &dyn RawClient) -> ServerInfo {
+    let request = Request::Hello {
+        protocol: VERSION,
+        client: "tests".into(),
+    };
+    match client.ask(&request) {
+        Reply::Hello(info) => *info,
+        other => panic!("expected a handshake, got {other:?}"),
+    }
+}
+
+fn a_hidden_model_is_not_in_the_handshake(client: Client) {
     let server = Server::start(&format!("{SMALL} --reveal-model false"));
     let text = br#"{"op":"hello","protocol":1,"client":"tests"}"#;
-    let (_, payload) = Wire::open(&server.instance).control(control_header(1), text);
+    let (_, payload) = client
+        .open(&server.instance)
+        .control(control_header(1), text);
     let text = String::from_utf8(payload).expect("text");
     assert!(
         text.contains(r#""model":null"#) && !text.contains("kernel"),
@@ -154,8 +216,8 @@ struct Steps {
 }
 
 impl Steps {
-    fn new() -> Self {
-        let table = Table::lay();
+    fn new(client: Client) -> Self {
+        let table = Table::lay(client);
         let good = StepRequest {
             sequence: 41,
             ..step_header(table.our_lease, N_MOVES)
@@ -180,9 +242,8 @@ impl Steps {
     }
 }
 
-#[test]
-fn a_step_of_wrong_numbers_is_refused_and_changes_nothing() {
-    let steps = Steps::new();
+fn a_step_of_wrong_numbers_is_refused_and_changes_nothing(client: Client) {
+    let steps = Steps::new(client);
     steps.check(|h| h.version = 2, VersionMismatch, 1);
     steps.check(|h| h.version = 0, VersionMismatch, 1);
     steps.check(|h| h.operation = 0, UnknownOperation, 0);
@@ -204,21 +265,20 @@ fn a_step_of_wrong_numbers_is_refused_and_changes_nothing() {
     steps.check_paths(|_| (), &[255, 2, 3, 0, 1, 4], BadMove, 0);
 }
 
-#[test]
-fn a_step_without_a_lease_on_its_worlds_is_refused_and_changes_nothing() {
-    let steps = Steps::new();
+fn a_step_without_a_lease_on_its_worlds_is_refused_and_changes_nothing(client: Client) {
+    let steps = Steps::new(client);
     let (theirs, ended) = (steps.table.their_lease, steps.table.ended_lease);
     steps.check(|h| h.lease = 0, NoLease, 0);
     steps.check(|h| h.lease = u64::MAX, NoLease, 0);
     steps.check(|h| h.first_world = 2, NoLease, 2);
     steps.check(|h| (h.first_world, h.lease) = (2, theirs), NoLease, 2);
     steps.check_paths(|h| h.n_worlds = 3, &[0; 18], NoLease, 2);
-    let us = u64::from(std::process::id());
+    let us = u64::from(steps.table.ours.pid());
     steps.check(|h| h.lease = ended, LeaseLost, us);
 }
 
 /// Requests, the status and detail of their refusal, and words of it. `OURS`, `THEIRS` and `ENDED`
-/// stand for leases, `US` for this process.
+/// stand for leases, `US` and `THEM` for processes.
 const REFUSED: &str = r#"
  => Malformed 0 malformed control message
 { => Malformed 0 malformed control message
@@ -234,7 +294,7 @@ null => Malformed 0 malformed control message
 {"op":"acquire","first_world":0,"n_worlds":4} => NoSuchWorld 3 worlds 0 to 2
 {"op":"acquire","first_world":4294967295,"n_worlds":4294967295} => NoSuchWorld 3 worlds 0 to 2
 {"op":"acquire","first_world":4294967296,"n_worlds":1} => Malformed 0 4294967296
-{"op":"acquire","first_world":1,"n_worlds":2} => Busy US take the worlds over
+{"op":"acquire","first_world":1,"n_worlds":2} => Busy THEM take the worlds over
 {"op":"renew","lease":12345} => NoLease 0 acquire it first
 {"op":"renew","lease":THEIRS} => NoLease 2 no lease on world 2
 {"op":"renew","lease":ENDED} => LeaseLost US lease lost
@@ -251,14 +311,14 @@ null => Malformed 0 malformed control message
 {"op":"reset","lease":OURS,"worlds":[{"world":0,"seed":1.5}]} => Malformed 0 1.5
 "#;
 
-#[test]
-fn a_control_request_is_refused_for_one_reason_and_changes_nothing() {
-    let table = Table::lay();
+fn a_control_request_is_refused_for_one_reason_and_changes_nothing(client: Client) {
+    let table = Table::lay(client);
     let refused = REFUSED
         .replace("OURS", &table.our_lease.to_string())
         .replace("THEIRS", &table.their_lease.to_string())
         .replace("ENDED", &table.ended_lease.to_string())
-        .replace("US", &std::process::id().to_string());
+        .replace("US", &table.ours.pid().to_string())
+        .replace("THEM", &table.theirs.pid().to_string());
     for line in refused.lines().skip(1) {
         let (text, refusal) = line.split_once(" => ").expect("request and refusal");
         let mut refusal = refusal.splitn(3, ' ');
@@ -270,10 +330,9 @@ fn a_control_request_is_refused_for_one_reason_and_changes_nothing() {
     }
 }
 
-#[test]
-fn another_version_is_refused_with_both_versions_and_what_to_do() {
+fn another_version_is_refused_with_both_versions_and_what_to_do(client: Client) {
     let server = Server::start(SMALL);
-    let wire = Wire::open(&server.instance);
+    let wire = client.open(&server.instance);
     for version in [0, 2, u32::MAX] {
         let header = ControlRequest {
             version,
@@ -290,10 +349,9 @@ fn another_version_is_refused_with_both_versions_and_what_to_do() {
     assert_eq!(server.status().n_refused, 3);
 }
 
-#[test]
-fn a_step_answer_echoes_its_request_and_fits_its_payload() {
+fn a_step_answer_echoes_its_request_and_fits_its_payload(client: Client) {
     let server = Server::start(&format!("{SMALL} --worlds 3"));
-    let wire = Wire::open(&server.instance);
+    let wire = client.open(&server.instance);
     let lease = wire.acquire(0, 3).lease;
     for sequence in [0, 1, u64::MAX] {
         let header = StepRequest {
@@ -314,10 +372,9 @@ fn a_step_answer_echoes_its_request_and_fits_its_payload() {
     }
 }
 
-#[test]
-fn a_client_that_shuts_the_server_down_is_answered() {
+fn a_client_that_shuts_the_server_down_is_answered(client: Client) {
     let server = Server::start(SMALL);
-    let reply = Wire::open(&server.instance).ask(&Request::Shutdown {});
+    let reply = client.open(&server.instance).ask(&Request::Shutdown {});
     assert_eq!(reply, Reply::Done);
     assert_eq!(server.program.wait(Duration::from_secs(1)).code, Some(0));
 }

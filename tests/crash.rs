@@ -1,7 +1,7 @@
 //! Agents that are killed or stopped in the middle of a step: the world stays exactly where it was.
 
 use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly, frames_until, status};
-use crate::wire::{Wire, answer, step_header};
+use crate::wire::{RawClient, Wire, answer, step_header};
 use agent::client::{Client, Observation};
 use protocol::channels::{ChannelError, Instance};
 use protocol::connection::ConnectionError;

@@ -1,7 +1,7 @@
 //! Resets, episode ends and coverage, as every client sees them.
 
 use crate::harness::{PATIENCE, SMALL, Server, eventually, fly, new_instance, reset};
-use crate::wire::{Wire, answer, control_header, step_header};
+use crate::wire::{RawClient, Wire, answer, control_header, step_header};
 use protocol::control::{Reply, Request, WorldInfo, WorldSeed};
 use protocol::message::{FLAG_FULL_COVERAGE, Operation, Status, StepRequest, split_step_payload};
 use protocol::{Coverage, Move, UNOBSERVED};

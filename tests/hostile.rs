@@ -5,7 +5,7 @@
 
 use crate::attacker::Attacker;
 use crate::harness::{PATIENCE, Paths, Server, claim, eventually, fly};
-use crate::wire::{Wire, answer, control_header, step_header};
+use crate::wire::{RawClient, Wire, answer, control_header, step_header};
 use agent::client::Client;
 use protocol::channels::Instance;
 use protocol::control::{MAX_CONTROL_BYTES, Reply, Request, WorldSeed};

@@ -3,7 +3,7 @@
 use crate::harness::{
     PATIENCE, Paths, SMALL, Server, claim, eventually, fly, new_instance, takeover,
 };
-use crate::wire::{Wire, step_header};
+use crate::wire::{RawClient, Wire, step_header};
 use agent::client::{Claim, Client};
 use protocol::Connection;
 use protocol::connection::ConnectionError;

@@ -1,9 +1,10 @@
 //! The real processes together: `emberwatch-server` and `emberwatch-agent` as a user runs them.
 //!
 //! `cargo build --workspace` first: cargo does not build another package's programs for a test.
-//! `harness` runs programs, `wire` speaks the protocol byte by byte; `learner` decides and
-//! `attacker` annoys; every other module is a group of facts. Each test has an instance, a folder and a deadline of its own. The long run of the
-//! hostile clients is `cargo test -p tests -- --ignored`.
+//! `harness` runs programs; `wire` speaks the protocol byte by byte, `python` lets the Python package speak
+//! it; `learner` decides and `attacker` annoys; every other module is a group of facts. Each test has an
+//! instance, a folder and a deadline of its own. `cargo test -p tests -- --ignored` adds the long run of the
+//! hostile clients, and what needs Python (`scripts/test` installs it).
 
 mod attacker;
 mod commands;
@@ -20,5 +21,6 @@ mod harness;
 mod hostile;
 mod learner;
 mod lease;
+mod python;
 mod restart;
 mod wire;

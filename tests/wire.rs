@@ -29,6 +29,42 @@ pub type Requests<Q, R> = Client<Ipc, [u8], Q, [u8], R>;
 /// A request that waits for its answer.
 pub type Pending<Q, R> = PendingResponse<Ipc, [u8], Q, [u8], R>;
 
+/// Sends raw messages and waits for their answers: what the compliance suite asks of a client.
+pub trait RawClient {
+    /// Sends a step request and waits for its answer.
+    fn step(&self, header: StepRequest, payload: &[u8]) -> StepAnswer;
+
+    /// Sends bytes on `control` and waits for the answer.
+    fn control(&self, header: ControlRequest, payload: &[u8]) -> ControlAnswer;
+
+    /// The process that the server sees.
+    fn pid(&self) -> u32;
+
+    /// Sends a well-formed control request; the status in the header must be the reply's.
+    fn ask(&self, request: &Request) -> Reply {
+        let text = serde_json::to_vec(request).expect("requests serialise");
+        let (header, payload) = self.control(control_header(7), &text);
+        assert_eq!((header.version, header.sequence), (VERSION, 7));
+        let reply: Reply = serde_json::from_slice(&payload).expect("a reply");
+        assert_eq!(Status::try_from(header.status), Ok(reply.status()));
+        reply
+    }
+
+    /// Acquires worlds.
+    fn acquire(&self, first_world: u32, n_worlds: u32) -> LeaseInfo {
+        let request = Request::Acquire {
+            first_world,
+            n_worlds,
+            takeover: false,
+            ttl_millis: None,
+        };
+        match self.ask(&request) {
+            Reply::Lease(lease) => lease,
+            other => panic!("expected a lease, got {other:?}"),
+        }
+    }
+}
+
 /// A client without manners.
 pub struct Wire {
     step: Requests<StepRequest, StepReply>,
@@ -83,41 +119,21 @@ impl Wire {
         self.server.notify().expect("wake the server");
         Ok(pending)
     }
+}
 
-    /// Sends a step request and waits for its answer.
-    pub fn step(&self, header: StepRequest, payload: &[u8]) -> StepAnswer {
+impl RawClient for Wire {
+    fn step(&self, header: StepRequest, payload: &[u8]) -> StepAnswer {
         let pending = self.send_step(header, payload).expect("send a step");
         answer(&pending, PATIENCE).expect("an answer to a step")
     }
 
-    /// Sends bytes on `control` and waits for the answer.
-    pub fn control(&self, header: ControlRequest, payload: &[u8]) -> ControlAnswer {
+    fn control(&self, header: ControlRequest, payload: &[u8]) -> ControlAnswer {
         let pending = self.send_control(header, payload).expect("send a request");
         answer(&pending, PATIENCE).expect("an answer on control")
     }
 
-    /// Sends a well-formed control request; the status in the header must be the reply's.
-    pub fn ask(&self, request: &Request) -> Reply {
-        let text = serde_json::to_vec(request).expect("requests serialise");
-        let (header, payload) = self.control(control_header(7), &text);
-        assert_eq!((header.version, header.sequence), (VERSION, 7));
-        let reply: Reply = serde_json::from_slice(&payload).expect("a reply");
-        assert_eq!(Status::try_from(header.status), Ok(reply.status()));
-        reply
-    }
-
-    /// Acquires worlds.
-    pub fn acquire(&self, first_world: u32, n_worlds: u32) -> LeaseInfo {
-        let request = Request::Acquire {
-            first_world,
-            n_worlds,
-            takeover: false,
-            ttl_millis: None,
-        };
-        match self.ask(&request) {
-            Reply::Lease(lease) => lease,
-            other => panic!("expected a lease, got {other:?}"),
-        }
+    fn pid(&self) -> u32 {
+        std::process::id()
     }
 }
 

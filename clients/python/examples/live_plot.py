@@ -41,14 +41,16 @@ def main() -> None:
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.5), layout="constrained")
     seen, rewards = None, deque(maxlen=1000)
-    image, (line,) = None, right.plot([], [], color="#c8371b")
+    image, (line,) = None, right.plot([], [], ".", markersize=3, color="#c8371b")
     left.set(title="last observed value of each cell", xticks=[], yticks=[])
     right.set(title="reward", xlabel="step k", ylabel="distinct burning cells found")
+    n_lost = 0
     for n_frames, frame in enumerate(emberwatch.observe(args.instance, world=args.world), 1):
         if seen is None or frame.result.step == 0:
             seen = np.full(frame.frame.shape, np.nan)
         is_seen = frame.frame != 255
         seen[is_seen] = frame.frame[is_seen]
+        n_lost += frame.n_lost
         rewards.append((frame.result.step, frame.result.reward))
         if n_frames % args.every == 0:
             if image is None:
@@ -56,6 +58,7 @@ def main() -> None:
                 image = left.imshow(seen, cmap=colors, vmin=0, vmax=2)
             image.set_data(seen)
             line.set_data(*zip(*rewards, strict=True))
+            right.set_title(f"reward ({n_frames} frames drawn from, {n_lost} missed)")
             right.relim()
             right.autoscale_view()
             plt.pause(0.001)

@@ -7,9 +7,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 from emberwatch.client import Client, ServerStatus
+from emberwatch.errors import EmberwatchError
 from emberwatch.programs import Program
 
 #: How long anything may take that should take milliseconds, seconds.
@@ -30,9 +31,11 @@ class Server:
         self.program = Program("emberwatch-server", flags)
         self._held = ExitStack()
         self._held.callback(self.program.stop)
-        self._held.callback(self.wake_up)
         try:
-            self._client = self.program.wait_for(self.connect)
+            self._client = self.program.wait_for(lambda: Client(instance))
+            self._held.enter_context(self._client)
+            self._held.callback(self._shut_down)
+            self._held.callback(self.wake_up)
             assert not ready or eventually(self._is_ready)
         except BaseException:
             self.close()
@@ -45,6 +48,11 @@ class Server:
     def status(self) -> ServerStatus:
         """What is going on at it; over a connection of its own, which counts as a client."""
         return self._client.status(timeout=PATIENCE)
+
+    def _shut_down(self) -> None:
+        """Asks it to stop: quicker than a signal, which it hears when it next looks around."""
+        with suppress(EmberwatchError):
+            self._client.shutdown(timeout=1.0)
 
     def _is_ready(self) -> bool:
         return not any(world.resetting for world in self.status().worlds)

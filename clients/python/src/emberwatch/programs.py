@@ -17,12 +17,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Final, TypeVar
 
-from emberwatch.errors import EmberwatchError, LaunchError, NoServerError, RequestTimeoutError
+from emberwatch.errors import (
+    EmberwatchError,
+    LaunchError,
+    NoServerError,
+    RequestTimeoutError,
+    ServerGoneError,
+)
 
 _Connection = TypeVar("_Connection")
 
 #: How long a program may take until it answers, seconds.
-START_TIMEOUT: Final = 20.0
+_START_TIMEOUT: Final = 20.0
 
 #: How long it may take to stop before it is killed, seconds.
 _STOP_TIMEOUT: Final = 3.0
@@ -87,18 +93,19 @@ class Program:
         _programs.add(self)
 
     def wait_for(
-        self, connect: Callable[[], _Connection], timeout: float = START_TIMEOUT
+        self, connect: Callable[[], _Connection], timeout: float | None = None
     ) -> _Connection:
-        """Connects to it, again and again until it answers.
+        """Connects to it, again and again until it answers, for 20 s unless told otherwise.
 
         Raises:
             LaunchError: If it ends first, with its own words, or does not answer in time.
         """
+        timeout = _START_TIMEOUT if timeout is None else timeout
         deadline, pause = time.monotonic() + timeout, 0.002
         while True:
             try:
                 return connect()
-            except (NoServerError, RequestTimeoutError) as error:
+            except (NoServerError, ServerGoneError, RequestTimeoutError) as error:
                 if self._process.poll() is not None:
                     code, words = self._process.returncode, self.words()
                     self.stop()

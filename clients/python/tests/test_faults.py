@@ -1,0 +1,445 @@
+"""Faults: processes killed and stopped at the worst moment, other versions, full memory."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import iceoryx2 as iox2
+import pytest
+from processes import PATIENCE, Script, Server, eventually, is_running
+
+from emberwatch import channels, errors, programs, wire
+from emberwatch.client import connect
+from emberwatch.env import WildfireEnv
+from emberwatch.programs import Program
+
+Start = Callable[..., Server]
+Run = Callable[..., Script]
+
+SMALL = {"height": 5, "width": 7, "n_moves": 6, "burn_in": 20}
+
+#: A learner with a private server: prints the server's pid and its instance.
+EMBEDDED = """
+import os, sys, time
+from emberwatch.env import WildfireEnv
+env = WildfireEnv(height=5, width=7, n_moves=6, burn_in=20)
+env.reset(seed=1)
+env.step([3] * 6)
+session = env._session
+print(session._client.info.pid, session.instance, flush=True)
+"""
+
+#: How it may end by itself, and the exit code.
+ENDS = {
+    "": 0,
+    "env.close()": 0,
+    "sys.exit(3)": 3,
+    "raise ValueError('unhandled')": 1,
+    "os._exit(4)": 4,
+    "os.abort()": -signal.SIGABRT,
+    "import threading; threading.Thread(target=lambda: time.sleep(0.1)).start()": 0,
+}
+
+#: How it may be ended while it steps.
+SIGNALS = {
+    signal.SIGKILL: -signal.SIGKILL,
+    signal.SIGTERM: -signal.SIGTERM,
+    signal.SIGHUP: -signal.SIGHUP,
+    signal.SIGINT: -signal.SIGINT,
+}
+
+
+def killed_after(started: Server, call: Callable[[], object]) -> float:
+    """Kills the server while a call waits for it; seconds from the kill to the typed error."""
+    started.stop()
+    sent: list[float] = []
+
+    def kill() -> None:
+        sent.append(time.monotonic())
+        started.signal(signal.SIGKILL)
+
+    killer = threading.Timer(0.05, kill)
+    killer.start()
+    with pytest.raises(errors.ServerGoneError, match=started.instance):
+        call()
+    waited = time.monotonic() - sent[0]
+    killer.join()
+    return waited
+
+
+@pytest.mark.parametrize("what", ["step", "control"])
+def test_a_server_killed_during_a_request_is_gone_within_half_a_second(
+    server: Start, what: str
+) -> None:
+    waited = []
+    for _ in range(3):
+        started = server()
+        client = started.connect()
+        lease = client.acquire()
+        calls = {"step": lambda: lease.step([3] * 6, timeout=PATIENCE)}  # noqa: B023
+        calls |= {"control": lambda: client.status(timeout=PATIENCE)}  # noqa: B023
+        waited.append(killed_after(started, calls[what]))
+        with pytest.raises(errors.ServerGoneError):
+            client.observe()
+    assert min(waited) < 0.5, waited
+
+
+def test_a_server_killed_during_the_handshake_is_gone_within_half_a_second(server: Start) -> None:
+    waited = []
+    for _ in range(3):
+        started = server()
+        waited.append(killed_after(started, lambda: connect(started.instance, timeout=PATIENCE)))  # noqa: B023
+    assert min(waited) < 0.5, waited
+
+
+def test_a_server_killed_between_steps_is_gone_at_the_next(server: Start) -> None:
+    started = server()
+    client = started.connect()
+    lease = client.acquire()
+    lease.step([3] * 6)
+    started.kill()
+    for call in (lambda: lease.step([3] * 6), client.status, lease.observe, lease.release):
+        with pytest.raises(errors.ServerGoneError, match=started.instance):
+            call()
+    with pytest.raises(errors.NoServerError):
+        connect(started.instance)
+
+
+def test_a_stopped_server_is_a_timeout_and_observing_tells_what_happened(server: Start) -> None:
+    started = server()
+    lease = started.connect().acquire()
+    for k in range(5):
+        before = lease.observe().result().step
+        assert before == lease.observe().result().step
+        started.stop()
+        start = time.monotonic()
+        with pytest.raises(errors.RequestTimeoutError, match=r"within 0\.3 s"):
+            lease.step([k % 4] * 6, timeout=0.3)
+        assert 0.3 <= time.monotonic() - start < 3
+        started.wake_up()
+        seen = lease.observe()
+        # The step was made or not; it is never made later.
+        assert seen.result().step in (before, before + 1)
+        assert lease.observe().result() == seen.result()
+        assert lease.step([1] * 6).result().step == seen.result().step + 1
+
+
+def test_an_answer_that_comes_in_time_after_a_pause_is_the_steps(server: Start) -> None:
+    started = server()
+    lease = started.connect().acquire()
+    started.stop()
+    threading.Timer(0.1, started.wake_up).start()
+    assert lease.step([3] * 6, timeout=PATIENCE).result().step == 1
+
+
+class Remains:
+    """What two processes have in shared memory, and whether it is gone."""
+
+    def __init__(self, *pids: int) -> None:
+        maps = "".join(Path(f"/proc/{pid}/maps").read_text() for pid in pids)
+        words = [line.split(maxsplit=5)[-1] for line in maps.splitlines()]
+        self._files = {Path(word) for word in words if word.startswith("/dev/shm/emberwatch")}
+        self._pids = pids
+        assert len(self._files) > 5
+
+    def left(self) -> list[str]:
+        """What is left. iceoryx2 keeps one file of 16 bytes for all processes."""
+        found = [path for path in self._files if path.exists() and path.stat().st_size > 16]
+        nodes = iox2.Node.list(iox2.ServiceType.Ipc, channels._config())
+        return [*map(str, found), *(str(pid) for pid in map(_pid, nodes) if pid in self._pids)]
+
+
+def _pid(node: Any) -> int:
+    """The process of an entry in the list of nodes, alive or dead."""
+    return node[0].id.pid(iox2.ServiceType.Ipc)
+
+
+def services(instance: str) -> list[str]:
+    """The services of an instance that iceoryx2 still knows."""
+    known = iox2.Service.list(channels._config(), iox2.ServiceType.Ipc)
+    names = [details.name().to_string() for details in known]
+    return [name for name in names if f"/{instance}/" in name]
+
+
+def embedded(script: Run, end: str) -> tuple[Script, int, str]:
+    """A learner with a private server: its process, the server's pid and instance."""
+    learner = script(EMBEDDED + end)
+    pid, instance = learner.line().split()
+    return learner, int(pid), instance
+
+
+@pytest.mark.parametrize("end", ENDS, ids=lambda end: end.partition(";")[0] or "normal")
+def test_a_private_server_ends_however_python_ends(script: Run, end: str) -> None:
+    learner, pid, instance = embedded(script, "input()\n" + end)
+    assert is_running(pid)
+    remains = Remains(learner.pid, pid)
+    learner.say()
+    code, _, _ = learner.end()
+    assert code == ENDS[end]
+    assert eventually(lambda: not is_running(pid), 1.0)
+    next_start(instance)
+    assert (remains.left(), services(instance)) == ([], [])
+
+
+@pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
+def test_a_private_server_ends_with_a_signalled_python(script: Run, number: int) -> None:
+    learner, pid, instance = embedded(script, "while True: env.step([1] * 6)")
+    remains = Remains(learner.pid, pid)
+    learner.signal(number)
+    code, _, _ = learner.end()
+    assert code == SIGNALS[number]
+    assert eventually(lambda: not is_running(pid), 1.0)
+    next_start(instance)
+    assert (remains.left(), services(instance)) == ([], [])
+
+
+def test_nothing_is_left_when_learner_and_private_server_are_killed(script: Run) -> None:
+    learner, pid, instance = embedded(script, "while True: env.step([1] * 6)")
+    remains = Remains(learner.pid, pid)
+    for process in (pid, learner.pid):
+        os.kill(process, signal.SIGKILL)
+    learner.end()
+    assert eventually(lambda: not is_running(pid))
+    next_start(instance)
+    assert (remains.left(), services(instance)) == ([], [])
+
+
+def next_start(instance: str) -> None:
+    """What any next start does first; nobody serves the instance of the last one."""
+    with pytest.raises(errors.NoServerError):
+        connect(instance)
+    env = WildfireEnv(**SMALL)
+    env.reset(seed=1)
+    env.close()
+
+
+def test_a_killed_client_frees_its_worlds_at_once(server: Start, script: Run) -> None:
+    started = server()
+    code = (
+        "import sys; from emberwatch import connect\n"
+        "lease = connect(sys.argv[1]).acquire(ttl=3600)\n"
+        "lease.step([3] * 6)\n"
+        "print('held', flush=True)\n"
+        "while True: lease.step([3] * 6)"
+    )
+    waited = []
+    for _ in range(3):
+        holder = script(code, started.instance)
+        assert holder.line() == "held"
+        holder.signal(signal.SIGKILL)
+        start = time.monotonic()
+        assert eventually(lambda: started.status().worlds[0].holder_pid is None)
+        waited.append(time.monotonic() - start)
+    assert min(waited) < 0.5, waited
+    assert started.connect().acquire().step([3] * 6).result().step > 1
+
+
+def test_killed_clients_use_up_no_limit(server: Start, script: Run) -> None:
+    started = server()
+    code = (
+        "import sys; from emberwatch import connect\n"
+        "clients = [connect(sys.argv[1]) for _ in range(8)]\n"
+        "print('connected', flush=True); input()"
+    )
+    for _ in range(3):
+        crowd = script(code, started.instance)
+        assert crowd.line() == "connected"
+        crowd.signal(signal.SIGKILL)
+        crowd.end()
+    assert eventually(lambda: started.status().n_clients == 1)
+    assert len([started.connect() for _ in range(15)]) == 15
+
+
+def check_mismatch(raised: pytest.ExceptionInfo[errors.VersionMismatchError]) -> None:
+    assert raised.value.detail == 1
+    words = str(raised.value)
+    assert "the client speaks 2, the server 1;" in words
+    assert "use a client and a server of one release" in words
+
+
+def test_a_client_of_another_version_is_told_both_and_what_to_do(
+    server: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = server()
+    monkeypatch.setattr(wire, "VERSION", 2)
+    with pytest.raises(errors.VersionMismatchError) as raised:
+        connect(started.instance)
+    monkeypatch.undo()
+    check_mismatch(raised)
+    assert started.status().n_clients == 1
+
+
+def test_a_server_refuses_the_header_of_another_version(
+    server: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = server()
+    client = started.connect()
+    name = channels.Node._name
+    monkeypatch.setattr(wire, "VERSION", 2)
+    # By the services of version 1, as nobody should.
+    monkeypatch.setattr(
+        channels.Node,
+        "_name",
+        lambda self, service: iox2.ServiceName.new(f"emberwatch/v1/{self.instance}/{service}"),
+    )
+    with pytest.raises(errors.VersionMismatchError) as raised:
+        connect(started.instance)
+    with pytest.raises(errors.VersionMismatchError) as on_step:
+        client.observe()
+    monkeypatch.undo()
+    assert channels.Node._name is name
+    check_mismatch(raised)
+    assert on_step.value.detail == 1 and "one release" in str(on_step.value)
+    assert client.observe().result().step == 0
+
+
+def test_a_server_of_another_version_elsewhere_is_not_meant(
+    server: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = server()
+    monkeypatch.setattr(wire, "VERSION", 2)
+    for instance in (started.instance + "0", started.instance[:-1] + "x", "nobody"):
+        with pytest.raises(errors.NoServerError):
+            connect(instance)
+
+
+def launch_error(**settings: object) -> str:
+    with pytest.raises(errors.LaunchError) as raised:
+        WildfireEnv(**(SMALL | settings)).reset(seed=1)
+    return str(raised.value)
+
+
+def test_a_server_that_does_not_start_says_why_in_its_own_words() -> None:
+    words = launch_error(start="nowhere")
+    assert "emberwatch-server ended with code" in words and "nowhere" in words
+
+
+def test_a_second_server_on_an_instance_says_who_serves_it(server: Start) -> None:
+    started = server()
+    program = Program("emberwatch-server", [f"--instance={started.instance}", "--burn-in=0"])
+    assert eventually(lambda: not is_running(program.pid))
+    words = program.words()
+    program.stop()
+    assert f"already running, as pid {started.program.pid}" in words
+    assert started.connect().acquire().step([3] * 6).result().step == 1
+
+
+def test_a_missing_model_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises((errors.EmberwatchError, OSError), match=r"none\.toml"):
+        WildfireEnv(model=tmp_path / "none.toml", **SMALL).reset(seed=1)
+
+
+def test_a_bad_model_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text("name = 5\n")
+    with pytest.raises(Exception, match="name") as raised:
+        WildfireEnv(model=path, **SMALL).reset(seed=1)
+    assert type(raised.value).__name__ in ("ModelError", "LaunchError")
+
+
+def test_a_missing_program_is_named_with_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(programs.sysconfig, "get_path", lambda _: str(tmp_path))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    words = launch_error()
+    for part in ("emberwatch-server", str(tmp_path), "pip install", "instance=..."):
+        assert part in words
+
+
+def test_a_program_that_cannot_run_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(programs.sysconfig, "get_path", lambda _: str(tmp_path))
+    for content, words in ((b"no program", "Exec format error"), (None, "Permission denied")):
+        path = tmp_path / "emberwatch-server"
+        path.write_bytes(content or b"")
+        path.chmod(0o700 if content else 0o600)
+        assert words in launch_error()
+
+
+def test_a_program_that_never_answers_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(programs.sysconfig, "get_path", lambda _: str(tmp_path))
+    monkeypatch.setattr(programs, "_START_TIMEOUT", 0.2)
+    path = tmp_path / "emberwatch-server"
+    path.write_text("#!/bin/sh\necho $$ > $0.pid\nexec sleep 60\n")
+    path.chmod(0o700)
+    assert "did not answer within 0.2 s" in launch_error()
+    assert not is_running(int((tmp_path / "emberwatch-server.pid").read_text()))
+
+
+def test_a_program_that_does_not_stop_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(programs.sysconfig, "get_path", lambda _: str(tmp_path))
+    monkeypatch.setattr(programs, "_STOP_TIMEOUT", 0.1)
+    path = tmp_path / "emberwatch-server"
+    path.write_text("#!/bin/sh\ntrap '' TERM\necho ready\nwhile :; do sleep 0.01; done\n")
+    path.chmod(0o700)
+    program = Program("emberwatch-server", [])
+    assert eventually(lambda: program.words() == "ready")
+    program.stop()
+    program.stop()
+    assert not is_running(program.pid)
+
+
+#: Runs the rest of its arguments where shared memory is a file system of 64 MB of its own.
+SMALL_MEMORY = (
+    'mount -t tmpfs -o size=64m tmpfs /dev/shm && mkdir -p "$0" && '
+    'mount -t tmpfs -o mode=700 tmpfs "$0" && exec "$@"'
+)
+
+
+@pytest.fixture
+def small_memory() -> Iterator[Callable[[str], subprocess.CompletedProcess[str]]]:
+    """Runs Python code with 64 MB of `/dev/shm`, in a mount namespace of its own."""
+    is_root = os.getuid() == 0
+    unshare = ["unshare", "-m"] if is_root else ["unshare", "-rm"]
+    place = Path("/tmp/emberwatch-0")
+    is_new = not place.exists()
+
+    def run(*command: str) -> subprocess.CompletedProcess[str]:
+        shell = [*unshare, "sh", "-c", SMALL_MEMORY, str(place), *command]
+        return subprocess.run(shell, capture_output=True, text=True, timeout=60)
+
+    if shutil.which("unshare") is None or run("true").returncode != 0:
+        pytest.skip("needs a mount namespace: `unshare -rm` is not permitted here")
+    yield lambda code: run(sys.executable, "-c", code)
+    if is_new and not is_root:
+        place.rmdir()
+
+
+def test_a_server_too_large_for_shared_memory_is_refused_before_it_starts(
+    small_memory: Callable[[str], subprocess.CompletedProcess[str]],
+) -> None:
+    code = (
+        "from emberwatch.env import WildfireEnv; from emberwatch.errors import LaunchError\n"
+        "try: WildfireEnv(height=512, width=512, burn_in=0).reset(seed=1)\n"
+        "except LaunchError as error: print(error)"
+    )
+    ended = small_memory(code)
+    assert ended.returncode == 0, ended.stderr
+    for words in ("emberwatch-server ended with code 1", "/dev/shm", "MiB", "free"):
+        assert words in ended.stdout, ended.stdout
+
+
+def test_an_environment_of_the_usual_size_fits_into_64_mb(
+    small_memory: Callable[[str], subprocess.CompletedProcess[str]],
+) -> None:
+    code = (
+        "from emberwatch.env import WildfireEnv\n"
+        "env = WildfireEnv(burn_in=10); env.reset(seed=1)\n"
+        "print(env.step([1] * 64)[4]['step'])"
+    )
+    ended = small_memory(code)
+    assert (ended.returncode, ended.stdout) == (0, "1\n"), ended.stderr

@@ -1,0 +1,174 @@
+"""`WildfireObjective-v0` and the agent behind it."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import emberwatch
+from emberwatch import errors
+from emberwatch.wrappers import Belief
+
+SMALL = {"height": 9, "width": 7, "n_moves": 5, "burn_in": 50}
+
+
+def make(**keywords: Any) -> Any:
+    arguments = SMALL | {"prior": "initial"} | keywords
+    return gymnasium.make("emberwatch/WildfireObjective-v0", **arguments).unwrapped
+
+
+@pytest.fixture
+def env() -> Iterator[Any]:
+    made = make()
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize("keywords", [{}, {"truth": True}, {"planner": "shooting"}])
+def test_gymnasium_accepts_it(keywords: dict[str, Any]) -> None:
+    env = make(render_mode="rgb_array", **keywords)
+    check_env(env, skip_render_check=True)
+    picture = env.render()
+    assert picture.dtype == np.uint8 and picture.ndim == 3
+    env.close()
+
+
+def test_actions_and_numbers_have_names(env: Any) -> None:
+    observation, _ = env.reset(seed=1000)
+    assert env.objectives == ("normal", "latent", "fire", "entropy")
+    assert env.action_space.n == len(env.objectives)
+    assert observation.shape == (len(env.summary_names),) == (74,)
+    named = dict(zip(env.summary_names, observation, strict=True))
+    assert sum(named[f"mean_{state}"] for state in env.objectives[:3]) == pytest.approx(1.0)
+
+
+def rollout(env: Any, actions: list[int]) -> list[Any]:
+    seen = [env.reset(seed=1003)]
+    seen += [env.step(action) for action in actions]
+    return seen
+
+
+def test_the_same_seed_and_decisions_give_the_same_episode(env: Any) -> None:
+    actions = [2, 3, 0, 1, 2, 2]
+    twin = make()
+    first, again, other = rollout(env, actions), rollout(env, actions), rollout(twin, actions)
+    twin.close()
+    for one, two, three in zip(first, again, other, strict=True):
+        assert gymnasium.utils.env_checker.data_equivalence(one, two)
+        assert gymnasium.utils.env_checker.data_equivalence(one, three)
+
+
+def test_the_world_is_that_of_wildfire_with_the_same_seed(env: Any) -> None:
+    plain = gymnasium.make("emberwatch/Wildfire-v0", **SMALL)
+    counts = [plain.reset(seed=1003)[1]["n_target_cells"]]
+    counts += [plain.step(np.zeros(5, np.int64))[4]["n_target_cells"] for _ in range(4)]
+    plain.close()
+    assert [seen[-1]["n_target_cells"] for seen in rollout(env, [2, 2, 3, 0])] == counts
+
+
+@pytest.mark.parametrize("action", [4, -1, 1.0, "fire", [0, 1], None])
+def test_a_wrong_action_is_refused_and_nothing_is_sent(env: Any, action: object) -> None:
+    env.reset(seed=1000)
+    with pytest.raises(errors.InvalidActionError, match="expected one integer, 0 to 3"):
+        env.step(action)
+    assert env.step(0)[4]["step"] == 1
+
+
+@pytest.mark.parametrize(
+    ("keywords", "words"),
+    [
+        ({"planner": "magic"}, "expected one of beam, shooting, got 'magic'"),
+        ({"prior": "none"}, "expected one of simulated, initial, uniform"),
+        ({"agent": "other"}, "expected one of own, running"),
+        ({"agent": "running"}, "expected instance="),
+    ],
+)
+def test_a_wrong_keyword_is_refused(keywords: dict[str, Any], words: str) -> None:
+    with pytest.raises(errors.SettingError, match=words):
+        make(**keywords)
+
+
+def test_before_a_reset_and_after_closing_there_is_nothing(env: Any) -> None:
+    for _ in range(2):
+        with pytest.raises(errors.ClosedError, match="reset it first"):
+            env.step(0)
+        env.reset(seed=1000)
+        env.close()
+        env.close()
+
+
+def test_an_agent_that_is_killed_is_noticed_and_a_reset_starts_another(env: Any) -> None:
+    env.reset(seed=1000)
+    os.kill(env._agent.pid, signal.SIGKILL)
+    with pytest.raises(errors.ServerGoneError, match="the agent on instance"):
+        env.step(0)
+    env.reset(seed=1000)
+    assert env.step(0)[4]["step"] == 1
+
+
+def test_a_server_that_is_killed_ends_the_agent_with_a_word(env: Any) -> None:
+    env.reset(seed=1000)
+    os.kill(env._session._program.pid, signal.SIGKILL)
+    with pytest.raises((errors.AgentEndsError, errors.ServerGoneError)):
+        env.step(0)
+    env.reset(seed=1000)
+
+
+def test_it_attaches_to_a_running_server_and_to_a_running_agent(env: Any) -> None:
+    env.reset(seed=1000)
+    env.step(2)
+    guest = gymnasium.make(
+        "emberwatch/WildfireObjective-v0", instance=env.instance, agent="running"
+    ).unwrapped
+    _, info = guest.reset(options={"resume": True})
+    assert info["step"] == 1
+    guest.step(2)
+    guest.close()
+    with emberwatch.Decisions(env.instance) as decisions:
+        assert decisions.last().step == 2
+        assert decisions.info.planner == "beam"
+        with pytest.raises(errors.BadObjectiveError) as refused:
+            decisions.decide(9)
+        assert refused.value.detail == 4
+    assert env.step(3)[4]["step"] == 3
+
+
+def test_another_world_has_no_agent(env: Any) -> None:
+    env.reset(seed=1000)
+    with pytest.raises(errors.NoServerError, match="no agent serves decisions for world 7"):
+        emberwatch.Decisions(env.instance, 7)
+
+
+def test_a_world_that_is_taken_over_ends_the_agent(env: Any) -> None:
+    env.reset(seed=1000)
+    with emberwatch.connect(env.instance) as client:
+        client.acquire(takeover=True)
+        with pytest.raises(errors.LeaseLostError, match="lease lost to pid"):
+            env.step(0)
+
+
+def test_a_busy_world_is_refused_with_the_agents_own_words() -> None:
+    env = gymnasium.make("emberwatch/Wildfire-v0", **SMALL).unwrapped
+    env.reset(seed=1000)
+    other = gymnasium.make(
+        "emberwatch/WildfireObjective-v0", instance=env.instance, prior="initial"
+    ).unwrapped
+    with pytest.raises(errors.LaunchError, match="busy: held by pid"):
+        other.reset()
+    other.close()
+    env.close()
+
+
+def test_beliefs_start_from_the_programs_prior() -> None:
+    env = Belief(gymnasium.make("emberwatch/Wildfire-v0", **SMALL), prior="simulated")
+    belief, _ = env.reset(seed=1000)
+    assert belief.shape == (3, 9, 7)
+    assert np.allclose(belief.sum(0), 1.0) and (belief > 0).all()
+    env.close()

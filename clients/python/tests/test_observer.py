@@ -1,0 +1,228 @@
+"""Observers and truth readers: what is published, to whom, and what they miss."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from processes import PATIENCE, Server, eventually
+
+from emberwatch import errors, wire
+from emberwatch.observer import Frame, Observer, Truth, TruthReader, observe
+from emberwatch.programs import unused_instance
+
+Start = Callable[..., Server]
+
+
+def frames_until(observer: Observer, step: int, world: int = 0, seed: int = 0) -> list[Frame]:
+    """Reads frames until that of a step has come; all of them, that one last."""
+    frames = []
+    while not frames or (frames[-1].world, frames[-1].result.step) != (world, step):
+        frame = observer.receive(PATIENCE)
+        assert frame is not None, f"no frame of world {world} at step {step}"
+        # Of the episode that is meant: a new server's begins with another seed.
+        if frame.world != world or frame.result.seed == seed + world:
+            frames.append(frame)
+    return frames
+
+
+def truth_at(reader: TruthReader, step: int) -> Truth:
+    """Reads hidden states until those of a step of world 0 have come."""
+    while True:
+        truth = reader.receive(PATIENCE)
+        assert truth is not None, f"no hidden states at step {step}"
+        if (truth.world, truth.step) == (0, step):
+            return truth
+
+
+def paths(k: int, n_worlds: int = 1) -> np.ndarray:
+    return np.random.default_rng(k).integers(0, 4, (n_worlds, 6))
+
+
+def test_a_frame_is_the_answer_of_its_step_with_the_path_flown(server: Start) -> None:
+    started = server(worlds=2)
+    lease = started.connect().acquire(1)
+    with observe(started.instance) as observer:
+        frames = frames_until(observer, 0, world=1, seed=0)
+        start = (0, 0)
+        for k in range(1, 21):
+            answer = lease.step(paths(k))
+            new = frames_until(observer, k, world=1)
+            frame = new[-1]
+            assert frame.result == answer.result()
+            assert (frame.frame == answer.frames[0]).all() and frame.frame.dtype == np.uint8
+            assert (frame.path == paths(k)[0]).all()
+            assert frame.start == start
+            start = (frame.result.row, frame.result.col)
+            frames += new
+    assert sum(frame.n_lost for frame in frames) == 0
+
+
+def test_a_reset_is_an_empty_frame_without_a_path(server: Start) -> None:
+    started = server()
+    lease = started.connect().acquire()
+    with observe(started.instance) as observer:
+        lease.step(paths(1))
+        frames_until(observer, 1)
+        lease.reset([5])
+        frame = frames_until(observer, 0, seed=5)[-1]
+    assert (frame.result.seed, frame.result.episode, frame.result.coverage) == (5, 1, 0)
+    assert (frame.frame == 255).all() and frame.path.shape == (0,)
+
+
+def test_a_late_observer_is_greeted_with_the_frame_of_every_world(server: Start) -> None:
+    started = server(worlds=3)
+    answer = started.connect().acquire(0, 3).step(paths(0, 3))
+    # The second and third come when another has just gone.
+    for _ in range(3):
+        with observe(started.instance) as observer:
+            greeted = {frame.world: frame for frame in [observer.receive(PATIENCE)] if frame}
+            while len(greeted) < 3:
+                frame = observer.receive(PATIENCE)
+                assert frame is not None
+                greeted[frame.world] = frame
+        for world, frame in greeted.items():
+            assert frame.result == answer.result(world)
+            assert (frame.frame == answer.frames[world]).all()
+
+
+def test_only_the_world_asked_for_is_shown(server: Start) -> None:
+    started = server(worlds=3)
+    lease = started.connect().acquire(0, 3)
+    with observe(started.instance, world=1) as observer:
+        lease.step(paths(0, 3))
+        lease.step(paths(1, 3))
+        frames = frames_until(observer, 2, world=1)
+    assert {frame.world for frame in frames} == {1}
+    assert sum(frame.n_lost for frame in frames) == 0
+
+
+def test_what_a_slow_observer_misses_is_counted(server: Start) -> None:
+    started = server()
+    lease = started.connect().acquire()
+    with observe(started.instance) as slow, observe(started.instance) as quick:
+        frames_until(slow, 0)
+        n_samples = len(frames_until(quick, 0))
+        for k in range(1, 2 * wire.FRAME_BUFFER + 1):
+            lease.step(paths(k))
+            n_samples += len(frames_until(quick, k))
+        frames = frames_until(slow, 2 * wire.FRAME_BUFFER)
+    assert len(frames) == wire.FRAME_BUFFER, "the newest are kept"
+    assert frames[0].n_lost >= wire.FRAME_BUFFER
+    assert sum(frame.n_lost for frame in frames[1:]) == 0
+    steps = [frame.result.step for frame in frames]
+    assert steps == list(range(wire.FRAME_BUFFER + 1, 2 * wire.FRAME_BUFFER + 1))
+
+
+def test_an_observer_comes_before_the_server_and_stays_for_the_next(server: Start) -> None:
+    instance = unused_instance()
+    with observe(instance) as observer:
+        assert observer.receive(0.0) is None
+        for seed in (11, 12):
+            started = server(instance, seed=seed)
+            assert frames_until(observer, 0, seed=seed)[-1].result.seed == seed
+            started.connect().acquire().step(paths(0))
+            frame = frames_until(observer, 1, seed=seed)[-1]
+            assert frame.n_lost == 0
+            started.kill()
+
+
+def test_hidden_states_are_read_only_where_they_are_published(server: Start) -> None:
+    secret = server()
+    with TruthReader(secret.instance) as reader:
+        secret.connect().acquire().step(paths(0))
+        assert reader.receive(0.1) is None
+
+
+def test_hidden_states_agree_with_the_results(server: Start) -> None:
+    # Ten cells of this world burn after its first step; most seeds begin without a fire.
+    started = server(height=12, width=9, burn_in=300, seed=28, publish_truth="true")
+    lease = started.connect().acquire()
+    n_burning = []
+    with TruthReader(started.instance) as reader:
+        for k in range(1, 11):
+            n_burning.append(lease.step(paths(k)).result().n_target_cells)
+            truth = truth_at(reader, k)
+            assert (truth.episode, truth.seed, truth.n_lost) == (0, 28, 0)
+            assert truth.states.shape == (12, 9) and truth.states.max() < 3
+            assert np.count_nonzero(truth.states == 2) == n_burning[-1]
+    assert n_burning[0] == 10
+
+
+def test_a_frame_is_a_copy(server: Start) -> None:
+    started = server()
+    lease = started.connect().acquire()
+    with observe(started.instance) as observer:
+        lease.step([3] * 6)
+        first = frames_until(observer, 1)[-1]
+        kept = first.frame.copy(), first.path.copy()
+        first_again = first.frame
+        lease.step([1] * 6)
+        frames_until(observer, 2)
+        assert (first_again == kept[0]).all() and (first.path == kept[1]).all()
+        first.frame[:] = 0
+        first.path[:] = 0
+    assert (first.frame == 0).all()
+
+
+def test_iterating_ends_when_no_frame_comes_in_time(server: Start) -> None:
+    started = server()
+    start = time.monotonic()
+    with observe(started.instance, timeout=0.2) as observer:
+        frames = list(observer)
+    assert frames and all(frame.result.step == 0 for frame in frames)
+    assert 0.2 <= time.monotonic() - start < 5
+    assert list(observe(unused_instance(), timeout=0)) == []
+
+
+def test_a_wait_lasts_as_long_as_it_may() -> None:
+    with observe(unused_instance()) as observer, TruthReader(unused_instance()) as reader:
+        for receive in (observer.receive, reader.receive):
+            for seconds in (0.0, 0.05):
+                start = time.monotonic()
+                assert receive(seconds) is None
+                assert seconds <= time.monotonic() - start < seconds + 2
+
+
+@pytest.mark.parametrize("make", [observe, TruthReader])
+def test_closing_again_is_fine_and_a_closed_observer_says_so(make: Callable[..., Observer]) -> None:
+    observer = make(unused_instance())
+    for _ in range(3):
+        observer.close()
+    with pytest.raises(errors.ClosedError, match="closed"):
+        observer.receive(0)
+
+
+def test_a_closed_observer_is_no_longer_counted(server: Start) -> None:
+    started = server()
+    with observe(started.instance), observe(started.instance):
+        assert eventually(lambda: started.status().n_observers == 2)
+    assert eventually(lambda: started.status().n_observers == 0)
+
+
+@pytest.mark.parametrize(
+    "make, limit", [(observe, wire.MAX_OBSERVERS), (TruthReader, wire.MAX_TRUTH_READERS)]
+)
+def test_one_too_many_is_told_the_limit_and_others_go_on(
+    server: Start, make: Callable[..., Observer], limit: int
+) -> None:
+    started = server(publish_truth="true")
+    readers = [make(started.instance) for _ in range(limit)]
+    with pytest.raises(errors.ChannelError, match=f"more than {limit} readers"):
+        make(started.instance)
+    started.connect().acquire().step(paths(0))
+    for reader in readers:
+        assert reader.receive(PATIENCE) is not None
+        reader.close()
+    make(started.instance).close()
+
+
+@pytest.mark.parametrize("timeout", [-1, -0.001, float("nan")])
+def test_an_impossible_timeout_is_refused(timeout: float) -> None:
+    with pytest.raises(errors.SettingError, match="timeout: expected seconds"):
+        observe(timeout=timeout)
+
+
+def test_a_bad_instance_name_is_refused() -> None:
+    with pytest.raises(errors.SettingError, match="instance"):
+        observe("a/b")

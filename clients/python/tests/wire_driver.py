@@ -1,0 +1,35 @@
+"""Sends raw messages through the package's ports, for the compliance suite in `tests/`.
+
+`wire_driver.py INSTANCE` opens `step` and `control` without a handshake. Each line of its standard
+input is a request, `{"service": "step", "header": "<hex>", "payload": "<hex>"}`, and each line of
+its standard output the answer, `{"header": "<hex>", "payload": "<hex>"}`.
+"""
+
+import json
+import sys
+
+from emberwatch import wire
+from emberwatch.channels import Node
+from emberwatch.ports import Bell, RequestPort
+
+HEADERS = {
+    "step": (wire.StepRequest, wire.StepReply),
+    "control": (wire.ControlRequest, wire.ControlReply),
+}
+
+
+def main() -> None:
+    bell = Bell(Node(sys.argv[1]))
+    ports = {
+        service: RequestPort(bell, service, headers, slice_len=4096, grows=True)
+        for service, headers in HEADERS.items()
+    }
+    for line in sys.stdin:
+        request = json.loads(line)
+        header, payload = bytes.fromhex(request["header"]), bytes.fromhex(request["payload"])
+        reply, answer = ports[request["service"]].exchange(header, payload, "a request", 10.0)
+        print(json.dumps({"header": bytes(reply).hex(), "payload": answer.hex()}), flush=True)
+
+
+if __name__ == "__main__":
+    main()

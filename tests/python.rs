@@ -1,0 +1,96 @@
+//! The protocol byte by byte through the Python package: `wire_driver.py` sends what it is told.
+
+use crate::harness::{PATIENCE, eventually, repository};
+use crate::wire::{ControlAnswer, RawClient, StepAnswer};
+use bytemuck::{AnyBitPattern, NoUninit, bytes_of, pod_read_unaligned};
+use protocol::channels::Instance;
+use protocol::message::{ControlRequest, StepRequest};
+use serde_json::{Value, json};
+use std::cell::RefCell;
+use std::io::{BufRead, BufReader, Write};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+
+/// A Python process with both channels open.
+pub struct PythonWire {
+    process: RefCell<Child>,
+    requests: RefCell<Option<ChildStdin>>,
+    answers: RefCell<BufReader<ChildStdout>>,
+}
+
+impl PythonWire {
+    /// Opens both channels of an instance, without a handshake.
+    pub fn open(instance: &Instance) -> Self {
+        let python = repository().join("target/venv/bin/python");
+        let driver = repository().join("clients/python/tests/wire_driver.py");
+        let mut process = Command::new(&python)
+            .args([driver.as_os_str(), instance.name().as_ref()])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap_or_else(|error| panic!("{}: {error}; run scripts/test", python.display()));
+        Self {
+            requests: RefCell::new(process.stdin.take()),
+            answers: RefCell::new(BufReader::new(process.stdout.take().expect("piped"))),
+            process: RefCell::new(process),
+        }
+    }
+
+    /// Waits for one answer; the driver ends if none comes in time.
+    fn exchange<R: AnyBitPattern>(
+        &self,
+        service: &str,
+        header: &impl NoUninit,
+        payload: &[u8],
+    ) -> (R, Vec<u8>) {
+        let request = json!({
+            "service": service,
+            "header": hex(bytes_of(header)),
+            "payload": hex(payload),
+        });
+        let mut requests = self.requests.borrow_mut();
+        let requests = requests.as_mut().expect("open until it is dropped");
+        writeln!(requests, "{request}").expect("tell the driver");
+        let mut line = String::new();
+        let mut answers = self.answers.borrow_mut();
+        answers.read_line(&mut line).expect("hear the driver");
+        let answer: Value = serde_json::from_str(&line).expect("an answer by the driver");
+        let bytes = |key: &str| bytes_of_hex(answer[key].as_str().expect("hexadecimal"));
+        (pod_read_unaligned(&bytes("header")), bytes("payload"))
+    }
+}
+
+impl RawClient for PythonWire {
+    fn step(&self, header: StepRequest, payload: &[u8]) -> StepAnswer {
+        self.exchange("step", &header, payload)
+    }
+
+    fn control(&self, header: ControlRequest, payload: &[u8]) -> ControlAnswer {
+        self.exchange("control", &header, payload)
+    }
+
+    fn pid(&self) -> u32 {
+        self.process.borrow().id()
+    }
+}
+
+impl Drop for PythonWire {
+    fn drop(&mut self) {
+        // At the end of its requests it closes its channels and ends.
+        self.requests.take();
+        let process = self.process.get_mut();
+        if !eventually(PATIENCE, || matches!(process.try_wait(), Ok(Some(_)))) {
+            let _ = process.kill();
+            let _ = process.wait();
+        }
+    }
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn bytes_of_hex(text: &str) -> Vec<u8> {
+    let digits = text.as_bytes().chunks_exact(2);
+    let byte = |digits| u8::from_str_radix(std::str::from_utf8(digits).ok()?, 16).ok();
+    digits.map(|digits| byte(digits).expect("a byte")).collect()
+}
