@@ -256,6 +256,8 @@ def test_seed_zero_is_a_seed() -> None:
     one.reset(seed=5)
     assert_same(one.reset(seed=0), other.reset(seed=0))
     assert one.unwrapped.np_random_seed == 0
+    with emberwatch.connect(one.unwrapped.instance) as client:
+        assert client.status().worlds[0].seed == 0
     one.close()
     other.close()
 
