@@ -1,13 +1,10 @@
-"""Faults: processes killed and stopped at the worst moment, other versions, full memory."""
+"""Faults: processes killed and stopped at the worst moment; other versions."""
 
 import os
-import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +12,9 @@ import iceoryx2 as iox2
 import pytest
 from processes import PATIENCE, Script, Server, eventually, is_running
 
-from emberwatch import channels, errors, programs, wire
+from emberwatch import channels, errors, wire
 from emberwatch.client import connect
 from emberwatch.env import WildfireEnv
-from emberwatch.programs import Program
 
 Start = Callable[..., Server]
 Run = Callable[..., Script]
@@ -312,138 +308,3 @@ def test_a_server_of_another_version_elsewhere_is_not_meant(
     for instance in (started.instance + "0", started.instance[:-1] + "x", "nobody"):
         with pytest.raises(errors.NoServerError):
             connect(instance)
-
-
-def launch_error(**settings: object) -> str:
-    with pytest.raises(errors.LaunchError) as raised:
-        WildfireEnv(**(SMALL | settings)).reset(seed=1)
-    return str(raised.value)
-
-
-def test_a_server_that_does_not_start_says_why_in_its_own_words() -> None:
-    words = launch_error(start="nowhere")
-    assert "emberwatch-server ended with code" in words and "nowhere" in words
-
-
-def test_a_second_server_on_an_instance_says_who_serves_it(server: Start) -> None:
-    started = server()
-    program = Program("emberwatch-server", [f"--instance={started.instance}", "--burn-in=0"])
-    assert eventually(lambda: not is_running(program.pid))
-    words = program.words()
-    program.stop()
-    assert f"already running, as pid {started.program.pid}" in words
-    assert started.connect().acquire().step([3] * 6).result().step == 1
-
-
-def test_a_missing_model_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises((errors.EmberwatchError, OSError), match=r"none\.toml"):
-        WildfireEnv(model=tmp_path / "none.toml", **SMALL).reset(seed=1)
-
-
-def test_a_bad_model_file_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "bad.toml"
-    path.write_text("name = 5\n")
-    with pytest.raises(Exception, match="name") as raised:
-        WildfireEnv(model=path, **SMALL).reset(seed=1)
-    assert type(raised.value).__name__ in ("ModelError", "LaunchError")
-
-
-def test_a_missing_program_is_named_with_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(programs.sysconfig, "get_path", lambda _: str(tmp_path))
-    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
-    monkeypatch.setenv("PATH", str(tmp_path))
-    words = launch_error()
-    for part in ("emberwatch-server", str(tmp_path), "pip install", "instance=..."):
-        assert part in words
-
-
-def test_a_program_that_cannot_run_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(programs.sysconfig, "get_path", lambda _: str(tmp_path))
-    for content, words in ((b"no program", "Exec format error"), (None, "Permission denied")):
-        path = tmp_path / "emberwatch-server"
-        path.write_bytes(content or b"")
-        path.chmod(0o700 if content else 0o600)
-        assert words in launch_error()
-
-
-def test_a_program_that_never_answers_is_given_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(programs.sysconfig, "get_path", lambda _: str(tmp_path))
-    monkeypatch.setattr(programs, "_START_TIMEOUT", 0.2)
-    path = tmp_path / "emberwatch-server"
-    path.write_text("#!/bin/sh\necho $$ > $0.pid\nexec sleep 60\n")
-    path.chmod(0o700)
-    assert "did not answer within 0.2 s" in launch_error()
-    assert not is_running(int((tmp_path / "emberwatch-server.pid").read_text()))
-
-
-def test_a_program_that_does_not_stop_is_killed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(programs.sysconfig, "get_path", lambda _: str(tmp_path))
-    monkeypatch.setattr(programs, "_STOP_TIMEOUT", 0.1)
-    path = tmp_path / "emberwatch-server"
-    path.write_text("#!/bin/sh\ntrap '' TERM\necho ready\nwhile :; do sleep 0.01; done\n")
-    path.chmod(0o700)
-    program = Program("emberwatch-server", [])
-    assert eventually(lambda: program.words() == "ready")
-    program.stop()
-    program.stop()
-    assert not is_running(program.pid)
-
-
-#: Runs the rest of its arguments where shared memory is a file system of 64 MB of its own.
-SMALL_MEMORY = (
-    'mount -t tmpfs -o size=64m tmpfs /dev/shm && mkdir -p "$0" && '
-    'mount -t tmpfs -o mode=700 tmpfs "$0" && exec "$@"'
-)
-
-
-@pytest.fixture
-def small_memory() -> Iterator[Callable[[str], subprocess.CompletedProcess[str]]]:
-    """Runs Python code with 64 MB of `/dev/shm`, in a mount namespace of its own."""
-    is_root = os.getuid() == 0
-    unshare = ["unshare", "-m"] if is_root else ["unshare", "-rm"]
-    place = Path("/tmp/emberwatch-0")
-    is_new = not place.exists()
-
-    def run(*command: str) -> subprocess.CompletedProcess[str]:
-        shell = [*unshare, "sh", "-c", SMALL_MEMORY, str(place), *command]
-        return subprocess.run(shell, capture_output=True, text=True, timeout=60)
-
-    if shutil.which("unshare") is None or run("true").returncode != 0:
-        pytest.skip("needs a mount namespace: `unshare -rm` is not permitted here")
-    yield lambda code: run(sys.executable, "-c", code)
-    if is_new and not is_root:
-        place.rmdir()
-
-
-def test_a_server_too_large_for_shared_memory_is_refused_before_it_starts(
-    small_memory: Callable[[str], subprocess.CompletedProcess[str]],
-) -> None:
-    code = (
-        "from emberwatch.env import WildfireEnv; from emberwatch.errors import LaunchError\n"
-        "try: WildfireEnv(height=512, width=512, burn_in=0).reset(seed=1)\n"
-        "except LaunchError as error: print(error)"
-    )
-    ended = small_memory(code)
-    assert ended.returncode == 0, ended.stderr
-    for words in ("emberwatch-server ended with code 1", "/dev/shm", "MiB", "free"):
-        assert words in ended.stdout, ended.stdout
-
-
-def test_an_environment_of_the_usual_size_fits_into_64_mb(
-    small_memory: Callable[[str], subprocess.CompletedProcess[str]],
-) -> None:
-    code = (
-        "from emberwatch.env import WildfireEnv\n"
-        "env = WildfireEnv(burn_in=10); env.reset(seed=1)\n"
-        "print(env.step([1] * 64)[4]['step'])"
-    )
-    ended = small_memory(code)
-    assert (ended.returncode, ended.stdout) == (0, "1\n"), ended.stderr

@@ -1,0 +1,213 @@
+"""Calls that wait: timeouts, closing, fork, Ctrl-C, and errors being handled."""
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from processes import PATIENCE, Script, Server, eventually
+
+from emberwatch import errors
+from emberwatch.client import connect
+
+Start = Callable[..., Server]
+Run = Callable[..., Script]
+
+US = os.getpid()
+
+
+def test_every_call_has_a_timeout(server: Start) -> None:
+    started = server()
+    client = started.connect()
+    lease = client.acquire()
+    started.stop()
+    for call in (
+        lambda: lease.step([3] * 6, timeout=0.05),
+        lambda: lease.observe(timeout=0.05),
+        lambda: client.status(timeout=0.05),
+        lambda: lease.reset(timeout=0.05),
+        lambda: lease.renew(timeout=0.05),
+        lambda: client.acquire(timeout=0.05),
+        lambda: lease.release(timeout=0.05),
+        lambda: connect(started.instance, timeout=0.05),
+    ):
+        start = time.monotonic()
+        with pytest.raises(errors.RequestTimeoutError, match=r"within 0\.05 s") as raised:
+            call()
+        assert started.instance in str(raised.value)
+        assert 0.05 <= time.monotonic() - start < 2.0
+    started.wake_up()
+    assert client.observe().result().step == 0
+
+
+@pytest.mark.parametrize("timeout", [0, -1, float("nan"), -float("inf")])
+def test_a_timeout_that_is_no_time_has_passed_already(server: Start, timeout: float) -> None:
+    started = server()
+    client = started.connect()
+    started.stop()
+    with pytest.raises(errors.RequestTimeoutError):
+        client.observe(timeout=timeout)
+    started.wake_up()
+    assert client.observe(timeout=float("inf")).result().step == 0
+
+
+def test_a_signal_that_is_handled_does_not_end_a_step(server: Start) -> None:
+    started = server()
+    lease = started.connect().acquire()
+    caught: list[int] = []
+    before = signal.signal(signal.SIGUSR1, lambda number, _: caught.append(number))
+
+    def disturb() -> None:
+        for _ in range(5):
+            n_caught = len(caught)
+            os.kill(US, signal.SIGUSR1)
+            eventually(lambda: len(caught) > n_caught)  # noqa: B023
+            asleep()
+        started.wake_up()
+
+    started.stop()
+    thread = threading.Thread(target=disturb)
+    thread.start()
+    try:
+        assert lease.step([3] * 6, timeout=PATIENCE).result().step == 1
+    finally:
+        thread.join()
+        signal.signal(signal.SIGUSR1, before)
+    assert len(caught) == 5
+
+
+def test_closing_again_is_fine_and_a_closed_client_says_so(server: Start) -> None:
+    client = server().connect()
+    lease = client.acquire()
+    for _ in range(3):
+        client.close()
+    for call in (client.status, client.observe, client.acquire, lambda: lease.step([3] * 6)):
+        with pytest.raises(errors.ClosedError, match="closed"):
+            call()
+    for call in (lease.observe, lease.reset, lease.renew, lease.release):
+        with pytest.raises(errors.ClosedError, match="closed"):
+            call()
+
+
+FORK = """
+import multiprocessing, os, sys, threading
+from emberwatch.client import Client
+from emberwatch.errors import ForkedError
+from emberwatch.observer import observe
+from emberwatch.programs import Program, unused_instance
+
+how, instance = sys.argv[1], unused_instance()
+small = "--height=5 --width=7 --moves=6 --burn-in=20".split()
+program = Program("emberwatch-server", [f"--instance={instance}", *small])
+client = program.wait_for(lambda: Client(instance))
+lease, observer = client.acquire(), observe(instance, timeout=0)
+lease.step([3] * 6)
+
+def child():
+    for call in (client.status, client.observe, lease.release, lambda: lease.step([3] * 6),
+                 lambda: observer.receive(0)):
+        try:
+            call()
+        except ForkedError as error:
+            assert "fork" in str(error) and "open a new one" in str(error)
+        else:
+            os._exit(9)
+    client.close()
+    observer.close()
+    program.stop()
+    with Client(instance) as own:
+        assert own.observe().result().step == 1
+    if how == "sys.exit":
+        sys.exit(5)
+    if how == "os._exit":
+        os._exit(5)
+    if how == "exception":
+        raise SystemError(5)
+
+if how == "multiprocessing":
+    process = multiprocessing.get_context("fork").Process(target=child)
+    process.start()
+    process.join()
+    code = process.exitcode
+else:
+    pid = os.fork()
+    if pid == 0:
+        child()
+        sys.exit(9)
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+assert lease.step([3] * 6).result().step == 2
+assert observer.receive(5) is not None
+print("child", code)
+"""
+
+
+@pytest.mark.parametrize(
+    "how, code",
+    [("sys.exit", 5), ("os._exit", 5), ("exception", 1), ("multiprocessing", 0)],
+)
+def test_a_forked_child_is_refused_and_its_parent_goes_on(script: Run, how: str, code: int) -> None:
+    ended, out, err = script(FORK, how).end()
+    assert (ended, out) == (0, f"child {code}\n"), err
+
+
+def asleep() -> None:
+    """Waits until the main thread sleeps, as it does on the answer of a stopped server."""
+    place = Path(f"/proc/{US}/task/{threading.main_thread().native_id}/stat")
+    looks = 0
+
+    def is_asleep() -> bool:
+        nonlocal looks
+        sleeps = place.read_text().rpartition(")")[2].split()[0] == "S"
+        looks = looks + 1 if sleeps else 0
+        return looks > 20
+
+    assert eventually(is_asleep)
+
+
+def interrupt() -> tuple[threading.Thread, list[float]]:
+    """A thread that sends this process Ctrl-C once it sleeps, and when it did."""
+    sent: list[float] = []
+
+    def run() -> None:
+        asleep()
+        sent.append(time.monotonic())
+        os.kill(US, signal.SIGINT)
+
+    return threading.Thread(target=run), sent
+
+
+def test_ctrl_c_ends_a_blocked_step_and_the_client_goes_on(server: Start) -> None:
+    started = server()
+    client = started.connect()
+    lease = client.acquire()
+    waited = []
+    for k in range(3):
+        started.stop()
+        thread, sent = interrupt()
+        with pytest.raises(KeyboardInterrupt) as raised:
+            thread.start()
+            lease.step([3] * 6, timeout=PATIENCE)
+        waited.append(time.monotonic() - sent[0])
+        thread.join()
+        started.wake_up()
+        # `raised` still holds the traceback, as an `except` block does.
+        before = client.observe().result().step
+        assert raised is not None
+        assert lease.step([3] * 6).result().step == before + 1, k
+    assert min(waited) < 0.25, waited
+
+
+def test_a_client_may_be_used_while_its_error_is_handled(server: Start) -> None:
+    started = server()
+    client = started.connect()
+    lease = client.acquire()
+    started.stop()
+    try:
+        lease.step([3] * 6, timeout=0.05)
+    except errors.RequestTimeoutError:
+        started.wake_up()
+        assert client.observe().result().step in (0, 1)
+        assert client.status().pid == started.program.pid

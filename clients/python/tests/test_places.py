@@ -1,0 +1,99 @@
+"""Where a client connects: limits, instance names, and the directory of the channels."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from processes import Server, eventually
+
+from emberwatch import channels, errors
+from emberwatch.client import connect
+
+Start = Callable[..., Server]
+
+US = os.getpid()
+
+
+def test_a_seventeenth_client_is_told_the_limit_and_others_go_on(server: Start) -> None:
+    started = server()
+    clients = [started.connect() for _ in range(15)]
+    with pytest.raises(errors.ChannelError, match="more than 16 clients"):
+        started.connect()
+    assert clients[-1].acquire().step([3] * 6).result().step == 1
+    clients[0].close()
+    assert eventually(lambda: _connects(started))
+
+
+def _connects(started: Server) -> bool:
+    try:
+        started.connect()
+    except errors.ChannelError:
+        return False
+    return True
+
+
+def test_without_a_server_the_instance_and_the_remedy_are_named() -> None:
+    with pytest.raises(errors.NoServerError) as raised:
+        connect("nobody-here")
+    assert "'nobody-here'" in str(raised.value)
+    assert "emberwatch-server --instance nobody-here" in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "a b", ".", "ä", "x" * 65, "a\n", "a\0"])
+def test_a_bad_instance_name_is_refused(name: str) -> None:
+    with pytest.raises(errors.SettingError, match="instance: expected 1 to 64 characters"):
+        connect(name)
+
+
+def test_the_longest_instance_name_is_served(server: Start) -> None:
+    name = f"python-{US}-".ljust(64, "x")
+    assert server(name).connect().instance == name
+
+
+@pytest.mark.parametrize("mode", [0o720, 0o702, 0o777])
+def test_a_directory_that_others_can_write_to_is_refused(
+    mode: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tmp_path.chmod(mode)
+    _refuses(tmp_path, "others cannot write to", monkeypatch)
+
+
+def test_a_directory_that_is_a_link_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "real").mkdir(mode=0o700)
+    (tmp_path / "link").symlink_to("real")
+    _refuses(tmp_path / "link", "expected a directory", monkeypatch)
+
+
+def test_a_file_in_place_of_the_directory_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch(mode=0o600)
+    _refuses(tmp_path / "file", "expected a directory", monkeypatch)
+    _refuses(tmp_path / "file/below", "create", monkeypatch)
+
+
+def test_a_directory_of_another_user_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    owner = tmp_path.stat().st_uid
+    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+    _refuses(tmp_path, "belongs to this user", monkeypatch)
+
+
+def test_the_directory_is_created_for_this_user_alone(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        place = channels._own_directory(tmp_path / "new")
+    finally:
+        os.umask(before)
+    assert place.stat().st_mode & 0o777 == 0o700
+
+
+def _refuses(place: Path, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(channels, "directory", lambda: place)
+    with pytest.raises(errors.ChannelError, match=words) as raised:
+        connect("default")
+    assert str(place) in str(raised.value)
