@@ -3,8 +3,9 @@
 import ctypes
 import dataclasses
 import json
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from processes import Server
 
 import emberwatch.client
 from emberwatch import errors, observer, wire
@@ -428,3 +430,17 @@ def test_random_samples_are_read_whole_or_refused_whole(
         assert states.shape == (height, width)
     except GarbledAnswerError:
         pass
+
+
+def test_the_worked_example_is_what_a_server_answers(server: Callable[..., Server]) -> None:
+    flags = re.search(r"^`emberwatch-server (.*?)`, then hello", document.PROTOCOL, re.MULTILINE)
+    assert flags
+    pairs = re.findall(r"--(\S+) (\S+)", flags[1])
+    started = server(**{name.replace("-", "_"): value for name, value in pairs})
+    message, _ = document.worked_example("StepReply")
+    path = document.worked_example("StepRequest")[0][ctypes.sizeof(wire.StepRequest) :]
+    with emberwatch.connect(started.instance) as client, client.acquire() as lease:
+        answer = lease.step(list(path))
+    head = ctypes.sizeof(wire.StepReply)
+    assert answer.results.tobytes() == message[head : head + wire.RESULT.size]
+    assert answer.frames.tobytes() == message[head + wire.RESULT.size :]
