@@ -15,6 +15,7 @@ from emberwatch.programs import Program, unused_instance
 
 WILDFIRE = "emberwatch/Wildfire-v0"
 MOVES = "emberwatch/WildfireMoves-v0"
+OBJECTIVE = "emberwatch/WildfireObjective-v0"
 
 #: Of its worlds every seed and every step looks different.
 LIVELY = str(Path(__file__).with_name("lively.toml"))

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from environments import LIVELY, MOVES, WILDFIRE, make, no_warnings
+from environments import LIVELY, MOVES, OBJECTIVE, WILDFIRE, make, no_warnings
 
 pytest.importorskip("stable_baselines3")
 
@@ -28,6 +28,8 @@ IMAGE = {"height": 36, "width": 40, "n_moves": 4, "burn_in": 10, "model": LIVELY
         (MOVES, {"observation": "move"}),
         (MOVES, {"observation": ("frame", "age", "visited", "robot", "move")}),
         (MOVES, {"reward": "move"}),
+        (OBJECTIVE, {"prior": "initial"}),
+        (OBJECTIVE, {"prior": "uniform", "planner": "shooting", "truth": True}),
     ],
     ids=str,
 )
@@ -39,10 +41,11 @@ def test_stable_baselines_finds_no_fault(name: str, keywords: dict[str, Any]) ->
         env.close()
 
 
-@pytest.mark.parametrize("name", [WILDFIRE, MOVES])
+@pytest.mark.parametrize("name", [WILDFIRE, MOVES, OBJECTIVE])
 def test_stable_baselines_finds_pictures(name: str) -> None:
+    keywords = {"prior": "initial"} if name == OBJECTIVE else {}
     with no_warnings():
-        env = make(name, **IMAGE, render_mode="rgb_array")
+        env = make(name, **IMAGE, **keywords, render_mode="rgb_array")
         check_env(env)
         env.close()
 
@@ -61,7 +64,9 @@ def test_its_vector_environments_carry_frames_and_ends(name: str) -> None:
     vector.close()
 
 
-@pytest.mark.parametrize(("name", "algorithm"), [(WILDFIRE, "PPO"), (MOVES, "DQN")])
+@pytest.mark.parametrize(
+    ("name", "algorithm"), [(WILDFIRE, "PPO"), (MOVES, "DQN"), (OBJECTIVE, "DQN")]
+)
 def test_it_learns_a_few_steps(name: str, algorithm: str) -> None:
     import stable_baselines3
 
@@ -70,7 +75,8 @@ def test_it_learns_a_few_steps(name: str, algorithm: str) -> None:
         algorithm, {"learning_starts": 4, "buffer_size": 32, "batch_size": 4}
     )
     kind = getattr(stable_baselines3, algorithm)
-    agent = kind("MultiInputPolicy", env, device="cpu", seed=1, **keywords)
+    policy = "MlpPolicy" if name == OBJECTIVE else "MultiInputPolicy"
+    agent = kind(policy, env, device="cpu", seed=1, **keywords)
     agent.learn(16)
     assert agent.num_timesteps >= 16
     agent.get_env().close()

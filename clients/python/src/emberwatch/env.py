@@ -137,7 +137,8 @@ class WildfireEnv(WorldEnv):
         Raises:
             InvalidActionError: If it is not `(T,)` integers in 0 to 3. Nothing is sent.
             LeaseLostError: If another client took the world over.
-            ServerGoneError, RequestTimeoutError: If the server does not answer.
+            ServerGoneError: If the server has ended; the next reset starts or finds another.
+            RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
         """
         moves = as_moves(action, 1, self._shape.n_moves)
         before, answer = self._answer, self._session.step(moves)

@@ -142,7 +142,8 @@ class WildfireMovesEnv(WorldEnv):
         Raises:
             InvalidActionError: If it is not an integer in 0 to 3. Nothing is done.
             LeaseLostError: If another client took the world over.
-            ServerGoneError, RequestTimeoutError: If the server does not answer.
+            ServerGoneError: If the server has ended; the next reset starts or finds another.
+            RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
         """
         moves = [*self._moves, _as_move(action)]
         if self._answer is None or not self._session.is_open:

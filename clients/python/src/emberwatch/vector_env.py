@@ -153,7 +153,8 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
             InvalidActionError: If it is not `(num_envs, T)` integers in 0 to 3. Nothing is sent.
             gymnasium.error.ResetNeeded: In mode `DISABLED`, if an episode is over.
             LeaseLostError: If another client took a world over.
-            ServerGoneError, RequestTimeoutError: If the server does not answer.
+            ServerGoneError: If the server has ended; the next reset starts or finds another.
+            RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
         """
         moves = as_moves(actions, self.num_envs, self._session.shape.n_moves)
         moves = moves.reshape(self.num_envs, -1)
