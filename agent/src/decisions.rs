@@ -15,7 +15,7 @@ use protocol::decisions::{Reply, Request};
 use protocol::message::{Status, VERSION};
 use protocol::program::{Keeper, NoKeeper};
 use protocol::responder::{ActiveControl, Responder, ResponderError, wait_until_taken};
-use protocol::wait::{Waiter, sleep_until_readable};
+use protocol::wait::{Waiter, sleep_until_event};
 use std::cell::Cell;
 use std::fmt::Display;
 use std::os::fd::BorrowedFd;
@@ -177,7 +177,7 @@ impl Service {
         }
     }
 
-    /// Sleeps until a wake-up or a death; returns whether there was one.
+    /// Sleeps until a wake-up, a signal or a death; returns whether there was one.
     fn sleep(&self, limit: Duration) -> Result<bool, ChannelError> {
         if self.desk.responder.drain()? {
             return Ok(true);
@@ -188,8 +188,7 @@ impl Service {
         ];
         let keeper = self.keeper.iter().map(Keeper::descriptor);
         let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(keeper).collect();
-        let readable = sleep_until_readable(&descriptors, limit).map_err(ipc_error("sleep"))?;
-        Ok(readable.contains(&true))
+        sleep_until_event(&descriptors, limit).map_err(ipc_error("sleep"))
     }
 
     fn handle(&mut self, request: &ActiveControl) -> Result<Answer, RunError> {

@@ -12,7 +12,7 @@ use protocol::message::{Operation, Status};
 use protocol::model::ModelError;
 use protocol::program::{Keeper, NoKeeper};
 use protocol::responder::{ActiveControl, listener_id, wait_until_taken};
-use protocol::wait::{Waiter, sleep_until_readable};
+use protocol::wait::{Waiter, sleep_until_event};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use rayon::{ThreadPool, ThreadPoolBuilder};
@@ -208,7 +208,7 @@ impl Server {
         woken.get().then_some(Found::Event)
     }
 
-    /// Sleeps until a wake-up, a death or a finished reset; returns whether there was one.
+    /// Sleeps until a wake-up, a signal, a death or a finished reset; returns whether there was one.
     fn sleep(&self, limit: Duration) -> Result<bool, ServeError> {
         if self.ports.drain()? {
             return Ok(true);
@@ -217,8 +217,7 @@ impl Server {
         let keeper = self.keeper.iter().map(Keeper::descriptor);
         let others = keeper.chain(self.clients.descriptors());
         let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(others).collect();
-        let readable = sleep_until_readable(&descriptors, limit).map_err(ipc_error("sleep"))?;
-        Ok(readable.contains(&true))
+        Ok(sleep_until_event(&descriptors, limit).map_err(ipc_error("sleep"))?)
     }
 
     fn answer_step(&mut self, now: Instant, request: &ActiveStep) {

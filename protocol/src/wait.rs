@@ -105,6 +105,27 @@ pub fn sleep_until_readable(
     descriptors: &[BorrowedFd<'_>],
     timeout: Duration,
 ) -> Result<Vec<bool>, Errno> {
+    match readable(descriptors, timeout) {
+        Err(Errno::INTR) => Ok(vec![false; descriptors.len()]),
+        other => other,
+    }
+}
+
+/// The same; returns whether there is anything to look at, which a signal is too.
+///
+/// # Errors
+/// The system's error, never `EINTR`.
+pub fn sleep_until_event(
+    descriptors: &[BorrowedFd<'_>],
+    timeout: Duration,
+) -> Result<bool, Errno> {
+    match readable(descriptors, timeout) {
+        Err(Errno::INTR) => Ok(true),
+        other => other.map(|readable| readable.contains(&true)),
+    }
+}
+
+fn readable(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> Result<Vec<bool>, Errno> {
     let mut polled: Vec<PollFd<'_>> = descriptors
         .iter()
         .map(|fd| PollFd::from_borrowed_fd(*fd, PollFlags::IN))
@@ -113,11 +134,8 @@ pub fn sleep_until_readable(
         tv_sec: 1,
         tv_nsec: 0,
     });
-    match poll(&mut polled, Some(&timeout)) {
-        Ok(_) => Ok(polled.iter().map(|fd| !fd.revents().is_empty()).collect()),
-        Err(Errno::INTR) => Ok(vec![false; descriptors.len()]),
-        Err(error) => Err(error),
-    }
+    poll(&mut polled, Some(&timeout))?;
+    Ok(polled.iter().map(|fd| !fd.revents().is_empty()).collect())
 }
 
 /// Whether a descriptor is readable now.

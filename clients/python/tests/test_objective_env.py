@@ -104,6 +104,19 @@ def test_before_a_reset_and_after_closing_there_is_nothing(env: Any) -> None:
         env.close()
 
 
+def test_a_seed_that_does_not_fit_is_refused(env: Any) -> None:
+    with pytest.raises(errors.SettingError, match="got 18446744073709551616"):
+        env.reset(seed=2**64)
+
+
+def test_a_reset_that_finds_the_agent_dead_is_the_last_to_fail(env: Any) -> None:
+    env.reset(seed=1000)
+    os.kill(env._agent.pid, signal.SIGKILL)
+    with pytest.raises(errors.ServerGoneError):
+        env.reset(seed=1000)
+    env.reset(seed=1000)
+
+
 def test_an_agent_that_is_killed_is_noticed_and_a_reset_starts_another(env: Any) -> None:
     env.reset(seed=1000)
     os.kill(env._agent.pid, signal.SIGKILL)

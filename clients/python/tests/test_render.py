@@ -234,6 +234,19 @@ def test_a_window_shows_the_picture(headless: None, monkeypatch: pytest.MonkeyPa
     screen.close()
 
 
+def test_two_screens_take_turns_in_the_one_window(
+    headless: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    one, other = Screen(), Screen()
+    for screen in (one, other, one):
+        screen.show(**PARTS)
+    other.close()
+    one.show(**PARTS)
+    one.close()
+
+
 def test_a_terminal_shows_the_text_in_place(
     headless: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -319,7 +319,7 @@ fn the_worked_example_decodes_to_what_stands_beside_it() {
     let shape = Shape::new(header.height as usize, header.width as usize).expect("a grid");
     let frame = Frame::from_bytes(shape, 3, frames).expect("a frame");
     let seen: Vec<(usize, u8)> = frame.observed().collect();
-    assert_eq!(seen, [(5, 0), (6, 2), (7, 2), (12, 1)]);
+    assert_eq!(seen, [(5, 1), (6, 0), (7, 2), (12, 2)]);
     assert_eq!(results[0].n_visited as usize, seen.len());
     assert_eq!(Coverage::try_from(results[0].coverage), Ok(Coverage::Path));
 }

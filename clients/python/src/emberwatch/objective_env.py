@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import weakref
+from collections.abc import Generator
 from typing import Any, Literal, Unpack
 
 import numpy as np
@@ -23,7 +26,7 @@ from emberwatch.errors import (
 from emberwatch.observer import Frame, Observer, TruthReader
 from emberwatch.programs import Program
 from emberwatch.replies import Decision
-from emberwatch.session import Settings, WorldArguments, draw_seed
+from emberwatch.session import Settings, WorldArguments, check_seeds, draw_seed
 from emberwatch.view import fly
 
 
@@ -139,8 +142,10 @@ class WildfireObjectiveEnv(WorldEnv):
         super(WorldEnv, self).reset(seed=seed)
         resume = wants_to_resume(options, seed)
         world_seed = draw_seed(self.np_random) if seed is None and not resume else seed
+        check_seeds([] if world_seed is None else [world_seed])
         decisions = self._open(world_seed)
-        decision = decisions.last() if resume else decisions.reset(world_seed)
+        with self._closing_when_lost():
+            decision = decisions.last() if resume else decisions.reset(world_seed)
         self._path = None
         return self._seen(decision)
 
@@ -161,12 +166,9 @@ class WildfireObjectiveEnv(WorldEnv):
             raise InvalidActionError(
                 f"action: expected one integer, 0 to {n_objectives - 1}, got {action!r}"
             )
-        try:
-            timeout = max(10.0, self._session.settings.timeout)
+        timeout = max(10.0, self._session.settings.timeout)
+        with self._closing_when_lost():
             decision = self._opened().decide(int(given.item()), timeout=timeout)
-        except (LeaseLostError, AgentEndsError, ServerGoneError):
-            self.close()
-            raise
         observation, info = self._seen(decision)
         return observation, decision.reward, decision.terminated, decision.truncated, info
 
@@ -181,6 +183,15 @@ class WildfireObjectiveEnv(WorldEnv):
         if agent is not None:
             agent.stop()
         super().close()
+
+    @contextlib.contextmanager
+    def _closing_when_lost(self) -> Generator[None]:
+        """What is gone is given up, so that the next reset opens anew."""
+        try:
+            yield
+        except (LeaseLostError, AgentEndsError, ServerGoneError):
+            self.close()
+            raise
 
     def _is_open(self) -> bool:
         return self._decisions is not None
@@ -218,6 +229,8 @@ class WildfireObjectiveEnv(WorldEnv):
         if settings.takeover:
             command.append("--takeover")
         self._agent = Program("emberwatch-agent", command)
+        # For environments that nobody closes. Does nothing where it has been stopped before.
+        weakref.finalize(self, self._agent.stop)
         return self._agent.wait_for(connect, RESET_TIMEOUT)
 
     def _opened(self) -> Decisions:

@@ -182,12 +182,15 @@ class Screen:
 
     def close(self) -> None:
         """Closes the window, if there is one; later pictures are not shown. May be called again."""
-        if self._window is not None:
+        # Another screen of this process may have taken the window over.
+        if self._window is not None and self._pygame.display.get_surface() is self._window:
             self._pygame.display.quit()
         self._window, self._kind = None, "nothing"
 
     def _show_in_window(self, image: NDArray[np.uint8]) -> None:
         pygame, (height, width, _) = self._pygame, image.shape
+        if self._window is None or self._pygame.display.get_surface() is not self._window:
+            self._window = None
         if self._window is None or self._window.get_size() != (width, height):
             self._window = pygame.display.set_mode((width, height))
             pygame.display.set_caption(self._title)

@@ -164,8 +164,7 @@ class Session:
             SettingError: If a seed does not fit into 64 bits.
             LeaseLostError, ServerGoneError: The session is closed then; another try opens anew.
         """
-        if max(seeds) >= 2**64:
-            raise SettingError(f"seed: expected less than 2**64, got {max(seeds)}")
+        check_seeds(seeds)
         self.open(seeds[0] - indices[0])
         lease = self._opened()
         try:
@@ -351,6 +350,17 @@ class _Truth:
                 raise GarbledAnswerError(f"truth: got a grid of {truth.states.shape}")
             self._moments[index] = (truth.episode, truth.step)
             self._states[index] = truth.states
+
+
+def check_seeds(seeds: Sequence[int]) -> None:
+    """Refuses seeds that do not fit into the wire's 64 bits.
+
+    Raises:
+        SettingError: Naming one.
+    """
+    for seed in seeds:
+        if not 0 <= seed < 2**64:
+            raise SettingError(f"seed: expected 0 to 2**64 - 1, got {seed}")
 
 
 def draw_seed(generator: np.random.Generator) -> int:
