@@ -115,10 +115,7 @@ pub fn sleep_until_readable(
 ///
 /// # Errors
 /// The system's error, never `EINTR`.
-pub fn sleep_until_event(
-    descriptors: &[BorrowedFd<'_>],
-    timeout: Duration,
-) -> Result<bool, Errno> {
+pub fn sleep_until_event(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> Result<bool, Errno> {
     match readable(descriptors, timeout) {
         Err(Errno::INTR) => Ok(true),
         other => other.map(|readable| readable.contains(&true)),
