@@ -342,7 +342,7 @@ def test_seeds_are_checked() -> None:
     env = make()
     with pytest.raises(gymnasium.error.Error, match="greater or equal"):
         env.reset(seed=-1)
-    with pytest.raises(SettingError, match=r"seed: expected less than 2\*\*64, got 18446744073709"):
+    with pytest.raises(SettingError, match=r"seed: expected 0 to .*, got 18446744073709"):
         env.reset(seed=2**64)
     env.reset(seed=2**64 - 1)
     env.close()

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from emberwatch.errors import SettingError
 from emberwatch.model import Model
-from emberwatch.session import Session, Settings, draw_seed
+from emberwatch.session import Session
+from emberwatch.settings import Settings, draw_seed
 from emberwatch.view import RENDER_FPS, RENDER_MODES, View
 from emberwatch.wire import StepAnswer, StepResult
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from emberwatch.base import WorldEnv
 from emberwatch.client import as_moves
 from emberwatch.observations import Observations, Parts
-from emberwatch.session import Settings, WorldArguments
+from emberwatch.settings import Settings, WorldArguments
 from emberwatch.view import fly
 from emberwatch.wire import StepAnswer, StepResult
 

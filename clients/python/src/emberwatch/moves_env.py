@@ -13,7 +13,7 @@ from emberwatch import wire
 from emberwatch.base import WorldEnv
 from emberwatch.errors import ClosedError, InvalidActionError, SettingError
 from emberwatch.observations import Observations, assemble, check_parts
-from emberwatch.session import Settings, WorldArguments
+from emberwatch.settings import Settings, WorldArguments
 from emberwatch.view import fly
 from emberwatch.wire import StepAnswer
 

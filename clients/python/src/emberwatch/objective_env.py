@@ -23,10 +23,11 @@ from emberwatch.errors import (
     ServerGoneError,
     SettingError,
 )
-from emberwatch.observer import Frame, Observer, TruthReader
+from emberwatch.observer import Frame, Observer
 from emberwatch.programs import Program
 from emberwatch.replies import Decision
-from emberwatch.session import Settings, WorldArguments, check_seeds, draw_seed
+from emberwatch.settings import Settings, WorldArguments, check_seeds, draw_seed
+from emberwatch.truth import HiddenStates
 from emberwatch.view import fly
 
 
@@ -109,7 +110,7 @@ class WildfireObjectiveEnv(WorldEnv):
         self._owns_agent = agent == "own"
         self._decisions: Decisions | None = None
         self._frames: Observer | None = None
-        self._truths: TruthReader | None = None
+        self._truths: HiddenStates | None = None
         self._frame: Frame | None = None
         n_objectives = self.model.n_states + 1
         self.action_space = spaces.Discrete(n_objectives)
@@ -209,7 +210,7 @@ class WildfireObjectiveEnv(WorldEnv):
             if self.render_mode is not None:
                 self._frames = Observer(instance, world=settings.world)
             if self._reveals:
-                self._truths = TruthReader(instance)
+                self._truths = HiddenStates(instance, settings, 1, self._shape)
             self._decisions = self._start_agent(instance)
         except BaseException:
             self.close()
@@ -247,7 +248,9 @@ class WildfireObjectiveEnv(WorldEnv):
         }
         moment = (decision.episode, decision.step)
         if self._truths is not None:
-            info["truth"] = self._truth = self._await_truth(self._truths, moment)
+            timeout = self._session.settings.timeout
+            self._truth = truth = self._truths.at([moment], timeout)[0]
+            info["truth"] = truth.copy()
         if self._frames is not None:
             self._frame = frame = self._await_frame(self._frames, moment)
             self._path = fly(frame.start, frame.path, self._shape) if len(frame.path) else None
@@ -263,15 +266,6 @@ class WildfireObjectiveEnv(WorldEnv):
                 raise RequestTimeoutError("no frame was published in time")
             if (frame.result.episode, frame.result.step) == moment:
                 return frame
-
-    def _await_truth(self, reader: TruthReader, moment: tuple[int, int]) -> NDArray[np.uint8]:
-        while True:
-            truth = reader.receive(self._session.settings.timeout)
-            if truth is None:
-                raise RequestTimeoutError("no hidden states were published in time")
-            is_ours = truth.world == self._session.settings.world
-            if is_ours and (truth.episode, truth.step) == moment:
-                return truth.states
 
     def _draw(self) -> Any:
         if self._frame is None:

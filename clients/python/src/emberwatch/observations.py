@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from emberwatch import wire
 from emberwatch.errors import SettingError
-from emberwatch.session import Shape
+from emberwatch.settings import Shape
 from emberwatch.wire import StepAnswer
 
 #: The parts that there are.

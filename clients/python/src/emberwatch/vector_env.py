@@ -18,7 +18,8 @@ from emberwatch.client import as_moves
 from emberwatch.errors import SettingError
 from emberwatch.model import Model
 from emberwatch.observations import Observations, Parts
-from emberwatch.session import Session, Settings, WorldArguments, check_count, draw_seed
+from emberwatch.session import Session
+from emberwatch.settings import Settings, WorldArguments, check_count, draw_seed
 from emberwatch.view import RENDER_FPS, RENDER_MODES, View, fly
 from emberwatch.wire import RESULT_DTYPE, StepAnswer
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from emberwatch.errors import SettingError
 from emberwatch.model import Model
 from emberwatch.render import Palette, Screen, ansi, rgb_array
-from emberwatch.session import Shape
+from emberwatch.settings import Shape
 
 #: The render modes of every environment here.
 RENDER_MODES: Final = ("human", "rgb_array", "ansi")
