@@ -76,6 +76,16 @@ pub enum RunError {
         /// The model's.
         got: usize,
     },
+    /// A model that contradicts the one that the server reveals.
+    #[error(
+        "model: expected the server's own, {expected:?}, as it reveals it, got another, {got:?}"
+    )]
+    RevealedModel {
+        /// The server's.
+        expected: String,
+        /// The one given.
+        got: String,
+    },
     /// A policy that only `compare` can feed.
     #[error("policy {policy:?} needs worlds that run one step ahead: only `compare` has them")]
     Clairvoyant {
@@ -283,9 +293,16 @@ pub fn prepare(
         }
         .into());
     }
-    let model = match (model, &info.model) {
-        (Some(model), _) => model.clone(),
-        (None, Some(text)) => Model::from_toml(text)?,
+    let revealed = info.model.as_deref().map(Model::from_toml).transpose()?;
+    let model = match (model, revealed) {
+        (Some(given), Some(revealed)) if *given != revealed => {
+            return Err(RunError::RevealedModel {
+                expected: revealed.file().name.clone(),
+                got: given.file().name.clone(),
+            });
+        }
+        (Some(given), _) => given.clone(),
+        (None, Some(revealed)) => revealed,
         (None, None) => {
             let instance = instance.name().into();
             return Err(RunError::NoModel { instance });

@@ -1,6 +1,6 @@
 //! `serve-decisions`: a learner outside decides, this program estimates, plans and steps.
 
-use super::read_model;
+use super::model_named;
 use agent::config::AgentFlags;
 use agent::decider::Assignment;
 use agent::decisions::serve_decisions;
@@ -9,7 +9,6 @@ use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
 use protocol::channels::Instance;
 use protocol::program::stop_on_signals;
-use std::path::PathBuf;
 
 /// Take decisions for one world from a learner outside.
 #[derive(Args)]
@@ -26,9 +25,9 @@ pub struct ServeDecisionsCommand {
     /// What plans a path for the objective decided
     #[arg(long, default_value = "beam")]
     planner: PlannerName,
-    /// The model file, where the server does not reveal its model
-    #[arg(long, value_name = "FILE")]
-    model: Option<PathBuf>,
+    /// `wildfire` or the path of a model file, where the server does not reveal its model
+    #[arg(long)]
+    model: Option<String>,
     /// End when this process ends
     #[arg(long, value_name = "PID")]
     exit_with: Option<i32>,
@@ -48,7 +47,7 @@ enum PlannerName {
 impl ServeDecisionsCommand {
     /// Serves to the end.
     pub fn run(&self) -> Result<()> {
-        let model = self.model.as_deref().map(read_model).transpose()?;
+        let model = self.model.as_deref().map(model_named).transpose()?;
         let task = Assignment {
             instance: Instance::new(&self.instance)?,
             world: self.world,

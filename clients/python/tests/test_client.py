@@ -1,7 +1,10 @@
 """A client and a running server: handshake, leases, steps, and refusals."""
 
+import gc
 import os
+import threading
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +12,7 @@ from numpy.typing import NDArray
 from processes import PATIENCE, Script, Server, eventually, is_running
 
 from emberwatch import errors, wire
-from emberwatch.client import connect
+from emberwatch.client import Client, connect
 from emberwatch.errors import InvalidActionError
 
 Start = Callable[..., Server]
@@ -382,3 +385,53 @@ def test_wrong_actions_of_many_worlds_are_named(server: Start) -> None:
         with pytest.raises(InvalidActionError, match=words):
             lease.step(action)
     assert started.status().n_steps == 0
+
+
+@pytest.mark.parametrize(
+    "worlds", [range(0, 3, 2), range(0), range(-1, 1), range(2, 4), [0, 2]], ids=str
+)
+def test_worlds_to_step_are_consecutive_and_of_the_lease(
+    server: Callable[..., Server], worlds: Any
+) -> None:
+    client = server(worlds=4).connect()
+    lease = client.acquire(0, 3)
+    with pytest.raises(errors.SettingError, match="worlds: expected a range of consecutive"):
+        lease.step([[3] * 6] * 2, worlds=worlds)
+    assert client.observe(0, 4).results["step"].tolist() == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("seed", [1.5, -1, 2**64, "7"])
+def test_seeds_are_integers_that_fit(server: Callable[..., Server], seed: Any) -> None:
+    lease = server().connect().acquire()
+    with pytest.raises(errors.SettingError, match="seed: expected an integer"):
+        lease.reset([seed])
+
+
+def test_threads_take_turns(server: Callable[..., Server]) -> None:
+    lease = server().connect().acquire()
+    steps: list[int] = []
+
+    def fly() -> None:
+        for _ in range(200):
+            steps.append(lease.step([3] * 6).result().step)
+
+    threads = [threading.Thread(target=fly) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(steps) == list(range(1, 601))
+
+
+def test_a_forgotten_client_leaves_no_descriptor(server: Callable[..., Server]) -> None:
+    started = server()
+
+    def n_open() -> int:
+        gc.collect()
+        return len(os.listdir("/proc/self/fd"))
+
+    Client(started.instance)
+    before = n_open()
+    for _ in range(5):
+        Client(started.instance)
+    assert n_open() == before

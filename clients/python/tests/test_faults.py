@@ -2,6 +2,7 @@
 
 import os
 import signal
+import statistics
 import threading
 import time
 from collections.abc import Callable
@@ -86,7 +87,7 @@ def test_a_server_killed_during_a_request_is_gone_within_half_a_second(
         waited.append(killed_after(started, calls[what]))
         with pytest.raises(errors.ServerGoneError):
             client.observe()
-    assert min(waited) < 0.5, waited
+    assert statistics.median(waited) < 0.5, waited
 
 
 def test_a_server_killed_during_the_handshake_is_gone_within_half_a_second(server: Start) -> None:
@@ -94,7 +95,7 @@ def test_a_server_killed_during_the_handshake_is_gone_within_half_a_second(serve
     for _ in range(3):
         started = server()
         waited.append(killed_after(started, lambda: connect(started.instance, timeout=PATIENCE)))  # noqa: B023
-    assert min(waited) < 0.5, waited
+    assert statistics.median(waited) < 0.5, waited
 
 
 def test_a_server_killed_between_steps_is_gone_at_the_next(server: Start) -> None:
@@ -237,7 +238,7 @@ def test_a_killed_client_frees_its_worlds_at_once(server: Start, script: Run) ->
         start = time.monotonic()
         assert eventually(lambda: started.status().worlds[0].holder_pid is None)
         waited.append(time.monotonic() - start)
-    assert min(waited) < 0.5, waited
+    assert statistics.median(waited) < 0.5, waited
     assert started.connect().acquire().step([3] * 6).result().step > 1
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from processes import Server, eventually
 
 import emberwatch
 from emberwatch import errors
@@ -73,7 +74,71 @@ def test_the_world_is_that_of_wildfire_with_the_same_seed(env: Any) -> None:
     assert [seen[-1]["n_target_cells"] for seen in rollout(env, [2, 2, 3, 0])] == counts
 
 
-@pytest.mark.parametrize("action", [4, -1, 1.0, "fire", [0, 1], None])
+def test_two_agents_of_their_own_do_not_share_a_world(env: Any) -> None:
+    env.reset(seed=1000)
+    env.step(2)
+    arguments = {"instance": env.instance, "prior": "initial", "planner": "shooting"}
+    for takeover in (False, True):
+        other = gymnasium.make(
+            "emberwatch/WildfireObjective-v0", takeover=takeover, **arguments
+        ).unwrapped
+        with pytest.raises(errors.LaunchError, match="served already, by pid"):
+            other.reset(seed=1001)
+        other.close()
+    assert env.step(2)[4]["step"] == 2
+
+
+def test_a_stopped_agent_is_a_timeout_and_the_next_step_asks_for_a_reset() -> None:
+    env = make(timeout=0.5)
+    env.reset(seed=1000)
+    os.kill(env._agent.pid, signal.SIGSTOP)
+    with pytest.raises(errors.RequestTimeoutError, match=r"within 0\.5 s"):
+        env.step(0)
+    os.kill(env._agent.pid, signal.SIGCONT)
+    with pytest.raises(errors.ClosedError, match="an earlier decision timed out"):
+        env.step(0)
+    _, info = env.reset(options={"resume": True})
+    assert env.step(0)[4]["step"] == info["step"] + 1
+    env.close()
+
+
+def test_a_lease_lost_between_steps_is_told_as_that(server: Callable[..., Server]) -> None:
+    started = server(lease_millis=300)
+    env = gymnasium.make(
+        "emberwatch/WildfireObjective-v0", instance=started.instance, prior="initial"
+    ).unwrapped
+    env.reset(seed=1000)
+    started.connect().acquire(takeover=True)
+    # The agent finds out when it renews its lease, and ends.
+    assert eventually(lambda: env._agent.ended()[0] is not None)
+    with pytest.raises(errors.LeaseLostError, match="lease lost to pid"):
+        env.step(0)
+    env.close()
+
+
+def test_truth_is_not_waited_for_longer_than_the_timeout(server: Callable[..., Server]) -> None:
+    started = server(publish_truth="true")
+    env = gymnasium.make(
+        "emberwatch/WildfireObjective-v0", instance=started.instance, prior="initial", truth=True
+    ).unwrapped
+    _, info = env.reset(seed=1000)
+    assert info["truth"].shape == (5, 7)
+    with pytest.raises(errors.RequestTimeoutError):
+        env._truths.at([(9, 9)], 0.2)
+    env.close()
+
+
+def test_a_hidden_model_must_be_given(server: Callable[..., Server]) -> None:
+    arguments = {"instance": server(reveal_model="false").instance, "prior": "initial"}
+    with pytest.raises(errors.SettingError, match="model: expected one"):
+        gymnasium.make("emberwatch/WildfireObjective-v0", **arguments)
+    env = gymnasium.make("emberwatch/WildfireObjective-v0", model="wildfire", **arguments)
+    env.reset(seed=1000)
+    assert env.step(2)[4]["step"] == 1
+    env.close()
+
+
+@pytest.mark.parametrize("action", [[[0], [1, 2]], 4, -1, 1.0, "fire", [0, 1], None])
 def test_a_wrong_action_is_refused_and_nothing_is_sent(env: Any, action: object) -> None:
     env.reset(seed=1000)
     with pytest.raises(errors.InvalidActionError, match="expected one integer, 0 to 3"):
@@ -129,7 +194,7 @@ def test_an_agent_that_is_killed_is_noticed_and_a_reset_starts_another(env: Any)
 def test_a_server_that_is_killed_ends_the_agent_with_a_word(env: Any) -> None:
     env.reset(seed=1000)
     os.kill(env._session._program.pid, signal.SIGKILL)
-    with pytest.raises((errors.AgentEndsError, errors.ServerGoneError)):
+    with pytest.raises(errors.ServerGoneError, match="the server on instance"):
         env.step(0)
     env.reset(seed=1000)
 

@@ -230,7 +230,7 @@ def test_the_first_reset_is_of_all_worlds() -> None:
 @pytest.mark.parametrize("seed", [[1], [1, 2, 3], []], ids=str)
 def test_a_wrong_number_of_seeds_is_named(seed: list[int]) -> None:
     env = make_vec(2)
-    with pytest.raises(SettingError, match=f"seed: expected 2 seeds, got {len(seed)}"):
+    with pytest.raises(SettingError, match="seed: expected an integer, None or 2 of them, got"):
         env.reset(seed=seed)
     env.close()
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from emberwatch.errors import SettingError
 from emberwatch.model import Model
+from emberwatch.replies import Decision
 from emberwatch.session import Session
 from emberwatch.settings import Settings, draw_seed
 from emberwatch.view import RENDER_FPS, RENDER_MODES, View
@@ -82,12 +83,7 @@ class WorldEnv(gymnasium.Env[Any, Any]):
 
     def _describe(self, answer: StepAnswer, result: StepResult) -> dict[str, Any]:
         """The `info` of an answer: what is for reports, without the seed."""
-        info: dict[str, Any] = {
-            "step": result.step,
-            "n_target_cells": result.n_target_cells,
-            "n_visited": result.n_visited,
-            "n_hits": result.n_hits,
-        }
+        info = reported(result)
         if self._reveals:
             self._truth = truth = self._session.truth(answer)[0]
             info["truth"] = truth.copy()
@@ -97,16 +93,28 @@ class WorldEnv(gymnasium.Env[Any, Any]):
         raise NotImplementedError
 
 
+def reported(result: StepResult | Decision) -> dict[str, Any]:
+    """What of a result is for reports: without the seed."""
+    return {
+        "step": result.step,
+        "n_target_cells": result.n_target_cells,
+        "n_visited": result.n_visited,
+        "n_hits": result.n_hits,
+    }
+
+
 def wants_to_resume(options: dict[str, Any] | None, seed: object) -> bool:
     """Reads the options of a reset.
 
     Raises:
         SettingError: If one is unknown, or a seed is given to go on from.
     """
-    unknown = sorted(set(options or {}) - {"resume"})
-    if unknown:
-        raise SettingError(f"options: expected 'resume', got {unknown[0]!r}")
-    resume = bool((options or {}).get("resume", False))
+    for key in options or {}:
+        if key != "resume":
+            raise SettingError(f"options: expected 'resume', got {key!r}")
+    resume = (options or {}).get("resume", False)
+    if not isinstance(resume, bool):
+        raise SettingError(f"options: expected resume True or False, got {resume!r}")
     if resume and seed is not None:
         raise SettingError("options: expected no seed with resume=True, which begins no episode")
     return resume

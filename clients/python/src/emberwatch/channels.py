@@ -12,7 +12,8 @@ import re
 import stat
 import weakref
 from pathlib import Path
-from typing import Any, Final
+from types import TracebackType
+from typing import Any, Final, Self
 
 from emberwatch import wire
 from emberwatch.errors import ChannelError, ClosedError, ForkedError, SettingError
@@ -146,6 +147,27 @@ class Node:
 
     def _name(self, service: str) -> Any:
         return iox2.ServiceName.new(f"emberwatch/v{wire.VERSION}/{self.instance}/{service}")
+
+
+class Closing:
+    """What `with` closes."""
+
+    def close(self) -> None:
+        """Closes it. Again is fine."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        """Returns itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Closes it."""
+        self.close()
 
 
 class guard:

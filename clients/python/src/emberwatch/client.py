@@ -6,17 +6,18 @@ Every call has a timeout in seconds; everything returned is a copy.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
-from emberwatch.channels import Node
-from emberwatch.errors import InvalidActionError, refusal
+from emberwatch.channels import Closing, Node
+from emberwatch.errors import InvalidActionError, SettingError, refusal
 from emberwatch.ports import Bell, RequestPort
 from emberwatch.replies import (
     Grant,
@@ -37,13 +38,17 @@ STEP_TIMEOUT: Final = 5.0
 RESET_TIMEOUT: Final = 120.0
 
 
-class Client:
-    """A connection to one server. Make it with `connect`; close it, or use it in a `with`."""
+class Client(Closing):
+    """A connection to one server. Make it with `connect`; close it, or use it in a `with`.
+
+    Threads may share it: they take turns.
+    """
 
     def __init__(self, instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> None:
         """Connects and shakes hands; see `connect`."""
         self._node = Node(instance)
         self._sequence = 0
+        self._turn = threading.Lock()
         try:
             self._node.clean_up()
             self._bell = Bell(self._node)
@@ -132,19 +137,6 @@ class Client:
                 part.close()
         self._node.close()
 
-    def __enter__(self) -> Self:
-        """Returns itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Closes the connection."""
-        self.close()
-
     def control(self, request: Mapping[str, Any], *, timeout: float) -> dict[str, Any]:
         """Asks on `control` (PROTOCOL.md section 6) and returns the reply's keys.
 
@@ -153,8 +145,9 @@ class Client:
             RequestTimeoutError, ServerGoneError, GarbledAnswerError: If there is no good answer.
         """
         self._node.check()
-        self._sequence += 1
-        return ask(self._control, self._bell, self._sequence, request, timeout)
+        with self._turn:
+            self._sequence += 1
+            return ask(self._control, self._bell, self._sequence, request, timeout)
 
     def exchange(
         self,
@@ -174,24 +167,25 @@ class Client:
             RequestTimeoutError, ServerGoneError, GarbledAnswerError: If there is no good answer.
         """
         self._node.check()
-        self._sequence += 1
-        header = wire.STEP_REQUEST.pack(
-            wire.VERSION,
-            operation,
-            lease,
-            self._sequence,
-            first_world,
-            n_worlds,
-            self.info.n_moves if operation == wire.STEP else 0,
-            flags,
-            self._bell.listener_low,
-            self._bell.listener_high,
-            0,
-        )
-        reply, payload = self._step.exchange(header, paths, "a step", timeout)
+        with self._turn:
+            self._sequence = sequence = self._sequence + 1
+            header = wire.STEP_REQUEST.pack(
+                wire.VERSION,
+                operation,
+                lease,
+                sequence,
+                first_world,
+                n_worlds,
+                self.info.n_moves if operation == wire.STEP else 0,
+                flags,
+                self._bell.listener_low,
+                self._bell.listener_high,
+                0,
+            )
+            reply, payload = self._step.exchange(header, paths, "a step", timeout)
         if reply.status != 0:
             raise refusal(reply.status, reply.detail)
-        wire.check_answer("answer to step", reply, self._sequence)
+        wire.check_answer("answer to step", reply, sequence)
         wire.check_worlds(reply, (first_world, n_worlds, self.info.height, self.info.width))
         return StepAnswer(reply, payload, self.info.n_observations)
 
@@ -245,7 +239,7 @@ class Lease:
             LeaseLostError: If the lease ended or a world was taken over.
             EpisodeOverError: If a world's episode was truncated: reset it.
         """
-        chosen = self.worlds if worlds is None else worlds
+        chosen = self.worlds if worlds is None else self._part(worlds)
         moves = as_moves(paths, len(chosen), self.client.info.n_moves)
         return self.step_moves(moves, chosen, full=full, timeout=timeout)
 
@@ -292,11 +286,20 @@ class Lease:
         if len(given) != len(chosen):
             raise InvalidActionError(f"seeds: expected {len(chosen)}, got {len(given)}")
         pairs = [
-            {"world": world, "seed": None if seed is None else int(seed)}
+            {"world": world, "seed": None if seed is None else as_seed(seed)}
             for world, seed in zip(chosen, given, strict=True)
         ]
         request = {"op": "reset", "lease": self.number, "worlds": pairs}
         return records(WorldInfo, self.client.control(request, timeout=timeout))
+
+    def _part(self, worlds: range) -> range:
+        """Checks worlds to step: consecutive, of this lease."""
+        is_part = isinstance(worlds, range) and worlds.step == 1 and len(worlds) > 0  # pyright: ignore[reportUnnecessaryIsInstance]
+        if not is_part or worlds.start < self.worlds.start or worlds.stop > self.worlds.stop:
+            raise SettingError(
+                f"worlds: expected a range of consecutive worlds within {self.worlds}, got {worlds}"
+            )
+        return worlds
 
     def renew(self, *, timeout: float = RESET_TIMEOUT) -> None:
         """Starts the lease's clock again without acting."""
@@ -342,6 +345,34 @@ def connect(instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> Clie
         ChannelError: If the channels cannot be opened, also when there are too many clients.
     """
     return Client(instance, timeout=timeout)
+
+
+def as_seed(seed: object) -> int:
+    """Checks a world's seed.
+
+    Raises:
+        SettingError: If it is not an integer that fits into the wire's 64 bits.
+    """
+    if isinstance(seed, int | np.integer):
+        number = int(cast("int", seed))
+        if 0 <= number < 2**64:
+            return number
+    raise SettingError(f"seed: expected an integer within 0 to 2**64 - 1, got {seed!r}")
+
+
+def as_choice(action: object, n_choices: int) -> int:
+    """Checks an action that is one integer below `n_choices`.
+
+    Raises:
+        InvalidActionError: Naming what was expected and what was got.
+    """
+    try:
+        given = np.asarray(action)
+    except (ValueError, OverflowError):
+        given = np.empty(0)
+    if given.size == 1 and given.dtype.kind in "iu" and 0 <= int(given.item()) < n_choices:
+        return int(given.item())
+    raise InvalidActionError(f"action: expected one integer, 0 to {n_choices - 1}, got {action!r}")
 
 
 def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]:

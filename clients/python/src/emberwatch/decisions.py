@@ -5,18 +5,18 @@ PROTOCOL.md section 13. `WildfireObjectiveEnv` makes an environment of it.
 
 from __future__ import annotations
 
-from types import TracebackType
-from typing import Any, Final, Self
+import threading
+from typing import Any, Final
 
 from emberwatch import wire
-from emberwatch.channels import Node
+from emberwatch.channels import Closing, Node
 from emberwatch.client import RESET_TIMEOUT, STEP_TIMEOUT
 from emberwatch.errors import NoServerError
 from emberwatch.ports import Bell, RequestPort
 from emberwatch.replies import Decision, DecisionsInfo, ask, record
 
 
-class Decisions:
+class Decisions(Closing):
     """A connection to the agent of one world. Close it, or use it in a `with`."""
 
     def __init__(
@@ -31,6 +31,7 @@ class Decisions:
         """
         self._node = Node(instance)
         self._sequence = 0
+        self._turn = threading.Lock()
         try:
             self._node.clean_up()
             self._bell = Bell(self._node, f"wake-agent-{world}", "agent")
@@ -84,20 +85,8 @@ class Decisions:
                 part.close()
         self._node.close()
 
-    def __enter__(self) -> Self:
-        """Returns itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Closes the connection."""
-        self.close()
-
     def _ask(self, request: dict[str, Any], timeout: float) -> dict[str, Any]:
         self._node.check()
-        self._sequence += 1
-        return ask(self._port, self._bell, self._sequence, request, timeout)
+        with self._turn:
+            self._sequence += 1
+            return ask(self._port, self._bell, self._sequence, request, timeout)

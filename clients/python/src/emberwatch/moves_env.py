@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from emberwatch import wire
 from emberwatch.base import WorldEnv
-from emberwatch.errors import ClosedError, InvalidActionError, SettingError
+from emberwatch.client import as_choice
+from emberwatch.errors import ClosedError, SettingError
 from emberwatch.observations import Observations, assemble, check_parts
 from emberwatch.settings import Settings, WorldArguments
 from emberwatch.view import fly
@@ -145,7 +146,7 @@ class WildfireMovesEnv(WorldEnv):
             ServerGoneError: If the server has ended; the next reset starts or finds another.
             RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
         """
-        moves = [*self._moves, _as_move(action)]
+        moves = [*self._moves, as_choice(action, wire.N_MOVES)]
         if self._answer is None or not self._session.is_open:
             raise ClosedError("the environment has no episode: reset it first")
         if len(moves) < self._shape.n_moves:
@@ -201,17 +202,3 @@ class WildfireMovesEnv(WorldEnv):
             return None
         flown = fly(self._start, self._moves, self._shape) if self._moves else self._path
         return self._view.draw(self._answer.frames[0], self._robot, flown, self._truth)
-
-
-def _as_move(action: object) -> int:
-    """Checks a move.
-
-    Raises:
-        InvalidActionError: Naming what was expected and what was got.
-    """
-    given = np.asarray(action)
-    if given.size != 1 or given.dtype.kind not in "iu" or not 0 <= int(given.item()) < wire.N_MOVES:
-        raise InvalidActionError(
-            f"action: expected one integer, 0 to {wire.N_MOVES - 1}, got {action!r}"
-        )
-    return int(given.item())

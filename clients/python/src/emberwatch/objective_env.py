@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import time
 import weakref
 from collections.abc import Generator
-from typing import Any, Literal, Unpack
+from typing import Any, Final, Literal, Unpack
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from emberwatch.base import WorldEnv, wants_to_resume
-from emberwatch.client import RESET_TIMEOUT
+from emberwatch.base import WorldEnv, reported, wants_to_resume
+from emberwatch.client import RESET_TIMEOUT, as_choice, as_seed
 from emberwatch.decisions import Decisions
 from emberwatch.errors import (
     AgentEndsError,
     ClosedError,
-    InvalidActionError,
     LeaseLostError,
+    NoServerError,
     RequestTimeoutError,
     ServerGoneError,
     SettingError,
@@ -26,9 +27,12 @@ from emberwatch.errors import (
 from emberwatch.observer import Frame, Observer
 from emberwatch.programs import Program
 from emberwatch.replies import Decision
-from emberwatch.settings import Settings, WorldArguments, check_seeds, draw_seed
+from emberwatch.settings import Settings, WorldArguments, draw_seed
 from emberwatch.truth import HiddenStates
 from emberwatch.view import fly
+
+#: Exit code of an agent whose lease was lost.
+_LEASE_LOST: Final = 3
 
 
 class WildfireObjectiveEnv(WorldEnv):
@@ -104,7 +108,7 @@ class WildfireObjectiveEnv(WorldEnv):
             raise SettingError("agent='running': expected instance=..., where it runs")
         super().__init__(settings, render_mode, reveals=settings.truth)
         if self.model is None:
-            raise SettingError("instance: expected a server that reveals its model")
+            raise SettingError("model: expected one, as the server does not reveal its own")
         self._arguments = {"planner": planner, "prior": prior}
         self._agent: Program | None = None
         self._owns_agent = agent == "own"
@@ -112,6 +116,8 @@ class WildfireObjectiveEnv(WorldEnv):
         self._frames: Observer | None = None
         self._truths: HiddenStates | None = None
         self._frame: Frame | None = None
+        #: Whether a decision has timed out, so that the world may stand elsewhere than thought.
+        self._is_lost = False
         n_objectives = self.model.n_states + 1
         self.action_space = spaces.Discrete(n_objectives)
         self.observation_space = spaces.Box(0.0, 1.0, (18 * n_objectives + 2,), np.float32)
@@ -137,16 +143,18 @@ class WildfireObjectiveEnv(WorldEnv):
         """Begins an episode; see `WildfireEnv`.
 
         Raises:
-            BusyError: If another client holds the world of a running server.
+            LaunchError: If the agent does not start, in its own words, such as that another client
+                holds the world of a running server.
             SettingError: If an option is unknown.
         """
         super(WorldEnv, self).reset(seed=seed)
         resume = wants_to_resume(options, seed)
         world_seed = draw_seed(self.np_random) if seed is None and not resume else seed
-        check_seeds([] if world_seed is None else [world_seed])
+        world_seed = None if world_seed is None else as_seed(world_seed)
         decisions = self._open(world_seed)
         with self._closing_when_lost():
             decision = decisions.last() if resume else decisions.reset(world_seed)
+        self._is_lost = False
         self._path = None
         return self._seen(decision)
 
@@ -158,18 +166,17 @@ class WildfireObjectiveEnv(WorldEnv):
         Raises:
             InvalidActionError: If it is not an integer in 0 to S. Nothing is sent.
             LeaseLostError: If another client took the world over.
-            ServerGoneError, AgentEndsError, RequestTimeoutError: If there is no answer.
+            ServerGoneError: If agent or server have ended, with the agent's words.
+            RequestTimeoutError: If there is no answer; the world may have moved: reset or resume.
         """
-        given = np.asarray(action)
-        n_objectives = len(self._opened().info.objectives)
-        is_integer = given.size == 1 and given.dtype.kind in "iu"
-        if not is_integer or not 0 <= int(given.item()) < n_objectives:
-            raise InvalidActionError(
-                f"action: expected one integer, 0 to {n_objectives - 1}, got {action!r}"
+        objective = as_choice(action, len(self._opened().info.objectives))
+        if self._is_lost:
+            raise ClosedError(
+                "an earlier decision timed out, and the world may have moved: reset, or go on from "
+                "where it stands with reset(options={'resume': True})"
             )
-        timeout = max(10.0, self._session.settings.timeout)
         with self._closing_when_lost():
-            decision = self._opened().decide(int(given.item()), timeout=timeout)
+            decision = self._opened().decide(objective, timeout=self._session.settings.timeout)
         observation, info = self._seen(decision)
         return observation, decision.reward, decision.terminated, decision.truncated, info
 
@@ -187,12 +194,19 @@ class WildfireObjectiveEnv(WorldEnv):
 
     @contextlib.contextmanager
     def _closing_when_lost(self) -> Generator[None]:
-        """What is gone is given up, so that the next reset opens anew."""
+        """What is gone is given up, in the agent's own words, so that a reset opens anew."""
         try:
             yield
-        except (LeaseLostError, AgentEndsError, ServerGoneError):
-            self.close()
+        except RequestTimeoutError:
+            self._is_lost = True
             raise
+        except (LeaseLostError, AgentEndsError, ServerGoneError) as error:
+            code, words = (None, "") if self._agent is None else self._agent.ended()
+            self.close()
+            if isinstance(error, LeaseLostError) or code is None:
+                raise
+            kind = LeaseLostError if code == _LEASE_LOST else ServerGoneError
+            raise kind(f"{error}: {words}") from None
 
     def _is_open(self) -> bool:
         return self._decisions is not None
@@ -223,16 +237,26 @@ class WildfireObjectiveEnv(WorldEnv):
         def connect() -> Decisions:
             return Decisions(instance, settings.world, timeout=settings.timeout)
 
+        def connect_to_own() -> Decisions:
+            decisions = connect()
+            if self._agent is not None and decisions.info.pid == self._agent.pid:
+                return decisions
+            # Another agent serves the world: ours is about to end, and to say so.
+            decisions.close()
+            raise NoServerError(f"world {settings.world} has another agent")
+
         if not self._owns_agent:
             return connect()
         flags = self._arguments | {"instance": instance, "world": str(settings.world)}
         command = ["serve-decisions", *(f"--{flag}={value}" for flag, value in flags.items())]
         if settings.takeover:
             command.append("--takeover")
+        if settings.instance is not None and settings.model is not None:
+            command.append(f"--model={settings.model_argument}")
         self._agent = Program("emberwatch-agent", command)
         # For environments that nobody closes. Does nothing where it has been stopped before.
         weakref.finalize(self, self._agent.stop)
-        return self._agent.wait_for(connect, RESET_TIMEOUT)
+        return self._agent.wait_for(connect_to_own, RESET_TIMEOUT)
 
     def _opened(self) -> Decisions:
         if self._decisions is None:
@@ -240,12 +264,7 @@ class WildfireObjectiveEnv(WorldEnv):
         return self._decisions
 
     def _seen(self, decision: Decision) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        info: dict[str, Any] = {
-            "step": decision.step,
-            "n_target_cells": decision.n_target_cells,
-            "n_visited": decision.n_visited,
-            "n_hits": decision.n_hits,
-        }
+        info = reported(decision)
         moment = (decision.episode, decision.step)
         if self._truths is not None:
             timeout = self._session.settings.timeout
@@ -260,8 +279,9 @@ class WildfireObjectiveEnv(WorldEnv):
 
     def _await_frame(self, reader: Observer, moment: tuple[int, int]) -> Frame:
         """The published frame of a moment: `(episode, step)`."""
+        deadline = time.perf_counter() + self._session.settings.timeout
         while True:
-            frame = reader.receive(self._session.settings.timeout)
+            frame = reader.receive(max(0.0, deadline - time.perf_counter()))
             if frame is None:
                 raise RequestTimeoutError("no frame was published in time")
             if (frame.result.episode, frame.result.step) == moment:

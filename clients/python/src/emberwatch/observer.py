@@ -10,14 +10,13 @@ import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch import wire
-from emberwatch.channels import Node, guard
+from emberwatch.channels import Closing, Node, guard
 from emberwatch.errors import GarbledAnswerError, SettingError
 from emberwatch.wire import StepResult
 
@@ -70,7 +69,7 @@ class Truth:
     n_lost: int
 
 
-class _Reader:
+class _Reader(Closing):
     """A subscriber of one channel."""
 
     def __init__(
@@ -101,19 +100,6 @@ class _Reader:
         """Stops reading. Again is fine."""
         self._subscriber = None
         self._node.close()
-
-    def __enter__(self) -> Self:
-        """Returns itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Stops reading."""
-        self.close()
 
     def _sample(self, timeout: float) -> tuple[Any, bytearray, int] | None:
         """Header, payload and number of lost samples; `None` if nothing comes in time."""

@@ -10,6 +10,7 @@ import ctypes
 import os
 import select
 import time
+import weakref
 from typing import Any, Final, Generic, TypeVar
 
 from emberwatch import wire
@@ -66,6 +67,7 @@ class Bell:
         self.listener_low: Final = identity & (2**64 - 1)
         self.listener_high: Final = identity >> 64
         self._process: int | None = None
+        self._forget: weakref.finalize[[int], Any] | None = None
         self._poll = select.poll()
         self._contended_until = 0.0
         self._next_clean_up = 0.0
@@ -80,13 +82,14 @@ class Bell:
             self._process = os.pidfd_open(pid)
         except ProcessLookupError:
             raise self.gone() from None
+        self._forget = weakref.finalize(self, os.close, self._process)
         self._poll.register(self._process, select.POLLIN)
 
     def close(self) -> None:
         """Stops watching and waking."""
-        if self._process is not None:
-            os.close(self._process)
-            self._process = None
+        if self._forget is not None:
+            self._forget()
+        self._process = self._forget = None
         self.ring = self._listener = None
 
     def has_ended(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import itertools
 import os
 import shutil
@@ -33,6 +34,9 @@ _START_TIMEOUT: Final = 20.0
 #: How long it may take to stop before it is killed, seconds.
 _STOP_TIMEOUT: Final = 3.0
 
+#: How long a program that says farewell may take to end, seconds.
+_FAREWELL: Final = 0.5
+
 _numbers = itertools.count()
 
 
@@ -58,7 +62,7 @@ def find(name: str) -> Path:
 
 
 def unused_instance() -> str:
-    """An instance name that no other program of this machine uses."""
+    """An instance name that no other program in this process-id namespace uses."""
     return f"python-{os.getpid()}-{next(_numbers)}"
 
 
@@ -127,6 +131,13 @@ class Program:
     def pid(self) -> int:
         """Its process id."""
         return self._process.pid
+
+    def ended(self) -> tuple[int | None, str]:
+        """Its exit code, waited for a moment, and its words; `None` if it runs still."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_FAREWELL)
+        code = self._process.returncode
+        return (None, "") if code is None else (code, self.words())
 
     def words(self) -> str:
         """What it wrote, such as warnings and errors."""

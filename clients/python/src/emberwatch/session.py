@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch import wire
-from emberwatch.client import RESET_TIMEOUT, Client, Lease
+from emberwatch.client import RESET_TIMEOUT, Client, Lease, as_seed
 from emberwatch.errors import (
     ClosedError,
     EmberwatchError,
@@ -25,7 +25,7 @@ from emberwatch.errors import (
 )
 from emberwatch.model import Model
 from emberwatch.programs import Program, unused_instance
-from emberwatch.settings import Settings, check_seeds, private_world, running_world
+from emberwatch.settings import Settings, private_world, running_world
 from emberwatch.truth import HiddenStates
 from emberwatch.wire import StepAnswer
 
@@ -56,8 +56,6 @@ class Session:
         self._truth: HiddenStates | None = None
         #: Whether a step has timed out, so that the worlds may stand elsewhere than thought.
         self._is_lost = False
-        if not settings.timeout > 0:
-            raise SettingError(f"timeout: expected seconds above 0, got {settings.timeout}")
         if settings.truth and n_worlds > wire.TRUTH_BUFFER:
             raise SettingError(
                 f"truth: expected at most {wire.TRUTH_BUFFER} worlds, got {n_worlds}"
@@ -93,8 +91,11 @@ class Session:
         """Goes on from where the worlds stand, such as after another agent.
 
         Raises:
+            SettingError: If a private server has not been started yet.
             LeaseLostError, ServerGoneError: The session is closed then; another try opens anew.
         """
+        if self.is_private and not self.is_open:
+            raise SettingError("options: expected a reset before resume=True, got the first one")
         self.open(None)
         try:
             return self._observe()
@@ -109,7 +110,7 @@ class Session:
             SettingError: If a seed does not fit into 64 bits.
             LeaseLostError, ServerGoneError: The session is closed then; another try opens anew.
         """
-        check_seeds(seeds)
+        seeds = [as_seed(seed) for seed in seeds]
         self.open(seeds[0] - indices[0])
         lease = self._opened()
         try:

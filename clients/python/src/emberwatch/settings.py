@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, TypedDict
+from typing import Any, Final, TypedDict
 
 import numpy as np
 
@@ -55,6 +55,28 @@ class Settings:
     truth: bool = False
     timeout: float = STEP_TIMEOUT
 
+    def __post_init__(self) -> None:
+        """Checks what does not depend on a server.
+
+        Raises:
+            SettingError: Naming a keyword, what it expects, and what it got.
+        """
+        self._check("instance", "a name or None", _is(self.instance, str, type(None)))
+        self._check("model", "a path or None", _is(self.model, str, os.PathLike, type(None)))
+        self._check("start", "a text or None", _is(self.start, str, type(None)))
+        self._check("takeover", "True or False", _is(self.takeover, bool))
+        self._check("truth", "True or False", _is(self.truth, bool))
+        self._check("world", "an integer, at least 0", _is_integer(self.world) and self.world >= 0)
+        burn_in = 0 if self.burn_in is None else self.burn_in
+        is_steps = _is_integer(burn_in) and 0 <= burn_in < 2**63
+        self._check("burn_in", "a number of steps, at least 0, or None", is_steps)
+        is_time = _is_number(self.timeout) and self.timeout > 0
+        self._check("timeout", "seconds above 0", is_time)
+
+    def _check(self, name: str, expected: str, is_right: bool) -> None:
+        if not is_right:
+            raise SettingError(f"{name}: expected {expected}, got {getattr(self, name)!r}")
+
     @property
     def model_argument(self) -> str:
         """The model as the programs take it."""
@@ -69,17 +91,6 @@ class Shape:
     width: int
     n_moves: int
     n_observations: int
-
-
-def check_seeds(seeds: Sequence[int]) -> None:
-    """Refuses seeds that do not fit into the wire's 64 bits.
-
-    Raises:
-        SettingError: Naming one.
-    """
-    for seed in seeds:
-        if not 0 <= seed < 2**64:
-            raise SettingError(f"seed: expected 0 to 2**64 - 1, got {seed}")
 
 
 def draw_seed(generator: np.random.Generator) -> int:
@@ -99,18 +110,26 @@ def private_world(settings: Settings) -> tuple[Model, Shape, int]:
             "takeover, world: expected instance=..., a running server to attach to; a private "
             f"server has its own worlds, got world {settings.world}"
         )
-    named = settings.model_argument
-    model = Model.wildfire() if named == "wildfire" else Model.read(Path(named))
+    model = _model(settings)
     shape = Shape(
         height=check_count("height", settings.height, 64, _MAX_SIDE),
         width=check_count("width", settings.width, 64, _MAX_SIDE),
         n_moves=check_count("n_moves", settings.n_moves, 64, _MAX_MOVES),
         n_observations=len(model.observation_names),
     )
-    burn_in = 10_000 if settings.burn_in is None else settings.burn_in
-    if burn_in < 0:
-        raise SettingError(f"burn_in: expected steps, at least 0, got {burn_in}")
-    return model, shape, burn_in
+    if settings.start is not None:
+        _check_start(settings.start, shape)
+    return model, shape, 10_000 if settings.burn_in is None else settings.burn_in
+
+
+def _check_start(start: str, shape: Shape) -> None:
+    cell = re.fullmatch(r"(\d{1,9}),(\d{1,9})", start)
+    is_cell = cell is not None and int(cell[1]) < shape.height and int(cell[2]) < shape.width
+    if start not in ("corner", "centre", "random") and not is_cell:
+        raise SettingError(
+            "start: expected corner, centre, random or ROW,COL within "
+            f"{shape.height} x {shape.width} cells, got {start!r}"
+        )
 
 
 def running_world(
@@ -121,9 +140,10 @@ def running_world(
     Raises:
         SettingError: Naming what the settings want otherwise.
     """
-    for name in ("model", "start"):
-        if getattr(settings, name) is not None:
-            raise SettingError(f"{name}: expected None, as the running server has its own")
+    if settings.start is not None:
+        raise SettingError("start: expected None, as the running server has its own")
+    if settings.model is not None and info.model is not None:
+        raise SettingError("model: expected None, as the running server reveals its own")
     for name in ("height", "width", "n_moves", "burn_in"):
         asked, has = getattr(settings, name), getattr(info, name)
         if asked is not None and asked != has:
@@ -142,8 +162,14 @@ def running_world(
         n_moves=info.n_moves,
         n_observations=info.n_observations,
     )
-    model = None if info.model is None else Model.from_toml(info.model)
-    return model, shape, info.burn_in
+    if settings.model is not None:
+        return _model(settings), shape, info.burn_in
+    return None if info.model is None else Model.from_toml(info.model), shape, info.burn_in
+
+
+def _model(settings: Settings) -> Model:
+    named = settings.model_argument
+    return Model.wildfire() if named == "wildfire" else Model.read(Path(named))
 
 
 def check_count(name: str, value: int | None, default: int, highest: int) -> int:
@@ -154,6 +180,18 @@ def check_count(name: str, value: int | None, default: int, highest: int) -> int
     """
     if value is None:
         return default
-    if not 1 <= value <= highest or int(value) != value:
-        raise SettingError(f"{name}: expected an integer within 1 to {highest}, got {value}")
-    return value
+    if not _is_integer(value) or not 1 <= value <= highest:
+        raise SettingError(f"{name}: expected an integer within 1 to {highest}, got {value!r}")
+    return int(value)
+
+
+def _is(value: object, *kinds: type[Any]) -> bool:
+    return isinstance(value, kinds)
+
+
+def _is_integer(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, float | np.floating) or _is_integer(value)

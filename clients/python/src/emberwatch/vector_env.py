@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from emberwatch.base import NOTHING_TO_DRAW, wants_to_resume
-from emberwatch.client import as_moves
+from emberwatch.client import as_moves, as_seed
 from emberwatch.errors import SettingError
 from emberwatch.model import Model
 from emberwatch.observations import Observations, Parts
@@ -300,9 +300,12 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
             return [None] * self.num_envs
         if isinstance(seed, int | np.integer):
             return [int(seed) + index for index in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise SettingError(f"seed: expected {self.num_envs} seeds, got {len(seed)}")
-        return seed
+        if not hasattr(seed, "__len__") or len(seed) != self.num_envs:
+            raise SettingError(
+                f"seed: expected an integer, None or {self.num_envs} of them, got {seed!r}"
+            )
+        # Checked before any world's generator is replaced.
+        return [None if one is None else as_seed(one) for one in seed]
 
     def _check_mask(self, mask: object) -> NDArray[np.bool_]:
         if mask is None:
