@@ -15,6 +15,7 @@ pub mod estimator;
 pub mod launch;
 pub mod planner;
 pub mod policy;
+pub mod replay;
 pub mod report;
 pub mod run;
 pub mod summary;
