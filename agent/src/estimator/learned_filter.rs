@@ -16,7 +16,7 @@ mod layout;
 mod operator;
 pub mod parameters;
 pub mod trainer;
-mod vector;
+pub mod vector;
 pub mod window;
 
 pub use adam::Adam;
@@ -29,7 +29,7 @@ use layout::Layout;
 use operator::Operator;
 use protocol::grid::Probabilities;
 use protocol::{Frame, Shape};
-use vector::{Vectorised, on_widest};
+use vector::{Lanes, Vectorised, on_widest};
 
 /// A learned filter of one world.
 #[derive(Debug, Clone)]
@@ -146,17 +146,18 @@ impl LearnedFilter {
 struct Predict<'a>(&'a mut LearnedFilter);
 
 impl Vectorised for Predict<'_> {
+    type Number = f32;
     type Output = ();
 
     #[inline(always)]
-    fn run<const FUSED: bool>(self) {
+    fn run<V: Lanes<f32>>(self) {
         let filter = self.0;
         let layout = filter.operator.layout;
         let [posterior, predictor] = &mut filter.planes;
         layout.load(filter.belief.as_slice(), posterior, |p| p);
         filter
             .operator
-            .forward::<FUSED>(posterior, predictor, &mut filter.factors);
+            .forward::<V>(posterior, predictor, &mut filter.factors);
         let belief = filter.belief.probabilities_mut().as_slice_mut();
         let belief = belief.expect("invariant: beliefs are row-major");
         layout.unload(predictor, belief, |p| p);

@@ -8,8 +8,7 @@
 //! alike, of which a learned kernel has none, and does not know derivatives.
 
 use super::layout::Layout;
-use super::vector::{LANES, multiply_add};
-use ndarray::NdFloat;
+use super::vector::{LANES, Lanes, Real};
 use std::array::from_fn;
 use std::ops::Range;
 
@@ -29,7 +28,7 @@ pub(super) struct Operator<T> {
     mask: Vec<T>,
 }
 
-impl<T: NdFloat> Operator<T> {
+impl<T: Real> Operator<T> {
     pub(super) fn new(layout: Layout, weights: &[T]) -> Self {
         let mut operator = Self {
             layout,
@@ -60,16 +59,16 @@ impl<T: NdFloat> Operator<T> {
 
     /// `u = Phi_w(p)` in planes; `factors` (one plane) gets `1 / sum_m v`, 0 beside the grid.
     #[inline(always)]
-    pub(super) fn forward<const FUSED: bool>(&self, p: &[T], u: &mut [T], factors: &mut [T]) {
+    pub(super) fn forward<V: Lanes<T>>(&self, p: &[T], u: &mut [T], factors: &mut [T]) {
         for row in 0..self.layout.shape.height() {
-            self.correlate::<FUSED>(&self.weights, p, u, row);
-            self.normalise(u, factors, row);
+            self.correlate::<V>(&self.weights, p, u, row);
+            self.normalise::<V>(u, factors, row);
         }
     }
 
     /// `h` from `g` and `u`, in some rows and columns.
     #[inline(always)]
-    pub(super) fn backward_normalise(
+    pub(super) fn backward_normalise<V: Lanes<T>>(
         &self,
         g: &[T],
         u: &[T],
@@ -80,20 +79,15 @@ impl<T: NdFloat> Operator<T> {
         let plane = self.layout.plane;
         for row in region.rows.clone() {
             for at in region.places(&self.layout, row) {
-                let mut mean = [T::zero(); LANES];
+                let mut mean = V::splat(T::zero());
                 for state in 0..self.layout.n_states {
-                    let (g, u) = (lanes(g, state * plane + at), lanes(u, state * plane + at));
-                    for lane in 0..LANES {
-                        mean[lane] += g[lane] * u[lane];
-                    }
+                    let (g, u) = (load::<T, V>(g, state * plane + at), load(u, state * plane + at));
+                    mean = g.multiply_add(u, mean);
                 }
-                let factor = lanes(factors, at);
+                let factor: V = load(factors, at);
                 for state in 0..self.layout.n_states {
-                    let g = lanes(g, state * plane + at);
-                    let h = lanes_mut(h, state * plane + at);
-                    for lane in 0..LANES {
-                        h[lane] = (g[lane] - mean[lane]) * factor[lane];
-                    }
+                    let g: V = load(g, state * plane + at);
+                    store(g.minus(mean).times(factor), h, state * plane + at);
                 }
             }
         }
@@ -101,7 +95,7 @@ impl<T: NdFloat> Operator<T> {
 
     /// Adds `dL/dw` of some rows and columns of `h` to `gradient`.
     #[inline(always)]
-    pub(super) fn add_weight_gradient<const FUSED: bool>(
+    pub(super) fn add_weight_gradient<V: Lanes<T>>(
         &self,
         p: &[T],
         h: &[T],
@@ -115,9 +109,9 @@ impl<T: NdFloat> Operator<T> {
                 while to < n_states {
                     let corner = (to, from, kernel_row);
                     match n_states - to {
-                        1 => self.taps::<FUSED, 1>(p, h, region, corner, gradient),
-                        2 => self.taps::<FUSED, 2>(p, h, region, corner, gradient),
-                        _ => self.taps::<FUSED, GROUP>(p, h, region, corner, gradient),
+                        1 => self.taps::<V, 1>(p, h, region, corner, gradient),
+                        2 => self.taps::<V, 2>(p, h, region, corner, gradient),
+                        _ => self.taps::<V, GROUP>(p, h, region, corner, gradient),
                     }
                     to += GROUP;
                 }
@@ -127,27 +121,27 @@ impl<T: NdFloat> Operator<T> {
 
     /// `dL/dp` from `h`, in some rows.
     #[inline(always)]
-    pub(super) fn backward_correlate<const FUSED: bool>(
+    pub(super) fn backward_correlate<V: Lanes<T>>(
         &self,
         h: &[T],
         g: &mut [T],
         rows: Range<usize>,
     ) {
         for row in rows {
-            self.correlate::<FUSED>(&self.turned, h, g, row);
+            self.correlate::<V>(&self.turned, h, g, row);
         }
     }
 
     /// One row of eq. 2.
     #[inline(always)]
-    fn correlate<const FUSED: bool>(&self, weights: &[T], from: &[T], to: &mut [T], row: usize) {
+    fn correlate<V: Lanes<T>>(&self, weights: &[T], from: &[T], to: &mut [T], row: usize) {
         let n_states = self.layout.n_states;
         let mut first = 0;
         while first < n_states {
             match n_states - first {
-                1 => self.group::<FUSED, 1>(weights, from, to, row, first),
-                2 => self.group::<FUSED, 2>(weights, from, to, row, first),
-                _ => self.group::<FUSED, GROUP>(weights, from, to, row, first),
+                1 => self.group::<V, 1>(weights, from, to, row, first),
+                2 => self.group::<V, 2>(weights, from, to, row, first),
+                _ => self.group::<V, GROUP>(weights, from, to, row, first),
             }
             first += GROUP;
         }
@@ -155,7 +149,7 @@ impl<T: NdFloat> Operator<T> {
 
     /// The same for the next states from `first` on.
     #[inline(always)]
-    fn group<const FUSED: bool, const G: usize>(
+    fn group<V: Lanes<T>, const G: usize>(
         &self,
         weights: &[T],
         from: &[T],
@@ -166,18 +160,18 @@ impl<T: NdFloat> Operator<T> {
         let columns = self.layout.columns();
         let mut col = 0;
         while col + WIDE * LANES <= columns {
-            self.block::<FUSED, G, WIDE>(weights, from, to, (row, col), first);
+            self.block::<V, G, WIDE>(weights, from, to, (row, col), first);
             col += WIDE * LANES;
         }
         while col < columns {
-            self.block::<FUSED, G, 1>(weights, from, to, (row, col), first);
+            self.block::<V, G, 1>(weights, from, to, (row, col), first);
             col += LANES;
         }
     }
 
     /// The same for `B` vectors of cells.
     #[inline(always)]
-    fn block<const FUSED: bool, const G: usize, const B: usize>(
+    fn block<V: Lanes<T>, const G: usize, const B: usize>(
         &self,
         weights: &[T],
         from: &[T],
@@ -187,62 +181,56 @@ impl<T: NdFloat> Operator<T> {
     ) {
         let layout = &self.layout;
         let (n_states, n_taps) = (layout.n_states, layout.n_taps());
-        let mut sums = [[[T::zero(); LANES]; B]; G];
+        let mut sums = [[V::splat(T::zero()); B]; G];
         for state in 0..n_states {
             for a in 0..layout.kernel_height {
                 for c in 0..layout.kernel_width {
                     let at = state * layout.plane + (row + a) * layout.stride + c + col;
-                    let cells: [&[T; LANES]; B] = from_fn(|b| lanes(from, at + b * LANES));
                     let tap = state * n_taps + a * layout.kernel_width + c;
-                    for g in 0..G {
-                        let weight = weights[(first + g) * n_states * n_taps + tap];
-                        for b in 0..B {
-                            for lane in 0..LANES {
-                                let sum = &mut sums[g][b][lane];
-                                *sum = multiply_add::<T, FUSED>(weight, cells[b][lane], *sum);
-                            }
+                    let weight = |g: usize| weights[(first + g) * n_states * n_taps + tap];
+                    let taps: [V; G] = from_fn(|g| V::splat(weight(g)));
+                    for b in 0..B {
+                        let cells: V = load(from, at + b * LANES);
+                        for g in 0..G {
+                            sums[g][b] = taps[g].multiply_add(cells, sums[g][b]);
                         }
                     }
                 }
             }
         }
-        for g in 0..G {
+        for (g, sums) in sums.iter().enumerate() {
             let at = (first + g) * layout.plane + layout.row(row) + col;
-            for b in 0..B {
-                *lanes_mut(to, at + b * LANES) = sums[g][b];
+            for (b, sum) in sums.iter().enumerate() {
+                store(*sum, to, at + b * LANES);
             }
         }
     }
 
     /// One row of eq. 3.
     #[inline(always)]
-    fn normalise(&self, u: &mut [T], factors: &mut [T], row: usize) {
+    fn normalise<V: Lanes<T>>(&self, u: &mut [T], factors: &mut [T], row: usize) {
         let layout = &self.layout;
         for col in (0..layout.columns()).step_by(LANES) {
             let at = layout.row(row) + col;
-            let mask = lanes(&self.mask, col);
+            let mask: V = load(&self.mask, col);
             // Beside the grid the sum may be 0, where no factor is wanted.
-            let mut total: [T; LANES] = from_fn(|lane| T::one() - mask[lane]);
+            let mut total = V::splat(T::one()).minus(mask);
             for state in 0..layout.n_states {
-                let weights = lanes(u, state * layout.plane + at);
-                for lane in 0..LANES {
-                    total[lane] += weights[lane];
-                }
+                total = total.plus(load(u, state * layout.plane + at));
             }
-            let factor: [T; LANES] = from_fn(|lane| mask[lane] / total[lane]);
-            *lanes_mut(factors, at) = factor;
+            let factor = mask.over(total);
+            store(factor, factors, at);
             for state in 0..layout.n_states {
-                let weights = lanes_mut(u, state * layout.plane + at);
-                for lane in 0..LANES {
-                    weights[lane] = weights[lane] * factor[lane];
-                }
+                let at = state * layout.plane + at;
+                let weights: V = load(u, at);
+                store(weights.times(factor), u, at);
             }
         }
     }
 
     /// The gradients of one row of the kernel between `from` and `G` next states, three taps a time.
     #[inline(always)]
-    fn taps<const FUSED: bool, const G: usize>(
+    fn taps<V: Lanes<T>, const G: usize>(
         &self,
         p: &[T],
         h: &[T],
@@ -252,17 +240,17 @@ impl<T: NdFloat> Operator<T> {
     ) {
         let mut first = 0;
         while first + 3 <= self.layout.kernel_width {
-            self.some_taps::<FUSED, G, 3>(p, h, region, corner, first, gradient);
+            self.some_taps::<V, G, 3>(p, h, region, corner, first, gradient);
             first += 3;
         }
         while first < self.layout.kernel_width {
-            self.some_taps::<FUSED, G, 1>(p, h, region, corner, first, gradient);
+            self.some_taps::<V, G, 1>(p, h, region, corner, first, gradient);
             first += 1;
         }
     }
 
     #[inline(always)]
-    fn some_taps<const FUSED: bool, const G: usize, const C: usize>(
+    fn some_taps<V: Lanes<T>, const G: usize, const C: usize>(
         &self,
         p: &[T],
         h: &[T],
@@ -274,26 +262,23 @@ impl<T: NdFloat> Operator<T> {
         let layout = &self.layout;
         let tap = from * layout.plane + kernel_row * layout.stride + first;
         let origin = layout.row(0);
-        let mut sums = [[[T::zero(); LANES]; C]; G];
+        let mut sums = [[V::splat(T::zero()); C]; G];
         for row in region.rows.clone() {
             for at in region.places(layout, row) {
-                let cells: [&[T; LANES]; C] = from_fn(|c| lanes(p, tap + at - origin + c));
+                let cells: [V; C] = from_fn(|c| load(p, tap + at - origin + c));
                 for g in 0..G {
-                    let h = lanes(h, (to + g) * layout.plane + at);
+                    let h: V = load(h, (to + g) * layout.plane + at);
                     for c in 0..C {
-                        for lane in 0..LANES {
-                            let sum = &mut sums[g][c][lane];
-                            *sum = multiply_add::<T, FUSED>(cells[c][lane], h[lane], *sum);
-                        }
+                        sums[g][c] = cells[c].multiply_add(h, sums[g][c]);
                     }
                 }
             }
         }
-        for g in 0..G {
+        for (g, sums) in sums.iter().enumerate() {
             let entry = ((to + g) * layout.n_states + from) * layout.n_taps();
             let entry = entry + kernel_row * layout.kernel_width + first;
-            for c in 0..C {
-                gradient[entry + c] += total(&sums[g][c]);
+            for (gradient, &sum) in gradient[entry..].iter_mut().zip(sums) {
+                *gradient += total(sum);
             }
         }
     }
@@ -346,21 +331,22 @@ fn widened(range: &Range<usize>, other: Range<usize>) -> Range<usize> {
 }
 
 #[inline(always)]
-fn lanes<T>(planes: &[T], at: usize) -> &[T; LANES] {
+fn load<T, V: Lanes<T>>(planes: &[T], at: usize) -> V {
     let lanes = planes[at..].first_chunk();
-    lanes.expect("invariant: the layout has room for whole vectors")
+    V::load(lanes.expect("invariant: the layout has room for whole vectors"))
 }
 
 #[inline(always)]
-fn lanes_mut<T>(planes: &mut [T], at: usize) -> &mut [T; LANES] {
+fn store<T, V: Lanes<T>>(numbers: V, planes: &mut [T], at: usize) {
     let lanes = planes[at..].first_chunk_mut();
-    lanes.expect("invariant: the layout has room for whole vectors")
+    numbers.store(lanes.expect("invariant: the layout has room for whole vectors"));
 }
 
+/// The sum of the lanes.
 #[inline(always)]
-fn total<T: NdFloat>(lanes: &[T; LANES]) -> f64 {
-    let lanes = lanes
-        .iter()
-        .map(|lane| lane.to_f64().expect("invariant: floats cast"));
-    lanes.sum()
+fn total<T: Real, V: Lanes<T>>(numbers: V) -> f64 {
+    let mut lanes = [T::zero(); LANES];
+    numbers.store(&mut lanes);
+    let lanes = lanes.iter();
+    lanes.map(|lane| lane.to_f64().expect("invariant: floats cast")).sum()
 }

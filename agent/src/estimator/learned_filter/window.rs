@@ -9,9 +9,8 @@
 use super::layout::Layout;
 use super::operator::{Operator, Region};
 use super::parameters::Tables;
-use super::vector::{Vectorised, on_widest};
+use super::vector::{Lanes, Real, Vectorised, on_widest};
 use crate::replay::Sighting;
-use ndarray::NdFloat;
 use protocol::Shape;
 
 /// Where a window's first predictor comes from.
@@ -60,7 +59,7 @@ struct Seen {
     value: usize,
 }
 
-impl<T: NdFloat> Window<T> {
+impl<T: Real> Window<T> {
     /// For windows of up to `n_frames` frames.
     pub fn new(tables: Tables<T>, shape: Shape, n_frames: usize) -> Self {
         let dimensions = tables.dimensions;
@@ -152,22 +151,22 @@ impl<T: NdFloat> Window<T> {
 
     /// Eq. 6.
     #[inline(always)]
-    fn predict<const FUSED: bool>(&mut self, frame: usize) {
+    fn predict<V: Lanes<T>>(&mut self, frame: usize) {
         let (before, after) = self.planes.split_at_mut(frame + 1);
         let factors = &mut self.factors[frame + 1];
         self.operator
-            .forward::<FUSED>(&before[frame], &mut after[0], factors);
+            .forward::<V>(&before[frame], &mut after[0], factors);
     }
 
     #[inline(always)]
-    fn backward<const FUSED: bool>(&mut self, n_frames: usize, outcome: &mut Outcome) {
+    fn backward<V: Lanes<T>>(&mut self, n_frames: usize, outcome: &mut Outcome) {
         self.by_belief.fill(T::zero());
         self.by_weights.fill(T::zero());
         let mut region = Region::default();
         for frame in (0..n_frames).rev() {
             self.uncorrect(frame, outcome, &mut region);
             if frame > 0 && !region.rows.is_empty() {
-                region = self.unpredict::<FUSED>(frame, &region, outcome);
+                region = self.unpredict::<V>(frame, &region, outcome);
             }
         }
     }
@@ -203,7 +202,7 @@ impl<T: NdFloat> Window<T> {
 
     /// Eqs. 2 and 3 backward: from `dL/du` of a frame to `dL/dp` of the one before.
     #[inline(always)]
-    fn unpredict<const FUSED: bool>(
+    fn unpredict<V: Lanes<T>>(
         &mut self,
         frame: usize,
         region: &Region,
@@ -212,10 +211,10 @@ impl<T: NdFloat> Window<T> {
         let (u, p) = (&self.planes[frame], &self.planes[frame - 1]);
         let operator = &self.operator;
         let h = &mut self.by_weights;
-        operator.backward_normalise(&self.by_belief, u, &self.factors[frame], h, region);
-        operator.add_weight_gradient::<FUSED>(p, h, region, &mut outcome.gradient[0]);
+        operator.backward_normalise::<V>(&self.by_belief, u, &self.factors[frame], h, region);
+        operator.add_weight_gradient::<V>(p, h, region, &mut outcome.gradient[0]);
         let reached = region.reached(&operator.layout);
-        operator.backward_correlate::<FUSED>(h, &mut self.by_belief, reached.rows.clone());
+        operator.backward_correlate::<V>(h, &mut self.by_belief, reached.rows.clone());
         reached
     }
 
@@ -243,11 +242,12 @@ struct Pass<'a, T> {
     end: &'a mut [f32],
 }
 
-impl<T: NdFloat> Vectorised for Pass<'_, T> {
+impl<T: Real> Vectorised for Pass<'_, T> {
+    type Number = T;
     type Output = Outcome;
 
     #[inline(always)]
-    fn run<const FUSED: bool>(self) -> Outcome {
+    fn run<V: Lanes<T>>(self) -> Outcome {
         let (window, n_frames) = (self.window, self.frames.len());
         let mut outcome = Outcome {
             gradient: window.tables.dimensions.lengths().map(|n| vec![0.0; n]),
@@ -258,13 +258,13 @@ impl<T: NdFloat> Vectorised for Pass<'_, T> {
         for (frame, sightings) in self.frames.iter().enumerate() {
             outcome.log_likelihood += window.correct(frame, sightings);
             outcome.n_seen += sightings.len();
-            window.predict::<FUSED>(frame);
+            window.predict::<V>(frame);
         }
         let cast = |p: T| p.to_f32().expect("invariant: floats cast");
         window
             .layout()
             .unload(&window.planes[n_frames], self.end, cast);
-        window.backward::<FUSED>(n_frames, &mut outcome);
+        window.backward::<V>(n_frames, &mut outcome);
         if matches!(self.start, Start::Initial) {
             window.add_initial_gradient(&mut outcome);
         }
