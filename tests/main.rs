@@ -21,4 +21,5 @@ mod hostile;
 mod learner;
 mod lease;
 mod restart;
+mod training;
 mod wire;

@@ -31,7 +31,9 @@ fn replay(is_straight: bool) -> Replay {
     let mut robot = shape().centre();
     for step in 0..64 * 64 {
         let direction = |t: u64| split_mix(step, if is_straight { 0 } else { t }) >> 62;
-        let moves: Vec<Move> = (0..N_MOVES).map(|t| Move::from_low_bits(direction(t))).collect();
+        let moves: Vec<Move> = (0..N_MOVES)
+            .map(|t| Move::from_low_bits(direction(t)))
+            .collect();
         let flight = fly(shape(), robot, &moves);
         robot = flight.end;
         if replay.wants_belief(0) {
@@ -46,21 +48,33 @@ fn frame(visited: &[usize]) -> Frame {
     let mut frame = Frame::empty(shape());
     for &cell in visited {
         let Cell { row, col } = shape().cell(cell);
-        frame.observe(cell, (split_mix((row / 8 * 8 + col / 8) as u64, 0) % 3) as u8);
+        frame.observe(
+            cell,
+            (split_mix((row / 8 * 8 + col / 8) as u64, 0) % 3) as u8,
+        );
     }
     frame
 }
 
 fn updates(c: &mut Criterion) {
     for (n_threads, is_straight) in [(1, false), (2, false), (1, true), (2, true)] {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build();
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(n_threads)
+            .build();
         let pool = pool.expect("threads");
         let mut replay = replay(is_straight);
         let mut trainer = Trainer::new(parameters(), shape(), LearningConfig::default(), 0);
-        let paths = if is_straight { "straight flights" } else { "random walks" };
+        let paths = if is_straight {
+            "straight flights"
+        } else {
+            "random walks"
+        };
         let name = format!("update 16 x 16, {paths}, {n_threads} threads (target: 2 ms on 2)");
         c.bench_function(&name, |b| {
-            b.iter(|| pool.install(|| trainer.update(&mut replay, Some(2))).expect("finite"));
+            b.iter(|| {
+                pool.install(|| trainer.update(&mut replay, Some(2)))
+                    .expect("finite")
+            });
         });
     }
 }

@@ -98,9 +98,7 @@ impl Agent {
             EstimatorKind::KnownModel => {
                 Estimator::KnownModel(Box::new(Filter::new(task.model, prior)?))
             }
-            EstimatorKind::Learned => {
-                Estimator::Learned(Box::new(learned_filter(policy, &task)?))
-            }
+            EstimatorKind::Learned => Estimator::Learned(Box::new(learned_filter(policy, &task)?)),
             EstimatorKind::Truth => {
                 let transition = Box::new(Transition::new(task.model, task.shape)?);
                 Estimator::Truth {

@@ -233,7 +233,9 @@ fn decode(kind: &'static str, bytes: &[u8]) -> Result<Contents, Problem> {
     let file = SafeTensors::deserialize(bytes).map_err(form)?;
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(form)?;
     let mut texts = metadata.metadata().clone().unwrap_or_default();
-    let got = texts.remove(KIND).unwrap_or_else(|| "something else".into());
+    let got = texts
+        .remove(KIND)
+        .unwrap_or_else(|| "something else".into());
     if got != kind {
         return Err(Problem::Kind {
             expected: kind,
@@ -266,7 +268,10 @@ fn tensor(name: &str, view: &TensorView<'_>) -> Result<Tensor, Problem> {
     let (numbers, _) = view.data().as_chunks();
     Ok(Tensor {
         shape: view.shape().to_vec(),
-        numbers: numbers.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect(),
+        numbers: numbers
+            .iter()
+            .map(|&bytes| f32::from_le_bytes(bytes))
+            .collect(),
     })
 }
 
@@ -309,7 +314,10 @@ mod tests {
         let check = |bytes: &[u8], what: &str| {
             std::fs::write(&path, bytes).expect("written");
             let error = read(&path, "tests").expect_err(what).to_string();
-            assert!(error.contains("checkpoint.safetensors: expected"), "{what}: {error}");
+            assert!(
+                error.contains("checkpoint.safetensors: expected"),
+                "{what}: {error}"
+            );
         };
         for length in 0..whole.len() {
             check(&whole[..length], &format!("cut to {length}"));
@@ -330,14 +338,24 @@ mod tests {
         let (_folder, path) = place();
         write(&path, "tests", &contents()).expect("written");
         let error = read(&path, "others").expect_err("another kind").to_string();
-        assert!(error.ends_with("expected a checkpoint of others, got one of tests"), "{error}");
+        assert!(
+            error.ends_with("expected a checkpoint of others, got one of tests"),
+            "{error}"
+        );
         let read = read(&path, "tests").expect("read");
         let error = |result: Result<&[f32], Problem>| result.expect_err("wrong").to_string();
         let words = "kernel: expected shape [4], got [2, 2]";
         assert_eq!(error(read.tensor("kernel", &[4])), words);
-        assert_eq!(error(read.tensor("bias", &[4])), "expected \"bias\" in it, found none");
+        assert_eq!(
+            error(read.tensor("bias", &[4])),
+            "expected \"bias\" in it, found none"
+        );
         assert_eq!(read.count("updates").ok(), Some(12));
         let missing = super::read(Path::new("no/such"), "tests").expect_err("none");
-        assert!(missing.to_string().starts_with("checkpoint no/such: No such file"));
+        assert!(
+            missing
+                .to_string()
+                .starts_with("checkpoint no/such: No such file")
+        );
     }
 }

@@ -248,7 +248,12 @@ impl Run {
         self.agent.correct(&self.observation.frame, Some(&truth))?;
         self.tally.add(
             &self.observation,
-            brier_score(self.agent.belief(), &truth, target, self.agent.target(target)),
+            brier_score(
+                self.agent.belief(),
+                &truth,
+                target,
+                self.agent.target(target),
+            ),
         );
         if is_last && self.agent.policy().estimator == EstimatorKind::KnownModel {
             self.moment = Some(self.moment(&before, plan, truth));
@@ -320,12 +325,7 @@ pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize, own: usize)
         let miss = f64::from(p) - f64::from(u8::from(usize::from(state) == target));
         miss * miss
     };
-    let sum: f64 = belief
-        .probability(own)
-        .iter()
-        .zip(truth)
-        .map(squared)
-        .sum();
+    let sum: f64 = belief.probability(own).iter().zip(truth).map(squared).sum();
     sum / truth.len() as f64
 }
 

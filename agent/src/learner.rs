@@ -86,7 +86,10 @@ impl Learner {
         let n_cells = posterior.shape().n_cells();
         let met = |state: usize| -> f64 {
             let plane = &posterior.as_slice()[state * n_cells..];
-            frame.observed().map(|(cell, _)| f64::from(plane[cell])).sum()
+            frame
+                .observed()
+                .map(|(cell, _)| f64::from(plane[cell]))
+                .sum()
         };
         let met: Vec<f64> = (0..posterior.n_states()).map(met).collect();
         self.reward.add(&met, reward);
@@ -175,7 +178,9 @@ impl Progress {
         ];
         for (name, numbers, shape) in estimates {
             let numbers = numbers.iter().map(|&x| x as f32).collect();
-            contents.tensors.insert(name.into(), Tensor { shape, numbers });
+            contents
+                .tensors
+                .insert(name.into(), Tensor { shape, numbers });
         }
         let texts = [
             ("settings", settings.to_owned()),
@@ -234,7 +239,9 @@ impl Progress {
 fn learned(parameters: &Parameters, reward: &RewardEstimate) -> Learned {
     Learned {
         tables: parameters.tables(),
-        target: reward.target().unwrap_or(parameters.dimensions.n_states - 1),
+        target: reward
+            .target()
+            .unwrap_or(parameters.dimensions.n_states - 1),
     }
 }
 
@@ -251,7 +258,9 @@ fn dimensions_of(contents: &Contents) -> Result<Dimensions, Problem> {
         got,
     };
     let (&[n_states, _, rows, cols], &[_, n_observations]) = (&*kernel, &*likelihood) else {
-        return Err(wrong(format!("{kernel:?} and a likelihood of {likelihood:?}")));
+        return Err(wrong(format!(
+            "{kernel:?} and a likelihood of {likelihood:?}"
+        )));
     };
     let dimensions = Dimensions {
         n_states,
@@ -307,6 +316,9 @@ mod tests {
         let mut without = contents.clone();
         without.tensors.remove("initial.first_moment");
         let error = Progress::from_contents(&without, None).expect_err("missing");
-        assert_eq!(error.to_string(), "expected \"initial.first_moment\" in it, found none");
+        assert_eq!(
+            error.to_string(),
+            "expected \"initial.first_moment\" in it, found none"
+        );
     }
 }

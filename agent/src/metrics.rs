@@ -74,7 +74,12 @@ impl Metrics {
     ///
     /// # Errors
     /// [`MetricsError`].
-    pub fn add(&mut self, tick: &Tick, updates: &[Update], n_updates: u64) -> Result<(), MetricsError> {
+    pub fn add(
+        &mut self,
+        tick: &Tick,
+        updates: &[Update],
+        n_updates: u64,
+    ) -> Result<(), MetricsError> {
         let rows = updates.iter().map(|update| {
             let (loss, rate) = (number(update.loss), number(update.rate));
             row(update.number, tick, loss, rate)
@@ -104,12 +109,15 @@ impl Metrics {
 }
 
 fn row(update: u64, tick: &Tick, loss: String, rate: String) -> [String; 6] {
-    let seen = tick.score.n_seen > 0;
+    let held_out = match tick.score.n_seen {
+        0 => String::new(),
+        _ => number(tick.score.mean()),
+    };
     [
         update.to_string(),
         tick.world_steps.to_string(),
         loss,
-        seen.then(|| number(tick.score.mean())).unwrap_or_default(),
+        held_out,
         number(tick.reward / tick.n_worlds.max(1) as f64),
         rate,
     ]

@@ -60,7 +60,9 @@ impl Replay {
     /// Whether the world's next frame is the first of a block that needs a belief to start from.
     pub fn wants_belief(&self, world: u32) -> bool {
         let open = self.open.get(&world);
-        open.is_some_and(|(_, block)| block.frames.is_empty() && block.start.as_deref() == Some(&[]))
+        open.is_some_and(|(_, block)| {
+            block.frames.is_empty() && block.start.as_deref() == Some(&[])
+        })
     }
 
     /// Gives the belief that [`Self::wants_belief`] asks for.
@@ -180,9 +182,15 @@ mod tests {
     fn beliefs_are_handed_on_along_a_track() {
         let mut replay = replay(4);
         assert_eq!(replay.block(2).expect("kept").start, Some(vec![2.0]));
-        replay.hand_on(0, &[9.0]);
-        assert_eq!(replay.block(2).map(|block| block.start.clone()), Some(Some(vec![9.0])));
-        assert_eq!(replay.block(3).map(|block| block.start.clone()), Some(Some(vec![2.0])));
+        replay.hand_on(1, &[9.0]);
+        assert_eq!(
+            replay.block(2).map(|block| block.start.clone()),
+            Some(Some(vec![2.0]))
+        );
+        assert_eq!(
+            replay.block(3).map(|block| block.start.clone()),
+            Some(Some(vec![9.0]))
+        );
         replay.hand_on(2, &[8.0]); // the block after it is not full: nobody to hand on to
         replay.hand_on(77, &[8.0]);
     }
@@ -195,6 +203,9 @@ mod tests {
         replay.push(0, &frame(7));
         replay.push(0, &frame(8));
         let last = replay.blocks().last().and_then(|last| replay.block(last));
-        assert_eq!(last.map(|block| (block.frames.len(), block.start.clone())), Some((2, None)));
+        assert_eq!(
+            last.map(|block| (block.frames.len(), block.start.clone())),
+            Some((2, None))
+        );
     }
 }

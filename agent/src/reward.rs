@@ -58,7 +58,9 @@ impl RewardEstimate {
             }
         }
         for row in (0..n).rev() {
-            let known: f64 = (row + 1..n).map(|col| matrix[row * n + col] * solution[col]).sum();
+            let known: f64 = (row + 1..n)
+                .map(|col| matrix[row * n + col] * solution[col])
+                .sum();
             solution[row] = (solution[row] - known) / matrix[row * n + row];
         }
         solution

@@ -6,20 +6,19 @@
 //! ([`crate::reward`]).
 
 use crate::checkpoint::{self, CheckpointError};
-use crate::client::{Claim, Client, Observation};
-use crate::compare::planner_seed;
+use crate::client::{Claim, Client};
 use crate::config::{AgentConfig, ConfigError};
+use crate::estimator::ZeroEvidence;
 use crate::estimator::learned_filter::{Dimensions, DimensionsError, NotFinite, Update};
-use crate::estimator::{LearnedFilter, ZeroEvidence};
 use crate::learner::{KIND, Learned, Learner, Progress};
 use crate::metrics::{Metrics, MetricsError, Tick};
-use crate::planner::{Planner, PlanningProblem, Target};
-use crate::policy::{PlannerKind, Policy};
-use crate::scoring::{Score, score};
+use crate::pilot::Pilot;
+use crate::policy::PlannerKind;
+use crate::scoring::Score;
+use protocol::Move;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::WorldSeed;
-use protocol::{Move, Shape};
 use rayon::prelude::*;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -139,15 +138,6 @@ struct Trainee {
     told: (Instant, TrainSummary, Score),
 }
 
-/// Acts on one world.
-struct Pilot {
-    filter: LearnedFilter,
-    observation: Observation,
-    walk: Box<dyn Planner + Send>,
-    beam: Box<dyn Planner + Send>,
-    seed: u64,
-}
-
 impl Trainee {
     fn attach(training: &Training) -> Result<Self, TrainError> {
         let place = training.out.join(CHECKPOINT);
@@ -207,7 +197,8 @@ impl Trainee {
                 true => Vec::new(),
                 false => self.learn(training)?,
             };
-            self.metrics.add(&tick, &updates, self.learner.n_updates())?;
+            self.metrics
+                .add(&tick, &updates, self.learner.n_updates())?;
             self.report(&tick);
             if self.saved.elapsed() > SAVE_INTERVAL {
                 self.save(training)?;
@@ -220,18 +211,18 @@ impl Trainee {
     /// Plans, flies, scores, corrects, predicts: one step of each world.
     fn step(&mut self, training: &Training) -> Result<Tick, TrainError> {
         let learned = self.learner.learned();
-        let explores = self.learner.world_steps() < training.config.learning.explore_steps;
-        let kind = if explores {
-            PlannerKind::RandomWalk
-        } else {
-            PlannerKind::Beam
-        };
         let n_moves = self.client.info().n_moves;
-        let plan = |pilot: &mut Pilot| {
+        let n_walking = self.n_walking(training);
+        let plan = |(index, pilot): (usize, &mut Pilot)| {
             pilot.filter.set(&learned.tables);
+            let kind = match index < n_walking {
+                true => PlannerKind::RandomWalk,
+                false => PlannerKind::Beam,
+            };
             pilot.plan(kind, learned.target, &training.config, n_moves)
         };
-        let paths: Vec<Vec<Move>> = self.pilots.par_iter_mut().map(plan).collect();
+        let pilots = self.pilots.par_iter_mut().enumerate();
+        let paths: Vec<Vec<Move>> = pilots.map(plan).collect();
         let observations = self.client.step(self.client.worlds(), &paths)?;
         let mut tick = Tick::default();
         let worlds = self.client.worlds().zip(observations).zip(&mut self.pilots);
@@ -239,13 +230,25 @@ impl Trainee {
             tick.reward += observation.result.reward;
             tick.score += pilot.take_in(world, observation, &mut self.learner)?;
         }
-        self.pilots.par_iter_mut().for_each(|pilot| pilot.filter.predict());
+        self.pilots
+            .par_iter_mut()
+            .for_each(|pilot| pilot.filter.predict());
         self.reset_ended(&learned, training)?;
         tick.n_worlds = self.pilots.len() as u64;
         tick.world_steps = self.learner.world_steps();
         self.summary.steps += tick.n_worlds;
         self.summary.reward += tick.reward;
         Ok(tick)
+    }
+
+    /// Worlds whose robots walk at random: all at first, some for good.
+    fn n_walking(&self, training: &Training) -> usize {
+        let learning = &training.config.learning;
+        let n_worlds = self.pilots.len();
+        if self.learner.world_steps() < learning.explore_steps {
+            return n_worlds;
+        }
+        (learning.explore_share * n_worlds as f64).round() as usize
     }
 
     fn learn(&mut self, training: &Training) -> Result<Vec<Update>, TrainError> {
@@ -303,77 +306,6 @@ impl Trainee {
             "training"
         );
         self.told = (Instant::now(), self.summary, Score::default());
-    }
-}
-
-impl Pilot {
-    fn new(
-        learned: &Learned,
-        shape: Shape,
-        observation: Observation,
-        config: &AgentConfig,
-    ) -> Self {
-        Self {
-            filter: LearnedFilter::new(&learned.tables, shape),
-            walk: config.planner(&Policy::learned(PlannerKind::RandomWalk)),
-            beam: config.planner(&Policy::learned(PlannerKind::Beam)),
-            seed: planner_seed(config, observation.result.seed),
-            observation,
-        }
-    }
-
-    /// Begins a track with the frame that the world shows.
-    fn begin(&mut self, world: u32, learner: &mut Learner) -> Result<(), TrainError> {
-        learner.begin(world);
-        let frame = &self.observation.frame;
-        learner.see(world, self.filter.belief(), frame);
-        self.filter.correct(frame)?;
-        self.filter.predict();
-        Ok(())
-    }
-
-    fn plan(
-        &mut self,
-        kind: PlannerKind,
-        target: usize,
-        config: &AgentConfig,
-        n_moves: usize,
-    ) -> Vec<Move> {
-        let policy = Policy::learned(kind);
-        let mut objective = config.objective(&policy);
-        let planner = match kind {
-            PlannerKind::RandomWalk => &mut self.walk,
-            PlannerKind::Shooting | PlannerKind::Beam => {
-                objective.target = Target::State(target);
-                &mut self.beam
-            }
-        };
-        let values = objective.values(self.filter.belief());
-        let problem = PlanningProblem {
-            start: self.observation.robot(),
-            n_moves,
-            values: &values,
-            seed: self.seed,
-            step: self.observation.result.step,
-        };
-        planner.plan(&problem).moves
-    }
-
-    /// Scores the prediction of a frame, hands it to the learner and corrects the belief with it.
-    fn take_in(
-        &mut self,
-        world: u32,
-        observation: Observation,
-        learner: &mut Learner,
-    ) -> Result<Score, TrainError> {
-        self.observation = observation;
-        let Observation { result, frame } = &self.observation;
-        let likelihood = self.filter.tables().likelihood_array();
-        let score = score(self.filter.belief(), &likelihood, frame);
-        learner.see(world, self.filter.belief(), frame);
-        self.filter.correct(frame)?;
-        learner.reward(self.filter.belief(), frame, result.reward);
-        Ok(score)
     }
 }
 

@@ -25,7 +25,7 @@ pub struct TrainCommand {
     #[arg(long, default_value_t = 0)]
     world: u32,
     /// Number of worlds to act on at once
-    #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    #[arg(long, default_value_t = 16, value_parser = clap::value_parser!(u32).range(1..=1024))]
     worlds: u32,
     /// World steps to act for, of all worlds together; 0: until stopped
     #[arg(long, default_value_t = 0)]

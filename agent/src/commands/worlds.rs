@@ -120,7 +120,9 @@ impl GridFlags {
             ("--burn-in", burn_in.to_string()),
         ];
         let pairs = settings.into_iter();
-        pairs.flat_map(|(flag, value)| [flag.to_owned(), value]).collect()
+        pairs
+            .flat_map(|(flag, value)| [flag.to_owned(), value])
+            .collect()
     }
 }
 

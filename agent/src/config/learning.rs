@@ -39,6 +39,8 @@ pub struct LearningConfig {
     pub anchor: f64,
     /// World steps, of all worlds together, flown at random before planning on the learned belief.
     pub explore_steps: u64,
+    /// Share of the worlds that go on walking at random.
+    pub explore_share: f64,
 }
 
 impl Default for LearningConfig {
@@ -54,12 +56,13 @@ impl Default for LearningConfig {
             observation_rate: 0.2,
             beta1: 0.9,
             beta2: 0.99,
-            steady_updates: 3_000,
+            steady_updates: 2_000,
             falling_updates: 3_000,
             final_rate: 0.05,
             updates_per_step: 0.5,
             anchor: 0.001,
             explore_steps: 4_000,
+            explore_share: 0.0,
         }
     }
 }
@@ -95,6 +98,7 @@ impl LearningConfig {
             ("learning.final_rate", self.final_rate, 1.0),
             ("learning.updates_per_step", self.updates_per_step, 1000.0),
             ("learning.anchor", self.anchor, 1000.0),
+            ("learning.explore_share", self.explore_share, 1.0),
         ];
         for (setting, got, most) in numbers {
             if !(0.0..=most).contains(&got) {
@@ -137,9 +141,18 @@ mod tests {
             let error = config.check().expect_err(words).to_string();
             assert_eq!(error, words);
         };
-        check(|c| c.streams = 0, "learning.streams: expected 1 to 1024, got 0");
-        check(|c| c.rate = f64::NAN, "learning.rate: expected 0 to 1, got NaN");
-        check(|c| c.beta1 = 1.0, "learning.beta1: expected 0 to 0.999999, got 1");
+        check(
+            |c| c.streams = 0,
+            "learning.streams: expected 1 to 1024, got 0",
+        );
+        check(
+            |c| c.rate = f64::NAN,
+            "learning.rate: expected 0 to 1, got NaN",
+        );
+        check(
+            |c| c.beta1 = 1.0,
+            "learning.beta1: expected 0 to 0.999999, got 1",
+        );
         assert!(LearningConfig::default().check().is_ok());
     }
 }

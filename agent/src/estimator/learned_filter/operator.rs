@@ -81,7 +81,10 @@ impl<T: Real> Operator<T> {
             for at in region.places(&self.layout, row) {
                 let mut mean = V::splat(T::zero());
                 for state in 0..self.layout.n_states {
-                    let (g, u) = (load::<T, V>(g, state * plane + at), load(u, state * plane + at));
+                    let (g, u) = (
+                        load::<T, V>(g, state * plane + at),
+                        load(u, state * plane + at),
+                    );
                     mean = g.multiply_add(u, mean);
                 }
                 let factor: V = load(factors, at);
@@ -121,12 +124,7 @@ impl<T: Real> Operator<T> {
 
     /// `dL/dp` from `h`, in some rows.
     #[inline(always)]
-    pub(super) fn backward_correlate<V: Lanes<T>>(
-        &self,
-        h: &[T],
-        g: &mut [T],
-        rows: Range<usize>,
-    ) {
+    pub(super) fn backward_correlate<V: Lanes<T>>(&self, h: &[T], g: &mut [T], rows: Range<usize>) {
         for row in rows {
             self.correlate::<V>(&self.turned, h, g, row);
         }
@@ -189,10 +187,10 @@ impl<T: Real> Operator<T> {
                     let tap = state * n_taps + a * layout.kernel_width + c;
                     let weight = |g: usize| weights[(first + g) * n_states * n_taps + tap];
                     let taps: [V; G] = from_fn(|g| V::splat(weight(g)));
-                    for b in 0..B {
-                        let cells: V = load(from, at + b * LANES);
-                        for g in 0..G {
-                            sums[g][b] = taps[g].multiply_add(cells, sums[g][b]);
+                    let cells: [V; B] = from_fn(|b| load(from, at + b * LANES));
+                    for (&tap, sums) in taps.iter().zip(&mut sums) {
+                        for (&cells, sum) in cells.iter().zip(sums) {
+                            *sum = tap.multiply_add(cells, *sum);
                         }
                     }
                 }
@@ -266,10 +264,10 @@ impl<T: Real> Operator<T> {
         for row in region.rows.clone() {
             for at in region.places(layout, row) {
                 let cells: [V; C] = from_fn(|c| load(p, tap + at - origin + c));
-                for g in 0..G {
+                for (g, sums) in sums.iter_mut().enumerate() {
                     let h: V = load(h, (to + g) * layout.plane + at);
-                    for c in 0..C {
-                        sums[g][c] = cells[c].multiply_add(h, sums[g][c]);
+                    for (&cells, sum) in cells.iter().zip(sums) {
+                        *sum = cells.multiply_add(h, *sum);
                     }
                 }
             }
@@ -348,5 +346,7 @@ fn total<T: Real, V: Lanes<T>>(numbers: V) -> f64 {
     let mut lanes = [T::zero(); LANES];
     numbers.store(&mut lanes);
     let lanes = lanes.iter();
-    lanes.map(|lane| lane.to_f64().expect("invariant: floats cast")).sum()
+    lanes
+        .map(|lane| lane.to_f64().expect("invariant: floats cast"))
+        .sum()
 }

@@ -5,9 +5,9 @@
 //! by zero.
 
 use ndarray::{Array2, NdFloat};
+use protocol::Model;
 use protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
 use protocol::randomness::split_mix;
-use protocol::Model;
 use thiserror::Error;
 
 /// Largest size of a free number: weights from 1e-7, probabilities from 1e-14 on.
@@ -320,7 +320,10 @@ mod tests {
                 let ((above, up), (below, down)) = (moved(1e-2), moved(-1e-2));
                 let difference = (above - below) / (up - down);
                 let got = f64::from(gradient.tensors[tensor][index]);
-                assert!((got - difference).abs() < 1e-4, "{tensor} {index}: {got} {difference}");
+                assert!(
+                    (got - difference).abs() < 1e-4,
+                    "{tensor} {index}: {got} {difference}"
+                );
             }
         }
     }
@@ -332,8 +335,26 @@ mod tests {
             assert!(error.contains(words), "{error}");
         };
         let fine = dimensions();
-        check(Dimensions { n_states: 1, ..fine }, "states: expected 2 to 64, got 1");
-        check(Dimensions { n_observations: 65, ..fine }, "got 65");
-        check(Dimensions { kernel: (3, 2), ..fine }, "odd sides up to 15, got 3 x 2");
+        check(
+            Dimensions {
+                n_states: 1,
+                ..fine
+            },
+            "states: expected 2 to 64, got 1",
+        );
+        check(
+            Dimensions {
+                n_observations: 65,
+                ..fine
+            },
+            "got 65",
+        );
+        check(
+            Dimensions {
+                kernel: (3, 2),
+                ..fine
+            },
+            "odd sides up to 15, got 3 x 2",
+        );
     }
 }
