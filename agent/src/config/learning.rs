@@ -62,7 +62,7 @@ impl Default for LearningConfig {
             updates_per_step: 0.5,
             anchor: 0.001,
             explore_steps: 4_000,
-            explore_share: 0.0,
+            explore_share: 0.25,
         }
     }
 }
