@@ -23,4 +23,5 @@ mod learner;
 mod lease;
 mod python;
 mod restart;
+mod training;
 mod wire;

@@ -2,8 +2,9 @@
 
 use crate::belief::{Belief, BeliefError};
 use crate::config::AgentConfig;
-use crate::estimator::{Filter, ZeroEvidence};
-use crate::planner::{CellValues, Objective, Plan, Planner, PlanningProblem};
+use crate::estimator::{Filter, LearnedFilter, ZeroEvidence};
+use crate::learner::Learned;
+use crate::planner::{CellValues, Objective, Plan, Planner, PlanningProblem, Target};
 use crate::policy::{EstimatorKind, Policy};
 use protocol::model::ModelError;
 use protocol::{Cell, Frame, Grid, Model, Probabilities, Shape, Transition};
@@ -32,6 +33,8 @@ pub struct Task<'a> {
     pub prior: &'a Belief,
     /// Seed of the planner's random numbers: the agent's and the world's.
     pub seed: u64,
+    /// What was learned, for policies that act on it.
+    pub learned: Option<&'a Learned>,
 }
 
 /// Why an agent cannot go on.
@@ -47,6 +50,20 @@ pub enum AgentError {
     /// Hidden states of another model.
     #[error("hidden states: {0}")]
     Belief(#[from] BeliefError),
+    /// A policy that needs a learned model was not given it.
+    #[error("policy {policy:?} needs a learned model: expected --checkpoint FILE")]
+    NeedsCheckpoint {
+        /// The policy.
+        policy: String,
+    },
+    /// A learned model of other observations.
+    #[error("checkpoint: expected {expected} observations as the world's, got {got}")]
+    OtherObservations {
+        /// The world's.
+        expected: usize,
+        /// The learned model's.
+        got: usize,
+    },
     /// A policy that needs the hidden state was not given it.
     #[error("policy {policy:?} needs the truth channel: start the server with --publish-truth")]
     NeedsTruth {
@@ -59,6 +76,7 @@ enum Estimator {
     /// Always the prior.
     None(Belief),
     KnownModel(Box<Filter>),
+    Learned(Box<LearnedFilter>),
     /// One-hot after `correct`, one step ahead of it after `predict`.
     Truth {
         belief: Belief,
@@ -80,6 +98,7 @@ impl Agent {
             EstimatorKind::KnownModel => {
                 Estimator::KnownModel(Box::new(Filter::new(task.model, prior)?))
             }
+            EstimatorKind::Learned => Estimator::Learned(Box::new(learned_filter(policy, &task)?)),
             EstimatorKind::Truth => {
                 let transition = Box::new(Transition::new(task.model, task.shape)?);
                 Estimator::Truth {
@@ -89,14 +108,36 @@ impl Agent {
             }
             EstimatorKind::NextTruth => Estimator::NextTruth(prior),
         };
-        Ok(Self {
+        let mut agent = Self {
             policy: policy.clone(),
             objective: config.objective(policy),
             estimator,
             planner: config.planner(policy),
             n_moves: task.n_moves,
             seed: task.seed,
-        })
+        };
+        if let (EstimatorKind::Learned, Some(learned)) = (policy.estimator, task.learned) {
+            agent.adopt(learned);
+        }
+        Ok(agent)
+    }
+
+    /// Acts on what was learned since; the belief stays. Only for policies with a learned belief.
+    pub fn adopt(&mut self, learned: &Learned) {
+        if let Estimator::Learned(filter) = &mut self.estimator {
+            filter.set(&learned.tables);
+            if let Target::State(target) = &mut self.objective.target {
+                *target = learned.target;
+            }
+        }
+    }
+
+    /// The state that the belief calls what pays most; `otherwise` unless that is learned.
+    pub fn target(&self, otherwise: usize) -> usize {
+        match (&self.estimator, self.objective.target) {
+            (Estimator::Learned(_), Target::State(target)) => target,
+            _ => otherwise,
+        }
     }
 
     /// The path for step k -> k + 1, from where the robot is (paper eq. 15).
@@ -125,6 +166,7 @@ impl Agent {
         match &mut self.estimator {
             Estimator::None(_) | Estimator::NextTruth(_) => Ok(()),
             Estimator::KnownModel(filter) => Ok(filter.correct(frame)?),
+            Estimator::Learned(filter) => Ok(filter.correct(frame)?),
             Estimator::Truth { belief, .. } => {
                 let truth = truth.ok_or_else(|| AgentError::NeedsTruth {
                     policy: self.policy.name.clone(),
@@ -140,6 +182,7 @@ impl Agent {
         match &mut self.estimator {
             Estimator::None(_) | Estimator::NextTruth(_) => {}
             Estimator::KnownModel(filter) => filter.predict(),
+            Estimator::Learned(filter) => filter.predict(),
             Estimator::Truth { belief, transition } => {
                 let mut next = Probabilities::zeros(belief.view().dim());
                 transition.apply(belief.probabilities_mut(), &mut next);
@@ -175,6 +218,20 @@ impl Estimator {
         match self {
             Self::None(belief) | Self::NextTruth(belief) | Self::Truth { belief, .. } => belief,
             Self::KnownModel(filter) => filter.belief(),
+            Self::Learned(filter) => filter.belief(),
         }
     }
+}
+
+fn learned_filter(policy: &Policy, task: &Task<'_>) -> Result<LearnedFilter, AgentError> {
+    let missing = || AgentError::NeedsCheckpoint {
+        policy: policy.name.clone(),
+    };
+    let learned = task.learned.ok_or_else(missing)?;
+    let got = learned.tables.dimensions.n_observations;
+    let expected = task.model.n_observations();
+    if got != expected {
+        return Err(AgentError::OtherObservations { expected, got });
+    }
+    Ok(LearnedFilter::new(&learned.tables, task.shape))
 }

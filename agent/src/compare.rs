@@ -5,6 +5,7 @@ use crate::arena::{Arena, ArenaError};
 use crate::belief::Belief;
 use crate::client::Observation;
 use crate::config::AgentConfig;
+use crate::learner::Learned;
 use crate::planner::Plan;
 use crate::policy::{EstimatorKind, Policy};
 use crate::report::PolicyRun;
@@ -27,6 +28,8 @@ pub struct Comparison {
     pub steps: u64,
     /// Settings of planners and estimators.
     pub config: AgentConfig,
+    /// What was learned, for policies that act on it.
+    pub learned: Option<Learned>,
 }
 
 /// What came out.
@@ -212,6 +215,7 @@ impl Match<'_> {
             n_moves,
             prior: self.prior,
             seed,
+            learned: self.comparison.learned.as_ref(),
         };
         Agent::new(self.policy, &self.comparison.config, task)
     }
@@ -244,7 +248,12 @@ impl Run {
         self.agent.correct(&self.observation.frame, Some(&truth))?;
         self.tally.add(
             &self.observation,
-            brier_score(self.agent.belief(), &truth, target),
+            brier_score(
+                self.agent.belief(),
+                &truth,
+                target,
+                self.agent.target(target),
+            ),
         );
         if is_last && self.agent.policy().estimator == EstimatorKind::KnownModel {
             self.moment = Some(self.moment(&before, plan, truth));
@@ -309,19 +318,14 @@ pub fn planner_seed(config: &AgentConfig, world_seed: u64) -> u64 {
 }
 
 /// Brier score of a belief: the mean over all cells of `(p - 1[x = target])^2`, where `p` is the
-/// probability of the state that pays most. 0 is perfect; the share `q` of such cells, told of each
-/// cell alike, scores `q (1 - q)`.
-pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize) -> f64 {
+/// probability of the state that pays most, which the belief numbers `own`. 0 is perfect; the share
+/// `q` of such cells, told of each cell alike, scores `q (1 - q)`.
+pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize, own: usize) -> f64 {
     let squared = |(&p, &state): (&f32, &u8)| {
         let miss = f64::from(p) - f64::from(u8::from(usize::from(state) == target));
         miss * miss
     };
-    let sum: f64 = belief
-        .probability(target)
-        .iter()
-        .zip(truth)
-        .map(squared)
-        .sum();
+    let sum: f64 = belief.probability(own).iter().zip(truth).map(squared).sum();
     sum / truth.len() as f64
 }
 
@@ -335,9 +339,9 @@ mod tests {
         let shape = Shape::new(1, 4).expect("test shape");
         let truth = Grid::from_shape_vec((1, 4), vec![2, 0, 1, 0]).expect("test grid");
         let certain = Belief::from_states(&truth, 3).expect("test states");
-        assert_eq!(brier_score(&certain, &truth, 2), 0.0);
+        assert_eq!(brier_score(&certain, &truth, 2, 2), 0.0);
         let uniform = Belief::uniform(3, shape);
         let expected = (4.0 / 9.0 + 3.0 / 9.0) / 4.0;
-        assert!((brier_score(&uniform, &truth, 2) - expected).abs() < 1e-6);
+        assert!((brier_score(&uniform, &truth, 2, 0) - expected).abs() < 1e-6);
     }
 }

@@ -1,5 +1,9 @@
 //! The agent's settings: defaults or the paper's preset, then a TOML file, then flags.
 
+mod learning;
+
+pub use learning::LearningConfig;
+
 use crate::belief::EntropyKind;
 use crate::estimator::Prior;
 use crate::planner::beam::DEFAULT_WIDTH;
@@ -26,8 +30,10 @@ pub struct AgentConfig {
     pub prior: PriorKind,
     /// Worlds simulated for the prior `simulated`, 1 to 10,000.
     pub prior_worlds: usize,
-    /// Seed of planners and of the prior's worlds.
+    /// Seed of planners, of the prior's worlds and of learners.
     pub seed: u64,
+    /// How the learned filter learns.
+    pub learning: LearningConfig,
 }
 
 /// What planners maximise besides the target that a policy's name says (paper eqs. 13 to 15).
@@ -83,7 +89,7 @@ pub struct AgentFlags {
     /// The known-model filter's first belief
     #[arg(long)]
     pub prior: Option<PriorKind>,
-    /// Seed of planners and of the prior's worlds [default: 0]
+    /// Seed of planners, of the prior's worlds and of learners [default: 0]
     #[arg(long)]
     pub agent_seed: Option<u64>,
 }
@@ -107,6 +113,16 @@ pub enum ConfigError {
         setting: &'static str,
         /// What it is.
         got: f32,
+    },
+    /// A setting that is no number of a sensible size.
+    #[error("{setting}: expected 0 to {most}, got {got}")]
+    Number {
+        /// Which setting.
+        setting: &'static str,
+        /// Greatest value allowed.
+        most: f64,
+        /// What it is.
+        got: f64,
     },
     /// A setting out of its range.
     #[error("{setting}: expected {least} to {most}, got {got}")]
@@ -132,6 +148,7 @@ impl Default for AgentConfig {
             prior: PriorKind::Simulated,
             prior_worlds: 64,
             seed: 0,
+            learning: LearningConfig::default(),
         }
     }
 }
@@ -178,6 +195,7 @@ impl AgentConfig {
                 return Err(ConfigError::Bonus { setting, got });
             }
         }
+        self.learning.check()?;
         Ok(self)
     }
 

@@ -202,6 +202,7 @@ fn agent(
         n_moves: client.info().n_moves,
         prior,
         seed: planner_seed(config, observation.result.seed),
+        learned: None,
     };
     // Any choice will do: each has the same estimator and planner.
     let mut agent = Agent::new(&choices[0], config, task)?;

@@ -6,18 +6,27 @@
 pub mod agent;
 pub mod arena;
 pub mod belief;
+pub mod checkpoint;
 pub mod client;
 pub mod compare;
 pub mod config;
 pub mod decider;
 pub mod decisions;
 pub mod estimator;
+pub mod evaluate;
 pub mod launch;
+pub mod learner;
+pub mod metrics;
+pub mod pilot;
 pub mod planner;
 pub mod policy;
+pub mod replay;
 pub mod report;
+pub mod reward;
 pub mod run;
+pub mod scoring;
 pub mod summary;
+pub mod train;
 pub mod truth;
 
 pub use belief::{Belief, EntropyKind};

@@ -24,6 +24,10 @@ enum Command {
     Prior(commands::PriorCommand),
     /// Compare policies on the same worlds: table, CSV and figures
     Compare(commands::CompareCommand),
+    /// Learn a model while acting: checkpoint and metrics
+    Train(commands::TrainCommand),
+    /// Score a checkpoint beside the known model
+    Evaluate(commands::EvaluateCommand),
 }
 
 fn main() -> ExitCode {
@@ -33,6 +37,8 @@ fn main() -> ExitCode {
         Command::ServeDecisions(command) => command.run(),
         Command::Prior(command) => command.run(),
         Command::Compare(command) => command.run(),
+        Command::Train(command) => command.run(),
+        Command::Evaluate(command) => command.run(),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

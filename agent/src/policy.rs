@@ -11,6 +11,8 @@ pub enum EstimatorKind {
     None,
     /// The Bayes filter with the true parameters (paper section III.A, masked as in III.C).
     KnownModel,
+    /// A Bayes filter with learned parameters.
+    Learned,
     /// The hidden state X_k, predicted one step ahead: an upper bound on estimation.
     Truth,
     /// The hidden state X_{k+1} that the path will meet: an upper bound on prediction too.
@@ -55,6 +57,7 @@ impl EstimatorKind {
         match self {
             Self::None => "none",
             Self::KnownModel => "known_model",
+            Self::Learned => "learned_filter",
             Self::Truth => "truth",
             Self::NextTruth => "next_truth",
         }
@@ -77,7 +80,7 @@ impl Policy {
     ///
     /// Names are `random_walk`, `coverage`, `shooting_*` and `beam_*` with `exploit` (the state that
     /// pays most), `exploit_only` (the same without the coverage bonus), `explore` (entropy) or the name
-    /// of a state, and `oracle_*` and `clairvoyant_*` with `shooting` or `beam`.
+    /// of a state, and `oracle_*`, `clairvoyant_*` and `learned_*` with `shooting` or `beam`.
     ///
     /// # Errors
     /// [`UnknownPolicy`] lists the names that there are.
@@ -107,12 +110,12 @@ impl Policy {
             _ => {
                 let (family, rest) = name.split_once('_').ok_or_else(unknown)?;
                 match family {
-                    "oracle" | "clairvoyant" => {
+                    "oracle" | "clairvoyant" | "learned" => {
                         let planner = planner_named(rest).ok_or_else(unknown)?;
-                        let estimator = if family == "oracle" {
-                            EstimatorKind::Truth
-                        } else {
-                            EstimatorKind::NextTruth
+                        let estimator = match family {
+                            "oracle" => EstimatorKind::Truth,
+                            "learned" => EstimatorKind::Learned,
+                            _ => EstimatorKind::NextTruth,
                         };
                         policy(estimator, planner, objective(planner, target))
                     }
@@ -148,6 +151,24 @@ impl Policy {
         let states = states.map(|(state, entry)| choice(&entry.name, Target::State(state)));
         states.chain([choice("entropy", Target::Entropy)]).collect()
     }
+
+    /// A planner on the learned belief; what it maximises is learned too.
+    pub fn learned(planner: PlannerKind) -> Self {
+        // The agent puts the state that pays most, as learned, in the place of this one.
+        let target = match planner {
+            PlannerKind::RandomWalk => Target::Coverage,
+            PlannerKind::Shooting | PlannerKind::Beam => Target::State(0),
+        };
+        Self {
+            name: format!("learned_{}", planner.label()),
+            estimator: EstimatorKind::Learned,
+            planner,
+            objective: objective(planner, target),
+        }
+    }
+
+    /// The names that need a checkpoint.
+    pub const LEARNED: [&'static str; 2] = ["learned_shooting", "learned_beam"];
 
     /// The benchmark's ladder under a model, from the least to the most informed.
     pub fn ladder(model: &Model) -> Vec<Self> {
@@ -210,6 +231,7 @@ fn ladder_names(model: &Model) -> Vec<String> {
 fn known_names(model: &Model) -> Vec<String> {
     let mut names = ladder_names(model);
     names.extend(["beam_explore", "beam_exploit_only", "clairvoyant_shooting"].map(String::from));
+    names.extend(Policy::LEARNED.map(String::from));
     names.extend(
         model
             .file()

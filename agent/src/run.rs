@@ -6,6 +6,7 @@ use crate::client::{Claim, Client, Observation, server_info, shape_of};
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
 use crate::estimator::Prior;
+use crate::learner::Learned;
 use crate::policy::{EstimatorKind, Policy, UnknownPolicy};
 use crate::truth::{TruthError, TruthFeed};
 use protocol::channels::{ChannelError, Instance};
@@ -41,6 +42,8 @@ pub struct Mission {
     pub model: Option<Model>,
     /// Settings of planners and estimators.
     pub config: AgentConfig,
+    /// What was learned, for policies that act on it.
+    pub learned: Option<Learned>,
 }
 
 /// Why a mission ended early.
@@ -184,6 +187,7 @@ impl Attached {
             n_moves,
             prior: &prior,
             seed,
+            learned: mission.learned.as_ref(),
         };
         let agent = Agent::new(&policy, &mission.config, task)?;
         let truth = if policy.estimator == EstimatorKind::Truth {

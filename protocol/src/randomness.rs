@@ -22,6 +22,8 @@ pub enum Purpose {
     Planner,
     /// Worlds simulated to find a filter's first prior.
     Prior,
+    /// The order in which a learner replays what it has seen; indexed by lap.
+    Learner,
     /// The seed of the next episode, where a reset names none; indexed by episode.
     Episode,
 }
@@ -35,6 +37,7 @@ impl Purpose {
             Self::Start => b"start",
             Self::Planner => b"planner",
             Self::Prior => b"prior",
+            Self::Learner => b"learner",
             Self::Episode => b"episode",
         }
     }

@@ -1,0 +1,94 @@
+//! Time of learning at the paper's size: 64 x 64 cells, 64 moves, 3 states, 16 streams x 16 frames.
+
+use agent::config::LearningConfig;
+use agent::estimator::LearnedFilter;
+use agent::estimator::learned_filter::{Dimensions, Parameters, Trainer};
+use agent::replay::Replay;
+use criterion::{Criterion, criterion_group, criterion_main};
+use protocol::path::fly;
+use protocol::randomness::split_mix;
+use protocol::{Cell, Frame, Move, Shape};
+
+const N_MOVES: u64 = 64;
+
+fn shape() -> Shape {
+    Shape::new(64, 64).expect("valid shape")
+}
+
+fn parameters() -> Parameters {
+    let dimensions = Dimensions {
+        n_states: 3,
+        n_observations: 3,
+        kernel: (3, 3),
+    };
+    Parameters::first(dimensions, 0)
+}
+
+/// What random walks, or straight flights, see of a made-up world.
+fn replay(is_straight: bool) -> Replay {
+    let mut replay = Replay::new(64, 64 * 64);
+    replay.begin(0);
+    let mut robot = shape().centre();
+    for step in 0..64 * 64 {
+        let direction = |t: u64| split_mix(step, if is_straight { 0 } else { t }) >> 62;
+        let moves: Vec<Move> = (0..N_MOVES)
+            .map(|t| Move::from_low_bits(direction(t)))
+            .collect();
+        let flight = fly(shape(), robot, &moves);
+        robot = flight.end;
+        if replay.wants_belief(0) {
+            replay.give_belief(0, &vec![1.0 / 3.0; 3 * shape().n_cells()]);
+        }
+        replay.push(0, &frame(&flight.visited));
+    }
+    replay
+}
+
+fn frame(visited: &[usize]) -> Frame {
+    let mut frame = Frame::empty(shape());
+    for &cell in visited {
+        let Cell { row, col } = shape().cell(cell);
+        frame.observe(
+            cell,
+            (split_mix((row / 8 * 8 + col / 8) as u64, 0) % 3) as u8,
+        );
+    }
+    frame
+}
+
+fn updates(c: &mut Criterion) {
+    for (n_threads, is_straight) in [(1, false), (2, false), (1, true), (2, true)] {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(n_threads)
+            .build();
+        let pool = pool.expect("threads");
+        let mut replay = replay(is_straight);
+        let mut trainer = Trainer::new(parameters(), shape(), LearningConfig::default(), 0);
+        let paths = if is_straight {
+            "straight flights"
+        } else {
+            "random walks"
+        };
+        let name = format!("update 16 x 16, {paths}, {n_threads} threads (target: 2 ms on 2)");
+        c.bench_function(&name, |b| {
+            b.iter(|| {
+                pool.install(|| trainer.update(&mut replay, Some(2)))
+                    .expect("finite")
+            });
+        });
+    }
+}
+
+fn filter(c: &mut Criterion) {
+    let mut filter = LearnedFilter::new(&parameters().tables(), shape());
+    let frame = frame(&(0..40).collect::<Vec<_>>());
+    c.bench_function("learned filter: correct + predict", |b| {
+        b.iter(|| {
+            filter.correct(&frame).expect("possible");
+            filter.predict();
+        });
+    });
+}
+
+criterion_group!(benches, updates, filter);
+criterion_main!(benches);

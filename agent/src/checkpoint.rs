@@ -1,0 +1,361 @@
+//! What a learner keeps between runs: named tensors and text in one safetensors file.
+//!
+//! Written beside the file and renamed, so whoever reads finds all or nothing. Read whole or refused:
+//! the file says which learner it is of, and a digest tells damage that keeps its form.
+
+use safetensors::tensor::TensorView;
+use safetensors::{Dtype, SafeTensors};
+use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use thiserror::Error;
+
+/// Entries of the metadata that this file makes itself.
+const KIND: &str = "emberwatch.kind";
+const DIGEST: &str = "emberwatch.digest";
+
+/// Largest file that is read, bytes: ten times what 64 states and 15 x 15 kernels need.
+const MAX_BYTES: u64 = 1 << 27;
+
+/// One tensor.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Tensor {
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// Its numbers, row-major.
+    pub numbers: Vec<f32>,
+}
+
+/// The contents of a checkpoint.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Contents {
+    /// By name.
+    pub tensors: BTreeMap<String, Tensor>,
+    /// By name; among them the effective settings.
+    pub texts: BTreeMap<String, String>,
+}
+
+/// Why a checkpoint could not be written or was refused.
+#[derive(Debug, Error)]
+#[error("checkpoint {}: {problem}", path.display())]
+pub struct CheckpointError {
+    path: PathBuf,
+    problem: Problem,
+}
+
+/// What is wrong with a checkpoint.
+#[derive(Debug, Error)]
+pub enum Problem {
+    /// The system refused.
+    #[error("{0}")]
+    Io(#[from] std::io::Error),
+    /// Too large to be one.
+    #[error("expected at most {MAX_BYTES} bytes, got {0}")]
+    Large(u64),
+    /// Not safetensors, or cut off.
+    #[error("expected a whole safetensors file, got one that is damaged or cut off: {0}")]
+    Form(String),
+    /// Another learner's, or none's.
+    #[error("expected a checkpoint of {expected}, got one of {got}")]
+    Kind {
+        /// Whose was asked for.
+        expected: &'static str,
+        /// Whose it is.
+        got: String,
+    },
+    /// The form is right and the numbers are not those that were written.
+    #[error("expected contents with digest {expected}, got {got}: the file is damaged")]
+    Digest {
+        /// What the file says.
+        expected: String,
+        /// What its contents give.
+        got: String,
+    },
+    /// A tensor or text that is missing.
+    #[error("expected {0:?} in it, found none")]
+    Missing(String),
+    /// A tensor of another shape.
+    #[error("{name}: expected shape {expected:?}, got {got:?}")]
+    Shape {
+        /// The tensor.
+        name: String,
+        /// What it must be.
+        expected: Vec<usize>,
+        /// What it is.
+        got: Vec<usize>,
+    },
+    /// A tensor or text with something else in it.
+    #[error("{name}: expected {expected}, got {got}")]
+    Value {
+        /// The tensor or text.
+        name: String,
+        /// What it must be.
+        expected: String,
+        /// What it is.
+        got: String,
+    },
+}
+
+impl Problem {
+    /// The error for a file.
+    pub fn of(self, path: &Path) -> CheckpointError {
+        let path = path.to_owned();
+        let problem = self;
+        CheckpointError { path, problem }
+    }
+}
+
+impl Contents {
+    /// A tensor that must be there, in this shape, with finite numbers.
+    ///
+    /// # Errors
+    /// [`Problem`] names it.
+    pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<&[f32], Problem> {
+        let missing = || Problem::Missing(name.into());
+        let Tensor { shape, numbers } = self.tensors.get(name).ok_or_else(missing)?;
+        if shape != expected {
+            let (name, expected, got) = (name.into(), expected.to_vec(), shape.clone());
+            return Err(Problem::Shape {
+                name,
+                expected,
+                got,
+            });
+        }
+        match numbers.iter().find(|number| !number.is_finite()) {
+            None => Ok(numbers),
+            Some(got) => Err(Problem::Value {
+                name: name.into(),
+                expected: "finite numbers".into(),
+                got: got.to_string(),
+            }),
+        }
+    }
+
+    /// A whole number that must be there.
+    ///
+    /// # Errors
+    /// [`Problem`] names it.
+    pub fn count(&self, name: &str) -> Result<u64, Problem> {
+        let text = self.texts.get(name);
+        let text = text.ok_or_else(|| Problem::Missing(name.into()))?;
+        text.parse().map_err(|_| Problem::Value {
+            name: name.into(),
+            expected: "a whole number".into(),
+            got: text.clone(),
+        })
+    }
+
+    /// FNV-1a (Fowler, Noll, Vo) over names, shapes, numbers and texts: against damage, not malice.
+    fn digest(&self) -> String {
+        let mut hash = 0xcbf2_9ce4_8422_2325_u64;
+        let mut take = |bytes: &[u8]| {
+            for &byte in bytes {
+                hash = (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
+            }
+        };
+        for (name, tensor) in &self.tensors {
+            take(name.as_bytes());
+            tensor
+                .shape
+                .iter()
+                .for_each(|&side| take(&(side as u64).to_le_bytes()));
+            tensor.numbers.iter().for_each(|n| take(&n.to_le_bytes()));
+        }
+        for (name, text) in &self.texts {
+            take(name.as_bytes());
+            take(text.as_bytes());
+        }
+        format!("{hash:016x}")
+    }
+}
+
+/// Writes a checkpoint of a kind of learner, whole or not at all.
+///
+/// # Errors
+/// [`CheckpointError`]; the file is then as it was.
+pub fn write(path: &Path, kind: &'static str, contents: &Contents) -> Result<(), CheckpointError> {
+    let bytes = encode(kind, contents).map_err(|problem| problem.of(path))?;
+    let mut beside = path.as_os_str().to_owned();
+    beside.push(format!(".{}", std::process::id()));
+    let beside = PathBuf::from(beside);
+    let written = File::create(&beside).and_then(|mut file| {
+        file.write_all(&bytes)?;
+        file.sync_all()?;
+        std::fs::rename(&beside, path)
+    });
+    if written.is_err() {
+        // The first error is the one to tell.
+        let _ = std::fs::remove_file(&beside);
+    }
+    written.map_err(|error| Problem::Io(error).of(path))
+}
+
+/// Reads a checkpoint of a kind of learner.
+///
+/// # Errors
+/// [`CheckpointError`] names the file and what is wrong with it.
+pub fn read(path: &Path, kind: &'static str) -> Result<Contents, CheckpointError> {
+    let bytes = || {
+        let size = std::fs::metadata(path)?.len();
+        if size > MAX_BYTES {
+            return Err(Problem::Large(size));
+        }
+        Ok(std::fs::read(path)?)
+    };
+    let contents = bytes().and_then(|bytes| decode(kind, &bytes));
+    contents.map_err(|problem| problem.of(path))
+}
+
+fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>, Problem> {
+    let form = |error: safetensors::SafeTensorError| Problem::Form(error.to_string());
+    let bytes = |tensor: &Tensor| -> Vec<u8> {
+        let numbers = tensor.numbers.iter();
+        numbers.flat_map(|number| number.to_le_bytes()).collect()
+    };
+    let bytes: Vec<Vec<u8>> = contents.tensors.values().map(bytes).collect();
+    let views = contents.tensors.iter().zip(&bytes);
+    let views = views.map(|((name, tensor), bytes)| {
+        Ok((
+            name,
+            TensorView::new(Dtype::F32, tensor.shape.clone(), bytes)?,
+        ))
+    });
+    let views = views.collect::<Result<Vec<_>, _>>().map_err(form)?;
+    let mut texts: HashMap<String, String> = contents.texts.clone().into_iter().collect();
+    texts.insert(KIND.into(), kind.into());
+    texts.insert(DIGEST.into(), contents.digest());
+    safetensors::serialize(views, Some(texts)).map_err(form)
+}
+
+fn decode(kind: &'static str, bytes: &[u8]) -> Result<Contents, Problem> {
+    let form = |error: safetensors::SafeTensorError| Problem::Form(error.to_string());
+    let file = SafeTensors::deserialize(bytes).map_err(form)?;
+    let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(form)?;
+    let mut texts = metadata.metadata().clone().unwrap_or_default();
+    let got = texts
+        .remove(KIND)
+        .unwrap_or_else(|| "something else".into());
+    if got != kind {
+        return Err(Problem::Kind {
+            expected: kind,
+            got,
+        });
+    }
+    let expected = texts.remove(DIGEST).unwrap_or_default();
+    let mut contents = Contents {
+        tensors: BTreeMap::new(),
+        texts: texts.into_iter().collect(),
+    };
+    for (name, view) in file.iter() {
+        contents.tensors.insert(name.into(), tensor(name, &view)?);
+    }
+    let got = contents.digest();
+    if got != expected {
+        return Err(Problem::Digest { expected, got });
+    }
+    Ok(contents)
+}
+
+fn tensor(name: &str, view: &TensorView<'_>) -> Result<Tensor, Problem> {
+    if view.dtype() != Dtype::F32 {
+        return Err(Problem::Value {
+            name: name.into(),
+            expected: "32-bit floats".into(),
+            got: format!("{:?}", view.dtype()),
+        });
+    }
+    let (numbers, _) = view.data().as_chunks();
+    Ok(Tensor {
+        shape: view.shape().to_vec(),
+        numbers: numbers
+            .iter()
+            .map(|&bytes| f32::from_le_bytes(bytes))
+            .collect(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn contents() -> Contents {
+        let mut contents = Contents::default();
+        let tensor = Tensor {
+            shape: vec![2, 2],
+            numbers: vec![1.0, -0.5, 0.0, 3e-9],
+        };
+        contents.tensors.insert("kernel".into(), tensor);
+        contents.texts.insert("updates".into(), "12".into());
+        contents
+    }
+
+    fn place() -> (tempfile::TempDir, PathBuf) {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("checkpoint.safetensors");
+        (folder, path)
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let (folder, path) = place();
+        write(&path, "tests", &contents()).expect("written");
+        write(&path, "tests", &contents()).expect("written over");
+        assert_eq!(read(&path, "tests").expect("read"), contents());
+        let files = std::fs::read_dir(folder.path()).expect("the folder");
+        assert_eq!(files.count(), 1, "nothing left beside it");
+    }
+
+    #[test]
+    fn every_cut_and_every_flipped_byte_is_refused_by_name() {
+        let (_folder, path) = place();
+        write(&path, "tests", &contents()).expect("written");
+        let whole = std::fs::read(&path).expect("readable");
+        let check = |bytes: &[u8], what: &str| {
+            std::fs::write(&path, bytes).expect("written");
+            let error = read(&path, "tests").expect_err(what).to_string();
+            assert!(
+                error.contains("checkpoint.safetensors: expected"),
+                "{what}: {error}"
+            );
+        };
+        for length in 0..whole.len() {
+            check(&whole[..length], &format!("cut to {length}"));
+        }
+        for at in 0..whole.len() {
+            let mut bytes = whole.clone();
+            bytes[at] ^= 1;
+            std::fs::write(&path, &bytes).expect("written");
+            // Space that pads the header may change without a change of meaning.
+            if let Ok(got) = read(&path, "tests") {
+                assert_eq!(got, contents(), "byte {at}");
+            }
+        }
+    }
+
+    #[test]
+    fn another_kind_shape_or_number_is_named() {
+        let (_folder, path) = place();
+        write(&path, "tests", &contents()).expect("written");
+        let error = read(&path, "others").expect_err("another kind").to_string();
+        assert!(
+            error.ends_with("expected a checkpoint of others, got one of tests"),
+            "{error}"
+        );
+        let read = read(&path, "tests").expect("read");
+        let error = |result: Result<&[f32], Problem>| result.expect_err("wrong").to_string();
+        let words = "kernel: expected shape [4], got [2, 2]";
+        assert_eq!(error(read.tensor("kernel", &[4])), words);
+        assert_eq!(
+            error(read.tensor("bias", &[4])),
+            "expected \"bias\" in it, found none"
+        );
+        assert_eq!(read.count("updates").ok(), Some(12));
+        let missing = super::read(Path::new("no/such"), "tests").expect_err("none");
+        assert!(
+            missing
+                .to_string()
+                .starts_with("checkpoint no/such: No such file")
+        );
+    }
+}

@@ -1,0 +1,215 @@
+//! `compare`: the benchmark.
+
+use super::worlds::WorldFlags;
+use super::{learned, make_folder, write};
+use agent::agent::AgentError;
+use agent::arena::Arena;
+use agent::compare::{Comparison, Moment, Results, compare};
+use agent::config::AgentFlags;
+use agent::policy::{EstimatorKind, PlannerKind, Policy};
+use agent::report::{
+    Snapshot, draw_ladder, draw_rewards, draw_snapshot, figures::FIRE_CELLS_PER_STEP, render_table,
+    write_csv,
+};
+use anyhow::{Context, Result, ensure};
+use clap::Args;
+use indicatif::{ProgressBar, ProgressStyle};
+use protocol::Model;
+use std::path::{Path, PathBuf};
+
+/// Compare policies on the same worlds.
+#[derive(Args)]
+pub struct CompareCommand {
+    /// The policies, separated by commas [default: the ladder]
+    #[arg(long, value_delimiter = ',')]
+    policies: Vec<String>,
+    /// The policy that others are paired against
+    #[arg(long, default_value = "shooting_exploit")]
+    baseline: String,
+    /// What `train` learned: adds `learned_shooting` and `learned_beam` to the ladder
+    #[arg(long, value_name = "FILE")]
+    checkpoint: Option<PathBuf>,
+    /// Write one line per policy and world to this file
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
+    /// Draw ladder.png, rewards.png and snapshot.png into this directory
+    #[arg(long, value_name = "DIR")]
+    figures: Option<PathBuf>,
+    #[command(flatten)]
+    worlds: WorldFlags,
+    #[command(flatten)]
+    settings: AgentFlags,
+}
+
+impl CompareCommand {
+    /// Runs the comparison and writes what it gave.
+    pub fn run(&self) -> Result<()> {
+        let config = self.settings.effective()?;
+        self.make_places()?;
+        let learned = learned(self.checkpoint.as_deref())?;
+        let mut worlds = self.worlds.open(self.needs_scouts(), |model| {
+            self.policies(model).map(|_| ())
+        })?;
+        let arena = &mut worlds.arena;
+        let comparison = Comparison {
+            policies: self.policies(arena.model())?,
+            seeds: self.worlds.seeds.clone(),
+            steps: self.worlds.steps,
+            config,
+            learned,
+        };
+        let results = run_comparison(arena, &comparison)?;
+        write(&render_table(&results.runs, &self.baseline))?;
+        if let Some(path) = &self.csv {
+            write_csv(path, &results.runs)?;
+        }
+        if let Some(directory) = &self.figures {
+            self.draw(directory, arena, &comparison, &results)?;
+        }
+        Ok(())
+    }
+
+    fn draw(
+        &self,
+        directory: &Path,
+        arena: &mut Arena,
+        comparison: &Comparison,
+        results: &Results,
+    ) -> Result<()> {
+        let label = axis_label(arena.model());
+        draw_ladder(&directory.join("ladder.png"), &results.runs, &label)?;
+        let first = self.worlds.seeds.start;
+        draw_rewards(
+            &directory.join("rewards.png"),
+            &results.runs,
+            first,
+            &label,
+            Some(&results.fire_cells),
+        )?;
+        match &results.moment {
+            Some(moment) => draw_moment(&directory.join("snapshot.png"), arena, moment)?,
+            None => tracing::warn!("no snapshot: no policy among these has a belief of its own"),
+        }
+        let settings = toml::to_string(&comparison.config)?;
+        let path = directory.join("agent.toml");
+        std::fs::write(&path, settings).with_context(|| format!("write {}", path.display()))
+    }
+
+    /// Makes the folders of the files to come: better to fail before a long comparison than after.
+    fn make_places(&self) -> Result<()> {
+        if let Some(path) = &self.csv {
+            ensure!(
+                !path.is_dir(),
+                "--csv: expected a file, got the folder {}",
+                path.display()
+            );
+            let parent = path.parent().filter(|parent| *parent != Path::new(""));
+            parent.map_or(Ok(()), make_folder)?;
+        }
+        self.figures.as_deref().map_or(Ok(()), make_folder)
+    }
+
+    fn policies(&self, model: &Model) -> Result<Vec<Policy>> {
+        let named = |name: &String| Policy::named(name, model);
+        let policies = match self.policies.as_slice() {
+            [] => self.ladder(model),
+            names => names.iter().map(named).collect::<Result<_, _>>()?,
+        };
+        let twice = policies
+            .iter()
+            .enumerate()
+            .find(|(index, policy)| policies[..*index].contains(policy));
+        ensure!(
+            twice.is_none(),
+            "policies: expected each name once, got {:?} twice",
+            twice.map_or("", |(_, policy)| &policy.name)
+        );
+        named(&self.baseline).context("--baseline")?;
+        let unlearned = policies
+            .iter()
+            .find(|policy| policy.estimator == EstimatorKind::Learned && self.checkpoint.is_none());
+        if let Some(policy) = unlearned {
+            let policy = policy.name.clone();
+            return Err(AgentError::NeedsCheckpoint { policy }.into());
+        }
+        Ok(policies)
+    }
+
+    /// The ladder, with the policies on a learned belief if there is one.
+    fn ladder(&self, model: &Model) -> Vec<Policy> {
+        let mut ladder = Policy::ladder(model);
+        if self.checkpoint.is_some() {
+            let known = ladder
+                .iter()
+                .rposition(|policy| policy.estimator == EstimatorKind::KnownModel);
+            let at = known.map_or(ladder.len(), |last| last + 1);
+            let learned = [PlannerKind::Shooting, PlannerKind::Beam].map(Policy::learned);
+            ladder.splice(at..at, learned);
+        }
+        ladder
+    }
+
+    fn needs_scouts(&self) -> bool {
+        self.policies.is_empty()
+            || self
+                .policies
+                .iter()
+                .any(|name| name.starts_with("clairvoyant"))
+    }
+}
+
+/// Runs a comparison with a bar that shows how far it is.
+pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Result<Results> {
+    let n_seeds = comparison.seeds.end - comparison.seeds.start;
+    let n_steps = comparison.policies.len() as u64 * n_seeds * comparison.steps;
+    let bar = progress_bar(n_steps);
+    let results = compare(arena, comparison, &|policy, steps| {
+        if bar.message() != policy {
+            if bar.is_hidden() {
+                tracing::info!(policy, done = bar.position(), of = n_steps, "comparing");
+            }
+            bar.set_message(policy.to_owned());
+        }
+        bar.inc(steps);
+    });
+    bar.finish_and_clear();
+    Ok(results?)
+}
+
+fn draw_moment(path: &Path, arena: &mut Arena, moment: &Moment) -> Result<()> {
+    let Some(observation) = arena.full_observation(moment.seed, moment.step)? else {
+        tracing::warn!(
+            "no snapshot: it needs one world more than the seeds and a server with --coverage client"
+        );
+        return Ok(());
+    };
+    let model = arena.model().clone();
+    let snapshot = Snapshot {
+        model: &model,
+        truth: moment.truth.clone(),
+        observation,
+        frame: moment.frame.clone(),
+        path_cells: moment.path_cells.clone(),
+        belief: moment.belief.probabilities(),
+        step: moment.step,
+        seed: moment.seed,
+    };
+    Ok(draw_snapshot(path, &snapshot)?)
+}
+
+fn axis_label(model: &Model) -> String {
+    let target = &model.file().states[model.target_state()].name;
+    let pays_one = (0..model.n_states())
+        .all(|state| model.reward()[state] == f64::from(u8::from(state == model.target_state())));
+    match (target.as_str(), pays_one) {
+        ("fire", true) => FIRE_CELLS_PER_STEP.into(),
+        (name, true) => format!("distinct {name} cells found per step"),
+        (_, false) => "reward per step".into(),
+    }
+}
+
+fn progress_bar(n_steps: u64) -> ProgressBar {
+    let style = "{msg:22} [{bar:32}] {percent:>3} %  {per_sec:.0}  {eta_precise} left";
+    let style = ProgressStyle::with_template(style).expect("invariant: the template is valid");
+    ProgressBar::new(n_steps).with_style(style.progress_chars("=> "))
+}

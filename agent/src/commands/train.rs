@@ -1,0 +1,118 @@
+//! `train`: learns a model while acting.
+
+use super::make_folder;
+use super::worlds::GridFlags;
+use agent::config::AgentFlags;
+use agent::launch::OwnServer;
+use agent::train::{Training, train};
+use anyhow::{Context, Result, ensure};
+use clap::Args;
+use protocol::channels::Instance;
+use protocol::program::stop_on_signals;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// First seed of the worlds to train on; those below are for tests.
+const TRAINING_SEED: u64 = 1000;
+
+/// Learn a model while acting on a server's worlds.
+#[derive(Args)]
+pub struct TrainCommand {
+    /// Act on this running server; without it, one is started and stopped
+    #[arg(long)]
+    instance: Option<String>,
+    /// The first world to act on
+    #[arg(long, default_value_t = 0)]
+    world: u32,
+    /// Number of worlds to act on at once
+    #[arg(long, default_value_t = 16, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    worlds: u32,
+    /// World steps to act for, of all worlds together; 0: until stopped
+    #[arg(long, default_value_t = 0)]
+    steps: u64,
+    /// Seconds to act for
+    #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
+    time_limit: Option<Duration>,
+    /// Folder for checkpoint.safetensors and metrics.csv
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Go on from the folder's checkpoint, with an empty replay
+    #[arg(long)]
+    resume: bool,
+    /// Act on the checkpoint's parameters without learning
+    #[arg(long, requires = "resume")]
+    freeze: bool,
+    /// Take the worlds from their holder
+    #[arg(long)]
+    takeover: bool,
+    /// The server's program, if it is not beside this one
+    #[arg(long, value_name = "PROGRAM", conflicts_with = "instance")]
+    server: Option<PathBuf>,
+    /// First seed of the worlds of the server that is started
+    #[arg(long, default_value_t = TRAINING_SEED, conflicts_with = "instance")]
+    seed: u64,
+    /// Burn-in of the server that is started
+    #[arg(long, default_value_t = 25_000, conflicts_with = "instance")]
+    burn_in: u64,
+    #[command(flatten)]
+    grid: GridFlags,
+    #[command(flatten)]
+    settings: AgentFlags,
+}
+
+impl TrainCommand {
+    /// Trains until done or told to stop.
+    pub fn run(&self) -> Result<()> {
+        let config = self.settings.effective()?;
+        let last = self.world.checked_add(self.worlds);
+        let last = last.context("--world: expected a world that a server may have")?;
+        make_folder(&self.out)?;
+        let stop = stop_on_signals().context("handle signals")?;
+        let (instance, _own) = self.server()?;
+        let training = Training {
+            instance,
+            worlds: self.world..last,
+            takeover: self.takeover,
+            steps: self.steps,
+            time_limit: self.time_limit,
+            out: self.out.clone(),
+            resume: self.resume,
+            freeze: self.freeze,
+            config,
+        };
+        let summary = train(&training, &stop)?;
+        let mean_reward = summary.reward / summary.steps.max(1) as f64;
+        tracing::info!(
+            steps = summary.steps,
+            updates = summary.updates,
+            mean_reward,
+            learning_seconds = summary.learning.as_secs_f64(),
+            "saved"
+        );
+        Ok(())
+    }
+
+    /// The server, and itself if it was started: dropped, it stops.
+    fn server(&self) -> Result<(Instance, Option<OwnServer>)> {
+        if let Some(name) = &self.instance {
+            return Ok((Instance::new(name)?, None));
+        }
+        self.grid.check()?;
+        ensure!(
+            self.world == 0,
+            "--world: expected 0 on a server of its own, got {}",
+            self.world
+        );
+        let mut arguments = self.grid.arguments(self.worlds, self.seed, self.burn_in);
+        // The learner does not look, and it could not.
+        arguments.extend(["--reveal-model", "false"].map(String::from));
+        let server = OwnServer::start(self.server.clone(), &arguments)?;
+        Ok((server.instance().clone(), Some(server)))
+    }
+}
+
+fn parse_seconds(text: &str) -> Result<Duration, String> {
+    let seconds: f64 = text.parse().map_err(|_| "expected seconds, such as 60")?;
+    let limit = Duration::try_from_secs_f64(seconds);
+    limit.map_err(|error| format!("expected seconds, such as 60: {error}"))
+}

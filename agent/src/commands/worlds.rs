@@ -1,0 +1,138 @@
+//! The worlds that policies meet: a running server's, or a private one's.
+
+use super::model_named;
+use agent::arena::{Arena, MAX_BATCH};
+use agent::launch::OwnServer;
+use anyhow::{Result, ensure};
+use clap::Args;
+use protocol::channels::Instance;
+use protocol::{Model, Shape};
+use std::ops::Range;
+use std::path::PathBuf;
+
+/// Most worlds of a comparison.
+const MAX_SEEDS: u64 = 100_000;
+
+/// Burn-in of the benchmark, steps.
+const BENCHMARK_BURN_IN: u64 = 25_000;
+
+/// Flags that say which worlds.
+#[derive(Debug, Args)]
+pub struct WorldFlags {
+    /// Use the worlds of this running server; without it, one is started and stopped
+    #[arg(long)]
+    instance: Option<String>,
+    /// World seeds, first..end
+    #[arg(long, value_parser = parse_seeds, default_value = "0..8")]
+    pub seeds: Range<u64>,
+    /// Scored steps of each world
+    #[arg(long, default_value_t = 1500, value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
+    pub steps: u64,
+    /// Steps simulated before the first scored one [default: 25000, or the running server's]
+    #[arg(long)]
+    burn_in: Option<u64>,
+    /// The server's program, if it is not beside this one
+    #[arg(long, value_name = "PROGRAM", conflicts_with = "instance")]
+    server: Option<PathBuf>,
+    #[command(flatten)]
+    grid: GridFlags,
+}
+
+/// Flags of a server that is started.
+#[derive(Debug, Args)]
+pub struct GridFlags {
+    /// `wildfire` or a model file, for the server that is started
+    #[arg(long, default_value = "wildfire", conflicts_with = "instance")]
+    model: String,
+    /// Grid height in cells, for the server that is started
+    #[arg(long, default_value_t = 64, conflicts_with = "instance")]
+    height: usize,
+    /// Grid width in cells, for the server that is started
+    #[arg(long, default_value_t = 64, conflicts_with = "instance")]
+    width: usize,
+    /// Moves in a path, for the server that is started
+    #[arg(long, default_value_t = 64, conflicts_with = "instance")]
+    moves: usize,
+}
+
+/// Worlds, and the server that was started for them: dropped, it stops.
+pub struct Worlds {
+    /// The worlds.
+    pub arena: Arena,
+    _own: Option<OwnServer>,
+}
+
+impl WorldFlags {
+    /// Attaches to the server or starts one. `check` refuses what cannot be right before that.
+    pub fn open(&self, needs_scouts: bool, check: impl Fn(&Model) -> Result<()>) -> Result<Worlds> {
+        let (instance, own) = match &self.instance {
+            Some(name) => (Instance::new(name)?, None),
+            None => {
+                check(&self.grid.check()?)?;
+                let arguments = self.server_arguments(needs_scouts);
+                let server = OwnServer::start(self.server.clone(), &arguments)?;
+                (server.instance().clone(), Some(server))
+            }
+        };
+        let arena = Arena::open(&instance, self.n_seeds(), needs_scouts)?;
+        let got = arena.info().burn_in;
+        let asked = self.burn_in.unwrap_or(got);
+        ensure!(
+            asked == got,
+            "--burn-in: expected the running server's {got}, got {asked}"
+        );
+        Ok(Worlds { arena, _own: own })
+    }
+
+    /// Number of worlds.
+    pub fn n_seeds(&self) -> u32 {
+        (self.seeds.end - self.seeds.start) as u32
+    }
+
+    fn server_arguments(&self, needs_scouts: bool) -> Vec<String> {
+        let batch = self.n_seeds().min(MAX_BATCH);
+        let worlds = batch * if needs_scouts { 2 } else { 1 } + 1;
+        let burn_in = self.burn_in.unwrap_or(BENCHMARK_BURN_IN);
+        let mut arguments = self.grid.arguments(worlds, self.seeds.start, burn_in);
+        let rest = ["--coverage", "client", "--publish-truth"];
+        arguments.extend(rest.map(String::from));
+        arguments
+    }
+}
+
+impl GridFlags {
+    /// The model, if it can be simulated on the grid.
+    pub fn check(&self) -> Result<Model> {
+        let model = model_named(&self.model)?;
+        model.check_on(Shape::new(self.height, self.width)?)?;
+        Ok(model)
+    }
+
+    /// The flags of a server with these worlds.
+    pub fn arguments(&self, worlds: u32, seed: u64, burn_in: u64) -> Vec<String> {
+        let settings = [
+            ("--worlds", worlds.to_string()),
+            ("--model", self.model.clone()),
+            ("--height", self.height.to_string()),
+            ("--width", self.width.to_string()),
+            ("--moves", self.moves.to_string()),
+            ("--seed", seed.to_string()),
+            ("--burn-in", burn_in.to_string()),
+        ];
+        let pairs = settings.into_iter();
+        pairs
+            .flat_map(|(flag, value)| [flag.to_owned(), value])
+            .collect()
+    }
+}
+
+fn parse_seeds(text: &str) -> Result<Range<u64>, String> {
+    let parsed = text
+        .split_once("..")
+        .and_then(|(first, end)| Some(first.parse().ok()?..end.parse().ok()?));
+    let seeds: Range<u64> = parsed.ok_or("expected FIRST..END, such as 0..8")?;
+    if seeds.start < seeds.end && seeds.end - seeds.start <= MAX_SEEDS {
+        return Ok(seeds);
+    }
+    Err(format!("expected 1 to {MAX_SEEDS} seeds, FIRST below END"))
+}

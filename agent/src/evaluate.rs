@@ -1,0 +1,206 @@
+//! How well a learned belief predicts what robots see, beside the known model's and none.
+//!
+//! Both filters are fed the same frames, of paths that neither, or the known-model one, chose. What
+//! is scored is each frame's log-likelihood per visited cell under the prediction made before it.
+
+use crate::agent::{Agent, AgentError, Task};
+use crate::arena::{Arena, ArenaError};
+use crate::belief::Belief;
+use crate::client::Observation;
+use crate::compare::planner_seed;
+use crate::config::AgentConfig;
+use crate::learner::Learned;
+use crate::policy::{PlannerKind, Policy, UnknownPolicy};
+use crate::scoring::{Score, score};
+use ndarray::Array2;
+use protocol::Move;
+use protocol::model::ModelError;
+use rayon::prelude::*;
+use std::ops::Range;
+use thiserror::Error;
+
+/// What is scored.
+#[derive(Debug, Clone)]
+pub struct Examination<'a> {
+    /// Chooses the paths: its name.
+    pub guide: &'a str,
+    /// The worlds.
+    pub seeds: Range<u64>,
+    /// Steps of each world.
+    pub steps: u64,
+    /// Settings of planners and estimators.
+    pub config: &'a AgentConfig,
+    /// What was learned.
+    pub learned: &'a Learned,
+}
+
+/// Scores on one world.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Marks {
+    /// The world.
+    pub seed: u64,
+    /// Of the known-model filter.
+    pub known: Score,
+    /// Of the learned one.
+    pub learned: Score,
+    /// How often each value was seen.
+    pub counts: Vec<u64>,
+}
+
+/// Why an examination failed.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ExaminationError {
+    /// The worlds.
+    #[error(transparent)]
+    Arena(#[from] ArenaError),
+    /// An agent.
+    #[error(transparent)]
+    Agent(#[from] AgentError),
+    /// The guide.
+    #[error(transparent)]
+    Policy(#[from] UnknownPolicy),
+    /// The model.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+}
+
+/// Flies the guide's paths and scores both filters on every frame.
+///
+/// # Errors
+/// [`ExaminationError`].
+pub fn examine(
+    arena: &mut Arena,
+    examination: &Examination<'_>,
+) -> Result<Vec<Marks>, ExaminationError> {
+    let config = examination.config;
+    let prior = config.prior(arena.info().burn_in);
+    let prior = prior.belief(arena.model(), arena.shape(), config.seed)?;
+    let seeds: Vec<u64> = examination.seeds.clone().collect();
+    let mut marks = Vec::new();
+    for batch in seeds.chunks(arena.batch_size()) {
+        let (observations, _) = arena.reset(batch)?;
+        let examinees = batch.iter().zip(observations);
+        let examinee = |(&seed, observation): (&u64, Observation)| {
+            Examinee::new(arena, examination, &prior, seed, observation)
+        };
+        let mut examinees: Vec<Examinee> = examinees.map(examinee).collect::<Result<_, _>>()?;
+        for step in 0..examination.steps {
+            let plan = |examinee: &mut Examinee| examinee.plan(step);
+            let paths: Vec<Vec<Move>> = examinees.par_iter_mut().map(plan).collect();
+            let (observations, _) = arena.step(batch, &paths, step + 1)?;
+            let seen = examinees.par_iter_mut().zip(observations);
+            seen.try_for_each(|(examinee, observation)| examinee.take_in(observation))?;
+        }
+        marks.extend(examinees.into_iter().map(|examinee| examinee.marks));
+    }
+    Ok(marks)
+}
+
+/// Score of telling each cell alike the frequencies with which values were seen in all worlds, with
+/// hindsight.
+pub fn score_of_frequencies(all: &[Marks], counts: &[u64]) -> Score {
+    let total = |value: usize| all.iter().map(|marks| marks.counts[value]).sum::<u64>();
+    let totals: Vec<u64> = (0..counts.len()).map(total).collect();
+    let sum: u64 = totals.iter().sum();
+    let mut score = Score::default();
+    for (&count, &total) in counts.iter().zip(&totals).filter(|(count, _)| **count > 0) {
+        score.log_likelihood += count as f64 * (total as f64 / sum as f64).ln();
+        score.n_seen += count;
+    }
+    score
+}
+
+/// Two filters on one world, and who chooses the paths.
+struct Examinee {
+    guide: Agent,
+    known: Agent,
+    learned: Agent,
+    likelihoods: [Array2<f64>; 2],
+    observation: Observation,
+    marks: Marks,
+}
+
+impl Examinee {
+    fn new(
+        arena: &Arena,
+        examination: &Examination<'_>,
+        prior: &Belief,
+        seed: u64,
+        observation: Observation,
+    ) -> Result<Self, ExaminationError> {
+        let model = arena.model();
+        let agent = |policy: &Policy| {
+            let task = Task {
+                model,
+                shape: arena.shape(),
+                n_moves: arena.info().n_moves,
+                prior,
+                seed: planner_seed(examination.config, seed),
+                learned: Some(examination.learned),
+            };
+            Agent::new(policy, examination.config, task)
+        };
+        let mut examinee = Self {
+            guide: agent(&Policy::named(examination.guide, model)?)?,
+            known: agent(&Policy::named("beam_exploit", model)?)?,
+            learned: agent(&Policy::learned(PlannerKind::Beam))?,
+            likelihoods: [
+                model.likelihood().clone(),
+                examination.learned.tables.likelihood_array(),
+            ],
+            marks: Marks {
+                seed,
+                known: Score::default(),
+                learned: Score::default(),
+                counts: vec![0; model.n_observations()],
+            },
+            observation,
+        };
+        examinee.filter()?;
+        Ok(examinee)
+    }
+
+    fn plan(&mut self, step: u64) -> Vec<Move> {
+        self.guide.plan(self.observation.robot(), step).moves
+    }
+
+    fn take_in(&mut self, observation: Observation) -> Result<(), AgentError> {
+        self.observation = observation;
+        let frame = &self.observation.frame;
+        let [known, learned] = &self.likelihoods;
+        self.marks.known += score(self.known.belief(), known, frame);
+        self.marks.learned += score(self.learned.belief(), learned, frame);
+        for (_, value) in frame.observed() {
+            self.marks.counts[usize::from(value)] += 1;
+        }
+        self.filter()
+    }
+
+    fn filter(&mut self) -> Result<(), AgentError> {
+        for agent in [&mut self.guide, &mut self.known, &mut self.learned] {
+            agent.correct(&self.observation.frame, None)?;
+            agent.predict();
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frequencies_score_the_entropy_of_what_was_seen() {
+        let marks = |counts: [u64; 3]| Marks {
+            seed: 0,
+            known: Score::default(),
+            learned: Score::default(),
+            counts: counts.to_vec(),
+        };
+        let all = [marks([3, 0, 1]), marks([1, 0, 3])];
+        let score = score_of_frequencies(&all, &all[0].counts);
+        assert_eq!(score.n_seen, 4);
+        assert!((score.mean() - 0.5_f64.ln()).abs() < 1e-12);
+    }
+}

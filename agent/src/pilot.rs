@@ -1,0 +1,101 @@
+//! One world's robot while a model is learned: plans on the learned belief and keeps it. Pure.
+
+use crate::client::Observation;
+use crate::compare::planner_seed;
+use crate::config::AgentConfig;
+use crate::estimator::{LearnedFilter, ZeroEvidence};
+use crate::learner::{Learned, Learner};
+use crate::planner::{Planner, PlanningProblem, Target};
+use crate::policy::{PlannerKind, Policy};
+use crate::scoring::{Score, score};
+use protocol::{Move, Shape};
+
+/// Acts on one world on a learned belief.
+pub struct Pilot {
+    /// The belief.
+    pub filter: LearnedFilter,
+    /// What the world shows.
+    pub observation: Observation,
+    walk: Box<dyn Planner + Send>,
+    beam: Box<dyn Planner + Send>,
+    seed: u64,
+}
+
+impl Pilot {
+    /// A pilot before it took in what the world shows.
+    pub fn new(
+        learned: &Learned,
+        shape: Shape,
+        observation: Observation,
+        config: &AgentConfig,
+    ) -> Self {
+        Self {
+            filter: LearnedFilter::new(&learned.tables, shape),
+            walk: config.planner(&Policy::learned(PlannerKind::RandomWalk)),
+            beam: config.planner(&Policy::learned(PlannerKind::Beam)),
+            seed: planner_seed(config, observation.result.seed),
+            observation,
+        }
+    }
+
+    /// Begins a track with the frame that the world shows.
+    ///
+    /// # Errors
+    /// [`ZeroEvidence`].
+    pub fn begin(&mut self, world: u32, learner: &mut Learner) -> Result<(), ZeroEvidence> {
+        learner.begin(world);
+        let frame = &self.observation.frame;
+        learner.see(world, self.filter.belief(), frame);
+        self.filter.correct(frame)?;
+        self.filter.predict();
+        Ok(())
+    }
+
+    /// The next path; `target`: the state that pays most.
+    pub fn plan(
+        &mut self,
+        kind: PlannerKind,
+        target: usize,
+        config: &AgentConfig,
+        n_moves: usize,
+    ) -> Vec<Move> {
+        let policy = Policy::learned(kind);
+        let mut objective = config.objective(&policy);
+        let planner = match kind {
+            PlannerKind::RandomWalk => &mut self.walk,
+            PlannerKind::Shooting | PlannerKind::Beam => {
+                objective.target = Target::State(target);
+                &mut self.beam
+            }
+        };
+        let values = objective.values(self.filter.belief());
+        let problem = PlanningProblem {
+            start: self.observation.robot(),
+            n_moves,
+            values: &values,
+            seed: self.seed,
+            step: self.observation.result.step,
+        };
+        planner.plan(&problem).moves
+    }
+
+    /// Scores the prediction of a frame, hands it to the learner and corrects the belief with it.
+    ///
+    /// # Errors
+    /// [`ZeroEvidence`].
+    pub fn take_in(
+        &mut self,
+        world: u32,
+        observation: Observation,
+        learner: &mut Learner,
+    ) -> Result<Score, ZeroEvidence> {
+        self.observation = observation;
+        let Observation { result, frame } = &self.observation;
+        let likelihood = self.filter.tables().likelihood_array();
+        let score = score(self.filter.belief(), &likelihood, frame);
+        learner.see(world, self.filter.belief(), frame);
+        self.filter.correct(frame)?;
+        learner.reward(self.filter.belief(), frame, result.reward);
+        Ok(score)
+    }
+}

@@ -1,0 +1,211 @@
+//! Recent frames of one or more worlds, in blocks that learners run through.
+//!
+//! A *track* is what one robot saw in one episode, without gaps. It is cut into blocks of equal
+//! length; a block keeps the belief before its first frame, which whoever runs through the block
+//! before it renews. Frames of a block that is not full yet are not replayed. The oldest blocks go
+//! when there is no room.
+
+use protocol::Frame;
+use std::collections::BTreeMap;
+
+/// One observed cell.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Sighting {
+    /// Row-major index of the cell.
+    pub cell: u32,
+    /// What was seen there.
+    pub value: u8,
+}
+
+/// Consecutive frames of one track.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Block {
+    /// What each frame shows.
+    pub frames: Vec<Vec<Sighting>>,
+    /// The belief before the first frame, shape `[S, H, W]`; `None` at the start of a track.
+    pub start: Option<Vec<f32>>,
+    /// The block that follows on its track.
+    next: u64,
+}
+
+/// Blocks of all tracks.
+#[derive(Debug, Clone)]
+pub struct Replay {
+    block_length: usize,
+    max_blocks: usize,
+    full: BTreeMap<u64, Block>,
+    /// The block that each world's frames go into, by world.
+    open: BTreeMap<u32, (u64, Block)>,
+    n_opened: u64,
+}
+
+impl Replay {
+    /// Room for `max_frames` frames, in blocks of `block_length`; for one block at least.
+    pub fn new(block_length: usize, max_frames: usize) -> Self {
+        Self {
+            block_length,
+            max_blocks: (max_frames / block_length).max(1),
+            full: BTreeMap::new(),
+            open: BTreeMap::new(),
+            n_opened: 0,
+        }
+    }
+
+    /// Begins a new track of a world; frames of its open block are dropped.
+    pub fn begin(&mut self, world: u32) {
+        let block = self.new_block(None);
+        self.open.insert(world, block);
+    }
+
+    /// Whether the world's next frame is the first of a block that needs a belief to start from.
+    pub fn wants_belief(&self, world: u32) -> bool {
+        let open = self.open.get(&world);
+        open.is_some_and(|(_, block)| {
+            block.frames.is_empty() && block.start.as_deref() == Some(&[])
+        })
+    }
+
+    /// Gives the belief that [`Self::wants_belief`] asks for.
+    pub fn give_belief(&mut self, world: u32, belief: &[f32]) {
+        if let Some((_, block)) = self.open.get_mut(&world) {
+            block.start = Some(belief.to_vec());
+        }
+    }
+
+    /// Adds the next frame of a world's track.
+    ///
+    /// # Panics
+    /// If the world's track was not begun.
+    pub fn push(&mut self, world: u32, frame: &Frame) {
+        let sighting = |(cell, value)| Sighting {
+            cell: cell as u32,
+            value,
+        };
+        let sightings = frame.observed().map(sighting).collect();
+        let (_, block) = self.open.get_mut(&world).expect("a track that was begun");
+        block.frames.push(sightings);
+        if block.frames.len() == self.block_length {
+            // An empty belief stands for one that is still to be given.
+            let following = self.new_block(Some(Vec::new()));
+            let next = following.0;
+            if let Some((id, mut block)) = self.open.insert(world, following) {
+                block.next = next;
+                self.full.insert(id, block);
+            }
+            while self.full.len() > self.max_blocks {
+                self.full.pop_first();
+            }
+        }
+    }
+
+    /// Number of full blocks.
+    pub fn n_blocks(&self) -> usize {
+        self.full.len()
+    }
+
+    /// Numbers of the full blocks, oldest first.
+    pub fn blocks(&self) -> impl Iterator<Item = u64> + '_ {
+        self.full.keys().copied()
+    }
+
+    /// A full block that is still there.
+    pub fn block(&self, number: u64) -> Option<&Block> {
+        self.full.get(&number)
+    }
+
+    /// Hands the belief at the end of a block on to the block after it.
+    pub fn hand_on(&mut self, number: u64, belief: &[f32]) {
+        let Some(next) = self.full.get(&number).map(|block| block.next) else {
+            return;
+        };
+        if let Some(block) = self.full.get_mut(&next) {
+            block.start = Some(belief.to_vec());
+        }
+    }
+
+    fn new_block(&mut self, start: Option<Vec<f32>>) -> (u64, Block) {
+        let number = self.n_opened;
+        self.n_opened += 1;
+        let block = Block {
+            frames: Vec::with_capacity(self.block_length),
+            start,
+            next: u64::MAX,
+        };
+        (number, block)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::Shape;
+
+    fn frame(value: u8) -> Frame {
+        let shape = Shape::new(1, 3).expect("test shape");
+        Frame::from_bytes(shape, 9, &[255, value, 255]).expect("test frame")
+    }
+
+    /// A replay with blocks of 2 and room for 3, and two worlds' frames in turn.
+    fn replay(n_frames: u8) -> Replay {
+        let mut replay = Replay::new(2, 7);
+        replay.begin(0);
+        replay.begin(5);
+        for value in 0..n_frames {
+            for world in [0, 5] {
+                if replay.wants_belief(world) {
+                    replay.give_belief(world, &[f32::from(value)]);
+                }
+                replay.push(world, &frame(value));
+            }
+        }
+        replay
+    }
+
+    #[test]
+    fn frames_come_back_in_blocks_of_their_world() {
+        let replay = replay(3);
+        assert_eq!(replay.blocks().collect::<Vec<_>>(), [0, 1]);
+        let block = replay.block(1).expect("kept");
+        let seen = |value| vec![Sighting { cell: 1, value }];
+        assert_eq!(block.frames, [seen(0), seen(1)]);
+        assert_eq!(block.start, None);
+        assert_eq!(replay.block(2), None, "not full");
+    }
+
+    #[test]
+    fn old_blocks_go_when_there_is_no_room() {
+        let replay = replay(6);
+        assert_eq!(replay.blocks().collect::<Vec<_>>(), [3, 4, 5]);
+    }
+
+    #[test]
+    fn beliefs_are_handed_on_along_a_track() {
+        let mut replay = replay(4);
+        assert_eq!(replay.block(2).expect("kept").start, Some(vec![2.0]));
+        replay.hand_on(1, &[9.0]);
+        assert_eq!(
+            replay.block(2).map(|block| block.start.clone()),
+            Some(Some(vec![2.0]))
+        );
+        assert_eq!(
+            replay.block(3).map(|block| block.start.clone()),
+            Some(Some(vec![9.0]))
+        );
+        replay.hand_on(2, &[8.0]); // the block after it is not full: nobody to hand on to
+        replay.hand_on(77, &[8.0]);
+    }
+
+    #[test]
+    fn a_new_track_drops_what_was_not_full() {
+        let mut replay = replay(3);
+        replay.begin(0);
+        assert!(!replay.wants_belief(0));
+        replay.push(0, &frame(7));
+        replay.push(0, &frame(8));
+        let last = replay.blocks().last().and_then(|last| replay.block(last));
+        assert_eq!(
+            last.map(|block| (block.frames.len(), block.start.clone())),
+            Some((2, None))
+        );
+    }
+}

@@ -1,0 +1,265 @@
+//! The learned filter against the known-model filter, finite differences and itself.
+
+use agent::Belief;
+use agent::config::LearningConfig;
+use agent::estimator::learned_filter::window::{Start, Window};
+use agent::estimator::learned_filter::{Dimensions, Parameters, Tables, Trainer, Update};
+use agent::estimator::{Filter, LearnedFilter};
+use agent::replay::{Replay, Sighting};
+use protocol::randomness::split_mix;
+use protocol::{Frame, Model, Shape};
+
+/// What a few cells of a made-up world show: no two frames see the same cells.
+fn sightings(shape: Shape, n_observations: usize, frame: u64) -> Vec<Sighting> {
+    let n_cells = shape.n_cells() as u64;
+    let mut cells: Vec<u64> = (0..6).map(|n| split_mix(frame, n) % n_cells).collect();
+    cells.sort_unstable();
+    cells.dedup();
+    let sighting = |cell: u64| Sighting {
+        cell: cell as u32,
+        value: (split_mix(cell, frame / 100) % n_observations as u64) as u8,
+    };
+    cells.into_iter().map(sighting).collect()
+}
+
+fn frame(shape: Shape, n_observations: usize, number: u64) -> Frame {
+    let mut frame = Frame::empty(shape);
+    for seen in sightings(shape, n_observations, number) {
+        frame.observe(seen.cell as usize, seen.value);
+    }
+    frame
+}
+
+fn belief(n_states: usize, shape: Shape, seed: u64) -> Vec<f32> {
+    let number = |index: usize| 0.1 + (split_mix(seed, index as u64) >> 40) as f32 / 2e7;
+    let n_cells = shape.n_cells();
+    let mut belief: Vec<f32> = (0..n_states * n_cells).map(number).collect();
+    for cell in 0..n_cells {
+        let sum: f32 = (0..n_states)
+            .map(|state| belief[state * n_cells + cell])
+            .sum();
+        (0..n_states).for_each(|state| belief[state * n_cells + cell] /= sum);
+    }
+    belief
+}
+
+#[test]
+fn with_the_true_parameters_it_is_the_known_model_filter() {
+    let road_ice = include_str!("../../config/models/road-ice.toml");
+    let models = [
+        Model::wildfire(),
+        Model::from_toml(road_ice).expect("valid"),
+    ];
+    for model in models {
+        for (height, width) in [(1, 1), (5, 9), (20, 33), (64, 64)] {
+            let shape = Shape::new(height, width).expect("test shape");
+            let prior = Belief::uniform(model.n_states(), shape);
+            let mut known = Filter::new(&model, prior.clone()).expect("valid model");
+            let mut learned = LearnedFilter::with_prior(&Tables::of_model(&model), prior);
+            for number in 0..30 {
+                let frame = frame(shape, model.n_observations(), number);
+                known.correct(&frame).expect("possible");
+                learned.correct(&frame).expect("possible");
+                known.predict();
+                learned.predict();
+            }
+            let pairs = known
+                .belief()
+                .as_slice()
+                .iter()
+                .zip(learned.belief().as_slice());
+            let most = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            // 30 steps of roundings of 6e-8.
+            assert!(most < 1e-5, "{} on {shape}: {most}", model.name());
+        }
+    }
+}
+
+/// `-log_likelihood` and its derivatives in f64.
+fn evaluate(
+    tables: &Tables<f64>,
+    shape: Shape,
+    start: Start<'_>,
+    frames: &[Vec<Sighting>],
+) -> (f64, [Vec<f64>; 3]) {
+    let mut window = Window::new(tables.clone(), shape, frames.len());
+    let mut end = vec![0.0; tables.dimensions.n_states * shape.n_cells()];
+    let outcome = window.run(start, frames, &mut end);
+    (-outcome.log_likelihood, outcome.gradient)
+}
+
+fn tensor(tables: &mut Tables<f64>, index: usize) -> &mut Vec<f64> {
+    match index {
+        0 => &mut tables.kernel,
+        1 => &mut tables.likelihood,
+        _ => &mut tables.initial,
+    }
+}
+
+fn check_gradients(dimensions: Dimensions, size: (usize, usize), from_belief: bool) {
+    let shape = Shape::new(size.0, size.1).expect("test shape");
+    let tables: Tables<f64> = Parameters::first(dimensions, 11).tables();
+    let frames: Vec<_> = (0..5)
+        .map(|number| sightings(shape, dimensions.n_observations, number))
+        .collect();
+    let belief = belief(dimensions.n_states, shape, 4);
+    let start = match from_belief {
+        true => Start::Belief(&belief),
+        false => Start::Initial,
+    };
+    let (_, gradient) = evaluate(&tables, shape, start, &frames);
+    for (which, gradient) in gradient.iter().enumerate() {
+        if which == 2 && from_belief {
+            assert!(
+                gradient.iter().all(|&slope| slope == 0.0),
+                "no first belief here"
+            );
+            continue;
+        }
+        for (entry, &got) in gradient.iter().enumerate() {
+            let moved = |by: f64| {
+                let mut moved = tables.clone();
+                tensor(&mut moved, which)[entry] += by;
+                evaluate(&moved, shape, start, &frames).0
+            };
+            // Central differences: the error is of the order of the square of the step, 1e-10.
+            let difference = (moved(1e-5) - moved(-1e-5)) / 2e-5;
+            let close = (got - difference).abs() <= 1e-6 * difference.abs().max(1.0);
+            assert!(
+                close,
+                "{dimensions:?} {size:?} {which} {entry}: {got}, not {difference}"
+            );
+        }
+    }
+}
+
+#[test]
+fn every_gradient_agrees_with_finite_differences() {
+    let dimensions = |n_states, n_observations, kernel| Dimensions {
+        n_states,
+        n_observations,
+        kernel,
+    };
+    for from_belief in [false, true] {
+        check_gradients(dimensions(3, 3, (3, 3)), (6, 7), from_belief);
+        check_gradients(dimensions(2, 3, (1, 5)), (4, 19), from_belief);
+        check_gradients(dimensions(4, 2, (5, 3)), (9, 70), from_belief);
+        check_gradients(dimensions(7, 4, (3, 1)), (3, 2), from_belief);
+    }
+}
+
+#[test]
+fn a_window_ends_with_the_filters_prediction() {
+    let shape = Shape::new(7, 18).expect("test shape");
+    let dimensions = Dimensions {
+        n_states: 3,
+        n_observations: 3,
+        kernel: (3, 3),
+    };
+    let tables: Tables = Parameters::first(dimensions, 2).tables();
+    let mut filter = LearnedFilter::new(&tables, shape);
+    let mut window = Window::new(tables, shape, 8);
+    let frames: Vec<_> = (0..8).map(|number| sightings(shape, 3, number)).collect();
+    let mut end = vec![0.0; 3 * shape.n_cells()];
+    window.run(Start::Initial, &frames, &mut end);
+    for number in 0..8 {
+        filter.correct(&frame(shape, 3, number)).expect("possible");
+        filter.predict();
+    }
+    let most = filter.belief().as_slice().iter().zip(&end);
+    let most = most.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(most < 1e-6, "{most}");
+}
+
+fn config() -> LearningConfig {
+    LearningConfig {
+        window: 4,
+        streams: 5,
+        block_windows: 2,
+        ..LearningConfig::default()
+    }
+}
+
+/// A replay of two worlds with enough blocks for [`config`].
+fn replay(shape: Shape, n_frames: u64) -> Replay {
+    let mut replay = Replay::new(8, 1000);
+    for world in 0..2 {
+        replay.begin(world);
+        for number in 0..n_frames {
+            if replay.wants_belief(world) {
+                replay.give_belief(world, &belief(3, shape, number));
+            }
+            replay.push(world, &frame(shape, 3, number * 2 + u64::from(world)));
+        }
+    }
+    replay
+}
+
+fn trainer(shape: Shape, seed: u64) -> Trainer {
+    let dimensions = Dimensions {
+        n_states: 3,
+        n_observations: 3,
+        kernel: (3, 3),
+    };
+    Trainer::new(Parameters::first(dimensions, seed), shape, config(), seed)
+}
+
+fn updates(n: usize, seed: u64) -> (Vec<Update>, Parameters) {
+    let shape = Shape::new(10, 12).expect("test shape");
+    let (mut trainer, mut replay) = (trainer(shape, seed), replay(shape, 40));
+    let update = |_| trainer.update(&mut replay, Some(2)).expect("finite");
+    let updates: Vec<Update> = (0..n)
+        .map(update)
+        .map(|update| update.expect("full"))
+        .collect();
+    (updates, trainer.parameters().clone())
+}
+
+#[test]
+fn training_repeats_bit_for_bit_on_any_number_of_threads() {
+    let on = |n_threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(n_threads)
+            .build();
+        pool.expect("threads").install(|| updates(30, 1))
+    };
+    let (one, two) = (on(1), on(2));
+    assert_eq!(one, two);
+    assert_eq!(one, on(1));
+    assert_ne!(one.0, updates(30, 2).0, "another seed");
+}
+
+#[test]
+fn training_lowers_the_loss() {
+    let (updates, _) = updates(200, 3);
+    let mean = |part: &[Update]| part.iter().map(|u| u.loss).sum::<f64>() / part.len() as f64;
+    let (before, after) = (mean(&updates[..20]), mean(&updates[180..]));
+    assert!(after < before - 0.1, "{before} {after}");
+}
+
+#[test]
+fn training_waits_for_a_block_for_each_stream() {
+    let shape = Shape::new(10, 12).expect("test shape");
+    let mut replay = replay(shape, 16); // 4 blocks
+    let update = trainer(shape, 0).update(&mut replay, None);
+    assert_eq!(update, Ok(None));
+}
+
+#[test]
+fn a_number_that_is_not_finite_stops_training_by_name() {
+    let shape = Shape::new(10, 12).expect("test shape");
+    let mut parameters = trainer(shape, 0).parameters().clone();
+    parameters.tensors[1][4] = f32::NAN;
+    let before = format!("{parameters:?}");
+    let mut trainer = Trainer::new(parameters, shape, config(), 0);
+    let error = trainer
+        .update(&mut replay(shape, 40), None)
+        .expect_err("NaN");
+    let words = "update 1: likelihood: expected finite numbers, got a parameter that is not";
+    assert_eq!(error.to_string(), words);
+    assert_eq!(
+        format!("{:?}", trainer.parameters()),
+        before,
+        "changed nothing"
+    );
+}

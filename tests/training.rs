@@ -1,0 +1,307 @@
+//! `emberwatch-agent train` and what becomes of its checkpoints.
+
+use crate::commands::{AGENT, check, check_table};
+use crate::harness::{Ended, Program, SMALL, Server, eventually, run};
+use rustix::process::Signal;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+use tempfile::TempDir;
+
+/// How long a small training may take.
+const LIMIT: Duration = Duration::from_secs(60);
+
+/// A private server with small worlds.
+const WORLDS: &str = "--worlds 2 --height 6 --width 9 --moves 5 --burn-in 60";
+
+/// Settings with which learning starts after 16 world steps of two worlds.
+const SETTINGS: &str = "[learning]
+window = 2
+streams = 4
+block_windows = 2
+explore_steps = 40
+updates_per_step = 1.0
+";
+
+struct Place {
+    folder: TempDir,
+}
+
+impl Place {
+    fn new() -> Self {
+        let folder = TempDir::new().expect("a folder");
+        std::fs::write(folder.path().join("agent.toml"), SETTINGS).expect("settings");
+        Self { folder }
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn checkpoint(&self, out: &str) -> PathBuf {
+        self.path(out).join("checkpoint.safetensors")
+    }
+
+    /// The command's words for training into a folder.
+    fn words(&self, out: &str, flags: &str) -> String {
+        let (config, out) = (self.path("agent.toml"), self.path(out));
+        format!(
+            "train --config {} --out {} {flags}",
+            config.display(),
+            out.display()
+        )
+    }
+
+    fn train(&self, out: &str, flags: &str) -> Ended {
+        agent(&self.words(out, flags))
+    }
+
+    fn rows(&self, out: &str) -> Vec<Vec<String>> {
+        let text = std::fs::read_to_string(self.path(out).join("metrics.csv"));
+        let text = text.expect("the metrics");
+        let mut lines = text.lines();
+        let header = "update,world_steps,loss,held_out_log_likelihood,mean_reward,rate";
+        assert_eq!(lines.next(), Some(header));
+        lines
+            .map(|line| line.split(',').map(String::from).collect())
+            .collect()
+    }
+}
+
+fn agent(words: &str) -> Ended {
+    let ended = run(AGENT, &words.split_whitespace().collect::<Vec<_>>(), LIMIT);
+    assert_eq!(ended.code, Some(0), "{words}: {}", ended.stderr);
+    ended
+}
+
+fn bytes(path: &Path) -> Vec<u8> {
+    std::fs::read(path).expect("a readable file")
+}
+
+#[test]
+fn the_same_seed_gives_the_same_losses_bit_for_bit() {
+    let place = Place::new();
+    for (out, seed) in [("a", 5), ("b", 5), ("c", 6)] {
+        place.train(out, &format!("{WORLDS} --steps 120 --agent-seed {seed}"));
+    }
+    let [a, b, c] = ["a", "b", "c"].map(|out| place.rows(out));
+    assert_eq!(a, b);
+    assert_ne!(a, c);
+    let losses: Vec<f64> = a.iter().filter_map(|row| row[2].parse().ok()).collect();
+    assert!(
+        losses.len() > 80 && losses.iter().all(|loss| loss.is_finite()),
+        "{losses:?}"
+    );
+    assert_eq!(a.last().map(|row| &*row[1]), Some("120"));
+}
+
+#[test]
+fn training_goes_on_from_its_checkpoint() {
+    let place = Place::new();
+    place.train("out", &format!("{WORLDS} --steps 60"));
+    let n_rows = place.rows("out").len();
+    let refused = place.words("out", &format!("{WORLDS} --steps 60"));
+    check(AGENT, &refused, &["--out", "expected --resume"]);
+    place.train("out", &format!("{WORLDS} --steps 60 --resume"));
+    let rows = place.rows("out");
+    assert_eq!(rows[n_rows][1], "62", "world steps go on");
+    let updates = |row: &Vec<String>| row[0].parse::<u64>().expect("a number");
+    assert_eq!(
+        updates(&rows[n_rows]),
+        updates(&rows[n_rows - 1]),
+        "an empty replay at first"
+    );
+    assert!(rows.last().map(updates) > rows.get(n_rows).map(updates));
+    assert_eq!(rows.last().map(|row| &*row[1]), Some("120"));
+}
+
+#[test]
+fn frozen_parameters_stay_as_they_are() {
+    let place = Place::new();
+    place.train("out", &format!("{WORLDS} --steps 80"));
+    let updates = place.rows("out").last().map(|row| row[0].clone());
+    place.train("out", &format!("{WORLDS} --steps 80 --resume --freeze"));
+    let rows = place.rows("out");
+    assert_eq!(rows.last().map(|row| row[0].clone()), updates);
+    assert!(
+        rows.last()
+            .is_some_and(|row| row[2].is_empty() && !row[3].is_empty())
+    );
+}
+
+#[test]
+fn a_signal_ends_training_with_a_checkpoint_and_a_free_world() {
+    for signal in [Signal::INT, Signal::TERM] {
+        let place = Place::new();
+        let server = Server::start(&format!("{SMALL} --worlds 2 --reveal-model false"));
+        let name = server.instance.name();
+        let words = place.words("out", &format!("--instance {name} --worlds 2"));
+        let program = Program::start(AGENT, &words.split_whitespace().collect::<Vec<_>>());
+        let acts = eventually(LIMIT, || server.status().n_steps > 40);
+        assert!(acts, "{}", program.stderr());
+        program.signal(signal);
+        let ended = program.wait(LIMIT);
+        assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+        assert!(place.checkpoint("out").is_file());
+        server.acquire(0..2);
+    }
+}
+
+#[test]
+fn a_server_that_dies_leaves_what_was_learned() {
+    let place = Place::new();
+    let server = Server::start(&format!("{SMALL} --worlds 2"));
+    let name = server.instance.name();
+    let words = place.words("out", &format!("--instance {name} --worlds 2"));
+    let program = Program::start(AGENT, &words.split_whitespace().collect::<Vec<_>>());
+    assert!(eventually(LIMIT, || server.status().n_steps > 40));
+    server.kill();
+    let ended = program.wait(LIMIT);
+    assert_eq!(ended.code, Some(1), "{}", ended.stderr);
+    assert!(!ended.stderr.contains("panicked"), "{}", ended.stderr);
+    assert!(place.checkpoint("out").is_file());
+}
+
+#[test]
+fn episodes_that_end_are_begun_anew() {
+    let place = Place::new();
+    let server = Server::start(&format!("{SMALL} --worlds 2 --max-steps 9"));
+    let name = server.instance.name();
+    place.train("out", &format!("--instance {name} --worlds 2 --steps 80"));
+    assert!(
+        server
+            .status()
+            .worlds
+            .iter()
+            .all(|world| world.info.step == 40 % 9)
+    );
+    assert!(
+        place
+            .rows("out")
+            .last()
+            .is_some_and(|row| !row[2].is_empty())
+    );
+}
+
+#[test]
+fn a_checkpoint_is_compared_and_evaluated() {
+    let place = Place::new();
+    place.train("out", &format!("{WORLDS} --steps 80"));
+    let checkpoint = place.checkpoint("out");
+    let checkpoint = checkpoint.display();
+    let worlds = "--seeds 3..5 --steps 5 --height 6 --width 9 --moves 5 --burn-in 60 \
+                  --beam-width 4 --shooting-samples 16";
+    let compared = agent(&format!("compare --checkpoint {checkpoint} {worlds}"));
+    let evaluated = agent(&format!("evaluate --checkpoint {checkpoint} {worlds}"));
+    for policy in ["learned_shooting", "learned_beam"] {
+        assert!(compared.stdout.contains(policy), "{}", compared.stdout);
+        assert!(evaluated.stdout.contains(policy), "{}", evaluated.stdout);
+    }
+    for row in ["class frequencies", "known-model filter", "learned - known"] {
+        assert!(evaluated.stdout.contains(row), "{}", evaluated.stdout);
+    }
+    let server = Server::start(SMALL);
+    let name = server.instance.name();
+    let flags = format!("--instance {name} --steps 5 --policy learned_beam");
+    agent(&format!("run {flags} --checkpoint {checkpoint}"));
+    check(
+        AGENT,
+        &format!("run {flags}"),
+        &["learned_beam", "--checkpoint FILE"],
+    );
+}
+
+#[test]
+fn a_checkpoint_that_does_not_fit_is_refused_by_name() {
+    let place = Place::new();
+    place.train("out", &format!("{WORLDS} --steps 40"));
+    let checkpoint = place.checkpoint("out");
+    let whole = bytes(&checkpoint);
+    let resume = place.words("out", &format!("{WORLDS} --steps 8 --resume"));
+    let settings = SETTINGS.replace("[learning]", "[learning]\nkernel = [5, 5]");
+    std::fs::write(place.path("agent.toml"), settings).expect("settings");
+    let shape = ["checkpoint.safetensors: kernel: expected shape [3, 3, 5, 5], got [3, 3, 3, 3]"];
+    check(AGENT, &resume, &shape);
+    let evaluate = format!(
+        "evaluate --checkpoint {} --seeds 0..1 --steps 1 --height 4 --width 4 --moves 2 --burn-in 1",
+        checkpoint.display()
+    );
+    std::fs::write(&checkpoint, &whole[..whole.len() / 2]).expect("cut");
+    check(
+        AGENT,
+        &resume,
+        &["checkpoint.safetensors", "damaged or cut off"],
+    );
+    check(
+        AGENT,
+        &evaluate,
+        &["checkpoint.safetensors", "damaged or cut off"],
+    );
+    let mut flipped = whole.clone();
+    *flipped.last_mut().expect("not empty") ^= 1;
+    std::fs::write(&checkpoint, flipped).expect("flipped");
+    check(
+        AGENT,
+        &resume,
+        &["checkpoint.safetensors", "expected contents with digest"],
+    );
+    std::fs::write(&checkpoint, "not a checkpoint").expect("written");
+    check(
+        AGENT,
+        &evaluate,
+        &["checkpoint.safetensors", "damaged or cut off"],
+    );
+}
+
+/// Flags of `train`, `evaluate` and `compare`, and the words of their refusal.
+const WRONG_FLAGS: &str = "
+train => --out
+train --out /proc/no => create /proc/no
+train --out /tmp --freeze => --resume
+train --out OUT --worlds 0 => --worlds | 1..=1024
+train --out OUT --instance nobody => no server on instance \"nobody\"
+train --out OUT --instance a/b => instance name | \"a/b\"
+train --out OUT --instance x --height 9 => --instance | --height
+train --out OUT --time-limit=-1 => --time-limit | expected seconds
+train --out OUT --time-limit soon => --time-limit | expected seconds
+train --out OUT --model no.toml => model file no.toml | No such file
+train --out OUT --world 3 => --world: expected 0
+train --out OUT --server no/such => start no/such | No such file
+train --out OUT --resume --burn-in 1 => checkpoint OUT/checkpoint.safetensors: No such file
+evaluate => --checkpoint
+evaluate --checkpoint no/such => checkpoint no/such: No such file
+compare --checkpoint no/such => checkpoint no/such: No such file
+compare --policies learned_beam => \"learned_beam\" needs a learned model: expected --checkpoint FILE
+";
+
+#[test]
+fn wrong_flags_of_learners_are_named() {
+    let folder = TempDir::new().expect("a folder");
+    let out = folder.path().join("out");
+    check_table(
+        AGENT,
+        &WRONG_FLAGS.replace("OUT", &out.display().to_string()),
+    );
+}
+
+#[test]
+fn worlds_and_settings_that_do_not_fit_are_named() {
+    let place = Place::new();
+    let server = Server::start(SMALL);
+    let words = |flags: &str| {
+        let name = server.instance.name();
+        place.words("out", &format!("--instance {name} {flags}"))
+    };
+    check(AGENT, &words("--worlds 2"), &["no such world"]);
+    let _held = server.acquire(0..1);
+    check(AGENT, &words("--worlds 1"), &["pid"]);
+    let settings = "[learning]\nkernel = [2, 3]\n";
+    std::fs::write(place.path("agent.toml"), settings).expect("settings");
+    let words = words("--worlds 1 --takeover --steps 1");
+    check(
+        AGENT,
+        &words,
+        &["kernel: expected odd sides up to 15, got 2 x 3"],
+    );
+    std::fs::write(place.path("agent.toml"), "[learning]\nrate = 2.0\n").expect("settings");
+    check(AGENT, &words, &["learning.rate: expected 0 to 1, got 2"]);
+}
