@@ -13,6 +13,7 @@ pub mod decider;
 pub mod decisions;
 pub mod estimator;
 pub mod launch;
+pub mod network;
 pub mod planner;
 pub mod policy;
 pub mod report;

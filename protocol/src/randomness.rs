@@ -24,6 +24,16 @@ pub enum Purpose {
     Prior,
     /// The seed of the next episode, where a reset names none; indexed by episode.
     Episode,
+    /// A network's first weights; indexed by tensor.
+    Weights,
+    /// The channels that dropout takes; indexed by update.
+    Dropout,
+    /// The hidden vector at the start of a window or run; indexed by update.
+    Hidden,
+    /// Which part of a replay is learnt from; indexed by update.
+    Replay,
+    /// A learnt policy's random actions; indexed by step.
+    Exploration,
 }
 
 impl Purpose {
@@ -36,6 +46,11 @@ impl Purpose {
             Self::Planner => b"planner",
             Self::Prior => b"prior",
             Self::Episode => b"episode",
+            Self::Weights => b"weights",
+            Self::Dropout => b"dropout",
+            Self::Hidden => b"hidden",
+            Self::Replay => b"replay",
+            Self::Exploration => b"exploration",
         }
     }
 }

@@ -1,0 +1,3 @@
+//! The autoencoder against the authors' network and against candle's stock layers.
+
+mod golden;
