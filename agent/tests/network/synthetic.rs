@@ -21,9 +21,15 @@ pub fn frames(shape: Shape, n_observations: u64, n_frames: u64, one_in: u64) -> 
 }
 
 /// Coins for every frame and channel, kept if `keeps` of the layer, frame and channel.
-pub fn dropout(n_frames: usize, scale: f32, keeps: impl Fn(usize, usize, usize) -> bool) -> Dropout {
+pub fn dropout(
+    n_frames: usize,
+    scale: f32,
+    keeps: impl Fn(usize, usize, usize) -> bool,
+) -> Dropout {
     let mask = |layer: usize, channels: usize| {
-        ChannelMask::new(n_frames, channels, |frame, channel| keeps(layer, frame, channel))
+        ChannelMask::new(n_frames, channels, |frame, channel| {
+            keeps(layer, frame, channel)
+        })
     };
     Dropout {
         scale,
