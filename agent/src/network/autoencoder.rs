@@ -195,7 +195,7 @@ impl Autoencoder {
         self.prediction = prediction;
     }
 
-    /// Reads a frame: the estimate `p_k` (eq. 11's Bayes rule at visited cells), after which
+    /// Reads a frame: the estimate `p_k` (Bayes' rule, eq. 10, at visited cells), after which
     /// [`Self::prediction`] is `u_{k+1}` and [`Self::hidden`] is `h_{k+1}`.
     ///
     /// # Errors

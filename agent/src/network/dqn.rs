@@ -144,7 +144,7 @@ impl Dqn {
         Some(self.learn(&batch))
     }
 
-    /// [`Self::update`] on a given batch (eqs. 19 to 21).
+    /// [`Self::update`] on a given batch (eqs. 19 and 21).
     pub fn learn(&mut self, batch: &[Transition]) -> f32 {
         let targets = self.targets(batch);
         let inputs: Vec<f32> = batch.iter().flat_map(|row| row.input.clone()).collect();

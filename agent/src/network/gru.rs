@@ -1,4 +1,4 @@
-//! The recurrence `h_{k+1} = RNN(h_k, Encoder(y_k))` of paper eq. 10: a GRU over a whole window.
+//! The recurrence `h_{k+1} = RNN(h_k, Encoder(y_k))` of paper eq. 9: a GRU over a whole window.
 //!
 //! With `i = W_ih e + b_ih` and `g = W_hh h + b_hh`, each in three parts r, z, n, as PyTorch has them:
 //! `r = sigmoid(i_r + g_r)`, `z = sigmoid(i_z + g_z)`, `n = tanh(i_n + r g_n)`, `h' = (1 - z) n + z h`.

@@ -86,7 +86,7 @@ impl Inference {
         }
     }
 
-    /// `Encoder(y)` of eq. 10.
+    /// `Encoder(y)` of eq. 9.
     #[inline(always)]
     fn encode<A: Arithmetic>(&mut self, visits: &[Visit], encoding: &mut [f32]) {
         const ONES: [f32; ENCODER_CHANNELS[0]] = [1.0; ENCODER_CHANNELS[0]];
@@ -99,7 +99,7 @@ impl Inference {
             .forward::<A>(third, &mut self.linear_input, encoding);
     }
 
-    /// `Decoder(h)` of eq. 10: probabilities, one plane of the padded grid per state.
+    /// `Decoder(h)` of eq. 9: probabilities, one plane of the padded grid per state.
     #[inline(always)]
     fn decode<A: Arithmetic>(&mut self, hidden: &[f32]) {
         let kept = |level: usize| match self.everything.decoder.get(level) {
@@ -158,7 +158,7 @@ impl Inference {
     }
 }
 
-/// `h_{k+1}` and the predictor `u_{k+1}` from `h_k` and a frame (eq. 10).
+/// `h_{k+1}` and the predictor `u_{k+1}` from `h_k` and a frame (eq. 9).
 pub(crate) struct Advance<'a> {
     pub(crate) inference: &'a mut Inference,
     pub(crate) visits: &'a [Visit],
