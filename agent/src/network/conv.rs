@@ -63,7 +63,7 @@ impl Sparse {
 
     /// `relu(mask (W y + b))` of one frame; the mask has one number per channel.
     #[inline(always)]
-    pub(crate) fn forward(&self, visits: &[Visit], mask: &[f32], out: &mut [f32]) {
+    pub(crate) fn forward<A: Arithmetic>(&self, visits: &[Visit], mask: &[f32], out: &mut [f32]) {
         let channels = self.shape.channels_out;
         for position in out.chunks_exact_mut(channels) {
             position.copy_from_slice(&self.bias);
@@ -71,7 +71,7 @@ impl Sparse {
         for &visit in visits {
             reached(&self.shape, visit, |position, tap| {
                 let column = &self.columns[self.column(visit.value, tap)..][..channels];
-                add_lanes(&mut out[position * channels..][..channels], column);
+                add_lanes::<A>(&mut out[position * channels..][..channels], column);
             });
         }
         for position in out.chunks_exact_mut(channels) {
@@ -83,7 +83,7 @@ impl Sparse {
 
     /// Adds one frame's gradients: `d_columns` in the layout of the columns, `d_bias` per channel.
     #[inline(always)]
-    pub(crate) fn backward(
+    pub(crate) fn backward<A: Arithmetic>(
         &self,
         visits: &[Visit],
         dz: &[f32],
@@ -92,12 +92,12 @@ impl Sparse {
     ) {
         let channels = self.shape.channels_out;
         for position in dz.chunks_exact(channels) {
-            add_lanes(d_bias, position);
+            add_lanes::<A>(d_bias, position);
         }
         for &visit in visits {
             reached(&self.shape, visit, |position, tap| {
                 let column = &mut d_columns[self.column(visit.value, tap)..][..channels];
-                add_lanes(column, &dz[position * channels..][..channels]);
+                add_lanes::<A>(column, &dz[position * channels..][..channels]);
             });
         }
     }
@@ -113,9 +113,9 @@ impl Sparse {
 }
 
 #[inline(always)]
-fn add_lanes(sums: &mut [f32], x: &[f32]) {
+fn add_lanes<A: Arithmetic>(sums: &mut [f32], x: &[f32]) {
     for (sums, x) in sums.as_chunks_mut().0.iter_mut().zip(x.as_chunks().0) {
-        *sums = Lanes(*sums).add(Lanes(*x)).0;
+        *sums = Lanes(*sums).add::<A>(Lanes(*x)).0;
     }
 }
 
@@ -165,7 +165,7 @@ impl DenseGradient {
 impl Dense {
     /// From PyTorch's `[out][in][tap]` and the normalisation of the input.
     pub(crate) fn new(shape: ConvShape, weight: &[f32], bias: &[f32], input: &Norm) -> Self {
-        assert!(shape.channels_out <= LANES && shape.channels_in % LANES == 0);
+        assert!(shape.channels_out <= LANES && shape.channels_in.is_multiple_of(LANES));
         let (taps, channels_in) = (shape.taps(), shape.channels_in);
         let mut conv = Self {
             shape,
@@ -264,7 +264,7 @@ impl Dense {
     ) {
         dx.fill(0.0);
         for position in dz.chunks_exact(LANES) {
-            add_lanes(&mut gradient.bias, position);
+            add_lanes::<A>(&mut gradient.bias, position);
         }
         for tap in 0..self.shape.taps() {
             for lanes in (0..self.shape.channels_in).step_by(LANES) {
@@ -298,7 +298,7 @@ impl Dense {
                 sums[index % 2] =
                     sums[index % 2].add_scaled::<A>(dz[usize::from(out) % LANES], *weights);
             }
-            sums[0].add(sums[1]).store(dx);
+            sums[0].add::<A>(sums[1]).store(dx);
         }
     }
 
@@ -328,7 +328,7 @@ impl Dense {
             }
             for (sum, &out) in sums.iter().zip(outs) {
                 let gradient = &mut gradient[self.weight_at(out, tap) + lanes..];
-                sum.add(Lanes::load(gradient)).store(gradient);
+                sum.add::<A>(Lanes::load(gradient)).store(gradient);
             }
         }
     }

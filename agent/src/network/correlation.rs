@@ -9,6 +9,9 @@ use super::lanes::{Arithmetic, LANES, Lanes};
 /// The 4 x 4 kernel of a pair of channels.
 pub(crate) type Kernel4x4 = [f32; LANES];
 
+/// Vectors of pixels per block, where a plane has as many. 4 x 4 sums fit the 32 registers of AVX-512.
+const WIDE: usize = 4;
+
 /// One term of each output.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Tap {
@@ -63,8 +66,12 @@ impl Correlation<'_> {
     ) {
         let mut first = 0;
         while first < length {
-            let n_vectors = ((length - first) / LANES).min(2);
-            let most = if n_vectors == 2 { 6 } else { 12 };
+            let n_vectors = if length - first >= WIDE * LANES {
+                WIDE
+            } else {
+                1
+            };
+            let most = if n_vectors == WIDE { 4 } else { 12 };
             let mut done = 0;
             for outputs in balanced(self.outputs, most) {
                 let out = &mut out[done * out_stride + first..];
@@ -86,9 +93,9 @@ impl Correlation<'_> {
         stride: usize,
     ) {
         let length = outputs.len();
-        if n_vectors == 2 {
+        if n_vectors == WIDE {
             with_constant!(
-                length, block, [1 2 3 4 5 6], 2,
+                length, block, [1 2 3 4], 4,
                 (self, outputs, taps, first, out, stride)
             );
         } else {

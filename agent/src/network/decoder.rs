@@ -9,7 +9,7 @@ use super::correlation::Kernel4x4;
 use super::deconv::{Doubling, Scratch};
 use super::dropout::{ChannelMask, Dropout};
 use super::encoder::total;
-use super::lanes::{Arithmetic, LANES, Lanes, sum_and_product};
+use super::lanes::{Arithmetic, LANES, Lanes, Portable, sum_and_product};
 use super::loss::CellLoss;
 use super::parallel::{Pass, chunks_of, for_each_chunk};
 use super::parameters::{DECODER, DECODER_NORMS, OBSERVATION, Tensors};
@@ -298,7 +298,7 @@ impl Decoder {
                 *sum += d;
             }
             for (sum, patches) in patch_sums.iter_mut().zip(&chunk.patch_sums[index]) {
-                *sum = sum.add(*patches);
+                *sum = sum.add::<Portable>(*patches);
             }
         }
         let kernels = d_weight.as_chunks_mut().0;
@@ -454,7 +454,7 @@ impl Chunk {
         doubling.backward::<A>([kept, outputs], scratch, &mut self.d_weights[index]);
         for (&output, sum) in outputs.iter().zip(&scratch.patch_sums) {
             let total = &mut self.patch_sums[index][usize::from(output)];
-            *total = total.add(*sum);
+            *total = total.add::<A>(*sum);
         }
         before_relu::<A>(doubling, norm, [u, &scratch.dx], kept, dy, &mut self.sums);
         for &channel in lost

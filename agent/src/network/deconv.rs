@@ -329,7 +329,7 @@ impl Doubling {
         scratch.patch_sums[..outputs.len()].fill(Lanes::ZERO);
         for first_row in (0..self.input[0]).step_by(self.band_rows()) {
             let n_rows = self.band_rows().min(self.input[0] - first_row);
-            self.gather_patches(outputs.len(), first_row, n_rows, scratch);
+            self.gather_patches::<A>(outputs.len(), first_row, n_rows, scratch);
             let band = Band {
                 doubling: self,
                 patches: &scratch.patches,
@@ -337,9 +337,9 @@ impl Doubling {
                 values: &scratch.values[first_row * self.input[1]..],
             };
             let mut input = 0;
-            for inputs in balanced(inputs, 6) {
+            for inputs in balanced(inputs, 4) {
                 let mut output = 0;
-                for outputs in balanced(outputs, 2) {
+                for outputs in balanced(outputs, 4) {
                     band.add::<A>([input, output], [inputs, outputs], d_weights);
                     output += outputs.len();
                 }
@@ -350,7 +350,13 @@ impl Doubling {
 
     /// The 4 x 4 gradients that each pixel of some rows reached, and their sum per output.
     #[inline(always)]
-    fn gather_patches(&self, n_outputs: usize, first_row: usize, n_rows: usize, to: &mut Scratch) {
+    fn gather_patches<A: Arithmetic>(
+        &self,
+        n_outputs: usize,
+        first_row: usize,
+        n_rows: usize,
+        to: &mut Scratch,
+    ) {
         let [rows, cols] = self.input;
         let border = 2 * cols + 2;
         for output in 0..n_outputs {
@@ -365,7 +371,7 @@ impl Doubling {
                     for (entries, row) in patch.as_chunks_mut::<4>().0.iter_mut().zip(reached) {
                         entries.copy_from_slice(&row[2 * col..][..4]);
                     }
-                    sum = sum.add(Lanes(*patch));
+                    sum = sum.add::<A>(Lanes(*patch));
                 }
             }
             to.patch_sums[output] = sum;
@@ -426,10 +432,16 @@ impl Band<'_> {
         d_weights: &mut [Kernel4x4],
     ) {
         let length = channels[0].len();
-        if channels[1].len() == 2 {
-            with_constant!(length, block, [1 2 3 4 5 6], 2, (self, first, channels, d_weights));
-        } else {
-            with_constant!(length, block, [1 2 3 4 5 6], 1, (self, first, channels, d_weights));
+        macro_rules! of_outputs {
+            ($n:literal) => {
+                with_constant!(length, block, [1 2 3 4], $n, (self, first, channels, d_weights))
+            };
+        }
+        match channels[1].len() {
+            4 => of_outputs!(4),
+            3 => of_outputs!(3),
+            2 => of_outputs!(2),
+            _ => of_outputs!(1),
         }
     }
 
@@ -462,7 +474,7 @@ impl Band<'_> {
         for (sums, &input) in sums.iter().zip(inputs) {
             for (sum, &output) in sums.iter().zip(outputs) {
                 let at = usize::from(input) * self.doubling.channels_out + usize::from(output);
-                d_weights[at] = sum.add(Lanes(d_weights[at])).0;
+                d_weights[at] = sum.add::<A>(Lanes(d_weights[at])).0;
             }
         }
     }

@@ -266,9 +266,9 @@ fn add_sums<A: Arithmetic>(x: &[f32], y: Option<&[f32]>, origin: &[f32], sums: &
         let (mut sum, mut product) = (Lanes::ZERO, Lanes::ZERO);
         let minus = Lanes(Lanes::load(&origin[first..]).0.map(|value| -value));
         for position in (first..x.len()).step_by(channels) {
-            let x = Lanes::load(&x[position..]).add(minus);
+            let x = Lanes::load(&x[position..]).add::<A>(minus);
             let y = y.map_or(x, |y| Lanes::load(&y[position..]));
-            sum = sum.add(x);
+            sum = sum.add::<A>(x);
             product = product.add_product::<A>(x, y);
         }
         for lane in 0..LANES {
@@ -296,7 +296,8 @@ impl Pass<Chunk> for SparseForward<'_> {
             .zip(chunk.maps[0].chunks_exact_mut(length.max(1)))
         {
             let mask = multipliers(&self.dropout.encoder[0], frame, self.dropout.scale);
-            self.sparse.forward(self.window.visits(frame), &mask, map);
+            self.sparse
+                .forward::<A>(self.window.visits(frame), &mask, map);
             add_sums::<A>(map, None, self.origin, &mut chunk.sums);
         }
     }
@@ -341,16 +342,12 @@ fn before_relu<A: Arithmetic>(
     dz: &mut [f32],
 ) {
     let channels = norm.constant.len();
-    for position in (0..map.len()).step_by(channels) {
-        for channel in 0..channels {
-            let at = position + channel;
-            let du = A::mul_add(map[at], norm.u_factor[channel], norm.constant[channel]);
-            let du = A::mul_add(d_map[at], norm.dy_factor[channel], du);
-            dz[at] = if map[at] > 0.0 {
-                du * mask[channel]
-            } else {
-                0.0
-            };
+    let positions = map.chunks_exact(channels).zip(d_map.chunks_exact(channels));
+    for ((map, d_map), dz) in positions.zip(dz.chunks_exact_mut(channels)) {
+        for (channel, (dz, mask)) in dz.iter_mut().zip(mask).enumerate() {
+            let du = A::mul_add(map[channel], norm.u_factor[channel], norm.constant[channel]);
+            let du = A::mul_add(d_map[channel], norm.dy_factor[channel], du);
+            *dz = if map[channel] > 0.0 { du * mask } else { 0.0 };
         }
     }
 }
@@ -419,7 +416,7 @@ impl Pass<Chunk> for SparseBackward<'_> {
             let (d_columns, d_bias) = (&mut chunk.d_columns, &mut chunk.d_bias);
             let visits = self.window.visits(frame);
             self.sparse
-                .backward(visits, &chunk.dz[..length], d_columns, d_bias);
+                .backward::<A>(visits, &chunk.dz[..length], d_columns, d_bias);
         }
     }
 }

@@ -92,7 +92,7 @@ impl Inference {
         const ONES: [f32; ENCODER_CHANNELS[0]] = [1.0; ENCODER_CHANNELS[0]];
         let [first, second, third] = &mut self.encoder_maps;
         let kept = |stage: usize| self.everything.encoder[stage].kept(0);
-        self.sparse.forward(visits, &ONES, first);
+        self.sparse.forward::<A>(visits, &ONES, first);
         self.dense[0].forward::<A>(first, kept(0), &ONES, second);
         self.dense[1].forward::<A>(second, kept(1), &ONES, third);
         self.linear
@@ -124,12 +124,12 @@ impl Inference {
             let channels = [kept(level), kept(level + 1)];
             doubling.forward::<A>(channels, &self.no_constants, 1.0, scratch, &mut after[0]);
         }
-        self.normalise();
+        self.normalise::<A>();
     }
 
     /// Softmax over the states, in place of the logits.
     #[inline(always)]
-    fn normalise(&mut self) {
+    fn normalise<A: Arithmetic>(&mut self) {
         let plane = self.decoder.doublings[3].plane_out();
         let logits = self.decoder_maps.last_mut().expect("invariant: five maps");
         let mut lanes = vec![Lanes::ZERO; self.states.len()];
@@ -138,7 +138,7 @@ impl Inference {
             for (state, lanes) in lanes.iter_mut().enumerate() {
                 *lanes = Lanes::load(&logits[state * plane + first..]);
             }
-            softmax(&lanes, &mut probabilities);
+            softmax::<A>(&lanes, &mut probabilities);
             for (state, lanes) in probabilities.iter().enumerate() {
                 lanes.store(&mut logits[state * plane + first..]);
             }

@@ -50,7 +50,7 @@ impl CellLoss {
     #[inline(always)]
     pub(crate) fn add<A: Arithmetic>(&mut self, logits: &mut [Lanes], values: &[u8; LANES]) {
         let seen = values.map(|value| if value == UNOBSERVED { 0.0 } else { 1.0 });
-        softmax(logits, &mut self.u);
+        softmax::<A>(logits, &mut self.u);
         self.d_u.fill(Lanes::ZERO);
         let mut likelihood = [1.0; LANES];
         for observed in 0..self.observation.len() / self.n_states {
@@ -119,19 +119,19 @@ pub(crate) fn softmax_of_columns(parameters: &[f32], n_states: usize) -> Vec<f32
 
 /// `u = softmax(logits)` in each lane.
 #[inline(always)]
-pub(crate) fn softmax(logits: &[Lanes], u: &mut [Lanes]) {
+pub(crate) fn softmax<A: Arithmetic>(logits: &[Lanes], u: &mut [Lanes]) {
     let mut largest = [f32::MIN; LANES];
     for logits in logits {
-        for lane in 0..LANES {
-            largest[lane] = largest[lane].max(logits.0[lane]);
+        for (largest, logit) in largest.iter_mut().zip(logits.0) {
+            *largest = largest.max(logit);
         }
     }
     let mut total = Lanes::ZERO;
     for (u, logits) in u.iter_mut().zip(logits) {
-        for lane in 0..LANES {
-            u.0[lane] = exp(logits.0[lane] - largest[lane]);
+        for (u, (logit, largest)) in u.0.iter_mut().zip(logits.0.iter().zip(&largest)) {
+            *u = exp(logit - largest);
         }
-        total = total.add(*u);
+        total = total.add::<A>(*u);
     }
     for u in u {
         for lane in 0..LANES {
@@ -178,6 +178,7 @@ fn exp(x: f32) -> f32 {
 
 #[cfg(test)]
 mod tests {
+    use super::super::lanes::Portable;
     use super::*;
 
     #[test]
@@ -225,7 +226,7 @@ mod tests {
             let mut lanes: Vec<Lanes> = logits.iter().map(|&x| Lanes([x as f32; LANES])).collect();
             let mut values = [UNOBSERVED; LANES];
             values[5] = value as u8;
-            loss.add::<TestArithmetic>(&mut lanes, &values);
+            loss.add::<Portable>(&mut lanes, &values);
             let close = |got: f32, expected: f64, what: &str| {
                 let error = (f64::from(got) - expected).abs();
                 assert!(error < 1e-5, "{what}: expected {expected}, got {got}");
@@ -254,15 +255,6 @@ mod tests {
                 };
                 close(got, slope(&moved), "observation matrix");
             }
-        }
-    }
-
-    #[derive(Clone, Copy)]
-    struct TestArithmetic;
-
-    impl Arithmetic for TestArithmetic {
-        fn mul_add(a: f32, b: f32, c: f32) -> f32 {
-            a * b + c
         }
     }
 }

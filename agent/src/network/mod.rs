@@ -43,6 +43,8 @@ mod seed;
 mod shape;
 mod visited;
 mod window;
+#[cfg(target_arch = "x86_64")]
+mod x86;
 
 pub use adam::{Adam, AdamSettings};
 pub use autoencoder::{Autoencoder, AutoencoderSettings, NotFinite};

@@ -152,7 +152,7 @@ impl LastLayer {
                     0.0
                 };
             }
-            sums[0] = sums[0].add(d);
+            sums[0] = sums[0].add::<A>(d);
             sums[1] = sums[1].add_product::<A>(d, neighbour.u);
             for (index, &channel) in kept.iter().enumerate() {
                 dy[index * *plane + neighbour.pixel] += d.0[usize::from(channel) % LANES];

@@ -11,7 +11,7 @@ pub fn frames(shape: Shape, n_observations: u64, n_frames: u64, one_in: u64) -> 
         let mut frame = Frame::empty(shape);
         for cell in 0..shape.n_cells() {
             let bits = split_mix(index, cell as u64);
-            if bits % one_in == 0 {
+            if bits.is_multiple_of(one_in) {
                 frame.observe(cell, ((bits >> 32) % n_observations) as u8);
             }
         }
