@@ -17,6 +17,7 @@ pub mod evaluate;
 pub mod launch;
 pub mod learner;
 pub mod metrics;
+pub mod network;
 pub mod pilot;
 pub mod planner;
 pub mod policy;

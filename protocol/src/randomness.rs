@@ -26,6 +26,16 @@ pub enum Purpose {
     Learner,
     /// The seed of the next episode, where a reset names none; indexed by episode.
     Episode,
+    /// A network's first weights; indexed by tensor.
+    Weights,
+    /// The channels that dropout takes; indexed by update.
+    Dropout,
+    /// The hidden vector at the start of a window or run; indexed by update.
+    Hidden,
+    /// Which part of a replay is learnt from; indexed by update.
+    Replay,
+    /// A learnt policy's random actions; indexed by step.
+    Exploration,
 }
 
 impl Purpose {
@@ -39,6 +49,11 @@ impl Purpose {
             Self::Prior => b"prior",
             Self::Learner => b"learner",
             Self::Episode => b"episode",
+            Self::Weights => b"weights",
+            Self::Dropout => b"dropout",
+            Self::Hidden => b"hidden",
+            Self::Replay => b"replay",
+            Self::Exploration => b"exploration",
         }
     }
 }

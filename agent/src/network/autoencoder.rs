@@ -1,0 +1,350 @@
+//! The dynamic autoencoder as the agent uses it: frames in, estimates and predictions out; windows of
+//! frames in, learnt parameters out.
+
+use super::adam::{Adam, AdamSettings};
+use super::dropout::Dropout;
+use super::gradient::Workspace;
+use super::inference::{Advance, Decode, Inference};
+use super::lanes::dispatch;
+use super::loss::softmax_of_columns;
+use super::parameters::{OBSERVATION, Tensors, normal};
+use super::shape::NetworkShape;
+use super::window::Window;
+use crate::belief::Belief;
+use crate::estimator::ZeroEvidence;
+use protocol::frame::Frame;
+use protocol::grid::{Probabilities, Shape};
+use protocol::randomness::{Purpose, stream};
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// Sizes and step size.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AutoencoderSettings {
+    /// Length of the encoder's output.
+    pub encoding: usize,
+    /// Length of the hidden vector h.
+    pub hidden: usize,
+    /// Frames in a window that is learnt from; all but the first are predicted.
+    pub window: usize,
+    /// Frames remembered.
+    pub replay: usize,
+    /// The optimiser.
+    pub adam: AdamSettings,
+}
+
+impl AutoencoderSettings {
+    /// What the authors ran for their table.
+    pub fn paper() -> Self {
+        Self {
+            encoding: 4,
+            hidden: 4,
+            window: 1000,
+            replay: 5000,
+            adam: AdamSettings::paper(1e-4),
+        }
+    }
+
+    /// The authors' larger network, with the larger of their step sizes.
+    pub fn paper_large() -> Self {
+        Self {
+            encoding: 16,
+            hidden: 16,
+            adam: AdamSettings::paper(1e-3),
+            ..Self::paper()
+        }
+    }
+}
+
+/// A number that is not finite: training must stop.
+#[derive(Debug, Error, PartialEq)]
+#[error("update {update}: expected finite numbers, got one that is not in {tensor}")]
+pub struct NotFinite {
+    /// Updates before this one.
+    pub update: u64,
+    /// The tensor, a gradient's with the prefix `gradient of`; or the loss.
+    pub tensor: String,
+}
+
+/// The network, its optimiser, and the state of the world that it follows.
+#[derive(Debug)]
+pub struct Autoencoder {
+    settings: AutoencoderSettings,
+    shape: NetworkShape,
+    seed: u64,
+    pub(crate) parameters: Tensors,
+    pub(crate) statistics: Tensors,
+    pub(crate) adam: Adam,
+    pub(crate) n_updates: u64,
+    pub(crate) hidden: Vec<f32>,
+    /// The predictor `u_k` of the next frame.
+    prediction: Belief,
+    /// Of the present parameters, if any frame was read since they changed.
+    inference: Option<Inference>,
+    workspace: Option<Workspace>,
+}
+
+impl Autoencoder {
+    /// A new network of a seed, which is also that of its masks and hidden vectors.
+    pub fn new(
+        settings: AutoencoderSettings,
+        grid: Shape,
+        n_states: usize,
+        n_observations: usize,
+        seed: u64,
+    ) -> Self {
+        let shape = NetworkShape {
+            grid,
+            n_states,
+            n_observations,
+            encoding: settings.encoding,
+            hidden: settings.hidden,
+        };
+        let mut parameters = Tensors::parameters(&shape);
+        parameters.initialise(seed);
+        let mut autoencoder = Self {
+            settings,
+            shape,
+            seed,
+            statistics: Tensors::statistics(&shape),
+            adam: Adam::new(parameters.numbers.len()),
+            parameters,
+            n_updates: 0,
+            hidden: Vec::new(),
+            prediction: Belief::uniform(n_states, grid),
+            inference: None,
+            workspace: None,
+        };
+        let hidden = autoencoder.draw_hidden(u64::MAX);
+        autoencoder.restart(hidden);
+        autoencoder
+    }
+
+    /// Sizes and step size.
+    pub fn settings(&self) -> &AutoencoderSettings {
+        &self.settings
+    }
+
+    /// Grid, states and observations.
+    pub fn shape(&self) -> &NetworkShape {
+        &self.shape
+    }
+
+    /// Updates so far.
+    pub fn n_updates(&self) -> u64 {
+        self.n_updates
+    }
+
+    /// The hidden vector `h_k`.
+    pub fn hidden(&self) -> &[f32] {
+        &self.hidden
+    }
+
+    /// The predictor `u_k` of the next frame.
+    pub fn prediction(&self) -> &Belief {
+        &self.prediction
+    }
+
+    /// The learnt observation matrix `O`, row-major `[observation][state]`; columns sum to one.
+    pub fn observation_matrix(&self) -> Vec<f32> {
+        softmax_of_columns(self.parameters.get(OBSERVATION), self.shape.n_states)
+    }
+
+    /// What Adam moves.
+    pub fn parameters(&self) -> &Tensors {
+        &self.parameters
+    }
+
+    /// Other parameters, as for a step size of their own.
+    pub fn parameters_mut(&mut self) -> &mut Tensors {
+        self.inference = None;
+        &mut self.parameters
+    }
+
+    /// The running statistics of the batch normalisations.
+    pub fn statistics(&self) -> &Tensors {
+        &self.statistics
+    }
+
+    /// Changes the step size.
+    pub fn set_learning_rate(&mut self, learning_rate: f32) {
+        self.settings.adam.learning_rate = learning_rate;
+    }
+
+    /// Forgets all frames: from here on, `h` is `hidden` and the predictor is decoded from it.
+    ///
+    /// # Panics
+    /// If `hidden` has another length.
+    pub fn restart(&mut self, hidden: Vec<f32>) {
+        assert_eq!(hidden.len(), self.shape.hidden, "numbers of h");
+        self.hidden = hidden;
+        let mut inference = self.take_inference();
+        let mut prediction = self.no_prediction();
+        dispatch(Decode {
+            inference: &mut inference,
+            hidden: &self.hidden,
+            prediction: slice(&mut prediction),
+        });
+        self.inference = Some(inference);
+        self.prediction = accepted(prediction);
+    }
+
+    /// Puts a predictor in place of the decoded one.
+    pub fn set_prediction(&mut self, prediction: Belief) {
+        self.prediction = prediction;
+    }
+
+    /// Reads a frame: the estimate `p_k` (Bayes' rule, eq. 10, at visited cells), after which
+    /// [`Self::prediction`] is `u_{k+1}` and [`Self::hidden`] is `h_{k+1}`.
+    ///
+    /// # Errors
+    /// [`ZeroEvidence`] where the predictor rules out what was seen; nothing has changed then.
+    ///
+    /// # Panics
+    /// If the frame is of another grid, or of more observations.
+    pub fn step(&mut self, frame: &Frame) -> Result<Belief, ZeroEvidence> {
+        let window = Window::new([frame]);
+        assert_eq!(frame.values().dim(), self.shape.grid.dim(), "frame: grid");
+        assert!(window.fits(&self.shape), "frame: observations");
+        let estimate = self.correct(frame)?;
+        let mut inference = self.take_inference();
+        let mut prediction = self.no_prediction();
+        dispatch(Advance {
+            inference: &mut inference,
+            visits: window.visits(0),
+            hidden: &mut self.hidden,
+            prediction: slice(&mut prediction),
+        });
+        self.inference = Some(inference);
+        self.prediction = accepted(prediction);
+        Ok(estimate)
+    }
+
+    /// Bayes' rule with the learnt `O` at visited cells; the predictor elsewhere.
+    fn correct(&self, frame: &Frame) -> Result<Belief, ZeroEvidence> {
+        let (n_states, n_cells) = (self.shape.n_states, self.shape.grid.n_cells());
+        let matrix = self.observation_matrix();
+        let mut estimate = self.prediction.probabilities().clone();
+        let cells = slice(&mut estimate);
+        for (cell, observed) in frame.observed() {
+            let likelihood = &matrix[usize::from(observed) * n_states..][..n_states];
+            let prior = self.prediction.as_slice()[cell..].iter().step_by(n_cells);
+            let joint = || {
+                prior
+                    .clone()
+                    .zip(likelihood)
+                    .map(|(&u, &o)| f64::from(u) * f64::from(o))
+            };
+            let evidence: f64 = joint().sum();
+            if evidence <= 0.0 {
+                return Err(ZeroEvidence {
+                    cell: self.shape.grid.cell(cell),
+                    observed,
+                    belief: prior.copied().collect(),
+                });
+            }
+            for (p, joint) in cells[cell..].iter_mut().step_by(n_cells).zip(joint()) {
+                *p = (joint / evidence) as f32;
+            }
+        }
+        Ok(accepted(estimate))
+    }
+
+    /// One step of Adam on a window, with dropout and `h_0` of this update; the loss before it.
+    ///
+    /// # Errors
+    /// [`NotFinite`] for a number that is not; nothing has changed then.
+    ///
+    /// # Panics
+    /// If the window has fewer than two frames or is of another grid.
+    pub fn update(&mut self, window: &Window) -> Result<f64, NotFinite> {
+        let dropout = Dropout::draw(window.len(), self.seed, self.n_updates);
+        let hidden = self.draw_hidden(self.n_updates);
+        self.update_with(window, &dropout, &hidden)
+    }
+
+    /// [`Self::update`] with given masks and `h_0`.
+    ///
+    /// # Errors
+    /// [`NotFinite`] for a number that is not; nothing has changed then.
+    ///
+    /// # Panics
+    /// If the window has fewer than two frames or is of another grid.
+    pub fn update_with(
+        &mut self,
+        window: &Window,
+        dropout: &Dropout,
+        hidden: &[f32],
+    ) -> Result<f64, NotFinite> {
+        assert!(window.len() > 1, "window: expected two frames or more");
+        assert!(window.fits(&self.shape), "window: grid or observations");
+        let mut workspace = self.take_workspace(window.len());
+        let mut statistics = self.statistics.clone();
+        let loss =
+            workspace.loss_and_gradient(&self.parameters, &mut statistics, window, dropout, hidden);
+        let broken = self.not_finite(loss, &workspace.gradient);
+        if broken.is_none() {
+            let gradient = &workspace.gradient.numbers;
+            let parameters = &mut self.parameters.numbers;
+            self.adam.step(&self.settings.adam, parameters, gradient);
+            self.statistics = statistics;
+            self.inference = None;
+            self.n_updates += 1;
+        }
+        self.workspace = Some(workspace);
+        broken.map_or(Ok(loss), |tensor| {
+            let update = self.n_updates;
+            Err(NotFinite { update, tensor })
+        })
+    }
+
+    /// The gradient of the last update.
+    pub fn gradient(&self) -> Option<&Tensors> {
+        self.workspace.as_ref().map(|workspace| &workspace.gradient)
+    }
+
+    /// The first thing that is not finite: a cause before what follows from it.
+    fn not_finite(&self, loss: f64, gradient: &Tensors) -> Option<String> {
+        let tensors = [&self.parameters, &self.statistics];
+        let tensor = tensors.into_iter().find_map(Tensors::not_finite);
+        let gradient = || {
+            let tensor = gradient.not_finite()?;
+            Some(format!("gradient of {tensor}"))
+        };
+        let loss = || (!loss.is_finite()).then(|| "loss".to_owned());
+        tensor.map(str::to_owned).or_else(gradient).or_else(loss)
+    }
+
+    /// `h_0 ~ N(0, I)` of an update.
+    fn draw_hidden(&self, update: u64) -> Vec<f32> {
+        let mut rng = stream(self.seed, Purpose::Hidden, update);
+        (0..self.shape.hidden).map(|_| normal(&mut rng)).collect()
+    }
+
+    fn take_inference(&mut self) -> Inference {
+        let inference = self.inference.take();
+        inference.unwrap_or_else(|| Inference::new(&self.shape, &self.parameters, &self.statistics))
+    }
+
+    fn take_workspace(&mut self, n_frames: usize) -> Workspace {
+        let workspace = self.workspace.take();
+        workspace
+            .filter(|workspace| workspace.n_frames() == n_frames)
+            .unwrap_or_else(|| Workspace::new(&self.shape, &self.parameters, n_frames))
+    }
+
+    fn no_prediction(&self) -> Probabilities {
+        let (height, width) = self.shape.grid.dim();
+        Probabilities::zeros((self.shape.n_states, height, width))
+    }
+}
+
+fn slice(probabilities: &mut Probabilities) -> &mut [f32] {
+    let slice = probabilities.as_slice_mut();
+    slice.expect("invariant: probabilities are row-major")
+}
+
+fn accepted(probabilities: Probabilities) -> Belief {
+    Belief::from_probabilities(probabilities).expect("invariant: a softmax is on the simplex")
+}

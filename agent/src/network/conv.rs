@@ -1,0 +1,359 @@
+//! The encoder's convolutions, forward and backward, one frame at a time.
+//!
+//! Maps have their channels last, padded to whole lanes. The first convolution is evaluated only where a
+//! cell was visited: its input is one-hot, so each visit adds one column of weights to each output that
+//! it reaches. The others read the batch normalisation before them folded into their weights:
+//! `W (s a + t) = (W s) a + W t`; there, channels lost to dropout are zero and skipped.
+
+use super::batch_norm::Norm;
+use super::lanes::{Arithmetic, LANES, Lanes};
+use super::shape::ConvShape;
+use super::window::Visit;
+
+/// Outputs computed at once by [`Dense::forward`]: as many sums as registers hold with ease.
+const BLOCK: usize = 6;
+
+/// Outputs of the first convolution that one visit reaches: `(position, tap)`.
+#[inline(always)]
+fn reached(shape: &ConvShape, visit: Visit, mut each: impl FnMut(usize, usize)) {
+    let along = |axis: usize, at: usize| {
+        let first = (at + 1)
+            .saturating_sub(shape.kernel[axis])
+            .div_ceil(shape.stride);
+        first..(at / shape.stride + 1).min(shape.output[axis])
+    };
+    let (row, col) = (usize::from(visit.row), usize::from(visit.col));
+    for out_row in along(0, row) {
+        for out_col in along(1, col) {
+            let tap = (row - out_row * shape.stride) * shape.kernel[1];
+            let tap = tap + col - out_col * shape.stride;
+            each(out_row * shape.output[1] + out_col, tap);
+        }
+    }
+}
+
+/// The first convolution.
+#[derive(Debug)]
+pub(crate) struct Sparse {
+    shape: ConvShape,
+    /// `[observation][tap][channel]`.
+    columns: Vec<f32>,
+    bias: Vec<f32>,
+}
+
+impl Sparse {
+    /// From PyTorch's `[channel][observation][tap]`.
+    pub(crate) fn new(shape: ConvShape, weight: &[f32], bias: &[f32]) -> Self {
+        let n_columns = shape.channels_in * shape.taps();
+        let channels = shape.channels_out;
+        let columns = (0..weight.len())
+            .map(|index| weight[index % channels * n_columns + index / channels])
+            .collect();
+        Self {
+            shape,
+            columns,
+            bias: bias.to_vec(),
+        }
+    }
+
+    #[inline(always)]
+    fn column(&self, value: u8, tap: usize) -> usize {
+        (usize::from(value) * self.shape.taps() + tap) * self.shape.channels_out
+    }
+
+    /// `relu(mask (W y + b))` of one frame; the mask has one number per channel.
+    #[inline(always)]
+    pub(crate) fn forward<A: Arithmetic>(&self, visits: &[Visit], mask: &[f32], out: &mut [f32]) {
+        let channels = self.shape.channels_out;
+        for position in out.chunks_exact_mut(channels) {
+            position.copy_from_slice(&self.bias);
+        }
+        for &visit in visits {
+            reached(&self.shape, visit, |position, tap| {
+                let column = &self.columns[self.column(visit.value, tap)..][..channels];
+                add_lanes::<A>(&mut out[position * channels..][..channels], column);
+            });
+        }
+        for position in out.chunks_exact_mut(channels) {
+            for (value, factor) in position.iter_mut().zip(mask) {
+                *value = (*value * factor).max(0.0);
+            }
+        }
+    }
+
+    /// Adds one frame's gradients: `d_columns` in the layout of the columns, `d_bias` per channel.
+    #[inline(always)]
+    pub(crate) fn backward<A: Arithmetic>(
+        &self,
+        visits: &[Visit],
+        dz: &[f32],
+        d_columns: &mut [f32],
+        d_bias: &mut [f32],
+    ) {
+        let channels = self.shape.channels_out;
+        for position in dz.chunks_exact(channels) {
+            add_lanes::<A>(d_bias, position);
+        }
+        for &visit in visits {
+            reached(&self.shape, visit, |position, tap| {
+                let column = &mut d_columns[self.column(visit.value, tap)..][..channels];
+                add_lanes::<A>(column, &dz[position * channels..][..channels]);
+            });
+        }
+    }
+
+    /// Gradients in PyTorch's layout.
+    pub(crate) fn weight_gradient(&self, d_columns: &[f32]) -> Vec<f32> {
+        let n_columns = self.shape.channels_in * self.shape.taps();
+        let channels = self.shape.channels_out;
+        (0..d_columns.len())
+            .map(|index| d_columns[index % n_columns * channels + index / n_columns])
+            .collect()
+    }
+}
+
+#[inline(always)]
+fn add_lanes<A: Arithmetic>(sums: &mut [f32], x: &[f32]) {
+    for (sums, x) in sums.as_chunks_mut().0.iter_mut().zip(x.as_chunks().0) {
+        *sums = Lanes(*sums).add::<A>(Lanes(*x)).0;
+    }
+}
+
+/// A convolution of a normalised map.
+#[derive(Debug)]
+pub(crate) struct Dense {
+    shape: ConvShape,
+    /// The input's normalisation is folded in: `[tap][in]`, one lane per output channel.
+    folded: Vec<Lanes>,
+    bias: Lanes,
+    /// As it is: `[out][tap][in]`.
+    weight: Vec<f32>,
+    input: Norm,
+}
+
+/// One frame's gradients of a [`Dense`] convolution are added to these.
+#[derive(Debug, Clone)]
+pub(crate) struct DenseGradient {
+    /// Of the folded weights, `[out][tap][in]`.
+    pub(crate) weight: Vec<f32>,
+    pub(crate) bias: Vec<f32>,
+}
+
+impl DenseGradient {
+    pub(crate) fn zeros(shape: &ConvShape) -> Self {
+        Self {
+            weight: vec![0.0; shape.channels_out * shape.taps() * shape.channels_in],
+            bias: vec![0.0; shape.lanes_out()],
+        }
+    }
+
+    pub(crate) fn clear(&mut self) {
+        self.weight.fill(0.0);
+        self.bias.fill(0.0);
+    }
+
+    pub(crate) fn add(&mut self, other: &Self) {
+        for (sum, x) in self.weight.iter_mut().zip(&other.weight) {
+            *sum += x;
+        }
+        for (sum, x) in self.bias.iter_mut().zip(&other.bias) {
+            *sum += x;
+        }
+    }
+}
+
+impl Dense {
+    /// From PyTorch's `[out][in][tap]` and the normalisation of the input.
+    pub(crate) fn new(shape: ConvShape, weight: &[f32], bias: &[f32], input: &Norm) -> Self {
+        assert!(shape.channels_out <= LANES && shape.channels_in.is_multiple_of(LANES));
+        let (taps, channels_in) = (shape.taps(), shape.channels_in);
+        let mut conv = Self {
+            shape,
+            folded: vec![Lanes::ZERO; taps * channels_in],
+            bias: Lanes::ZERO,
+            weight: vec![0.0; weight.len()],
+            input: input.clone(),
+        };
+        for out in 0..shape.channels_out {
+            conv.bias.0[out] = bias[out];
+            for channel in 0..channels_in {
+                for tap in 0..taps {
+                    let entry = weight[(out * channels_in + channel) * taps + tap];
+                    conv.folded[tap * channels_in + channel].0[out] = entry * input.scale[channel];
+                    conv.bias.0[out] += entry * input.shift[channel];
+                    conv.weight[(out * taps + tap) * channels_in + channel] = entry;
+                }
+            }
+        }
+        conv
+    }
+
+    /// Numbers per input position.
+    pub(crate) fn inputs(&self) -> usize {
+        self.shape.channels_in
+    }
+
+    /// Where the input of an output's tap begins.
+    #[inline(always)]
+    fn input_at(&self, out_row: usize, out_col: usize, tap: usize) -> usize {
+        let row = out_row * self.shape.stride + tap / self.shape.kernel[1];
+        let col = out_col * self.shape.stride + tap % self.shape.kernel[1];
+        (row * self.shape.input[1] + col) * self.shape.channels_in
+    }
+
+    /// `relu(mask (W x + b))` of one frame, of the input channels that are kept.
+    #[inline(always)]
+    pub(crate) fn forward<A: Arithmetic>(
+        &self,
+        input: &[f32],
+        kept: &[u16],
+        mask: &[f32],
+        out: &mut [f32],
+    ) {
+        let [rows, cols] = self.shape.output;
+        let mut out = out.as_chunks_mut::<LANES>().0.iter_mut();
+        for row in 0..rows {
+            for first in (0..cols).step_by(BLOCK) {
+                let sums = self.block::<A>(input, kept, row, first);
+                for (sum, out) in sums[..BLOCK.min(cols - first)].iter().zip(&mut out) {
+                    for lane in 0..LANES {
+                        out[lane] = (sum.0[lane] * mask[lane]).max(0.0);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Up to [`BLOCK`] outputs of a row; those beyond the row's end are worthless.
+    #[inline(always)]
+    fn block<A: Arithmetic>(
+        &self,
+        input: &[f32],
+        kept: &[u16],
+        row: usize,
+        first: usize,
+    ) -> [Lanes; BLOCK] {
+        let last = self.shape.output[1] - 1;
+        let channels = self.shape.channels_in;
+        let mut sums = [self.bias; BLOCK];
+        for tap in 0..self.shape.taps() {
+            let weights = &self.folded[tap * channels..][..channels];
+            let inputs: [&[f32]; BLOCK] = std::array::from_fn(|at| {
+                &input[self.input_at(row, (first + at).min(last), tap)..][..channels]
+            });
+            for &channel in kept {
+                let channel = usize::from(channel);
+                for at in 0..BLOCK {
+                    sums[at] = sums[at].add_scaled::<A>(inputs[at][channel], weights[channel]);
+                }
+            }
+        }
+        sums
+    }
+
+    /// From `dz` of one frame and the output channels it keeps: the gradient of the normalised input,
+    /// written to `dx`, and those of the folded parameters, added to `gradient`.
+    #[inline(always)]
+    pub(crate) fn backward<A: Arithmetic>(
+        &self,
+        input: &[f32],
+        kept: &[u16],
+        dz: &[f32],
+        dx: &mut [f32],
+        gradient: &mut DenseGradient,
+    ) {
+        dx.fill(0.0);
+        for position in dz.chunks_exact(LANES) {
+            add_lanes::<A>(&mut gradient.bias, position);
+        }
+        for tap in 0..self.shape.taps() {
+            for lanes in (0..self.shape.channels_in).step_by(LANES) {
+                self.input_gradient::<A>(kept, dz, tap, lanes, dx);
+                self.weight_gradient::<A>(input, kept, dz, tap, lanes, &mut gradient.weight);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn input_gradient<A: Arithmetic>(
+        &self,
+        kept: &[u16],
+        dz: &[f32],
+        tap: usize,
+        lanes: usize,
+        dx: &mut [f32],
+    ) {
+        let mut weights = [Lanes::ZERO; LANES];
+        for (weights, &out) in weights.iter_mut().zip(kept) {
+            *weights = Lanes::load(&self.weight[self.weight_at(out, tap) + lanes..]);
+        }
+        for (position, dz) in dz.as_chunks::<LANES>().0.iter().enumerate() {
+            let (row, col) = (
+                position / self.shape.output[1],
+                position % self.shape.output[1],
+            );
+            let dx = &mut dx[self.input_at(row, col, tap) + lanes..];
+            let mut sums = [Lanes::load(dx), Lanes::ZERO];
+            for (index, (weights, &out)) in weights.iter().zip(kept).enumerate() {
+                sums[index % 2] =
+                    sums[index % 2].add_scaled::<A>(dz[usize::from(out) % LANES], *weights);
+            }
+            sums[0].add::<A>(sums[1]).store(dx);
+        }
+    }
+
+    #[inline(always)]
+    fn weight_gradient<A: Arithmetic>(
+        &self,
+        input: &[f32],
+        kept: &[u16],
+        dz: &[f32],
+        tap: usize,
+        lanes: usize,
+        gradient: &mut [f32],
+    ) {
+        for outs in kept.chunks(OUTS) {
+            let at: [usize; OUTS] =
+                std::array::from_fn(|out| usize::from(outs[out.min(outs.len() - 1)]) % LANES);
+            let mut sums = [Lanes::ZERO; OUTS];
+            for (position, dz) in dz.as_chunks::<LANES>().0.iter().enumerate() {
+                let (row, col) = (
+                    position / self.shape.output[1],
+                    position % self.shape.output[1],
+                );
+                let x = Lanes::load(&input[self.input_at(row, col, tap) + lanes..]);
+                for out in 0..OUTS {
+                    sums[out] = sums[out].add_scaled::<A>(dz[at[out]], x);
+                }
+            }
+            for (sum, &out) in sums.iter().zip(outs) {
+                let gradient = &mut gradient[self.weight_at(out, tap) + lanes..];
+                sum.add::<A>(Lanes::load(gradient)).store(gradient);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn weight_at(&self, out: u16, tap: usize) -> usize {
+        (usize::from(out) * self.shape.taps() + tap) * self.shape.channels_in
+    }
+
+    /// Gradients of weight and bias in PyTorch's layout: through the folding, `dW = s d(W s) + t db`.
+    pub(crate) fn unfold(&self, gradient: &DenseGradient) -> (Vec<f32>, Vec<f32>) {
+        let (taps, channels) = (self.shape.taps(), self.shape.channels_in);
+        let weight = (0..gradient.weight.len()).map(|index| {
+            let (out, channel, tap) = (
+                index / (channels * taps),
+                index / taps % channels,
+                index % taps,
+            );
+            let folded = gradient.weight[(out * taps + tap) * channels + channel];
+            folded * self.input.scale[channel] + gradient.bias[out] * self.input.shift[channel]
+        });
+        let bias = gradient.bias[..self.shape.channels_out].to_vec();
+        (weight.collect(), bias)
+    }
+}
+
+/// Output channels whose weight gradients are summed at once.
+const OUTS: usize = 8;

@@ -1,0 +1,197 @@
+//! Sixteen numbers at once, on the widest vectors that the CPU has.
+//!
+//! [`dispatch`] compiles a kernel once for AVX-512, once for AVX2 and once for any CPU. Everything
+//! between [`Kernel::run`] and [`Lanes`] is `#[inline(always)]`, to be compiled for those vectors.
+//! Sums and products of [`Lanes`] are named instructions (`x86.rs`): LLVM finds vectors in plain loops
+//! over slices, but not reliably in blocks of many sums.
+
+use std::array::from_fn;
+
+/// Numbers in [`Lanes`]: those of one AVX-512 register.
+pub(crate) const LANES: usize = 16;
+
+/// How sums and products are computed.
+pub(crate) trait Arithmetic: Copy {
+    /// `a * b + c`.
+    fn mul_add(a: f32, b: f32, c: f32) -> f32;
+
+    /// `sum + a * b`, lane by lane.
+    fn add_product(sum: Lanes, a: Lanes, b: Lanes) -> Lanes;
+
+    /// `sum + factor * x`.
+    #[inline(always)]
+    fn add_scaled(sum: Lanes, factor: f32, x: Lanes) -> Lanes {
+        Self::add_product(sum, Lanes([factor; LANES]), x)
+    }
+
+    /// `a + b`.
+    fn add(a: Lanes, b: Lanes) -> Lanes;
+}
+
+/// On any CPU. Rounds products and sums: without hardware for it, `f32::mul_add` is a slow call.
+#[derive(Clone, Copy)]
+pub(crate) struct Portable;
+
+impl Arithmetic for Portable {
+    #[inline(always)]
+    fn mul_add(a: f32, b: f32, c: f32) -> f32 {
+        a * b + c
+    }
+
+    #[inline(always)]
+    fn add_product(sum: Lanes, a: Lanes, b: Lanes) -> Lanes {
+        Lanes(from_fn(|lane| a.0[lane] * b.0[lane] + sum.0[lane]))
+    }
+
+    #[inline(always)]
+    fn add(a: Lanes, b: Lanes) -> Lanes {
+        Lanes(from_fn(|lane| a.0[lane] + b.0[lane]))
+    }
+}
+
+/// Work to be compiled for each set of instructions.
+pub(crate) trait Kernel {
+    /// Does the work.
+    fn run<A: Arithmetic>(self);
+}
+
+/// Runs a kernel with the best instructions of this CPU.
+pub(crate) fn dispatch(kernel: impl Kernel) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use super::x86;
+        let fused = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+        if fused && is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512vl") {
+            #[expect(unsafe_code, reason = "sound with AVX-512, which this CPU has")]
+            unsafe {
+                x86::run_with_avx512(kernel);
+            }
+            return;
+        }
+        if fused {
+            #[expect(unsafe_code, reason = "sound with AVX2 and FMA, which this CPU has")]
+            unsafe {
+                x86::run_with_avx2(kernel);
+            }
+            return;
+        }
+    }
+    kernel.run::<Portable>();
+}
+
+/// Sixteen numbers.
+#[derive(Debug, Clone, Copy)]
+#[repr(C, align(64))]
+pub(crate) struct Lanes(pub(crate) [f32; LANES]);
+
+impl Lanes {
+    pub(crate) const ZERO: Self = Self([0.0; LANES]);
+
+    /// The first sixteen numbers of a slice.
+    #[inline(always)]
+    pub(crate) fn load(from: &[f32]) -> Self {
+        Self(*from.first_chunk().expect("invariant: whole lanes"))
+    }
+
+    /// Overwrites the first sixteen numbers of a slice.
+    #[inline(always)]
+    pub(crate) fn store(self, to: &mut [f32]) {
+        *to.first_chunk_mut().expect("invariant: whole lanes") = self.0;
+    }
+
+    /// `self + factor * x`.
+    #[inline(always)]
+    pub(crate) fn add_scaled<A: Arithmetic>(self, factor: f32, x: Self) -> Self {
+        A::add_scaled(self, factor, x)
+    }
+
+    /// `self + a * b`, lane by lane.
+    #[inline(always)]
+    pub(crate) fn add_product<A: Arithmetic>(self, a: Self, b: Self) -> Self {
+        A::add_product(self, a, b)
+    }
+
+    #[inline(always)]
+    pub(crate) fn add<A: Arithmetic>(self, other: Self) -> Self {
+        A::add(self, other)
+    }
+
+    /// The sum over the lanes, pairwise.
+    #[inline(always)]
+    pub(crate) fn sum(self) -> f32 {
+        let mut sums = self.0;
+        for half in [8, 4, 2, 1] {
+            for lane in 0..half {
+                sums[lane] += sums[lane + half];
+            }
+        }
+        sums[0]
+    }
+}
+
+/// The sums of `x` and of `x * y` over two slices of equal length.
+#[inline(always)]
+pub(crate) fn sum_and_product<A: Arithmetic>(x: &[f32], y: &[f32]) -> (f32, f32) {
+    let (mut sum, mut product) = (Lanes::ZERO, Lanes::ZERO);
+    let ((x_lanes, x_rest), (y_lanes, y_rest)) = (x.as_chunks(), y.as_chunks());
+    for (x, y) in x_lanes.iter().zip(y_lanes) {
+        sum = sum.add::<A>(Lanes(*x));
+        product = product.add_product::<A>(Lanes(*x), Lanes(*y));
+    }
+    let (mut sum, mut product) = (sum.sum(), product.sum());
+    for (x, y) in x_rest.iter().zip(y_rest) {
+        sum += x;
+        product = A::mul_add(*x, *y, product);
+    }
+    (sum, product)
+}
+
+/// The next multiple of [`LANES`].
+pub(crate) const fn whole_lanes(length: usize) -> usize {
+    length.next_multiple_of(LANES)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What every kind of arithmetic must give, up to the rounding of the product.
+    struct Check;
+
+    impl Kernel for Check {
+        #[inline(always)]
+        fn run<A: Arithmetic>(self) {
+            let [a, b, c] =
+                [1.5, -2.25, 0.125].map(|first| Lanes(from_fn(|lane| first + lane as f32)));
+            for lane in 0..LANES {
+                let [a_lane, b_lane, c_lane] = [a, b, c].map(|lanes| lanes.0[lane]);
+                assert_eq!(c.add_product::<A>(a, b).0[lane], a_lane * b_lane + c_lane);
+                assert_eq!(c.add_scaled::<A>(3.0, b).0[lane], 3.0 * b_lane + c_lane);
+                assert_eq!(a.add::<A>(b).0[lane], a_lane + b_lane);
+            }
+        }
+    }
+
+    #[test]
+    fn every_arithmetic_is_that_of_single_numbers() {
+        dispatch(Check);
+        Check.run::<Portable>();
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+            #[expect(unsafe_code, reason = "sound with AVX2 and FMA, which this CPU has")]
+            unsafe {
+                super::super::x86::run_with_avx2(Check);
+            }
+        }
+    }
+
+    #[test]
+    fn sums_and_products_are_those_of_plain_loops() {
+        for length in [0, 1, 15, 16, 17, 100] {
+            let x: Vec<f32> = (0..length).map(|i| i as f32).collect();
+            let y: Vec<f32> = (0..length).map(|i| (i % 3) as f32).collect();
+            let expected = (x.iter().sum(), x.iter().zip(&y).map(|(x, y)| x * y).sum());
+            assert_eq!(sum_and_product::<Portable>(&x, &y), expected, "{length}");
+        }
+    }
+}

@@ -1,0 +1,260 @@
+//! The loss of paper eqs. 8 and 11 at single cells, sixteen at once.
+//!
+//! At a visited cell the predictor is `u = softmax(logits)`, the predicted observation `q = O u` with
+//! each column of `O` a softmax, and the loss the binary cross-entropy of all O channels:
+//! `-log q_y - sum over a != y of log(1 - q_a)`.
+
+use super::lanes::{Arithmetic, LANES, Lanes};
+use protocol::frame::UNOBSERVED;
+
+/// Added inside logarithms, as in the authors' code.
+const EPSILON: f32 = 1e-10;
+
+/// The observation matrix, and its gradient so far.
+#[derive(Debug, Clone)]
+pub(crate) struct CellLoss {
+    n_states: usize,
+    /// `[observation][state]`; columns sum to one.
+    observation: Vec<f32>,
+    /// `1 / number of targets`.
+    weight: f32,
+    d_observation: Vec<f64>,
+    loss: f64,
+    /// Room for `u` and its gradient.
+    u: Vec<Lanes>,
+    d_u: Vec<Lanes>,
+}
+
+impl CellLoss {
+    /// From the matrix before its softmax, `[O, S]`, and the number of cells in the mean.
+    pub(crate) fn new(parameters: &[f32], n_states: usize, n_targets: usize) -> Self {
+        let observation = softmax_of_columns(parameters, n_states);
+        Self {
+            n_states,
+            d_observation: vec![0.0; observation.len()],
+            observation,
+            weight: 1.0 / n_targets.max(1) as f32,
+            loss: 0.0,
+            u: vec![Lanes::ZERO; n_states],
+            d_u: vec![Lanes::ZERO; n_states],
+        }
+    }
+
+    /// The sum of the losses so far, before division by the number of cells.
+    pub(crate) fn sum(&self) -> f64 {
+        self.loss
+    }
+
+    /// Adds sixteen cells of observed `values` and turns their logits, one `Lanes` per state, into
+    /// gradients. Cells that are not observed add nothing.
+    #[inline(always)]
+    pub(crate) fn add<A: Arithmetic>(&mut self, logits: &mut [Lanes], values: &[u8; LANES]) {
+        let seen = values.map(|value| if value == UNOBSERVED { 0.0 } else { 1.0 });
+        softmax::<A>(logits, &mut self.u);
+        self.d_u.fill(Lanes::ZERO);
+        let mut likelihood = [1.0; LANES];
+        for observed in 0..self.observation.len() / self.n_states {
+            let row = observed * self.n_states..(observed + 1) * self.n_states;
+            let mut q = Lanes::ZERO;
+            for (u, entry) in self.u.iter().zip(&self.observation[row.clone()]) {
+                q = q.add_scaled::<A>(*entry, *u);
+            }
+            let mut d_q = Lanes::ZERO;
+            for lane in 0..LANES {
+                let hit = usize::from(values[lane]) == observed;
+                let term = EPSILON + if hit { q.0[lane] } else { 1.0 - q.0[lane] };
+                likelihood[lane] *= term;
+                let slope = if hit { -self.weight } else { self.weight };
+                d_q.0[lane] = seen[lane] * slope / term;
+            }
+            for (state, index) in row.enumerate() {
+                let d_u = &mut self.d_u[state];
+                *d_u = d_u.add_scaled::<A>(self.observation[index], d_q);
+                let d = Lanes::ZERO.add_product::<A>(d_q, self.u[state]).sum();
+                self.d_observation[index] += f64::from(d);
+            }
+        }
+        for lane in 0..LANES {
+            if values[lane] != UNOBSERVED {
+                // One logarithm a cell. At most one factor other than q_y is near zero, as the q sum to
+                // one, so the product cannot underflow.
+                self.loss -= f64::from(likelihood[lane].ln());
+            }
+        }
+        softmax_gradient::<A>(&self.u, &self.d_u, logits);
+    }
+
+    /// The sum of the gradients of some chunks with respect to the matrix before its softmax.
+    pub(crate) fn gradient<'a>(chunks: impl Iterator<Item = &'a Self>) -> Vec<f32> {
+        let chunks: Vec<&Self> = chunks.collect();
+        let (n_states, matrix) = (chunks[0].n_states, &chunks[0].observation);
+        let d_matrix: Vec<f64> = (0..matrix.len())
+            .map(|index| chunks.iter().map(|chunk| chunk.d_observation[index]).sum())
+            .collect();
+        let entry = |index: usize| {
+            let column = (index % n_states..matrix.len()).step_by(n_states);
+            let mean: f64 = column.map(|at| f64::from(matrix[at]) * d_matrix[at]).sum();
+            (f64::from(matrix[index]) * (d_matrix[index] - mean)) as f32
+        };
+        (0..matrix.len()).map(entry).collect()
+    }
+}
+
+/// The observation matrix: each column, the observations of one state, sums to one.
+pub(crate) fn softmax_of_columns(parameters: &[f32], n_states: usize) -> Vec<f32> {
+    let column = |state: usize| parameters.iter().skip(state).step_by(n_states);
+    let largest = |state| column(state).fold(f32::MIN, |largest, &p| largest.max(p));
+    let exps: Vec<f32> = parameters
+        .iter()
+        .enumerate()
+        .map(|(index, p)| (p - largest(index % n_states)).exp())
+        .collect();
+    let total = |state: usize| exps.iter().skip(state).step_by(n_states).sum::<f32>();
+    let totals: Vec<f32> = (0..n_states).map(total).collect();
+    let entries = exps.iter().enumerate();
+    entries
+        .map(|(index, exp)| exp / totals[index % n_states])
+        .collect()
+}
+
+/// `u = softmax(logits)` in each lane.
+#[inline(always)]
+pub(crate) fn softmax<A: Arithmetic>(logits: &[Lanes], u: &mut [Lanes]) {
+    let mut largest = [f32::MIN; LANES];
+    for logits in logits {
+        for (largest, logit) in largest.iter_mut().zip(logits.0) {
+            *largest = largest.max(logit);
+        }
+    }
+    let mut total = Lanes::ZERO;
+    for (u, logits) in u.iter_mut().zip(logits) {
+        for (u, (logit, largest)) in u.0.iter_mut().zip(logits.0.iter().zip(&largest)) {
+            *u = exp(logit - largest);
+        }
+        total = total.add::<A>(*u);
+    }
+    for u in u {
+        for lane in 0..LANES {
+            u.0[lane] /= total.0[lane];
+        }
+    }
+}
+
+/// `u_s (d_s - sum over r of u_r d_r)`, in place of the logits.
+#[inline(always)]
+fn softmax_gradient<A: Arithmetic>(u: &[Lanes], d_u: &[Lanes], logits: &mut [Lanes]) {
+    let mut mean = Lanes::ZERO;
+    for (u, d_u) in u.iter().zip(d_u) {
+        mean = mean.add_product::<A>(*u, *d_u);
+    }
+    for (logits, (u, d_u)) in logits.iter_mut().zip(u.iter().zip(d_u)) {
+        for lane in 0..LANES {
+            logits.0[lane] = u.0[lane] * (d_u.0[lane] - mean.0[lane]);
+        }
+    }
+}
+
+/// `exp(x)` for `x <= 0` to 2 units in the last place, without a call, so that loops of it become
+/// vectors: `2^n 2^f` with `|f| <= 1/2` and `2^f` by its series.
+#[inline(always)]
+fn exp(x: f32) -> f32 {
+    /// Adding this rounds to a whole number, found in the low bits.
+    const ROUND: f32 = 12_582_912.0;
+    let power = x.max(-87.0) * std::f32::consts::LOG2_E;
+    let rounded = power + ROUND;
+    let f = (power - (rounded - ROUND)) * std::f32::consts::LN_2;
+    let series = [
+        1.0 / 720.0,
+        1.0 / 120.0,
+        1.0 / 24.0,
+        1.0 / 6.0,
+        0.5,
+        1.0,
+        1.0,
+    ];
+    let fraction = series.iter().fold(0.0, |sum, term| sum * f + term);
+    f32::from_bits(fraction.to_bits().wrapping_add(rounded.to_bits() << 23))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::lanes::Portable;
+    use super::*;
+
+    #[test]
+    fn exp_is_the_exponential() {
+        for step in 0..8700 {
+            let x = -0.01 * step as f32;
+            let exact = f64::from(x).exp();
+            let error = (f64::from(exp(x)) / exact - 1.0).abs();
+            // The argument's own rounding grows with it.
+            assert!(error < 3e-7 + 1e-7 * f64::from(x.abs()), "{x}: {error}");
+        }
+    }
+
+    /// The loss in 64 bits, written as in the paper.
+    fn exact(parameters: &[f64], logits: &[f64], value: usize) -> f64 {
+        let n_states = logits.len();
+        let total: f64 = logits.iter().map(|x| x.exp()).sum();
+        let column = |state: usize| parameters.iter().skip(state).step_by(n_states);
+        let q = |observed: usize| -> f64 {
+            (0..n_states)
+                .map(|state| {
+                    let sum: f64 = column(state).map(|p| p.exp()).sum();
+                    parameters[observed * n_states + state].exp() / sum * logits[state].exp()
+                        / total
+                })
+                .sum()
+        };
+        (0..parameters.len() / n_states)
+            .map(|observed| match observed == value {
+                true => -q(observed).ln(),
+                false => -(1.0 - q(observed)).ln(),
+            })
+            .sum()
+    }
+
+    #[test]
+    fn gradients_are_finite_differences() {
+        for (n_states, n_observations) in [(3, 3), (2, 4), (4, 2)] {
+            let wave = |index: usize| (index as f64 * 1.7).sin();
+            let parameters: Vec<f64> = (0..n_states * n_observations).map(wave).collect();
+            let logits: Vec<f64> = (0..n_states).map(|state| 2.0 * wave(state + 50)).collect();
+            let value = n_observations - 1;
+            let single = |values: &[f64]| values.iter().map(|&x| x as f32).collect::<Vec<_>>();
+            let mut loss = CellLoss::new(&single(&parameters), n_states, 1);
+            let mut lanes: Vec<Lanes> = logits.iter().map(|&x| Lanes([x as f32; LANES])).collect();
+            let mut values = [UNOBSERVED; LANES];
+            values[5] = value as u8;
+            loss.add::<Portable>(&mut lanes, &values);
+            let close = |got: f32, expected: f64, what: &str| {
+                let error = (f64::from(got) - expected).abs();
+                assert!(error < 1e-5, "{what}: expected {expected}, got {got}");
+            };
+            close(
+                loss.sum() as f32,
+                exact(&parameters, &logits, value),
+                "loss",
+            );
+            let slope = |f: &dyn Fn(f64) -> f64| (f(1e-5) - f(-1e-5)) / 2e-5;
+            for state in 0..n_states {
+                let moved = |by: f64| {
+                    let mut logits = logits.clone();
+                    logits[state] += by;
+                    exact(&parameters, &logits, value)
+                };
+                close(lanes[state].0[5], slope(&moved), "logit");
+                close(lanes[state].0[4], 0.0, "unseen");
+            }
+            let gradient = CellLoss::gradient(std::iter::once(&loss));
+            for (index, got) in gradient.into_iter().enumerate() {
+                let moved = |by: f64| {
+                    let mut parameters = parameters.clone();
+                    parameters[index] += by;
+                    exact(&parameters, &logits, value)
+                };
+                close(got, slope(&moved), "observation matrix");
+            }
+        }
+    }
+}

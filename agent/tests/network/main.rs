@@ -1,0 +1,7 @@
+//! The autoencoder against the authors' network and against candle's stock layers.
+
+mod dqn;
+mod golden;
+mod properties;
+mod stock;
+mod synthetic;
