@@ -13,6 +13,9 @@ use super::window::Visit;
 /// Outputs computed at once by [`Dense::forward`]: as many sums as registers hold with ease.
 const BLOCK: usize = 6;
 
+/// Output channels of a backward pass that are taken at once.
+const OUTS: usize = 8;
+
 /// Outputs of the first convolution that one visit reaches: `(position, tap)`.
 #[inline(always)]
 fn reached(shape: &ConvShape, visit: Visit, mut each: impl FnMut(usize, usize)) {
@@ -201,6 +204,13 @@ impl Dense {
         (row * self.shape.input[1] + col) * self.shape.channels_in
     }
 
+    /// [`Self::input_at`] of an output's number.
+    #[inline(always)]
+    fn input_of(&self, position: usize, tap: usize) -> usize {
+        let cols = self.shape.output[1];
+        self.input_at(position / cols, position % cols, tap)
+    }
+
     /// `relu(mask (W x + b))` of one frame, of the input channels that are kept.
     #[inline(always)]
     pub(crate) fn forward<A: Arithmetic>(
@@ -283,22 +293,19 @@ impl Dense {
         lanes: usize,
         dx: &mut [f32],
     ) {
-        let mut weights = [Lanes::ZERO; LANES];
-        for (weights, &out) in weights.iter_mut().zip(kept) {
-            *weights = Lanes::load(&self.weight[self.weight_at(out, tap) + lanes..]);
-        }
-        for (position, dz) in dz.as_chunks::<LANES>().0.iter().enumerate() {
-            let (row, col) = (
-                position / self.shape.output[1],
-                position % self.shape.output[1],
-            );
-            let dx = &mut dx[self.input_at(row, col, tap) + lanes..];
-            let mut sums = [Lanes::load(dx), Lanes::ZERO];
-            for (index, (weights, &out)) in weights.iter().zip(kept).enumerate() {
-                sums[index % 2] =
-                    sums[index % 2].add_scaled::<A>(dz[usize::from(out) % LANES], *weights);
+        for outs in kept.chunks(OUTS) {
+            let (at, mut weights) = (places(outs), [Lanes::ZERO; OUTS]);
+            for (weights, &out) in weights.iter_mut().zip(outs) {
+                *weights = Lanes::load(&self.weight[self.weight_at(out, tap) + lanes..]);
             }
-            sums[0].add::<A>(sums[1]).store(dx);
+            for (position, dz) in dz.as_chunks::<LANES>().0.iter().enumerate() {
+                let dx = &mut dx[self.input_of(position, tap) + lanes..];
+                let mut sum = Lanes::load(dx);
+                for out in 0..OUTS {
+                    sum = sum.add_scaled::<A>(dz[at[out]], weights[out]);
+                }
+                sum.store(dx);
+            }
         }
     }
 
@@ -313,15 +320,10 @@ impl Dense {
         gradient: &mut [f32],
     ) {
         for outs in kept.chunks(OUTS) {
-            let at: [usize; OUTS] =
-                std::array::from_fn(|out| usize::from(outs[out.min(outs.len() - 1)]) % LANES);
+            let at = places(outs);
             let mut sums = [Lanes::ZERO; OUTS];
             for (position, dz) in dz.as_chunks::<LANES>().0.iter().enumerate() {
-                let (row, col) = (
-                    position / self.shape.output[1],
-                    position % self.shape.output[1],
-                );
-                let x = Lanes::load(&input[self.input_at(row, col, tap) + lanes..]);
+                let x = Lanes::load(&input[self.input_of(position, tap) + lanes..]);
                 for out in 0..OUTS {
                     sums[out] = sums[out].add_scaled::<A>(dz[at[out]], x);
                 }
@@ -355,5 +357,8 @@ impl Dense {
     }
 }
 
-/// Output channels whose weight gradients are summed at once.
-const OUTS: usize = 8;
+/// The lanes of up to [`OUTS`] channels; the last one's where there are fewer.
+#[inline(always)]
+fn places(outs: &[u16]) -> [usize; OUTS] {
+    std::array::from_fn(|out| usize::from(outs[out.min(outs.len() - 1)]) % LANES)
+}

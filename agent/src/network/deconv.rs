@@ -273,11 +273,12 @@ impl Doubling {
         for row in 0..2 * rows + 2 {
             let from = &bordered[row * border..][..border];
             let at = row % 2 * 4 * length + row / 2 * cols;
-            for col in 0..4 {
-                let to = &mut group[at + col * length..][..cols];
-                let from = from[col / 2 * 2..].as_chunks::<2>().0;
-                for (to, from) in to.iter_mut().zip(from) {
-                    *to = from[col % 2];
+            for col in [0, 2] {
+                let (even, odd) = group[at + col * length..].split_at_mut(length);
+                let to = even[..cols].iter_mut().zip(&mut odd[..cols]);
+                // Both of a pair at once: LLVM makes shuffles of this, and slow gathers of each alone.
+                for ((even, odd), pair) in to.zip(from[col..].as_chunks::<2>().0) {
+                    [*even, *odd] = *pair;
                 }
             }
         }
@@ -371,8 +372,11 @@ impl Doubling {
                     for (entries, row) in patch.as_chunks_mut::<4>().0.iter_mut().zip(reached) {
                         entries.copy_from_slice(&row[2 * col..][..4]);
                     }
-                    sum = sum.add::<A>(Lanes(*patch));
                 }
+            }
+            // Not in the loop above: a patch just written in parts is slow to read as a whole.
+            for patch in patches.as_chunks().0 {
+                sum = sum.add::<A>(Lanes(*patch));
             }
             to.patch_sums[output] = sum;
         }

@@ -119,13 +119,9 @@ impl Lanes {
     /// The sum over the lanes, pairwise.
     #[inline(always)]
     pub(crate) fn sum(self) -> f32 {
-        let mut sums = self.0;
-        for half in [8, 4, 2, 1] {
-            for lane in 0..half {
-                sums[lane] += sums[lane + half];
-            }
-        }
-        sums[0]
+        let eight: [f32; 8] = from_fn(|lane| self.0[lane] + self.0[lane + 8]);
+        let four: [f32; 4] = from_fn(|lane| eight[lane] + eight[lane + 4]);
+        (four[0] + four[2]) + (four[1] + four[3])
     }
 }
 
