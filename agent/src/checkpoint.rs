@@ -3,6 +3,7 @@
 //! Written beside the file and renamed, so whoever reads finds all or nothing. Read whole or refused:
 //! the file says which learner it is of, and a digest tells damage that keeps its form.
 
+use crate::belief::BeliefError;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use std::collections::{BTreeMap, HashMap};
@@ -71,11 +72,14 @@ pub enum Problem {
     /// Not safetensors, or cut off.
     #[error("expected a whole safetensors file, got one that is damaged or cut off: {0}")]
     Form(String),
+    /// The second of its kind.
+    #[error("expected one checkpoint of {0}, got two")]
+    Twice(&'static str),
     /// Another learner's, or none's.
     #[error("expected a checkpoint of {expected}, got one of {got}")]
     Kind {
         /// Whose was asked for.
-        expected: &'static str,
+        expected: String,
         /// Whose it is.
         got: String,
     },
@@ -100,6 +104,9 @@ pub enum Problem {
         /// What it is.
         got: Vec<usize>,
     },
+    /// A predictor that is no belief.
+    #[error("state.prediction: {0}")]
+    Prediction(#[from] BeliefError),
     /// A tensor or text with something else in it.
     #[error("{name}: expected {expected}, got {got}")]
     Value {
@@ -294,6 +301,17 @@ pub fn write(path: &Path, kind: &'static str, contents: &Contents) -> Result<(),
 /// # Errors
 /// [`CheckpointError`] names the file and what is wrong with it.
 pub fn read(path: &Path, kind: &'static str) -> Result<Contents, CheckpointError> {
+    read_any(path, &[kind]).map(|(_, contents)| contents)
+}
+
+/// Reads a checkpoint of one of some kinds, and tells which.
+///
+/// # Errors
+/// [`CheckpointError`] names the file and what is wrong with it.
+pub fn read_any(
+    path: &Path,
+    kinds: &[&'static str],
+) -> Result<(&'static str, Contents), CheckpointError> {
     let bytes = || {
         let size = std::fs::metadata(path)?.len();
         if size > MAX_BYTES {
@@ -301,7 +319,7 @@ pub fn read(path: &Path, kind: &'static str) -> Result<Contents, CheckpointError
         }
         Ok(std::fs::read(path)?)
     };
-    let contents = bytes().and_then(|bytes| decode(kind, &bytes));
+    let contents = bytes().and_then(|bytes| decode(kinds, &bytes));
     contents.map_err(|problem| problem.of(path))
 }
 
@@ -335,7 +353,7 @@ fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>, Problem> {
     }
 }
 
-fn decode(kind: &'static str, bytes: &[u8]) -> Result<Contents, Problem> {
+fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Contents), Problem> {
     let form = |error: safetensors::SafeTensorError| Problem::Form(error.to_string());
     let file = SafeTensors::deserialize(bytes).map_err(form)?;
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(form)?;
@@ -343,12 +361,10 @@ fn decode(kind: &'static str, bytes: &[u8]) -> Result<Contents, Problem> {
     let got = texts
         .remove(KIND)
         .unwrap_or_else(|| "something else".into());
-    if got != kind {
-        return Err(Problem::Kind {
-            expected: kind,
-            got,
-        });
-    }
+    let Some(&kind) = kinds.iter().find(|kind| **kind == got) else {
+        let expected = kinds.join(" or ");
+        return Err(Problem::Kind { expected, got });
+    };
     let expected = texts.remove(DIGEST).unwrap_or_default();
     let mut contents = Contents {
         texts: texts.into_iter().collect(),
@@ -361,7 +377,7 @@ fn decode(kind: &'static str, bytes: &[u8]) -> Result<Contents, Problem> {
     if got != expected {
         return Err(Problem::Digest { expected, got });
     }
-    Ok(contents)
+    Ok((kind, contents))
 }
 
 impl Contents {
