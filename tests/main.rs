@@ -7,6 +7,7 @@
 //! hostile clients, and what needs Python (`scripts/test` installs it).
 
 mod attacker;
+mod autoencoder;
 mod commands;
 mod compare;
 mod compliance;

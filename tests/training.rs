@@ -196,7 +196,11 @@ fn a_checkpoint_is_compared_and_evaluated() {
         assert!(compared.stdout.contains(policy), "{}", compared.stdout);
         assert!(evaluated.stdout.contains(policy), "{}", evaluated.stdout);
     }
-    for row in ["class frequencies", "known-model filter", "learned - known"] {
+    for row in [
+        "class frequencies",
+        "known_model",
+        "learned_filter - known_model",
+    ] {
         assert!(evaluated.stdout.contains(row), "{}", evaluated.stdout);
     }
     let server = Server::start(SMALL);
@@ -270,7 +274,7 @@ train --out OUT --resume --burn-in 1 => checkpoint OUT/checkpoint.safetensors: N
 evaluate => --checkpoint
 evaluate --checkpoint no/such => checkpoint no/such: No such file
 compare --checkpoint no/such => checkpoint no/such: No such file
-compare --policies learned_beam => \"learned_beam\" needs a learned model: expected --checkpoint FILE
+compare --policies learned_beam => \"learned_beam\" needs what `train` learned: expected --checkpoint FILE of a filter
 ";
 
 #[test]

@@ -128,3 +128,50 @@ fn row(tick: &Tick, lesson: &Lesson) -> Vec<String> {
         numbers.map(|number| number.map_or(String::new(), |number| format!("{number:?}")));
     counts.into_iter().chain(numbers).collect()
 }
+
+/// The rows of a file, as numbers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Rows {
+    names: Vec<String>,
+    rows: Vec<Vec<Option<f64>>>,
+}
+
+impl Rows {
+    /// Reads the file of a folder. What is no number is as if it were not there.
+    ///
+    /// # Errors
+    /// [`MetricsError`].
+    pub fn read(folder: &Path) -> Result<Self, MetricsError> {
+        let path = folder.join(METRICS);
+        let fail = |problem: csv::Error| MetricsError {
+            path: path.clone(),
+            problem,
+        };
+        let mut reader = csv::Reader::from_path(&path).map_err(fail)?;
+        let names = reader.headers().map_err(fail)?;
+        let names = names.iter().map(String::from).collect();
+        let mut rows = Vec::new();
+        for record in reader.records() {
+            let record = record.map_err(fail)?;
+            rows.push(record.iter().map(|field| field.parse().ok()).collect());
+        }
+        Ok(Self { names, rows })
+    }
+
+    /// Number of rows.
+    pub fn len(&self) -> usize {
+        self.rows.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+
+    /// A column, one entry per row; nothing but `None` where there is no such column.
+    pub fn column(&self, name: &str) -> Vec<Option<f64>> {
+        let at = self.names.iter().position(|known| known == name);
+        let field = |row: &Vec<Option<f64>>| at.and_then(|at| row.get(at).copied().flatten());
+        self.rows.iter().map(field).collect()
+    }
+}

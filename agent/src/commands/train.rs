@@ -4,6 +4,7 @@ use super::make_folder;
 use super::worlds::GridFlags;
 use agent::config::{AgentFlags, LearnerKind, Preset};
 use agent::launch::OwnServer;
+use agent::report::training::draw_training;
 use agent::train::{Training, train};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
@@ -33,7 +34,7 @@ pub struct TrainCommand {
     /// Seconds to act for
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     time_limit: Option<Duration>,
-    /// Folder for checkpoint.safetensors and metrics.csv
+    /// Folder for checkpoint.safetensors, metrics.csv and training.png
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Go on from the folder's checkpoint, with an empty replay
@@ -94,6 +95,9 @@ impl TrainCommand {
         );
         for (part, time) in summary.times {
             tracing::info!(part, seconds = time.as_secs_f64(), "time");
+        }
+        if summary.steps > 0 {
+            draw_training(&self.out)?;
         }
         Ok(())
     }

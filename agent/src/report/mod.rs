@@ -1,13 +1,14 @@
 //! What a comparison of policies looks like: a table, a CSV file and figures.
 //!
 //! Everything here turns finished [`PolicyRun`]s into text or a file; nothing here runs a policy.
-//! Read [`statistics`] first, then [`table`], [`csv`] and [`figures`].
+//! Read [`statistics`] first, then [`table`], [`csv`] and [`figures`]. [`training`] turns metrics into curves.
 
 pub mod csv;
 pub mod figures;
 mod number;
 pub mod statistics;
 pub mod table;
+pub mod training;
 
 pub use self::csv::write_csv;
 pub use self::figures::{Snapshot, draw_ladder, draw_rewards, draw_snapshot};

@@ -44,6 +44,26 @@ impl Axis {
         axis
     }
 
+    /// An axis of decimal logarithms over all the given (finite) ones, with ticks at whole powers of ten.
+    pub fn of_powers(logarithms: impl Iterator<Item = f64>) -> Self {
+        let (least, most) = logarithms.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), value| {
+            (a.min(value), b.max(value))
+        });
+        let first = if least.is_finite() {
+            least.floor()
+        } else {
+            0.0
+        };
+        let last = most.ceil().max(first + 1.0);
+        Self {
+            ticks: (0..=(last - first) as i64)
+                .map(|tick| first + tick as f64)
+                .collect(),
+            range: (first, last),
+            decimals: 0,
+        }
+    }
+
     /// Where a value lies in the range: 0 at its start, 1 at its end.
     pub fn fraction(&self, value: f64) -> f64 {
         let (first, last) = self.range;
@@ -114,6 +134,15 @@ mod tests {
         );
         check(&[], &[0.0, 0.2, 0.4, 0.6, 0.8, 1.0], "0.2");
         check(&[0.0, 0.0], &[0.0, 0.2, 0.4, 0.6, 0.8, 1.0], "0.2");
+    }
+
+    #[test]
+    fn powers_of_ten_have_ticks() {
+        let axis = Axis::of_powers([-3.6, -2.1].into_iter());
+        assert_eq!(axis.ticks, [-4.0, -3.0, -2.0]);
+        assert_eq!(axis.fraction(-3.0), 0.5);
+        assert_eq!(Axis::of_powers([].into_iter()).ticks, [0.0, 1.0]);
+        assert_eq!(Axis::of_powers([-2.0].into_iter()).ticks, [-2.0, -1.0]);
     }
 
     #[test]

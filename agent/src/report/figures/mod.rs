@@ -1,10 +1,11 @@
-//! Figures as PNG: the ladder of policies, rewards over time, and a snapshot of one step.
+//! Figures as PNG: the ladder of policies, rewards over time, a snapshot of one step, and curves.
 //!
 //! Drawn at two pixels a point, with a font and colours of their own, so that a figure looks the
 //! same on every machine. [`canvas`] draws, [`axis`] scales, [`palette`] colours.
 
 mod axis;
 mod canvas;
+pub mod curves;
 mod ladder;
 mod legend;
 mod palette;

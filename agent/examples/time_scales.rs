@@ -1,0 +1,50 @@
+//! Draws the step sizes of autoencoder and DQN over a run of 25,000 iterations: those that vanish
+//! (`config/agent.toml`), and the authors' constants (`--preset paper`).
+//!
+//! `cargo run -p agent --example time_scales -- docs/time-scales.png`
+
+use agent::config::{AgentConfig, StepSize};
+use agent::report::figures::curves::{Curve, Page, Panel, Scale, draw_curves};
+use std::path::Path;
+
+const ITERATIONS: u64 = 25_000;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let path = std::env::args().nth(1);
+    let path = path.ok_or("expected the path of a PNG file")?;
+    let panels = [
+        ("Step sizes that vanish (default)", AgentConfig::default()),
+        (
+            "Step sizes of the authors' code (preset paper)",
+            AgentConfig::paper(),
+        ),
+    ];
+    let page = Page {
+        title: "Two time scales".into(),
+        note: "rate (1 + n / steady)^-power at iteration n; paper eq. 17".into(),
+        axis: "iteration n".into(),
+        panels: panels.map(|(title, config)| panel(title, &config)).into(),
+    };
+    Ok(draw_curves(Path::new(&path), &page)?)
+}
+
+fn panel(title: &str, config: &AgentConfig) -> Panel {
+    let (model, dqn) = (config.autoencoder.step_size, config.dqn.step_size);
+    let curve = |name: &str, value: &dyn Fn(u64) -> f64| Curve {
+        name: name.into(),
+        points: (0..=ITERATIONS)
+            .step_by(100)
+            .map(|n| (n as f64, value(n)))
+            .collect(),
+    };
+    let at = |size: StepSize| move |n| size.at(n);
+    Panel {
+        title: title.into(),
+        scale: Scale::Logarithmic,
+        curves: vec![
+            curve("autoencoder", &at(model)),
+            curve("DQN", &at(dqn)),
+            curve("quotient", &|n| model.at(n) / dqn.at(n)),
+        ],
+    }
+}

@@ -1,0 +1,226 @@
+//! `emberwatch-agent train` with the autoencoder: the paper's Algorithm 1, small.
+
+use crate::commands::{AGENT, check};
+use crate::harness::{Ended, Server, run};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+use tempfile::TempDir;
+
+/// How long a small training may take.
+const LIMIT: Duration = Duration::from_secs(60);
+
+/// A server with one small world.
+const WORLD: &str = "--height 6 --width 9 --moves 5 --burn-in 60";
+
+/// Settings with which both networks learn after a few steps.
+const SETTINGS: &str = "learner = \"autoencoder\"
+shooting_samples = 16
+[autoencoder]
+window = 4
+replay_frames = 12
+full_frames = 6
+[dqn]
+batch = 4
+replay = 20
+";
+
+/// Columns of the metrics.
+const LOSS: usize = 2;
+const DQN_LOSS: usize = 6;
+
+struct Place {
+    folder: TempDir,
+}
+
+impl Place {
+    fn new(settings: &str) -> Self {
+        let folder = TempDir::new().expect("a folder");
+        std::fs::write(folder.path().join("agent.toml"), settings).expect("settings");
+        Self { folder }
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn checkpoint(&self, out: &str) -> PathBuf {
+        self.path(out).join("checkpoint.safetensors")
+    }
+
+    /// The command's words for training into a folder.
+    fn words(&self, out: &str, flags: &str) -> String {
+        let (config, out) = (self.path("agent.toml"), self.path(out));
+        let (config, out) = (config.display(), out.display());
+        format!("train --config {config} --out {out} {flags}")
+    }
+
+    fn train(&self, out: &str, flags: &str) -> Vec<Vec<String>> {
+        agent(&self.words(out, flags));
+        let text = std::fs::read_to_string(self.path(out).join("metrics.csv"));
+        let text = text.expect("the metrics");
+        let mut lines = text.lines();
+        let header = "update,world_steps,loss,held_out_log_likelihood,mean_reward,rate,\
+                      dqn_loss,dqn_rate,action,action_value,epsilon";
+        assert_eq!(lines.next(), Some(header));
+        lines
+            .map(|line| line.split(',').map(String::from).collect())
+            .collect()
+    }
+}
+
+fn agent(words: &str) -> Ended {
+    let ended = run(AGENT, &words.split_whitespace().collect::<Vec<_>>(), LIMIT);
+    assert_eq!(ended.code, Some(0), "{words}: {}", ended.stderr);
+    ended
+}
+
+/// What a checkpoint holds, but for its settings.
+fn contents(path: &Path) -> agent::checkpoint::Contents {
+    let mut contents = agent::checkpoint::read(path, "autoencoder").expect("a checkpoint");
+    contents.texts.remove("settings");
+    contents
+}
+
+#[test]
+fn the_same_seed_gives_the_same_losses_bit_for_bit() {
+    let place = Place::new(SETTINGS);
+    let train =
+        |out: &str, seed: u64| place.train(out, &format!("{WORLD} --steps 30 --agent-seed {seed}"));
+    let [a, b, c] = [("a", 5), ("b", 5), ("c", 6)].map(|(out, seed)| train(out, seed));
+    assert_eq!(a, b);
+    assert_ne!(a, c);
+    for column in [LOSS, DQN_LOSS] {
+        let losses: Vec<f64> = a
+            .iter()
+            .filter_map(|row| row[column].parse().ok())
+            .collect();
+        assert!(losses.len() >= 26, "{column}: {losses:?}");
+        assert!(losses.iter().all(|loss| loss.is_finite()), "{losses:?}");
+    }
+}
+
+#[test]
+fn a_training_that_stopped_goes_on_as_if_it_had_not() {
+    let place = Place::new(SETTINGS);
+    let flags = format!("{WORLD} --coverage client");
+    let whole = Server::start(&flags);
+    let name = whole.instance.name();
+    let whole = place.train("whole", &format!("--instance {name} --steps 24"));
+    let parts = Server::start(&flags);
+    let name = parts.instance.name();
+    place.train("parts", &format!("--instance {name} --steps 11"));
+    let again = place.words("parts", &format!("--instance {name} --steps 11"));
+    check(AGENT, &again, &["--out", "expected --resume"]);
+    let parts = place.train("parts", &format!("--instance {name} --steps 13 --resume"));
+    assert_eq!(whole, parts);
+    let checkpoint = |out| contents(&place.checkpoint(out));
+    assert_eq!(checkpoint("whole"), checkpoint("parts"));
+}
+
+#[test]
+fn another_world_is_begun_anew() {
+    let place = Place::new(SETTINGS);
+    place.train("out", &format!("{WORLD} --steps 20"));
+    let rows = place.train("out", &format!("{WORLD} --steps 20 --resume --seed 7"));
+    assert_eq!(rows.len(), 40);
+    assert_eq!(rows[39][1], "40");
+    assert!(!rows[39][LOSS].is_empty());
+    let frozen = place.train("out", &format!("{WORLD} --steps 5 --resume --freeze"));
+    assert_eq!(frozen[44][0], rows[39][0], "no update");
+    assert!(frozen[44][LOSS].is_empty());
+}
+
+#[test]
+fn numbers_that_are_not_finite_stop_training_with_a_checkpoint() {
+    for (section, tensor) in [("autoencoder", "decoder.0.weight"), ("dqn", "dqn.network")] {
+        let place = Place::new(SETTINGS);
+        place.train("out", &format!("{WORLD} --steps 10"));
+        let path = place.checkpoint("out");
+        let mut broken = agent::checkpoint::read(&path, "autoencoder").expect("a checkpoint");
+        let numbers = broken.tensors.iter_mut();
+        for (name, stored) in numbers {
+            if name.starts_with(tensor) {
+                // Finite, so that it is read, and too large to be worked with.
+                stored.numbers.fill(3e38);
+            }
+        }
+        agent::checkpoint::write(&path, "autoencoder", &broken).expect("written");
+        let resume = place.words("out", &format!("{WORLD} --steps 10 --resume"));
+        let words = ["update ", "expected finite numbers", "are in"];
+        check(AGENT, &resume, &words);
+        let saved = contents(&path);
+        assert!(saved.tensors.contains_key("W_obs_param"), "{section}");
+    }
+}
+
+#[test]
+fn a_checkpoint_enters_the_ladder() {
+    let place = Place::new(SETTINGS);
+    place.train("out", &format!("{WORLD} --steps 12"));
+    let checkpoint = place.checkpoint("out");
+    let checkpoint = checkpoint.display();
+    let worlds = format!("--seeds 3..5 --steps 5 {WORLD} --beam-width 4 --shooting-samples 16");
+    let compared = agent(&format!("compare --checkpoint {checkpoint} {worlds}"));
+    let evaluated = agent(&format!("evaluate --checkpoint {checkpoint} {worlds}"));
+    for policy in ["exploit", "explore", "policy", "beam"] {
+        let policy = format!("autoencoder_{policy} ");
+        assert!(compared.stdout.contains(&policy), "{}", compared.stdout);
+        assert!(evaluated.stdout.contains(&policy), "{}", evaluated.stdout);
+    }
+    let row = "autoencoder - known_model";
+    assert!(evaluated.stdout.contains(row), "{}", evaluated.stdout);
+    let server = Server::start(WORLD);
+    let run = format!("run --instance {} --steps 5", server.instance.name());
+    let run = format!("{run} --policy autoencoder_policy");
+    agent(&format!("{run} --checkpoint {checkpoint}"));
+    check(
+        AGENT,
+        &run,
+        &["autoencoder_policy", "--checkpoint FILE of an autoencoder"],
+    );
+    let twice = format!("compare --checkpoint {checkpoint} --checkpoint {checkpoint} {worlds}");
+    check(
+        AGENT,
+        &twice,
+        &["expected one checkpoint of autoencoder, got two"],
+    );
+    let other = worlds.replace("--height 6", "--height 7");
+    let other = format!("compare --policies autoencoder_beam --checkpoint {checkpoint} {other}");
+    check(
+        AGENT,
+        &other,
+        &["expected a network for 7 x 9 cells", "got one for 6 x 9"],
+    );
+}
+
+#[test]
+fn what_does_not_fit_is_named() {
+    let place = Place::new(SETTINGS);
+    let words = |flags: &str| place.words("out", flags);
+    check(
+        AGENT,
+        &words(&format!("{WORLD} --worlds 2")),
+        &["--worlds: expected 1 for the autoencoder", "got 2"],
+    );
+    let server = Server::start(WORLD);
+    let instance = format!("--instance {}", server.instance.name());
+    check(
+        AGENT,
+        &words(&instance),
+        &["autoencoder.full_frames: 6 frames", "--coverage client"],
+    );
+    place.train("out", &format!("{WORLD} --steps 8"));
+    let resume = words(&format!("{WORLD} --steps 8 --resume"));
+    let check_settings = |settings: &str, expected: &[&str]| {
+        std::fs::write(place.path("agent.toml"), settings).expect("settings");
+        check(AGENT, &resume, expected);
+    };
+    check_settings(
+        &SETTINGS.replace("[dqn]", "hidden = 5\n[dqn]"),
+        &["weight_ih_l0: expected shape"],
+    );
+    check_settings(
+        &SETTINGS.replace("learner = \"autoencoder\"\n", ""),
+        &["expected a checkpoint of learned_filter, got one of autoencoder"],
+    );
+}
