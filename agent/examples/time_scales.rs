@@ -21,7 +21,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     ];
     let page = Page {
         title: "Two time scales".into(),
-        note: "rate (1 + n / steady)^-power at iteration n; paper eq. 17".into(),
+        note: "rate (1 + n / steady)^-power at iteration n; paper eq. 20".into(),
         axis: "iteration n".into(),
         panels: panels.map(|(title, config)| panel(title, &config)).into(),
     };

@@ -12,7 +12,7 @@ const PAPER_DQN_RATE: f64 = 0.01;
 ///
 /// With powers of more than one half and at most one, sums of step sizes diverge and those of their
 /// squares do not. The autoencoder's power is larger than the DQN's, so that the quotient of the two
-/// vanishes too (paper eq. 17, `eps_sys / eps_dqn -> 0`). A power of 0 keeps the step size.
+/// vanishes too (paper eq. 20, `eps_sys / eps_dqn -> 0`). A power of 0 keeps the step size.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StepSize {

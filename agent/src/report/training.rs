@@ -93,7 +93,7 @@ fn averages(rows: &Rows, column: &str) -> Vec<(f64, f64)> {
     parts.filter_map(average).collect()
 }
 
-/// The model's step size as a share of the DQN's, where both are there (paper eq. 17).
+/// The model's step size as a share of the DQN's, where both are there (paper eq. 20).
 fn quotient([model, dqn]: &[Curve; 2]) -> Curve {
     let of_dqn = |x: f64| dqn.points.iter().find(|point| point.0 == x);
     let share = |&(x, rate): &(f64, f64)| Some((x, rate / of_dqn(x)?.1));

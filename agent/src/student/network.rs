@@ -3,7 +3,7 @@
 //!
 //! One iteration: `h_{k+1}` and the predictor `u_{k+1}` from the frame (eq. 9), the estimate `p_k` by Bayes'
 //! rule (eq. 10), an action from `h` (eq. 17), a path for it (eq. 15), the path's frame and reward; then one
-//! step of Adam on each network (eq. 20), with step sizes of their own ([`crate::config::StepSize`]).
+//! step of Adam on each network (eq. 19), with step sizes of their own ([`crate::config::StepSize`]).
 
 use super::{Lesson, NotFinite, Site, Student};
 use crate::belief::Belief;
