@@ -2,6 +2,8 @@
 
 use crate::synthetic::{Scene, ladder, model, noise, run, scene};
 use agent::report::figures::FIRE_CELLS_PER_STEP;
+use agent::report::figures::curves::{Curve, Page, Panel, Scale, draw_curves};
+use agent::report::training::{FIGURE, draw_training};
 use agent::report::{PolicyRun, ReportError, Snapshot, draw_ladder, draw_rewards, draw_snapshot};
 use protocol::{Cell, Model};
 use std::collections::HashSet;
@@ -190,5 +192,75 @@ fn results_that_cannot_be_drawn_are_errors() {
     assert!(
         matches!(nowhere, Err(ReportError::Write { .. })),
         "{nowhere:?}"
+    );
+}
+
+fn page(panels: Vec<Panel>) -> Page {
+    Page {
+        title: "Curves".into(),
+        note: "small print".into(),
+        axis: "iteration n".into(),
+        panels,
+    }
+}
+
+#[test]
+fn curves_of_many_and_of_few_points() {
+    let curve = |name: &str, n: usize, value: fn(f64) -> f64| Curve {
+        name: name.into(),
+        points: (0..n).map(|x| (x as f64, value(x as f64))).collect(),
+    };
+    let panel = |scale, curves| Panel {
+        title: "rate per update".into(),
+        scale,
+        curves,
+    };
+    let path = target("curves");
+    let logarithmic = vec![
+        curve("vanishes", 1000, |x| 1e-3 / (1.0 + x)),
+        curve("is zero at first", 1000, |x| (x - 10.0).max(0.0)),
+    ];
+    let panels = vec![
+        panel(Scale::Logarithmic, logarithmic),
+        panel(Scale::Linear, vec![curve("one point", 1, |_| -3.0)]),
+        panel(Scale::Linear, vec![curve("none", 0, |x| x)]),
+        panel(Scale::Linear, vec![curve("none either", 9, |_| f64::NAN)]),
+    ];
+    draw_curves(&path, &page(panels)).expect("drawn");
+    // Two panels: the others have nothing to draw.
+    check(&path, Some(2 * (84 + 2 * 190 + 64)));
+    let empty = draw_curves(&target("never"), &page(Vec::new()));
+    assert_eq!(empty, Err(ReportError::Empty { what: "curves" }));
+}
+
+#[test]
+fn a_training_is_drawn_from_its_metrics() {
+    let folder = target("training").with_extension("");
+    std::fs::create_dir_all(&folder).expect("target is writable");
+    let mut text = "update,world_steps,loss,held_out_log_likelihood,mean_reward,rate,dqn_loss,\
+                    dqn_rate\n"
+        .to_owned();
+    for row in 0..2000_u64 {
+        let loss = if row < 500 {
+            String::new()
+        } else {
+            format!("{}", 0.5 + noise(1, row))
+        };
+        let reward = 7.0 + noise(2, row);
+        text += &format!(
+            "{row},{row},{loss},{},{reward},1e-4,{},0.01\n",
+            -0.4,
+            1.0 + noise(3, row)
+        );
+    }
+    std::fs::write(folder.join("metrics.csv"), text).expect("written");
+    draw_training(&folder).expect("drawn");
+    check(&folder.join(FIGURE), Some(2 * (84 + 5 * 190 + 64)));
+    let missing = draw_training(Path::new("no/such")).expect_err("no metrics");
+    assert!(
+        missing
+            .to_string()
+            .starts_with("metrics no/such/metrics.csv"),
+        "{missing}"
     );
 }

@@ -12,6 +12,8 @@ const PANEL: f64 = 190.0;
 /// Height of the page's title, and of the axis under the last panel.
 const HEAD: f64 = 84.0;
 const FOOT: f64 = 64.0;
+/// Empty room under a plot.
+const GAP: f64 = 22.0;
 /// Room for the name of a panel, above its plot.
 const TITLE: f64 = 30.0;
 const LABEL_GAP: f64 = 19.0;
@@ -84,7 +86,7 @@ pub fn draw_curves(path: &Path, page: &Page) -> Result<(), ReportError> {
             let top = HEAD + PANEL * index as f64;
             let plot = Plot {
                 top: top + TITLE,
-                bottom: top + PANEL - 14.0,
+                bottom: top + PANEL - GAP,
                 right,
                 values: panel.axis(),
                 steps: &steps,
@@ -97,7 +99,7 @@ pub fn draw_curves(path: &Path, page: &Page) -> Result<(), ReportError> {
             );
             plot.draw(canvas, panel);
         }
-        draw_steps(canvas, &steps, right, height - FOOT - 14.0, &page.axis);
+        draw_steps(canvas, &steps, right, height - FOOT - GAP, &page.axis);
     })
 }
 
