@@ -76,7 +76,9 @@ fn dqn(c: &mut Criterion) {
             next: vector(row * 100 + 20),
         });
     }
-    c.bench_function("dqn: update (torch: 0.65 ms)", |b| b.iter(|| dqn.update()));
+    c.bench_function("dqn: update (torch: 0.65 ms)", |b| {
+        b.iter(|| dqn.update().expect("finite"));
+    });
     let input = vector(1);
     c.bench_function("dqn: act (candle: 3.5 us)", |b| {
         b.iter(|| dqn.act(&input, 3))

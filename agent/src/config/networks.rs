@@ -149,6 +149,8 @@ pub struct DqnConfig {
     pub batch: usize,
     /// Discount, 0 to 1.
     pub gamma: f32,
+    /// Steps whose rewards a transition adds up, 1 to 1,000.
+    pub n_step: usize,
     /// Share of the network in its target after each update, 0 to 1.
     pub tau: f32,
     /// Chance of a random action at the first step, 0 to 1.
@@ -184,6 +186,7 @@ impl DqnConfig {
             replay: settings.replay,
             batch: settings.batch,
             gamma: settings.gamma,
+            n_step: settings.n_step,
             tau: settings.tau,
             epsilon: settings.epsilon,
             epsilon_end: settings.epsilon_end,
@@ -199,6 +202,7 @@ impl DqnConfig {
     /// [`ConfigError`] names the first that is wrong.
     pub fn check(&self) -> Result<(), ConfigError> {
         between("dqn.batch", self.batch, 1, 65_536)?;
+        between("dqn.n_step", self.n_step, 1, 1_000)?;
         between("dqn.replay", self.replay, self.batch, 10_000_000)?;
         for (setting, got) in [
             ("dqn.gamma", self.gamma),
@@ -219,6 +223,7 @@ impl DqnConfig {
             replay: self.replay,
             batch: self.batch,
             gamma: self.gamma,
+            n_step: self.n_step,
             tau: self.tau,
             epsilon: self.epsilon,
             epsilon_end: self.epsilon_end,

@@ -1,5 +1,6 @@
 //! Adam, as PyTorch has it, with moments that can be saved.
 
+use super::lanes::{Arithmetic, Kernel, dispatch};
 use serde::{Deserialize, Serialize};
 
 /// Settings of Adam.
@@ -45,6 +46,23 @@ impl Adam {
 
     /// Moves parameters against their gradient.
     pub fn step(&mut self, settings: &AdamSettings, parameters: &mut [f32], gradient: &[f32]) {
+        dispatch(Step {
+            adam: self,
+            settings,
+            parameters,
+            gradient,
+        });
+    }
+
+    /// [`Self::step`] with the vectors of the caller. Sums and products are rounded one by one, so it
+    /// gives the same bits with all.
+    #[inline(always)]
+    pub(crate) fn move_by(
+        &mut self,
+        settings: &AdamSettings,
+        parameters: &mut [f32],
+        gradient: &[f32],
+    ) {
         self.step += 1;
         let bias = |beta: f32| 1.0 - f64::from(beta).powf(self.step as f64);
         let rate = (f64::from(settings.learning_rate) / bias(settings.betas[0])) as f32;
@@ -56,6 +74,21 @@ impl Adam {
             *v = second * *v + (1.0 - second) * d * d;
             *parameter -= rate * *m / (v.sqrt() * root + settings.epsilon);
         }
+    }
+}
+
+struct Step<'a> {
+    adam: &'a mut Adam,
+    settings: &'a AdamSettings,
+    parameters: &'a mut [f32],
+    gradient: &'a [f32],
+}
+
+impl Kernel for Step<'_> {
+    #[inline(always)]
+    fn run<A: Arithmetic>(self) {
+        self.adam
+            .move_by(self.settings, self.parameters, self.gradient);
     }
 }
 

@@ -3,14 +3,23 @@
 //! Its input is the autoencoder's hidden vector, or any other summary of the belief. A transition is
 //! never terminal: episodes are cut off, the world goes on.
 
+mod learning;
+mod memory;
+mod state;
+mod track;
+
+pub use track::Track;
+
 use super::adam::{Adam, AdamSettings};
+use super::autoencoder::NotFinite;
 use super::lanes::{Arithmetic, Kernel, dispatch};
 use super::parameters::uniform;
-use super::perceptron::{Activations, Perceptron};
+use super::perceptron::{Batch, Perceptron};
+use learning::{Learn, Workspace};
+use memory::{Memory, Row};
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
-use std::collections::VecDeque;
 
 /// Width of both hidden layers, as in the authors' code.
 const WIDTH: usize = 128;
@@ -25,6 +34,8 @@ pub struct DqnSettings {
     pub batch: usize,
     /// Discount.
     pub gamma: f32,
+    /// Steps that a transition spans, see [`Track`]: what follows it is discounted by `gamma^n`.
+    pub n_step: usize,
     /// Share of the network in its target after each update.
     pub tau: f32,
     /// Chance of a random action at the first step.
@@ -46,6 +57,7 @@ impl DqnSettings {
             replay: 1000,
             batch: 64,
             gamma: 0.99,
+            n_step: 1,
             tau: 0.01,
             epsilon: 0.1,
             epsilon_end: 0.1,
@@ -83,12 +95,14 @@ pub struct Transition {
 pub struct Dqn {
     settings: DqnSettings,
     seed: u64,
+    n_inputs: usize,
     n_actions: usize,
     network: Perceptron,
     target: Perceptron,
     adam: Adam,
-    replay: VecDeque<Transition>,
+    memory: Memory,
     n_updates: u64,
+    workspace: Workspace,
 }
 
 impl Dqn {
@@ -98,24 +112,50 @@ impl Dqn {
         Self {
             settings,
             seed,
+            n_inputs,
             n_actions,
             target: network.clone(),
             adam: Adam::new(network.numbers.len()),
             network,
-            replay: VecDeque::with_capacity(settings.replay),
+            memory: Memory::new(settings.replay, n_inputs),
             n_updates: 0,
+            workspace: Workspace::default(),
         }
     }
 
-    /// The value of each action, `Q(h, .)`.
-    pub fn values(&self, input: &[f32]) -> Vec<f32> {
-        let mut values = outputs(&self.network, input);
-        values.pop().expect("invariant: a layer")
+    /// Settings, with the present step size.
+    pub fn settings(&self) -> &DqnSettings {
+        &self.settings
+    }
+
+    /// Updates so far.
+    pub fn n_updates(&self) -> u64 {
+        self.n_updates
+    }
+
+    /// Transitions remembered.
+    pub fn n_remembered(&self) -> usize {
+        self.memory.len()
     }
 
     /// Changes the step size.
     pub fn set_learning_rate(&mut self, learning_rate: f32) {
         self.settings.adam.learning_rate = learning_rate;
+    }
+
+    /// The value of each action, `Q(h, .)`.
+    ///
+    /// # Panics
+    /// If `input` has another length.
+    pub fn values(&self, input: &[f32]) -> Vec<f32> {
+        assert_eq!(input.len(), self.n_inputs, "numbers of the input");
+        let mut batch = Batch::default();
+        batch.input.extend_from_slice(input);
+        dispatch(Forward {
+            network: &self.network,
+            batch: &mut batch,
+        });
+        batch.values()[..self.n_actions].to_vec()
     }
 
     /// The action of the largest value.
@@ -132,158 +172,57 @@ impl Dqn {
         }
     }
 
+    /// Makes transitions of [`DqnSettings::n_step`] steps out of one world's single steps.
+    pub fn track(&self) -> Track {
+        Track::new(self.settings.n_step, self.settings.gamma)
+    }
+
     /// Remembers a transition, and forgets the oldest if there are too many.
+    ///
+    /// # Panics
+    /// If it has other numbers of inputs or an action that there is not.
     pub fn remember(&mut self, transition: Transition) {
-        if self.replay.len() == self.settings.replay {
-            self.replay.pop_front();
-        }
-        self.replay.push_back(transition);
+        assert!(transition.action < self.n_actions, "transition: action");
+        self.memory.push(Row::from(&transition));
     }
 
     /// One step of Adam on a random batch, then of the target; the loss before it, or `None` while there
     /// are fewer transitions than a batch.
-    pub fn update(&mut self) -> Option<f32> {
-        if self.replay.len() < self.settings.batch {
-            return None;
+    ///
+    /// # Errors
+    /// [`NotFinite`] for a number that is not; nothing has changed then.
+    pub fn update(&mut self) -> Result<Option<f32>, NotFinite> {
+        if self.memory.len() < self.settings.batch.max(1) {
+            return Ok(None);
         }
         let mut rng = stream(self.seed, Purpose::Replay, self.n_updates);
-        let mut pick = || (rng.next_u64() % self.replay.len() as u64) as usize;
-        let batch: Vec<Transition> = (0..self.settings.batch)
-            .map(|_| self.replay[pick()].clone())
-            .collect();
-        Some(self.learn(&batch))
+        self.workspace.clear();
+        for _ in 0..self.settings.batch {
+            let age = (rng.next_u64() % self.memory.len() as u64) as usize;
+            self.workspace.add(self.memory.row(age));
+        }
+        self.learn_workspace().map(Some)
     }
 
     /// [`Self::update`] on a given batch (eqs. 19 and 21).
-    pub fn learn(&mut self, batch: &[Transition]) -> f32 {
-        let targets = self.targets(batch);
-        let inputs: Vec<f32> = batch.iter().flat_map(|row| row.input.clone()).collect();
-        let activations = outputs(&self.network, &inputs);
-        let values = activations.last().expect("invariant: a layer");
-        let mut d_values = vec![0.0; values.len()];
-        let mut loss = 0.0;
-        for (index, (row, target)) in batch.iter().zip(targets).enumerate() {
-            let at = index * self.n_actions + row.action;
-            let error = values[at] - target;
-            loss += error * error / batch.len() as f32;
-            d_values[at] = 2.0 * error / batch.len() as f32;
-        }
-        let mut gradient = Vec::new();
-        dispatch(Backward {
-            network: &self.network,
-            activations: &activations,
-            d_values,
-            gradient: &mut gradient,
-        });
-        let numbers = &mut self.network.numbers;
-        self.adam.step(&self.settings.adam, numbers, &gradient);
-        self.follow();
-        self.n_updates += 1;
-        loss
-    }
-
-    /// `r + gamma Q'(h', a')` of each transition.
-    fn targets(&self, batch: &[Transition]) -> Vec<f32> {
-        let next: Vec<f32> = batch.iter().flat_map(|row| row.next.clone()).collect();
-        let of_target = outputs(&self.target, &next)
-            .pop()
-            .expect("invariant: a layer");
-        let of_network = match self.settings.double {
-            true => outputs(&self.network, &next).pop(),
-            false => None,
-        };
-        let rows = 0..batch.len();
-        let target = |row: usize| {
-            let range = row * self.n_actions..(row + 1) * self.n_actions;
-            let judge = of_network.as_ref().unwrap_or(&of_target);
-            let action = best(&judge[range.clone()]);
-            batch[row].reward + self.settings.gamma * of_target[range][action]
-        };
-        rows.map(target).collect()
-    }
-
-    /// Moves the target towards the network.
-    fn follow(&mut self) {
-        let tau = self.settings.tau;
-        for (target, number) in self.target.numbers.iter_mut().zip(&self.network.numbers) {
-            *target += tau * (number - *target);
-        }
-    }
-
-    /// Updates so far.
-    pub fn n_updates(&self) -> u64 {
-        self.n_updates
-    }
-
-    /// Transitions remembered.
-    pub fn n_transitions(&self) -> usize {
-        self.replay.len()
-    }
-
-    /// Everything that a resumed run needs but settings, seed and counts: name, shape, numbers.
-    pub fn named_tensors(&self) -> Vec<(String, Vec<usize>, Vec<f32>)> {
-        let mut tensors = Vec::new();
-        for (part, numbers) in [
-            ("network", &self.network.numbers),
-            ("target", &self.target.numbers),
-            ("adam.first", &self.adam.first),
-            ("adam.second", &self.adam.second),
-        ] {
-            let layers = self.network.with_numbers(numbers).tensors();
-            let named = |(name, shape, numbers)| (format!("dqn.{part}.{name}"), shape, numbers);
-            tensors.extend(layers.into_iter().map(named));
-        }
-        let rows = || self.replay.iter();
-        let n = rows().len();
-        let flat = |of: fn(&Transition) -> &[f32]| rows().flat_map(of).copied().collect();
-        let n_inputs = self.network.ends(0)[0];
-        let actions = rows().map(|row| row.action as f32).collect();
-        let rewards = rows().map(|row| row.reward).collect();
-        for (name, shape, numbers) in [
-            ("input", vec![n, n_inputs], flat(|row| &row.input)),
-            ("action", vec![n], actions),
-            ("reward", vec![n], rewards),
-            ("next", vec![n, n_inputs], flat(|row| &row.next)),
-        ] {
-            tensors.push((format!("dqn.replay.{name}"), shape, numbers));
-        }
-        tensors
-    }
-
-    /// Takes over what [`Self::named_tensors`] gave, of a learner of the same sizes. `numbers` finds those of
-    /// a name and shape.
     ///
     /// # Errors
-    /// As of `numbers`; nothing has changed then.
-    pub fn load<E>(
-        &mut self,
-        numbers: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
-        n_updates: u64,
-        n_transitions: usize,
-    ) -> Result<(), E> {
-        let layers = |part: &str| {
-            self.network
-                .filled(|name, shape| numbers(&format!("dqn.{part}.{name}"), shape))
-        };
-        let [network, target] = [layers("network")?, layers("target")?];
-        let [first, second] = [layers("adam.first")?, layers("adam.second")?];
-        let n_inputs = self.network.ends(0)[0];
-        let pairs = [n_transitions, n_inputs];
-        let input = numbers("dqn.replay.input", &pairs)?;
-        let next = numbers("dqn.replay.next", &pairs)?;
-        let actions = numbers("dqn.replay.action", &[n_transitions])?;
-        let rewards = numbers("dqn.replay.reward", &[n_transitions])?;
-        let row = |index: usize| Transition {
-            input: input[index * n_inputs..][..n_inputs].to_vec(),
-            action: (actions[index] as usize).min(self.n_actions - 1),
-            reward: rewards[index],
-            next: next[index * n_inputs..][..n_inputs].to_vec(),
-        };
-        self.replay = (0..n_transitions).map(row).collect();
-        (self.network, self.target) = (network, target);
-        (self.adam.first, self.adam.second) = (first.numbers, second.numbers);
-        (self.adam.step, self.n_updates) = (n_updates, n_updates);
-        Ok(())
+    /// [`NotFinite`] for a number that is not; nothing has changed then.
+    pub fn learn(&mut self, batch: &[Transition]) -> Result<f32, NotFinite> {
+        self.workspace.clear();
+        for transition in batch {
+            self.workspace.add(Row::from(transition));
+        }
+        self.learn_workspace()
+    }
+
+    fn learn_workspace(&mut self) -> Result<f32, NotFinite> {
+        let mut loss = Ok(0.0);
+        dispatch(Learn {
+            dqn: self,
+            loss: &mut loss,
+        });
+        loss
     }
 
     /// The network's layers as PyTorch has them: name, shape, numbers.
@@ -299,39 +238,14 @@ fn best(values: &[f32]) -> usize {
     values.iter().enumerate().fold(0, larger)
 }
 
-fn outputs(network: &Perceptron, inputs: &[f32]) -> Activations {
-    let mut activations = Vec::new();
-    dispatch(Forward {
-        network,
-        inputs,
-        activations: &mut activations,
-    });
-    activations
-}
-
 struct Forward<'a> {
     network: &'a Perceptron,
-    inputs: &'a [f32],
-    activations: &'a mut Activations,
+    batch: &'a mut Batch,
 }
 
 impl Kernel for Forward<'_> {
     #[inline(always)]
     fn run<A: Arithmetic>(self) {
-        *self.activations = self.network.forward::<A>(self.inputs);
-    }
-}
-
-struct Backward<'a> {
-    network: &'a Perceptron,
-    activations: &'a Activations,
-    d_values: Vec<f32>,
-    gradient: &'a mut Vec<f32>,
-}
-
-impl Kernel for Backward<'_> {
-    #[inline(always)]
-    fn run<A: Arithmetic>(self) {
-        *self.gradient = self.network.backward::<A>(self.activations, self.d_values);
+        self.network.forward::<A>(self.batch);
     }
 }

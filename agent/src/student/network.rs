@@ -14,6 +14,7 @@ use crate::config::AgentConfig;
 use crate::estimator::ZeroEvidence;
 use crate::learned::{LearnedNetwork, likelihood};
 use crate::metrics::Tick;
+use crate::network::dqn::Track;
 use crate::network::{Autoencoder, Dqn, Replay, Transition};
 use crate::planner::{Objective, Planner, PlanningProblem};
 use crate::policy::Policy;
@@ -65,6 +66,7 @@ pub struct NetworkStudent {
     planner: Box<dyn Planner + Send>,
     observation: Option<Observation>,
     decision: Option<Decision>,
+    track: Track,
     times: [(&'static str, Duration); 4],
 }
 
@@ -111,10 +113,10 @@ impl Progress {
     /// As a checkpoint, without the settings.
     pub fn to_contents(&self) -> Contents {
         let mut contents = Contents::default();
-        let named = self.autoencoder.named_numbers().into_iter();
-        for (name, shape, numbers) in named.chain(self.dqn.named_tensors()) {
+        for (name, shape, numbers) in self.autoencoder.named_numbers() {
             contents.tensors.insert(name, Tensor { shape, numbers });
         }
+        self.dqn.save(&mut contents);
         let frames = self
             .replay
             .frames()
@@ -152,8 +154,6 @@ impl Progress {
             ),
             ("adam_steps", adam_steps),
             ("updates", updates),
-            ("dqn_updates", self.dqn.n_updates()),
-            ("dqn_transitions", self.dqn.n_transitions() as u64),
             ("iterations", self.iterations),
         ] {
             contents.texts.insert(name.into(), count.to_string());
@@ -204,9 +204,7 @@ impl Progress {
         let numbers = |name: &str, dims: &[usize]| contents.tensor(name, dims).map(<[f32]>::to_vec);
         let counters = [contents.count("adam_steps")?, contents.count("updates")?];
         self.autoencoder.load(numbers, counters)?;
-        let n_transitions = contents.count("dqn_transitions")? as usize;
-        let n_updates = contents.count("dqn_updates")?;
-        self.dqn.load(numbers, n_updates, n_transitions)?;
+        self.dqn.load(contents)?;
         let n_states = self.reward.rewards.len();
         self.reward.products = contents.floats("reward.products", n_states * n_states)?;
         self.reward.rewards = contents.floats("reward.rewards", n_states)?;
@@ -252,6 +250,7 @@ impl NetworkStudent {
                 .map(|choice| config.objective(choice))
                 .collect(),
             planner: config.planner(&choices[0]),
+            track: progress.dqn.track(),
             progress,
             site,
             config: config.clone(),
@@ -285,12 +284,15 @@ impl NetworkStudent {
             self.progress.reward.add(&met, reward);
         }
         if let Some(decision) = &self.decision {
-            self.progress.dqn.remember(Transition {
+            let step = Transition {
                 input: decision.hidden.clone(),
                 action: decision.action,
                 reward: reward as f32,
                 next: self.progress.autoencoder.hidden().to_vec(),
-            });
+            };
+            if let Some(transition) = self.track.add(step) {
+                self.progress.dqn.remember(transition);
+            }
         }
     }
 
@@ -300,7 +302,7 @@ impl NetworkStudent {
         self.progress.dqn.set_learning_rate(rate as f32);
         let loss = self.progress.dqn.update();
         self.times[2].1 += start.elapsed();
-        Ok([loss.map(f64::from), Some(rate)])
+        Ok([loss?.map(f64::from), Some(rate)])
     }
 
     fn update_autoencoder(&mut self) -> Result<[Option<f64>; 2], NotFinite> {
@@ -340,6 +342,7 @@ impl Student for NetworkStudent {
         let goes_on = self.progress.standing == Some(standing);
         self.progress.standing = Some(standing);
         self.decision = None;
+        self.track = self.progress.dqn.track();
         if !goes_on {
             self.progress.autoencoder.forget();
             self.progress.replay.begin();

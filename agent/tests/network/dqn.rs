@@ -1,5 +1,6 @@
 //! The DQN beside candle's stock linear layers and AdamW, whose weight decay of zero makes it Adam.
 
+use agent::checkpoint::Contents;
 use agent::network::{Dqn, DqnSettings, Transition};
 use candle_core::{DType, Device, Result, Tensor, Var};
 use candle_nn::{AdamW, Optimizer, ParamsAdamW};
@@ -96,7 +97,7 @@ fn check(double: bool) -> Result<()> {
         let loss = stock_loss(&layers, &targets, &batch, double)?;
         let expected: f32 = loss.to_dtype(DType::F32)?.to_scalar()?;
         optimiser.backward_step(&loss)?;
-        let got = dqn.learn(&batch);
+        let got = dqn.learn(&batch).expect("finite");
         assert!(
             (got / expected - 1.0).abs() < 1e-4,
             "{update}: loss {got}, expected {expected}"
@@ -148,7 +149,8 @@ fn it_learns_which_action_pays() {
         });
     }
     for _ in 0..200 {
-        dqn.update().expect("enough transitions");
+        let loss = dqn.update().expect("finite");
+        loss.expect("enough transitions");
     }
     let greedy = |input: f32| {
         let values = dqn.values(&[input]);
@@ -158,4 +160,147 @@ fn it_learns_which_action_pays() {
     let random = (0..1000).filter(|&step| dqn.act(&[1.0], step) == 0).count();
     // One in ten is random, half of those the other action: 50 in 1000, standard deviation 7.
     assert!((20..90).contains(&random), "{random}");
+}
+
+/// With a full replay, and one update made.
+fn learner(settings: DqnSettings, seed: u64) -> Dqn {
+    let mut dqn = Dqn::new(settings, N_INPUTS, N_ACTIONS, seed);
+    for transition in (0..3).flat_map(batch) {
+        dqn.remember(transition);
+    }
+    dqn.update().expect("finite").expect("enough transitions");
+    dqn
+}
+
+fn small() -> DqnSettings {
+    DqnSettings {
+        replay: 150,
+        ..DqnSettings::paper()
+    }
+}
+
+#[test]
+fn a_saved_dqn_resumes_bit_for_bit() {
+    let mut dqn = learner(small(), 2);
+    dqn.set_learning_rate(0.003);
+    let mut contents = Contents::default();
+    dqn.save(&mut contents);
+    let mut resumed = Dqn::new(*dqn.settings(), N_INPUTS, N_ACTIONS, 2);
+    resumed.load(&contents).expect("the same sizes");
+    assert_eq!(resumed.n_updates(), 1);
+    assert_eq!(resumed.n_remembered(), 150);
+    for update in 0..5 {
+        let transition = batch(9).swap_remove(update);
+        dqn.remember(transition.clone());
+        resumed.remember(transition);
+        let bits = |dqn: &mut Dqn| dqn.update().expect("finite").map(f32::to_bits);
+        assert_eq!(bits(&mut dqn), bits(&mut resumed), "update {update}");
+    }
+    assert_eq!(dqn.named_tensors(), resumed.named_tensors());
+}
+
+#[test]
+fn a_shorter_replay_loads_the_latest_transitions() {
+    let mut contents = Contents::default();
+    learner(small(), 2).save(&mut contents);
+    let settings = DqnSettings {
+        replay: 70,
+        ..small()
+    };
+    let mut dqn = Dqn::new(settings, N_INPUTS, N_ACTIONS, 2);
+    dqn.load(&contents).expect("the same sizes");
+    let rewards = |tensors: &[(String, Vec<usize>, Vec<f32>)]| {
+        let found = tensors
+            .iter()
+            .find(|(name, ..)| name == "dqn.replay.reward");
+        found.expect("rewards").2.clone()
+    };
+    let all = &contents.tensors["dqn.replay.reward"].numbers;
+    assert_eq!(rewards(&dqn.named_tensors()), all[80..]);
+}
+
+#[test]
+fn a_checkpoint_of_something_else_is_refused_by_name_and_changes_nothing() {
+    let mut contents = Contents::default();
+    learner(small(), 2).save(&mut contents);
+    let check = |change: fn(&mut Contents), words: &str| {
+        let mut contents = contents.clone();
+        change(&mut contents);
+        let mut dqn = learner(small(), 3);
+        let before = dqn.named_tensors();
+        let error = dqn.load(&contents).expect_err(words).to_string();
+        assert_eq!(error, words);
+        assert_eq!(dqn.named_tensors(), before, "{words}");
+    };
+    check(
+        |contents| {
+            contents
+                .tensors
+                .retain(|name, _| name != "dqn.target.2.bias")
+        },
+        "expected \"dqn.target.2.bias\" in it, found none",
+    );
+    let name = |contents: &mut Contents| {
+        let tensor = contents.tensors.get_mut("dqn.replay.action");
+        tensor.expect("actions").numbers[7] = 4.0;
+    };
+    check(name, "dqn.replay.action: expected actions below 4, got 4");
+    check(
+        |contents| {
+            let tensor = contents.tensors.get_mut("dqn.replay.next").expect("nexts");
+            tensor.shape = vec![75, 12];
+        },
+        "dqn.replay.next: expected shape [150, 6], got [75, 12]",
+    );
+}
+
+#[test]
+fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
+    let check = |name: &str, at: usize, words: &str| {
+        let mut dqn = learner(small(), 2);
+        let mut rows = batch(7);
+        match name {
+            "dqn.replay.input" => rows[at].input[2] = f32::NAN,
+            "dqn.replay.next" => rows[at].next[2] = f32::INFINITY,
+            "dqn.replay.reward" => rows[at].reward = f32::NEG_INFINITY,
+            // Squared, it is no longer finite.
+            _ => rows[at].reward = 1e30,
+        }
+        let before = dqn.named_tensors();
+        let error = dqn.learn(&rows).expect_err(words);
+        assert_eq!((error.update, error.tensor.as_str()), (1, words));
+        assert_eq!(dqn.named_tensors(), before, "{words}");
+        dqn.learn(&batch(7)).expect("finite again");
+    };
+    check("dqn.replay.input", 5, "dqn.replay.input");
+    check("dqn.replay.next", 63, "dqn.replay.next");
+    check("dqn.replay.reward", 0, "dqn.replay.reward");
+    check("large", 3, "loss");
+}
+
+#[test]
+fn a_network_that_overflows_is_named() {
+    let mut dqn = learner(small(), 2);
+    dqn.set_learning_rate(f32::INFINITY);
+    dqn.update().expect("finite until this step");
+    let error = dqn.update().expect_err("not finite");
+    assert_eq!(
+        (error.update, error.tensor.as_str()),
+        (2, "dqn.network.0.weight")
+    );
+}
+
+#[test]
+fn what_follows_several_steps_is_discounted_as_often() {
+    let targets = |gamma: f32, n_step: usize| {
+        let settings = DqnSettings {
+            gamma,
+            n_step,
+            ..small()
+        };
+        let mut dqn = Dqn::new(settings, N_INPUTS, N_ACTIONS, 2);
+        dqn.learn(&batch(0)).expect("finite")
+    };
+    assert_eq!(targets(0.5, 3), targets(0.125, 1));
+    assert_ne!(targets(0.5, 3), targets(0.5, 1));
 }
