@@ -5,14 +5,14 @@
 //! learned from in a step comes from worlds that differ. Rewards say which learned state pays
 //! ([`crate::reward`]).
 
-use crate::checkpoint::{self, CheckpointError};
+use crate::checkpoint::{self, CheckpointError, Problem};
 use crate::client::{Claim, Client};
 use crate::config::{AgentConfig, ConfigError};
 use crate::estimator::ZeroEvidence;
 use crate::estimator::learned_filter::{Dimensions, DimensionsError, NotFinite, Update};
 use crate::learner::{KIND, Learned, Learner, Progress};
 use crate::metrics::{Metrics, MetricsError, Tick};
-use crate::pilot::Pilot;
+use crate::pilot::{Pilot, Stand};
 use crate::policy::PlannerKind;
 use crate::scoring::Score;
 use protocol::Move;
@@ -20,6 +20,7 @@ use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::WorldSeed;
 use rayon::prelude::*;
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -156,19 +157,35 @@ impl Trainee {
         };
         let mut client = Client::acquire(&training.instance, &claim)?;
         let dimensions = dimensions(&training.config, client.info().n_observations)?;
-        let progress = match contents {
-            Some(contents) => Progress::from_contents(&contents, Some(dimensions))
-                .map_err(|problem| problem.of(&place))?,
-            None => Progress::first(dimensions, training.config.seed),
+        let config = &training.config;
+        let shape = client.shape();
+        let wrong = |problem: Problem| problem.of(&place);
+        let mut learner = match &contents {
+            Some(contents) => {
+                Learner::from_contents(contents, dimensions, shape, config).map_err(wrong)?
+            }
+            None => Learner::new(Progress::first(dimensions, config.seed), shape, config),
+        };
+        let stands = match &contents {
+            Some(contents) => {
+                Stand::restored(dimensions.n_states, shape, contents).map_err(wrong)?
+            }
+            None => BTreeMap::new(),
         };
         let metrics = Metrics::open(&training.out, training.resume)?;
-        let learned = progress.learned();
-        let mut learner = Learner::new(progress, client.shape(), &training.config);
+        let learned = learner.learned();
         let observations = client.observe(client.worlds())?;
+        if training.resume && !Stand::any_is_of(&stands, client.worlds(), &observations) {
+            tracing::info!("other worlds than the checkpoint's: an empty replay");
+            learner.forget();
+        }
         let mut pilots = Vec::new();
         for (world, observation) in client.worlds().zip(observations) {
-            let mut pilot = Pilot::new(&learned, client.shape(), observation, &training.config);
-            pilot.begin(world, &mut learner)?;
+            let mut pilot = Pilot::new(&learned, shape, observation, config);
+            let goes_on = pilot.go_on(world, stands.get(&world), &mut learner)?;
+            if training.resume && !goes_on {
+                tracing::info!(world, "a new track");
+            }
             pilots.push(pilot);
         }
         let now = Instant::now();
@@ -194,7 +211,10 @@ impl Trainee {
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
             let tick = self.step(training)?;
             let updates = match training.freeze {
-                true => Vec::new(),
+                true => {
+                    self.learner.rest();
+                    Vec::new()
+                }
                 false => self.learn(training)?,
             };
             self.metrics
@@ -285,8 +305,10 @@ impl Trainee {
     fn save(&mut self, training: &Training) -> Result<PathBuf, TrainError> {
         self.saved = Instant::now();
         let place = training.out.join(CHECKPOINT);
-        let contents = self.learner.progress();
-        let contents = contents.to_contents(&toml::to_string(&training.config)?);
+        let settings = toml::to_string(&training.config)?;
+        let mut contents = self.learner.to_contents(&settings);
+        let pilots = self.client.worlds().zip(&self.pilots);
+        Stand::store(pilots, self.client.shape(), &mut contents);
         checkpoint::write(&place, KIND, &contents)?;
         Ok(place)
     }
