@@ -1,7 +1,10 @@
 //! `emberwatch-agent train` and what becomes of its checkpoints.
 
 use crate::commands::{AGENT, check, check_table};
-use crate::harness::{Ended, Program, SMALL, Server, eventually, run};
+use crate::harness::{Ended, Program, SMALL, Server, eventually, fly, run};
+use agent::checkpoint::{self, Contents};
+use agent::learner::KIND;
+use protocol::Move;
 use rustix::process::Signal;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -39,6 +42,10 @@ impl Place {
 
     fn checkpoint(&self, out: &str) -> PathBuf {
         self.path(out).join("checkpoint.safetensors")
+    }
+
+    fn contents(&self, out: &str) -> Contents {
+        checkpoint::read(&self.checkpoint(out), KIND).expect("a checkpoint")
     }
 
     /// The command's words for training into a folder.
@@ -95,13 +102,45 @@ fn the_same_seed_gives_the_same_losses_bit_for_bit() {
 }
 
 #[test]
-fn training_goes_on_from_its_checkpoint() {
+fn training_goes_on_bit_for_bit_where_it_stopped() {
+    // 60 steps end in mid-block, mid-window and in the walk; 120 after the first updates.
+    for stops in [&[60_u64][..], &[120], &[22, 61, 100]] {
+        let place = Place::new();
+        let [whole, parts] = ["whole", "parts"].map(|out| {
+            let server = Server::start(&format!("{SMALL} --worlds 2 --seed 4"));
+            let train = |flags: String| {
+                let name = server.instance.name();
+                place.train(out, &format!("--instance {name} --worlds 2 {flags}"))
+            };
+            let mut done = 0;
+            for &stop in stops.iter().filter(|_| out == "parts") {
+                let resume = if done > 0 { "--resume" } else { "" };
+                train(format!("--steps {} {resume}", stop - done));
+                // Two worlds step at once.
+                done = stop.next_multiple_of(2);
+            }
+            let resume = if done > 0 { "--resume" } else { "" };
+            let ended = train(format!("--steps {} {resume}", 200 - done));
+            assert!(!ended.stderr.contains("a new track"), "{}", ended.stderr);
+            (place.rows(out), place.contents(out))
+        });
+        assert_eq!(whole.0, parts.0, "{stops:?}");
+        assert_eq!(whole.0.last().map(|row| &*row[1]), Some("200"));
+        // Parameters, moments, replay, places and beliefs alike.
+        assert!(whole.1 == parts.1, "{stops:?}: checkpoints differ");
+    }
+}
+
+#[test]
+fn other_worlds_begin_new_tracks_and_an_empty_replay() {
     let place = Place::new();
     place.train("out", &format!("{WORLDS} --steps 60"));
     let n_rows = place.rows("out").len();
     let refused = place.words("out", &format!("{WORLDS} --steps 60"));
     check(AGENT, &refused, &["--out", "expected --resume"]);
-    place.train("out", &format!("{WORLDS} --steps 60 --resume"));
+    let ended = place.train("out", &format!("{WORLDS} --steps 60 --resume"));
+    let new_tracks = ended.stderr.matches("a new track").count();
+    assert_eq!(new_tracks, 2, "{}", ended.stderr);
     let rows = place.rows("out");
     assert_eq!(rows[n_rows][1], "62", "world steps go on");
     let updates = |row: &Vec<String>| row[0].parse::<u64>().expect("a number");
@@ -112,6 +151,59 @@ fn training_goes_on_from_its_checkpoint() {
     );
     assert!(rows.last().map(updates) > rows.get(n_rows).map(updates));
     assert_eq!(rows.last().map(|row| &*row[1]), Some("120"));
+}
+
+#[test]
+fn a_world_that_stands_elsewhere_begins_a_new_track_and_the_replay_stays() {
+    let place = Place::new();
+    let server = Server::start(&format!("{SMALL} --worlds 2"));
+    let flags = format!("--instance {} --worlds 2", server.instance.name());
+    place.train("out", &format!("{flags} --steps 60"));
+    let n_rows = place.rows("out").len();
+    fly(&mut server.acquire(0..1), vec![Move::from_low_bits(0); 6]);
+    let ended = place.train("out", &format!("{flags} --steps 60 --resume"));
+    let new_tracks = ended.stderr.matches("a new track").count();
+    assert_eq!(new_tracks, 1, "{}", ended.stderr);
+    let rows = place.rows("out");
+    let updates = |row: &Vec<String>| row[0].parse::<u64>().expect("a number");
+    assert!(updates(&rows[n_rows]) > updates(&rows[n_rows - 1]));
+}
+
+#[test]
+fn a_number_that_is_not_finite_ends_training_by_name_with_a_checkpoint() {
+    let place = Place::new();
+    place.train("out", &format!("{WORLDS} --steps 80"));
+    let checkpoint = place.checkpoint("out");
+    // Finite, but a large step along it is not.
+    let settings = format!("{SETTINGS}rate = 1.0\nobservation_rate = 100.0\n");
+    std::fs::write(place.path("agent.toml"), settings).expect("settings");
+    let mut contents = place.contents("out");
+    for (name, number) in [("first_moment", f32::MAX), ("second_moment", 0.0)] {
+        let tensor = contents.tensors.get_mut(&format!("likelihood.{name}"));
+        tensor.expect("a moment").numbers[4] = number;
+    }
+    checkpoint::write(&checkpoint, KIND, &contents).expect("written");
+    let n_rows = place.rows("out").len();
+    let next = contents.count("updates").expect("updates") + 1;
+    let words = place.words("out", &format!("{WORLDS} --steps 80 --resume"));
+    let ended = run(AGENT, &words.split_whitespace().collect::<Vec<_>>(), LIMIT);
+    assert_eq!(ended.code, Some(1), "{}", ended.stderr);
+    let expected = format!(
+        "update {next}: likelihood: expected finite numbers, got a step to a number that is not; \
+         the parameters before it are in {}",
+        checkpoint.display()
+    );
+    assert!(ended.stderr.contains(&expected), "{}", ended.stderr);
+    assert!(!ended.stderr.contains("panicked"), "{}", ended.stderr);
+    let saved = place.contents("out");
+    for name in ["kernel", "likelihood", "initial"] {
+        let tensors = [&contents, &saved].map(|contents| contents.tensors.get(name));
+        assert_eq!(tensors[0], tensors[1], "{name}: as before the update");
+    }
+    assert_eq!(saved.count("updates").expect("updates"), next - 1);
+    assert!(place.rows("out").len() >= n_rows);
+    // It reads back whole: a later run gets as far, and no further.
+    check(AGENT, &words, &["likelihood: expected finite numbers"]);
 }
 
 #[test]

@@ -47,7 +47,23 @@ pub struct Claim {
     pub time_to_live: Option<Duration>,
 }
 
+/// Which step of which run a world shows, and from where: seed, episode, step k, the robot's row and column.
+pub type Place = [u64; 5];
+
 impl Observation {
+    /// Which step of which run this is.
+    pub fn place(&self) -> Place {
+        let StepResult { row, col, .. } = self.result;
+        let [row, col] = [row, col].map(u64::from);
+        [
+            self.result.seed,
+            self.result.episode,
+            self.result.step,
+            row,
+            col,
+        ]
+    }
+
     /// The robot's cell.
     pub fn robot(&self) -> Cell {
         Cell {

@@ -1,5 +1,9 @@
 //! One world's robot while a model is learned: plans on the learned belief and keeps it. Pure.
 
+mod stored;
+
+pub use stored::Stand;
+
 use crate::client::Observation;
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
@@ -49,6 +53,27 @@ impl Pilot {
         self.filter.correct(frame)?;
         self.filter.predict();
         Ok(())
+    }
+
+    /// Goes on where a checkpoint left it, if the world still shows what it showed then; else begins
+    /// a new track. Returns whether it goes on.
+    ///
+    /// # Errors
+    /// [`ZeroEvidence`].
+    pub fn go_on(
+        &mut self,
+        world: u32,
+        stand: Option<&Stand>,
+        learner: &mut Learner,
+    ) -> Result<bool, ZeroEvidence> {
+        match stand {
+            Some(stand) if stand.is_of(&self.observation) && learner.has_track(world) => {
+                let belief = stand.belief.clone();
+                self.filter = LearnedFilter::with_prior(self.filter.tables(), belief);
+                Ok(true)
+            }
+            _ => self.begin(world, learner).map(|()| false),
+        }
     }
 
     /// The next path; `target`: the state that pays most.

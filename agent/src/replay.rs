@@ -5,6 +5,10 @@
 //! before it renews. Frames of a block that is not full yet are not replayed. The oldest blocks go
 //! when there is no room.
 
+mod stored;
+
+pub use stored::Form;
+
 use protocol::Frame;
 use std::collections::BTreeMap;
 
@@ -29,7 +33,7 @@ pub struct Block {
 }
 
 /// Blocks of all tracks.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Replay {
     block_length: usize,
     max_blocks: usize,
@@ -55,6 +59,11 @@ impl Replay {
     pub fn begin(&mut self, world: u32) {
         let block = self.new_block(None);
         self.open.insert(world, block);
+    }
+
+    /// Whether the world's track was begun.
+    pub fn has_track(&self, world: u32) -> bool {
+        self.open.contains_key(&world)
     }
 
     /// Whether the world's next frame is the first of a block that needs a belief to start from.

@@ -9,11 +9,12 @@ use crate::estimator::{ZeroEvidence, learned_filter};
 use crate::metrics::Tick;
 use crate::network as networks;
 use protocol::{Move, Shape};
+use std::ops::Range;
 use std::time::Duration;
 use thiserror::Error;
 
 /// The worlds to act on, as far as a learner is told.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct Site {
     /// The grid.
     pub shape: Shape,
@@ -21,8 +22,8 @@ pub struct Site {
     pub n_observations: usize,
     /// Moves in a path.
     pub n_moves: usize,
-    /// Number of worlds.
-    pub n_worlds: usize,
+    /// The worlds' numbers.
+    pub worlds: Range<u32>,
 }
 
 /// What one update did.
@@ -50,7 +51,7 @@ pub enum NotFinite {
     Network(#[from] networks::NotFinite),
 }
 
-/// What learns while it acts on worlds, which it numbers from 0.
+/// What learns while it acts.
 pub trait Student {
     /// How its checkpoints call it.
     fn kind(&self) -> &'static str;
@@ -63,11 +64,18 @@ pub trait Student {
         false
     }
 
-    /// A world begins, here or anew, with the frame that it shows. Worlds begin in order.
+    /// Takes in what the worlds show when it comes to them. Returns whether it goes on in one of them
+    /// where its checkpoint left it.
     ///
     /// # Errors
     /// [`ZeroEvidence`].
-    fn begin(&mut self, world: usize, observation: Observation) -> Result<(), ZeroEvidence>;
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<bool, ZeroEvidence>;
+
+    /// A world begins anew.
+    ///
+    /// # Errors
+    /// [`ZeroEvidence`].
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), ZeroEvidence>;
 
     /// The next path of each world.
     fn plan(&mut self) -> Vec<Vec<Move>>;
@@ -83,6 +91,9 @@ pub trait Student {
     /// # Errors
     /// [`NotFinite`].
     fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite>;
+
+    /// Forgets the updates that steps have earned: nothing is learned from them.
+    fn rest(&mut self) {}
 
     /// Updates of the model so far.
     fn n_updates(&self) -> u64;

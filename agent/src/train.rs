@@ -176,8 +176,8 @@ impl Trainee {
         let mut student = student(training, &client, contents.as_ref(), &place)?;
         let metrics = Metrics::open(&training.out, student.columns(), training.resume)?;
         let observations = client.observe(client.worlds())?;
-        for (world, observation) in observations.into_iter().enumerate() {
-            student.begin(world, observation)?;
+        if !student.attach(observations)? && training.resume {
+            tracing::info!("other worlds than the checkpoint's, or other steps: beginning anew");
         }
         let now = Instant::now();
         Ok(Self {
@@ -201,7 +201,10 @@ impl Trainee {
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
             let tick = self.step()?;
             let lessons = match training.freeze {
-                true => Vec::new(),
+                true => {
+                    self.student.rest();
+                    Vec::new()
+                }
                 false => self.learn(training)?,
             };
             let n_updates = self.student.n_updates();
@@ -223,17 +226,16 @@ impl Trainee {
             true => self.client.step_full(worlds.clone(), &paths)?,
             false => self.client.step(worlds.clone(), &paths)?,
         };
-        let ended: Vec<(usize, u32)> = observations
-            .iter()
-            .enumerate()
-            .filter(|(_, seen)| seen.result.truncated != 0 || seen.result.terminated != 0)
-            .map(|(index, _)| (index, worlds.start + index as u32))
-            .collect();
+        let ended = worlds.zip(&observations).filter(|(_, seen)| {
+            let result = &seen.result;
+            result.truncated != 0 || result.terminated != 0
+        });
+        let ended: Vec<u32> = ended.map(|(world, _)| world).collect();
         let tick = self.student.take_in(observations)?;
-        for (index, world) in ended {
+        for world in ended {
             self.client.reset(&[WorldSeed { world, seed: None }])?;
             let observation = self.client.observe(world..world + 1)?.remove(0);
-            self.student.begin(index, observation)?;
+            self.student.begin(world, observation)?;
         }
         self.summary.steps += tick.n_worlds;
         self.summary.reward += tick.reward;
@@ -302,26 +304,24 @@ fn student(
         shape: client.shape(),
         n_observations: info.n_observations,
         n_moves: info.n_moves,
-        n_worlds: training.worlds.len(),
+        worlds: training.worlds.clone(),
     };
     let wrong = |problem: Problem| problem.of(place);
     Ok(match config.learner {
         LearnerKind::Filter => {
             let dimensions = dimensions(config, site.n_observations)?;
-            let progress = match contents {
+            Box::new(match contents {
                 Some(contents) => {
-                    let expected = Some(dimensions);
-                    learner::Progress::from_contents(contents, expected).map_err(wrong)?
+                    FilterStudent::resume(contents, dimensions, site, config).map_err(wrong)?
                 }
-                None => learner::Progress::first(dimensions, config.seed),
-            };
-            Box::new(FilterStudent::new(progress, site, config))
+                None => FilterStudent::new(dimensions, site, config),
+            })
         }
         LearnerKind::Autoencoder => {
-            if site.n_worlds != 1 {
-                return Err(TrainError::OneWorld(site.n_worlds));
+            if site.worlds.len() != 1 {
+                return Err(TrainError::OneWorld(site.worlds.len()));
             }
-            let mut progress = network::Progress::first(site, config);
+            let mut progress = network::Progress::first(&site, config);
             if let Some(contents) = contents {
                 progress.load(contents).map_err(wrong)?;
             }

@@ -37,7 +37,7 @@ pub struct TrainCommand {
     /// Folder for checkpoint.safetensors, metrics.csv and training.png
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Go on from the folder's checkpoint, with an empty replay
+    /// Go on from the folder's checkpoint, bit for bit in worlds that stand where it left them
     #[arg(long)]
     resume: bool,
     /// Act on the checkpoint's parameters without learning

@@ -15,13 +15,14 @@ pub mod adam;
 mod layout;
 mod operator;
 pub mod parameters;
+mod stored;
 pub mod trainer;
 pub mod vector;
 pub mod window;
 
 pub use adam::Adam;
 pub use parameters::{Dimensions, DimensionsError, Parameters, Tables};
-pub use trainer::{NotFinite, Trainer, Update};
+pub use trainer::{Iterates, NotFinite, Trainer, Update};
 
 use super::ZeroEvidence;
 use crate::belief::Belief;

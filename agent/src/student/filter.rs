@@ -2,16 +2,18 @@
 //! the belief of the filter as it is.
 
 use super::{Lesson, NotFinite, Site, Student};
-use crate::checkpoint::Contents;
+use crate::checkpoint::{Contents, Problem};
 use crate::client::Observation;
 use crate::config::AgentConfig;
 use crate::estimator::ZeroEvidence;
+use crate::estimator::learned_filter::Dimensions;
 use crate::learner::{KIND, LearnedModel, Learner, Progress};
 use crate::metrics::Tick;
-use crate::pilot::Pilot;
+use crate::pilot::{Pilot, Stand};
 use crate::policy::PlannerKind;
 use protocol::Move;
 use rayon::prelude::*;
+use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 /// A filter that is learned.
@@ -21,16 +23,45 @@ pub struct FilterStudent {
     learner: Learner,
     learned: LearnedModel,
     pilots: Vec<Pilot>,
+    /// Where a checkpoint left the worlds.
+    stands: BTreeMap<u32, Stand>,
     planning: Duration,
     learning: Duration,
 }
 
 impl FilterStudent {
-    /// Goes on from some progress, or begins.
-    pub fn new(progress: Progress, site: Site, config: &AgentConfig) -> Self {
+    /// A student before its first frame.
+    pub fn new(dimensions: Dimensions, site: Site, config: &AgentConfig) -> Self {
+        let progress = Progress::first(dimensions, config.seed);
+        let learner = Learner::new(progress, site.shape, config);
+        Self::of(learner, BTreeMap::new(), site, config)
+    }
+
+    /// Goes on from a checkpoint.
+    ///
+    /// # Errors
+    /// [`Problem`] names what is missing or of another shape.
+    pub fn resume(
+        contents: &Contents,
+        dimensions: Dimensions,
+        site: Site,
+        config: &AgentConfig,
+    ) -> Result<Self, Problem> {
+        let learner = Learner::from_contents(contents, dimensions, site.shape, config)?;
+        let stands = Stand::restored(dimensions.n_states, site.shape, contents)?;
+        Ok(Self::of(learner, stands, site, config))
+    }
+
+    fn of(
+        learner: Learner,
+        stands: BTreeMap<u32, Stand>,
+        site: Site,
+        config: &AgentConfig,
+    ) -> Self {
         Self {
-            learned: progress.learned(),
-            learner: Learner::new(progress, site.shape, config),
+            learned: learner.learned(),
+            learner,
+            stands,
             site,
             config: config.clone(),
             pilots: Vec::new(),
@@ -58,13 +89,25 @@ impl Student for FilterStudent {
         &[]
     }
 
-    fn begin(&mut self, world: usize, observation: Observation) -> Result<(), ZeroEvidence> {
-        let mut pilot = Pilot::new(&self.learned, self.site.shape, observation, &self.config);
-        pilot.begin(world as u32, &mut self.learner)?;
-        match self.pilots.get_mut(world) {
-            Some(former) => *former = pilot,
-            None => self.pilots.push(pilot),
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<bool, ZeroEvidence> {
+        let worlds = self.site.worlds.clone();
+        let goes_on = Stand::any_is_of(&self.stands, worlds.clone(), &observations);
+        if !goes_on {
+            // Frames of other worlds, perhaps of another model.
+            self.learner.forget();
         }
+        for (world, observation) in worlds.zip(observations) {
+            let mut pilot = Pilot::new(&self.learned, self.site.shape, observation, &self.config);
+            pilot.go_on(world, self.stands.get(&world), &mut self.learner)?;
+            self.pilots.push(pilot);
+        }
+        Ok(goes_on)
+    }
+
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), ZeroEvidence> {
+        let mut pilot = Pilot::new(&self.learned, self.site.shape, observation, &self.config);
+        pilot.begin(world, &mut self.learner)?;
+        self.pilots[(world - self.site.worlds.start) as usize] = pilot;
         Ok(())
     }
 
@@ -87,10 +130,10 @@ impl Student for FilterStudent {
 
     fn take_in(&mut self, observations: Vec<Observation>) -> Result<Tick, ZeroEvidence> {
         let mut tick = Tick::default();
-        let worlds = observations.into_iter().zip(&mut self.pilots).enumerate();
-        for (world, (observation, pilot)) in worlds {
+        let worlds = self.site.worlds.clone().zip(observations);
+        for ((world, observation), pilot) in worlds.zip(&mut self.pilots) {
             tick.reward += observation.result.reward;
-            tick.score += pilot.take_in(world as u32, observation, &mut self.learner)?;
+            tick.score += pilot.take_in(world, observation, &mut self.learner)?;
         }
         self.pilots
             .par_iter_mut()
@@ -113,12 +156,19 @@ impl Student for FilterStudent {
         Ok(updates?.into_iter().map(lesson).collect())
     }
 
+    fn rest(&mut self) {
+        self.learner.rest();
+    }
+
     fn n_updates(&self) -> u64 {
         self.learner.n_updates()
     }
 
     fn contents(&self) -> Contents {
-        self.learner.progress().to_contents("")
+        let mut contents = self.learner.to_contents("");
+        let pilots = self.site.worlds.clone().zip(&self.pilots);
+        Stand::store(pilots, self.site.shape, &mut contents);
+        contents
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {

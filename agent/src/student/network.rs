@@ -8,7 +8,7 @@
 use super::{Lesson, NotFinite, Site, Student};
 use crate::belief::Belief;
 use crate::checkpoint::{Bytes, Contents, Problem, Tensor};
-use crate::client::Observation;
+use crate::client::{Observation, Place};
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
 use crate::estimator::ZeroEvidence;
@@ -30,17 +30,6 @@ pub const KIND: &str = "autoencoder";
 
 const COLUMNS: [&str; 5] = ["dqn_loss", "dqn_rate", "action", "action_value", "epsilon"];
 
-/// Where a world stands: which of its steps its last frame shows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Standing {
-    /// Seed of the world.
-    pub seed: u64,
-    /// Episodes before this one.
-    pub episode: u64,
-    /// Step k.
-    pub step: u64,
-}
-
 /// What is learned, and where learning stands.
 pub struct Progress {
     /// The model.
@@ -53,8 +42,8 @@ pub struct Progress {
     pub reward: RewardEstimate,
     /// Iterations of Algorithm 1.
     pub iterations: u64,
-    /// The world that the hidden vector knows, if any.
-    pub standing: Option<Standing>,
+    /// Where the world is that the hidden vector knows, if any.
+    pub place: Option<Place>,
 }
 
 /// An autoencoder and a DQN that are learned.
@@ -79,7 +68,7 @@ struct Decision {
 
 impl Progress {
     /// Before the first frame.
-    pub fn first(site: Site, config: &AgentConfig) -> Self {
+    pub fn first(site: &Site, config: &AgentConfig) -> Self {
         let n_states = match config.autoencoder.states {
             0 => site.n_observations,
             states => states,
@@ -94,7 +83,7 @@ impl Progress {
             replay: Replay::new(settings.replay),
             reward: RewardEstimate::new(n_states),
             iterations: 0,
-            standing: None,
+            place: None,
         }
     }
 
@@ -124,9 +113,7 @@ impl Progress {
         let shape = self.autoencoder.shape().grid;
         let (height, width) = shape.dim();
         let [adam_steps, updates] = self.autoencoder.counters();
-        let standing = self
-            .standing
-            .map_or(vec![], |s| vec![s.seed, s.episode, s.step]);
+        let place = self.place.iter().flatten().copied();
         for (name, bytes) in [
             (
                 "replay.frames",
@@ -141,7 +128,7 @@ impl Progress {
                 "reward.rewards",
                 Bytes::of_floats(self.reward.rewards.iter().copied()),
             ),
-            ("standing", Bytes::of_counts(standing)),
+            ("place", Bytes::of_counts(place)),
         ] {
             contents.bytes.insert(name.into(), bytes);
         }
@@ -189,9 +176,9 @@ impl Progress {
             shape: shape.map_err(|error| wrong("height", "a grid", error.to_string()))?,
             n_observations: observations,
             n_moves: 0,
-            n_worlds: 1,
+            worlds: 0..1,
         };
-        let mut progress = Self::first(site, &config);
+        let mut progress = Self::first(&site, &config);
         progress.load(contents)?;
         Ok(progress)
     }
@@ -210,14 +197,7 @@ impl Progress {
         self.reward.rewards = contents.floats("reward.rewards", n_states)?;
         self.load_replay(contents)?;
         self.iterations = contents.count("iterations")?;
-        self.standing = match contents.counts("standing")?[..] {
-            [seed, episode, step] => Some(Standing {
-                seed,
-                episode,
-                step,
-            }),
-            _ => None,
-        };
+        self.place = contents.counts("place")?.try_into().ok();
         Ok(())
     }
 
@@ -337,18 +317,26 @@ impl Student for NetworkStudent {
         self.progress.iterations < self.config.autoencoder.full_frames
     }
 
-    fn begin(&mut self, _: usize, observation: Observation) -> Result<(), ZeroEvidence> {
-        let standing = Standing::of(&observation);
-        let goes_on = self.progress.standing == Some(standing);
-        self.progress.standing = Some(standing);
-        self.decision = None;
-        self.track = self.progress.dqn.track();
-        if !goes_on {
-            self.progress.autoencoder.forget();
-            self.progress.replay.begin();
-            self.read(&observation.frame)?;
-            self.progress.replay.push(observation.frame.clone());
+    fn attach(&mut self, mut observations: Vec<Observation>) -> Result<bool, ZeroEvidence> {
+        let observation = observations.remove(0);
+        let shown = self.progress.replay.frames().last();
+        let goes_on =
+            self.progress.place == Some(observation.place()) && shown == Some(&observation.frame);
+        if goes_on {
+            self.observation = Some(observation);
+        } else {
+            self.begin(self.site.worlds.start, observation)?;
         }
+        Ok(goes_on)
+    }
+
+    fn begin(&mut self, _: u32, observation: Observation) -> Result<(), ZeroEvidence> {
+        self.progress.place = Some(observation.place());
+        self.track = self.progress.dqn.track();
+        self.progress.autoencoder.forget();
+        self.progress.replay.begin();
+        self.read(&observation.frame)?;
+        self.progress.replay.push(observation.frame.clone());
         self.observation = Some(observation);
         Ok(())
     }
@@ -384,7 +372,7 @@ impl Student for NetworkStudent {
         let is_full = observation.result.coverage == Coverage::Full as u32;
         let prediction = self.progress.autoencoder.prediction();
         let score = score(prediction, &likelihood(&self.progress.autoencoder), &frame);
-        self.progress.standing = Some(Standing::of(&observation));
+        self.progress.place = Some(observation.place());
         let reward = observation.result.reward;
         self.observation = Some(observation);
         let estimate = self.read(&frame)?;
@@ -434,17 +422,5 @@ impl Student for NetworkStudent {
 
     fn times(&self) -> Vec<(&'static str, Duration)> {
         self.times.to_vec()
-    }
-}
-
-impl Standing {
-    /// Of a world that shows this.
-    pub fn of(observation: &Observation) -> Self {
-        let result = &observation.result;
-        Self {
-            seed: result.seed,
-            episode: result.episode,
-            step: result.step,
-        }
     }
 }

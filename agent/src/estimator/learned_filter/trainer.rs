@@ -23,15 +23,23 @@ const N_PARTS: usize = 8;
 /// Learns the parameters; holds all that a later update depends on but the replay.
 #[derive(Debug, Clone)]
 pub struct Trainer {
-    parameters: Parameters,
-    adam: Adam,
-    config: LearningConfig,
+    iterates: Iterates,
+    pub(super) config: LearningConfig,
     seed: u64,
-    streams: Vec<Stream>,
+    pub(super) streams: Vec<Stream>,
     windows: Vec<Window<f32>>,
     /// Blocks still to be run through in this lap.
-    lap: Vec<u64>,
-    n_laps: u64,
+    pub(super) lap: Vec<u64>,
+    pub(super) n_laps: u64,
+}
+
+/// Where the updates have come to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Iterates {
+    /// The parameters.
+    pub parameters: Parameters,
+    /// The optimiser.
+    pub adam: Adam,
 }
 
 /// What one update did.
@@ -59,28 +67,32 @@ pub struct NotFinite {
 
 /// A place in the replay, and the belief before the frame there.
 #[derive(Debug, Clone)]
-struct Stream {
-    block: Option<u64>,
-    n_done: usize,
-    belief: Vec<f32>,
+pub(super) struct Stream {
+    pub(super) block: Option<u64>,
+    pub(super) n_done: usize,
+    pub(super) belief: Vec<f32>,
     end: Vec<f32>,
+}
+
+impl Iterates {
+    /// Before the first update.
+    pub fn first(parameters: Parameters) -> Self {
+        Self {
+            adam: Adam::new(parameters.dimensions),
+            parameters,
+        }
+    }
 }
 
 impl Trainer {
     /// Before the first update.
     pub fn new(parameters: Parameters, shape: Shape, config: LearningConfig, seed: u64) -> Self {
-        let adam = Adam::new(parameters.dimensions);
-        Self::resume(parameters, adam, shape, config, seed)
+        Self::resume(Iterates::first(parameters), shape, config, seed)
     }
 
-    /// After the updates that an optimiser has made.
-    pub fn resume(
-        parameters: Parameters,
-        adam: Adam,
-        shape: Shape,
-        config: LearningConfig,
-        seed: u64,
-    ) -> Self {
+    /// After some updates; the streams are not yet in any block.
+    pub fn resume(iterates: Iterates, shape: Shape, config: LearningConfig, seed: u64) -> Self {
+        let parameters = &iterates.parameters;
         let tables: Tables = parameters.tables();
         let numbers = vec![0.0; parameters.dimensions.n_states * shape.n_cells()];
         let stream = Stream {
@@ -90,9 +102,8 @@ impl Trainer {
             end: numbers,
         };
         Self {
-            n_laps: adam.n_steps,
-            parameters,
-            adam,
+            n_laps: iterates.adam.n_steps,
+            iterates,
             config,
             seed,
             streams: vec![stream; config.streams],
@@ -101,19 +112,19 @@ impl Trainer {
         }
     }
 
-    /// The parameters.
-    pub fn parameters(&self) -> &Parameters {
-        &self.parameters
+    /// Where the updates have come to.
+    pub fn iterates(&self) -> &Iterates {
+        &self.iterates
     }
 
-    /// The optimiser.
-    pub fn adam(&self) -> &Adam {
-        &self.adam
+    /// The parameters.
+    pub fn parameters(&self) -> &Parameters {
+        &self.iterates.parameters
     }
 
     /// Their dimensions.
     pub fn dimensions(&self) -> Dimensions {
-        self.parameters.dimensions
+        self.iterates.parameters.dimensions
     }
 
     /// One update; `None` while the replay has no block for each stream, or nothing was seen.
@@ -131,8 +142,12 @@ impl Trainer {
         }
         self.place_streams(replay);
         let outcomes = self.run_windows(replay);
-        self.move_streams(replay);
         let (log_likelihood, n_seen, mut gradient) = add_up(&outcomes, self.dimensions());
+        // Before a belief that is not finite gets into the replay.
+        if !log_likelihood.is_finite() {
+            return Err(self.wrong("loss", "a sum that is not"));
+        }
+        self.move_streams(replay);
         if n_seen == 0 {
             return Ok(None);
         }
@@ -145,6 +160,14 @@ impl Trainer {
         }
         let loss = -log_likelihood / n_seen as f64;
         self.step(loss, &gradient).map(Some)
+    }
+
+    /// Takes the streams out of their blocks: the replay is another.
+    pub fn leave_replay(&mut self) {
+        self.lap.clear();
+        self.streams
+            .iter_mut()
+            .for_each(|stream| stream.block = None);
     }
 
     /// Gives streams at the end of a block, or whose block is gone, another one.
@@ -183,7 +206,7 @@ impl Trainer {
     }
 
     fn run_windows(&mut self, replay: &Replay) -> Vec<Outcome> {
-        let tables = self.parameters.tables();
+        let tables = self.iterates.parameters.tables();
         let length = self.config.window;
         let part = self.streams.len().div_ceil(N_PARTS);
         let parts = self.streams.par_chunks_mut(part).zip(&mut self.windows);
@@ -218,7 +241,7 @@ impl Trainer {
     /// state which is observable with negligible uncertainties" (paper section III.E, remark).
     fn add_anchor(&self, state: usize, by_likelihood: &mut [f64]) {
         let n_observations = self.dimensions().n_observations;
-        let likelihood = self.parameters.tables::<f64>().likelihood;
+        let likelihood = self.iterates.parameters.tables::<f64>().likelihood;
         let row = &likelihood[state * n_observations..][..n_observations];
         let shown = (0..n_observations).max_by(|&a, &b| row[a].total_cmp(&row[b]));
         if let Some(shown) = shown {
@@ -227,21 +250,13 @@ impl Trainer {
     }
 
     fn step(&mut self, loss: f64, by_tables: &[Vec<f64>; 3]) -> Result<Update, NotFinite> {
-        let number = self.adam.n_steps + 1;
-        let wrong = |tensor, what| NotFinite {
-            update: number,
-            tensor,
-            what,
-        };
-        if let Some(tensor) = self.parameters.not_finite() {
-            return Err(wrong(tensor, "a parameter that is not"));
+        let number = self.iterates.adam.n_steps + 1;
+        if let Some(tensor) = self.iterates.parameters.not_finite() {
+            return Err(self.wrong(tensor, "a parameter that is not"));
         }
-        let gradient = self.parameters.chain(by_tables);
+        let gradient = self.iterates.parameters.chain(by_tables);
         if let Some(tensor) = gradient.not_finite() {
-            return Err(wrong(tensor, "a gradient that is not"));
-        }
-        if !loss.is_finite() {
-            return Err(wrong("loss", "a sum that is not"));
+            return Err(self.wrong(tensor, "a gradient that is not"));
         }
         let rate = self.config.rate * self.config.rate_at(number - 1);
         let observation_rate = rate * self.config.observation_rate;
@@ -250,14 +265,24 @@ impl Trainer {
             beta1: self.config.beta1,
             beta2: self.config.beta2,
         };
-        let (mut adam, mut parameters) = (self.adam.clone(), self.parameters.clone());
-        adam.step(&mut parameters, &gradient, size);
-        if let Some(tensor) = parameters.not_finite() {
-            return Err(wrong(tensor, "a step to a number that is not"));
+        let mut next = self.iterates.clone();
+        next.adam.step(&mut next.parameters, &gradient, size);
+        if let Some(tensor) = next.parameters.not_finite() {
+            return Err(self.wrong(tensor, "a step to a number that is not"));
         }
-        parameters.bound();
-        (self.adam, self.parameters) = (adam, parameters);
+        next.parameters.bound();
+        self.iterates = next;
         Ok(Update { number, loss, rate })
+    }
+
+    /// What the update under way met.
+    fn wrong(&self, tensor: &'static str, what: &'static str) -> NotFinite {
+        let update = self.iterates.adam.n_steps + 1;
+        NotFinite {
+            update,
+            tensor,
+            what,
+        }
     }
 }
 

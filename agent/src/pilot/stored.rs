@@ -1,0 +1,125 @@
+//! Where pilots are, in a checkpoint.
+
+use super::Pilot;
+use crate::belief::Belief;
+use crate::checkpoint::{Bytes, Contents, Problem, Tensor};
+use crate::client::{Observation, Place};
+use ndarray::Array3;
+use protocol::Shape;
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+/// Names in checkpoints.
+const PLACES: &str = "worlds.places";
+const FRAMES: &str = "worlds.frames";
+const BELIEFS: &str = "worlds.beliefs";
+
+/// Numbers of a place.
+const N_PLACE: usize = size_of::<Place>() / size_of::<u64>();
+
+/// Where a checkpoint left a world: what it showed, and the belief about what comes next.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Stand {
+    place: Place,
+    frame: Vec<u8>,
+    pub(super) belief: Belief,
+}
+
+impl Stand {
+    /// Whether a world shows what it showed then. That may be another server's: seeds, step, flight
+    /// and noise of sensors would all have to be the same.
+    pub fn is_of(&self, observation: &Observation) -> bool {
+        self.place == observation.place() && self.frame == observation.frame.as_bytes()
+    }
+
+    /// Whether any of these worlds shows what it showed then.
+    pub fn any_is_of(
+        stands: &BTreeMap<u32, Self>,
+        worlds: Range<u32>,
+        observations: &[Observation],
+    ) -> bool {
+        worlds.zip(observations).any(|(world, observation)| {
+            let stand = stands.get(&world);
+            stand.is_some_and(|stand| stand.is_of(observation))
+        })
+    }
+
+    /// Puts where pilots are into a checkpoint.
+    pub fn store<'a>(
+        pilots: impl Iterator<Item = (u32, &'a Pilot)>,
+        shape: Shape,
+        contents: &mut Contents,
+    ) {
+        let (height, width) = shape.dim();
+        let (mut places, mut frames, mut beliefs) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut n_pilots, mut n_states) = (0, 0);
+        for (world, pilot) in pilots {
+            places.push(u64::from(world));
+            places.extend(pilot.observation.place());
+            frames.extend_from_slice(pilot.observation.frame.as_bytes());
+            beliefs.extend_from_slice(pilot.filter.belief().as_slice());
+            n_states = pilot.filter.belief().n_states();
+            n_pilots += 1;
+        }
+        let beliefs = Tensor {
+            shape: vec![n_pilots, n_states, height, width],
+            numbers: beliefs,
+        };
+        let frames = Bytes {
+            shape: vec![n_pilots, height, width],
+            bytes: frames,
+        };
+        let places = Bytes::of_counts(places);
+        contents.bytes.insert(PLACES.into(), places);
+        contents.bytes.insert(FRAMES.into(), frames);
+        contents.tensors.insert(BELIEFS.into(), beliefs);
+    }
+
+    /// What [`Self::store`] put there, by world; none of another grid.
+    ///
+    /// # Errors
+    /// [`Problem`] names what is missing or of another shape.
+    pub fn restored(
+        n_states: usize,
+        shape: Shape,
+        contents: &Contents,
+    ) -> Result<BTreeMap<u32, Self>, Problem> {
+        let (height, width) = shape.dim();
+        let places = contents.counts(PLACES)?;
+        let (places, _) = places.as_chunks::<{ N_PLACE + 1 }>();
+        let frames = contents.bytes.get(FRAMES);
+        if frames.is_some_and(|frames| frames.shape.get(1..) != Some(&[height, width])) {
+            return Ok(BTreeMap::new());
+        }
+        let frames = contents.bytes(FRAMES, &[places.len(), height, width])?;
+        let dim = [places.len(), n_states, height, width];
+        let beliefs = contents.tensor(BELIEFS, &dim)?;
+        let n_cells = height * width;
+        let each = places.iter().zip(frames.chunks_exact(n_cells));
+        let each = each.zip(beliefs.chunks_exact(n_states * n_cells));
+        let stand = |((numbers, frame), belief): ((&[u64; N_PLACE + 1], &[u8]), &[f32])| {
+            // Before the place, the world.
+            let &[world, ref place @ ..] = numbers;
+            let world = u32::try_from(world).map_err(|_| wrong(PLACES, "worlds", world))?;
+            let belief = Array3::from_shape_vec((n_states, height, width), belief.to_vec());
+            let belief = belief.expect("invariant: S x H x W numbers");
+            let belief = Belief::from_probabilities(belief);
+            let belief = belief.map_err(|error| wrong(BELIEFS, "beliefs", error))?;
+            let stand = Self {
+                place: *place,
+                frame: frame.to_vec(),
+                belief,
+            };
+            Ok((world, stand))
+        };
+        each.map(stand).collect()
+    }
+}
+
+fn wrong(name: &str, expected: &str, got: impl ToString) -> Problem {
+    Problem::Value {
+        name: name.into(),
+        expected: expected.into(),
+        got: got.to_string(),
+    }
+}
