@@ -1,0 +1,186 @@
+//! What a high-level decision chooses among (the actions `a_k` of paper section III.E): what a path is
+//! for, how much exploring counts beside it, how far ahead a plan looks, and where it is drawn to. Pure.
+
+use crate::belief::{Belief, EntropyKind};
+use crate::planner::{CellValues, Objective, Planner, PlanningProblem, Target};
+use crate::policy::{BEAM_BONUS, PlannerKind, Policy};
+use crate::summary::{N_BLOCKS, block};
+use protocol::{Cell, Grid, Model, Move, Shape};
+
+/// Rise in a cell's value per cell nearer to an action's region. A straight flight of T = 12 moves gains
+/// 23 more than one to and fro, so the robot goes there whatever burns on its way, by the way that burns most.
+pub const REGION_SLOPE: f32 = 0.3;
+
+/// One choice of a high-level decision.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Action {
+    /// Its name in tables and files, unique in its set.
+    pub name: String,
+    /// What a cell is worth.
+    pub objective: Objective,
+    /// Weight of each cell's entropy, as a share of the greatest, beside that; 0 or more.
+    pub exploration: f32,
+    /// Paths that a plan looks ahead, at least 1; only the first is flown.
+    pub horizon: usize,
+    /// Where the robot is drawn to.
+    pub region: Option<Region>,
+}
+
+/// A block of the grid, of `N_BLOCKS` by `N_BLOCKS` as in [`crate::summary`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Region {
+    /// Row of the block, from the top.
+    pub row: usize,
+    /// Column of the block, from the left.
+    pub col: usize,
+}
+
+/// The actions of a decision maker, at least one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ActionSet {
+    actions: Vec<Action>,
+}
+
+impl Action {
+    /// A plain objective: no exploring beside it, one path ahead, no region.
+    pub fn plain(name: &str, objective: Objective) -> Self {
+        Self {
+            name: name.into(),
+            objective,
+            exploration: 0.0,
+            horizon: 1,
+            region: None,
+        }
+    }
+
+    /// What the cells are worth under a belief about the time at which the path is observed.
+    pub fn values(&self, belief: &Belief) -> CellValues {
+        let mut values = self.objective.values(belief);
+        if self.exploration > 0.0 {
+            let greatest = (belief.n_states() as f32).ln().max(f32::MIN_POSITIVE);
+            values.add(self.exploration / greatest, &belief.entropy(EntropyKind::Sum));
+        }
+        if let Some(region) = self.region {
+            values.add(REGION_SLOPE, &region.nearness(belief.shape()));
+        }
+        values
+    }
+
+    /// The path that a planner finds for this action, `n_moves` long.
+    pub fn plan(
+        &self,
+        planner: &mut dyn Planner,
+        belief: &Belief,
+        start: Cell,
+        n_moves: usize,
+        (seed, step): (u64, u64),
+    ) -> Vec<Move> {
+        let values = self.values(belief);
+        let problem = PlanningProblem {
+            start,
+            n_moves: n_moves * self.horizon,
+            values: &values,
+            seed,
+            step,
+        };
+        let mut moves = planner.plan(&problem).moves;
+        moves.truncate(n_moves);
+        moves
+    }
+}
+
+impl Region {
+    /// Every block, row by row.
+    pub fn all() -> impl Iterator<Item = Self> {
+        let region = |index| Self {
+            row: index / N_BLOCKS,
+            col: index % N_BLOCKS,
+        };
+        (0..N_BLOCKS * N_BLOCKS).map(region)
+    }
+
+    /// Moves from a cell to the block's nearest cell.
+    pub fn distance(self, cell: Cell, shape: Shape) -> usize {
+        let away = |at: usize, index: usize, side: usize| {
+            let block = block(index, side);
+            block.start.saturating_sub(at) + (at + 1).saturating_sub(block.end)
+        };
+        away(cell.row, self.row, shape.height()) + away(cell.col, self.col, shape.width())
+    }
+
+    /// Height plus width less each cell's distance, shape `[H, W]`; nowhere negative.
+    fn nearness(self, shape: Shape) -> Grid<f32> {
+        let farthest = shape.height() + shape.width();
+        Grid::from_shape_fn(shape.dim(), |(row, col)| {
+            (farthest - self.distance(Cell { row, col }, shape)) as f32
+        })
+    }
+}
+
+impl ActionSet {
+    /// The paper's: the probability of each state, then entropy; as [`Policy::choices`].
+    pub fn paper(planner: PlannerKind, model: &Model) -> Self {
+        let choices = Policy::choices(planner, model).into_iter();
+        let actions = choices.map(|choice| Action::plain(&choice.name, choice.objective));
+        Self {
+            actions: actions.collect(),
+        }
+    }
+
+    /// For beam search: what pays most, alone, with exploring beside it, and further ahead; each other
+    /// state; exploring alone; and what pays most on the way to each block of the grid.
+    pub fn beam(model: &Model) -> Self {
+        let objective = |target| Objective {
+            coverage_bonus: BEAM_BONUS,
+            ..Objective::new(target)
+        };
+        let target = model.target_state();
+        let exploit = Action::plain("exploit", objective(Target::State(target)));
+        let exploring = |weight: f32| Action {
+            name: format!("exploit_explore_{weight}"),
+            exploration: weight,
+            ..exploit.clone()
+        };
+        let ahead = |horizon: usize| Action {
+            name: format!("exploit_ahead_{horizon}"),
+            horizon,
+            ..exploit.clone()
+        };
+        let states = model.file().states.iter().enumerate();
+        let others = states.filter(|(state, _)| *state != target);
+        let others = others.map(|(state, entry)| {
+            Action::plain(&entry.name, objective(Target::State(state)))
+        });
+        let region = |region: Region| Action {
+            name: format!("exploit_at_{}_{}", region.row, region.col),
+            region: Some(region),
+            ..exploit.clone()
+        };
+        let few = [
+            exploit.clone(),
+            exploring(0.1),
+            exploring(0.3),
+            ahead(3),
+            Action::plain("explore", objective(Target::Entropy)),
+        ];
+        let actions = few.into_iter().chain(others).chain(Region::all().map(region));
+        Self {
+            actions: actions.collect(),
+        }
+    }
+
+    /// The actions, in the order of the network's outputs.
+    pub fn actions(&self) -> &[Action] {
+        &self.actions
+    }
+
+    /// Their names.
+    pub fn names(&self) -> Vec<String> {
+        self.actions.iter().map(|action| action.name.clone()).collect()
+    }
+
+    /// The action of a name.
+    pub fn named(&self, name: &str) -> Option<&Action> {
+        self.actions.iter().find(|action| action.name == name)
+    }
+}
