@@ -3,11 +3,14 @@
 use crate::belief::{Belief, BeliefError};
 use crate::config::AgentConfig;
 use crate::estimator::{Filter, LearnedFilter, ZeroEvidence};
-use crate::learner::Learned;
+use crate::learned::{Learned, LearnedNetwork};
+use crate::learner::LearnedModel;
+use crate::network::Autoencoder;
 use crate::planner::{CellValues, Objective, Plan, Planner, PlanningProblem, Target};
 use crate::policy::{EstimatorKind, Policy};
 use protocol::model::ModelError;
 use protocol::{Cell, Frame, Grid, Model, Probabilities, Shape, Transition};
+use std::sync::Arc;
 use thiserror::Error;
 
 /// A policy at work on one world.
@@ -16,8 +19,17 @@ pub struct Agent {
     objective: Objective,
     estimator: Estimator,
     planner: Box<dyn Planner + Send>,
+    decider: Option<Decider>,
+    /// The state that pays most, where that is learned.
+    target: Option<usize>,
     n_moves: usize,
     seed: u64,
+}
+
+/// Chooses what a path is for (paper eq. 17): the objective that the DQN values most.
+struct Decider {
+    network: Arc<LearnedNetwork>,
+    objectives: Vec<Objective>,
 }
 
 /// What an agent is built for.
@@ -34,7 +46,7 @@ pub struct Task<'a> {
     /// Seed of the planner's random numbers: the agent's and the world's.
     pub seed: u64,
     /// What was learned, for policies that act on it.
-    pub learned: Option<&'a Learned>,
+    pub learned: &'a Learned,
 }
 
 /// Why an agent cannot go on.
@@ -51,10 +63,22 @@ pub enum AgentError {
     #[error("hidden states: {0}")]
     Belief(#[from] BeliefError),
     /// A policy that needs a learned model was not given it.
-    #[error("policy {policy:?} needs a learned model: expected --checkpoint FILE")]
+    #[error("policy {policy:?} needs what `train` learned: expected --checkpoint FILE of {kind}")]
     NeedsCheckpoint {
         /// The policy.
         policy: String,
+        /// Whose checkpoint.
+        kind: &'static str,
+    },
+    /// A network of another grid.
+    #[error(
+        "checkpoint: expected a network for {expected} cells as the world's, got one for {got}"
+    )]
+    OtherGrid {
+        /// The world's.
+        expected: String,
+        /// The network's.
+        got: String,
     },
     /// A learned model of other observations.
     #[error("checkpoint: expected {expected} observations as the world's, got {got}")]
@@ -77,6 +101,8 @@ enum Estimator {
     None(Belief),
     KnownModel(Box<Filter>),
     Learned(Box<LearnedFilter>),
+    /// The network, and its estimate or predictor.
+    Autoencoder(Box<Autoencoder>, Belief),
     /// One-hot after `correct`, one step ahead of it after `predict`.
     Truth {
         belief: Belief,
@@ -99,6 +125,7 @@ impl Agent {
                 Estimator::KnownModel(Box::new(Filter::new(task.model, prior)?))
             }
             EstimatorKind::Learned => Estimator::Learned(Box::new(learned_filter(policy, &task)?)),
+            EstimatorKind::Autoencoder => autoencoder(policy, &task)?,
             EstimatorKind::Truth => {
                 let transition = Box::new(Transition::new(task.model, task.shape)?);
                 Estimator::Truth {
@@ -108,41 +135,36 @@ impl Agent {
             }
             EstimatorKind::NextTruth => Estimator::NextTruth(prior),
         };
-        let mut agent = Self {
+        let target = task.learned.target(policy.estimator);
+        let mut objective = config.objective(policy);
+        if let (Target::State(state), Some(target)) = (&mut objective.target, target) {
+            *state = target;
+        }
+        let decider = task.learned.network.clone().filter(|_| policy.is_decided);
+        Ok(Self {
             policy: policy.clone(),
-            objective: config.objective(policy),
+            objective,
             estimator,
             planner: config.planner(policy),
+            decider: decider.map(|network| Decider::new(network, config)),
+            target,
             n_moves: task.n_moves,
             seed: task.seed,
-        };
-        if let (EstimatorKind::Learned, Some(learned)) = (policy.estimator, task.learned) {
-            agent.adopt(learned);
-        }
-        Ok(agent)
-    }
-
-    /// Acts on what was learned since; the belief stays. Only for policies with a learned belief.
-    pub fn adopt(&mut self, learned: &Learned) {
-        if let Estimator::Learned(filter) = &mut self.estimator {
-            filter.set(&learned.tables);
-            if let Target::State(target) = &mut self.objective.target {
-                *target = learned.target;
-            }
-        }
+        })
     }
 
     /// The state that the belief calls what pays most; `otherwise` unless that is learned.
     pub fn target(&self, otherwise: usize) -> usize {
-        match (&self.estimator, self.objective.target) {
-            (Estimator::Learned(_), Target::State(target)) => target,
-            _ => otherwise,
-        }
+        self.target.unwrap_or(otherwise)
     }
 
     /// The path for step k -> k + 1, from where the robot is (paper eq. 15).
     pub fn plan(&mut self, robot: Cell, step: u64) -> Plan {
-        self.plan_for(self.objective, robot, step)
+        let objective = match (&self.decider, &self.estimator) {
+            (Some(decider), Estimator::Autoencoder(network, _)) => decider.decide(network.hidden()),
+            _ => self.objective,
+        };
+        self.plan_for(objective, robot, step)
     }
 
     /// As [`Self::plan`], for an objective other than the policy's.
@@ -167,6 +189,10 @@ impl Agent {
             Estimator::None(_) | Estimator::NextTruth(_) => Ok(()),
             Estimator::KnownModel(filter) => Ok(filter.correct(frame)?),
             Estimator::Learned(filter) => Ok(filter.correct(frame)?),
+            Estimator::Autoencoder(network, belief) => {
+                *belief = network.step(frame)?;
+                Ok(())
+            }
             Estimator::Truth { belief, .. } => {
                 let truth = truth.ok_or_else(|| AgentError::NeedsTruth {
                     policy: self.policy.name.clone(),
@@ -183,6 +209,7 @@ impl Agent {
             Estimator::None(_) | Estimator::NextTruth(_) => {}
             Estimator::KnownModel(filter) => filter.predict(),
             Estimator::Learned(filter) => filter.predict(),
+            Estimator::Autoencoder(network, belief) => belief.clone_from(network.prediction()),
             Estimator::Truth { belief, transition } => {
                 let mut next = Probabilities::zeros(belief.view().dim());
                 transition.apply(belief.probabilities_mut(), &mut next);
@@ -216,22 +243,68 @@ impl Agent {
 impl Estimator {
     fn belief(&self) -> &Belief {
         match self {
-            Self::None(belief) | Self::NextTruth(belief) | Self::Truth { belief, .. } => belief,
+            Self::None(belief)
+            | Self::NextTruth(belief)
+            | Self::Truth { belief, .. }
+            | Self::Autoencoder(_, belief) => belief,
             Self::KnownModel(filter) => filter.belief(),
             Self::Learned(filter) => filter.belief(),
         }
     }
 }
 
-fn learned_filter(policy: &Policy, task: &Task<'_>) -> Result<LearnedFilter, AgentError> {
-    let missing = || AgentError::NeedsCheckpoint {
-        policy: policy.name.clone(),
-    };
-    let learned = task.learned.ok_or_else(missing)?;
-    let got = learned.tables.dimensions.n_observations;
-    let expected = task.model.n_observations();
-    if got != expected {
-        return Err(AgentError::OtherObservations { expected, got });
+impl Decider {
+    fn new(network: Arc<LearnedNetwork>, config: &AgentConfig) -> Self {
+        let choices = Policy::network_choices(network.autoencoder.shape().n_states);
+        let objectives = choices.iter().map(|choice| config.objective(choice));
+        Self {
+            objectives: objectives.collect(),
+            network,
+        }
     }
+
+    fn decide(&self, hidden: &[f32]) -> Objective {
+        self.objectives[self.network.dqn.best(hidden)]
+    }
+}
+
+fn learned_filter(policy: &Policy, task: &Task<'_>) -> Result<LearnedFilter, AgentError> {
+    let learned: &LearnedModel = present(policy, &task.learned.filter, "a filter")?;
+    same_observations(task, learned.tables.dimensions.n_observations)?;
     Ok(LearnedFilter::new(&learned.tables, task.shape))
+}
+
+fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<Estimator, AgentError> {
+    let learned = present(policy, &task.learned.network, "an autoencoder")?;
+    let shape = learned.autoencoder.shape();
+    same_observations(task, shape.n_observations)?;
+    if shape.grid != task.shape {
+        let cells = |(height, width): (usize, usize)| format!("{height} x {width}");
+        return Err(AgentError::OtherGrid {
+            expected: cells(task.shape.dim()),
+            got: cells(shape.grid.dim()),
+        });
+    }
+    let follower = learned.autoencoder.follower();
+    let belief = follower.prediction().clone();
+    Ok(Estimator::Autoencoder(Box::new(follower), belief))
+}
+
+fn present<'a, T>(
+    policy: &Policy,
+    learned: &'a Option<T>,
+    kind: &'static str,
+) -> Result<&'a T, AgentError> {
+    learned.as_ref().ok_or_else(|| AgentError::NeedsCheckpoint {
+        policy: policy.name.clone(),
+        kind,
+    })
+}
+
+fn same_observations(task: &Task<'_>, got: usize) -> Result<(), AgentError> {
+    let expected = task.model.n_observations();
+    match got == expected {
+        true => Ok(()),
+        false => Err(AgentError::OtherObservations { expected, got }),
+    }
 }

@@ -1,8 +1,9 @@
-//! What a learner keeps between runs: named tensors and text in one safetensors file.
+//! What a learner keeps between runs: named tensors, bytes and text in one safetensors file.
 //!
 //! Written beside the file and renamed, so whoever reads finds all or nothing. Read whole or refused:
 //! the file says which learner it is of, and a digest tells damage that keeps its form.
 
+use crate::belief::BeliefError;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use std::collections::{BTreeMap, HashMap};
@@ -15,8 +16,12 @@ use thiserror::Error;
 const KIND: &str = "emberwatch.kind";
 const DIGEST: &str = "emberwatch.digest";
 
-/// Largest file that is read, bytes: ten times what 64 states and 15 x 15 kernels need.
-const MAX_BYTES: u64 = 1 << 27;
+/// Largest file that is written or read, bytes: 200 times what a full replay of 64 x 64 cells and 3
+/// states needs.
+const MAX_BYTES: u64 = 1 << 32;
+
+/// Bytes of a number of 64 bits.
+const WORD: usize = 8;
 
 /// One tensor.
 #[derive(Debug, Clone, PartialEq)]
@@ -27,11 +32,22 @@ pub struct Tensor {
     pub numbers: Vec<f32>,
 }
 
+/// A tensor of bytes: what is no 32-bit float, such as frames or counters.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Bytes {
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// Its bytes, row-major.
+    pub bytes: Vec<u8>,
+}
+
 /// The contents of a checkpoint.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Contents {
     /// By name.
     pub tensors: BTreeMap<String, Tensor>,
+    /// By name, which none of the tensors has.
+    pub bytes: BTreeMap<String, Bytes>,
     /// By name; among them the effective settings.
     pub texts: BTreeMap<String, String>,
 }
@@ -56,11 +72,14 @@ pub enum Problem {
     /// Not safetensors, or cut off.
     #[error("expected a whole safetensors file, got one that is damaged or cut off: {0}")]
     Form(String),
+    /// The second of its kind.
+    #[error("expected one checkpoint of {0}, got two")]
+    Twice(&'static str),
     /// Another learner's, or none's.
     #[error("expected a checkpoint of {expected}, got one of {got}")]
     Kind {
         /// Whose was asked for.
-        expected: &'static str,
+        expected: String,
         /// Whose it is.
         got: String,
     },
@@ -85,6 +104,9 @@ pub enum Problem {
         /// What it is.
         got: Vec<usize>,
     },
+    /// A predictor that is no belief.
+    #[error("state.prediction: {0}")]
+    Prediction(#[from] BeliefError),
     /// A tensor or text with something else in it.
     #[error("{name}: expected {expected}, got {got}")]
     Value {
@@ -106,6 +128,30 @@ impl Problem {
     }
 }
 
+impl Bytes {
+    /// Whole numbers, little-endian, shape `[n, 8]`.
+    pub fn of_counts(counts: impl IntoIterator<Item = u64>) -> Self {
+        let counts = counts.into_iter().flat_map(u64::to_le_bytes);
+        Self::of_rows(WORD, counts.collect())
+    }
+
+    /// Floats of 64 bits, little-endian, shape `[n, 8]`.
+    pub fn of_floats(floats: impl IntoIterator<Item = f64>) -> Self {
+        let floats = floats.into_iter().flat_map(f64::to_le_bytes);
+        Self::of_rows(WORD, floats.collect())
+    }
+
+    /// Rows of so many bytes, shape `[n, width]`.
+    ///
+    /// # Panics
+    /// If they are no whole rows.
+    pub fn of_rows(width: usize, bytes: Vec<u8>) -> Self {
+        assert_eq!(bytes.len() % width, 0, "bytes: expected whole rows");
+        let shape = vec![bytes.len() / width, width];
+        Self { shape, bytes }
+    }
+}
+
 impl Contents {
     /// A tensor that must be there, in this shape, with finite numbers.
     ///
@@ -124,6 +170,59 @@ impl Contents {
         }
         match numbers.iter().find(|number| !number.is_finite()) {
             None => Ok(numbers),
+            Some(got) => Err(Problem::Value {
+                name: name.into(),
+                expected: "finite numbers".into(),
+                got: got.to_string(),
+            }),
+        }
+    }
+
+    /// A tensor of bytes that must be there, in this shape.
+    ///
+    /// # Errors
+    /// [`Problem`] names it.
+    pub fn bytes(&self, name: &str, expected: &[usize]) -> Result<&[u8], Problem> {
+        let missing = || Problem::Missing(name.into());
+        let Bytes { shape, bytes } = self.bytes.get(name).ok_or_else(missing)?;
+        if shape == expected {
+            return Ok(bytes);
+        }
+        let (name, expected, got) = (name.into(), expected.to_vec(), shape.clone());
+        Err(Problem::Shape {
+            name,
+            expected,
+            got,
+        })
+    }
+
+    /// Rows of so many bytes, any number of them, that must be there.
+    ///
+    /// # Errors
+    /// [`Problem`] names them.
+    pub fn rows(&self, name: &str, width: usize) -> Result<&[u8], Problem> {
+        let n_rows = self.bytes.get(name).and_then(|bytes| bytes.shape.first());
+        self.bytes(name, &[n_rows.copied().unwrap_or(0), width])
+    }
+
+    /// What [`Bytes::of_counts`] made.
+    ///
+    /// # Errors
+    /// [`Problem`] names it.
+    pub fn counts(&self, name: &str) -> Result<Vec<u64>, Problem> {
+        let (words, _) = self.rows(name, WORD)?.as_chunks::<WORD>();
+        Ok(words.iter().map(|&word| u64::from_le_bytes(word)).collect())
+    }
+
+    /// What [`Bytes::of_floats`] made of so many finite numbers.
+    ///
+    /// # Errors
+    /// [`Problem`] names it.
+    pub fn floats(&self, name: &str, n_floats: usize) -> Result<Vec<f64>, Problem> {
+        let (words, _) = self.bytes(name, &[n_floats, WORD])?.as_chunks::<WORD>();
+        let floats: Vec<f64> = words.iter().map(|&word| f64::from_le_bytes(word)).collect();
+        match floats.iter().find(|float| !float.is_finite()) {
+            None => Ok(floats),
             Some(got) => Err(Problem::Value {
                 name: name.into(),
                 expected: "finite numbers".into(),
@@ -154,13 +253,19 @@ impl Contents {
                 hash = (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
             }
         };
+        let sides = |shape: &[usize]| -> Vec<u8> {
+            let sides = shape.iter();
+            sides.flat_map(|&n| (n as u64).to_le_bytes()).collect()
+        };
         for (name, tensor) in &self.tensors {
             take(name.as_bytes());
-            tensor
-                .shape
-                .iter()
-                .for_each(|&side| take(&(side as u64).to_le_bytes()));
+            take(&sides(&tensor.shape));
             tensor.numbers.iter().for_each(|n| take(&n.to_le_bytes()));
+        }
+        for (name, Bytes { shape, bytes }) in &self.bytes {
+            take(name.as_bytes());
+            take(&sides(shape));
+            take(bytes);
         }
         for (name, text) in &self.texts {
             take(name.as_bytes());
@@ -196,6 +301,17 @@ pub fn write(path: &Path, kind: &'static str, contents: &Contents) -> Result<(),
 /// # Errors
 /// [`CheckpointError`] names the file and what is wrong with it.
 pub fn read(path: &Path, kind: &'static str) -> Result<Contents, CheckpointError> {
+    read_any(path, &[kind]).map(|(_, contents)| contents)
+}
+
+/// Reads a checkpoint of one of some kinds, and tells which.
+///
+/// # Errors
+/// [`CheckpointError`] names the file and what is wrong with it.
+pub fn read_any(
+    path: &Path,
+    kinds: &[&'static str],
+) -> Result<(&'static str, Contents), CheckpointError> {
     let bytes = || {
         let size = std::fs::metadata(path)?.len();
         if size > MAX_BYTES {
@@ -203,32 +319,41 @@ pub fn read(path: &Path, kind: &'static str) -> Result<Contents, CheckpointError
         }
         Ok(std::fs::read(path)?)
     };
-    let contents = bytes().and_then(|bytes| decode(kind, &bytes));
+    let contents = bytes().and_then(|bytes| decode(kinds, &bytes));
     contents.map_err(|problem| problem.of(path))
 }
 
 fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>, Problem> {
     let form = |error: safetensors::SafeTensorError| Problem::Form(error.to_string());
-    let bytes = |tensor: &Tensor| -> Vec<u8> {
+    let Contents {
+        tensors,
+        bytes,
+        texts,
+    } = contents;
+    let numbers = |tensor: &Tensor| -> Vec<u8> {
         let numbers = tensor.numbers.iter();
         numbers.flat_map(|number| number.to_le_bytes()).collect()
     };
-    let bytes: Vec<Vec<u8>> = contents.tensors.values().map(bytes).collect();
-    let views = contents.tensors.iter().zip(&bytes);
-    let views = views.map(|((name, tensor), bytes)| {
-        Ok((
-            name,
-            TensorView::new(Dtype::F32, tensor.shape.clone(), bytes)?,
-        ))
-    });
+    let numbers: Vec<Vec<u8>> = tensors.values().map(numbers).collect();
+    let floats = tensors.iter().zip(&numbers);
+    let floats = floats.map(|((name, tensor), numbers)| (name, Dtype::F32, &tensor.shape, numbers));
+    let bytes = bytes.iter();
+    let bytes = bytes.map(|(name, Bytes { shape, bytes })| (name, Dtype::U8, shape, bytes));
+    let views = floats.chain(bytes);
+    let views = views
+        .map(|(name, kind, shape, bytes)| Ok((name, TensorView::new(kind, shape.clone(), bytes)?)));
     let views = views.collect::<Result<Vec<_>, _>>().map_err(form)?;
-    let mut texts: HashMap<String, String> = contents.texts.clone().into_iter().collect();
+    let mut texts: HashMap<String, String> = texts.clone().into_iter().collect();
     texts.insert(KIND.into(), kind.into());
     texts.insert(DIGEST.into(), contents.digest());
-    safetensors::serialize(views, Some(texts)).map_err(form)
+    let file = safetensors::serialize(views, Some(texts)).map_err(form)?;
+    match file.len() as u64 {
+        ..=MAX_BYTES => Ok(file),
+        size => Err(Problem::Large(size)),
+    }
 }
 
-fn decode(kind: &'static str, bytes: &[u8]) -> Result<Contents, Problem> {
+fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Contents), Problem> {
     let form = |error: safetensors::SafeTensorError| Problem::Form(error.to_string());
     let file = SafeTensors::deserialize(bytes).map_err(form)?;
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(form)?;
@@ -236,43 +361,49 @@ fn decode(kind: &'static str, bytes: &[u8]) -> Result<Contents, Problem> {
     let got = texts
         .remove(KIND)
         .unwrap_or_else(|| "something else".into());
-    if got != kind {
-        return Err(Problem::Kind {
-            expected: kind,
-            got,
-        });
-    }
+    let Some(&kind) = kinds.iter().find(|kind| **kind == got) else {
+        let expected = kinds.join(" or ");
+        return Err(Problem::Kind { expected, got });
+    };
     let expected = texts.remove(DIGEST).unwrap_or_default();
     let mut contents = Contents {
-        tensors: BTreeMap::new(),
         texts: texts.into_iter().collect(),
+        ..Contents::default()
     };
     for (name, view) in file.iter() {
-        contents.tensors.insert(name.into(), tensor(name, &view)?);
+        contents.insert(name, &view)?;
     }
     let got = contents.digest();
     if got != expected {
         return Err(Problem::Digest { expected, got });
     }
-    Ok(contents)
+    Ok((kind, contents))
 }
 
-fn tensor(name: &str, view: &TensorView<'_>) -> Result<Tensor, Problem> {
-    if view.dtype() != Dtype::F32 {
-        return Err(Problem::Value {
-            name: name.into(),
-            expected: "32-bit floats".into(),
-            got: format!("{:?}", view.dtype()),
-        });
+impl Contents {
+    fn insert(&mut self, name: &str, view: &TensorView<'_>) -> Result<(), Problem> {
+        let (shape, bytes) = (view.shape().to_vec(), view.data());
+        match view.dtype() {
+            Dtype::U8 => {
+                let bytes = bytes.to_vec();
+                self.bytes.insert(name.into(), Bytes { shape, bytes });
+            }
+            Dtype::F32 => {
+                let (numbers, _) = bytes.as_chunks();
+                let numbers = numbers.iter().map(|&number| f32::from_le_bytes(number));
+                let numbers = numbers.collect();
+                self.tensors.insert(name.into(), Tensor { shape, numbers });
+            }
+            other => {
+                return Err(Problem::Value {
+                    name: name.into(),
+                    expected: "32-bit floats or bytes".into(),
+                    got: format!("{other:?}"),
+                });
+            }
+        }
+        Ok(())
     }
-    let (numbers, _) = view.data().as_chunks();
-    Ok(Tensor {
-        shape: view.shape().to_vec(),
-        numbers: numbers
-            .iter()
-            .map(|&bytes| f32::from_le_bytes(bytes))
-            .collect(),
-    })
 }
 
 #[cfg(test)]
@@ -286,6 +417,12 @@ mod tests {
             numbers: vec![1.0, -0.5, 0.0, 3e-9],
         };
         contents.tensors.insert("kernel".into(), tensor);
+        let counts = Bytes::of_counts([3, u64::MAX]);
+        contents.bytes.insert("lap".into(), counts);
+        let floats = Bytes::of_floats([0.1, 1e-300]);
+        contents.bytes.insert("owed".into(), floats);
+        let empty = Bytes::of_rows(5, Vec::new());
+        contents.bytes.insert("frames".into(), empty);
         contents.texts.insert("updates".into(), "12".into());
         contents
     }
@@ -351,6 +488,16 @@ mod tests {
             "expected \"bias\" in it, found none"
         );
         assert_eq!(read.count("updates").ok(), Some(12));
+        assert_eq!(read.counts("lap").ok(), Some(vec![3, u64::MAX]));
+        assert_eq!(read.floats("owed", 2).ok(), Some(vec![0.1, 1e-300]));
+        assert_eq!(read.rows("frames", 5).ok(), Some(&[][..]));
+        let error = |result: Result<&[u8], Problem>| result.expect_err("wrong").to_string();
+        let words = "frames: expected shape [0, 4], got [0, 5]";
+        assert_eq!(error(read.rows("frames", 4)), words);
+        let words = "lap: expected shape [16], got [2, 8]";
+        assert_eq!(error(read.bytes("lap", &[16])), words);
+        let error = read.counts("kernel").expect_err("floats").to_string();
+        assert_eq!(error, "expected \"kernel\" in it, found none");
         let missing = super::read(Path::new("no/such"), "tests").expect_err("none");
         assert!(
             missing

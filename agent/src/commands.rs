@@ -15,9 +15,9 @@ pub use train::TrainCommand;
 
 use agent::config::AgentFlags;
 use agent::decisions::DecisionsError;
-use agent::learner::Learned;
+use agent::learned::Learned;
 use agent::run::{Mission, RunError, run};
-use agent::train::{TrainError, read_learned};
+use agent::train::TrainError;
 use anyhow::{Context, Result};
 use clap::Args;
 use protocol::Model;
@@ -53,7 +53,7 @@ pub struct RunCommand {
     /// The model file, where the server does not reveal its model
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
-    /// What `train` learned, for policies `learned_*`
+    /// What `train` learned, for policies `learned_*` and `autoencoder_*`
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
     #[command(flatten)]
@@ -72,7 +72,7 @@ impl RunCommand {
             takeover: self.takeover,
             model,
             config: self.settings.effective()?,
-            learned: learned(self.checkpoint.as_deref())?,
+            learned: Learned::read(self.checkpoint.as_deref())?,
         };
         let summary = run(&mission, &*stop_on_signals().context("handle signals")?)?;
         let mean_reward = summary.reward / summary.steps.max(1) as f64;
@@ -115,11 +115,6 @@ fn read_model(path: &Path) -> Result<Model> {
     let text =
         std::fs::read_to_string(path).with_context(|| format!("model file {}", path.display()))?;
     Model::from_toml(&text).with_context(|| format!("model file {}", path.display()))
-}
-
-/// What a checkpoint holds.
-fn learned(checkpoint: Option<&Path>) -> Result<Option<Learned>> {
-    Ok(checkpoint.map(read_learned).transpose()?)
 }
 
 fn make_folder(path: &Path) -> Result<()> {

@@ -5,7 +5,7 @@ use crate::arena::{Arena, ArenaError};
 use crate::belief::Belief;
 use crate::client::Observation;
 use crate::config::AgentConfig;
-use crate::learner::Learned;
+use crate::learned::Learned;
 use crate::planner::Plan;
 use crate::policy::{EstimatorKind, Policy};
 use crate::report::PolicyRun;
@@ -29,7 +29,7 @@ pub struct Comparison {
     /// Settings of planners and estimators.
     pub config: AgentConfig,
     /// What was learned, for policies that act on it.
-    pub learned: Option<Learned>,
+    pub learned: Learned,
 }
 
 /// What came out.
@@ -215,7 +215,7 @@ impl Match<'_> {
             n_moves,
             prior: self.prior,
             seed,
-            learned: self.comparison.learned.as_ref(),
+            learned: &self.comparison.learned,
         };
         Agent::new(self.policy, &self.comparison.config, task)
     }

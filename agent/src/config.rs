@@ -1,8 +1,10 @@
 //! The agent's settings: defaults or the paper's preset, then a TOML file, then flags.
 
 mod learning;
+mod networks;
 
 pub use learning::LearningConfig;
+pub use networks::{AutoencoderConfig, DqnConfig, StepSize};
 
 use crate::belief::EntropyKind;
 use crate::estimator::Prior;
@@ -32,8 +34,24 @@ pub struct AgentConfig {
     pub prior_worlds: usize,
     /// Seed of planners, of the prior's worlds and of learners.
     pub seed: u64,
+    /// What `train` learns.
+    pub learner: LearnerKind,
     /// How the learned filter learns.
     pub learning: LearningConfig,
+    /// How the autoencoder learns.
+    pub autoencoder: AutoencoderConfig,
+    /// How the DQN learns.
+    pub dqn: DqnConfig,
+}
+
+/// What `train` learns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum LearnerKind {
+    /// A Bayes filter of the model's own form, with unknown parameters
+    Filter,
+    /// The paper's Algorithm 1: a dynamic autoencoder, and a DQN that chooses objectives
+    Autoencoder,
 }
 
 /// What planners maximise besides the target that a policy's name says (paper eqs. 13 to 15).
@@ -148,7 +166,10 @@ impl Default for AgentConfig {
             prior: PriorKind::Simulated,
             prior_worlds: 64,
             seed: 0,
+            learner: LearnerKind::Filter,
             learning: LearningConfig::default(),
+            autoencoder: AutoencoderConfig::default(),
+            dqn: DqnConfig::default(),
         }
     }
 }
@@ -165,11 +186,15 @@ impl Default for ObjectiveConfig {
 }
 
 impl AgentConfig {
-    /// What the authors ran: moves clamped after the sum, a uniform first belief.
+    /// What the authors ran: moves clamped after the sum, a uniform first belief, the autoencoder and the
+    /// DQN with steps of constant size.
     pub fn paper() -> Self {
         Self {
             shooting_integration: Integration::ClampSum,
             prior: PriorKind::Uniform,
+            learner: LearnerKind::Autoencoder,
+            autoencoder: AutoencoderConfig::paper(),
+            dqn: DqnConfig::paper(),
             ..Self::default()
         }
     }
@@ -196,6 +221,8 @@ impl AgentConfig {
             }
         }
         self.learning.check()?;
+        self.autoencoder.check()?;
+        self.dqn.check()?;
         Ok(self)
     }
 

@@ -7,6 +7,7 @@ use crate::belief::Belief;
 use crate::client::{Claim, Client, Observation};
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
+use crate::learned::Learned;
 use crate::planner::Objective;
 use crate::policy::{PlannerKind, Policy};
 use crate::run::RunError;
@@ -202,7 +203,7 @@ fn agent(
         n_moves: client.info().n_moves,
         prior,
         seed: planner_seed(config, observation.result.seed),
-        learned: None,
+        learned: &Learned::default(),
     };
     // Any choice will do: each has the same estimator and planner.
     let mut agent = Agent::new(&choices[0], config, task)?;

@@ -1,6 +1,6 @@
-//! How well a learned belief predicts what robots see, beside the known model's and none.
+//! How well learned beliefs predict what robots see, beside the known model's and none.
 //!
-//! Both filters are fed the same frames, of paths that neither, or the known-model one, chose. What
+//! All are fed the same frames, of paths that none of them, or the known-model filter, chose. What
 //! is scored is each frame's log-likelihood per visited cell under the prediction made before it.
 
 use crate::agent::{Agent, AgentError, Task};
@@ -9,8 +9,8 @@ use crate::belief::Belief;
 use crate::client::Observation;
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
-use crate::learner::Learned;
-use crate::policy::{PlannerKind, Policy, UnknownPolicy};
+use crate::learned::Learned;
+use crate::policy::{EstimatorKind, Policy, UnknownPolicy};
 use crate::scoring::{Score, score};
 use ndarray::Array2;
 use protocol::Move;
@@ -30,6 +30,8 @@ pub struct Examination<'a> {
     pub steps: u64,
     /// Settings of planners and estimators.
     pub config: &'a AgentConfig,
+    /// Whose predictions.
+    pub estimators: &'a [EstimatorKind],
     /// What was learned.
     pub learned: &'a Learned,
 }
@@ -39,10 +41,8 @@ pub struct Examination<'a> {
 pub struct Marks {
     /// The world.
     pub seed: u64,
-    /// Of the known-model filter.
-    pub known: Score,
-    /// Of the learned one.
-    pub learned: Score,
+    /// Of each estimator.
+    pub scores: Vec<Score>,
     /// How often each value was seen.
     pub counts: Vec<u64>,
 }
@@ -65,7 +65,7 @@ pub enum ExaminationError {
     Model(#[from] ModelError),
 }
 
-/// Flies the guide's paths and scores both filters on every frame.
+/// Flies the guide's paths and scores each estimator's prediction of every frame.
 ///
 /// # Errors
 /// [`ExaminationError`].
@@ -111,12 +111,10 @@ pub fn score_of_frequencies(all: &[Marks], counts: &[u64]) -> Score {
     score
 }
 
-/// Two filters on one world, and who chooses the paths.
+/// Estimators on one world, and who chooses the paths.
 struct Examinee {
     guide: Agent,
-    known: Agent,
-    learned: Agent,
-    likelihoods: [Array2<f64>; 2],
+    estimators: Vec<(Agent, Array2<f64>)>,
     observation: Observation,
     marks: Marks,
 }
@@ -130,29 +128,35 @@ impl Examinee {
         observation: Observation,
     ) -> Result<Self, ExaminationError> {
         let model = arena.model();
-        let agent = |policy: &Policy| {
+        let agent = |name: &str| -> Result<Agent, ExaminationError> {
             let task = Task {
                 model,
                 shape: arena.shape(),
                 n_moves: arena.info().n_moves,
                 prior,
                 seed: planner_seed(examination.config, seed),
-                learned: Some(examination.learned),
+                learned: examination.learned,
             };
-            Agent::new(policy, examination.config, task)
+            let policy = Policy::named(name, model)?;
+            Ok(Agent::new(&policy, examination.config, task)?)
         };
+        let estimator = |&kind: &EstimatorKind| -> Result<_, ExaminationError> {
+            let learned = examination.learned;
+            let (policy, likelihood) = match kind {
+                EstimatorKind::Learned => ("learned_beam", learned.filter_likelihood()),
+                EstimatorKind::Autoencoder => ("autoencoder_beam", learned.network_likelihood()),
+                _ => ("beam_exploit", None),
+            };
+            let likelihood = likelihood.unwrap_or_else(|| model.likelihood().clone());
+            Ok((agent(policy)?, likelihood))
+        };
+        let estimators = examination.estimators.iter().map(estimator);
         let mut examinee = Self {
-            guide: agent(&Policy::named(examination.guide, model)?)?,
-            known: agent(&Policy::named("beam_exploit", model)?)?,
-            learned: agent(&Policy::learned(PlannerKind::Beam))?,
-            likelihoods: [
-                model.likelihood().clone(),
-                examination.learned.tables.likelihood_array(),
-            ],
+            guide: agent(examination.guide)?,
+            estimators: estimators.collect::<Result<_, _>>()?,
             marks: Marks {
                 seed,
-                known: Score::default(),
-                learned: Score::default(),
+                scores: vec![Score::default(); examination.estimators.len()],
                 counts: vec![0; model.n_observations()],
             },
             observation,
@@ -168,9 +172,10 @@ impl Examinee {
     fn take_in(&mut self, observation: Observation) -> Result<(), AgentError> {
         self.observation = observation;
         let frame = &self.observation.frame;
-        let [known, learned] = &self.likelihoods;
-        self.marks.known += score(self.known.belief(), known, frame);
-        self.marks.learned += score(self.learned.belief(), learned, frame);
+        let scores = self.marks.scores.iter_mut().zip(&self.estimators);
+        for (sum, (agent, likelihood)) in scores {
+            *sum += score(agent.belief(), likelihood, frame);
+        }
         for (_, value) in frame.observed() {
             self.marks.counts[usize::from(value)] += 1;
         }
@@ -178,7 +183,8 @@ impl Examinee {
     }
 
     fn filter(&mut self) -> Result<(), AgentError> {
-        for agent in [&mut self.guide, &mut self.known, &mut self.learned] {
+        let estimators = self.estimators.iter_mut().map(|(agent, _)| agent);
+        for agent in estimators.chain([&mut self.guide]) {
             agent.correct(&self.observation.frame, None)?;
             agent.predict();
         }
@@ -194,8 +200,7 @@ mod tests {
     fn frequencies_score_the_entropy_of_what_was_seen() {
         let marks = |counts: [u64; 3]| Marks {
             seed: 0,
-            known: Score::default(),
-            learned: Score::default(),
+            scores: Vec::new(),
             counts: counts.to_vec(),
         };
         let all = [marks([3, 0, 1]), marks([1, 0, 3])];

@@ -7,7 +7,7 @@ use crate::estimator::learned_filter::{
     Adam, Dimensions, NotFinite, Parameters, Tables, Trainer, Update,
 };
 use crate::replay::Replay;
-use crate::reward::RewardEstimate;
+use crate::reward::{RewardEstimate, met};
 use protocol::{Frame, Shape};
 
 /// How checkpoints of this learner call it.
@@ -15,7 +15,7 @@ pub const KIND: &str = "learned_filter";
 
 /// What was learned: all that acting on it needs.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Learned {
+pub struct LearnedModel {
     /// The filter's parameters.
     pub tables: Tables,
     /// The state that pays most.
@@ -83,16 +83,7 @@ impl Learner {
 
     /// The reward of the path that a frame shows, with the belief after it.
     pub fn reward(&mut self, posterior: &Belief, frame: &Frame, reward: f64) {
-        let n_cells = posterior.shape().n_cells();
-        let met = |state: usize| -> f64 {
-            let plane = &posterior.as_slice()[state * n_cells..];
-            frame
-                .observed()
-                .map(|(cell, _)| f64::from(plane[cell]))
-                .sum()
-        };
-        let met: Vec<f64> = (0..posterior.n_states()).map(met).collect();
-        self.reward.add(&met, reward);
+        self.reward.add(&met(posterior, frame), reward);
         self.world_steps += 1;
         self.owed += self.config.updates_per_step;
     }
@@ -112,7 +103,7 @@ impl Learner {
     }
 
     /// What is known by now.
-    pub fn learned(&self) -> Learned {
+    pub fn learned(&self) -> LearnedModel {
         let progress = self.trainer.parameters();
         learned(progress, &self.reward)
     }
@@ -150,7 +141,7 @@ impl Progress {
     }
 
     /// What is known by then.
-    pub fn learned(&self) -> Learned {
+    pub fn learned(&self) -> LearnedModel {
         learned(&self.parameters, &self.reward)
     }
 
@@ -236,8 +227,8 @@ impl Progress {
     }
 }
 
-fn learned(parameters: &Parameters, reward: &RewardEstimate) -> Learned {
-    Learned {
+fn learned(parameters: &Parameters, reward: &RewardEstimate) -> LearnedModel {
+    LearnedModel {
         tables: parameters.tables(),
         target: reward
             .target()

@@ -1,7 +1,7 @@
 //! Metrics of a training as CSV: one row per update, and one per step without any.
 
-use crate::estimator::learned_filter::Update;
 use crate::scoring::Score;
+use crate::student::Lesson;
 use std::fs::OpenOptions;
 use std::path::{Path, PathBuf};
 use thiserror::Error;
@@ -43,14 +43,16 @@ pub struct MetricsError {
 pub struct Metrics {
     path: PathBuf,
     writer: csv::Writer<std::fs::File>,
+    /// Columns of the learner's own.
+    n_more: usize,
 }
 
 impl Metrics {
-    /// Opens the file in a folder, to go on with it or anew.
+    /// Opens the file in a folder, to go on with it or anew. `more`: columns of the learner's own.
     ///
     /// # Errors
     /// [`MetricsError`].
-    pub fn open(folder: &Path, goes_on: bool) -> Result<Self, MetricsError> {
+    pub fn open(folder: &Path, more: &[&str], goes_on: bool) -> Result<Self, MetricsError> {
         let path = folder.join(METRICS);
         let goes_on = goes_on && path.exists();
         let mut options = OpenOptions::new();
@@ -65,9 +67,15 @@ impl Metrics {
         };
         let mut writer = csv::Writer::from_writer(file.map_err(|error| fail(error.into()))?);
         if !goes_on {
-            writer.write_record(HEADER).map_err(fail)?;
+            let header = HEADER.iter().chain(more);
+            writer.write_record(header).map_err(fail)?;
         }
-        Ok(Self { path, writer })
+        let n_more = more.len();
+        Ok(Self {
+            path,
+            writer,
+            n_more,
+        })
     }
 
     /// Adds a step's rows.
@@ -77,17 +85,18 @@ impl Metrics {
     pub fn add(
         &mut self,
         tick: &Tick,
-        updates: &[Update],
+        lessons: &[Lesson],
         n_updates: u64,
     ) -> Result<(), MetricsError> {
-        let rows = updates.iter().map(|update| {
-            let (loss, rate) = (number(update.loss), number(update.rate));
-            row(update.number, tick, loss, rate)
-        });
-        let without = row(n_updates, tick, String::new(), String::new());
-        let without = updates.is_empty().then_some(without);
-        for row in rows.chain(without) {
-            let written = self.writer.write_record(row);
+        let nothing = Lesson {
+            number: n_updates,
+            loss: None,
+            rate: None,
+            more: vec![None; self.n_more],
+        };
+        let nothing = lessons.is_empty().then_some(&nothing);
+        for lesson in lessons.iter().chain(nothing) {
+            let written = self.writer.write_record(row(tick, lesson));
             written.map_err(|problem| self.fail(problem))?;
         }
         Ok(())
@@ -108,22 +117,14 @@ impl Metrics {
     }
 }
 
-fn row(update: u64, tick: &Tick, loss: String, rate: String) -> [String; 6] {
-    let held_out = match tick.score.n_seen {
-        0 => String::new(),
-        _ => number(tick.score.mean()),
-    };
-    [
-        update.to_string(),
-        tick.world_steps.to_string(),
-        loss,
-        held_out,
-        number(tick.reward / tick.n_worlds.max(1) as f64),
-        rate,
-    ]
-}
-
-/// The shortest form that reads back as the same number.
-fn number(value: f64) -> String {
-    format!("{value:?}")
+fn row(tick: &Tick, lesson: &Lesson) -> Vec<String> {
+    let held_out = (tick.score.n_seen > 0).then(|| tick.score.mean());
+    let mean_reward = tick.reward / tick.n_worlds.max(1) as f64;
+    let numbers = [lesson.loss, held_out, Some(mean_reward), lesson.rate];
+    let counts = [lesson.number, tick.world_steps].map(|count| count.to_string());
+    let numbers = numbers.iter().chain(&lesson.more);
+    // The shortest form that reads back as the same number.
+    let numbers =
+        numbers.map(|number| number.map_or(String::new(), |number| format!("{number:?}")));
+    counts.into_iter().chain(numbers).collect()
 }

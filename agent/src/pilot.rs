@@ -4,7 +4,7 @@ use crate::client::Observation;
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
 use crate::estimator::{LearnedFilter, ZeroEvidence};
-use crate::learner::{Learned, Learner};
+use crate::learner::{LearnedModel, Learner};
 use crate::planner::{Planner, PlanningProblem, Target};
 use crate::policy::{PlannerKind, Policy};
 use crate::scoring::{Score, score};
@@ -24,7 +24,7 @@ pub struct Pilot {
 impl Pilot {
     /// A pilot before it took in what the world shows.
     pub fn new(
-        learned: &Learned,
+        learned: &LearnedModel,
         shape: Shape,
         observation: Observation,
         config: &AgentConfig,

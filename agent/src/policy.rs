@@ -13,6 +13,8 @@ pub enum EstimatorKind {
     KnownModel,
     /// A Bayes filter with learned parameters.
     Learned,
+    /// The paper's dynamic autoencoder (sections III.B and III.C).
+    Autoencoder,
     /// The hidden state X_k, predicted one step ahead: an upper bound on estimation.
     Truth,
     /// The hidden state X_{k+1} that the path will meet: an upper bound on prediction too.
@@ -41,6 +43,8 @@ pub struct Policy {
     pub planner: PlannerKind,
     /// What it maximises.
     pub objective: Objective,
+    /// Whether a DQN chooses what each path is for instead (paper section III.E).
+    pub is_decided: bool,
 }
 
 /// A name that is no policy's.
@@ -58,6 +62,7 @@ impl EstimatorKind {
             Self::None => "none",
             Self::KnownModel => "known_model",
             Self::Learned => "learned_filter",
+            Self::Autoencoder => "autoencoder",
             Self::Truth => "truth",
             Self::NextTruth => "next_truth",
         }
@@ -80,7 +85,9 @@ impl Policy {
     ///
     /// Names are `random_walk`, `coverage`, `shooting_*` and `beam_*` with `exploit` (the state that
     /// pays most), `exploit_only` (the same without the coverage bonus), `explore` (entropy) or the name
-    /// of a state, and `oracle_*`, `clairvoyant_*` and `learned_*` with `shooting` or `beam`.
+    /// of a state, and `oracle_*`, `clairvoyant_*` and `learned_*` with `shooting` or `beam`. On the
+    /// autoencoder's belief there are `autoencoder_exploit` and `autoencoder_explore`, which shoot,
+    /// `autoencoder_policy`, for which the DQN chooses among the paper's objectives, and `autoencoder_beam`.
     ///
     /// # Errors
     /// [`UnknownPolicy`] lists the names that there are.
@@ -95,6 +102,7 @@ impl Policy {
             estimator,
             planner,
             objective,
+            is_decided: false,
         };
         Ok(match name {
             "random_walk" => policy(
@@ -110,6 +118,7 @@ impl Policy {
             _ => {
                 let (family, rest) = name.split_once('_').ok_or_else(unknown)?;
                 match family {
+                    "autoencoder" => Self::of_autoencoder(rest).ok_or_else(unknown)?,
                     "oracle" | "clairvoyant" | "learned" => {
                         let planner = planner_named(rest).ok_or_else(unknown)?;
                         let estimator = match family {
@@ -146,6 +155,7 @@ impl Policy {
             estimator: EstimatorKind::KnownModel,
             planner,
             objective: objective(planner, target),
+            is_decided: false,
         };
         let states = model.file().states.iter().enumerate();
         let states = states.map(|(state, entry)| choice(&entry.name, Target::State(state)));
@@ -164,11 +174,54 @@ impl Policy {
             estimator: EstimatorKind::Learned,
             planner,
             objective: objective(planner, target),
+            is_decided: false,
         }
     }
 
-    /// The names that need a checkpoint.
-    pub const LEARNED: [&'static str; 2] = ["learned_shooting", "learned_beam"];
+    /// A policy on the autoencoder's belief; the agent puts the state that pays most, as learned, in the
+    /// place of this one.
+    fn of_autoencoder(name: &str) -> Option<Self> {
+        let (planner, target) = match name {
+            "exploit" | "policy" => (PlannerKind::Shooting, Target::State(0)),
+            "explore" => (PlannerKind::Shooting, Target::Entropy),
+            "beam" => (PlannerKind::Beam, Target::State(0)),
+            _ => return None,
+        };
+        Some(Self {
+            name: format!("autoencoder_{name}"),
+            estimator: EstimatorKind::Autoencoder,
+            planner,
+            objective: objective(planner, target),
+            is_decided: name == "policy",
+        })
+    }
+
+    /// What the DQN of Algorithm 1 chooses among (paper section IV): the probability of each of the
+    /// autoencoder's states, then entropy.
+    pub fn network_choices(n_states: usize) -> Vec<Self> {
+        let choice = |name: String, target| Self {
+            name,
+            estimator: EstimatorKind::Autoencoder,
+            planner: PlannerKind::Shooting,
+            objective: objective(PlannerKind::Shooting, target),
+            is_decided: false,
+        };
+        let states =
+            (0..n_states).map(|state| choice(format!("state_{state}"), Target::State(state)));
+        let entropy = choice("entropy".into(), Target::Entropy);
+        states.chain([entropy]).collect()
+    }
+
+    /// The names that need the checkpoint of a learned filter.
+    pub const OF_FILTER: [&'static str; 2] = ["learned_shooting", "learned_beam"];
+
+    /// The names that need the checkpoint of an autoencoder.
+    pub const OF_AUTOENCODER: [&'static str; 4] = [
+        "autoencoder_explore",
+        "autoencoder_exploit",
+        "autoencoder_policy",
+        "autoencoder_beam",
+    ];
 
     /// The benchmark's ladder under a model, from the least to the most informed.
     pub fn ladder(model: &Model) -> Vec<Self> {
@@ -231,7 +284,8 @@ fn ladder_names(model: &Model) -> Vec<String> {
 fn known_names(model: &Model) -> Vec<String> {
     let mut names = ladder_names(model);
     names.extend(["beam_explore", "beam_exploit_only", "clairvoyant_shooting"].map(String::from));
-    names.extend(Policy::LEARNED.map(String::from));
+    names.extend(Policy::OF_FILTER.map(String::from));
+    names.extend(Policy::OF_AUTOENCODER.map(String::from));
     names.extend(
         model
             .file()

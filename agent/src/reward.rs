@@ -5,11 +5,27 @@
 //! found by least squares with forgetting, as early posteriors are poor. A learned filter has no
 //! other way to know which of its states is the fire.
 
+use crate::belief::Belief;
+use protocol::Frame;
+
 /// Share of what was known that is kept at each path: a memory of 2,000 paths.
 const KEPT: f64 = 0.9995;
 
 /// Added to the diagonal, in squared cells: no state needs to have been met.
 const RIDGE: f64 = 1.0;
+
+/// What a path met: the expected number of a frame's cells in each state, under the belief after it.
+pub fn met(posterior: &Belief, frame: &Frame) -> Vec<f64> {
+    let n_cells = posterior.shape().n_cells();
+    let planes = posterior.as_slice().chunks_exact(n_cells);
+    let cells = |plane: &[f32]| {
+        frame
+            .observed()
+            .map(|(cell, _)| f64::from(plane[cell]))
+            .sum()
+    };
+    planes.map(cells).collect()
+}
 
 /// Sums of products of what was met, for least squares.
 #[derive(Debug, Clone, PartialEq)]

@@ -6,7 +6,7 @@ use crate::client::{Claim, Client, Observation, server_info, shape_of};
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
 use crate::estimator::Prior;
-use crate::learner::Learned;
+use crate::learned::Learned;
 use crate::policy::{EstimatorKind, Policy, UnknownPolicy};
 use crate::truth::{TruthError, TruthFeed};
 use protocol::channels::{ChannelError, Instance};
@@ -43,7 +43,7 @@ pub struct Mission {
     /// Settings of planners and estimators.
     pub config: AgentConfig,
     /// What was learned, for policies that act on it.
-    pub learned: Option<Learned>,
+    pub learned: Learned,
 }
 
 /// Why a mission ended early.
@@ -187,7 +187,7 @@ impl Attached {
             n_moves,
             prior: &prior,
             seed,
-            learned: mission.learned.as_ref(),
+            learned: &mission.learned,
         };
         let agent = Agent::new(&policy, &mission.config, task)?;
         let truth = if policy.estimator == EstimatorKind::Truth {

@@ -1,25 +1,23 @@
-//! Learns a model while acting: attach, fly, correct, learn, predict, on several worlds at once.
+//! Learns while acting: attach, fly, correct, learn, predict, save.
 //!
 //! The learner is told the grid, the number of observations and each path's reward and frame; the
-//! model that a server may reveal is not read. One message steps all worlds, so that what is
-//! learned from in a step comes from worlds that differ. Rewards say which learned state pays
-//! ([`crate::reward`]).
+//! model that a server may reveal is not read. One message steps all worlds. What is learned, and how
+//! it acts meanwhile, is a [`Student`]'s.
 
-use crate::checkpoint::{self, CheckpointError};
+use crate::checkpoint::{self, CheckpointError, Contents, Problem};
 use crate::client::{Claim, Client};
-use crate::config::{AgentConfig, ConfigError};
+use crate::config::{AgentConfig, ConfigError, LearnerKind};
 use crate::estimator::ZeroEvidence;
-use crate::estimator::learned_filter::{Dimensions, DimensionsError, NotFinite, Update};
-use crate::learner::{KIND, Learned, Learner, Progress};
+use crate::estimator::learned_filter::{Dimensions, DimensionsError};
+use crate::learner;
 use crate::metrics::{Metrics, MetricsError, Tick};
-use crate::pilot::Pilot;
-use crate::policy::PlannerKind;
 use crate::scoring::Score;
-use protocol::Move;
+use crate::student::filter::FilterStudent;
+use crate::student::network::{self, NetworkStudent};
+use crate::student::{Lesson, NotFinite, Site, Student};
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
-use protocol::control::WorldSeed;
-use rayon::prelude::*;
+use protocol::control::{CoverageRule, WorldSeed};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -86,6 +84,15 @@ pub enum TrainError {
     /// A folder that holds a training already.
     #[error("--out {0}: expected --resume or a folder without a checkpoint, got one with it")]
     Taken(String),
+    /// Full frames that the server does not give.
+    #[error(
+        "autoencoder.full_frames: {0} frames that show every cell need a server with --coverage \
+         client or full, or the setting 0"
+    )]
+    NoFullFrames(u64),
+    /// Worlds that one memory cannot follow.
+    #[error("--worlds: expected 1 for the autoencoder, which follows one world, got {0}")]
+    OneWorld(usize),
     /// Settings that cannot be written into a checkpoint.
     #[error("settings: {0}")]
     Settings(#[from] toml::ser::Error),
@@ -100,7 +107,7 @@ pub enum TrainError {
 }
 
 /// What a training did.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct TrainSummary {
     /// World steps acted, of all worlds together.
     pub steps: u64,
@@ -108,8 +115,8 @@ pub struct TrainSummary {
     pub updates: u64,
     /// Sum of rewards.
     pub reward: f64,
-    /// Time in updates.
-    pub learning: Duration,
+    /// Time spent, by part.
+    pub times: Vec<(&'static str, Duration)>,
 }
 
 /// Trains until the steps are done, the time is over or `stop` is set; saves in any case.
@@ -130,12 +137,19 @@ pub fn train(training: &Training, stop: &AtomicBool) -> Result<TrainSummary, Tra
 /// A learner at its worlds.
 struct Trainee {
     client: Client,
-    pilots: Vec<Pilot>,
-    learner: Learner,
+    student: Box<dyn Student>,
     metrics: Metrics,
     summary: TrainSummary,
     saved: Instant,
-    told: (Instant, TrainSummary, Score),
+    told: Told,
+}
+
+/// What was told last, and what to tell next.
+struct Told {
+    at: Instant,
+    steps: u64,
+    reward: f64,
+    score: Score,
 }
 
 impl Trainee {
@@ -145,8 +159,12 @@ impl Trainee {
             return Err(TrainError::Taken(training.out.display().to_string()));
         }
         // A checkpoint that cannot be read is refused before worlds are held for it.
+        let kind = match training.config.learner {
+            LearnerKind::Filter => learner::KIND,
+            LearnerKind::Autoencoder => network::KIND,
+        };
         let contents = match training.resume {
-            true => Some(checkpoint::read(&place, KIND)?),
+            true => Some(checkpoint::read(&place, kind)?),
             false => None,
         };
         let claim = Claim {
@@ -155,31 +173,20 @@ impl Trainee {
             time_to_live: Some(LEASE),
         };
         let mut client = Client::acquire(&training.instance, &claim)?;
-        let dimensions = dimensions(&training.config, client.info().n_observations)?;
-        let progress = match contents {
-            Some(contents) => Progress::from_contents(&contents, Some(dimensions))
-                .map_err(|problem| problem.of(&place))?,
-            None => Progress::first(dimensions, training.config.seed),
-        };
-        let metrics = Metrics::open(&training.out, training.resume)?;
-        let learned = progress.learned();
-        let mut learner = Learner::new(progress, client.shape(), &training.config);
+        let mut student = student(training, &client, contents.as_ref(), &place)?;
+        let metrics = Metrics::open(&training.out, student.columns(), training.resume)?;
         let observations = client.observe(client.worlds())?;
-        let mut pilots = Vec::new();
-        for (world, observation) in client.worlds().zip(observations) {
-            let mut pilot = Pilot::new(&learned, client.shape(), observation, &training.config);
-            pilot.begin(world, &mut learner)?;
-            pilots.push(pilot);
+        for (world, observation) in observations.into_iter().enumerate() {
+            student.begin(world, observation)?;
         }
         let now = Instant::now();
         Ok(Self {
             client,
-            pilots,
-            learner,
+            student,
             metrics,
             summary: TrainSummary::default(),
             saved: now,
-            told: (now, TrainSummary::default(), Score::default()),
+            told: Told::at(now, &TrainSummary::default()),
         })
     }
 
@@ -192,13 +199,13 @@ impl Trainee {
         let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
         let is_done = |steps: u64| training.steps > 0 && steps >= training.steps;
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
-            let tick = self.step(training)?;
-            let updates = match training.freeze {
+            let tick = self.step()?;
+            let lessons = match training.freeze {
                 true => Vec::new(),
                 false => self.learn(training)?,
             };
-            self.metrics
-                .add(&tick, &updates, self.learner.n_updates())?;
+            let n_updates = self.student.n_updates();
+            self.metrics.add(&tick, &lessons, n_updates)?;
             self.report(&tick);
             if self.saved.elapsed() > SAVE_INTERVAL {
                 self.save(training)?;
@@ -209,114 +216,122 @@ impl Trainee {
     }
 
     /// Plans, flies, scores, corrects, predicts: one step of each world.
-    fn step(&mut self, training: &Training) -> Result<Tick, TrainError> {
-        let learned = self.learner.learned();
-        let n_moves = self.client.info().n_moves;
-        let n_walking = self.n_walking(training);
-        let plan = |(index, pilot): (usize, &mut Pilot)| {
-            pilot.filter.set(&learned.tables);
-            let kind = match index < n_walking {
-                true => PlannerKind::RandomWalk,
-                false => PlannerKind::Beam,
-            };
-            pilot.plan(kind, learned.target, &training.config, n_moves)
+    fn step(&mut self) -> Result<Tick, TrainError> {
+        let paths = self.student.plan();
+        let worlds = self.client.worlds();
+        let observations = match self.student.wants_full_frames() {
+            true => self.client.step_full(worlds.clone(), &paths)?,
+            false => self.client.step(worlds.clone(), &paths)?,
         };
-        let pilots = self.pilots.par_iter_mut().enumerate();
-        let paths: Vec<Vec<Move>> = pilots.map(plan).collect();
-        let observations = self.client.step(self.client.worlds(), &paths)?;
-        let mut tick = Tick::default();
-        let worlds = self.client.worlds().zip(observations).zip(&mut self.pilots);
-        for ((world, observation), pilot) in worlds {
-            tick.reward += observation.result.reward;
-            tick.score += pilot.take_in(world, observation, &mut self.learner)?;
+        let ended: Vec<(usize, u32)> = observations
+            .iter()
+            .enumerate()
+            .filter(|(_, seen)| seen.result.truncated != 0 || seen.result.terminated != 0)
+            .map(|(index, _)| (index, worlds.start + index as u32))
+            .collect();
+        let tick = self.student.take_in(observations)?;
+        for (index, world) in ended {
+            self.client.reset(&[WorldSeed { world, seed: None }])?;
+            let observation = self.client.observe(world..world + 1)?.remove(0);
+            self.student.begin(index, observation)?;
         }
-        self.pilots
-            .par_iter_mut()
-            .for_each(|pilot| pilot.filter.predict());
-        self.reset_ended(&learned, training)?;
-        tick.n_worlds = self.pilots.len() as u64;
-        tick.world_steps = self.learner.world_steps();
         self.summary.steps += tick.n_worlds;
         self.summary.reward += tick.reward;
         Ok(tick)
     }
 
-    /// Worlds whose robots walk at random: all at first, some for good.
-    fn n_walking(&self, training: &Training) -> usize {
-        let learning = &training.config.learning;
-        let n_worlds = self.pilots.len();
-        if self.learner.world_steps() < learning.explore_steps {
-            return n_worlds;
-        }
-        (learning.explore_share * n_worlds as f64).round() as usize
-    }
-
-    fn learn(&mut self, training: &Training) -> Result<Vec<Update>, TrainError> {
-        let start = Instant::now();
-        let updates = self.learner.learn();
-        self.summary.learning += start.elapsed();
-        self.summary.updates = self.learner.n_updates();
-        match updates {
-            Ok(updates) => Ok(updates),
-            Err(problem) => {
-                let saved = self.save(training)?;
-                self.metrics.flush()?;
-                let saved = saved.display().to_string();
-                Err(TrainError::NotFinite { problem, saved })
-            }
-        }
-    }
-
-    /// Starts episodes anew that reached their end.
-    fn reset_ended(&mut self, learned: &Learned, training: &Training) -> Result<(), TrainError> {
-        for (world, pilot) in self.client.worlds().zip(&mut self.pilots) {
-            let result = &pilot.observation.result;
-            if result.truncated == 0 && result.terminated == 0 {
-                continue;
-            }
-            self.client.reset(&[WorldSeed { world, seed: None }])?;
-            let observation = self.client.observe(world..world + 1)?.remove(0);
-            *pilot = Pilot::new(learned, self.client.shape(), observation, &training.config);
-            pilot.begin(world, &mut self.learner)?;
-        }
-        Ok(())
+    fn learn(&mut self, training: &Training) -> Result<Vec<Lesson>, TrainError> {
+        let lessons = self.student.learn();
+        self.summary.updates = self.student.n_updates();
+        lessons.or_else(|problem| {
+            let saved = self.save(training)?.display().to_string();
+            self.metrics.flush()?;
+            Err(TrainError::NotFinite { problem, saved })
+        })
     }
 
     fn save(&mut self, training: &Training) -> Result<PathBuf, TrainError> {
         self.saved = Instant::now();
         let place = training.out.join(CHECKPOINT);
-        let contents = self.learner.progress();
-        let contents = contents.to_contents(&toml::to_string(&training.config)?);
-        checkpoint::write(&place, KIND, &contents)?;
+        let mut contents = self.student.contents();
+        let settings = toml::to_string(&training.config)?;
+        contents.texts.insert("settings".into(), settings);
+        checkpoint::write(&place, self.student.kind(), &contents)?;
+        self.summary.times = self.student.times();
         Ok(place)
     }
 
     fn report(&mut self, tick: &Tick) {
-        let (since, before, score) = &mut self.told;
-        *score += tick.score;
-        if since.elapsed() < REPORT_INTERVAL {
+        let told = &mut self.told;
+        told.score += tick.score;
+        if told.at.elapsed() < REPORT_INTERVAL {
             return;
         }
-        let steps = self.summary.steps - before.steps;
+        let steps = self.summary.steps - told.steps;
         tracing::info!(
             world_steps = tick.world_steps,
-            updates = self.learner.n_updates(),
-            log_likelihood = score.mean(),
-            mean_reward = (self.summary.reward - before.reward) / steps.max(1) as f64,
+            updates = self.student.n_updates(),
+            log_likelihood = told.score.mean(),
+            mean_reward = (self.summary.reward - told.reward) / steps.max(1) as f64,
             "training"
         );
-        self.told = (Instant::now(), self.summary, Score::default());
+        *told = Told::at(Instant::now(), &self.summary);
     }
 }
 
-/// What was learned by a checkpoint.
-///
-/// # Errors
-/// [`CheckpointError`].
-pub fn read_learned(path: &Path) -> Result<Learned, CheckpointError> {
-    let contents = checkpoint::read(path, KIND)?;
-    let progress = Progress::from_contents(&contents, None);
-    Ok(progress.map_err(|problem| problem.of(path))?.learned())
+impl Told {
+    fn at(at: Instant, summary: &TrainSummary) -> Self {
+        Self {
+            at,
+            steps: summary.steps,
+            reward: summary.reward,
+            score: Score::default(),
+        }
+    }
+}
+
+/// What the settings say that learns, going on from a checkpoint's contents if there are any.
+fn student(
+    training: &Training,
+    client: &Client,
+    contents: Option<&Contents>,
+    place: &Path,
+) -> Result<Box<dyn Student>, TrainError> {
+    let (info, config) = (client.info(), &training.config);
+    let site = Site {
+        shape: client.shape(),
+        n_observations: info.n_observations,
+        n_moves: info.n_moves,
+        n_worlds: training.worlds.len(),
+    };
+    let wrong = |problem: Problem| problem.of(place);
+    Ok(match config.learner {
+        LearnerKind::Filter => {
+            let dimensions = dimensions(config, site.n_observations)?;
+            let progress = match contents {
+                Some(contents) => {
+                    let expected = Some(dimensions);
+                    learner::Progress::from_contents(contents, expected).map_err(wrong)?
+                }
+                None => learner::Progress::first(dimensions, config.seed),
+            };
+            Box::new(FilterStudent::new(progress, site, config))
+        }
+        LearnerKind::Autoencoder => {
+            if site.n_worlds != 1 {
+                return Err(TrainError::OneWorld(site.n_worlds));
+            }
+            let mut progress = network::Progress::first(site, config);
+            if let Some(contents) = contents {
+                progress.load(contents).map_err(wrong)?;
+            }
+            let full_frames = config.autoencoder.full_frames;
+            if progress.iterations < full_frames && info.coverage == CoverageRule::Path {
+                return Err(TrainError::NoFullFrames(full_frames));
+            }
+            Box::new(NetworkStudent::new(progress, site, config))
+        }
+    })
 }
 
 fn dimensions(config: &AgentConfig, n_observations: usize) -> Result<Dimensions, DimensionsError> {

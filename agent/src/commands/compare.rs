@@ -1,12 +1,13 @@
 //! `compare`: the benchmark.
 
 use super::worlds::WorldFlags;
-use super::{learned, make_folder, write};
+use super::{make_folder, write};
 use agent::agent::AgentError;
 use agent::arena::Arena;
 use agent::compare::{Comparison, Moment, Results, compare};
 use agent::config::AgentFlags;
-use agent::policy::{EstimatorKind, PlannerKind, Policy};
+use agent::learned::Learned;
+use agent::policy::{EstimatorKind, Policy};
 use agent::report::{
     Snapshot, draw_ladder, draw_rewards, draw_snapshot, figures::FIRE_CELLS_PER_STEP, render_table,
     write_csv,
@@ -26,9 +27,10 @@ pub struct CompareCommand {
     /// The policy that others are paired against
     #[arg(long, default_value = "shooting_exploit")]
     baseline: String,
-    /// What `train` learned: adds `learned_shooting` and `learned_beam` to the ladder
+    /// What `train` learned: a filter adds `learned_*` to the ladder, an autoencoder `autoencoder_*`; may be
+    /// given for each
     #[arg(long, value_name = "FILE")]
-    checkpoint: Option<PathBuf>,
+    checkpoint: Vec<PathBuf>,
     /// Write one line per policy and world to this file
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
@@ -46,13 +48,13 @@ impl CompareCommand {
     pub fn run(&self) -> Result<()> {
         let config = self.settings.effective()?;
         self.make_places()?;
-        let learned = learned(self.checkpoint.as_deref())?;
+        let learned = Learned::read(self.checkpoint.iter().map(PathBuf::as_path))?;
         let mut worlds = self.worlds.open(self.needs_scouts(), |model| {
-            self.policies(model).map(|_| ())
+            self.policies(model, &learned).map(|_| ())
         })?;
         let arena = &mut worlds.arena;
         let comparison = Comparison {
-            policies: self.policies(arena.model())?,
+            policies: self.policies(arena.model(), &learned)?,
             seeds: self.worlds.seeds.clone(),
             steps: self.worlds.steps,
             config,
@@ -109,10 +111,10 @@ impl CompareCommand {
         self.figures.as_deref().map_or(Ok(()), make_folder)
     }
 
-    fn policies(&self, model: &Model) -> Result<Vec<Policy>> {
+    fn policies(&self, model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
         let named = |name: &String| Policy::named(name, model);
         let policies = match self.policies.as_slice() {
-            [] => self.ladder(model),
+            [] => ladder(model, learned),
             names => names.iter().map(named).collect::<Result<_, _>>()?,
         };
         let twice = policies
@@ -125,28 +127,16 @@ impl CompareCommand {
             twice.map_or("", |(_, policy)| &policy.name)
         );
         named(&self.baseline).context("--baseline")?;
-        let unlearned = policies
-            .iter()
-            .find(|policy| policy.estimator == EstimatorKind::Learned && self.checkpoint.is_none());
-        if let Some(policy) = unlearned {
+        for policy in &policies {
+            let kind = match policy.estimator {
+                EstimatorKind::Learned if learned.filter.is_none() => "a filter",
+                EstimatorKind::Autoencoder if learned.network.is_none() => "an autoencoder",
+                _ => continue,
+            };
             let policy = policy.name.clone();
-            return Err(AgentError::NeedsCheckpoint { policy }.into());
+            return Err(AgentError::NeedsCheckpoint { policy, kind }.into());
         }
         Ok(policies)
-    }
-
-    /// The ladder, with the policies on a learned belief if there is one.
-    fn ladder(&self, model: &Model) -> Vec<Policy> {
-        let mut ladder = Policy::ladder(model);
-        if self.checkpoint.is_some() {
-            let known = ladder
-                .iter()
-                .rposition(|policy| policy.estimator == EstimatorKind::KnownModel);
-            let at = known.map_or(ladder.len(), |last| last + 1);
-            let learned = [PlannerKind::Shooting, PlannerKind::Beam].map(Policy::learned);
-            ladder.splice(at..at, learned);
-        }
-        ladder
     }
 
     fn needs_scouts(&self) -> bool {
@@ -156,6 +146,27 @@ impl CompareCommand {
                 .iter()
                 .any(|name| name.starts_with("clairvoyant"))
     }
+}
+
+/// The ladder, with the policies on learned beliefs beside those on the known model.
+fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
+    let mut ladder = Policy::ladder(model);
+    let named = |name: &&str| Policy::named(name, model).expect("invariant: these are known");
+    let mut insert = |after: fn(&Policy) -> bool, names: &[&str]| {
+        let at = ladder.iter().rposition(after).map_or(0, |last| last + 1);
+        ladder.splice(at..at, names.iter().map(named));
+    };
+    if learned.filter.is_some() {
+        let is_known = |policy: &Policy| policy.estimator == EstimatorKind::KnownModel;
+        insert(is_known, &Policy::OF_FILTER);
+    }
+    if learned.network.is_some() {
+        insert(
+            |policy| policy.estimator == EstimatorKind::None,
+            &Policy::OF_AUTOENCODER,
+        );
+    }
+    ladder
 }
 
 /// Runs a comparison with a bar that shows how far it is.

@@ -7,11 +7,10 @@ use agent::arena::Arena;
 use agent::compare::Comparison;
 use agent::config::{AgentConfig, AgentFlags};
 use agent::evaluate::{Examination, Marks, examine, score_of_frequencies};
-use agent::learner::Learned;
-use agent::policy::Policy;
+use agent::learned::Learned;
+use agent::policy::{EstimatorKind, Policy};
 use agent::report::{render_table, statistics::Estimate, write_csv};
 use agent::scoring::Score;
-use agent::train::read_learned;
 use anyhow::Result;
 use clap::Args;
 use std::path::PathBuf;
@@ -19,12 +18,12 @@ use std::path::PathBuf;
 /// What rewards are paired against.
 const BASELINE: &str = "beam_exploit";
 
-/// What is compared.
+/// What is compared besides policies on what was learned.
 const POLICIES: [&str; 4] = [
+    "random_walk",
+    "coverage",
     "shooting_exploit",
     "beam_exploit",
-    "learned_shooting",
-    "learned_beam",
 ];
 
 /// Who chooses the paths on which predictions are scored.
@@ -33,9 +32,9 @@ const GUIDES: [&str; 2] = ["random_walk", "beam_exploit"];
 /// Score a checkpoint beside the known model.
 #[derive(Args)]
 pub struct EvaluateCommand {
-    /// What `train` learned
-    #[arg(long, value_name = "FILE")]
-    checkpoint: PathBuf,
+    /// What `train` learned; may be given for a filter and for an autoencoder
+    #[arg(long, value_name = "FILE", required = true)]
+    checkpoint: Vec<PathBuf>,
     /// Only score predictions, not policies
     #[arg(long)]
     predictions_only: bool,
@@ -52,7 +51,8 @@ impl EvaluateCommand {
     /// Scores predictions, then policies.
     pub fn run(&self) -> Result<()> {
         let config = self.settings.effective()?;
-        let learned = read_learned(&self.checkpoint)?;
+        let learned = Learned::read(self.checkpoint.iter().map(PathBuf::as_path))?;
+        let estimators = estimators(&learned);
         let mut worlds = self.worlds.open(false, |_| Ok(()))?;
         let arena = &mut worlds.arena;
         for guide in GUIDES {
@@ -61,9 +61,11 @@ impl EvaluateCommand {
                 seeds: self.worlds.seeds.clone(),
                 steps: self.worlds.steps,
                 config: &config,
+                estimators: &estimators,
                 learned: &learned,
             };
-            write(&predictions(guide, &examine(arena, &examination)?))?;
+            let marks = examine(arena, &examination)?;
+            write(&predictions(guide, &estimators, &marks))?;
         }
         if !self.predictions_only {
             self.policies(arena, config, learned)?;
@@ -72,13 +74,20 @@ impl EvaluateCommand {
     }
 
     fn policies(&self, arena: &mut Arena, config: AgentConfig, learned: Learned) -> Result<()> {
+        let mut names = POLICIES.to_vec();
+        if learned.filter.is_some() {
+            names.extend(Policy::OF_FILTER);
+        }
+        if learned.network.is_some() {
+            names.extend(Policy::OF_AUTOENCODER);
+        }
         let named = |name| Policy::named(name, arena.model());
         let comparison = Comparison {
-            policies: POLICIES.into_iter().map(named).collect::<Result<_, _>>()?,
+            policies: names.into_iter().map(named).collect::<Result<_, _>>()?,
             seeds: self.worlds.seeds.clone(),
             steps: self.worlds.steps,
             config,
-            learned: Some(learned),
+            learned,
         };
         let results = run_comparison(arena, &comparison)?;
         write(&render_table(&results.runs, BASELINE))?;
@@ -89,24 +98,34 @@ impl EvaluateCommand {
     }
 }
 
-/// Log-likelihood per visited cell, ± one standard error over worlds.
-fn predictions(guide: &str, marks: &[Marks]) -> String {
+/// The known-model filter, and what was learned.
+fn estimators(learned: &Learned) -> Vec<EstimatorKind> {
+    let filter = learned.filter.as_ref().map(|_| EstimatorKind::Learned);
+    let network = learned.network.as_ref().map(|_| EstimatorKind::Autoencoder);
+    let known = [EstimatorKind::KnownModel];
+    known.into_iter().chain(filter).chain(network).collect()
+}
+
+/// Log-likelihood per visited cell, ± one standard error over worlds; differences are paired.
+fn predictions(guide: &str, estimators: &[EstimatorKind], marks: &[Marks]) -> String {
     let column = |of: &dyn Fn(&Marks) -> Score| -> Vec<f64> {
         marks.iter().map(|marks| of(marks).mean()).collect()
     };
-    let known = column(&|marks| marks.known);
-    let learned = column(&|marks| marks.learned);
+    let difference = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a - b).collect();
     let frequencies = column(&|one| score_of_frequencies(marks, &one.counts));
-    let difference: Vec<f64> = learned.iter().zip(&known).map(|(a, b)| a - b).collect();
-    let rows = [
-        ("class frequencies", frequencies),
-        ("known-model filter", known),
-        ("learned filter", learned),
-        ("learned - known", difference),
-    ];
+    let scores = |index: usize| column(&|marks| marks.scores[index]);
+    let known = scores(0);
+    let mut rows = vec![("class frequencies".to_owned(), frequencies)];
+    for (index, estimator) in estimators.iter().enumerate() {
+        rows.push((estimator.label().into(), scores(index)));
+    }
+    for (index, estimator) in estimators.iter().enumerate().skip(1) {
+        let name = format!("{} - known_model", estimator.label());
+        rows.push((name, difference(&scores(index), &known)));
+    }
     let mut text = format!("log-likelihood per visited cell on the paths of {guide}:\n");
     for (name, values) in rows {
-        text += &format!("  {name:20}{}\n", estimate(&values));
+        text += &format!("  {name:28}{}\n", estimate(&values));
     }
     text
 }

@@ -2,7 +2,7 @@
 
 use super::make_folder;
 use super::worlds::GridFlags;
-use agent::config::AgentFlags;
+use agent::config::{AgentFlags, LearnerKind, Preset};
 use agent::launch::OwnServer;
 use agent::train::{Training, train};
 use anyhow::{Context, Result, ensure};
@@ -24,9 +24,9 @@ pub struct TrainCommand {
     /// The first world to act on
     #[arg(long, default_value_t = 0)]
     world: u32,
-    /// Number of worlds to act on at once
-    #[arg(long, default_value_t = 16, value_parser = clap::value_parser!(u32).range(1..=1024))]
-    worlds: u32,
+    /// Number of worlds to act on at once [default: 16, or the autoencoder's 1]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    worlds: Option<u32>,
     /// World steps to act for, of all worlds together; 0: until stopped
     #[arg(long, default_value_t = 0)]
     steps: u64,
@@ -51,9 +51,9 @@ pub struct TrainCommand {
     /// First seed of the worlds of the server that is started
     #[arg(long, default_value_t = TRAINING_SEED, conflicts_with = "instance")]
     seed: u64,
-    /// Burn-in of the server that is started
-    #[arg(long, default_value_t = 25_000, conflicts_with = "instance")]
-    burn_in: u64,
+    /// Burn-in of the server that is started [default: 25000; of preset paper: 0]
+    #[arg(long, conflicts_with = "instance")]
+    burn_in: Option<u64>,
     #[command(flatten)]
     grid: GridFlags,
     #[command(flatten)]
@@ -64,11 +64,15 @@ impl TrainCommand {
     /// Trains until done or told to stop.
     pub fn run(&self) -> Result<()> {
         let config = self.settings.effective()?;
-        let last = self.world.checked_add(self.worlds);
+        let n_worlds = self.worlds.unwrap_or(match config.learner {
+            LearnerKind::Filter => 16,
+            LearnerKind::Autoencoder => 1,
+        });
+        let last = self.world.checked_add(n_worlds);
         let last = last.context("--world: expected a world that a server may have")?;
         make_folder(&self.out)?;
         let stop = stop_on_signals().context("handle signals")?;
-        let (instance, _own) = self.server()?;
+        let (instance, _own) = self.server(n_worlds)?;
         let training = Training {
             instance,
             worlds: self.world..last,
@@ -86,14 +90,16 @@ impl TrainCommand {
             steps = summary.steps,
             updates = summary.updates,
             mean_reward,
-            learning_seconds = summary.learning.as_secs_f64(),
             "saved"
         );
+        for (part, time) in summary.times {
+            tracing::info!(part, seconds = time.as_secs_f64(), "time");
+        }
         Ok(())
     }
 
     /// The server, and itself if it was started: dropped, it stops.
-    fn server(&self) -> Result<(Instance, Option<OwnServer>)> {
+    fn server(&self, n_worlds: u32) -> Result<(Instance, Option<OwnServer>)> {
         if let Some(name) = &self.instance {
             return Ok((Instance::new(name)?, None));
         }
@@ -103,9 +109,14 @@ impl TrainCommand {
             "--world: expected 0 on a server of its own, got {}",
             self.world
         );
-        let mut arguments = self.grid.arguments(self.worlds, self.seed, self.burn_in);
-        // The learner does not look, and it could not.
-        arguments.extend(["--reveal-model", "false"].map(String::from));
+        let burn_in = self.burn_in.unwrap_or(match self.settings.preset {
+            Preset::Default => 25_000,
+            Preset::Paper => 0,
+        });
+        let mut arguments = self.grid.arguments(n_worlds, self.seed, burn_in);
+        // The learner does not look at the model, and it could not.
+        let rest = ["--reveal-model", "false", "--coverage", "client"];
+        arguments.extend(rest.map(String::from));
         let server = OwnServer::start(self.server.clone(), &arguments)?;
         Ok((server.instance().clone(), Some(server)))
     }

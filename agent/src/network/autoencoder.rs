@@ -116,8 +116,7 @@ impl Autoencoder {
             inference: None,
             workspace: None,
         };
-        let hidden = autoencoder.draw_hidden(u64::MAX);
-        autoencoder.restart(hidden);
+        autoencoder.forget();
         autoencoder
     }
 
@@ -170,6 +169,28 @@ impl Autoencoder {
     /// Changes the step size.
     pub fn set_learning_rate(&mut self, learning_rate: f32) {
         self.settings.adam.learning_rate = learning_rate;
+    }
+
+    /// The same network with its parameters fixed, for another world: before its first frame.
+    pub fn follower(&self) -> Self {
+        let mut follower = Self::new(
+            self.settings,
+            self.shape.grid,
+            self.shape.n_states,
+            self.shape.n_observations,
+            self.seed,
+        );
+        follower.parameters = self.parameters.clone();
+        follower.statistics = self.statistics.clone();
+        follower.inference = None;
+        follower.forget();
+        follower
+    }
+
+    /// Forgets all frames: `h ~ N(0, I)`, the same for a seed.
+    pub fn forget(&mut self) {
+        let hidden = self.draw_hidden(u64::MAX);
+        self.restart(hidden);
     }
 
     /// Forgets all frames: from here on, `h` is `hidden` and the predictor is decoded from it.

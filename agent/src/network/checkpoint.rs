@@ -6,7 +6,7 @@
 
 use super::autoencoder::Autoencoder;
 use super::parameters::Tensors;
-use crate::belief::Belief;
+use crate::belief::{Belief, BeliefError};
 use candle_core::{DType, Device, Tensor};
 use ndarray::Array;
 use std::collections::HashMap;
@@ -21,16 +21,16 @@ const PREDICTION: &str = "state.prediction";
 #[derive(Debug, Error)]
 pub enum CheckpointError {
     /// Bytes that are no safetensors file.
-    #[error("checkpoint: {0}")]
+    #[error("{0}")]
     Damaged(#[from] candle_core::Error),
     /// A tensor is not there.
-    #[error("checkpoint: expected a tensor {name}, got none")]
+    #[error("expected a tensor {name}, got none")]
     Missing {
         /// Its name.
         name: String,
     },
     /// A tensor of another network's size.
-    #[error("checkpoint: expected {name} of shape {expected:?}, got {got:?}")]
+    #[error("expected {name} of shape {expected:?}, got {got:?}")]
     Shape {
         /// The tensor.
         name: String,
@@ -40,44 +40,55 @@ pub enum CheckpointError {
         got: Vec<usize>,
     },
     /// A tensor no network can work with.
-    #[error("checkpoint: expected finite numbers, got one that is not in {name}")]
+    #[error("expected finite numbers, got one that is not in {name}")]
     NotFinite {
         /// The tensor.
         name: String,
     },
     /// A predictor that is no belief.
-    #[error("checkpoint: {0}")]
-    Prediction(#[from] crate::belief::BeliefError),
+    #[error("{0}")]
+    Prediction(#[from] BeliefError),
 }
 
 impl Autoencoder {
-    /// Everything that a resumed run needs but settings and seed, by name.
-    ///
-    /// # Errors
-    /// As candle's, which does not happen for tensors in memory.
-    pub fn named_tensors(&self) -> candle_core::Result<Vec<(String, Tensor)>> {
+    /// Everything that a resumed run needs but settings, seed and [`Self::counters`]: name, shape, numbers.
+    pub fn named_numbers(&self) -> Vec<(String, Vec<usize>, Vec<f32>)> {
         let mut named = Vec::new();
-        let mut add = |name: String, numbers: &[f32], dims: &[usize]| {
-            named.push((name, Tensor::from_slice(numbers, dims, &Device::Cpu)?));
-            candle_core::Result::Ok(())
+        let mut add = |name: String, dims: &[usize], numbers: &[f32]| {
+            named.push((name, dims.to_vec(), numbers.to_vec()));
         };
         for (name, dims, numbers) in self.parameters.iter().chain(self.statistics.iter()) {
-            add(name.to_owned(), numbers, dims)?;
+            add(name.to_owned(), dims, numbers);
         }
         let moments = [("first", &self.adam.first), ("second", &self.adam.second)];
         for (moment, numbers) in moments {
             for (name, dims, numbers) in self.parameters.with_numbers(numbers).iter() {
-                add(format!("adam.{moment}.{name}"), numbers, dims)?;
+                add(format!("adam.{moment}.{name}"), dims, numbers);
             }
         }
-        add(HIDDEN.to_owned(), &self.hidden, &[self.hidden.len()])?;
+        add(HIDDEN.to_owned(), &[self.hidden.len()], &self.hidden);
         let prediction = self.prediction();
-        add(
-            PREDICTION.to_owned(),
-            prediction.as_slice(),
-            prediction.view().shape(),
-        )?;
-        let counters = [self.adam.step as i64, self.n_updates as i64];
+        let dims = prediction.view().shape().to_vec();
+        add(PREDICTION.to_owned(), &dims, prediction.as_slice());
+        named
+    }
+
+    /// Steps of Adam, and updates.
+    pub fn counters(&self) -> [u64; 2] {
+        [self.adam.step, self.n_updates]
+    }
+
+    /// [`Self::named_numbers`] and [`Self::counters`] as candle's tensors.
+    ///
+    /// # Errors
+    /// As candle's, which does not happen for tensors in memory.
+    pub fn named_tensors(&self) -> candle_core::Result<Vec<(String, Tensor)>> {
+        let tensor = |(name, dims, numbers): (String, Vec<usize>, Vec<f32>)| {
+            Ok((name, Tensor::from_vec(numbers, dims, &Device::Cpu)?))
+        };
+        let named = self.named_numbers().into_iter().map(tensor);
+        let mut named = named.collect::<candle_core::Result<Vec<_>>>()?;
+        let counters = self.counters().map(|counter| counter as i64);
         named.push((COUNTERS.to_owned(), Tensor::new(&counters, &Device::Cpu)?));
         Ok(named)
     }
@@ -97,21 +108,35 @@ impl Autoencoder {
     /// [`CheckpointError`] for anything else; nothing has changed then.
     pub fn load_safetensors(&mut self, bytes: &[u8]) -> Result<(), CheckpointError> {
         let tensors = Stored(candle_core::safetensors::load_buffer(bytes, &Device::Cpu)?);
-        let parameters = tensors.filled(&self.parameters, "")?;
-        let statistics = tensors.filled(&self.statistics, "")?;
-        let first = tensors.filled(&self.parameters, "adam.first.")?;
-        let second = tensors.filled(&self.parameters, "adam.second.")?;
-        let hidden = tensors.numbers(HIDDEN, &[self.hidden.len()])?;
+        let counters = tensors.counters()?;
+        self.load(|name, dims| tensors.numbers(name, dims), counters)
+    }
+
+    /// Takes over what [`Self::named_numbers`] and [`Self::counters`] gave, of a network of the same sizes.
+    /// `numbers` finds those of a name and shape.
+    ///
+    /// # Errors
+    /// As of `numbers`, or for a predictor that is no belief; nothing has changed then.
+    pub fn load<E: From<BeliefError>>(
+        &mut self,
+        numbers: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
+        counters: [u64; 2],
+    ) -> Result<(), E> {
+        let filled = |like: &Tensors, prefix: &str| filled(like, prefix, &numbers);
+        let parameters = filled(&self.parameters, "")?;
+        let statistics = filled(&self.statistics, "")?;
+        let first = filled(&self.parameters, "adam.first.")?;
+        let second = filled(&self.parameters, "adam.second.")?;
+        let hidden = numbers(HIDDEN, &[self.hidden.len()])?;
         let dims = self.prediction().view().shape().to_vec();
-        let prediction = tensors.numbers(PREDICTION, &dims)?;
+        let prediction = numbers(PREDICTION, &dims)?;
         let prediction = Array::from_shape_vec((dims[0], dims[1], dims[2]), prediction);
         let prediction = prediction.expect("invariant: the tensor has this shape");
         let prediction = Belief::from_probabilities(prediction)?;
-        let [step, n_updates] = tensors.counters()?;
         *self.parameters_mut() = parameters;
         self.statistics = statistics;
         (self.adam.first, self.adam.second) = (first.numbers, second.numbers);
-        (self.adam.step, self.n_updates) = (step, n_updates);
+        [self.adam.step, self.n_updates] = counters;
         self.hidden = hidden;
         self.set_prediction(prediction);
         Ok(())
@@ -126,8 +151,9 @@ impl Autoencoder {
         tensors: HashMap<String, Tensor>,
     ) -> Result<(), CheckpointError> {
         let tensors = Stored(tensors);
-        let parameters = tensors.filled(&self.parameters, "")?;
-        self.statistics = tensors.filled(&self.statistics, "")?;
+        let numbers = |name: &str, dims: &[usize]| tensors.numbers(name, dims);
+        let parameters = filled(&self.parameters, "", &numbers)?;
+        self.statistics = filled(&self.statistics, "", &numbers)?;
         *self.parameters_mut() = parameters;
         Ok(())
     }
@@ -162,17 +188,21 @@ impl Stored {
         }
     }
 
-    /// Tensors like the given ones, with the numbers stored under their names behind a prefix.
-    fn filled(&self, like: &Tensors, prefix: &str) -> Result<Tensors, CheckpointError> {
-        let mut numbers = Vec::with_capacity(like.numbers.len());
-        for (name, dims, _) in like.iter() {
-            numbers.extend(self.numbers(&format!("{prefix}{name}"), dims)?);
-        }
-        Ok(like.with_numbers(&numbers))
-    }
-
     fn counters(&self) -> Result<[u64; 2], CheckpointError> {
         let counters: Vec<i64> = self.get(COUNTERS, &[2])?.to_dtype(DType::I64)?.to_vec1()?;
         Ok([counters[0] as u64, counters[1] as u64])
     }
+}
+
+/// Tensors like the given ones, with the numbers found under their names behind a prefix.
+fn filled<E>(
+    like: &Tensors,
+    prefix: &str,
+    found: &impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
+) -> Result<Tensors, E> {
+    let mut numbers = Vec::with_capacity(like.numbers.len());
+    for (name, dims, _) in like.iter() {
+        numbers.extend(found(&format!("{prefix}{name}"), dims)?);
+    }
+    Ok(like.with_numbers(&numbers))
 }

@@ -6,7 +6,7 @@
 use super::adam::{Adam, AdamSettings};
 use super::lanes::{Arithmetic, Kernel, dispatch};
 use super::parameters::uniform;
-use super::perceptron::{Activations, Perceptron, transposed};
+use super::perceptron::{Activations, Perceptron};
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
@@ -113,6 +113,16 @@ impl Dqn {
         values.pop().expect("invariant: a layer")
     }
 
+    /// Changes the step size.
+    pub fn set_learning_rate(&mut self, learning_rate: f32) {
+        self.settings.adam.learning_rate = learning_rate;
+    }
+
+    /// The action of the largest value.
+    pub fn best(&self, input: &[f32]) -> usize {
+        best(&self.values(input))
+    }
+
     /// The best action, or with the chance of this step a random one.
     pub fn act(&self, input: &[f32], step: u64) -> usize {
         let mut rng = stream(self.seed, Purpose::Exploration, step);
@@ -200,23 +210,85 @@ impl Dqn {
         }
     }
 
-    /// The network's layers as PyTorch has them: name, shape, numbers.
-    pub fn tensors(&self) -> Vec<(String, Vec<usize>, Vec<f32>)> {
+    /// Updates so far.
+    pub fn n_updates(&self) -> u64 {
+        self.n_updates
+    }
+
+    /// Transitions remembered.
+    pub fn n_transitions(&self) -> usize {
+        self.replay.len()
+    }
+
+    /// Everything that a resumed run needs but settings, seed and counts: name, shape, numbers.
+    pub fn named_tensors(&self) -> Vec<(String, Vec<usize>, Vec<f32>)> {
         let mut tensors = Vec::new();
-        for layer in 0..self.network.n_layers() {
-            let [weight, bias, end] = self.network.places(layer);
-            let [inputs, outputs] = self.network.ends(layer);
-            let numbers = &self.network.numbers;
-            let weights = transposed(&numbers[weight..bias], outputs);
-            let name = 2 * layer;
-            tensors.push((format!("{name}.weight"), vec![outputs, inputs], weights));
-            tensors.push((
-                format!("{name}.bias"),
-                vec![outputs],
-                numbers[bias..end].to_vec(),
-            ));
+        for (part, numbers) in [
+            ("network", &self.network.numbers),
+            ("target", &self.target.numbers),
+            ("adam.first", &self.adam.first),
+            ("adam.second", &self.adam.second),
+        ] {
+            let layers = self.network.with_numbers(numbers).tensors();
+            let named = |(name, shape, numbers)| (format!("dqn.{part}.{name}"), shape, numbers);
+            tensors.extend(layers.into_iter().map(named));
+        }
+        let rows = || self.replay.iter();
+        let n = rows().len();
+        let flat = |of: fn(&Transition) -> &[f32]| rows().flat_map(of).copied().collect();
+        let n_inputs = self.network.ends(0)[0];
+        let actions = rows().map(|row| row.action as f32).collect();
+        let rewards = rows().map(|row| row.reward).collect();
+        for (name, shape, numbers) in [
+            ("input", vec![n, n_inputs], flat(|row| &row.input)),
+            ("action", vec![n], actions),
+            ("reward", vec![n], rewards),
+            ("next", vec![n, n_inputs], flat(|row| &row.next)),
+        ] {
+            tensors.push((format!("dqn.replay.{name}"), shape, numbers));
         }
         tensors
+    }
+
+    /// Takes over what [`Self::named_tensors`] gave, of a learner of the same sizes. `numbers` finds those of
+    /// a name and shape.
+    ///
+    /// # Errors
+    /// As of `numbers`; nothing has changed then.
+    pub fn load<E>(
+        &mut self,
+        numbers: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
+        n_updates: u64,
+        n_transitions: usize,
+    ) -> Result<(), E> {
+        let layers = |part: &str| {
+            self.network
+                .filled(|name, shape| numbers(&format!("dqn.{part}.{name}"), shape))
+        };
+        let [network, target] = [layers("network")?, layers("target")?];
+        let [first, second] = [layers("adam.first")?, layers("adam.second")?];
+        let n_inputs = self.network.ends(0)[0];
+        let pairs = [n_transitions, n_inputs];
+        let input = numbers("dqn.replay.input", &pairs)?;
+        let next = numbers("dqn.replay.next", &pairs)?;
+        let actions = numbers("dqn.replay.action", &[n_transitions])?;
+        let rewards = numbers("dqn.replay.reward", &[n_transitions])?;
+        let row = |index: usize| Transition {
+            input: input[index * n_inputs..][..n_inputs].to_vec(),
+            action: (actions[index] as usize).min(self.n_actions - 1),
+            reward: rewards[index],
+            next: next[index * n_inputs..][..n_inputs].to_vec(),
+        };
+        self.replay = (0..n_transitions).map(row).collect();
+        (self.network, self.target) = (network, target);
+        (self.adam.first, self.adam.second) = (first.numbers, second.numbers);
+        (self.adam.step, self.n_updates) = (n_updates, n_updates);
+        Ok(())
+    }
+
+    /// The network's layers as PyTorch has them: name, shape, numbers.
+    pub fn tensors(&self) -> Vec<(String, Vec<usize>, Vec<f32>)> {
+        self.network.tensors()
     }
 }
 

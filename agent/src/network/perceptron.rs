@@ -53,6 +53,47 @@ impl Perceptron {
         [first, first + inputs * outputs, first + length(layer)]
     }
 
+    /// The same layers with other numbers.
+    pub(crate) fn with_numbers(&self, numbers: &[f32]) -> Self {
+        Self {
+            sizes: self.sizes.clone(),
+            numbers: numbers.to_vec(),
+        }
+    }
+
+    /// The layers as PyTorch has them: name, shape, numbers.
+    pub(crate) fn tensors(&self) -> Vec<(String, Vec<usize>, Vec<f32>)> {
+        let mut tensors = Vec::new();
+        for layer in 0..self.n_layers() {
+            let [weight, bias, end] = self.places(layer);
+            let [inputs, outputs] = self.ends(layer);
+            let weights = transposed(&self.numbers[weight..bias], outputs);
+            let biases = self.numbers[bias..end].to_vec();
+            let name = 2 * layer;
+            tensors.push((format!("{name}.weight"), vec![outputs, inputs], weights));
+            tensors.push((format!("{name}.bias"), vec![outputs], biases));
+        }
+        tensors
+    }
+
+    /// The same layers with what is found under [`Self::tensors`]'s names and shapes.
+    pub(crate) fn filled<E>(
+        &self,
+        found: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
+    ) -> Result<Self, E> {
+        let mut filled = self.clone();
+        for layer in 0..self.n_layers() {
+            let [weight, bias, end] = self.places(layer);
+            let [inputs, outputs] = self.ends(layer);
+            let name = 2 * layer;
+            let weights = found(&format!("{name}.weight"), &[outputs, inputs])?;
+            filled.numbers[weight..bias].copy_from_slice(&transposed(&weights, inputs));
+            let biases = found(&format!("{name}.bias"), &[outputs])?;
+            filled.numbers[bias..end].copy_from_slice(&biases);
+        }
+        Ok(filled)
+    }
+
     /// All layers' outputs for the rows of `input`.
     #[inline(always)]
     pub(crate) fn forward<A: Arithmetic>(&self, input: &[f32]) -> Activations {
@@ -113,7 +154,7 @@ impl Perceptron {
 }
 
 /// The transpose of a matrix with `columns` columns.
-pub(crate) fn transposed(matrix: &[f32], columns: usize) -> Vec<f32> {
+fn transposed(matrix: &[f32], columns: usize) -> Vec<f32> {
     let rows = matrix.len() / columns;
     let mut transposed = vec![0.0; matrix.len()];
     for (row, numbers) in matrix.chunks_exact(columns).enumerate() {

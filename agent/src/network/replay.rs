@@ -5,12 +5,17 @@ use protocol::frame::Frame;
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use std::collections::VecDeque;
+use std::ops::Range;
 
-/// The last frames of one world, oldest first.
+/// The last frames of one robot, oldest first, in tracks without gaps.
 #[derive(Debug, Clone)]
 pub struct Replay {
     capacity: usize,
     frames: VecDeque<Frame>,
+    /// Frames that were ever remembered.
+    n_pushed: u64,
+    /// The numbers of frames with which tracks begin.
+    begins: VecDeque<u64>,
 }
 
 impl Replay {
@@ -19,7 +24,14 @@ impl Replay {
         Self {
             capacity,
             frames: VecDeque::with_capacity(capacity),
+            n_pushed: 0,
+            begins: VecDeque::new(),
         }
+    }
+
+    /// Begins a new track: no window holds frames before and after this.
+    pub fn begin(&mut self) {
+        self.begins.push_back(self.n_pushed);
     }
 
     /// Remembers a frame, and forgets the oldest if there are too many.
@@ -28,6 +40,37 @@ impl Replay {
             self.frames.pop_front();
         }
         self.frames.push_back(frame);
+        self.n_pushed += 1;
+        let oldest = self.n_oldest();
+        while self.begins.front().is_some_and(|&begin| begin <= oldest) {
+            self.begins.pop_front();
+        }
+    }
+
+    /// The number of the oldest frame that is remembered.
+    fn n_oldest(&self) -> u64 {
+        self.n_pushed - self.frames.len() as u64
+    }
+
+    /// Where windows of some length may start, as ranges of places.
+    fn starts(&self, length: usize) -> Vec<Range<usize>> {
+        let oldest = self.n_oldest();
+        let begins = self.begins.iter().map(|begin| (begin - oldest) as usize);
+        let edges: Vec<usize> = [0].into_iter().chain(begins).chain([self.len()]).collect();
+        let starts = |track: &[usize]| track[0]..(track[1] + 1).saturating_sub(length);
+        let tracks = edges.windows(2).map(starts);
+        tracks.filter(|starts| !starts.is_empty()).collect()
+    }
+
+    /// The frames, oldest first.
+    pub fn frames(&self) -> impl Iterator<Item = &Frame> {
+        self.frames.iter()
+    }
+
+    /// The places of frames with which tracks begin, but for the oldest frame's.
+    pub fn tracks(&self) -> impl Iterator<Item = u64> {
+        let oldest = self.n_oldest();
+        self.begins.iter().map(move |begin| begin - oldest)
     }
 
     /// Frames remembered.
@@ -40,12 +83,17 @@ impl Replay {
         self.frames.is_empty()
     }
 
-    /// Consecutive frames from a random one on, those of an update under a seed; `None` while there are
-    /// fewer than `length`.
+    /// Consecutive frames of one track from a random one on, those of an update under a seed; `None` while
+    /// no track has `length` frames.
     pub fn window(&self, length: usize, seed: u64, update: u64) -> Option<Window> {
-        let n_starts = (self.len() + 1).checked_sub(length).filter(|&n| n > 0)?;
+        let starts = self.starts(length);
+        let n_starts: usize = starts.iter().map(Range::len).sum();
+        if n_starts == 0 {
+            return None;
+        }
         let mut rng = stream(seed, Purpose::Replay, update);
-        let first = (rng.next_u64() % n_starts as u64) as usize;
+        let choice = (rng.next_u64() % n_starts as u64) as usize;
+        let first = starts.into_iter().flatten().nth(choice)?;
         Some(Window::new(self.frames.range(first..first + length)))
     }
 }
@@ -75,5 +123,22 @@ mod tests {
             seen[cell(0)..=cell(3)].fill(true);
         }
         assert!((0..20).all(|cell| seen[cell] == (cell >= 12)), "{seen:?}");
+    }
+
+    #[test]
+    fn no_window_spans_two_tracks() {
+        let mut replay = Replay::new(10);
+        let frame = Frame::empty(Shape::new(4, 5).expect("valid shape"));
+        replay.begin();
+        for number in 0..30 {
+            if [7, 21, 25, 26].contains(&number) {
+                replay.begin();
+            }
+            replay.push(frame.clone());
+        }
+        // Places 0 to 9 hold frames 20 to 29.
+        assert_eq!(replay.starts(1), [0..1, 1..5, 5..6, 6..10]);
+        assert_eq!(replay.starts(4), [1..2, 6..7]);
+        assert!(replay.window(5, 0, 0).is_none());
     }
 }

@@ -68,6 +68,11 @@ impl Window {
         self.visits.len() - self.starts[1.min(self.len())]
     }
 
+    /// Whether there is anything to predict.
+    pub fn has_targets(&self) -> bool {
+        self.n_targets() > 0
+    }
+
     /// Whether each visit is a cell and an observation of the network.
     pub(crate) fn fits(&self, shape: &NetworkShape) -> bool {
         let (height, width) = shape.grid.dim();

@@ -1,0 +1,92 @@
+//! What checkpoints hold, by kind: all that policies on a learned belief need.
+
+use crate::checkpoint::{self, CheckpointError, Problem};
+use crate::learner::{self, LearnedModel};
+use crate::network::{Autoencoder, Dqn};
+use crate::policy::EstimatorKind;
+use crate::student::network;
+use ndarray::Array2;
+use std::path::Path;
+use std::sync::Arc;
+
+/// Everything that was learned.
+#[derive(Debug, Clone, Default)]
+pub struct Learned {
+    /// A filter, for policies `learned_*`.
+    pub filter: Option<LearnedModel>,
+    /// An autoencoder and a DQN, for policies `autoencoder_*`.
+    pub network: Option<Arc<LearnedNetwork>>,
+}
+
+/// What Algorithm 1 learned, with its parameters fixed.
+#[derive(Debug)]
+pub struct LearnedNetwork {
+    /// The model; each world follows it with a copy of its own.
+    pub autoencoder: Autoencoder,
+    /// The choice of objectives.
+    pub dqn: Dqn,
+    /// The state that pays most.
+    pub target: usize,
+}
+
+impl Learned {
+    /// What some checkpoints hold, of each kind one at most.
+    ///
+    /// # Errors
+    /// [`CheckpointError`] names the file that cannot be read, or is the second of its kind.
+    pub fn read<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<Self, CheckpointError> {
+        let mut learned = Self::default();
+        for path in paths {
+            let (kind, contents) = checkpoint::read_any(path, &[learner::KIND, network::KIND])?;
+            let twice = match kind {
+                learner::KIND => {
+                    let progress = learner::Progress::from_contents(&contents, None);
+                    let model = progress.map_err(|problem| problem.of(path))?.learned();
+                    learned.filter.replace(model).is_some()
+                }
+                _ => {
+                    let progress = network::Progress::read(&contents);
+                    let network = progress.map_err(|problem| problem.of(path))?.learned();
+                    learned.network.replace(Arc::new(network)).is_some()
+                }
+            };
+            if twice {
+                return Err(Problem::Twice(kind).of(path));
+            }
+        }
+        Ok(learned)
+    }
+}
+
+impl Learned {
+    /// The state that pays most, as the one who learned an estimator's model found it.
+    pub fn target(&self, estimator: EstimatorKind) -> Option<usize> {
+        match estimator {
+            EstimatorKind::Learned => self.filter.as_ref().map(|filter| filter.target),
+            EstimatorKind::Autoencoder => self.network.as_ref().map(|network| network.target),
+            _ => None,
+        }
+    }
+
+    /// `P(y | x)` of the filter, shape `[S, O]`.
+    pub fn filter_likelihood(&self) -> Option<Array2<f64>> {
+        self.filter
+            .as_ref()
+            .map(|filter| filter.tables.likelihood_array())
+    }
+
+    /// `P(y | x)` of the autoencoder, shape `[S, O]`.
+    pub fn network_likelihood(&self) -> Option<Array2<f64>> {
+        self.network
+            .as_ref()
+            .map(|network| likelihood(&network.autoencoder))
+    }
+}
+
+/// `P(y | x)` of a network, shape `[S, O]`.
+pub fn likelihood(autoencoder: &Autoencoder) -> Array2<f64> {
+    let shape = autoencoder.shape();
+    let matrix = autoencoder.observation_matrix();
+    let entry = |(state, value)| f64::from(matrix[value * shape.n_states + state]);
+    Array2::from_shape_fn((shape.n_states, shape.n_observations), entry)
+}

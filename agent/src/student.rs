@@ -1,0 +1,95 @@
+//! What learns while it acts, as [`crate::train`] drives it. Pure: frames in, paths out.
+
+pub mod filter;
+pub mod network;
+
+use crate::checkpoint::Contents;
+use crate::client::Observation;
+use crate::estimator::{ZeroEvidence, learned_filter};
+use crate::metrics::Tick;
+use crate::network as networks;
+use protocol::{Move, Shape};
+use std::time::Duration;
+use thiserror::Error;
+
+/// The worlds to act on, as far as a learner is told.
+#[derive(Debug, Clone, Copy)]
+pub struct Site {
+    /// The grid.
+    pub shape: Shape,
+    /// Number of values that an observed cell may show.
+    pub n_observations: usize,
+    /// Moves in a path.
+    pub n_moves: usize,
+    /// Number of worlds.
+    pub n_worlds: usize,
+}
+
+/// What one update did.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Lesson {
+    /// Number of updates of the model so far.
+    pub number: u64,
+    /// The model's loss before it, if the model was updated.
+    pub loss: Option<f64>,
+    /// The model's step size, if it was updated.
+    pub rate: Option<f64>,
+    /// What [`Student::columns`] names.
+    pub more: Vec<Option<f64>>,
+}
+
+/// A number that is not finite: learning cannot go on; nothing was changed by the update that met it.
+#[derive(Debug, PartialEq, Error)]
+#[non_exhaustive]
+pub enum NotFinite {
+    /// In the learned filter.
+    #[error(transparent)]
+    Filter(#[from] learned_filter::NotFinite),
+    /// In the autoencoder or the DQN.
+    #[error(transparent)]
+    Network(#[from] networks::NotFinite),
+}
+
+/// What learns while it acts on worlds, which it numbers from 0.
+pub trait Student {
+    /// How its checkpoints call it.
+    fn kind(&self) -> &'static str;
+
+    /// Names of what its lessons tell beside loss and rate.
+    fn columns(&self) -> &'static [&'static str];
+
+    /// Whether its next frames should show every cell, where the server gives such.
+    fn wants_full_frames(&self) -> bool {
+        false
+    }
+
+    /// A world begins, here or anew, with the frame that it shows. Worlds begin in order.
+    ///
+    /// # Errors
+    /// [`ZeroEvidence`].
+    fn begin(&mut self, world: usize, observation: Observation) -> Result<(), ZeroEvidence>;
+
+    /// The next path of each world.
+    fn plan(&mut self) -> Vec<Vec<Move>>;
+
+    /// Takes in what the paths showed: scores the prediction, corrects, predicts, remembers.
+    ///
+    /// # Errors
+    /// [`ZeroEvidence`].
+    fn take_in(&mut self, observations: Vec<Observation>) -> Result<Tick, ZeroEvidence>;
+
+    /// Makes the updates that the steps since the last call have earned.
+    ///
+    /// # Errors
+    /// [`NotFinite`].
+    fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite>;
+
+    /// Updates of the model so far.
+    fn n_updates(&self) -> u64;
+
+    /// What a later run goes on from.
+    fn contents(&self) -> Contents;
+
+    /// Time spent so far, by part.
+    fn times(&self) -> Vec<(&'static str, Duration)>;
+}
