@@ -2,10 +2,10 @@
 //! for, how much exploring counts beside it, how far ahead a plan looks, and where it is drawn to. Pure.
 
 use crate::belief::{Belief, EntropyKind};
-use crate::planner::{CellValues, Objective, Planner, PlanningProblem, Target};
+use crate::planner::{CellValues, Objective, Plan, Planner, PlanningProblem, Target};
 use crate::policy::{BEAM_BONUS, PlannerKind, Policy};
 use crate::summary::{N_BLOCKS, block};
-use protocol::{Cell, Grid, Model, Move, Shape};
+use protocol::{Cell, Grid, Model, Shape};
 
 /// Rise in a cell's value per cell nearer to an action's region. A straight flight of T = 12 moves gains
 /// 23 more than one to and fro, so the robot goes there whatever burns on its way, by the way that burns most.
@@ -58,7 +58,10 @@ impl Action {
         let mut values = self.objective.values(belief);
         if self.exploration > 0.0 {
             let greatest = (belief.n_states() as f32).ln().max(f32::MIN_POSITIVE);
-            values.add(self.exploration / greatest, &belief.entropy(EntropyKind::Sum));
+            values.add(
+                self.exploration / greatest,
+                &belief.entropy(EntropyKind::Sum),
+            );
         }
         if let Some(region) = self.region {
             values.add(REGION_SLOPE, &region.nearness(belief.shape()));
@@ -66,7 +69,8 @@ impl Action {
         values
     }
 
-    /// The path that a planner finds for this action, `n_moves` long.
+    /// The path that a planner finds for this action, `n_moves` long; its score is that of the whole horizon.
+    /// `seed` and `step` are those of the planner's random numbers.
     pub fn plan(
         &self,
         planner: &mut dyn Planner,
@@ -74,7 +78,7 @@ impl Action {
         start: Cell,
         n_moves: usize,
         (seed, step): (u64, u64),
-    ) -> Vec<Move> {
+    ) -> Plan {
         let values = self.values(belief);
         let problem = PlanningProblem {
             start,
@@ -83,9 +87,9 @@ impl Action {
             seed,
             step,
         };
-        let mut moves = planner.plan(&problem).moves;
-        moves.truncate(n_moves);
-        moves
+        let mut plan = planner.plan(&problem);
+        plan.moves.truncate(n_moves);
+        plan
     }
 }
 
@@ -148,9 +152,8 @@ impl ActionSet {
         };
         let states = model.file().states.iter().enumerate();
         let others = states.filter(|(state, _)| *state != target);
-        let others = others.map(|(state, entry)| {
-            Action::plain(&entry.name, objective(Target::State(state)))
-        });
+        let others = others
+            .map(|(state, entry)| Action::plain(&entry.name, objective(Target::State(state))));
         let region = |region: Region| Action {
             name: format!("exploit_at_{}_{}", region.row, region.col),
             region: Some(region),
@@ -163,7 +166,10 @@ impl ActionSet {
             ahead(3),
             Action::plain("explore", objective(Target::Entropy)),
         ];
-        let actions = few.into_iter().chain(others).chain(Region::all().map(region));
+        let actions = few
+            .into_iter()
+            .chain(others)
+            .chain(Region::all().map(region));
         Self {
             actions: actions.collect(),
         }
@@ -176,7 +182,10 @@ impl ActionSet {
 
     /// Their names.
     pub fn names(&self) -> Vec<String> {
-        self.actions.iter().map(|action| action.name.clone()).collect()
+        self.actions
+            .iter()
+            .map(|action| action.name.clone())
+            .collect()
     }
 
     /// The action of a name.

@@ -1,8 +1,10 @@
 //! The agent's settings: defaults or the paper's preset, then a TOML file, then flags.
 
+mod decisions;
 mod learning;
 mod networks;
 
+pub use decisions::DecisionsConfig;
 pub use learning::LearningConfig;
 pub use networks::{AutoencoderConfig, DqnConfig, StepSize};
 
@@ -42,6 +44,8 @@ pub struct AgentConfig {
     pub autoencoder: AutoencoderConfig,
     /// How the DQN learns.
     pub dqn: DqnConfig,
+    /// How the DQN over actions of beam search learns.
+    pub decisions: DecisionsConfig,
 }
 
 /// What `train` learns.
@@ -52,6 +56,8 @@ pub enum LearnerKind {
     Filter,
     /// The paper's Algorithm 1: a dynamic autoencoder, and a DQN that chooses objectives
     Autoencoder,
+    /// A DQN that chooses among actions of beam search on the known model's belief
+    Decisions,
 }
 
 /// What planners maximise besides the target that a policy's name says (paper eqs. 13 to 15).
@@ -170,6 +176,7 @@ impl Default for AgentConfig {
             learning: LearningConfig::default(),
             autoencoder: AutoencoderConfig::default(),
             dqn: DqnConfig::default(),
+            decisions: DecisionsConfig::default(),
         }
     }
 }
@@ -223,6 +230,7 @@ impl AgentConfig {
         self.learning.check()?;
         self.autoencoder.check()?;
         self.dqn.check()?;
+        self.decisions.check()?;
         Ok(self)
     }
 
