@@ -193,3 +193,88 @@ impl ActionSet {
         self.actions.iter().find(|action| action.name == name)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shape() -> Shape {
+        Shape::new(16, 8).expect("test shape")
+    }
+
+    #[test]
+    fn the_papers_actions_are_the_policies_choices() {
+        let model = Model::wildfire();
+        let set = ActionSet::paper(PlannerKind::Beam, &model);
+        assert_eq!(set.names(), ["normal", "latent", "fire", "entropy"]);
+        let belief = Belief::uniform(3, shape());
+        for (action, choice) in set
+            .actions()
+            .iter()
+            .zip(Policy::choices(PlannerKind::Beam, &model))
+        {
+            assert_eq!(action.values(&belief), choice.objective.values(&belief));
+        }
+    }
+
+    #[test]
+    fn beam_actions_have_names_of_their_own_and_exploit_first() {
+        let model = Model::wildfire();
+        let set = ActionSet::beam(&model);
+        let names = set.names();
+        let distinct: std::collections::BTreeSet<&String> = names.iter().collect();
+        assert_eq!((names.len(), distinct.len()), (23, 23));
+        let exploit = Policy::named("beam_exploit", &model).expect("known");
+        assert_eq!(set.actions()[0].objective, exploit.objective);
+        assert!(names.iter().all(|name| !name.contains(' ')), "{names:?}");
+    }
+
+    #[test]
+    fn distance_is_to_the_blocks_nearest_cell() {
+        // Blocks of 4 rows and 2 columns.
+        let region = Region { row: 1, col: 2 };
+        let distance = |row, col| region.distance(Cell { row, col }, shape());
+        assert_eq!([distance(4, 4), distance(7, 5)], [0, 0]);
+        assert_eq!([distance(3, 4), distance(8, 4)], [1, 1]);
+        assert_eq!([distance(0, 0), distance(15, 7)], [8, 10]);
+    }
+
+    #[test]
+    fn a_region_draws_the_robot_there() {
+        let model = Model::wildfire();
+        let set = ActionSet::beam(&model);
+        let (belief, start) = (Belief::uniform(3, shape()), Cell { row: 0, col: 0 });
+        for region in Region::all() {
+            let name = format!("exploit_at_{}_{}", region.row, region.col);
+            let action = set.named(&name).expect("an action");
+            let mut planner = crate::planner::BeamSearch::default();
+            let plan = action.plan(&mut planner, &belief, start, 24, (0, 0));
+            let end = protocol::path::fly(shape(), start, &plan.moves).end;
+            assert_eq!(region.distance(end, shape()), 0, "{name}: {end}");
+        }
+    }
+
+    #[test]
+    fn a_longer_horizon_flies_towards_what_one_path_cannot_reach() {
+        let mut states = Grid::zeros((16, 8));
+        states[[10, 0]] = 2;
+        let belief = Belief::from_states(&states, 3).expect("valid states");
+        let set = ActionSet::beam(&Model::wildfire());
+        let action = set.named("exploit_ahead_3").expect("an action");
+        let mut planner = crate::planner::BeamSearch::new(200);
+        let start = Cell { row: 0, col: 0 };
+        let plan = action.plan(&mut planner, &belief, start, 4, (0, 0));
+        assert_eq!(plan.moves.len(), 4);
+        let end = protocol::path::fly(shape(), start, &plan.moves).end;
+        assert!(end.row > 1, "{end}");
+    }
+
+    #[test]
+    fn exploration_adds_the_entropy_as_a_share_of_the_greatest() {
+        let set = ActionSet::beam(&Model::wildfire());
+        let belief = Belief::uniform(3, shape());
+        let value = |name: &str| set.named(name).expect(name).values(&belief).value()[[0, 0]];
+        let more = value("exploit_explore_0.3") - value("exploit");
+        assert!((more - 0.3).abs() < 1e-6, "{more}");
+    }
+}

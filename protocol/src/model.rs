@@ -217,6 +217,20 @@ mod tests {
     use super::*;
 
     #[test]
+    fn built_in_models_have_their_names_and_fit_the_grid() {
+        let shape = Shape::new(64, 64).expect("test shape");
+        let mut n_models = 0;
+        for name in Model::built_in_names() {
+            let model = Model::built_in(name).expect(name);
+            assert_eq!(model.name(), name);
+            assert_eq!(model.check_on(shape), Ok(()), "{name}");
+            n_models += 1;
+        }
+        assert_eq!(n_models, 3);
+        assert_eq!(Model::built_in("wildfire-dense"), None);
+    }
+
+    #[test]
     fn the_built_in_model_has_the_published_parameters() {
         // DESIGN: g = 0.1, a0 = 0.9999, a1 = 0.99992, a2 = 0.999; the authors' kernel.
         let model = Model::wildfire();
