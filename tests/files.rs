@@ -135,6 +135,8 @@ fn the_documented_files_are_accepted() {
         "config/server.toml",
         "config/models/wildfire.toml",
         "config/models/road-ice.toml",
+        "config/models/wildfire-sparse.toml",
+        "config/models/wildfire-latent.toml",
     ] {
         let path: PathBuf = repository().join(file);
         let path = path.to_str().expect("a plain path");

@@ -1,6 +1,8 @@
 //! One agent on one world: plan, then correct and predict. Pure; the wire is elsewhere.
 
+use crate::action::Action;
 use crate::belief::{Belief, BeliefError};
+use crate::checkpoint::Problem;
 use crate::config::AgentConfig;
 use crate::estimator::{Filter, LearnedFilter, ZeroEvidence};
 use crate::learned::{Learned, LearnedNetwork};
@@ -8,6 +10,7 @@ use crate::learner::LearnedModel;
 use crate::network::Autoencoder;
 use crate::planner::{CellValues, Objective, Plan, Planner, PlanningProblem, Target};
 use crate::policy::{EstimatorKind, Policy};
+use crate::student::decisions::Decisions;
 use protocol::model::ModelError;
 use protocol::{Cell, Frame, Grid, Model, Probabilities, Shape, Transition};
 use std::sync::Arc;
@@ -26,10 +29,13 @@ pub struct Agent {
     seed: u64,
 }
 
-/// Chooses what a path is for (paper eq. 17): the objective that the DQN values most.
-struct Decider {
-    network: Arc<LearnedNetwork>,
-    objectives: Vec<Objective>,
+/// Chooses what a path is for (paper eq. 17): what the DQN values most.
+enum Decider {
+    Objective {
+        network: Arc<LearnedNetwork>,
+        objectives: Vec<Objective>,
+    },
+    Action(Arc<Decisions>),
 }
 
 /// What an agent is built for.
@@ -80,6 +86,9 @@ pub enum AgentError {
         /// The network's.
         got: String,
     },
+    /// Decisions that do not fit the model.
+    #[error("checkpoint: {0}")]
+    Decisions(#[from] Problem),
     /// A learned model of other observations.
     #[error("checkpoint: expected {expected} observations as the world's, got {got}")]
     OtherObservations {
@@ -140,13 +149,16 @@ impl Agent {
         if let (Target::State(state), Some(target)) = (&mut objective.target, target) {
             *state = target;
         }
-        let decider = task.learned.network.clone().filter(|_| policy.is_decided);
+        let decider = policy
+            .is_decided
+            .then(|| decider(policy, &task, config))
+            .transpose()?;
         Ok(Self {
             policy: policy.clone(),
             objective,
             estimator,
             planner: config.planner(policy),
-            decider: decider.map(|network| Decider::new(network, config)),
+            decider,
             target,
             n_moves: task.n_moves,
             seed: task.seed,
@@ -161,10 +173,30 @@ impl Agent {
     /// The path for step k -> k + 1, from where the robot is (paper eq. 15).
     pub fn plan(&mut self, robot: Cell, step: u64) -> Plan {
         let objective = match (&self.decider, &self.estimator) {
-            (Some(decider), Estimator::Autoencoder(network, _)) => decider.decide(network.hidden()),
-            _ => self.objective,
+            (
+                Some(Decider::Objective {
+                    network,
+                    objectives,
+                }),
+                Estimator::Autoencoder(follower, _),
+            ) => objectives[network.dqn.best(follower.hidden())],
+            (Some(Decider::Action(decisions)), estimator) => {
+                let decisions = decisions.clone();
+                let action = decisions.decide(estimator.belief(), robot, self.n_moves);
+                return self.plan_action(action, robot, step);
+            }
+            _ => match self.policy.action.clone() {
+                Some(action) => return self.plan_action(&action, robot, step),
+                None => self.objective,
+            },
         };
         self.plan_for(objective, robot, step)
+    }
+
+    /// As [`Self::plan`], for an action other than the policy's.
+    pub fn plan_action(&mut self, action: &Action, robot: Cell, step: u64) -> Plan {
+        let (belief, random) = (self.estimator.belief(), (self.seed, step));
+        action.plan(&mut *self.planner, belief, robot, self.n_moves, random)
     }
 
     /// As [`Self::plan`], for an objective other than the policy's.
@@ -253,19 +285,21 @@ impl Estimator {
     }
 }
 
-impl Decider {
-    fn new(network: Arc<LearnedNetwork>, config: &AgentConfig) -> Self {
-        let choices = Policy::network_choices(network.autoencoder.shape().n_states);
-        let objectives = choices.iter().map(|choice| config.objective(choice));
-        Self {
-            objectives: objectives.collect(),
-            network,
-        }
+/// What decides for a policy: the DQN learned beside its belief, or that of a known model's.
+fn decider(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<Decider, AgentError> {
+    if policy.estimator != EstimatorKind::Autoencoder {
+        let contents = present(policy, &task.learned.decisions, "decisions")?;
+        let mut decisions = Decisions::first(task.model, &config.decisions, config.seed);
+        decisions.load(contents)?;
+        return Ok(Decider::Action(Arc::new(decisions)));
     }
-
-    fn decide(&self, hidden: &[f32]) -> Objective {
-        self.objectives[self.network.dqn.best(hidden)]
-    }
+    let network = present(policy, &task.learned.network, "an autoencoder")?.clone();
+    let choices = Policy::network_choices(network.autoencoder.shape().n_states);
+    let objectives = choices.iter().map(|choice| config.objective(choice));
+    Ok(Decider::Objective {
+        objectives: objectives.collect(),
+        network,
+    })
 }
 
 fn learned_filter(policy: &Policy, task: &Task<'_>) -> Result<LearnedFilter, AgentError> {

@@ -105,8 +105,8 @@ pub fn exit_code(error: &anyhow::Error) -> ExitCode {
 
 /// A built-in model, or that of a file.
 fn model_named(name: &str) -> Result<Model> {
-    if name == "wildfire" {
-        return Ok(Model::wildfire());
+    if let Some(model) = Model::built_in(name) {
+        return Ok(model);
     }
     read_model(Path::new(name))
 }

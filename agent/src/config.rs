@@ -1,8 +1,10 @@
 //! The agent's settings: defaults or the paper's preset, then a TOML file, then flags.
 
+mod decisions;
 mod learning;
 mod networks;
 
+pub use decisions::DecisionsConfig;
 pub use learning::LearningConfig;
 pub use networks::{AutoencoderConfig, DqnConfig, StepSize};
 
@@ -42,6 +44,8 @@ pub struct AgentConfig {
     pub autoencoder: AutoencoderConfig,
     /// How the DQN learns.
     pub dqn: DqnConfig,
+    /// How the DQN over actions of beam search learns.
+    pub decisions: DecisionsConfig,
 }
 
 /// What `train` learns.
@@ -52,6 +56,8 @@ pub enum LearnerKind {
     Filter,
     /// The paper's Algorithm 1: a dynamic autoencoder, and a DQN that chooses objectives
     Autoencoder,
+    /// A DQN that chooses among actions of beam search on the known model's belief
+    Decisions,
 }
 
 /// What planners maximise besides the target that a policy's name says (paper eqs. 13 to 15).
@@ -107,6 +113,9 @@ pub struct AgentFlags {
     /// The known-model filter's first belief
     #[arg(long)]
     pub prior: Option<PriorKind>,
+    /// What `train` learns [default: filter; of preset paper: autoencoder]
+    #[arg(long)]
+    pub learner: Option<LearnerKind>,
     /// Seed of planners, of the prior's worlds and of learners [default: 0]
     #[arg(long)]
     pub agent_seed: Option<u64>,
@@ -170,6 +179,7 @@ impl Default for AgentConfig {
             learning: LearningConfig::default(),
             autoencoder: AutoencoderConfig::default(),
             dqn: DqnConfig::default(),
+            decisions: DecisionsConfig::default(),
         }
     }
 }
@@ -223,6 +233,7 @@ impl AgentConfig {
         self.learning.check()?;
         self.autoencoder.check()?;
         self.dqn.check()?;
+        self.decisions.check()?;
         Ok(self)
     }
 
@@ -291,6 +302,7 @@ impl AgentFlags {
         config.beam_width = self.beam_width.unwrap_or(config.beam_width);
         config.shooting_samples = self.shooting_samples.unwrap_or(config.shooting_samples);
         config.prior = self.prior.unwrap_or(config.prior);
+        config.learner = self.learner.unwrap_or(config.learner);
         config.seed = self.agent_seed.unwrap_or(config.seed);
         config.check()
     }

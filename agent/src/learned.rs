@@ -1,13 +1,16 @@
 //! What checkpoints hold, by kind: all that policies on a learned belief need.
 
-use crate::checkpoint::{self, CheckpointError, Problem};
+use crate::checkpoint::{self, CheckpointError, Contents, Problem};
 use crate::learner::{self, LearnedModel};
 use crate::network::{Autoencoder, Dqn};
 use crate::policy::EstimatorKind;
-use crate::student::network;
+use crate::student::{decisions, network};
 use ndarray::Array2;
 use std::path::Path;
 use std::sync::Arc;
+
+/// Kinds of checkpoints that policies act on.
+const KINDS: [&str; 3] = [learner::KIND, network::KIND, decisions::KIND];
 
 /// Everything that was learned.
 #[derive(Debug, Clone, Default)]
@@ -16,6 +19,8 @@ pub struct Learned {
     pub filter: Option<LearnedModel>,
     /// An autoencoder and a DQN, for policies `autoencoder_*`.
     pub network: Option<Arc<LearnedNetwork>>,
+    /// Decisions, for `dqn_beam`; they fit a model or not.
+    pub decisions: Option<Arc<Contents>>,
 }
 
 /// What Algorithm 1 learned, with its parameters fixed.
@@ -37,13 +42,14 @@ impl Learned {
     pub fn read<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<Self, CheckpointError> {
         let mut learned = Self::default();
         for path in paths {
-            let (kind, contents) = checkpoint::read_any(path, &[learner::KIND, network::KIND])?;
+            let (kind, contents) = checkpoint::read_any(path, &KINDS)?;
             let twice = match kind {
                 learner::KIND => {
                     let progress = learner::Progress::from_contents(&contents, None);
                     let model = progress.map_err(|problem| problem.of(path))?.learned();
                     learned.filter.replace(model).is_some()
                 }
+                decisions::KIND => learned.decisions.replace(Arc::new(contents)).is_some(),
                 _ => {
                     let progress = network::Progress::read(&contents);
                     let network = progress.map_err(|problem| problem.of(path))?.learned();

@@ -3,6 +3,7 @@
 //! One step, in reading order: [`client`] (frames in, paths out), [`estimator`] (frame to
 //! [`belief`]), [`planner`] (belief to path).
 
+pub mod action;
 pub mod agent;
 pub mod arena;
 pub mod belief;

@@ -1,5 +1,6 @@
 //! Policies by name: which belief, which planner, which objective (the ladder of the benchmark).
 
+use crate::action::{Action, ActionSet};
 use crate::planner::{Objective, Target};
 use protocol::Model;
 use thiserror::Error;
@@ -45,6 +46,8 @@ pub struct Policy {
     pub objective: Objective,
     /// Whether a DQN chooses what each path is for instead (paper section III.E).
     pub is_decided: bool,
+    /// What each path is for instead, always the same.
+    pub action: Option<Action>,
 }
 
 /// A name that is no policy's.
@@ -88,6 +91,7 @@ impl Policy {
     /// of a state, and `oracle_*`, `clairvoyant_*` and `learned_*` with `shooting` or `beam`. On the
     /// autoencoder's belief there are `autoencoder_exploit` and `autoencoder_explore`, which shoot,
     /// `autoencoder_policy`, for which the DQN chooses among the paper's objectives, and `autoencoder_beam`.
+    /// `dqn_beam` chooses among [`ActionSet::beam`] by a DQN; `act_*` always takes the action of that name.
     ///
     /// # Errors
     /// [`UnknownPolicy`] lists the names that there are.
@@ -103,6 +107,7 @@ impl Policy {
             planner,
             objective,
             is_decided: false,
+            action: None,
         };
         Ok(match name {
             "random_walk" => policy(
@@ -118,6 +123,15 @@ impl Policy {
             _ => {
                 let (family, rest) = name.split_once('_').ok_or_else(unknown)?;
                 match family {
+                    "dqn" if rest == "beam" => Self {
+                        is_decided: true,
+                        ..policy(
+                            EstimatorKind::KnownModel,
+                            PlannerKind::Beam,
+                            objective(PlannerKind::Beam, target),
+                        )
+                    },
+                    "act" => Self::always(name, rest, model).ok_or_else(unknown)?,
                     "autoencoder" => Self::of_autoencoder(rest).ok_or_else(unknown)?,
                     "oracle" | "clairvoyant" | "learned" => {
                         let planner = planner_named(rest).ok_or_else(unknown)?;
@@ -156,6 +170,7 @@ impl Policy {
             planner,
             objective: objective(planner, target),
             is_decided: false,
+            action: None,
         };
         let states = model.file().states.iter().enumerate();
         let states = states.map(|(state, entry)| choice(&entry.name, Target::State(state)));
@@ -175,7 +190,22 @@ impl Policy {
             planner,
             objective: objective(planner, target),
             is_decided: false,
+            action: None,
         }
+    }
+
+    /// Beam search on the known model's belief that always takes one action.
+    fn always(name: &str, action: &str, model: &Model) -> Option<Self> {
+        let actions = ActionSet::beam(model);
+        let action = actions.named(action)?;
+        Some(Self {
+            name: name.into(),
+            estimator: EstimatorKind::KnownModel,
+            planner: PlannerKind::Beam,
+            objective: action.objective,
+            is_decided: false,
+            action: Some(action.clone()),
+        })
     }
 
     /// A policy on the autoencoder's belief; the agent puts the state that pays most, as learned, in the
@@ -193,6 +223,7 @@ impl Policy {
             planner,
             objective: objective(planner, target),
             is_decided: name == "policy",
+            action: None,
         })
     }
 
@@ -205,12 +236,16 @@ impl Policy {
             planner: PlannerKind::Shooting,
             objective: objective(PlannerKind::Shooting, target),
             is_decided: false,
+            action: None,
         };
         let states =
             (0..n_states).map(|state| choice(format!("state_{state}"), Target::State(state)));
         let entropy = choice("entropy".into(), Target::Entropy);
         states.chain([entropy]).collect()
     }
+
+    /// The name that needs a checkpoint of decisions.
+    pub const OF_DECISIONS: [&'static str; 1] = ["dqn_beam"];
 
     /// The names that need the checkpoint of a learned filter.
     pub const OF_FILTER: [&'static str; 2] = ["learned_shooting", "learned_beam"];
@@ -285,6 +320,13 @@ fn known_names(model: &Model) -> Vec<String> {
     let mut names = ladder_names(model);
     names.extend(["beam_explore", "beam_exploit_only", "clairvoyant_shooting"].map(String::from));
     names.extend(Policy::OF_FILTER.map(String::from));
+    names.extend(Policy::OF_DECISIONS.map(String::from));
+    names.extend(
+        ActionSet::beam(model)
+            .names()
+            .iter()
+            .map(|name| format!("act_{name}")),
+    );
     names.extend(Policy::OF_AUTOENCODER.map(String::from));
     names.extend(
         model

@@ -1,5 +1,6 @@
 //! What learns while it acts, as [`crate::train`] drives it. Pure: frames in, paths out.
 
+pub mod decisions;
 pub mod filter;
 pub mod network;
 

@@ -90,8 +90,8 @@ fn block_indices() -> impl Iterator<Item = (usize, usize)> {
     (0..N_BLOCKS * N_BLOCKS).map(|index| (index / N_BLOCKS, index % N_BLOCKS))
 }
 
-/// The rows or columns of a block; never none.
-fn block(index: usize, side: usize) -> Range<usize> {
+/// The rows or columns of a block of the grid, of [`N_BLOCKS`] on this side; never none.
+pub(crate) fn block(index: usize, side: usize) -> Range<usize> {
     let start = index * side / N_BLOCKS;
     start..((index + 1) * side / N_BLOCKS).max(start + 1)
 }

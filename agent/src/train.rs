@@ -1,23 +1,26 @@
 //! Learns while acting: attach, fly, correct, learn, predict, save.
 //!
 //! The learner is told the grid, the number of observations and each path's reward and frame; the
-//! model that a server may reveal is not read. One message steps all worlds. What is learned, and how
+//! model that a server may reveal is not read, but by who learns decisions. One message steps all worlds. What is learned, and how
 //! it acts meanwhile, is a [`Student`]'s.
 
 use crate::checkpoint::{self, CheckpointError, Contents, Problem};
 use crate::client::{Claim, Client};
 use crate::config::{AgentConfig, ConfigError, LearnerKind};
-use crate::estimator::ZeroEvidence;
 use crate::estimator::learned_filter::{Dimensions, DimensionsError};
+use crate::estimator::{Filter, ZeroEvidence};
 use crate::learner;
 use crate::metrics::{Metrics, MetricsError, Tick};
 use crate::scoring::Score;
+use crate::student::decisions::{self, Decisions, DecisionsStudent};
 use crate::student::filter::FilterStudent;
 use crate::student::network::{self, NetworkStudent};
 use crate::student::{Lesson, NotFinite, Site, Student};
+use protocol::Model;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::{CoverageRule, WorldSeed};
+use protocol::model::ModelError;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -33,8 +36,8 @@ const SAVE_INTERVAL: Duration = Duration::from_secs(30);
 /// How often progress is told.
 const REPORT_INTERVAL: Duration = Duration::from_secs(5);
 
-/// The lease outlives a pause of this length, such as a slow disk's.
-const LEASE: Duration = Duration::from_secs(60);
+/// The lease outlives a pause of this length, such as a slow disk's or that in which a prior is simulated.
+const LEASE: Duration = Duration::from_secs(600);
 
 /// What to train on, for how long.
 #[derive(Debug, Clone)]
@@ -93,6 +96,12 @@ pub enum TrainError {
     /// Worlds that one memory cannot follow.
     #[error("--worlds: expected 1 for the autoencoder, which follows one world, got {0}")]
     OneWorld(usize),
+    /// The model that a filter needs.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// A server that hides it.
+    #[error("learning decisions needs the server's model: start it with --reveal-model true")]
+    NoModel,
     /// Settings that cannot be written into a checkpoint.
     #[error("settings: {0}")]
     Settings(#[from] toml::ser::Error),
@@ -162,6 +171,7 @@ impl Trainee {
         let kind = match training.config.learner {
             LearnerKind::Filter => learner::KIND,
             LearnerKind::Autoencoder => network::KIND,
+            LearnerKind::Decisions => decisions::KIND,
         };
         let contents = match training.resume {
             true => Some(checkpoint::read(&place, kind)?),
@@ -330,6 +340,19 @@ fn student(
                 return Err(TrainError::NoFullFrames(full_frames));
             }
             Box::new(NetworkStudent::new(progress, site, config))
+        }
+        LearnerKind::Decisions => {
+            let model = info.model.as_deref().ok_or(TrainError::NoModel)?;
+            let model = Model::from_toml(model)?;
+            let mut decisions = Decisions::first(&model, &config.decisions, config.seed);
+            if let Some(contents) = contents {
+                decisions.load(contents).map_err(wrong)?;
+            }
+            let prior = config.prior(info.burn_in);
+            let filter = Filter::new(&model, prior.belief(&model, site.shape, config.seed)?)?;
+            Box::new(DecisionsStudent::new(
+                decisions, filter, &model, site, config,
+            ))
         }
     })
 }

@@ -13,7 +13,7 @@ use thiserror::Error;
 /// Most worlds of one server.
 pub const MAX_WORLDS: u32 = 1024;
 
-/// The name of the built-in model.
+/// The name of the default model.
 const WILDFIRE: &str = "wildfire";
 
 /// Every setting; `config/server.toml` lists them with their defaults.
@@ -24,7 +24,7 @@ pub struct ServerConfig {
     pub instance: String,
     /// Number of independent worlds, 1 to 1024; world i starts from `seed + i`.
     pub worlds: u32,
-    /// `wildfire`, or the path of a model file.
+    /// A built-in model (`wildfire`, `wildfire-sparse`, `wildfire-latent`), or the path of a model file.
     pub model: String,
     /// Grid height, cells.
     pub height: usize,
@@ -64,7 +64,7 @@ pub struct ServerFlags {
     /// Number of independent worlds [default: 1]
     #[arg(long)]
     pub worlds: Option<u32>,
-    /// `wildfire` or the path of a model file [default: wildfire]
+    /// `wildfire`, `wildfire-sparse`, `wildfire-latent` or the path of a model file [default: wildfire]
     #[arg(long)]
     pub model: Option<String>,
     /// Grid height in cells [default: 64]
@@ -255,8 +255,8 @@ impl ServerConfig {
     }
 
     fn read_model(&self) -> Result<Model, ConfigError> {
-        if self.model == WILDFIRE {
-            return Ok(Model::wildfire());
+        if let Some(model) = Model::built_in(&self.model) {
+            return Ok(model);
         }
         let path = Path::new(&self.model);
         Model::from_toml(&read("model file", path)?)

@@ -23,7 +23,21 @@ pub const MAX_KERNEL_SIDE: usize = 15;
 /// normal `f32` is 1e-38, so that sums from 1e-30 on keep their precision in beliefs.
 const LEAST_SHARE: f64 = 1e-30;
 
-const WILDFIRE: &str = include_str!("../../config/models/wildfire.toml");
+/// The built-in models by name.
+const BUILT_IN: [(&str, &str); 3] = [
+    (
+        "wildfire",
+        include_str!("../../config/models/wildfire.toml"),
+    ),
+    (
+        "wildfire-sparse",
+        include_str!("../../config/models/wildfire-sparse.toml"),
+    ),
+    (
+        "wildfire-latent",
+        include_str!("../../config/models/wildfire-latent.toml"),
+    ),
+];
 
 /// A checked model: every model that exists can be simulated and filtered.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,7 +53,20 @@ pub struct Model {
 impl Model {
     /// The built-in wildfire model (`config/models/wildfire.toml`).
     pub fn wildfire() -> Self {
-        Self::from_toml(WILDFIRE).expect("invariant: the built-in model is valid, as a test shows")
+        Self::built_in("wildfire").expect("invariant: the wildfire is built in")
+    }
+
+    /// The built-in model of a name: `wildfire`, `wildfire-sparse` or `wildfire-latent`
+    /// (`config/models`).
+    pub fn built_in(name: &str) -> Option<Self> {
+        let (_, text) = BUILT_IN.iter().find(|(known, _)| *known == name)?;
+        let model = Self::from_toml(text);
+        Some(model.expect("invariant: built-in models are valid, as a test shows"))
+    }
+
+    /// The names of the built-in models.
+    pub fn built_in_names() -> impl Iterator<Item = &'static str> {
+        BUILT_IN.iter().map(|(name, _)| *name)
     }
 
     /// Reads and checks a model file's text.
@@ -188,6 +215,20 @@ impl Model {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn built_in_models_have_their_names_and_fit_the_grid() {
+        let shape = Shape::new(64, 64).expect("test shape");
+        let mut n_models = 0;
+        for name in Model::built_in_names() {
+            let model = Model::built_in(name).expect(name);
+            assert_eq!(model.name(), name);
+            assert_eq!(model.check_on(shape), Ok(()), "{name}");
+            n_models += 1;
+        }
+        assert_eq!(n_models, 3);
+        assert_eq!(Model::built_in("wildfire-dense"), None);
+    }
 
     #[test]
     fn the_built_in_model_has_the_published_parameters() {

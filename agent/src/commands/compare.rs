@@ -27,7 +27,8 @@ pub struct CompareCommand {
     /// The policy that others are paired against
     #[arg(long, default_value = "shooting_exploit")]
     baseline: String,
-    /// What `train` learned: a filter adds `learned_*` to the ladder, an autoencoder `autoencoder_*`; may be
+    /// What `train` learned: a filter adds `learned_*` to the ladder, an autoencoder `autoencoder_*`,
+    /// decisions `dqn_beam`; may be
     /// given for each
     #[arg(long, value_name = "FILE")]
     checkpoint: Vec<PathBuf>,
@@ -131,6 +132,9 @@ impl CompareCommand {
             let kind = match policy.estimator {
                 EstimatorKind::Learned if learned.filter.is_none() => "a filter",
                 EstimatorKind::Autoencoder if learned.network.is_none() => "an autoencoder",
+                EstimatorKind::KnownModel if policy.is_decided && learned.decisions.is_none() => {
+                    "decisions"
+                }
                 _ => continue,
             };
             let policy = policy.name.clone();
@@ -156,8 +160,11 @@ fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
         let at = ladder.iter().rposition(after).map_or(0, |last| last + 1);
         ladder.splice(at..at, names.iter().map(named));
     };
+    let is_known = |policy: &Policy| policy.estimator == EstimatorKind::KnownModel;
+    if learned.decisions.is_some() {
+        insert(is_known, &Policy::OF_DECISIONS);
+    }
     if learned.filter.is_some() {
-        let is_known = |policy: &Policy| policy.estimator == EstimatorKind::KnownModel;
         insert(is_known, &Policy::OF_FILTER);
     }
     if learned.network.is_some() {

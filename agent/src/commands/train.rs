@@ -66,14 +66,14 @@ impl TrainCommand {
     pub fn run(&self) -> Result<()> {
         let config = self.settings.effective()?;
         let n_worlds = self.worlds.unwrap_or(match config.learner {
-            LearnerKind::Filter => 16,
+            LearnerKind::Filter | LearnerKind::Decisions => 16,
             LearnerKind::Autoencoder => 1,
         });
         let last = self.world.checked_add(n_worlds);
         let last = last.context("--world: expected a world that a server may have")?;
         make_folder(&self.out)?;
         let stop = stop_on_signals().context("handle signals")?;
-        let (instance, _own) = self.server(n_worlds)?;
+        let (instance, _own) = self.server(n_worlds, config.learner)?;
         let training = Training {
             instance,
             worlds: self.world..last,
@@ -103,7 +103,7 @@ impl TrainCommand {
     }
 
     /// The server, and itself if it was started: dropped, it stops.
-    fn server(&self, n_worlds: u32) -> Result<(Instance, Option<OwnServer>)> {
+    fn server(&self, n_worlds: u32, learner: LearnerKind) -> Result<(Instance, Option<OwnServer>)> {
         if let Some(name) = &self.instance {
             return Ok((Instance::new(name)?, None));
         }
@@ -118,8 +118,9 @@ impl TrainCommand {
             Preset::Paper => 0,
         });
         let mut arguments = self.grid.arguments(n_worlds, self.seed, burn_in);
-        // The learner does not look at the model, and it could not.
-        let rest = ["--reveal-model", "false", "--coverage", "client"];
+        // Who learns a model does not look at it, and could not.
+        let reveals = (learner == LearnerKind::Decisions).to_string();
+        let rest = ["--reveal-model", &reveals, "--coverage", "client"];
         arguments.extend(rest.map(String::from));
         let server = OwnServer::start(self.server.clone(), &arguments)?;
         Ok((server.instance().clone(), Some(server)))

@@ -93,6 +93,11 @@ impl CellValues {
         self.value.view()
     }
 
+    /// Adds `weight` times a layer of shape `[H, W]`, whose numbers are finite, to the cells' values.
+    pub fn add(&mut self, weight: f32, layer: &Grid<f32>) {
+        self.value.scaled_add(weight, layer);
+    }
+
     /// Added once for each distinct cell.
     pub fn coverage_bonus(&self) -> f32 {
         self.coverage_bonus

@@ -1,0 +1,364 @@
+//! Learns which action of [`ActionSet::beam`] to take (paper section III.E): beam search plans on the
+//! known-model filter's belief, and a DQN that sees a summary of it chooses what each path is for.
+
+use super::{Lesson, NotFinite, Site, Student};
+use crate::action::{Action, ActionSet};
+use crate::belief::Belief;
+use crate::checkpoint::{Contents, Problem, Tensor};
+use crate::client::Observation;
+use crate::compare::planner_seed;
+use crate::config::{AgentConfig, DecisionsConfig};
+use crate::estimator::{Filter, ZeroEvidence};
+use crate::metrics::Tick;
+use crate::network::{Dqn, Transition};
+use crate::planner::BeamSearch;
+use crate::scoring::score;
+use crate::summary::{summarise, summary_length};
+use ndarray::Array2;
+use protocol::{Cell, Model, Move};
+use rayon::prelude::*;
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+/// How checkpoints of this learner call it.
+pub const KIND: &str = "decisions";
+
+/// Between the names of actions in a checkpoint.
+const SEPARATOR: &str = " ";
+
+/// A DQN over the actions of a model.
+#[derive(Debug, Clone)]
+pub struct Decisions {
+    /// Values of actions.
+    pub dqn: Dqn,
+    /// The actions, in the order of the values.
+    pub actions: ActionSet,
+    /// World steps that were learned from.
+    pub world_steps: u64,
+    n_states: usize,
+}
+
+/// A DQN that learns on several worlds.
+pub struct DecisionsStudent {
+    site: Site,
+    config: AgentConfig,
+    decisions: Decisions,
+    filter: Filter,
+    likelihood: Array2<f64>,
+    pilots: Vec<Pilot>,
+    owed: f64,
+    times: [(&'static str, Duration); 2],
+}
+
+/// One world's robot.
+struct Pilot {
+    filter: Filter,
+    planner: BeamSearch,
+    observation: Observation,
+    input: Vec<f32>,
+    action: usize,
+    /// Input, action and scaled reward of the last steps.
+    steps: VecDeque<(Vec<f32>, usize, f32)>,
+}
+
+/// What the DQN sees of a belief: its summary, of which the square root spreads small probabilities;
+/// from 0 to 1, `summary_length` of them.
+pub fn input(belief: &Belief, robot: Cell, n_moves: usize) -> Vec<f32> {
+    let summary = summarise(belief, robot, n_moves);
+    let spread = summary.iter().map(|share| share.sqrt());
+    spread.collect()
+}
+
+impl Decisions {
+    /// Before the first step, for worlds of a model.
+    pub fn first(model: &Model, config: &DecisionsConfig, seed: u64) -> Self {
+        let actions = ActionSet::beam(model);
+        let (n_states, n_actions) = (model.n_states(), actions.actions().len());
+        Self {
+            dqn: Dqn::new(config.settings(), summary_length(n_states), n_actions, seed),
+            actions,
+            world_steps: 0,
+            n_states,
+        }
+    }
+
+    /// The action that is worth most on a belief.
+    pub fn decide(&self, belief: &Belief, robot: Cell, n_moves: usize) -> &Action {
+        &self.actions.actions()[self.dqn.best(&input(belief, robot, n_moves))]
+    }
+
+    /// As a checkpoint, without settings and replay.
+    pub fn to_contents(&self) -> Contents {
+        let mut contents = Contents::default();
+        for (name, shape, numbers) in self.dqn.named_tensors() {
+            if !name.starts_with("dqn.replay") {
+                contents.tensors.insert(name, Tensor { shape, numbers });
+            }
+        }
+        for (name, text) in [
+            ("actions", self.actions.names().join(SEPARATOR)),
+            ("states", self.n_states.to_string()),
+            ("dqn_updates", self.dqn.n_updates().to_string()),
+            ("world_steps", self.world_steps.to_string()),
+        ] {
+            contents.texts.insert(name.into(), text);
+        }
+        contents
+    }
+
+    /// Takes over a checkpoint, with an empty replay.
+    ///
+    /// # Errors
+    /// [`Problem`] names what is missing, of another form, or of a model with other states or actions.
+    pub fn load(&mut self, contents: &Contents) -> Result<(), Problem> {
+        for (name, expected) in [
+            ("states", self.n_states.to_string()),
+            ("actions", self.actions.names().join(SEPARATOR)),
+        ] {
+            let got = contents.texts.get(name);
+            let got = got.ok_or_else(|| Problem::Missing(name.into()))?.clone();
+            if got != expected {
+                let name = name.into();
+                return Err(Problem::Value {
+                    name,
+                    expected,
+                    got,
+                });
+            }
+        }
+        let n_updates = contents.count("dqn_updates")?;
+        let numbers = |name: &str, shape: &[usize]| match name.starts_with("dqn.replay") {
+            true => Ok(Vec::new()),
+            false => contents.tensor(name, shape).map(<[f32]>::to_vec),
+        };
+        self.dqn.load(numbers, n_updates, 0)?;
+        self.world_steps = contents.count("world_steps")?;
+        Ok(())
+    }
+}
+
+impl DecisionsStudent {
+    /// Goes on from some decisions, or begins. `filter` is that of the worlds' model before its first frame.
+    pub fn new(
+        decisions: Decisions,
+        filter: Filter,
+        model: &Model,
+        site: Site,
+        config: &AgentConfig,
+    ) -> Self {
+        Self {
+            site,
+            config: config.clone(),
+            decisions,
+            filter,
+            likelihood: model.likelihood().clone(),
+            pilots: Vec::new(),
+            owed: 0.0,
+            times: ["planning", "learning"].map(|part| (part, Duration::ZERO)),
+        }
+    }
+}
+
+impl Pilot {
+    /// Remembers what an action brought, and gives the transition that is complete by then.
+    fn bring(&mut self, config: &DecisionsConfig, next: Vec<f32>) -> Option<Transition> {
+        let reward = self.observation.result.reward as f32 * config.reward_scale;
+        let input = std::mem::replace(&mut self.input, next);
+        self.steps.push_back((input, self.action, reward));
+        if self.steps.len() < config.n_steps {
+            return None;
+        }
+        let rewards = self.steps.iter().rev();
+        let reward = rewards.fold(0.0, |sum, (_, _, reward)| reward + config.gamma * sum);
+        let (input, action, _) = self.steps.pop_front()?;
+        Some(Transition {
+            input,
+            action,
+            reward,
+            next: self.input.clone(),
+        })
+    }
+}
+
+impl Student for DecisionsStudent {
+    fn kind(&self) -> &'static str {
+        KIND
+    }
+
+    fn columns(&self) -> &'static [&'static str] {
+        &["epsilon"]
+    }
+
+    fn begin(&mut self, world: usize, observation: Observation) -> Result<(), ZeroEvidence> {
+        let mut filter = self.filter.clone();
+        filter.correct(&observation.frame)?;
+        filter.predict();
+        let pilot = Pilot {
+            input: input(filter.belief(), observation.robot(), self.site.n_moves),
+            filter,
+            planner: BeamSearch::new(self.config.beam_width),
+            observation,
+            action: 0,
+            steps: VecDeque::new(),
+        };
+        match self.pilots.get_mut(world) {
+            Some(place) => *place = pilot,
+            None => self.pilots.push(pilot),
+        }
+        Ok(())
+    }
+
+    fn plan(&mut self) -> Vec<Vec<Move>> {
+        let start = Instant::now();
+        let (decisions, config, n_moves) = (&self.decisions, &self.config, self.site.n_moves);
+        let plan = |(index, pilot): (usize, &mut Pilot)| {
+            let step = decisions.world_steps + index as u64;
+            pilot.action = decisions.dqn.act(&pilot.input, step);
+            let action = &decisions.actions.actions()[pilot.action];
+            let result = &pilot.observation.result;
+            let random = (planner_seed(config, result.seed), result.step);
+            let (robot, belief) = (pilot.observation.robot(), pilot.filter.belief());
+            let plan = action.plan(&mut pilot.planner, belief, robot, n_moves, random);
+            plan.moves
+        };
+        let paths = self.pilots.par_iter_mut().enumerate().map(plan).collect();
+        self.times[0].1 += start.elapsed();
+        paths
+    }
+
+    fn take_in(&mut self, observations: Vec<Observation>) -> Result<Tick, ZeroEvidence> {
+        let mut tick = Tick::default();
+        for (pilot, observation) in self.pilots.iter_mut().zip(observations) {
+            tick.reward += observation.result.reward;
+            tick.score += score(pilot.filter.belief(), &self.likelihood, &observation.frame);
+            pilot.filter.correct(&observation.frame)?;
+            pilot.observation = observation;
+        }
+        let n_moves = self.site.n_moves;
+        let config = &self.config.decisions;
+        let bring = |pilot: &mut Pilot| {
+            pilot.filter.predict();
+            let next = input(pilot.filter.belief(), pilot.observation.robot(), n_moves);
+            pilot.bring(config, next)
+        };
+        let transitions: Vec<_> = self.pilots.par_iter_mut().map(bring).collect();
+        for transition in transitions.into_iter().flatten() {
+            self.decisions.dqn.remember(transition);
+        }
+        tick.n_worlds = self.pilots.len() as u64;
+        self.decisions.world_steps += tick.n_worlds;
+        tick.world_steps = self.decisions.world_steps;
+        self.owed += tick.n_worlds as f64 * config.updates_per_step;
+        Ok(tick)
+    }
+
+    fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {
+        let start = Instant::now();
+        let settings = self.config.decisions.settings();
+        let epsilon = f64::from(settings.epsilon_at(self.decisions.world_steps));
+        let mut lessons = Vec::new();
+        while self.owed >= 1.0 {
+            self.owed -= 1.0;
+            let Some(loss) = self.decisions.dqn.update() else {
+                continue;
+            };
+            lessons.push(Lesson {
+                number: self.n_updates(),
+                loss: Some(f64::from(loss)),
+                rate: Some(f64::from(settings.adam.learning_rate)),
+                more: vec![Some(epsilon)],
+            });
+        }
+        self.times[1].1 += start.elapsed();
+        Ok(lessons)
+    }
+
+    fn n_updates(&self) -> u64 {
+        self.decisions.dqn.n_updates()
+    }
+
+    fn contents(&self) -> Contents {
+        self.decisions.to_contents()
+    }
+
+    fn times(&self) -> Vec<(&'static str, Duration)> {
+        self.times.to_vec()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::message::StepResult;
+    use protocol::{Frame, Shape};
+
+    #[test]
+    fn decisions_survive_a_checkpoint_and_others_are_refused_by_name() {
+        let model = Model::wildfire();
+        let config = DecisionsConfig::default();
+        let decisions = Decisions::first(&model, &config, 3);
+        let contents = decisions.to_contents();
+        let mut again = Decisions::first(&model, &config, 4);
+        again.load(&contents).expect("of the same model");
+        assert_eq!(again.dqn.tensors(), decisions.dqn.tensors());
+        let mut other = contents.clone();
+        other.texts.insert("states".into(), "4".into());
+        let error = again.load(&other).expect_err("other states").to_string();
+        assert_eq!(error, "states: expected 3, got 4");
+        other = contents.clone();
+        other.texts.insert("actions".into(), "exploit".into());
+        let error = again.load(&other).expect_err("other actions").to_string();
+        assert!(
+            error.starts_with("actions: expected exploit exploit_explore"),
+            "{error}"
+        );
+        other = contents;
+        other.texts.remove("actions");
+        let error = again.load(&other).expect_err("none").to_string();
+        assert_eq!(error, "expected \"actions\" in it, found none");
+    }
+
+    #[test]
+    fn a_transition_adds_up_the_rewards_of_its_steps() {
+        let model = Model::wildfire();
+        let shape = Shape::new(4, 4).expect("test shape");
+        let filter = Filter::new(&model, Belief::uniform(3, shape)).expect("valid");
+        let observation = |reward: f64| Observation {
+            result: StepResult {
+                reward,
+                ..StepResult::default()
+            },
+            frame: Frame::empty(shape),
+        };
+        let config = DecisionsConfig {
+            n_steps: 3,
+            gamma: 0.5,
+            reward_scale: 0.1,
+            ..DecisionsConfig::default()
+        };
+        let mut pilot = Pilot {
+            filter,
+            planner: BeamSearch::new(1),
+            observation: observation(0.0),
+            input: vec![0.0],
+            action: 7,
+            steps: VecDeque::new(),
+        };
+        let mut bring = |reward: f64, next: f32| {
+            pilot.observation = observation(reward);
+            pilot.bring(&config, vec![next])
+        };
+        assert_eq!(bring(10.0, 1.0), None);
+        assert_eq!(bring(20.0, 2.0), None);
+        let first = bring(40.0, 3.0).expect("three steps");
+        // 1 + 2 / 2 + 4 / 4.
+        assert!((first.reward - 3.0).abs() < 1e-6, "{first:?}");
+        assert_eq!(
+            (first.input, first.action, first.next),
+            (vec![0.0], 7, vec![3.0])
+        );
+        let second = bring(0.0, 4.0).expect("three steps");
+        assert!((second.reward - 4.0).abs() < 1e-6, "{second:?}");
+        assert_eq!(second.input, vec![1.0]);
+    }
+}
