@@ -90,13 +90,14 @@ impl DecisionsConfig {
         }
     }
 
-    /// As the DQN takes them. A transition spans `n_steps`, so that its discount is theirs together.
+    /// As the DQN takes them.
     pub fn settings(&self) -> DqnSettings {
         let paper = DqnSettings::paper();
         DqnSettings {
             replay: self.replay,
             batch: self.batch,
-            gamma: self.gamma.powi(self.n_steps as i32),
+            gamma: self.gamma,
+            n_step: self.n_steps,
             tau: self.tau,
             epsilon: self.epsilon,
             epsilon_end: self.epsilon_end,

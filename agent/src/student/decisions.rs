@@ -4,12 +4,13 @@
 use super::{Lesson, NotFinite, Site, Student};
 use crate::action::{Action, ActionSet};
 use crate::belief::Belief;
-use crate::checkpoint::{Contents, Problem, Tensor};
+use crate::checkpoint::{Contents, Problem};
 use crate::client::Observation;
 use crate::compare::planner_seed;
 use crate::config::{AgentConfig, DecisionsConfig};
 use crate::estimator::{Filter, ZeroEvidence};
 use crate::metrics::Tick;
+use crate::network::dqn::Track;
 use crate::network::{Dqn, Transition};
 use crate::planner::BeamSearch;
 use crate::scoring::score;
@@ -17,7 +18,6 @@ use crate::summary::{summarise, summary_length};
 use ndarray::Array2;
 use protocol::{Cell, Model, Move};
 use rayon::prelude::*;
-use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 /// How checkpoints of this learner call it.
@@ -57,8 +57,7 @@ struct Pilot {
     observation: Observation,
     input: Vec<f32>,
     action: usize,
-    /// Input, action and scaled reward of the last steps.
-    steps: VecDeque<(Vec<f32>, usize, f32)>,
+    track: Track,
 }
 
 /// What the DQN sees of a belief: its summary, of which the square root spreads small probabilities;
@@ -87,18 +86,13 @@ impl Decisions {
         &self.actions.actions()[self.dqn.best(&input(belief, robot, n_moves))]
     }
 
-    /// As a checkpoint, without settings and replay.
+    /// As a checkpoint, without settings.
     pub fn to_contents(&self) -> Contents {
         let mut contents = Contents::default();
-        for (name, shape, numbers) in self.dqn.named_tensors() {
-            if !name.starts_with("dqn.replay") {
-                contents.tensors.insert(name, Tensor { shape, numbers });
-            }
-        }
+        self.dqn.save(&mut contents);
         for (name, text) in [
             ("actions", self.actions.names().join(SEPARATOR)),
             ("states", self.n_states.to_string()),
-            ("dqn_updates", self.dqn.n_updates().to_string()),
             ("world_steps", self.world_steps.to_string()),
         ] {
             contents.texts.insert(name.into(), text);
@@ -106,7 +100,7 @@ impl Decisions {
         contents
     }
 
-    /// Takes over a checkpoint, with an empty replay.
+    /// Takes over a checkpoint.
     ///
     /// # Errors
     /// [`Problem`] names what is missing, of another form, or of a model with other states or actions.
@@ -126,12 +120,7 @@ impl Decisions {
                 });
             }
         }
-        let n_updates = contents.count("dqn_updates")?;
-        let numbers = |name: &str, shape: &[usize]| match name.starts_with("dqn.replay") {
-            true => Ok(Vec::new()),
-            false => contents.tensor(name, shape).map(<[f32]>::to_vec),
-        };
-        self.dqn.load(numbers, n_updates, 0)?;
+        self.dqn.load(contents)?;
         self.world_steps = contents.count("world_steps")?;
         Ok(())
     }
@@ -160,22 +149,28 @@ impl DecisionsStudent {
 }
 
 impl Pilot {
-    /// Remembers what an action brought, and gives the transition that is complete by then.
+    /// A robot that has taken in what its world shows.
+    fn new(student: &DecisionsStudent, observation: Observation) -> Result<Self, ZeroEvidence> {
+        let mut filter = student.filter.clone();
+        filter.correct(&observation.frame)?;
+        filter.predict();
+        Ok(Self {
+            input: input(filter.belief(), observation.robot(), student.site.n_moves),
+            filter,
+            planner: BeamSearch::new(student.config.beam_width),
+            observation,
+            action: 0,
+            track: student.decisions.dqn.track(),
+        })
+    }
+
+    /// Takes in what an action brought, and gives the transition that is complete by then.
     fn bring(&mut self, config: &DecisionsConfig, next: Vec<f32>) -> Option<Transition> {
-        let reward = self.observation.result.reward as f32 * config.reward_scale;
-        let input = std::mem::replace(&mut self.input, next);
-        self.steps.push_back((input, self.action, reward));
-        if self.steps.len() < config.n_steps {
-            return None;
-        }
-        let rewards = self.steps.iter().rev();
-        let reward = rewards.fold(0.0, |sum, (_, _, reward)| reward + config.gamma * sum);
-        let (input, action, _) = self.steps.pop_front()?;
-        Some(Transition {
-            input,
-            action,
-            reward,
-            next: self.input.clone(),
+        self.track.add(Transition {
+            input: std::mem::replace(&mut self.input, next.clone()),
+            action: self.action,
+            reward: self.observation.result.reward as f32 * config.reward_scale,
+            next,
         })
     }
 }
@@ -189,22 +184,16 @@ impl Student for DecisionsStudent {
         &["epsilon"]
     }
 
-    fn begin(&mut self, world: usize, observation: Observation) -> Result<(), ZeroEvidence> {
-        let mut filter = self.filter.clone();
-        filter.correct(&observation.frame)?;
-        filter.predict();
-        let pilot = Pilot {
-            input: input(filter.belief(), observation.robot(), self.site.n_moves),
-            filter,
-            planner: BeamSearch::new(self.config.beam_width),
-            observation,
-            action: 0,
-            steps: VecDeque::new(),
-        };
-        match self.pilots.get_mut(world) {
-            Some(place) => *place = pilot,
-            None => self.pilots.push(pilot),
-        }
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<bool, ZeroEvidence> {
+        let pilots = observations.into_iter().map(|seen| Pilot::new(self, seen));
+        self.pilots = pilots.collect::<Result<_, _>>()?;
+        // Transitions do not depend on where their worlds stand now.
+        Ok(true)
+    }
+
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), ZeroEvidence> {
+        let pilot = Pilot::new(self, observation)?;
+        self.pilots[(world - self.site.worlds.start) as usize] = pilot;
         Ok(())
     }
 
@@ -259,7 +248,7 @@ impl Student for DecisionsStudent {
         let mut lessons = Vec::new();
         while self.owed >= 1.0 {
             self.owed -= 1.0;
-            let Some(loss) = self.decisions.dqn.update() else {
+            let Some(loss) = self.decisions.dqn.update()? else {
                 continue;
             };
             lessons.push(Lesson {
@@ -271,6 +260,10 @@ impl Student for DecisionsStudent {
         }
         self.times[1].1 += start.elapsed();
         Ok(lessons)
+    }
+
+    fn rest(&mut self) {
+        self.owed = 0.0;
     }
 
     fn n_updates(&self) -> u64 {
@@ -289,8 +282,6 @@ impl Student for DecisionsStudent {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::message::StepResult;
-    use protocol::{Frame, Shape};
 
     #[test]
     fn decisions_survive_a_checkpoint_and_others_are_refused_by_name() {
@@ -316,49 +307,5 @@ mod tests {
         other.texts.remove("actions");
         let error = again.load(&other).expect_err("none").to_string();
         assert_eq!(error, "expected \"actions\" in it, found none");
-    }
-
-    #[test]
-    fn a_transition_adds_up_the_rewards_of_its_steps() {
-        let model = Model::wildfire();
-        let shape = Shape::new(4, 4).expect("test shape");
-        let filter = Filter::new(&model, Belief::uniform(3, shape)).expect("valid");
-        let observation = |reward: f64| Observation {
-            result: StepResult {
-                reward,
-                ..StepResult::default()
-            },
-            frame: Frame::empty(shape),
-        };
-        let config = DecisionsConfig {
-            n_steps: 3,
-            gamma: 0.5,
-            reward_scale: 0.1,
-            ..DecisionsConfig::default()
-        };
-        let mut pilot = Pilot {
-            filter,
-            planner: BeamSearch::new(1),
-            observation: observation(0.0),
-            input: vec![0.0],
-            action: 7,
-            steps: VecDeque::new(),
-        };
-        let mut bring = |reward: f64, next: f32| {
-            pilot.observation = observation(reward);
-            pilot.bring(&config, vec![next])
-        };
-        assert_eq!(bring(10.0, 1.0), None);
-        assert_eq!(bring(20.0, 2.0), None);
-        let first = bring(40.0, 3.0).expect("three steps");
-        // 1 + 2 / 2 + 4 / 4.
-        assert!((first.reward - 3.0).abs() < 1e-6, "{first:?}");
-        assert_eq!(
-            (first.input, first.action, first.next),
-            (vec![0.0], 7, vec![3.0])
-        );
-        let second = bring(0.0, 4.0).expect("three steps");
-        assert!((second.reward - 4.0).abs() < 1e-6, "{second:?}");
-        assert_eq!(second.input, vec![1.0]);
     }
 }
