@@ -314,7 +314,7 @@ mod tests {
         );
         check(
             |c| c.tensors.get_mut(STARTS).expect("stored").shape[3] = 4,
-            "replay.starts: expected shape [3, 2, 1, 3], got [3, 2, 1, 4]",
+            "replay.starts: expected shape [4, 2, 1, 3], got [4, 2, 1, 4]",
         );
     }
 }

@@ -140,6 +140,9 @@ impl Trainer {
         if replay.n_blocks() < self.streams.len() {
             return Ok(None);
         }
+        if let Some(tensor) = self.iterates.parameters.not_finite() {
+            return Err(self.wrong(tensor, "a parameter that is not"));
+        }
         self.place_streams(replay);
         let outcomes = self.run_windows(replay);
         let (log_likelihood, n_seen, mut gradient) = add_up(&outcomes, self.dimensions());
@@ -251,9 +254,6 @@ impl Trainer {
 
     fn step(&mut self, loss: f64, by_tables: &[Vec<f64>; 3]) -> Result<Update, NotFinite> {
         let number = self.iterates.adam.n_steps + 1;
-        if let Some(tensor) = self.iterates.parameters.not_finite() {
-            return Err(self.wrong(tensor, "a parameter that is not"));
-        }
         let gradient = self.iterates.parameters.chain(by_tables);
         if let Some(tensor) = gradient.not_finite() {
             return Err(self.wrong(tensor, "a gradient that is not"));
