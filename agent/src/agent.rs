@@ -7,7 +7,7 @@ use crate::config::AgentConfig;
 use crate::estimator::{Filter, LearnedFilter, ZeroEvidence};
 use crate::learned::{Learned, LearnedNetwork};
 use crate::learner::LearnedModel;
-use crate::network::Autoencoder;
+use crate::network::{self as networks, Autoencoder};
 use crate::planner::{CellValues, Objective, Plan, Planner, PlanningProblem, Target};
 use crate::policy::{EstimatorKind, Policy};
 use crate::student::decisions::Decisions;
@@ -62,6 +62,9 @@ pub enum AgentError {
     /// A frame that the belief held for impossible.
     #[error(transparent)]
     ZeroEvidence(#[from] ZeroEvidence),
+    /// A network whose numbers are too large to be worked with.
+    #[error("checkpoint: {0}")]
+    NotFinite(#[from] networks::NotFinite),
     /// The model does not fit the grid.
     #[error(transparent)]
     Model(#[from] ModelError),
@@ -269,6 +272,15 @@ impl Agent {
     /// The policy.
     pub fn policy(&self) -> &Policy {
         &self.policy
+    }
+}
+
+impl From<networks::StepError> for AgentError {
+    fn from(error: networks::StepError) -> Self {
+        match error {
+            networks::StepError::ZeroEvidence(error) => error.into(),
+            networks::StepError::NotFinite(error) => error.into(),
+        }
     }
 }
 

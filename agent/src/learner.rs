@@ -88,7 +88,9 @@ impl Learner {
 
     /// The reward of the path that a frame shows, with the belief after it.
     pub fn reward(&mut self, posterior: &Belief, frame: &Frame, reward: f64) {
-        self.reward.add(&met(posterior, frame), reward);
+        let visited: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
+        self.reward
+            .add(&met(posterior, visited.into_iter()), reward);
         self.world_steps += 1;
         self.owed += self.config.updates_per_step;
     }
@@ -113,11 +115,6 @@ impl Learner {
         let block = learning.window * learning.block_windows;
         self.replay = Replay::new(block, learning.replay_frames);
         self.trainer.leave_replay();
-        self.owed = 0.0;
-    }
-
-    /// Forgets the updates that steps have earned: nothing is learned from them.
-    pub fn rest(&mut self) {
         self.owed = 0.0;
     }
 

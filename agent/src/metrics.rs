@@ -2,12 +2,14 @@
 
 use crate::scoring::Score;
 use crate::student::Lesson;
-use std::fs::OpenOptions;
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 /// The file's name in the folder of a training.
 pub const METRICS: &str = "metrics.csv";
+
+/// The name of that of a run without learning.
+pub const FROZEN: &str = "frozen.csv";
 
 const HEADER: [&str; 6] = [
     "update",
@@ -31,12 +33,30 @@ pub struct Tick {
     pub score: Score,
 }
 
-/// A file that cannot be written.
+/// A file that cannot be written or read, or is another learner's.
 #[derive(Debug, Error)]
 #[error("metrics {}: {problem}", path.display())]
 pub struct MetricsError {
     path: PathBuf,
-    problem: csv::Error,
+    problem: Box<dyn std::error::Error + Send + Sync>,
+}
+
+impl MetricsError {
+    fn new(path: &Path, problem: csv::Error) -> Self {
+        let (path, problem) = (path.to_owned(), problem.into());
+        Self { path, problem }
+    }
+
+    fn columns(path: &Path, expected: &csv::StringRecord, got: &csv::StringRecord) -> Self {
+        let names = |record: &csv::StringRecord| record.iter().collect::<Vec<_>>().join(",");
+        let problem = format!(
+            "expected the columns {}, got {}",
+            names(expected),
+            names(got)
+        );
+        let (path, problem) = (path.to_owned(), problem.into());
+        Self { path, problem }
+    }
 }
 
 /// The open file.
@@ -48,29 +68,59 @@ pub struct Metrics {
 }
 
 impl Metrics {
-    /// Opens the file in a folder, to go on with it or anew. `more`: columns of the learner's own.
+    /// Begins a file. `more`: columns of the learner's own.
     ///
     /// # Errors
     /// [`MetricsError`].
-    pub fn open(folder: &Path, more: &[&str], goes_on: bool) -> Result<Self, MetricsError> {
-        let path = folder.join(METRICS);
-        let goes_on = goes_on && path.exists();
-        let mut options = OpenOptions::new();
-        options.create(true).write(true);
-        let file = match goes_on {
-            true => options.append(true).open(&path),
-            false => options.truncate(true).open(&path),
-        };
-        let fail = |problem: csv::Error| MetricsError {
-            path: path.clone(),
-            problem,
-        };
-        let mut writer = csv::Writer::from_writer(file.map_err(|error| fail(error.into()))?);
-        if !goes_on {
-            let header = HEADER.iter().chain(more);
-            writer.write_record(header).map_err(fail)?;
+    pub fn begin(path: &Path, more: &[&str]) -> Result<Self, MetricsError> {
+        Self::write(path, more, &[])
+    }
+
+    /// Goes on with a file, from which rows after some world step go, as they came after what is gone on
+    /// from, and rows that a kill cut off; begins it if it is not there.
+    ///
+    /// # Errors
+    /// [`MetricsError`], also for a file with other columns.
+    pub fn go_on(path: &Path, more: &[&str], world_steps: u64) -> Result<Self, MetricsError> {
+        if !path.exists() {
+            return Self::begin(path, more);
         }
-        let n_more = more.len();
+        let fail = |problem: csv::Error| MetricsError::new(path, problem);
+        let reader = csv::ReaderBuilder::new().flexible(true).from_path(path);
+        let mut reader = reader.map_err(fail)?;
+        let got = reader.headers().map_err(fail)?;
+        let expected = csv::StringRecord::from_iter(HEADER.iter().chain(more));
+        if *got != expected {
+            return Err(MetricsError::columns(path, &expected, got));
+        }
+        let is_kept = |row: &csv::StringRecord| {
+            let step = row.get(1).and_then(|step| step.parse().ok());
+            row.len() == expected.len() && step.is_some_and(|step: u64| step <= world_steps)
+        };
+        let rows = reader
+            .records()
+            .collect::<Result<Vec<_>, _>>()
+            .map_err(fail)?;
+        let rows: Vec<_> = rows.into_iter().filter(is_kept).collect();
+        let beside = path.with_extension("csv.new");
+        let written = Self::write(&beside, more, &rows)?;
+        std::fs::rename(&beside, path).map_err(|error| fail(error.into()))?;
+        Ok(Self {
+            path: path.to_owned(),
+            ..written
+        })
+    }
+
+    fn write(path: &Path, more: &[&str], rows: &[csv::StringRecord]) -> Result<Self, MetricsError> {
+        let fail = |problem: csv::Error| MetricsError::new(path, problem);
+        let mut writer = csv::Writer::from_path(path).map_err(fail)?;
+        let header = HEADER.iter().chain(more);
+        writer.write_record(header).map_err(fail)?;
+        for row in rows {
+            writer.write_record(row).map_err(fail)?;
+        }
+        writer.flush().map_err(|error| fail(error.into()))?;
+        let (path, n_more) = (path.to_owned(), more.len());
         Ok(Self {
             path,
             writer,
@@ -112,8 +162,7 @@ impl Metrics {
     }
 
     fn fail(&self, problem: csv::Error) -> MetricsError {
-        let path = self.path.clone();
-        MetricsError { path, problem }
+        MetricsError::new(&self.path, problem)
     }
 }
 
@@ -143,11 +192,9 @@ impl Rows {
     /// [`MetricsError`].
     pub fn read(folder: &Path) -> Result<Self, MetricsError> {
         let path = folder.join(METRICS);
-        let fail = |problem: csv::Error| MetricsError {
-            path: path.clone(),
-            problem,
-        };
-        let mut reader = csv::Reader::from_path(&path).map_err(fail)?;
+        let fail = |problem: csv::Error| MetricsError::new(&path, problem);
+        let reader = csv::ReaderBuilder::new().flexible(true).from_path(&path);
+        let mut reader = reader.map_err(fail)?;
         let names = reader.headers().map_err(fail)?;
         let names = names.iter().map(String::from).collect();
         let mut rows = Vec::new();

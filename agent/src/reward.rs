@@ -6,7 +6,6 @@
 //! other way to know which of its states is the fire.
 
 use crate::belief::Belief;
-use protocol::Frame;
 
 /// Share of what was known that is kept at each path: a memory of 2,000 paths.
 const KEPT: f64 = 0.9995;
@@ -14,16 +13,11 @@ const KEPT: f64 = 0.9995;
 /// Added to the diagonal, in squared cells: no state needs to have been met.
 const RIDGE: f64 = 1.0;
 
-/// What a path met: the expected number of a frame's cells in each state, under the belief after it.
-pub fn met(posterior: &Belief, frame: &Frame) -> Vec<f64> {
+/// What a path met: the expected number of the visited cells in each state, under the belief after it.
+pub fn met(posterior: &Belief, visited: impl Iterator<Item = usize> + Clone) -> Vec<f64> {
     let n_cells = posterior.shape().n_cells();
     let planes = posterior.as_slice().chunks_exact(n_cells);
-    let cells = |plane: &[f32]| {
-        frame
-            .observed()
-            .map(|(cell, _)| f64::from(plane[cell]))
-            .sum()
-    };
+    let cells = |plane: &[f32]| visited.clone().map(|cell| f64::from(plane[cell])).sum();
     planes.map(cells).collect()
 }
 

@@ -40,7 +40,19 @@ pub struct Lesson {
     pub more: Vec<Option<f64>>,
 }
 
-/// A number that is not finite: learning cannot go on; nothing was changed by the update that met it.
+/// Why a student cannot go on.
+#[derive(Debug, PartialEq, Error)]
+pub enum StudentError {
+    /// A frame that the belief held for impossible.
+    #[error(transparent)]
+    ZeroEvidence(#[from] ZeroEvidence),
+    /// A number that is not finite.
+    #[error(transparent)]
+    NotFinite(#[from] NotFinite),
+}
+
+/// A number that is not finite: learning cannot go on; nothing was changed by the step or update that
+/// met it.
 #[derive(Debug, PartialEq, Error)]
 #[non_exhaustive]
 pub enum NotFinite {
@@ -50,6 +62,15 @@ pub enum NotFinite {
     /// In the autoencoder or the DQN.
     #[error(transparent)]
     Network(#[from] networks::NotFinite),
+}
+
+impl From<networks::StepError> for StudentError {
+    fn from(error: networks::StepError) -> Self {
+        match error {
+            networks::StepError::ZeroEvidence(error) => error.into(),
+            networks::StepError::NotFinite(error) => NotFinite::from(error).into(),
+        }
+    }
 }
 
 /// What learns while it acts.
@@ -69,14 +90,14 @@ pub trait Student {
     /// where its checkpoint left it.
     ///
     /// # Errors
-    /// [`ZeroEvidence`].
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<bool, ZeroEvidence>;
+    /// [`StudentError`].
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<bool, StudentError>;
 
     /// A world begins anew.
     ///
     /// # Errors
-    /// [`ZeroEvidence`].
-    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), ZeroEvidence>;
+    /// [`StudentError`].
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError>;
 
     /// The next path of each world.
     fn plan(&mut self) -> Vec<Vec<Move>>;
@@ -84,8 +105,8 @@ pub trait Student {
     /// Takes in what the paths showed: scores the prediction, corrects, predicts, remembers.
     ///
     /// # Errors
-    /// [`ZeroEvidence`].
-    fn take_in(&mut self, observations: Vec<Observation>) -> Result<Tick, ZeroEvidence>;
+    /// [`StudentError`].
+    fn take_in(&mut self, observations: Vec<Observation>) -> Result<Tick, StudentError>;
 
     /// Makes the updates that the steps since the last call have earned.
     ///
@@ -93,8 +114,11 @@ pub trait Student {
     /// [`NotFinite`].
     fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite>;
 
-    /// Forgets the updates that steps have earned: nothing is learned from them.
-    fn rest(&mut self) {}
+    /// From here on it acts on what was learned, as well as it knows: without random actions.
+    fn freeze(&mut self);
+
+    /// World steps that were learned from, of all worlds together.
+    fn world_steps(&self) -> u64;
 
     /// Updates of the model so far.
     fn n_updates(&self) -> u64;

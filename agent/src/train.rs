@@ -1,26 +1,26 @@
 //! Learns while acting: attach, fly, correct, learn, predict, save.
 //!
 //! The learner is told the grid, the number of observations and each path's reward and frame; the
-//! model that a server may reveal is not read, but by who learns decisions. One message steps all worlds. What is learned, and how
-//! it acts meanwhile, is a [`Student`]'s.
+//! model that a server may reveal is read only where decisions are learned. One message steps all worlds.
+//! What is learned, and how it acts meanwhile, is a [`Student`]'s.
 
 use crate::checkpoint::{self, CheckpointError, Contents, Problem};
-use crate::client::{Claim, Client};
+use crate::client::{Claim, Client, Observation};
 use crate::config::{AgentConfig, ConfigError, LearnerKind};
+use crate::estimator::Filter;
 use crate::estimator::learned_filter::{Dimensions, DimensionsError};
-use crate::estimator::{Filter, ZeroEvidence};
 use crate::learner;
-use crate::metrics::{Metrics, MetricsError, Tick};
+use crate::metrics::{FROZEN, METRICS, Metrics, MetricsError, Tick};
 use crate::scoring::Score;
 use crate::student::decisions::{self, Decisions, DecisionsStudent};
 use crate::student::filter::FilterStudent;
 use crate::student::network::{self, NetworkStudent};
-use crate::student::{Lesson, NotFinite, Site, Student};
-use protocol::Model;
+use crate::student::{Site, Student, StudentError};
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::{CoverageRule, WorldSeed};
 use protocol::model::ModelError;
+use protocol::{Model, Move};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -42,8 +42,6 @@ const LEASE: Duration = Duration::from_secs(600);
 /// What to train on, for how long.
 #[derive(Debug, Clone)]
 pub struct Training {
-    /// The server.
-    pub instance: Instance,
     /// The worlds to act on.
     pub worlds: Range<u32>,
     /// Take the worlds from their holder.
@@ -81,9 +79,24 @@ pub enum TrainError {
     /// Settings that no filter has with the server's observations.
     #[error(transparent)]
     Dimensions(#[from] DimensionsError),
-    /// A frame that the belief held for impossible.
-    #[error(transparent)]
-    ZeroEvidence(#[from] ZeroEvidence),
+    /// The learner.
+    #[error("after {world_steps} world steps: {problem}; what was learned before is in {saved}")]
+    Student {
+        /// What is wrong.
+        problem: StudentError,
+        /// World steps that were learned from.
+        world_steps: u64,
+        /// The checkpoint.
+        saved: String,
+    },
+    /// What was learned could not be saved either.
+    #[error("{problem}; what was learned is lost: {also}")]
+    NotSaved {
+        /// Why training ended.
+        problem: Box<TrainError>,
+        /// Why it is not saved.
+        also: Box<TrainError>,
+    },
     /// A folder that holds a training already.
     #[error("--out {0}: expected --resume or a folder without a checkpoint, got one with it")]
     Taken(String),
@@ -105,14 +118,51 @@ pub enum TrainError {
     /// Settings that cannot be written into a checkpoint.
     #[error("settings: {0}")]
     Settings(#[from] toml::ser::Error),
-    /// A number that is not finite.
-    #[error("{problem}; the parameters before it are in {saved}")]
-    NotFinite {
-        /// Where it is.
-        problem: NotFinite,
-        /// The checkpoint.
-        saved: String,
-    },
+}
+
+impl Training {
+    /// Checks folder and number of worlds, before a server is held or started for them; returns the
+    /// contents of the checkpoint to go on from.
+    ///
+    /// # Errors
+    /// [`TrainError`].
+    pub fn check(&self) -> Result<Option<Contents>, TrainError> {
+        let place = self.out.join(CHECKPOINT);
+        if place.exists() && !self.resume {
+            return Err(TrainError::Taken(self.out.display().to_string()));
+        }
+        let n_worlds = self.worlds.len();
+        let kind = match self.config.learner {
+            LearnerKind::Filter => learner::KIND,
+            LearnerKind::Autoencoder if n_worlds != 1 => {
+                return Err(TrainError::OneWorld(n_worlds));
+            }
+            LearnerKind::Autoencoder => network::KIND,
+            LearnerKind::Decisions => decisions::KIND,
+        };
+        let contents = self.resume.then(|| checkpoint::read(&place, kind));
+        let contents = contents.transpose()?;
+        let before = contents
+            .as_ref()
+            .and_then(|contents| contents.texts.get("settings"));
+        if before
+            .is_some_and(|before| toml::to_string(&self.config).is_ok_and(|now| now != *before))
+        {
+            tracing::warn!(
+                "settings: other than the checkpoint was trained with; these hold from here on"
+            );
+        }
+        Ok(contents)
+    }
+
+    /// The error for a student that cannot go on; what it learned is saved when training ends.
+    fn stopped(&self, problem: StudentError, student: &dyn Student) -> TrainError {
+        TrainError::Student {
+            problem,
+            world_steps: student.world_steps(),
+            saved: self.out.join(CHECKPOINT).display().to_string(),
+        }
+    }
 }
 
 /// What a training did.
@@ -128,17 +178,30 @@ pub struct TrainSummary {
     pub times: Vec<(&'static str, Duration)>,
 }
 
-/// Trains until the steps are done, the time is over or `stop` is set; saves in any case.
+/// Trains on a server until the steps are done, the time is over or `stop` is set; saves in any case.
+/// `contents`: what [`Training::check`] gave.
 ///
 /// # Errors
 /// [`TrainError`].
-pub fn train(training: &Training, stop: &AtomicBool) -> Result<TrainSummary, TrainError> {
-    let mut trainee = Trainee::attach(training)?;
+pub fn train(
+    instance: &Instance,
+    training: &Training,
+    contents: Option<Contents>,
+    stop: &AtomicBool,
+) -> Result<TrainSummary, TrainError> {
+    let mut trainee = Trainee::attach(instance, training, contents)?;
     let deadline = training.time_limit.map(|limit| Instant::now() + limit);
     let outcome = trainee.act(training, stop, deadline);
     let saved = trainee.save(training);
-    outcome?;
-    saved?;
+    trainee.summary.times = trainee.student.times();
+    match (outcome, saved) {
+        (Ok(()), saved) => saved?,
+        (Err(problem), Ok(())) => return Err(problem),
+        (Err(problem), Err(also)) => {
+            let [problem, also] = [problem, also].map(Box::new);
+            return Err(TrainError::NotSaved { problem, also });
+        }
+    }
     trainee.client.release()?;
     Ok(trainee.summary)
 }
@@ -162,32 +225,33 @@ struct Told {
 }
 
 impl Trainee {
-    fn attach(training: &Training) -> Result<Self, TrainError> {
+    fn attach(
+        instance: &Instance,
+        training: &Training,
+        contents: Option<Contents>,
+    ) -> Result<Self, TrainError> {
         let place = training.out.join(CHECKPOINT);
-        if place.exists() && !training.resume {
-            return Err(TrainError::Taken(training.out.display().to_string()));
-        }
-        // A checkpoint that cannot be read is refused before worlds are held for it.
-        let kind = match training.config.learner {
-            LearnerKind::Filter => learner::KIND,
-            LearnerKind::Autoencoder => network::KIND,
-            LearnerKind::Decisions => decisions::KIND,
-        };
-        let contents = match training.resume {
-            true => Some(checkpoint::read(&place, kind)?),
-            false => None,
-        };
         let claim = Claim {
             worlds: training.worlds.clone(),
             takeover: training.takeover,
             time_to_live: Some(LEASE),
         };
-        let mut client = Client::acquire(&training.instance, &claim)?;
+        let mut client = Client::acquire(instance, &claim)?;
         let mut student = student(training, &client, contents.as_ref(), &place)?;
-        let metrics = Metrics::open(&training.out, student.columns(), training.resume)?;
-        let observations = client.observe(client.worlds())?;
-        if !student.attach(observations)? && training.resume {
-            tracing::info!("other worlds than the checkpoint's, or other steps: beginning anew");
+        let metrics = metrics(training, &*student)?;
+        if training.freeze {
+            student.freeze();
+        }
+        let mut observations = client.observe(client.worlds())?;
+        for (world, seen) in client.worlds().zip(&mut observations) {
+            if is_over(seen) {
+                *seen = reset(&mut client, world)?;
+            }
+        }
+        let attached = student.attach(observations);
+        let goes_on = attached.map_err(|problem| training.stopped(problem, &*student))?;
+        if training.resume && !goes_on {
+            tracing::info!("the worlds are not where the checkpoint left them: beliefs begin anew");
         }
         let now = Instant::now();
         Ok(Self {
@@ -209,68 +273,71 @@ impl Trainee {
         let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
         let is_done = |steps: u64| training.steps > 0 && steps >= training.steps;
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
-            let tick = self.step()?;
+            let paths = self.student.plan();
+            let observations = self.fly(&paths)?;
+            let taken = self.take_in(observations)?;
+            let tick = taken.map_err(|problem| training.stopped(problem, &*self.student))?;
             let lessons = match training.freeze {
-                true => {
-                    self.student.rest();
-                    Vec::new()
-                }
-                false => self.learn(training)?,
+                true => Ok(Vec::new()),
+                false => self.student.learn(),
             };
+            let lessons =
+                lessons.map_err(|problem| training.stopped(problem.into(), &*self.student))?;
+            self.summary.updates = self.student.n_updates();
             let n_updates = self.student.n_updates();
             self.metrics.add(&tick, &lessons, n_updates)?;
             self.report(&tick);
             if self.saved.elapsed() > SAVE_INTERVAL {
                 self.save(training)?;
-                self.metrics.flush()?;
             }
         }
         Ok(())
     }
 
-    /// Plans, flies, scores, corrects, predicts: one step of each world.
-    fn step(&mut self) -> Result<Tick, TrainError> {
-        let paths = self.student.plan();
+    /// One step of each world.
+    fn fly(&mut self, paths: &[Vec<Move>]) -> Result<Vec<Observation>, ConnectionError> {
         let worlds = self.client.worlds();
-        let observations = match self.student.wants_full_frames() {
-            true => self.client.step_full(worlds.clone(), &paths)?,
-            false => self.client.step(worlds.clone(), &paths)?,
-        };
-        let ended = worlds.zip(&observations).filter(|(_, seen)| {
-            let result = &seen.result;
-            result.truncated != 0 || result.terminated != 0
-        });
+        match self.student.wants_full_frames() {
+            true => self.client.step_full(worlds, paths),
+            false => self.client.step(worlds, paths),
+        }
+    }
+
+    /// Scores, corrects, predicts; worlds at the end of their episodes begin anew.
+    fn take_in(
+        &mut self,
+        observations: Vec<Observation>,
+    ) -> Result<Result<Tick, StudentError>, ConnectionError> {
+        let ended = self.client.worlds().zip(&observations);
+        let ended = ended.filter(|(_, seen)| is_over(seen));
         let ended: Vec<u32> = ended.map(|(world, _)| world).collect();
-        let tick = self.student.take_in(observations)?;
+        let tick = match self.student.take_in(observations) {
+            Ok(tick) => tick,
+            Err(problem) => return Ok(Err(problem)),
+        };
         for world in ended {
-            self.client.reset(&[WorldSeed { world, seed: None }])?;
-            let observation = self.client.observe(world..world + 1)?.remove(0);
-            self.student.begin(world, observation)?;
+            let observation = reset(&mut self.client, world)?;
+            if let Err(problem) = self.student.begin(world, observation) {
+                return Ok(Err(problem));
+            }
         }
         self.summary.steps += tick.n_worlds;
         self.summary.reward += tick.reward;
-        Ok(tick)
+        Ok(Ok(tick))
     }
 
-    fn learn(&mut self, training: &Training) -> Result<Vec<Lesson>, TrainError> {
-        let lessons = self.student.learn();
-        self.summary.updates = self.student.n_updates();
-        lessons.or_else(|problem| {
-            let saved = self.save(training)?.display().to_string();
-            self.metrics.flush()?;
-            Err(TrainError::NotFinite { problem, saved })
-        })
-    }
-
-    fn save(&mut self, training: &Training) -> Result<PathBuf, TrainError> {
+    /// Writes the checkpoint, unless nothing is learned.
+    fn save(&mut self, training: &Training) -> Result<(), TrainError> {
         self.saved = Instant::now();
-        let place = training.out.join(CHECKPOINT);
+        self.metrics.flush()?;
+        if training.freeze {
+            return Ok(());
+        }
         let mut contents = self.student.contents();
         let settings = toml::to_string(&training.config)?;
         contents.texts.insert("settings".into(), settings);
-        checkpoint::write(&place, self.student.kind(), &contents)?;
-        self.summary.times = self.student.times();
-        Ok(place)
+        let place = training.out.join(CHECKPOINT);
+        Ok(checkpoint::write(&place, self.student.kind(), &contents)?)
     }
 
     fn report(&mut self, tick: &Tick) {
@@ -302,6 +369,26 @@ impl Told {
     }
 }
 
+fn is_over(seen: &Observation) -> bool {
+    seen.result.truncated != 0 || seen.result.terminated != 0
+}
+
+/// Starts a world's next episode.
+fn reset(client: &mut Client, world: u32) -> Result<Observation, ConnectionError> {
+    client.reset(&[WorldSeed { world, seed: None }])?;
+    Ok(client.observe(world..world + 1)?.remove(0))
+}
+
+/// The file of metrics: a run without learning has one of its own.
+fn metrics(training: &Training, student: &dyn Student) -> Result<Metrics, MetricsError> {
+    let (columns, world_steps) = (student.columns(), student.world_steps());
+    match (training.freeze, training.resume) {
+        (true, _) => Metrics::begin(&training.out.join(FROZEN), columns),
+        (false, true) => Metrics::go_on(&training.out.join(METRICS), columns, world_steps),
+        (false, false) => Metrics::begin(&training.out.join(METRICS), columns),
+    }
+}
+
 /// What the settings say that learns, going on from a checkpoint's contents if there are any.
 fn student(
     training: &Training,
@@ -328,9 +415,6 @@ fn student(
             })
         }
         LearnerKind::Autoencoder => {
-            if site.worlds.len() != 1 {
-                return Err(TrainError::OneWorld(site.worlds.len()));
-            }
             let mut progress = network::Progress::first(&site, config);
             if let Some(contents) = contents {
                 progress.load(contents).map_err(wrong)?;

@@ -32,7 +32,7 @@ const GUIDES: [&str; 2] = ["random_walk", "beam_exploit"];
 /// Score a checkpoint beside the known model.
 #[derive(Args)]
 pub struct EvaluateCommand {
-    /// What `train` learned; may be given for a filter and for an autoencoder
+    /// What `train` learned; may be given once for each kind of learner
     #[arg(long, value_name = "FILE", required = true)]
     checkpoint: Vec<PathBuf>,
     /// Only score predictions, not policies
@@ -80,6 +80,9 @@ impl EvaluateCommand {
         }
         if learned.network.is_some() {
             names.extend(Policy::OF_AUTOENCODER);
+        }
+        if learned.decisions.is_some() {
+            names.extend(Policy::OF_DECISIONS);
         }
         let named = |name| Policy::named(name, arena.model());
         let comparison = Comparison {

@@ -73,9 +73,8 @@ impl TrainCommand {
         let last = last.context("--world: expected a world that a server may have")?;
         make_folder(&self.out)?;
         let stop = stop_on_signals().context("handle signals")?;
-        let (instance, _own) = self.server(n_worlds, config.learner)?;
+        let learner = config.learner;
         let training = Training {
-            instance,
             worlds: self.world..last,
             takeover: self.takeover,
             steps: self.steps,
@@ -85,18 +84,20 @@ impl TrainCommand {
             freeze: self.freeze,
             config,
         };
-        let summary = train(&training, &stop)?;
+        let contents = training.check()?;
+        let (instance, _own) = self.server(n_worlds, learner)?;
+        let summary = train(&instance, &training, contents, &stop)?;
         let mean_reward = summary.reward / summary.steps.max(1) as f64;
         tracing::info!(
             steps = summary.steps,
             updates = summary.updates,
             mean_reward,
-            "saved"
+            "done"
         );
         for (part, time) in summary.times {
             tracing::info!(part, seconds = time.as_secs_f64(), "time");
         }
-        if summary.steps > 0 {
+        if summary.steps > 0 && !self.freeze {
             draw_training(&self.out)?;
         }
         Ok(())

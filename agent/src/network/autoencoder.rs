@@ -67,6 +67,17 @@ pub struct NotFinite {
     pub tensor: String,
 }
 
+/// Why a frame was not taken in; nothing has changed then.
+#[derive(Debug, Error, PartialEq)]
+pub enum StepError {
+    /// The predictor rules out what was seen.
+    #[error(transparent)]
+    ZeroEvidence(#[from] ZeroEvidence),
+    /// The hidden vector has a number that is not finite.
+    #[error(transparent)]
+    NotFinite(#[from] NotFinite),
+}
+
 /// The network, its optimiser, and the state of the world that it follows.
 #[derive(Debug)]
 pub struct Autoencoder {
@@ -220,24 +231,31 @@ impl Autoencoder {
     /// [`Self::prediction`] is `u_{k+1}` and [`Self::hidden`] is `h_{k+1}`.
     ///
     /// # Errors
-    /// [`ZeroEvidence`] where the predictor rules out what was seen; nothing has changed then.
+    /// [`StepError`]; nothing has changed then.
     ///
     /// # Panics
     /// If the frame is of another grid, or of more observations.
-    pub fn step(&mut self, frame: &Frame) -> Result<Belief, ZeroEvidence> {
+    pub fn step(&mut self, frame: &Frame) -> Result<Belief, StepError> {
         let window = Window::new([frame]);
         assert_eq!(frame.values().dim(), self.shape.grid.dim(), "frame: grid");
         assert!(window.fits(&self.shape), "frame: observations");
         let estimate = self.correct(frame)?;
         let mut inference = self.take_inference();
         let mut prediction = self.no_prediction();
+        let mut hidden = self.hidden.clone();
         dispatch(Advance {
             inference: &mut inference,
             visits: window.visits(0),
-            hidden: &mut self.hidden,
+            hidden: &mut hidden,
             prediction: slice(&mut prediction),
         });
         self.inference = Some(inference);
+        // Softmax and ReLU would make numbers again of what is none.
+        if hidden.iter().any(|number| !number.is_finite()) {
+            let (update, tensor) = (self.n_updates, "the hidden vector".into());
+            return Err(NotFinite { update, tensor }.into());
+        }
+        self.hidden = hidden;
         self.prediction = accepted(prediction);
         Ok(estimate)
     }
@@ -305,19 +323,34 @@ impl Autoencoder {
         let loss =
             workspace.loss_and_gradient(&self.parameters, &mut statistics, window, dropout, hidden);
         let broken = self.not_finite(loss, &workspace.gradient);
-        if broken.is_none() {
-            let gradient = &workspace.gradient.numbers;
-            let parameters = &mut self.parameters.numbers;
-            self.adam.step(&self.settings.adam, parameters, gradient);
-            self.statistics = statistics;
-            self.inference = None;
-            self.n_updates += 1;
-        }
+        let broken = broken.or_else(|| self.move_by(&workspace.gradient, statistics));
         self.workspace = Some(workspace);
         broken.map_or(Ok(loss), |tensor| {
             let update = self.n_updates;
             Err(NotFinite { update, tensor })
         })
+    }
+
+    /// A step of Adam, unless it leads to a number that is not finite: then the tensor's name.
+    fn move_by(&mut self, gradient: &Tensors, statistics: Tensors) -> Option<String> {
+        let (mut adam, mut parameters) = (self.adam.clone(), self.parameters.clone());
+        let numbers = &mut parameters.numbers;
+        adam.step(&self.settings.adam, numbers, &gradient.numbers);
+        let broken = [&statistics, &parameters]
+            .into_iter()
+            .find_map(Tensors::not_finite);
+        if let Some(tensor) = broken {
+            return Some(format!("{tensor} after the update"));
+        }
+        for (name, moment) in [("first", &adam.first), ("second", &adam.second)] {
+            if let Some(tensor) = parameters.with_numbers(moment).not_finite() {
+                return Some(format!("adam.{name}.{tensor}"));
+            }
+        }
+        (self.adam, self.parameters, self.statistics) = (adam, parameters, statistics);
+        self.inference = None;
+        self.n_updates += 1;
+        None
     }
 
     /// The gradient of the last update.

@@ -48,7 +48,7 @@ mod window;
 mod x86;
 
 pub use adam::{Adam, AdamSettings};
-pub use autoencoder::{Autoencoder, AutoencoderSettings, NotFinite};
+pub use autoencoder::{Autoencoder, AutoencoderSettings, NotFinite, StepError};
 pub use checkpoint::CheckpointError;
 pub use dqn::{Dqn, DqnSettings, Track, Transition};
 pub use dropout::{ChannelMask, Dropout};

@@ -1,7 +1,7 @@
 //! Learns which action of [`ActionSet::beam`] to take (paper section III.E): beam search plans on the
 //! known-model filter's belief, and a DQN that sees a summary of it chooses what each path is for.
 
-use super::{Lesson, NotFinite, Site, Student};
+use super::{Lesson, NotFinite, Site, Student, StudentError};
 use crate::action::{Action, ActionSet};
 use crate::belief::Belief;
 use crate::checkpoint::{Contents, Problem};
@@ -47,6 +47,7 @@ pub struct DecisionsStudent {
     likelihood: Array2<f64>,
     pilots: Vec<Pilot>,
     owed: f64,
+    is_frozen: bool,
     times: [(&'static str, Duration); 2],
 }
 
@@ -143,6 +144,7 @@ impl DecisionsStudent {
             likelihood: model.likelihood().clone(),
             pilots: Vec::new(),
             owed: 0.0,
+            is_frozen: false,
             times: ["planning", "learning"].map(|part| (part, Duration::ZERO)),
         }
     }
@@ -184,14 +186,14 @@ impl Student for DecisionsStudent {
         &["epsilon"]
     }
 
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<bool, ZeroEvidence> {
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<bool, StudentError> {
         let pilots = observations.into_iter().map(|seen| Pilot::new(self, seen));
         self.pilots = pilots.collect::<Result<_, _>>()?;
-        // Transitions do not depend on where their worlds stand now.
-        Ok(true)
+        // Beliefs begin anew, wherever the worlds stand.
+        Ok(false)
     }
 
-    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), ZeroEvidence> {
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {
         let pilot = Pilot::new(self, observation)?;
         self.pilots[(world - self.site.worlds.start) as usize] = pilot;
         Ok(())
@@ -200,9 +202,13 @@ impl Student for DecisionsStudent {
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let start = Instant::now();
         let (decisions, config, n_moves) = (&self.decisions, &self.config, self.site.n_moves);
+        let is_frozen = self.is_frozen;
         let plan = |(index, pilot): (usize, &mut Pilot)| {
             let step = decisions.world_steps + index as u64;
-            pilot.action = decisions.dqn.act(&pilot.input, step);
+            pilot.action = match is_frozen {
+                true => decisions.dqn.best(&pilot.input),
+                false => decisions.dqn.act(&pilot.input, step),
+            };
             let action = &decisions.actions.actions()[pilot.action];
             let result = &pilot.observation.result;
             let random = (planner_seed(config, result.seed), result.step);
@@ -215,7 +221,7 @@ impl Student for DecisionsStudent {
         paths
     }
 
-    fn take_in(&mut self, observations: Vec<Observation>) -> Result<Tick, ZeroEvidence> {
+    fn take_in(&mut self, observations: Vec<Observation>) -> Result<Tick, StudentError> {
         let mut tick = Tick::default();
         for (pilot, observation) in self.pilots.iter_mut().zip(observations) {
             tick.reward += observation.result.reward;
@@ -262,8 +268,12 @@ impl Student for DecisionsStudent {
         Ok(lessons)
     }
 
-    fn rest(&mut self) {
-        self.owed = 0.0;
+    fn freeze(&mut self) {
+        self.is_frozen = true;
+    }
+
+    fn world_steps(&self) -> u64 {
+        self.decisions.world_steps
     }
 
     fn n_updates(&self) -> u64 {

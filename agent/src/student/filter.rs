@@ -1,11 +1,10 @@
 //! Learns the filter's parameters on several worlds at once: robots walk at random first, then plan on
 //! the belief of the filter as it is.
 
-use super::{Lesson, NotFinite, Site, Student};
+use super::{Lesson, NotFinite, Site, Student, StudentError};
 use crate::checkpoint::{Contents, Problem};
 use crate::client::Observation;
 use crate::config::AgentConfig;
-use crate::estimator::ZeroEvidence;
 use crate::estimator::learned_filter::Dimensions;
 use crate::learner::{KIND, LearnedModel, Learner, Progress};
 use crate::metrics::Tick;
@@ -25,6 +24,7 @@ pub struct FilterStudent {
     pilots: Vec<Pilot>,
     /// Where a checkpoint left the worlds.
     stands: BTreeMap<u32, Stand>,
+    is_frozen: bool,
     planning: Duration,
     learning: Duration,
 }
@@ -65,13 +65,17 @@ impl FilterStudent {
             site,
             config: config.clone(),
             pilots: Vec::new(),
+            is_frozen: false,
             planning: Duration::ZERO,
             learning: Duration::ZERO,
         }
     }
 
-    /// Worlds whose robots walk at random: all at first, some for good.
+    /// Worlds whose robots walk at random: all at first, some for good; none of a frozen student.
     fn n_walking(&self) -> usize {
+        if self.is_frozen {
+            return 0;
+        }
         let learning = &self.config.learning;
         if self.learner.world_steps() < learning.explore_steps {
             return self.pilots.len();
@@ -89,7 +93,7 @@ impl Student for FilterStudent {
         &[]
     }
 
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<bool, ZeroEvidence> {
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<bool, StudentError> {
         let worlds = self.site.worlds.clone();
         let goes_on = Stand::any_is_of(&self.stands, worlds.clone(), &observations);
         if !goes_on {
@@ -104,7 +108,7 @@ impl Student for FilterStudent {
         Ok(goes_on)
     }
 
-    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), ZeroEvidence> {
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {
         let mut pilot = Pilot::new(&self.learned, self.site.shape, observation, &self.config);
         pilot.begin(world, &mut self.learner)?;
         self.pilots[(world - self.site.worlds.start) as usize] = pilot;
@@ -128,7 +132,7 @@ impl Student for FilterStudent {
         paths
     }
 
-    fn take_in(&mut self, observations: Vec<Observation>) -> Result<Tick, ZeroEvidence> {
+    fn take_in(&mut self, observations: Vec<Observation>) -> Result<Tick, StudentError> {
         let mut tick = Tick::default();
         let worlds = self.site.worlds.clone().zip(observations);
         for ((world, observation), pilot) in worlds.zip(&mut self.pilots) {
@@ -156,8 +160,12 @@ impl Student for FilterStudent {
         Ok(updates?.into_iter().map(lesson).collect())
     }
 
-    fn rest(&mut self) {
-        self.learner.rest();
+    fn freeze(&mut self) {
+        self.is_frozen = true;
+    }
+
+    fn world_steps(&self) -> u64 {
+        self.learner.world_steps()
     }
 
     fn n_updates(&self) -> u64 {

@@ -5,13 +5,12 @@
 //! rule (eq. 10), an action from `h` (eq. 17), a path for it (eq. 15), the path's frame and reward; then one
 //! step of Adam on each network (eq. 19), with step sizes of their own ([`crate::config::StepSize`]).
 
-use super::{Lesson, NotFinite, Site, Student};
+use super::{Lesson, NotFinite, Site, Student, StudentError};
 use crate::belief::Belief;
 use crate::checkpoint::{Bytes, Contents, Problem, Tensor};
 use crate::client::{Observation, Place};
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
-use crate::estimator::ZeroEvidence;
 use crate::learned::{LearnedNetwork, likelihood};
 use crate::metrics::Tick;
 use crate::network::dqn::Track;
@@ -20,8 +19,8 @@ use crate::planner::{Objective, Planner, PlanningProblem};
 use crate::policy::Policy;
 use crate::reward::{RewardEstimate, met};
 use crate::scoring::score;
-use protocol::frame::Coverage;
 use protocol::model::MAX_VALUES;
+use protocol::path::fly;
 use protocol::{Frame, Move, Shape};
 use std::time::{Duration, Instant};
 
@@ -56,11 +55,13 @@ pub struct NetworkStudent {
     observation: Option<Observation>,
     decision: Option<Decision>,
     track: Track,
+    is_frozen: bool,
     times: [(&'static str, Duration); 4],
 }
 
-/// The action of a step, and what it was chosen on.
+/// The action of a step, what it was chosen on, and the cells that its path visits.
 struct Decision {
+    visited: Vec<usize>,
     hidden: Vec<f32>,
     action: usize,
     value: f32,
@@ -189,6 +190,7 @@ impl Progress {
     /// [`Problem`] names what is missing or of another form; some of it may have been taken over then.
     pub fn load(&mut self, contents: &Contents) -> Result<(), Problem> {
         let numbers = |name: &str, dims: &[usize]| contents.tensor(name, dims).map(<[f32]>::to_vec);
+        squares_are_not_negative(contents)?;
         let counters = [contents.count("adam_steps")?, contents.count("updates")?];
         self.autoencoder.load(numbers, counters)?;
         self.dqn.load(contents)?;
@@ -197,16 +199,24 @@ impl Progress {
         self.reward.rewards = contents.floats("reward.rewards", n_states)?;
         self.load_replay(contents)?;
         self.iterations = contents.count("iterations")?;
-        self.place = contents.counts("place")?.try_into().ok();
+        let place = contents.counts("place")?;
+        self.place = match place[..] {
+            [] => None,
+            _ => Some(place.try_into().map_err(|got: Vec<u64>| Problem::Value {
+                name: "place".into(),
+                expected: "five numbers".into(),
+                got: got.len().to_string(),
+            })?),
+        };
         Ok(())
     }
 
     fn load_replay(&mut self, contents: &Contents) -> Result<(), Problem> {
         let shape = self.autoencoder.shape();
         let rows = contents.rows("replay.frames", shape.grid.n_cells())?;
-        let tracks = contents.counts("replay.tracks")?;
+        let mut tracks = contents.counts("replay.tracks")?.into_iter().peekable();
         for (index, row) in rows.chunks_exact(shape.grid.n_cells()).enumerate() {
-            if tracks.contains(&(index as u64)) {
+            if tracks.next_if_eq(&(index as u64)).is_some() {
                 self.replay.begin();
             }
             let frame = Frame::from_bytes(shape.grid, shape.n_observations, row);
@@ -218,6 +228,22 @@ impl Progress {
         }
         Ok(())
     }
+}
+
+/// Means of squares, whose roots are taken.
+fn squares_are_not_negative(contents: &Contents) -> Result<(), Problem> {
+    let is_square = |name: &str| name.contains("adam.second.") || name.ends_with("running_var");
+    let squares = contents.tensors.iter().filter(|(name, _)| is_square(name));
+    for (name, tensor) in squares {
+        if let Some(got) = tensor.numbers.iter().find(|number| **number < 0.0) {
+            return Err(Problem::Value {
+                name: name.clone(),
+                expected: "numbers from 0 on".into(),
+                got: got.to_string(),
+            });
+        }
+    }
+    Ok(())
 }
 
 impl NetworkStudent {
@@ -236,6 +262,7 @@ impl NetworkStudent {
             config: config.clone(),
             observation: None,
             decision: None,
+            is_frozen: false,
             times: ["planning", "inference", "dqn", "autoencoder"]
                 .map(|part| (part, Duration::ZERO)),
         }
@@ -247,23 +274,18 @@ impl NetworkStudent {
     }
 
     /// Reads a frame: `h`, the estimate and the next predictor.
-    fn read(&mut self, frame: &Frame) -> Result<Belief, ZeroEvidence> {
+    fn read(&mut self, frame: &Frame) -> Result<Belief, StudentError> {
         let start = Instant::now();
         let estimate = self.progress.autoencoder.step(frame);
         self.times[1].1 += start.elapsed();
-        estimate
+        Ok(estimate?)
     }
 
     /// Adds the transition to the DQN's replay, and what the path met to the estimate of rewards.
-    fn remember(&mut self, estimate: &Belief, is_full: bool) {
-        let Observation { result, frame } = self.observation();
-        let reward = result.reward;
-        // A full frame does not tell which cells the path visited.
-        if !is_full {
-            let met = met(estimate, frame);
-            self.progress.reward.add(&met, reward);
-        }
+    fn remember(&mut self, estimate: &Belief, reward: f64) {
         if let Some(decision) = &self.decision {
+            let met = met(estimate, decision.visited.iter().copied());
+            self.progress.reward.add(&met, reward);
             let step = Transition {
                 input: decision.hidden.clone(),
                 action: decision.action,
@@ -296,7 +318,8 @@ impl NetworkStudent {
         let Some(window) = window.filter(|window| window.has_targets()) else {
             return Ok([None; 2]);
         };
-        let rate = config.step_size.at(number);
+        // Both step sizes go by the iteration, as eq. 20 compares them.
+        let rate = config.step_size.at(self.progress.iterations);
         self.progress.autoencoder.set_learning_rate(rate as f32);
         let loss = self.progress.autoencoder.update(&window);
         self.times[3].1 += start.elapsed();
@@ -314,10 +337,10 @@ impl Student for NetworkStudent {
     }
 
     fn wants_full_frames(&self) -> bool {
-        self.progress.iterations < self.config.autoencoder.full_frames
+        !self.is_frozen && self.progress.iterations < self.config.autoencoder.full_frames
     }
 
-    fn attach(&mut self, mut observations: Vec<Observation>) -> Result<bool, ZeroEvidence> {
+    fn attach(&mut self, mut observations: Vec<Observation>) -> Result<bool, StudentError> {
         let observation = observations.remove(0);
         let shown = self.progress.replay.frames().last();
         let goes_on =
@@ -330,7 +353,7 @@ impl Student for NetworkStudent {
         Ok(goes_on)
     }
 
-    fn begin(&mut self, _: u32, observation: Observation) -> Result<(), ZeroEvidence> {
+    fn begin(&mut self, _: u32, observation: Observation) -> Result<(), StudentError> {
         self.progress.place = Some(observation.place());
         self.track = self.progress.dqn.track();
         self.progress.autoencoder.forget();
@@ -345,7 +368,10 @@ impl Student for NetworkStudent {
         let start = Instant::now();
         let hidden = self.progress.autoencoder.hidden().to_vec();
         let dqn = &self.progress.dqn;
-        let action = dqn.act(&hidden, self.progress.iterations);
+        let action = match self.is_frozen {
+            true => dqn.best(&hidden),
+            false => dqn.act(&hidden, self.progress.iterations),
+        };
         let value = dqn.values(&hidden)[action];
         let values = self.objectives[action].values(self.progress.autoencoder.prediction());
         let observation = self.observation();
@@ -358,6 +384,7 @@ impl Student for NetworkStudent {
         };
         let plan = self.planner.plan(&problem);
         self.decision = Some(Decision {
+            visited: fly(self.site.shape, problem.start, &plan.moves).visited,
             hidden,
             action,
             value,
@@ -366,17 +393,16 @@ impl Student for NetworkStudent {
         vec![plan.moves]
     }
 
-    fn take_in(&mut self, mut observations: Vec<Observation>) -> Result<Tick, ZeroEvidence> {
+    fn take_in(&mut self, mut observations: Vec<Observation>) -> Result<Tick, StudentError> {
         let observation = observations.remove(0);
         let frame = observation.frame.clone();
-        let is_full = observation.result.coverage == Coverage::Full as u32;
         let prediction = self.progress.autoencoder.prediction();
         let score = score(prediction, &likelihood(&self.progress.autoencoder), &frame);
         self.progress.place = Some(observation.place());
         let reward = observation.result.reward;
         self.observation = Some(observation);
         let estimate = self.read(&frame)?;
-        self.remember(&estimate, is_full);
+        self.remember(&estimate, reward);
         self.progress.replay.push(frame);
         self.progress.iterations += 1;
         Ok(Tick {
@@ -410,6 +436,14 @@ impl Student for NetworkStudent {
             rate,
             more,
         }])
+    }
+
+    fn freeze(&mut self) {
+        self.is_frozen = true;
+    }
+
+    fn world_steps(&self) -> u64 {
+        self.progress.iterations
     }
 
     fn n_updates(&self) -> u64 {
