@@ -1,7 +1,8 @@
 //! `emberwatch-agent train` with the autoencoder: the paper's Algorithm 1, small.
 
 use crate::commands::{AGENT, check};
-use crate::harness::{Ended, Server, run};
+use crate::harness::{Ended, Server, fly, run};
+use protocol::Move;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tempfile::TempDir;
@@ -125,9 +126,79 @@ fn another_world_is_begun_anew() {
     assert_eq!(rows.len(), 40);
     assert_eq!(rows[39][1], "40");
     assert!(!rows[39][LOSS].is_empty());
-    let frozen = place.train("out", &format!("{WORLD} --steps 5 --resume --freeze"));
-    assert_eq!(frozen[44][0], rows[39][0], "no update");
-    assert!(frozen[44][LOSS].is_empty());
+}
+
+#[test]
+fn frozen_networks_stay_as_they_are() {
+    let place = Place::new(SETTINGS);
+    let learned = place.train("out", &format!("{WORLD} --steps 20"));
+    let checkpoint = std::fs::read(place.checkpoint("out")).expect("a checkpoint");
+    let after = place.train("out", &format!("{WORLD} --steps 9 --resume --freeze"));
+    assert_eq!(learned, after, "metrics of learning");
+    let again = std::fs::read(place.checkpoint("out")).expect("a checkpoint");
+    assert!(checkpoint == again, "the checkpoint changed");
+    let frozen = std::fs::read_to_string(place.path("out").join("frozen.csv"));
+    assert_eq!(frozen.expect("its own metrics").lines().count(), 1 + 9);
+}
+
+#[test]
+fn a_kill_costs_no_more_than_the_steps_since_the_checkpoint() {
+    let place = Place::new(SETTINGS);
+    let rows = place.train("out", &format!("{WORLD} --steps 20"));
+    let metrics = place.path("out").join("metrics.csv");
+    let text = std::fs::read_to_string(&metrics).expect("the metrics");
+    let last = text.lines().last().expect("rows").replace(",20,", ",21,");
+    // What a kill leaves: a row after the checkpoint, and half of another.
+    std::fs::write(&metrics, format!("{text}{last}\n{}", &last[..9])).expect("written");
+    let after = place.train("out", &format!("{WORLD} --steps 5 --resume"));
+    assert_eq!(after[..20], rows[..]);
+    let steps: Vec<&str> = after[20..].iter().map(|row| &*row[1]).collect();
+    assert_eq!(steps, ["21", "22", "23", "24", "25"]);
+    std::fs::write(&metrics, "update,loss\n").expect("written");
+    let resume = place.words("out", &format!("{WORLD} --steps 5 --resume"));
+    check(
+        AGENT,
+        &resume,
+        &[
+            "metrics.csv: expected the columns update,world_steps",
+            "got update,loss",
+        ],
+    );
+}
+
+#[test]
+fn episodes_that_end_are_begun_anew() {
+    let place = Place::new(&SETTINGS.replace("[dqn]", "[dqn]\nn_step = 2"));
+    let server = Server::start(&format!("{WORLD} --coverage client --max-steps 7"));
+    let instance = format!("--instance {}", server.instance.name());
+    let rows = place.train("out", &format!("{instance} --steps 30"));
+    assert!(!rows[29][LOSS].is_empty() && !rows[29][DQN_LOSS].is_empty());
+    assert_eq!(server.status().worlds[0].info.step, 30 % 7);
+    // An agent that stopped at an episode's end leaves a world that only a reset goes on from.
+    let mut client = server.acquire(0..1);
+    for _ in 30 % 7..7 {
+        fly(&mut client, vec![Move::Up; 5]);
+    }
+    client.release().expect("released");
+    let rows = place.train("out", &format!("{instance} --steps 3 --resume"));
+    assert_eq!(rows.len(), 33);
+    assert_eq!(server.status().worlds[0].info.step, 3);
+}
+
+#[test]
+fn full_observation_tells_which_state_pays() {
+    let place = Place::new(SETTINGS);
+    let server = Server::start(&format!("{WORLD} --coverage full"));
+    let name = server.instance.name();
+    let rows = place.train("out", &format!("--instance {name} --steps 30"));
+    assert!(!rows[29][LOSS].is_empty());
+    let rewards: f64 = rows
+        .iter()
+        .filter_map(|row| row[4].parse::<f64>().ok())
+        .sum();
+    let stored = contents(&place.checkpoint("out"));
+    let estimate = stored.floats("reward.rewards", 3).expect("three states");
+    assert_eq!(rewards > 0.0, estimate.iter().sum::<f64>() > 0.0);
 }
 
 #[test]
@@ -146,10 +217,12 @@ fn numbers_that_are_not_finite_stop_training_with_a_checkpoint() {
         }
         agent::checkpoint::write(&path, "autoencoder", &broken).expect("written");
         let resume = place.words("out", &format!("{WORLD} --steps 10 --resume"));
-        let words = ["update ", "expected finite numbers", "are in"];
+        let words = ["world steps: update ", "expected finite numbers", "is in"];
         check(AGENT, &resume, &words);
         let saved = contents(&path);
         assert!(saved.tensors.contains_key("W_obs_param"), "{section}");
+        // What was saved is read again, and stops again.
+        check(AGENT, &resume, &words);
     }
 }
 
