@@ -86,12 +86,12 @@ pub trait Student {
         false
     }
 
-    /// Takes in what the worlds show when it comes to them. Returns whether it goes on in one of them
-    /// where its checkpoint left it.
+    /// Takes in what the worlds show when it comes to them. Returns in how many of them it goes on where
+    /// its checkpoint left it.
     ///
     /// # Errors
     /// [`StudentError`].
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<bool, StudentError>;
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError>;
 
     /// A world begins anew.
     ///

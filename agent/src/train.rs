@@ -249,9 +249,11 @@ impl Trainee {
             }
         }
         let attached = student.attach(observations);
-        let goes_on = attached.map_err(|problem| training.stopped(problem, &*student))?;
-        if training.resume && !goes_on {
-            tracing::info!("the worlds are not where the checkpoint left them: beliefs begin anew");
+        let n_gone_on = attached.map_err(|problem| training.stopped(problem, &*student))?;
+        let n_new = training.worlds.len() - n_gone_on;
+        if training.resume && n_new > 0 {
+            let worlds = n_new;
+            tracing::info!(worlds, "not where the checkpoint left them: beliefs begin anew");
         }
         let now = Instant::now();
         Ok(Self {

@@ -186,11 +186,11 @@ impl Student for DecisionsStudent {
         &["epsilon"]
     }
 
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<bool, StudentError> {
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError> {
         let pilots = observations.into_iter().map(|seen| Pilot::new(self, seen));
         self.pilots = pilots.collect::<Result<_, _>>()?;
         // Beliefs begin anew, wherever the worlds stand.
-        Ok(false)
+        Ok(0)
     }
 
     fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {

@@ -93,19 +93,20 @@ impl Student for FilterStudent {
         &[]
     }
 
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<bool, StudentError> {
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError> {
         let worlds = self.site.worlds.clone();
-        let goes_on = Stand::any_is_of(&self.stands, worlds.clone(), &observations);
-        if !goes_on {
+        let mut n_gone_on = 0;
+        if !Stand::any_is_of(&self.stands, worlds.clone(), &observations) {
             // Frames of other worlds, perhaps of another model.
             self.learner.forget();
         }
         for (world, observation) in worlds.zip(observations) {
             let mut pilot = Pilot::new(&self.learned, self.site.shape, observation, &self.config);
-            pilot.go_on(world, self.stands.get(&world), &mut self.learner)?;
+            let stand = self.stands.get(&world);
+            n_gone_on += usize::from(pilot.go_on(world, stand, &mut self.learner)?);
             self.pilots.push(pilot);
         }
-        Ok(goes_on)
+        Ok(n_gone_on)
     }
 
     fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {

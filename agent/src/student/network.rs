@@ -340,7 +340,7 @@ impl Student for NetworkStudent {
         !self.is_frozen && self.progress.iterations < self.config.autoencoder.full_frames
     }
 
-    fn attach(&mut self, mut observations: Vec<Observation>) -> Result<bool, StudentError> {
+    fn attach(&mut self, mut observations: Vec<Observation>) -> Result<usize, StudentError> {
         let observation = observations.remove(0);
         let shown = self.progress.replay.frames().last();
         let goes_on =
@@ -350,7 +350,7 @@ impl Student for NetworkStudent {
         } else {
             self.begin(self.site.worlds.start, observation)?;
         }
-        Ok(goes_on)
+        Ok(usize::from(goes_on))
     }
 
     fn begin(&mut self, _: u32, observation: Observation) -> Result<(), StudentError> {
