@@ -249,8 +249,16 @@ mod tests {
             let action = set.named(&name).expect("an action");
             let mut planner = crate::planner::BeamSearch::default();
             let plan = action.plan(&mut planner, &belief, start, 24, (0, 0));
-            let end = protocol::path::fly(shape(), start, &plan.moves).end;
-            assert_eq!(region.distance(end, shape()), 0, "{name}: {end}");
+            let flight = protocol::path::fly(shape(), start, &plan.moves);
+            // A block of eight cells does not fill a path.
+            let mut visited = flight.visited.iter().map(|&cell| shape().cell(cell));
+            let is_there = visited.any(|cell| region.distance(cell, shape()) == 0);
+            assert!(is_there, "{name}: {}", flight.end);
+            assert!(
+                region.distance(flight.end, shape()) <= 3,
+                "{name}: {}",
+                flight.end
+            );
         }
     }
 

@@ -253,7 +253,10 @@ impl Trainee {
         let n_new = training.worlds.len() - n_gone_on;
         if training.resume && n_new > 0 {
             let worlds = n_new;
-            tracing::info!(worlds, "not where the checkpoint left them: beliefs begin anew");
+            tracing::info!(
+                worlds,
+                "not where the checkpoint left them: beliefs begin anew"
+            );
         }
         let now = Instant::now();
         Ok(Self {
