@@ -204,13 +204,6 @@ impl Dense {
         (row * self.shape.input[1] + col) * self.shape.channels_in
     }
 
-    /// [`Self::input_at`] of an output's number.
-    #[inline(always)]
-    fn input_of(&self, position: usize, tap: usize) -> usize {
-        let cols = self.shape.output[1];
-        self.input_at(position / cols, position % cols, tap)
-    }
-
     /// `relu(mask (W x + b))` of one frame, of the input channels that are kept.
     #[inline(always)]
     pub(crate) fn forward<A: Arithmetic>(
@@ -277,60 +270,89 @@ impl Dense {
             add_lanes::<A>(&mut gradient.bias, position);
         }
         for tap in 0..self.shape.taps() {
-            for lanes in (0..self.shape.channels_in).step_by(LANES) {
-                self.input_gradient::<A>(kept, dz, tap, lanes, dx);
-                self.weight_gradient::<A>(input, kept, dz, tap, lanes, &mut gradient.weight);
+            for outs in kept.chunks(OUTS) {
+                let mut first = 0;
+                while first + 2 * LANES <= self.shape.channels_in {
+                    let place = Place { tap, outs, first };
+                    self.input_gradient::<A, 2>(place, dz, dx);
+                    self.weight_gradient::<A, 2>(place, input, dz, &mut gradient.weight);
+                    first += 2 * LANES;
+                }
+                if first < self.shape.channels_in {
+                    let place = Place { tap, outs, first };
+                    self.input_gradient::<A, 1>(place, dz, dx);
+                    self.weight_gradient::<A, 1>(place, input, dz, &mut gradient.weight);
+                }
             }
         }
     }
 
+    /// Calls `each` with every output's `dz` and with where the inputs of a place begin.
     #[inline(always)]
-    fn input_gradient<A: Arithmetic>(
+    fn each_output(
         &self,
-        kept: &[u16],
+        place: Place<'_>,
         dz: &[f32],
-        tap: usize,
-        lanes: usize,
+        mut each: impl FnMut(&[f32; LANES], usize),
+    ) {
+        let cols = self.shape.output[1];
+        let step = self.shape.stride * self.shape.channels_in;
+        for (row, dz) in dz.as_chunks().0.chunks_exact(cols).enumerate() {
+            let first = self.input_at(row, 0, place.tap) + place.first;
+            for (col, dz) in dz.iter().enumerate() {
+                each(dz, first + col * step);
+            }
+        }
+    }
+
+    /// Of `VECTORS` times sixteen input channels, through [`OUTS`] outputs.
+    #[inline(always)]
+    fn input_gradient<A: Arithmetic, const VECTORS: usize>(
+        &self,
+        place: Place<'_>,
+        dz: &[f32],
         dx: &mut [f32],
     ) {
-        for outs in kept.chunks(OUTS) {
-            let (at, mut weights) = (places(outs), [Lanes::ZERO; OUTS]);
-            for (weights, &out) in weights.iter_mut().zip(outs) {
-                *weights = Lanes::load(&self.weight[self.weight_at(out, tap) + lanes..]);
-            }
-            for (position, dz) in dz.as_chunks::<LANES>().0.iter().enumerate() {
-                let dx = &mut dx[self.input_of(position, tap) + lanes..];
-                let mut sum = Lanes::load(dx);
-                for out in 0..OUTS {
-                    sum = sum.add_scaled::<A>(dz[at[out]], weights[out]);
-                }
-                sum.store(dx);
-            }
+        let (at, mut weights) = (places(place.outs), [[Lanes::ZERO; VECTORS]; OUTS]);
+        for (weights, &out) in weights.iter_mut().zip(place.outs) {
+            *weights = vectors(&self.weight[self.weight_at(out, place.tap) + place.first..]);
         }
+        self.each_output(place, dz, |dz, input| {
+            let dx = &mut dx[input..][..VECTORS * LANES];
+            let mut sums: [Lanes; VECTORS] = vectors(dx);
+            for out in 0..OUTS {
+                for (sum, weights) in sums.iter_mut().zip(weights[out]) {
+                    *sum = sum.add_scaled::<A>(dz[at[out]], weights);
+                }
+            }
+            for (dx, sum) in dx.as_chunks_mut().0.iter_mut().zip(sums) {
+                *dx = sum.0;
+            }
+        });
     }
 
+    /// From `VECTORS` times sixteen input channels to [`OUTS`] outputs.
     #[inline(always)]
-    fn weight_gradient<A: Arithmetic>(
+    fn weight_gradient<A: Arithmetic, const VECTORS: usize>(
         &self,
+        place: Place<'_>,
         input: &[f32],
-        kept: &[u16],
         dz: &[f32],
-        tap: usize,
-        lanes: usize,
         gradient: &mut [f32],
     ) {
-        for outs in kept.chunks(OUTS) {
-            let at = places(outs);
-            let mut sums = [Lanes::ZERO; OUTS];
-            for (position, dz) in dz.as_chunks::<LANES>().0.iter().enumerate() {
-                let x = Lanes::load(&input[self.input_of(position, tap) + lanes..]);
-                for out in 0..OUTS {
-                    sums[out] = sums[out].add_scaled::<A>(dz[at[out]], x);
+        let (at, mut sums) = (places(place.outs), [[Lanes::ZERO; VECTORS]; OUTS]);
+        self.each_output(place, dz, |dz, first| {
+            let x: [Lanes; VECTORS] = vectors(&input[first..]);
+            for out in 0..OUTS {
+                for (sum, x) in sums[out].iter_mut().zip(x) {
+                    *sum = sum.add_scaled::<A>(dz[at[out]], x);
                 }
             }
-            for (sum, &out) in sums.iter().zip(outs) {
-                let gradient = &mut gradient[self.weight_at(out, tap) + lanes..];
-                sum.add::<A>(Lanes::load(gradient)).store(gradient);
+        });
+        for (sums, &out) in sums.iter().zip(place.outs) {
+            let gradient = &mut gradient[self.weight_at(out, place.tap) + place.first..];
+            for (gradient, sum) in gradient.as_chunks_mut().0.iter_mut().zip(sums) {
+                *gradient = sum.add::<A>(Lanes(*gradient)).0;
             }
         }
     }
@@ -355,6 +377,22 @@ impl Dense {
         let bias = gradient.bias[..self.shape.channels_out].to_vec();
         (weight.collect(), bias)
     }
+}
+
+/// Which weights a part of the backward pass is about.
+#[derive(Clone, Copy)]
+struct Place<'a> {
+    tap: usize,
+    /// Up to [`OUTS`] output channels.
+    outs: &'a [u16],
+    /// The first input channel.
+    first: usize,
+}
+
+/// The first `VECTORS` times sixteen numbers.
+#[inline(always)]
+fn vectors<const VECTORS: usize>(numbers: &[f32]) -> [Lanes; VECTORS] {
+    std::array::from_fn(|vector| Lanes::load(&numbers[vector * LANES..]))
 }
 
 /// The lanes of up to [`OUTS`] channels; the last one's where there are fewer.

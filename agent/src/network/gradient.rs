@@ -97,3 +97,94 @@ fn update_running(statistics: &mut Tensors, name: &str, norm: &Norm) {
         .update_running(&mut new_mean, new_variance);
     statistics.get_mut(&mean).copy_from_slice(&new_mean);
 }
+
+#[cfg(test)]
+mod tests {
+    use crate::network::lanes::Width;
+    use crate::network::lanes::tests::at_width;
+    use crate::network::{Autoencoder, AutoencoderSettings, Dqn, DqnSettings, Transition, Window};
+    use protocol::frame::Frame;
+    use protocol::grid::Shape;
+    use protocol::randomness::split_mix;
+
+    /// Named numbers.
+    type Numbers = Vec<(String, Vec<f32>)>;
+
+    /// Frames in which one cell of `one_in` is seen.
+    fn frames(shape: Shape, one_in: u64) -> Vec<Frame> {
+        let frame = |index: u64| {
+            let mut frame = Frame::empty(shape);
+            for cell in 0..shape.n_cells() {
+                let bits = split_mix(index, cell as u64);
+                if bits.is_multiple_of(one_in) {
+                    frame.observe(cell, ((bits >> 32) % 3) as u8);
+                }
+            }
+            frame
+        };
+        (0..24).map(frame).collect()
+    }
+
+    /// Loss and gradient of an update, and the prediction of a step after it.
+    fn autoencoder(grid: [usize; 2], one_in: u64) -> Numbers {
+        let shape = Shape::new(grid[0], grid[1]).expect("shape");
+        let frames = frames(shape, one_in);
+        let mut network = Autoencoder::new(AutoencoderSettings::paper_large(), shape, 3, 3, 1);
+        let loss = network.update(&Window::new(&frames)).expect("finite");
+        let gradient = network.gradient().expect("an update").iter();
+        let mut numbers: Numbers = gradient
+            .map(|(name, _, numbers)| (name.to_owned(), numbers.to_vec()))
+            .collect();
+        network.step(&frames[0]).expect("possible frame");
+        let prediction = network.prediction().as_slice().to_vec();
+        numbers.extend([
+            ("loss".into(), vec![loss as f32]),
+            ("prediction".into(), prediction),
+        ]);
+        numbers
+    }
+
+    fn dqn() -> Numbers {
+        let number = |index: u64| (split_mix(7, index) >> 40) as f32 / (1 << 24) as f32;
+        let vector = |first: u64| (0..5).map(|i| number(first + i)).collect();
+        let transition = |row: u64| Transition {
+            input: vector(row * 100),
+            action: (row % 3) as usize,
+            reward: number(row * 100 + 50),
+            next: vector(row * 100 + 20),
+        };
+        let batch: Vec<Transition> = (0..50).map(transition).collect();
+        let mut dqn = Dqn::new(DqnSettings::paper(), 5, 3, 1);
+        let loss = dqn.learn(&batch).expect("finite");
+        let values = dqn.values(&batch[0].input);
+        vec![("loss".into(), vec![loss]), ("values".into(), values)]
+    }
+
+    /// No tensor differs by more than a share of its largest number.
+    fn check(what: &str, numbers: impl Fn() -> Numbers + Sync) {
+        let narrowest = at_width(Width::Portable, &numbers);
+        for width in [Width::Avx2, Width::Avx512] {
+            let others = at_width(width, &numbers);
+            for ((name, one), (_, other)) in narrowest.iter().zip(&others) {
+                let largest = one.iter().fold(1e-6_f32, |largest, x| largest.max(x.abs()));
+                let apart = one
+                    .iter()
+                    .zip(other)
+                    .map(|(one, other)| (one - other).abs());
+                let worst = apart.fold(0.0, f32::max) / largest;
+                assert!(worst < 1e-3, "{what}, {width:?}, {name}: off by {worst}");
+            }
+            if Width::widest() >= Width::Avx2 {
+                assert_ne!(narrowest, others, "{what}: both with {width:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn every_vector_width_gives_the_same_updates_and_steps_up_to_rounding() {
+        check("paths", || autoencoder([64, 64], 100));
+        check("full frames", || autoencoder([64, 64], 1));
+        check("a padded grid", || autoencoder([20, 33], 10));
+        check("dqn", dqn);
+    }
+}

@@ -55,28 +55,47 @@ pub(crate) trait Kernel {
     fn run<A: Arithmetic>(self);
 }
 
+/// Sets of instructions, the widest vectors last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[cfg_attr(not(target_arch = "x86_64"), expect(dead_code))]
+pub(crate) enum Width {
+    Portable,
+    Avx2,
+    Avx512,
+}
+
+impl Width {
+    /// The widest that this CPU has.
+    pub(crate) fn widest() -> Self {
+        #[cfg(target_arch = "x86_64")]
+        {
+            let fused = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+            if fused && is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512vl")
+            {
+                return Self::Avx512;
+            }
+            if fused {
+                return Self::Avx2;
+            }
+        }
+        Self::Portable
+    }
+}
+
 /// Runs a kernel with the best instructions of this CPU.
 pub(crate) fn dispatch(kernel: impl Kernel) {
-    #[cfg(target_arch = "x86_64")]
-    {
-        use super::x86;
-        let fused = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
-        if fused && is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512vl") {
-            #[expect(unsafe_code, reason = "sound with AVX-512, which this CPU has")]
-            unsafe {
-                x86::run_with_avx512(kernel);
-            }
-            return;
-        }
-        if fused {
-            #[expect(unsafe_code, reason = "sound with AVX2 and FMA, which this CPU has")]
-            unsafe {
-                x86::run_with_avx2(kernel);
-            }
-            return;
-        }
+    let width = Width::widest();
+    #[cfg(test)]
+    let width = width.min(tests::LIMIT.get());
+    match width {
+        #[cfg(target_arch = "x86_64")]
+        #[expect(unsafe_code, reason = "sound with AVX-512, which this CPU has")]
+        Width::Avx512 => unsafe { super::x86::run_with_avx512(kernel) },
+        #[cfg(target_arch = "x86_64")]
+        #[expect(unsafe_code, reason = "sound with AVX2 and FMA, which this CPU has")]
+        Width::Avx2 => unsafe { super::x86::run_with_avx2(kernel) },
+        _ => kernel.run::<Portable>(),
     }
-    kernel.run::<Portable>();
 }
 
 /// Sixteen numbers.
@@ -148,8 +167,23 @@ pub(crate) const fn whole_lanes(length: usize) -> usize {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
+    use std::cell::Cell;
+
+    thread_local! {
+        /// The widest vectors that kernels of this thread may use.
+        pub(crate) static LIMIT: Cell<Width> = const { Cell::new(Width::Avx512) };
+    }
+
+    /// Runs something on two threads whose kernels use no wider vectors.
+    pub(crate) fn at_width<T: Send>(width: Width, work: impl FnOnce() -> T + Send) -> T {
+        let threads = rayon::ThreadPoolBuilder::new()
+            .num_threads(2)
+            .start_handler(move |_| LIMIT.set(width))
+            .build();
+        threads.expect("threads").install(work)
+    }
 
     /// What every kind of arithmetic must give, up to the rounding of the product.
     struct Check;
@@ -170,14 +204,8 @@ mod tests {
 
     #[test]
     fn every_arithmetic_is_that_of_single_numbers() {
-        dispatch(Check);
-        Check.run::<Portable>();
-        #[cfg(target_arch = "x86_64")]
-        if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-            #[expect(unsafe_code, reason = "sound with AVX2 and FMA, which this CPU has")]
-            unsafe {
-                super::super::x86::run_with_avx2(Check);
-            }
+        for width in [Width::Portable, Width::Avx2, Width::Avx512] {
+            at_width(width, || dispatch(Check));
         }
     }
 

@@ -7,7 +7,6 @@ use super::lanes::{Arithmetic, LANES, Lanes, whole_lanes};
 /// The matrix, each channel's cells padded to whole lanes.
 #[derive(Debug)]
 pub(crate) struct Seed {
-    hidden: usize,
     channels: usize,
     cells: usize,
     /// `[hidden][channel][cell]`.
@@ -26,7 +25,6 @@ impl Seed {
             to[..cells].copy_from_slice(from);
         }
         Self {
-            hidden,
             channels,
             cells,
             weight: padded,
@@ -76,28 +74,27 @@ impl Seed {
         }
     }
 
-    /// From `dz` of one kept channel: adds to the gradients of h and of the weights.
+    /// From `dz` of one kept channel: adds to the gradients of h, whose lanes remain to be summed, and
+    /// of the weights.
     #[inline(always)]
     pub(crate) fn backward<A: Arithmetic>(
         &self,
         h: &[f32],
         channel: u16,
         dz: &[f32],
-        d_h: &mut [f32],
+        d_h: &mut [Lanes],
         d_weight: &mut [f32],
     ) {
-        for input in 0..self.hidden {
-            let mut sum = Lanes::ZERO;
+        for (input, (h, sum)) in h.iter().zip(d_h).enumerate() {
             for first in (0..dz.len()).step_by(LANES) {
                 let at = self.at(input, channel, first);
                 let dz = Lanes::load(&dz[first..]);
-                sum = sum.add_product::<A>(dz, Lanes::load(&self.weight[at..]));
+                *sum = sum.add_product::<A>(dz, Lanes::load(&self.weight[at..]));
                 let d_weight = &mut d_weight[at..];
                 Lanes::load(d_weight)
-                    .add_scaled::<A>(h[input], dz)
+                    .add_scaled::<A>(*h, dz)
                     .store(d_weight);
             }
-            d_h[input] += sum.sum();
         }
     }
 }

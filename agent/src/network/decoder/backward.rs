@@ -104,33 +104,45 @@ impl Pass<Chunk> for DoublingBackward<'_> {
                     &chunk.u[index + 1][range.clone()],
                     &chunk.dy[index + 1][range],
                 );
-                let factor = level.dropout.scale;
-                before_dropout::<A>(u, dy, self.norm, channel, factor, &mut chunk.dz);
-                doubling.place_gradient(at, &chunk.dz, &mut chunk.scratch[index]);
+                let undo = BeforeDropout::new(self.norm, channel, level.dropout.scale);
+                doubling.place_gradient(at, &mut chunk.scratch[index], |row, dz| {
+                    let range = row * dz.len()..(row + 1) * dz.len();
+                    undo.write::<A>(&u[range.clone()], &dy[range], dz);
+                });
             }
             chunk.through_doubling::<A>(level, number, frame, outputs);
         }
     }
 }
 
-/// `dz` of one channel: back through normalisation and dropout.
-#[inline(always)]
-fn before_dropout<A: Arithmetic>(
-    u: &[f32],
-    dy: &[f32],
-    norm: &NormGradient,
-    channel: u16,
-    factor: f32,
-    dz: &mut [f32],
-) {
-    let channel = usize::from(channel);
-    let dy_factor = norm.dy_factor[channel] * factor;
-    let (u_factor, constant) = (
-        norm.u_factor[channel] * factor,
-        norm.constant[channel] * factor,
-    );
-    for ((dz, u), dy) in dz.iter_mut().zip(u).zip(dy) {
-        *dz = A::mul_add(*dy, dy_factor, A::mul_add(*u, u_factor, constant));
+/// Of one channel: back through normalisation and dropout.
+struct BeforeDropout {
+    dy_factor: f32,
+    u_factor: f32,
+    constant: f32,
+}
+
+impl BeforeDropout {
+    #[inline(always)]
+    fn new(norm: &NormGradient, channel: u16, factor: f32) -> Self {
+        let channel = usize::from(channel);
+        Self {
+            dy_factor: norm.dy_factor[channel] * factor,
+            u_factor: norm.u_factor[channel] * factor,
+            constant: norm.constant[channel] * factor,
+        }
+    }
+
+    /// `dz` of some pixels.
+    #[inline(always)]
+    fn write<A: Arithmetic>(&self, u: &[f32], dy: &[f32], dz: &mut [f32]) {
+        for ((dz, u), dy) in dz.iter_mut().zip(u).zip(dy) {
+            *dz = A::mul_add(
+                *dy,
+                self.dy_factor,
+                A::mul_add(*u, self.u_factor, self.constant),
+            );
+        }
     }
 }
 
@@ -203,12 +215,12 @@ impl Pass<Chunk> for SeedBackward<'_> {
     #[inline(always)]
     fn run<A: Arithmetic>(&self, chunk: &mut Chunk) {
         chunk.d_seed.fill(0.0);
-        chunk.d_hidden.fill(0.0);
         let plane = self.seed.plane();
         let n_hidden = chunk.d_hidden.len() / chunk.frames.len().max(1);
+        let mut sums = vec![Lanes::ZERO; n_hidden];
         for (number, frame) in chunk.frames.clone().enumerate() {
             let h = &self.hidden[frame * n_hidden..][..n_hidden];
-            let d_h = &mut chunk.d_hidden[number * n_hidden..][..n_hidden];
+            sums.fill(Lanes::ZERO);
             for (at, &channel) in self.dropout.decoder[0].kept(frame).iter().enumerate() {
                 let first = (number * DECODER_CHANNELS[0] + at) * plane;
                 let (u, dy) = (
@@ -216,9 +228,13 @@ impl Pass<Chunk> for SeedBackward<'_> {
                     &chunk.dy[0][first..][..plane],
                 );
                 let dz = &mut chunk.dz[..plane];
-                before_dropout::<A>(u, dy, self.norm, channel, self.dropout.scale, dz);
+                BeforeDropout::new(self.norm, channel, self.dropout.scale).write::<A>(u, dy, dz);
                 self.seed
-                    .backward::<A>(h, channel, dz, d_h, &mut chunk.d_seed);
+                    .backward::<A>(h, channel, dz, &mut sums, &mut chunk.d_seed);
+            }
+            let d_h = &mut chunk.d_hidden[number * n_hidden..][..n_hidden];
+            for (d_h, sum) in d_h.iter_mut().zip(&sums) {
+                *d_h = sum.sum();
             }
         }
     }

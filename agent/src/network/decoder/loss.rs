@@ -111,7 +111,10 @@ impl Loss<'_> {
         }
         self.add_cells::<A>(chunk);
         for (state, dz) in chunk.logits.chunks_exact(doubling.plane_out()).enumerate() {
-            doubling.place_gradient(state, dz, &mut chunk.scratch[level.level]);
+            let scratch = &mut chunk.scratch[level.level];
+            doubling.place_gradient(state, scratch, |row, to| {
+                to.copy_from_slice(&dz[row * to.len()..][..to.len()]);
+            });
         }
         chunk.through_doubling::<A>(level, number, frame, &self.states);
     }

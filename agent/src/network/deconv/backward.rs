@@ -5,15 +5,24 @@ use crate::network::correlation::{Correlation, Kernel4x4, Tap, balanced, with_co
 use crate::network::lanes::{Arithmetic, Lanes};
 
 impl Doubling {
-    /// Puts the gradient of kept output number `index` where [`Self::backward`] expects it; `dz` has
-    /// one number per pixel.
+    /// Puts the gradient of kept output number `index` where [`Self::backward`] expects it: `write`
+    /// is given each row's number and place.
     #[inline(always)]
-    pub(crate) fn place_gradient(&self, index: usize, dz: &[f32], scratch: &mut Scratch) {
+    pub(crate) fn place_gradient(
+        &self,
+        index: usize,
+        scratch: &mut Scratch,
+        mut write: impl FnMut(usize, &mut [f32]),
+    ) {
         let [rows, cols] = self.input;
         let border = 2 * cols + 2;
         let bordered = &mut scratch.bordered[index * (2 * rows + 2) * border..];
-        for (row, dz) in dz[..4 * rows * cols].chunks_exact(2 * cols).enumerate() {
-            bordered[(row + 1) * border + 1..][..2 * cols].copy_from_slice(dz);
+        for (row, bordered) in bordered[border..]
+            .chunks_exact_mut(border)
+            .enumerate()
+            .take(2 * rows)
+        {
+            write(row, &mut bordered[1..=2 * cols]);
         }
         let length = self.gradient_plane();
         let group = &mut scratch.gradients[index * GRADIENT_PLANES * length..];

@@ -93,23 +93,23 @@ fn before_relu<A: Arithmetic>(
     mask: &[f32],
     dz: &mut [f32],
 ) {
-    let lanes = |numbers: &[f32], group: usize| Lanes::load(&numbers[group * LANES..]).0;
-    let n_groups = norm.constant.len() / LANES;
-    let groups = map
-        .as_chunks::<LANES>()
-        .0
-        .iter()
-        .zip(d_map.as_chunks::<LANES>().0);
-    for (index, ((map, d_map), dz)) in groups.zip(dz.as_chunks_mut::<LANES>().0).enumerate() {
-        let group = index % n_groups;
-        let [dy_factor, u_factor] = [&norm.dy_factor, &norm.u_factor].map(|f| lanes(f, group));
-        let [constant, mask] = [&norm.constant[..], mask].map(|numbers| lanes(numbers, group));
-        let du = Lanes(constant)
-            .add_product::<A>(Lanes(*map), Lanes(u_factor))
-            .add_product::<A>(Lanes(*d_map), Lanes(dy_factor));
-        for lane in 0..LANES {
-            let factor = if map[lane] > 0.0 { mask[lane] } else { 0.0 };
-            dz[lane] = du.0[lane] * factor;
+    let channels = norm.constant.len();
+    let positions = map
+        .chunks_exact(channels)
+        .zip(d_map.chunks_exact(channels))
+        .zip(dz.chunks_exact_mut(channels));
+    for ((map, d_map), dz) in positions {
+        for first in (0..channels).step_by(LANES) {
+            let lanes = |numbers: &[f32]| Lanes::load(&numbers[first..]);
+            let du = lanes(&norm.constant)
+                .add_product::<A>(lanes(map), lanes(&norm.u_factor))
+                .add_product::<A>(lanes(d_map), lanes(&norm.dy_factor));
+            let (map, mask) = (lanes(map), lanes(mask));
+            let through = |lane: usize| match map.0[lane] > 0.0 {
+                true => du.0[lane] * mask.0[lane],
+                false => 0.0,
+            };
+            Lanes(std::array::from_fn(through)).store(&mut dz[first..]);
         }
     }
 }

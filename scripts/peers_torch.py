@@ -1,0 +1,199 @@
+"""PyTorch on the same CPU: the peer of `agent/benches/network.rs`, measured in the same run.
+
+The dynamic autoencoder from the layer table of REPRODUCTION.md and a DQN, with torch's own layers:
+hidden 16, windows of 1,000 frames of 64 x 64 cells. Two threads; single inputs with one as well.
+Everything is measured twice: with glibc's allocator as it is, and with one that keeps its memory
+and uses huge pages.
+
+Prints medians with minimum and maximum over rounds, and the mean processor time, which says more
+on a busy machine. Needs torch. Words on the command line choose what is measured.
+"""
+
+import os
+import statistics
+import subprocess
+import sys
+import time
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+N_FRAMES, SIDE, N_STATES, HIDDEN = 1000, 64, 3, 16
+N_VISITED = 33
+N_THREADS = 2
+DQN_INPUTS, DQN_ACTIONS, DQN_BATCH, DQN_REPLAY = 16, 4, 64, 1000
+
+# glibc reads these at start, so each setting is a process of its own.
+AS_IS = {}
+TUNED = {
+    "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
+    "MALLOC_MMAP_THRESHOLD_": str(1 << 32),
+    "MALLOC_TRIM_THRESHOLD_": str(1 << 34),
+    "MALLOC_TOP_PAD_": str(1 << 28),
+    "THP_MEM_ALLOC_ENABLE": "1",
+}
+
+
+class Autoencoder(nn.Module):
+    """Frames to predictors of the next: encoder, recurrence, decoder, observation matrix."""
+
+    def __init__(self):
+        super().__init__()
+        channels, kernels = [N_STATES, 32, 16, 8], [(8, 4), (4, 2), (3, 1)]
+        encoder = []
+        for before, after, (side, stride) in zip(channels, channels[1:], kernels, strict=False):
+            encoder += [nn.Conv2d(before, after, side, stride), nn.Dropout2d(), nn.ReLU()]
+            encoder += [nn.BatchNorm2d(after)]
+        self.encoder = nn.Sequential(*encoder, nn.Flatten(), nn.Linear(128, HIDDEN))
+        self.recurrence = nn.GRU(HIDDEN, HIDDEN)
+        channels = [HIDDEN, 128, 64, 32, 16]
+        decoder = []
+        for before, after in zip(channels, channels[1:], strict=False):
+            stride, padding = (1, 0) if before == HIDDEN else (2, 1)
+            decoder += [nn.ConvTranspose2d(before, after, 4, stride, padding, bias=False)]
+            decoder += [nn.Dropout2d(), nn.BatchNorm2d(after), nn.ReLU()]
+        last = nn.ConvTranspose2d(channels[-1], N_STATES, 4, 2, 1, bias=False)
+        self.decoder = nn.Sequential(*decoder, last, nn.Softmax(1))
+        self.observation = nn.Parameter(torch.randn(N_STATES, N_STATES))
+
+    def forward(self, frames, hidden):
+        """Predictors after each of some consecutive frames, and the last hidden vector."""
+        track, hidden = self.recurrence(self.encoder(frames), hidden)
+        return self.decoder(track[..., None, None]), hidden
+
+    def observed(self, predictors):
+        """Predicted observations at each cell."""
+        return torch.einsum("os,tshw->tohw", self.observation.softmax(0), predictors)
+
+
+def frames(share):
+    """One-hot frames of which a share of the cells is visited, and where."""
+    values = torch.randint(N_STATES, (N_FRAMES, SIDE, SIDE))
+    visited = torch.rand(N_FRAMES, SIDE, SIDE) < share
+    one_hot = functional.one_hot(values, N_STATES).permute(0, 3, 1, 2).float()
+    return one_hot.contiguous() * visited[:, None], visited
+
+
+def autoencoder_update(share):
+    network, (seen, visited) = Autoencoder(), frames(share)
+    optimiser = torch.optim.Adam(network.parameters(), 1e-3, betas=(0.5, 0.9))
+    # The loss needs visited cells only, which is what a careful user of torch would write.
+    step, row, col = visited[1:].nonzero(as_tuple=True)
+    goal = seen[1:][step, :, row, col]
+
+    def update():
+        predictors, _ = network(seen[:-1], torch.randn(1, HIDDEN))
+        at_visits = predictors[step, :, row, col] @ network.observation.softmax(0).T
+        loss = functional.binary_cross_entropy(at_visits, goal, reduction="sum") / len(step)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+
+    return update
+
+
+def inference_step():
+    network, (seen, visited) = Autoencoder().eval(), frames(N_VISITED / SIDE**2)
+    frame, (row, col) = seen[:1], visited[0].nonzero(as_tuple=True)
+    state = {"hidden": torch.randn(1, HIDDEN), "prior": torch.full((N_STATES, SIDE, SIDE), 1 / 3)}
+
+    @torch.no_grad()
+    def step():
+        posterior = state["prior"].clone()
+        likelihood = frame[0, :, row, col].T @ network.observation.softmax(0)
+        joint = posterior[:, row, col] * likelihood.T
+        posterior[:, row, col] = joint / joint.sum(0)
+        predictors, state["hidden"] = network(frame, state["hidden"])
+        state["prior"] = predictors[0]
+        return posterior
+
+    return step
+
+
+def perceptron():
+    layers = [nn.Linear(DQN_INPUTS, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(128, DQN_ACTIONS))
+
+
+def dqn_update():
+    network, target = perceptron(), perceptron()
+    target.load_state_dict(network.state_dict())
+    optimiser = torch.optim.Adam(network.parameters(), 0.01)
+    before, after = torch.rand(2, DQN_REPLAY, DQN_INPUTS)
+    action = torch.randint(DQN_ACTIONS, (DQN_REPLAY, 1))
+    reward = torch.rand(DQN_REPLAY, 1)
+    ours, theirs = list(network.parameters()), list(target.parameters())
+
+    def update():
+        batch = torch.randint(DQN_REPLAY, (DQN_BATCH,))
+        with torch.no_grad():
+            goal = reward[batch] + 0.99 * target(after[batch]).amax(1, keepdim=True)
+        loss = functional.mse_loss(network(before[batch]).gather(1, action[batch]), goal)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        with torch.no_grad():
+            torch._foreach_lerp_(theirs, ours, 0.01)
+
+    return update
+
+
+def dqn_act():
+    network, state = perceptron(), torch.rand(1, DQN_INPUTS)
+
+    @torch.no_grad()
+    def act():
+        return int(network(state).argmax())
+
+    return act
+
+
+def report(what, make, rounds, inner=1, threads=N_THREADS):
+    """Times `rounds` rounds of `inner` calls each of what `make` makes."""
+    words = [word for word in sys.argv[1:] if not word.startswith("--")]
+    if words and not any(word in what for word in words):
+        return
+    torch.set_num_threads(threads)
+    function = make()
+    for _ in range(inner + 1):
+        function()
+    micros, busy = [], time.process_time()
+    for _ in range(rounds):
+        start = time.perf_counter()
+        for _ in range(inner):
+            function()
+        micros.append((time.perf_counter() - start) * 1e6 / inner)
+    busy = (time.process_time() - busy) * 1e6 / inner / rounds
+    median, spread = statistics.median(micros), f"({min(micros):.1f} to {max(micros):.1f})"
+    who = f"torch, {threads} thread{'s' * (threads > 1)}"
+    print(
+        f"{who:<16} {what:<34} {median:11.1f} us  {spread:<26} processor {busy:11.1f} us",
+        flush=True,
+    )
+
+
+def measure(quick):
+    torch.manual_seed(0)
+    rounds, some = 3 if quick else 9, N_VISITED / SIDE**2
+    report("autoencoder: update on paths", lambda: autoencoder_update(some), rounds)
+    report("autoencoder: update on full frames", lambda: autoencoder_update(1.1), rounds)
+    for threads in (N_THREADS, 1):
+        report("autoencoder: inference step", inference_step, 9, 20, threads)
+        report("dqn: update", dqn_update, 9, 50, threads)
+        report("dqn: act", dqn_act, 9, 500, threads)
+
+
+def main():
+    if "--here" in sys.argv:
+        measure("--quick" in sys.argv)
+        return
+    print(f"torch {torch.__version__}", flush=True)
+    for words, environment in (("as it is", AS_IS), ("keeping memory, huge pages", TUNED)):
+        print(f"-- allocator: {words}", flush=True)
+        command = [sys.executable, __file__, "--here", *sys.argv[1:]]
+        subprocess.run(command, env=os.environ | environment, check=True)
+
+
+if __name__ == "__main__":
+    main()
