@@ -20,6 +20,9 @@ const DIGEST: &str = "emberwatch.digest";
 /// states needs.
 const MAX_BYTES: u64 = 1 << 32;
 
+/// Largest count: far from where one more would not fit.
+const MAX_COUNT: u64 = 1 << 53;
+
 /// Bytes of a number of 64 bits.
 const WORD: usize = 8;
 
@@ -238,9 +241,10 @@ impl Contents {
     pub fn count(&self, name: &str) -> Result<u64, Problem> {
         let text = self.texts.get(name);
         let text = text.ok_or_else(|| Problem::Missing(name.into()))?;
-        text.parse().map_err(|_| Problem::Value {
+        let count = text.parse().ok().filter(|count| *count <= MAX_COUNT);
+        count.ok_or_else(|| Problem::Value {
             name: name.into(),
-            expected: "a whole number".into(),
+            expected: format!("a whole number up to {MAX_COUNT}"),
             got: text.clone(),
         })
     }

@@ -51,13 +51,13 @@ impl StepSize {
 pub struct AutoencoderConfig {
     /// Number of states S, 2 to 64; 0: as many as there are observations.
     pub states: usize,
-    /// Length of the encoder's output, 1 to 1,024.
+    /// Length of the encoder's output, 1 to 256.
     pub encoding: usize,
-    /// Length of the hidden vector h, 1 to 1,024.
+    /// Length of the hidden vector h, 1 to 256.
     pub hidden: usize,
-    /// Frames of an update, 2 to 100,000.
+    /// Frames of an update, 2 to 10,000.
     pub window: usize,
-    /// Frames that the replay keeps, at least a window.
+    /// Frames that the replay keeps, at least a window, at most 100,000.
     pub replay_frames: usize,
     /// First frames that show every cell, if the server gives such.
     pub full_frames: u64,
@@ -104,14 +104,14 @@ impl AutoencoderConfig {
         let least_states = if self.states == 0 { 0 } else { 2 };
         let sizes = [
             ("autoencoder.states", self.states, least_states, 64),
-            ("autoencoder.encoding", self.encoding, 1, 1024),
-            ("autoencoder.hidden", self.hidden, 1, 1024),
-            ("autoencoder.window", self.window, 2, 100_000),
+            ("autoencoder.encoding", self.encoding, 1, 256),
+            ("autoencoder.hidden", self.hidden, 1, 256),
+            ("autoencoder.window", self.window, 2, 10_000),
             (
                 "autoencoder.replay_frames",
                 self.replay_frames,
                 self.window,
-                1_000_000,
+                100_000,
             ),
         ];
         for (setting, got, least, most) in sizes {
@@ -143,7 +143,7 @@ impl AutoencoderConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DqnConfig {
-    /// Transitions that the replay keeps, at least a batch.
+    /// Transitions that the replay keeps, at least a batch, at most 1,000,000.
     pub replay: usize,
     /// Transitions of an update, 1 to 65,536.
     pub batch: usize,
@@ -203,7 +203,7 @@ impl DqnConfig {
     pub fn check(&self) -> Result<(), ConfigError> {
         between("dqn.batch", self.batch, 1, 65_536)?;
         between("dqn.n_step", self.n_step, 1, 1_000)?;
-        between("dqn.replay", self.replay, self.batch, 10_000_000)?;
+        between("dqn.replay", self.replay, self.batch, 1_000_000)?;
         for (setting, got) in [
             ("dqn.gamma", self.gamma),
             ("dqn.tau", self.tau),
@@ -292,7 +292,7 @@ mod tests {
         };
         assert_eq!(
             small.check().map_err(|error| error.to_string()),
-            Err("autoencoder.replay_frames: expected 1000 to 1000000, got 999".into())
+            Err("autoencoder.replay_frames: expected 1000 to 100000, got 999".into())
         );
         let eager = DqnConfig {
             epsilon: 2.0,

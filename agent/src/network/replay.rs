@@ -23,7 +23,7 @@ impl Replay {
     pub fn new(capacity: usize) -> Self {
         Self {
             capacity,
-            frames: VecDeque::with_capacity(capacity),
+            frames: VecDeque::new(),
             n_pushed: 0,
             begins: VecDeque::new(),
         }

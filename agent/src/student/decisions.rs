@@ -183,7 +183,7 @@ impl Student for DecisionsStudent {
     }
 
     fn columns(&self) -> &'static [&'static str] {
-        &["epsilon"]
+        &["dqn_loss", "dqn_rate", "epsilon"]
     }
 
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError> {
@@ -259,9 +259,13 @@ impl Student for DecisionsStudent {
             };
             lessons.push(Lesson {
                 number: self.n_updates(),
-                loss: Some(f64::from(loss)),
-                rate: Some(f64::from(settings.adam.learning_rate)),
-                more: vec![Some(epsilon)],
+                loss: None,
+                rate: None,
+                more: vec![
+                    Some(f64::from(loss)),
+                    Some(f64::from(settings.adam.learning_rate)),
+                    Some(epsilon),
+                ],
             });
         }
         self.times[1].1 += start.elapsed();

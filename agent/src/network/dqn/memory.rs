@@ -43,10 +43,10 @@ impl Memory {
             n_inputs,
             len: 0,
             next_slot: 0,
-            input: Vec::with_capacity(capacity * n_inputs),
-            next: Vec::with_capacity(capacity * n_inputs),
-            action: Vec::with_capacity(capacity),
-            reward: Vec::with_capacity(capacity),
+            input: Vec::new(),
+            next: Vec::new(),
+            action: Vec::new(),
+            reward: Vec::new(),
         }
     }
 
