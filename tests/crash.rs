@@ -244,7 +244,7 @@ fn a_step_whose_client_gave_up_waiting_is_made_once_and_its_answer_taken_for_no_
 fn the_private_server_of_a_comparison_ends_with_it() {
     let flags = "compare --seeds 0..1 --steps 1000000 --height 5 --width 5 --moves 4 --burn-in 5 \
                  --policies random_walk,coverage --baseline random_walk";
-    for signal in [Signal::KILL, Signal::INT] {
+    for signal in [Signal::KILL, Signal::TERM] {
         let flags: Vec<&str> = flags.split_whitespace().collect();
         let agent = Program::start("emberwatch-agent", &flags);
         let instance = Instance::new(&format!("private-{}", agent.pid())).expect("a plain name");

@@ -399,3 +399,38 @@ fn worlds_and_settings_that_do_not_fit_are_named() {
     std::fs::write(place.path("agent.toml"), "[learning]\nrate = 2.0\n").expect("settings");
     check(AGENT, &words, &["learning.rate: expected 0 to 1, got 2"]);
 }
+
+#[test]
+fn decisions_are_learned_and_enter_the_ladder() {
+    let place = Place::new();
+    let settings = "learner = \"decisions\"\nbeam_width = 4\nprior_worlds = 2\n\
+                    [decisions]\nbatch = 8\nreplay = 100\nupdates_per_step = 1.0\n";
+    std::fs::write(place.path("agent.toml"), settings).expect("settings");
+    place.train("out", &format!("{WORLDS} --steps 60"));
+    place.train("out", &format!("{WORLDS} --steps 40 --resume"));
+    let metrics = std::fs::read_to_string(place.path("out").join("metrics.csv"));
+    let metrics = metrics.expect("the metrics");
+    let last: Vec<&str> = metrics.lines().last().expect("rows").split(',').collect();
+    assert_eq!(last[1], "100");
+    assert!(last[6].parse::<f64>().is_ok_and(f64::is_finite), "{last:?}");
+    let checkpoint = place.checkpoint("out");
+    let worlds =
+        "--seeds 3..5 --steps 5 --height 6 --width 9 --moves 5 --burn-in 60 --beam-width 4";
+    let policies = "--policies dqn_beam,act_exploit --baseline act_exploit";
+    let compare = format!("compare {policies} {worlds}");
+    let compared = agent(&format!("{compare} --checkpoint {}", checkpoint.display()));
+    assert!(compared.stdout.contains("dqn_beam"), "{}", compared.stdout);
+    check(AGENT, &compare, &["dqn_beam", "--checkpoint FILE"]);
+    let other = format!("{compare} --model config/models/road-ice.toml");
+    let other = format!("{other} --checkpoint {}", checkpoint.display());
+    let root = crate::harness::repository().display().to_string();
+    let other = other.replace("config/models", &format!("{root}/config/models"));
+    check(AGENT, &other, &["states: expected"]);
+    let server = Server::start(&format!("{SMALL} --worlds 2 --reveal-model false"));
+    let flags = format!("--instance {} --worlds 2 --steps 4", server.instance.name());
+    check(
+        AGENT,
+        &place.words("hidden", &flags),
+        &["--reveal-model true"],
+    );
+}
