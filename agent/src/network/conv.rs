@@ -241,9 +241,10 @@ impl Dense {
         let mut sums = [self.bias; BLOCK];
         for tap in 0..self.shape.taps() {
             let weights = &self.folded[tap * channels..][..channels];
-            let inputs: [&[f32]; BLOCK] = std::array::from_fn(|at| {
-                &input[self.input_at(row, (first + at).min(last), tap)..][..channels]
-            });
+            let mut inputs = [input; BLOCK];
+            for (at, inputs) in inputs.iter_mut().enumerate() {
+                *inputs = &input[self.input_at(row, (first + at).min(last), tap)..][..channels];
+            }
             for &channel in kept {
                 let channel = usize::from(channel);
                 for at in 0..BLOCK {
@@ -315,11 +316,12 @@ impl Dense {
     ) {
         let (at, mut weights) = (places(place.outs), [[Lanes::ZERO; VECTORS]; OUTS]);
         for (weights, &out) in weights.iter_mut().zip(place.outs) {
-            *weights = vectors(&self.weight[self.weight_at(out, place.tap) + place.first..]);
+            *weights =
+                Lanes::load_all(&self.weight[self.weight_at(out, place.tap) + place.first..]);
         }
         self.each_output(place, dz, |dz, input| {
             let dx = &mut dx[input..][..VECTORS * LANES];
-            let mut sums: [Lanes; VECTORS] = vectors(dx);
+            let mut sums = Lanes::load_all::<VECTORS>(dx);
             for out in 0..OUTS {
                 for (sum, weights) in sums.iter_mut().zip(weights[out]) {
                     *sum = sum.add_scaled::<A>(dz[at[out]], weights);
@@ -342,7 +344,7 @@ impl Dense {
     ) {
         let (at, mut sums) = (places(place.outs), [[Lanes::ZERO; VECTORS]; OUTS]);
         self.each_output(place, dz, |dz, first| {
-            let x: [Lanes; VECTORS] = vectors(&input[first..]);
+            let x = Lanes::load_all::<VECTORS>(&input[first..]);
             for out in 0..OUTS {
                 for (sum, x) in sums[out].iter_mut().zip(x) {
                     *sum = sum.add_scaled::<A>(dz[at[out]], x);
@@ -387,12 +389,6 @@ struct Place<'a> {
     outs: &'a [u16],
     /// The first input channel.
     first: usize,
-}
-
-/// The first `VECTORS` times sixteen numbers.
-#[inline(always)]
-fn vectors<const VECTORS: usize>(numbers: &[f32]) -> [Lanes; VECTORS] {
-    std::array::from_fn(|vector| Lanes::load(&numbers[vector * LANES..]))
 }
 
 /// The lanes of up to [`OUTS`] channels; the last one's where there are fewer.

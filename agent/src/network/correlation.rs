@@ -126,11 +126,12 @@ impl Correlation<'_> {
         }
         for (planes, &input) in self.planes.chunks_exact(self.stride).zip(self.inputs) {
             let weights = &self.weights[usize::from(input) * self.input_step..];
-            let kernels: [&Kernel4x4; OUTPUTS] = std::array::from_fn(|output| &weights[at[output]]);
+            let mut kernels = [&weights[0]; OUTPUTS];
+            for (kernel, at) in kernels.iter_mut().zip(at) {
+                *kernel = &weights[at];
+            }
             for tap in taps {
-                let pixels = &planes[tap.offset + first..][..VECTORS * LANES];
-                let pixels: [Lanes; VECTORS] =
-                    std::array::from_fn(|vector| Lanes::load(&pixels[vector * LANES..]));
+                let pixels = Lanes::load_all::<VECTORS>(&planes[tap.offset + first..]);
                 for output in 0..OUTPUTS {
                     let weight = kernels[output][tap.entry % LANES];
                     for vector in 0..VECTORS {

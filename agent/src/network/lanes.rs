@@ -112,6 +112,20 @@ impl Lanes {
         Self(*from.first_chunk().expect("invariant: whole lanes"))
     }
 
+    /// The first `N` times sixteen numbers of a slice.
+    ///
+    /// A loop, as calls of `std::array::from_fn` are not always compiled into their caller, and then copy
+    /// arrays that should stay in registers.
+    #[inline(always)]
+    pub(crate) fn load_all<const N: usize>(from: &[f32]) -> [Self; N] {
+        let from = &from[..N * LANES];
+        let mut lanes = [Self::ZERO; N];
+        for (at, lanes) in lanes.iter_mut().enumerate() {
+            *lanes = Self::load(&from[at * LANES..]);
+        }
+        lanes
+    }
+
     /// Overwrites the first sixteen numbers of a slice.
     #[inline(always)]
     pub(crate) fn store(self, to: &mut [f32]) {

@@ -91,16 +91,18 @@ impl Product<'_> {
             row_step,
             inner_step,
         } = self.left;
-        let left: [&[f32]; ROWS] = std::array::from_fn(|at| &numbers[(row + at) * row_step..]);
-        let start = |vector: usize| match self.start {
-            Some(start) => Lanes::load(&start[column + vector * LANES..]),
-            None => Lanes::ZERO,
+        let mut left = [numbers; ROWS];
+        for (at, left) in left.iter_mut().enumerate() {
+            *left = &numbers[(row + at) * row_step..];
+        }
+        let start = match self.start {
+            Some(start) => Lanes::load_all::<VECTORS>(&start[column..]),
+            None => [Lanes::ZERO; VECTORS],
         };
-        let mut sums = [std::array::from_fn::<_, VECTORS, _>(start); ROWS];
+        let mut sums = [start; ROWS];
         let right = self.right.chunks_exact(self.n_columns).take(self.n_inner);
         for (inner, right) in right.enumerate() {
-            let right: [Lanes; VECTORS] =
-                std::array::from_fn(|vector| Lanes::load(&right[column + vector * LANES..]));
+            let right = Lanes::load_all::<VECTORS>(&right[column..]);
             for at in 0..ROWS {
                 let factor = left[at][inner * inner_step];
                 for vector in 0..VECTORS {

@@ -222,12 +222,11 @@ impl Band<'_> {
         });
         let mut sums = [[Lanes::ZERO; OUTPUTS]; INPUTS];
         for pixel in 0..self.length {
-            let patches: [Lanes; OUTPUTS] =
-                std::array::from_fn(|index| Lanes(patches[index][pixel]));
-            for input in 0..INPUTS {
-                for output in 0..OUTPUTS {
+            for output in 0..OUTPUTS {
+                let patch = Lanes(patches[output][pixel]);
+                for input in 0..INPUTS {
                     let sum = &mut sums[input][output];
-                    *sum = sum.add_scaled::<A>(values[input][pixel], patches[output]);
+                    *sum = sum.add_scaled::<A>(values[input][pixel], patch);
                 }
             }
         }
