@@ -3,7 +3,7 @@
 
 use crate::belief::{Belief, EntropyKind};
 use crate::planner::{CellValues, Objective, Plan, Planner, PlanningProblem, Target};
-use crate::policy::{BEAM_BONUS, PlannerKind, Policy};
+use crate::policy::BEAM_BONUS;
 use crate::summary::{N_BLOCKS, block};
 use protocol::{Cell, Grid, Model, Shape};
 
@@ -123,15 +123,6 @@ impl Region {
 }
 
 impl ActionSet {
-    /// The paper's: the probability of each state, then entropy; as [`Policy::choices`].
-    pub fn paper(planner: PlannerKind, model: &Model) -> Self {
-        let choices = Policy::choices(planner, model).into_iter();
-        let actions = choices.map(|choice| Action::plain(&choice.name, choice.objective));
-        Self {
-            actions: actions.collect(),
-        }
-    }
-
     /// For beam search: what pays most, alone, with exploring beside it, and further ahead; each other
     /// state; exploring alone; and what pays most on the way to each block of the grid.
     pub fn beam(model: &Model) -> Self {
@@ -198,24 +189,10 @@ impl ActionSet {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::policy::Policy;
 
     fn shape() -> Shape {
         Shape::new(16, 8).expect("test shape")
-    }
-
-    #[test]
-    fn the_papers_actions_are_the_policies_choices() {
-        let model = Model::wildfire();
-        let set = ActionSet::paper(PlannerKind::Beam, &model);
-        assert_eq!(set.names(), ["normal", "latent", "fire", "entropy"]);
-        let belief = Belief::uniform(3, shape());
-        for (action, choice) in set
-            .actions()
-            .iter()
-            .zip(Policy::choices(PlannerKind::Beam, &model))
-        {
-            assert_eq!(action.values(&belief), choice.objective.values(&belief));
-        }
     }
 
     #[test]

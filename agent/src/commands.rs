@@ -50,10 +50,10 @@ pub struct RunCommand {
     /// Take the world from its holder
     #[arg(long)]
     takeover: bool,
-    /// The model file, where the server does not reveal its model
-    #[arg(long, value_name = "FILE")]
-    model: Option<PathBuf>,
-    /// What `train` learned, for policies `learned_*` and `autoencoder_*`
+    /// A built-in model or a model file, where the server does not reveal its model
+    #[arg(long, value_name = "MODEL")]
+    model: Option<String>,
+    /// What `train` learned, for policies `learned_*`, `autoencoder_*` and `dqn_beam`
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
     #[command(flatten)]
@@ -63,7 +63,7 @@ pub struct RunCommand {
 impl RunCommand {
     /// Runs the mission.
     pub fn run(&self) -> Result<()> {
-        let model = self.model.as_deref().map(read_model).transpose()?;
+        let model = self.model.as_deref().map(model_named).transpose()?;
         let mission = Mission {
             instance: Instance::new(&self.instance)?,
             world: self.world,
@@ -115,6 +115,12 @@ fn read_model(path: &Path) -> Result<Model> {
     let text =
         std::fs::read_to_string(path).with_context(|| format!("model file {}", path.display()))?;
     Model::from_toml(&text).with_context(|| format!("model file {}", path.display()))
+}
+
+/// Makes the folder of a file to come.
+fn make_folder_of(path: &Path) -> Result<()> {
+    let parent = path.parent().filter(|parent| *parent != Path::new(""));
+    parent.map_or(Ok(()), make_folder)
 }
 
 fn make_folder(path: &Path) -> Result<()> {

@@ -119,14 +119,21 @@ pub fn compare(
         fire_cells: Vec::new(),
         moment: None,
     };
+    let game = |policy, seeds| Match {
+        comparison,
+        policy,
+        prior: &prior,
+        seeds,
+    };
+    // What does not fit is refused before hours of what does.
+    for policy in &comparison.policies {
+        let game = game(policy, &seeds[..1]);
+        let agent = game.agent(arena, seeds[0]);
+        agent.map_err(|problem| game.wrong(problem))?;
+    }
     for policy in &comparison.policies {
         for batch in seeds.chunks(arena.batch_size()) {
-            let game = Match {
-                comparison,
-                policy,
-                prior: &prior,
-                seeds: batch,
-            };
+            let game = game(policy, batch);
             let mut runs = game.play(arena, progress)?;
             if batch[0] == comparison.seeds.start {
                 results.fire_cells.clone_from(&runs[0].tally.fire_cells);

@@ -113,9 +113,6 @@ pub struct AgentFlags {
     /// The known-model filter's first belief
     #[arg(long)]
     pub prior: Option<PriorKind>,
-    /// What `train` learns [default: filter; of preset paper: autoencoder]
-    #[arg(long)]
-    pub learner: Option<LearnerKind>,
     /// Seed of planners, of the prior's worlds and of learners [default: 0]
     #[arg(long)]
     pub agent_seed: Option<u64>,
@@ -302,7 +299,6 @@ impl AgentFlags {
         config.beam_width = self.beam_width.unwrap_or(config.beam_width);
         config.shooting_samples = self.shooting_samples.unwrap_or(config.shooting_samples);
         config.prior = self.prior.unwrap_or(config.prior);
-        config.learner = self.learner.unwrap_or(config.learner);
         config.seed = self.agent_seed.unwrap_or(config.seed);
         config.check()
     }

@@ -2,6 +2,7 @@
 
 use protocol::channels::{ChannelError, Instance};
 use protocol::connection::{Connection, ConnectionError};
+use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
 use std::process::{Child, Command};
 use std::time::{Duration, Instant};
@@ -58,7 +59,9 @@ impl OwnServer {
         let mut command = Command::new(&program);
         command
             .args(["--instance", instance.name(), "--exit-with", &pid])
-            .args(arguments);
+            .args(arguments)
+            // A terminal's Ctrl-C is for this program, which still needs the server then.
+            .process_group(0);
         if std::env::var_os("RUST_LOG").is_none() {
             command.env("RUST_LOG", "warn");
         }

@@ -86,11 +86,10 @@ impl Learner {
         self.replay.push(world, frame);
     }
 
-    /// The reward of the path that a frame shows, with the belief after it.
-    pub fn reward(&mut self, posterior: &Belief, frame: &Frame, reward: f64) {
-        let visited: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
-        self.reward
-            .add(&met(posterior, visited.into_iter()), reward);
+    /// The reward of a path that visited some cells, with the belief after its frame.
+    pub fn reward(&mut self, posterior: &Belief, visited: &[usize], reward: f64) {
+        let met = met(posterior, visited.iter().copied());
+        self.reward.add(&met, reward);
         self.world_steps += 1;
         self.owed += self.config.updates_per_step;
     }

@@ -12,6 +12,7 @@ use crate::learner::{LearnedModel, Learner};
 use crate::planner::{Planner, PlanningProblem, Target};
 use crate::policy::{PlannerKind, Policy};
 use crate::scoring::{Score, score};
+use protocol::path::fly;
 use protocol::{Move, Shape};
 
 /// Acts on one world on a learned belief.
@@ -23,6 +24,8 @@ pub struct Pilot {
     walk: Box<dyn Planner + Send>,
     beam: Box<dyn Planner + Send>,
     seed: u64,
+    /// The cells that the last path visits.
+    visited: Vec<usize>,
 }
 
 impl Pilot {
@@ -38,6 +41,7 @@ impl Pilot {
             walk: config.planner(&Policy::learned(PlannerKind::RandomWalk)),
             beam: config.planner(&Policy::learned(PlannerKind::Beam)),
             seed: planner_seed(config, observation.result.seed),
+            visited: Vec::new(),
             observation,
         }
     }
@@ -101,7 +105,10 @@ impl Pilot {
             seed: self.seed,
             step: self.observation.result.step,
         };
-        planner.plan(&problem).moves
+        let moves = planner.plan(&problem).moves;
+        let shape = self.filter.belief().shape();
+        self.visited = fly(shape, problem.start, &moves).visited;
+        moves
     }
 
     /// Scores the prediction of a frame, hands it to the learner and corrects the belief with it.
@@ -120,7 +127,7 @@ impl Pilot {
         let score = score(self.filter.belief(), &likelihood, frame);
         learner.see(world, self.filter.belief(), frame);
         self.filter.correct(frame)?;
-        learner.reward(self.filter.belief(), frame, result.reward);
+        learner.reward(self.filter.belief(), &self.visited, result.reward);
         Ok(score)
     }
 }

@@ -334,15 +334,15 @@ impl Trainee {
     /// Writes the checkpoint, unless nothing is learned.
     fn save(&mut self, training: &Training) -> Result<(), TrainError> {
         self.saved = Instant::now();
-        self.metrics.flush()?;
         if training.freeze {
-            return Ok(());
+            return Ok(self.metrics.flush()?);
         }
         let mut contents = self.student.contents();
         let settings = toml::to_string(&training.config)?;
         contents.texts.insert("settings".into(), settings);
         let place = training.out.join(CHECKPOINT);
-        Ok(checkpoint::write(&place, self.student.kind(), &contents)?)
+        checkpoint::write(&place, self.student.kind(), &contents)?;
+        Ok(self.metrics.flush()?)
     }
 
     fn report(&mut self, tick: &Tick) {
@@ -425,7 +425,8 @@ fn student(
                 progress.load(contents).map_err(wrong)?;
             }
             let full_frames = config.autoencoder.full_frames;
-            if progress.iterations < full_frames && info.coverage == CoverageRule::Path {
+            let wants = progress.iterations < full_frames && !training.freeze;
+            if wants && info.coverage == CoverageRule::Path {
                 return Err(TrainError::NoFullFrames(full_frames));
             }
             Box::new(NetworkStudent::new(progress, site, config))

@@ -1,7 +1,7 @@
 //! `compare`: the benchmark.
 
 use super::worlds::WorldFlags;
-use super::{make_folder, write};
+use super::{make_folder, make_folder_of, write};
 use agent::agent::AgentError;
 use agent::arena::Arena;
 use agent::compare::{Comparison, Moment, Results, compare};
@@ -106,8 +106,7 @@ impl CompareCommand {
                 "--csv: expected a file, got the folder {}",
                 path.display()
             );
-            let parent = path.parent().filter(|parent| *parent != Path::new(""));
-            parent.map_or(Ok(()), make_folder)?;
+            make_folder_of(path)?;
         }
         self.figures.as_deref().map_or(Ok(()), make_folder)
     }

@@ -2,7 +2,7 @@
 
 use super::compare::run_comparison;
 use super::worlds::WorldFlags;
-use super::write;
+use super::{make_folder_of, write};
 use agent::arena::Arena;
 use agent::compare::Comparison;
 use agent::config::{AgentConfig, AgentFlags};
@@ -51,6 +51,9 @@ impl EvaluateCommand {
     /// Scores predictions, then policies.
     pub fn run(&self) -> Result<()> {
         let config = self.settings.effective()?;
+        if let Some(path) = &self.csv {
+            make_folder_of(path)?;
+        }
         let learned = Learned::read(self.checkpoint.iter().map(PathBuf::as_path))?;
         let estimators = estimators(&learned);
         let mut worlds = self.worlds.open(false, |_| Ok(()))?;

@@ -28,6 +28,9 @@ pub struct TrainCommand {
     /// Number of worlds to act on at once [default: 16, or the autoencoder's 1]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1024))]
     worlds: Option<u32>,
+    /// What to learn [default: filter; of preset paper: autoencoder]
+    #[arg(long)]
+    learner: Option<LearnerKind>,
     /// World steps to act for, of all worlds together; 0: until stopped
     #[arg(long, default_value_t = 0)]
     steps: u64,
@@ -37,7 +40,8 @@ pub struct TrainCommand {
     /// Folder for checkpoint.safetensors, metrics.csv and training.png
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Go on from the folder's checkpoint, bit for bit in worlds that stand where it left them
+    /// Go on from the folder's checkpoint; a filter or an autoencoder bit for bit in worlds that stand where
+    /// it left them
     #[arg(long)]
     resume: bool,
     /// Act on the checkpoint's parameters without learning
@@ -64,7 +68,8 @@ pub struct TrainCommand {
 impl TrainCommand {
     /// Trains until done or told to stop.
     pub fn run(&self) -> Result<()> {
-        let config = self.settings.effective()?;
+        let mut config = self.settings.effective()?;
+        config.learner = self.learner.unwrap_or(config.learner);
         let n_worlds = self.worlds.unwrap_or(match config.learner {
             LearnerKind::Filter | LearnerKind::Decisions => 16,
             LearnerKind::Autoencoder => 1,

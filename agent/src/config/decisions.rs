@@ -15,7 +15,7 @@ pub struct DecisionsConfig {
     /// Discount per step, 0 to 1.
     pub gamma: f32,
     /// Steps whose rewards a transition adds up, 1 to 64.
-    pub n_steps: usize,
+    pub n_step: usize,
     /// Factor on rewards, 0 to 1000.
     pub reward_scale: f32,
     /// Updates per world step, 0 to 16.
@@ -40,7 +40,7 @@ impl Default for DecisionsConfig {
             replay: 50_000,
             batch: 64,
             gamma: 0.95,
-            n_steps: 4,
+            n_step: 4,
             reward_scale: 0.1,
             updates_per_step: 0.25,
             tau: 0.005,
@@ -62,7 +62,7 @@ impl DecisionsConfig {
         let ranges = [
             ("decisions.batch", self.batch, 1, 65_536),
             ("decisions.replay", self.replay, self.batch, 200_000),
-            ("decisions.n_steps", self.n_steps, 1, 64),
+            ("decisions.n_step", self.n_step, 1, 64),
         ];
         for (setting, got, least, most) in ranges {
             if !(least..=most).contains(&got) {
@@ -97,7 +97,7 @@ impl DecisionsConfig {
             replay: self.replay,
             batch: self.batch,
             gamma: self.gamma,
-            n_step: self.n_steps,
+            n_step: self.n_step,
             tau: self.tau,
             epsilon: self.epsilon,
             epsilon_end: self.epsilon_end,
@@ -124,8 +124,8 @@ mod tests {
             assert_eq!(error, words);
         };
         check(
-            |c| c.n_steps = 0,
-            "decisions.n_steps: expected 1 to 64, got 0",
+            |c| c.n_step = 0,
+            "decisions.n_step: expected 1 to 64, got 0",
         );
         check(
             |c| c.replay = 8,

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 const PAPER_RATE: f64 = 1e-4;
 const PAPER_DQN_RATE: f64 = 0.01;
 
-/// A step size that vanishes: `rate (1 + n / steady)^-power` at update n.
+/// A step size that vanishes: `rate (1 + n / steady)^-power` at iteration n.
 ///
 /// With powers of more than one half and at most one, sums of step sizes diverge and those of their
 /// squares do not. The autoencoder's power is larger than the DQN's, so that the quotient of the two
@@ -16,9 +16,9 @@ const PAPER_DQN_RATE: f64 = 0.01;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StepSize {
-    /// At the first update.
+    /// At the first iteration.
     pub rate: f64,
-    /// Updates after which it has fallen to `2^-power` of that.
+    /// Iterations after which it has fallen to `2^-power` of that.
     pub steady: u64,
     /// How fast it falls, 0 to 1.
     pub power: f64,
@@ -34,9 +34,9 @@ impl StepSize {
         }
     }
 
-    /// The step size of an update, counted from 0.
-    pub fn at(&self, update: u64) -> f64 {
-        self.rate * (1.0 + update as f64 / self.steady.max(1) as f64).powf(-self.power)
+    /// The step size of an iteration, counted from 0.
+    pub fn at(&self, iteration: u64) -> f64 {
+        self.rate * (1.0 + iteration as f64 / self.steady.max(1) as f64).powf(-self.power)
     }
 
     fn check(&self, [rate, power]: [&'static str; 2]) -> Result<(), ConfigError> {

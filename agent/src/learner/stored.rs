@@ -12,14 +12,13 @@ use protocol::Shape;
 const PRODUCTS: &str = "reward.products";
 const REWARDS: &str = "reward.rewards";
 const WORLD_STEPS: &str = "world_steps";
-const SETTINGS: &str = "settings";
 const FORM: &str = "replay.form";
 const OWED: &str = "owed";
 
 impl Learner {
-    /// As a checkpoint, with the effective settings.
-    pub fn to_contents(&self, settings: &str) -> Contents {
-        let mut contents = self.progress().to_contents(settings);
+    /// As a checkpoint, without the settings.
+    pub fn to_contents(&self) -> Contents {
+        let mut contents = self.progress().to_contents();
         let form = self.form();
         let memory = Bytes::of_counts(self.memory().map(|side| side as u64));
         contents.bytes.insert(FORM.into(), memory);
@@ -71,8 +70,8 @@ impl Learner {
 }
 
 impl Progress {
-    /// As a checkpoint, with the effective settings.
-    pub fn to_contents(&self, settings: &str) -> Contents {
+    /// As a checkpoint, without the settings.
+    pub fn to_contents(&self) -> Contents {
         let mut contents = Contents::default();
         self.iterates.store(&mut contents);
         let estimates = [
@@ -83,10 +82,7 @@ impl Progress {
             let numbers = Bytes::of_floats(numbers.iter().copied());
             contents.bytes.insert(name.into(), numbers);
         }
-        let texts = [
-            (SETTINGS, settings.to_owned()),
-            (WORLD_STEPS, self.world_steps.to_string()),
-        ];
+        let texts = [(WORLD_STEPS, self.world_steps.to_string())];
         for (name, text) in texts {
             contents.texts.insert(name.into(), text);
         }
@@ -162,12 +158,11 @@ mod tests {
 
     #[test]
     fn progress_survives_a_checkpoint() {
-        let contents = progress().to_contents("seed = 1");
+        let contents = progress().to_contents();
         let own = Progress::from_contents(&contents, None).expect("whole");
         assert_eq!(own, progress());
         let expected = Some(progress().iterates.parameters.dimensions);
         assert_eq!(Progress::from_contents(&contents, expected).ok(), Some(own));
-        assert_eq!(contents.texts["settings"], "seed = 1");
     }
 
     #[test]
@@ -184,17 +179,18 @@ mod tests {
         for value in [0, 1, 1, 0, 1] {
             let frame = Frame::from_bytes(shape, 2, &[value, 255, 1]).expect("a frame");
             learner.see(4, &belief, &frame);
-            learner.reward(&belief, &frame, 0.3);
+            let visited: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
+            learner.reward(&belief, &visited, 0.3);
         }
         learner.learn().expect("finite");
-        let contents = learner.to_contents("");
+        let contents = learner.to_contents();
         let dimensions = progress().iterates.parameters.dimensions;
         let restored = |config: &AgentConfig| {
             Learner::from_contents(&contents, dimensions, shape, config).expect("whole")
         };
         let same = restored(&config);
         assert!(same.has_track(4) && same.n_updates() > 9);
-        assert_eq!(same.to_contents(""), contents);
+        assert_eq!(same.to_contents(), contents);
         config.learning.streams = 3;
         let other = restored(&config);
         assert!(!other.has_track(4), "an empty replay");
@@ -203,7 +199,7 @@ mod tests {
 
     #[test]
     fn another_shape_is_refused_by_the_tensors_name() {
-        let contents = progress().to_contents("");
+        let contents = progress().to_contents();
         let check = |change: fn(&mut Dimensions), words: &str| {
             let mut dimensions = progress().iterates.parameters.dimensions;
             change(&mut dimensions);

@@ -118,7 +118,9 @@ impl Student for FilterStudent {
 
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let start = Instant::now();
-        self.learned = self.learner.learned();
+        if !self.is_frozen {
+            self.learned = self.learner.learned();
+        }
         let n_walking = self.n_walking();
         let plan = |(index, pilot): (usize, &mut Pilot)| {
             pilot.filter.set(&self.learned.tables);
@@ -174,7 +176,7 @@ impl Student for FilterStudent {
     }
 
     fn contents(&self) -> Contents {
-        let mut contents = self.learner.to_contents("");
+        let mut contents = self.learner.to_contents();
         let pilots = self.site.worlds.clone().zip(&self.pilots);
         Stand::store(pilots, self.site.shape, &mut contents);
         contents
