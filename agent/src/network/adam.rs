@@ -70,10 +70,21 @@ impl Adam {
         let [first, second] = settings.betas;
         let moments = self.first.iter_mut().zip(&mut self.second);
         for ((parameter, d), (m, v)) in parameters.iter_mut().zip(gradient).zip(moments) {
-            *m = first * *m + (1.0 - first) * d;
-            *v = second * *v + (1.0 - second) * d * d;
+            *m = flushed(first * *m + (1.0 - first) * d);
+            *v = flushed(second * *v + (1.0 - second) * d * d);
             *parameter -= rate * *m / (v.sqrt() * root + settings.epsilon);
         }
+    }
+}
+
+/// Zero for a subnormal number, which is where a moment stays whose gradient is zero, and which takes
+/// some processors a hundred times as long.
+#[inline(always)]
+fn flushed(number: f32) -> f32 {
+    if number.abs() < f32::MIN_POSITIVE {
+        0.0
+    } else {
+        number
     }
 }
 
@@ -117,5 +128,16 @@ mod tests {
                 assert!((f64::from(parameters[index]) - exact[index]).abs() < 1e-6);
             }
         }
+    }
+
+    #[test]
+    fn moments_without_a_gradient_end_at_zero() {
+        let mut adam = Adam::new(1);
+        let settings = AdamSettings::paper(0.1);
+        adam.step(&settings, &mut [0.0], &[1e-3]);
+        for _ in 0..2000 {
+            adam.step(&settings, &mut [0.0], &[0.0]);
+        }
+        assert_eq!((adam.first[0], adam.second[0]), (0.0, 0.0));
     }
 }
