@@ -112,7 +112,7 @@ impl Attacker {
             flags: self.number(0),
             listener_low: self.rng.random(),
             listener_high: self.rng.random(),
-            reserved: self.rng.random(),
+            step: self.rng.random(),
         }
     }
 

@@ -247,7 +247,7 @@ fn a_step_of_wrong_numbers_is_refused_and_changes_nothing(client: Client) {
     steps.check(|h| h.version = 2, VersionMismatch, 1);
     steps.check(|h| h.version = 0, VersionMismatch, 1);
     steps.check(|h| h.operation = 0, UnknownOperation, 0);
-    steps.check(|h| h.operation = 3, UnknownOperation, 3);
+    steps.check(|h| h.operation = 4, UnknownOperation, 4);
     for (first, n_worlds) in [(0, 0), (3, 1), (0, 4), (2, 2), (u32::MAX, 1), (1, u32::MAX)] {
         let range = |h: &mut StepRequest| (h.first_world, h.n_worlds) = (first, n_worlds);
         steps.check(range, NoSuchWorld, 3);

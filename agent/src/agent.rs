@@ -21,6 +21,8 @@ pub struct Agent {
     policy: Policy,
     objective: Objective,
     estimator: Estimator,
+    /// Says to other agents what the belief is, where it is all that the estimator knows.
+    belief_kind: Option<String>,
     planner: Box<dyn Planner + Send>,
     decider: Option<Decider>,
     /// The state that pays most, where that is learned.
@@ -147,6 +149,7 @@ impl Agent {
             }
             EstimatorKind::NextTruth => Estimator::NextTruth(prior),
         };
+        let belief_kind = belief_kind(&estimator, &task);
         let target = task.learned.target(policy.estimator);
         let mut objective = config.objective(policy);
         if let (Target::State(state), Some(target)) = (&mut objective.target, target) {
@@ -160,6 +163,7 @@ impl Agent {
             policy: policy.clone(),
             objective,
             estimator,
+            belief_kind,
             planner: config.planner(policy),
             decider,
             target,
@@ -269,6 +273,29 @@ impl Agent {
         self.estimator.belief()
     }
 
+    /// What says to other agents what the belief is; `None` for estimators that see no frames or know
+    /// more than their belief.
+    pub fn belief_kind(&self) -> Option<&str> {
+        self.belief_kind.as_deref()
+    }
+
+    /// Whether frames are what its belief is made of.
+    pub fn sees_frames(&self) -> bool {
+        matches!(
+            self.estimator,
+            Estimator::KnownModel(_) | Estimator::Learned(_) | Estimator::Autoencoder(..)
+        )
+    }
+
+    /// Goes on from a belief about X_{k+1} of its own kind and shape.
+    pub fn take_over(&mut self, belief: Belief) {
+        match &mut self.estimator {
+            Estimator::KnownModel(filter) => filter.set_belief(belief),
+            Estimator::Learned(filter) => filter.set_belief(belief),
+            _ => {}
+        }
+    }
+
     /// The policy.
     pub fn policy(&self) -> &Policy {
         &self.policy
@@ -295,6 +322,27 @@ impl Estimator {
             Self::Learned(filter) => filter.belief(),
         }
     }
+}
+
+/// The kind of belief, with a checksum of the parameters that give it its meaning.
+fn belief_kind(estimator: &Estimator, task: &Task<'_>) -> Option<String> {
+    let (kind, checksum) = match estimator {
+        Estimator::KnownModel(_) => {
+            let text = format!("{:?}", task.model.file());
+            ("known_model", crc32fast::hash(text.as_bytes()))
+        }
+        Estimator::Learned(filter) => {
+            let tables = filter.tables();
+            let numbers = [&tables.kernel, &tables.likelihood, &tables.initial];
+            let numbers = numbers.into_iter().flatten();
+            let bytes: Vec<u8> = numbers.flat_map(|number| number.to_le_bytes()).collect();
+            ("learned_filter", crc32fast::hash(&bytes))
+        }
+        _ => return None,
+    };
+    Some(format!(
+        "{kind} {checksum:08x}, probabilities [S, H, W] as f32"
+    ))
 }
 
 /// What decides for a policy: the DQN learned beside its belief, or that of a known model's.

@@ -1,8 +1,12 @@
 //! The agent's end of the wire: acquire worlds, fly paths, receive frames.
 
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD as BASE64;
 use protocol::channels::Instance;
 use protocol::connection::{ConnectionError, StepAnswer, unexpected};
-use protocol::control::{LeaseInfo, Reply, Request, ServerInfo, WorldInfo, WorldSeed};
+use protocol::control::{
+    LeaseInfo, MAX_BELIEF_PART, Reply, Request, ServerInfo, WorldInfo, WorldSeed,
+};
 use protocol::message::{FLAG_FULL_COVERAGE, Operation, StepRequest, StepResult};
 use protocol::path::path_to_bytes;
 use protocol::{Cell, Connection, Frame, Move, Shape};
@@ -139,6 +143,68 @@ impl Client {
         self.observations(&answer)
     }
 
+    /// What the worlds showed at an earlier step k.
+    ///
+    /// # Errors
+    /// [`ConnectionError`]; a refusal as `NotKept` tells the oldest step that is kept.
+    pub fn recall(
+        &mut self,
+        worlds: Range<u32>,
+        step: u64,
+    ) -> Result<Vec<Observation>, ConnectionError> {
+        let request = StepRequest {
+            step,
+            ..self.request(Operation::Recall, &worlds)
+        };
+        let answer = self.connection.step(request, &[], STEP_TIMEOUT)?;
+        self.observations(&answer)
+    }
+
+    /// Leaves a belief about the first world to whoever acts on it next.
+    ///
+    /// # Errors
+    /// [`ConnectionError`].
+    pub fn leave_belief(&mut self, kind: &str, bytes: &[u8]) -> Result<(), ConnectionError> {
+        for (index, part) in bytes.chunks(MAX_BELIEF_PART).enumerate() {
+            let request = Request::LeaveBelief {
+                lease: self.lease,
+                world: self.worlds.start,
+                kind: kind.into(),
+                offset: (index * MAX_BELIEF_PART) as u64,
+                length: bytes.len() as u64,
+                data: BASE64.encode(part),
+            };
+            self.connection.control(&request, STEP_TIMEOUT)?;
+        }
+        Ok(())
+    }
+
+    /// The belief that was left about the first world as it stands, if it is of a kind.
+    ///
+    /// # Errors
+    /// [`ConnectionError`].
+    pub fn belief(&mut self, kind: &str) -> Result<Option<Vec<u8>>, ConnectionError> {
+        let world = self.worlds.start;
+        let mut bytes = Vec::new();
+        loop {
+            let offset = bytes.len() as u64;
+            let request = Request::Belief { world, offset };
+            match self.connection.control(&request, STEP_TIMEOUT) {
+                Ok(Reply::Belief { info, data, .. }) if info.kind == kind => {
+                    let part = BASE64.decode(data).map_err(|error| garbled(&error))?;
+                    bytes.extend_from_slice(&part);
+                    if bytes.len() as u64 >= info.length || part.is_empty() {
+                        return Ok(Some(bytes));
+                    }
+                }
+                // Of another kind, none, or a server that knows no beliefs.
+                Ok(Reply::Belief { .. }) | Err(ConnectionError::Refused { .. }) => return Ok(None),
+                Ok(other) => return Err(unexpected("belief", &other)),
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
     /// Starts new episodes with the given seeds; returns when burn-in is done.
     ///
     /// # Errors
@@ -227,6 +293,13 @@ impl Client {
             })
         };
         answer.results.iter().zip(frames).map(observation).collect()
+    }
+}
+
+fn garbled(problem: &dyn std::fmt::Display) -> ConnectionError {
+    ConnectionError::Garbled {
+        what: "belief",
+        problem: problem.to_string(),
     }
 }
 

@@ -7,6 +7,7 @@ use crate::belief::Belief;
 use crate::client::{Claim, Client, Observation};
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
+use crate::handover::{leave, resume};
 use crate::learned::Learned;
 use crate::planner::Objective;
 use crate::policy::{PlannerKind, Policy};
@@ -67,7 +68,7 @@ impl Decider {
         let last_use = Instant::now();
         let choices = Policy::choices(task.planner, &model);
         let observation = observe(&mut client)?;
-        let agent = agent(
+        let mut agent = agent(
             &client,
             &model,
             &prior,
@@ -75,6 +76,9 @@ impl Decider {
             &choices,
             &observation,
         )?;
+        if !resume(&mut client, &mut agent, &observation)? {
+            take_in(&mut agent, &observation)?;
+        }
         let info = agent_info(task, &model, &choices, &client);
         let last = decision(&agent, &observation, &client, None);
         Ok(Self {
@@ -118,6 +122,7 @@ impl Decider {
             &self.choices,
             &self.observation,
         )?;
+        take_in(&mut self.agent, &self.observation)?;
         self.last = decision(&self.agent, &self.observation, &self.client, None);
         Ok(&self.last)
     }
@@ -135,8 +140,7 @@ impl Decider {
         let worlds = self.client.worlds();
         self.observation = self.client.step(worlds, &[plan.moves])?.remove(0);
         self.last_use = Instant::now();
-        self.agent.correct(&self.observation.frame, None)?;
-        self.agent.predict();
+        take_in(&mut self.agent, &self.observation)?;
         self.last = decision(
             &self.agent,
             &self.observation,
@@ -174,7 +178,8 @@ impl Decider {
     ///
     /// # Errors
     /// [`RunError::Connection`].
-    pub fn release(self) -> Result<(), RunError> {
+    pub fn release(mut self) -> Result<(), RunError> {
+        leave(&mut self.client, &self.agent)?;
         Ok(self.client.release()?)
     }
 
@@ -188,7 +193,7 @@ fn observe(client: &mut Client) -> Result<Observation, RunError> {
     Ok(client.observe(client.worlds())?.remove(0))
 }
 
-/// An agent that has taken in the world's last frame.
+/// An agent before its first frame.
 fn agent(
     client: &Client,
     model: &Model,
@@ -206,10 +211,13 @@ fn agent(
         learned: &Learned::default(),
     };
     // Any choice will do: each has the same estimator and planner.
-    let mut agent = Agent::new(&choices[0], config, task)?;
+    Ok(Agent::new(&choices[0], config, task)?)
+}
+
+fn take_in(agent: &mut Agent, observation: &Observation) -> Result<(), RunError> {
     agent.correct(&observation.frame, None)?;
     agent.predict();
-    Ok(agent)
+    Ok(())
 }
 
 fn decision(

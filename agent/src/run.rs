@@ -6,6 +6,7 @@ use crate::client::{Claim, Client, Observation, server_info, shape_of};
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
 use crate::estimator::Prior;
+use crate::handover::{leave, resume};
 use crate::learned::Learned;
 use crate::policy::{EstimatorKind, Policy, UnknownPolicy};
 use crate::truth::{TruthError, TruthFeed};
@@ -130,7 +131,11 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
             Err(error) => return Err(error),
         }
     }
-    match attached.client.release().map_err(RunError::from) {
+    let Attached {
+        mut client, agent, ..
+    } = attached;
+    let released = leave(&mut client, &agent).and_then(|()| client.release());
+    match released.map_err(RunError::from) {
         Err(error) if !is_outage(&error) => Err(error),
         _ => Ok(summary),
     }
@@ -206,7 +211,10 @@ impl Attached {
             observation,
             report,
         };
-        attached.take_in()?;
+        let present = &attached.observation;
+        if !resume(&mut attached.client, &mut attached.agent, present)? {
+            attached.take_in()?;
+        }
         Ok(attached)
     }
 

@@ -8,6 +8,7 @@ use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use env_server::config::ServerConfig;
 use env_server::lease::ClientId;
 use env_server::simulator::{Outcome, Simulator, Surroundings};
+use env_server::snapshot::decode;
 use protocol::control::{Reply, Request};
 use protocol::message::{Operation, Status, StepRequest, VERSION};
 use protocol::randomness::split_mix;
@@ -107,5 +108,26 @@ fn simulator_step(criterion: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, simulator_step);
+fn snapshot(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("snapshot (target: 100 us each)");
+    let mut session = Session::new(1);
+    // As many as are kept.
+    (0..300).for_each(|_| _ = session.step());
+    let simulator = &session.simulator;
+    let bytes = simulator.snapshot(0..1).expect("a world that is ready");
+    group.throughput(Throughput::Bytes(bytes.len() as u64));
+    group.bench_function("to bytes", |bencher| {
+        bencher.iter(|| simulator.snapshot(0..1));
+    });
+    let place = simulator.place();
+    group.bench_function("from bytes", |bencher| {
+        bencher.iter(|| {
+            let snapshot = decode(&bytes).expect("a snapshot");
+            snapshot.restore(&place.settings, &place.rules, place.n_moves)
+        });
+    });
+    group.finish();
+}
+
+criterion_group!(benches, simulator_step, snapshot);
 criterion_main!(benches);

@@ -50,6 +50,16 @@ pub struct ServerConfig {
     pub lease_millis: u64,
     /// Threads that simulate; 0: one per core.
     pub threads: usize,
+    /// Steps of each world whose frames are kept for agents that come later, 0 to 1,000,000.
+    pub history: u32,
+    /// Begin with the worlds of this snapshot file, or of the last in this folder; empty: anew.
+    pub restore: String,
+    /// Write a snapshot after so many steps of all worlds together, per world; 0: never.
+    pub snapshot_every: u64,
+    /// The folder for these snapshots.
+    pub snapshot_dir: String,
+    /// How many of them to keep, at least 1.
+    pub snapshot_keep: u32,
 }
 
 /// The same settings as flags; each overrides the file.
@@ -103,6 +113,21 @@ pub struct ServerFlags {
     /// Threads that simulate, 0 for one per core [default: 0]
     #[arg(long)]
     pub threads: Option<usize>,
+    /// Steps of each world whose frames are kept for agents that come later [default: 256]
+    #[arg(long)]
+    pub history: Option<u32>,
+    /// Begin with the worlds of this snapshot file, or of the last in this folder, if there is one
+    #[arg(long, value_name = "FILE|FOLDER")]
+    pub restore: Option<String>,
+    /// Write a snapshot each so many steps, and one at the end [default: 0, never]
+    #[arg(long, value_name = "STEPS")]
+    pub snapshot_every: Option<u64>,
+    /// The folder for these snapshots
+    #[arg(long, value_name = "FOLDER")]
+    pub snapshot_dir: Option<String>,
+    /// How many of these snapshots to keep [default: 3]
+    #[arg(long)]
+    pub snapshot_keep: Option<u32>,
 }
 
 /// [`CoverageRule`] as a flag.
@@ -182,6 +207,11 @@ impl Default for ServerConfig {
             reveal_model: true,
             lease_millis: 30_000,
             threads: 0,
+            history: 256,
+            restore: String::new(),
+            snapshot_every: 0,
+            snapshot_dir: String::new(),
+            snapshot_keep: 3,
         }
     }
 }
@@ -217,6 +247,11 @@ impl ServerFlags {
         set(&mut config.reveal_model, &self.reveal_model);
         set(&mut config.lease_millis, &self.lease_millis);
         set(&mut config.threads, &self.threads);
+        set(&mut config.history, &self.history);
+        set(&mut config.restore, &self.restore);
+        set(&mut config.snapshot_every, &self.snapshot_every);
+        set(&mut config.snapshot_dir, &self.snapshot_dir);
+        set(&mut config.snapshot_keep, &self.snapshot_keep);
         Ok(config)
     }
 }
@@ -234,6 +269,16 @@ impl ServerConfig {
         in_range("lease_millis", self.lease_millis, 100, 86_400_000)?;
         in_range("threads", self.threads as u64, 0, 256)?;
         in_range("burn_in", self.burn_in, 0, 1 << 40)?;
+        in_range("history", self.history.into(), 0, 1_000_000)?;
+        in_range("snapshot_keep", self.snapshot_keep.into(), 1, 1_000_000)?;
+        if (self.snapshot_every == 0) != self.snapshot_dir.is_empty() {
+            let got = format!("{} and {:?}", self.snapshot_every, self.snapshot_dir);
+            return Err(ConfigError::Range {
+                setting: "snapshot_every and snapshot_dir",
+                expected: "both or neither".into(),
+                got,
+            });
+        }
         if let Start::At(cell) = self.start
             && !shape.contains(cell)
         {

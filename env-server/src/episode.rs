@@ -3,10 +3,12 @@
 //! A step flies the path, moves the world from X_k to X_{k+1}, and observes the visited cells of
 //! X_{k+1} (paper Algorithm 1; the order is the authors').
 
+use crate::history::{History, Seen};
 use crate::sensor::Sensor;
+use crate::snapshot::{Misfit, WorldSnapshot, Written};
 use crate::world::World;
 use protocol::message::StepResult;
-use protocol::path::fly;
+use protocol::path::{fly, path_from_bytes, path_to_bytes};
 use protocol::randomness::{Purpose, stream};
 use protocol::{Cell, Coverage, Dynamics, Frame, Grid, Model, Move, Shape};
 use rand::RngExt;
@@ -36,12 +38,18 @@ pub struct Rules {
     pub reward: Vec<f64>,
     /// The state that pays most.
     pub target_state: u8,
+    /// Number of states S.
+    pub n_states: usize,
+    /// Number of observations O.
+    pub n_observations: usize,
     /// Steps simulated before k = 0.
     pub burn_in: u64,
     /// Episode length; 0: never truncated.
     pub max_steps: u64,
     /// The robot's start.
     pub start: Start,
+    /// Steps whose frames are kept.
+    pub history: usize,
     sensor: Sensor,
     dynamics: Dynamics,
 }
@@ -53,6 +61,7 @@ pub struct Episode {
     /// The world at k = 0, so that the next reset to the same seed needs no burn-in.
     beginning: World,
     frame: Frame,
+    history: History,
     path: Vec<Move>,
     path_start: Cell,
     robot: Cell,
@@ -75,9 +84,12 @@ impl Rules {
             shape,
             reward: model.reward().to_vec(),
             target_state: model.target_state() as u8,
+            n_states: model.file().states.len(),
+            n_observations: model.file().observations.len(),
             burn_in,
             max_steps,
             start,
+            history: 0,
             sensor: Sensor::new(model),
             dynamics: Dynamics::new(model, shape)?,
         })
@@ -140,6 +152,8 @@ impl Episode {
             truncated: u16::from(rules.max_steps > 0 && step >= rules.max_steps),
             ..self.result
         };
+        let observed = (coverage != Coverage::Full).then_some(&flight.visited[..]);
+        self.history.push(&self.result, &self.frame, observed);
         self.path_start = self.robot;
         self.robot = flight.end;
         self.path.clear();
@@ -154,6 +168,13 @@ impl Episode {
     /// The last step's frame.
     pub fn frame(&self) -> &Frame {
         &self.frame
+    }
+
+    /// What step k showed, if it is kept; else the oldest step that is.
+    pub fn recall(&self, step: u64) -> Result<&Seen, u64> {
+        let oldest = || self.history.all().next().map(|seen| seen.result.step);
+        let seen = self.history.step(step);
+        seen.ok_or_else(|| oldest().unwrap_or(self.result.step))
     }
 
     /// The hidden states, shape `[H, W]`.
@@ -171,6 +192,65 @@ impl Episode {
         self.result.truncated != 0
     }
 
+    /// All that decides its future, and what it shows now.
+    pub fn written(&self) -> Written<'_> {
+        fn bytes(states: &Grid<u8>) -> &[u8] {
+            states.as_slice().expect("invariant: states are row-major")
+        }
+        Written {
+            result: bytemuck::bytes_of(&self.result),
+            states: bytes(self.world.states()),
+            beginning: bytes(self.beginning.states()),
+            frame: self.frame.as_bytes(),
+            path: path_to_bytes(&self.path),
+            path_start: [self.path_start.row as u32, self.path_start.col as u32],
+            history: self.history.all().map(Seen::written).collect(),
+        }
+    }
+
+    /// The episode that a snapshot shows: it goes on bit for bit as the one that was taken.
+    ///
+    /// # Errors
+    /// [`Misfit`] names what cannot be part of an episode under these rules.
+    pub fn restore(rules: &Rules, snapshot: WorldSnapshot) -> Result<Self, Misfit> {
+        snapshot.check(rules)?;
+        let WorldSnapshot {
+            result,
+            states,
+            beginning,
+            frame,
+            path,
+            path_start,
+            history,
+        } = snapshot;
+        let grid = |states| Grid::from_shape_vec(rules.shape.dim(), states);
+        let world = |step, states| {
+            let states = grid(states).expect("invariant: the length was checked");
+            World::at(
+                rules.dynamics.clone(),
+                result.seed,
+                rules.burn_in,
+                step,
+                states,
+            )
+        };
+        let n_observations = rules.n_observations;
+        let frame = Frame::from_bytes(rules.shape, n_observations, &frame);
+        Ok(Self {
+            world: world(result.step, states),
+            beginning: world(0, beginning),
+            frame: frame.map_err(|error| Misfit(error.to_string()))?,
+            history: History::with(rules.history, history),
+            path: path_from_bytes(&path).map_err(|error| Misfit(error.to_string()))?,
+            path_start,
+            robot: Cell {
+                row: result.row as usize,
+                col: result.col as usize,
+            },
+            result,
+        })
+    }
+
     fn beginning(rules: &Rules, world: World, episode: u64) -> Self {
         let robot = rules.start_cell(world.seed());
         let result = StepResult {
@@ -183,10 +263,13 @@ impl Episode {
             ..StepResult::default()
         };
         let (beginning, frame) = (world.clone(), Frame::empty(rules.shape));
+        let mut history = History::new(rules.history);
+        history.push(&result, &frame, Some(&[]));
         Self {
             world,
             beginning,
             frame,
+            history,
             path: Vec::new(),
             path_start: robot,
             robot,
@@ -236,7 +319,6 @@ fn count(states: &Grid<u8>, wanted: u8) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::path::path_from_bytes;
 
     fn rules(max_steps: u64, start: Start) -> Rules {
         let shape = Shape::new(12, 20).expect("test shape");

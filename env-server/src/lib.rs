@@ -2,10 +2,15 @@
 //!
 //! One step, in reading order: [`world`] (hidden states), [`sensor`] (noise), [`episode`] (path,
 //! reward, frame), [`lease`] (who may act), [`simulator`] (request in, answer out), [`ports`] and
-//! [`server`] (shared memory and the loop). [`resets`] and [`liveness`] keep slow things off that loop.
+//! [`server`] (shared memory and the loop). [`resets`], [`files`] and [`liveness`] keep slow things off
+//! that loop. [`snapshot`] writes worlds down, [`history`] and [`beliefs`] keep what the next agent needs.
 
+pub mod autosave;
+pub mod beliefs;
 pub mod config;
 pub mod episode;
+pub mod files;
+pub mod history;
 pub mod lease;
 pub mod liveness;
 pub mod ports;
@@ -14,4 +19,5 @@ pub mod resets;
 pub mod sensor;
 pub mod server;
 pub mod simulator;
+pub mod snapshot;
 pub mod world;

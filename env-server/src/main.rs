@@ -1,5 +1,7 @@
 //! `emberwatch-server`: reads settings, starts logging, serves.
 
+mod commands;
+
 use anyhow::{Context, Result};
 use clap::{Args, Parser, Subcommand};
 use env_server::config::ServerFlags;
@@ -40,6 +42,12 @@ enum Command {
     Status(Target),
     /// Stop a running server
     Stop(Target),
+    /// Write worlds of a running server to a file
+    Snapshot(commands::SnapshotCommand),
+    /// Put the worlds of a file in the place of a running server's
+    Restore(commands::RestoreCommand),
+    /// Put a copy of one world of a running server in the place of another
+    Fork(commands::ForkCommand),
 }
 
 #[derive(Args)]
@@ -67,6 +75,9 @@ fn run(cli: &Cli) -> Result<()> {
     match &cli.command {
         Some(Command::Status(target)) => show_status(target),
         Some(Command::Stop(target)) => ask(target, &Request::Shutdown {}).map(|_| ()),
+        Some(Command::Snapshot(command)) => command.run(),
+        Some(Command::Restore(command)) => command.run(),
+        Some(Command::Fork(command)) => command.run(),
         None => {
             let checked = cli.flags.effective()?.check()?;
             if cli.check {

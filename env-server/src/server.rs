@@ -1,11 +1,14 @@
 //! The loop: receive, check the lease, step, answer, publish.
 
+use crate::autosave::{Autosave, FirstWorlds, first_worlds};
 use crate::config::Checked;
+use crate::files::{Done, Files};
 use crate::liveness::{Clients, Janitor};
 use crate::ports::{ActiveStep, PortError, Ports};
 use crate::publications::Publications;
 use crate::resets::Resets;
-use crate::simulator::{Awaited, Outcome, Simulator, Surroundings};
+use crate::simulator::{Awaited, FileOrder, Outcome, Simulator, Surroundings};
+use crate::snapshot::folder::FileError;
 use protocol::channels::{ChannelError, ipc_error};
 use protocol::control::Reply;
 use protocol::message::{Operation, Status};
@@ -17,6 +20,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use std::cell::Cell;
+use std::collections::HashMap;
 use std::collections::hash_map::RandomState;
 use std::hash::BuildHasher;
 use std::ops::Range;
@@ -57,6 +61,9 @@ pub enum ServeError {
     /// The process to end with is not there.
     #[error(transparent)]
     Keeper(#[from] NoKeeper),
+    /// A snapshot to begin with is refused, or none could be written.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// Threads could not be started.
     #[error("start {n_threads} threads: {problem}")]
     Threads {
@@ -80,6 +87,7 @@ pub fn serve(
     while !stop.load(Ordering::Relaxed) && !server.is_over {
         server.turn()?;
     }
+    server.save_last();
     tracing::info!(n_steps = server.simulator.n_steps(), "stopped");
     Ok(())
 }
@@ -93,6 +101,10 @@ struct Server {
     janitor: Janitor,
     resets: Resets,
     awaiting: Vec<(ActiveControl, Awaited)>,
+    files: Files,
+    /// Requests that wait for a file, by the number of its job.
+    file_orders: HashMap<u64, (ActiveControl, FileOrder)>,
+    autosave: Option<Autosave>,
     payload: Vec<u8>,
     /// Observers that were there at the last look.
     publications: Publications,
@@ -131,12 +143,22 @@ impl Server {
             "serving"
         );
         let n_threads = config.threads;
-        let (simulator, orders) = Simulator::new(checked, threads(n_threads)?, token_source())?;
+        let autosave = Autosave::new(&checked)?;
+        let settings = checked.clone();
+        let (mut simulator, mut orders) =
+            Simulator::new(checked, threads(n_threads)?, token_source())?;
+        let place = simulator.place();
+        if let Some(FirstWorlds { path, worlds }) = first_worlds(&settings, &place)? {
+            tracing::info!(file = %path.display(), "restored");
+            orders.clear();
+            for (world, episode) in worlds.into_iter().enumerate() {
+                simulator.finish_reset(world, episode);
+            }
+        }
+        let not_started = |problem: String| ServeError::Threads { n_threads, problem };
+        let files = Files::start(place).map_err(|error| not_started(error.to_string()))?;
         let resets = Resets::new(threads(n_threads)?, simulator.rules().clone());
-        let resets = resets.map_err(|errno| ServeError::Threads {
-            n_threads,
-            problem: errno.to_string(),
-        })?;
+        let resets = resets.map_err(|errno| not_started(errno.to_string()))?;
         resets.start(orders);
         let now = Instant::now();
         Ok(Self {
@@ -148,6 +170,9 @@ impl Server {
             janitor: Janitor::start(),
             resets,
             awaiting: Vec::new(),
+            files,
+            file_orders: HashMap::new(),
+            autosave,
             payload: Vec::new(),
             publications: Publications::default(),
             rate: Rate {
@@ -213,7 +238,11 @@ impl Server {
         if self.ports.drain()? {
             return Ok(true);
         }
-        let own = [self.ports.descriptor(), self.resets.descriptor()];
+        let own = [
+            self.ports.descriptor(),
+            self.resets.descriptor(),
+            self.files.descriptor(),
+        ];
         let keeper = self.keeper.iter().map(Keeper::descriptor);
         let others = keeper.chain(self.clients.descriptors());
         let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(others).collect();
@@ -234,6 +263,7 @@ impl Server {
         if header.operation == Operation::Step as u32 {
             let worlds = self.simulator.worlds_of(&reply);
             self.publish(worlds);
+            self.save_if_due();
         }
     }
 
@@ -257,6 +287,14 @@ impl Server {
                 self.resets.start(orders);
                 self.awaiting.push((request, awaited));
                 self.answer_awaiting(now);
+            }
+            Outcome::Changed(worlds, reply) => {
+                self.send_reply(&request, &reply);
+                self.publish(worlds);
+            }
+            Outcome::File(job, order) => {
+                let number = self.files.order(job);
+                self.file_orders.insert(number, (request, order));
             }
             Outcome::Shutdown => {
                 self.send_reply(&request, &Reply::Done);
@@ -294,6 +332,7 @@ impl Server {
     fn look_around(&mut self, now: Instant) {
         self.last_tick = now;
         self.take_resets(now);
+        self.take_files(now);
         self.forget_abandoned(now);
         self.bury_the_dead();
         self.is_over |= self.keeper.as_ref().is_some_and(Keeper::has_ended);
@@ -316,6 +355,68 @@ impl Server {
         self.answer_awaiting(now);
     }
 
+    fn save_if_due(&mut self) {
+        let n_steps = self.simulator.n_steps();
+        if let Some(autosave) = &mut self.autosave
+            && autosave.is_due(n_steps)
+            && let Some(bytes) = self.simulator.snapshot(self.simulator.worlds())
+        {
+            autosave.order(n_steps, bytes, &mut self.files);
+        }
+    }
+
+    /// What a server that ends leaves to the next.
+    fn save_last(&mut self) {
+        let n_steps = self.simulator.n_steps();
+        if let Some(autosave) = &mut self.autosave
+            && let Some(bytes) = self.simulator.snapshot(self.simulator.worlds())
+        {
+            autosave.order(n_steps, bytes, &mut self.files);
+        }
+    }
+
+    fn take_files(&mut self, now: Instant) {
+        for (number, outcome) in self.files.finished() {
+            if let Some(autosave) = &mut self.autosave
+                && autosave.is_done(number)
+            {
+                if let Err(error) = outcome {
+                    tracing::warn!("not saved: {error}");
+                }
+                self.save_if_due(); // Steps may have gone on meanwhile, and stopped.
+                continue;
+            }
+            let Some((request, order)) = self.file_orders.remove(&number) else {
+                continue; // Its client gave up.
+            };
+            let reply = self.file_reply(now, &order, outcome);
+            self.send_reply(&request, &reply);
+            if let (FileOrder::Restored { worlds, .. }, Status::Ok) = (order, reply.status()) {
+                self.publish(worlds);
+            }
+        }
+    }
+
+    fn file_reply(
+        &mut self,
+        now: Instant,
+        order: &FileOrder,
+        outcome: Result<Done, FileError>,
+    ) -> Reply {
+        match outcome {
+            Ok(Done::Loaded(episodes)) => self.simulator.finish_restore(now, order, episodes),
+            Ok(Done::Saved { path, n_bytes }) => self.simulator.saved(order, &path, n_bytes),
+            Err(error) => {
+                self.simulator.forget_file(now, order);
+                Reply::Error {
+                    status: Status::BadFile,
+                    detail: 0,
+                    message: error.to_string(),
+                }
+            }
+        }
+    }
+
     /// Lets go of requests whose clients no longer wait: until then, iceoryx2 hands out none of the
     /// same client's next ones.
     fn forget_abandoned(&mut self, now: Instant) {
@@ -324,6 +425,13 @@ impl Server {
             let is_awaited = request.is_connected();
             if !is_awaited {
                 simulator.forget_awaited(now, awaited);
+            }
+            is_awaited
+        });
+        self.file_orders.retain(|_, (request, order)| {
+            let is_awaited = request.is_connected();
+            if !is_awaited {
+                simulator.forget_file(now, order);
             }
             is_awaited
         });

@@ -4,12 +4,17 @@
 //! sends is bytes and numbers it chose freely: nothing here may panic on them.
 
 mod control;
+mod stored;
 
 pub use control::{Awaited, Outcome, Surroundings};
+pub use stored::FileOrder;
 
+use crate::beliefs::Beliefs;
 use crate::config::Checked;
 use crate::episode::{Episode, Rules};
+use crate::history::Seen;
 use crate::lease::{ClientId, Leases, Refusal};
+use crate::snapshot::Settings;
 use protocol::message::{
     FLAG_FULL_COVERAGE, Operation, Status, StepReply, StepRequest, StepResult, VERSION,
 };
@@ -31,6 +36,8 @@ const PARALLEL_CELLS: usize = 1 << 17;
 pub struct Simulator {
     checked: Checked,
     rules: Rules,
+    settings: Settings,
+    beliefs: Beliefs,
     slots: Vec<Slot>,
     leases: Leases,
     threads: ThreadPool,
@@ -76,13 +83,16 @@ impl Simulator {
         next_token: Box<dyn FnMut() -> u64>,
     ) -> Result<(Self, Vec<ResetOrder>), ModelError> {
         let config = &checked.config;
-        let rules = Rules::new(
+        let mut rules = Rules::new(
             &checked.model,
             checked.shape,
             config.burn_in,
             config.max_steps,
             config.start,
         )?;
+        rules.history = config.history as usize;
+        let settings = Settings::of(&checked);
+        let beliefs = Beliefs::new(config.worlds as usize, checked.shape.n_cells());
         let (n_worlds, first_seed) = (config.worlds as usize, config.seed);
         let slots = (0..n_worlds)
             .map(|_| Slot::Resetting(StepResult::default()))
@@ -98,6 +108,8 @@ impl Simulator {
             Self {
                 checked,
                 rules,
+                settings,
+                beliefs,
                 slots,
                 leases,
                 threads,
@@ -129,9 +141,12 @@ impl Simulator {
             ..StepReply::default()
         };
         match outcome {
-            Ok(worlds) => {
+            Ok((operation, worlds)) => {
                 let n_worlds = worlds.len() as u32;
-                self.write_worlds(worlds, payload);
+                match operation {
+                    Operation::Recall => self.write_past(worlds, request.step, payload),
+                    _ => self.write_worlds(worlds, payload),
+                }
                 StepReply {
                     status: Status::Ok as u32,
                     n_worlds,
@@ -149,9 +164,9 @@ impl Simulator {
         }
     }
 
-    /// Puts a world that was reset back.
+    /// Puts a world that was reset back, or one that a server begins with.
     pub fn finish_reset(&mut self, world: usize, episode: Box<Episode>) {
-        self.slots[world] = Slot::Ready(episode);
+        self.put(world, episode);
     }
 
     /// The rules, for those who carry out resets.
@@ -208,7 +223,7 @@ impl Simulator {
         client: ClientId,
         request: &StepRequest,
         paths: &[u8],
-    ) -> Result<Range<usize>, Refusal> {
+    ) -> Result<(Operation, Range<usize>), Refusal> {
         if request.version != VERSION {
             return Err(Refusal::new(Status::VersionMismatch, VERSION.into()));
         }
@@ -218,6 +233,10 @@ impl Simulator {
         let worlds = self.range(request.first_world, request.n_worlds)?;
         match operation {
             Operation::Observe => self.check_observation(&worlds, paths)?,
+            Operation::Recall => {
+                self.check_observation(&worlds, paths)?;
+                self.check_kept(&worlds, request.step)?;
+            }
             Operation::Step => {
                 let batch = self.check_batch(worlds.clone(), request, paths)?;
                 self.leases.use_lease(now, request.lease, client, &worlds)?;
@@ -225,7 +244,7 @@ impl Simulator {
                 self.run(batch);
             }
         }
-        Ok(worlds)
+        Ok((operation, worlds))
     }
 
     fn range(&self, first: u32, n_worlds: u32) -> Result<Range<usize>, Refusal> {
@@ -240,10 +259,20 @@ impl Simulator {
         if !paths.is_empty() {
             return Err(Refusal::new(Status::WrongLength, 0));
         }
+        self.check_present(worlds)
+    }
+
+    fn check_present(&self, worlds: &Range<usize>) -> Result<(), Refusal> {
         let resetting = worlds.clone().find(|&world| self.episode(world).is_none());
         resetting.map_or(Ok(()), |world| {
             Err(Refusal::new(Status::Resetting, world as u64))
         })
+    }
+
+    fn check_kept(&self, worlds: &Range<usize>, step: u64) -> Result<(), Refusal> {
+        let mut episodes = worlds.clone().filter_map(|world| self.episode(world));
+        let missing = episodes.find_map(|episode| episode.recall(step).err());
+        missing.map_or(Ok(()), |oldest| Err(Refusal::new(Status::NotKept, oldest)))
     }
 
     fn check_batch(
@@ -306,6 +335,21 @@ impl Simulator {
             slots.iter_mut().zip(paths).for_each(step);
         }
         self.n_steps += batch.worlds.len() as u64;
+    }
+
+    fn write_past(&self, worlds: Range<usize>, step: u64, payload: &mut Vec<u8>) {
+        let episodes = worlds.filter_map(|world| self.episode(world));
+        let seen: Vec<&Seen> = episodes
+            .filter_map(|episode| episode.recall(step).ok())
+            .collect();
+        for seen in &seen {
+            payload.extend_from_slice(bytemuck::bytes_of(&seen.result));
+        }
+        for seen in &seen {
+            let start = payload.len();
+            payload.resize(start + self.rules.shape.n_cells(), 0);
+            seen.write_frame(&mut payload[start..]);
+        }
     }
 
     fn write_worlds(&self, worlds: Range<usize>, payload: &mut Vec<u8>) {

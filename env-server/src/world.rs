@@ -32,6 +32,17 @@ impl World {
         }
     }
 
+    /// The world that stood at step k with these states.
+    pub fn at(dynamics: Dynamics, seed: u64, burn_in: u64, step: u64, states: Grid<u8>) -> Self {
+        Self {
+            dynamics,
+            states,
+            seed,
+            burn_in,
+            step,
+        }
+    }
+
     /// Moves the world from k to k + 1 (paper eq. 4, each cell drawn from `Phi` of the states).
     pub fn advance(&mut self) {
         self.dynamics

@@ -168,8 +168,8 @@ impl Siege {
                 self.awaited.push((client, awaited));
             }
             Outcome::Answer(Reply::Error { .. }) => self.n_refused += 1,
-            Outcome::Answer(_) => {}
-            Outcome::Shutdown => panic!("nobody asked for that"),
+            Outcome::Answer(_) | Outcome::Changed(..) => {}
+            Outcome::Shutdown | Outcome::File(..) => panic!("nobody asked for that"),
         }
     }
 
@@ -278,8 +278,8 @@ fn ask(simulator: &mut Simulator, now: Instant, text: &[u8]) -> Option<Reply> {
             carry_out(simulator, orders);
             simulator.answer_awaited(now, &awaited)
         }
-        Outcome::Answer(reply) => Some(reply),
-        Outcome::Shutdown => None,
+        Outcome::Answer(reply) | Outcome::Changed(_, reply) => Some(reply),
+        Outcome::Shutdown | Outcome::File(..) => None,
     }
 }
 

@@ -8,6 +8,9 @@ use serde::{Deserialize, Serialize};
 /// Longest control message accepted: 1 MiB.
 pub const MAX_CONTROL_BYTES: usize = 1 << 20;
 
+/// Most bytes of a belief in one message, before they are written in base64.
+pub const MAX_BELIEF_PART: usize = 1 << 19;
+
 /// What a client asks on the control channel.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "op", rename_all = "snake_case", deny_unknown_fields)]
@@ -49,6 +52,61 @@ pub enum Request {
         /// The worlds and their seeds.
         worlds: Vec<WorldSeed>,
     },
+    /// Write worlds to a file on the server's host.
+    Snapshot {
+        /// First world.
+        first_world: u32,
+        /// Number of worlds, at least 1.
+        n_worlds: u32,
+        /// The file, an absolute path.
+        path: String,
+    },
+    /// Put the worlds of such a file in the place of one's own.
+    Restore {
+        /// The lease.
+        lease: u64,
+        /// First world.
+        first_world: u32,
+        /// Number of worlds, at least 1.
+        n_worlds: u32,
+        /// The first of the file's worlds that is read.
+        #[serde(default)]
+        from: u32,
+        /// The file, an absolute path.
+        path: String,
+    },
+    /// Put a copy of one world in the place of one's own.
+    Fork {
+        /// The lease, of the world that is replaced.
+        lease: u64,
+        /// The world that is copied.
+        from: u32,
+        /// The world that is replaced.
+        to: u32,
+    },
+    /// Leave the next part of a belief about a world to whoever acts on it next.
+    LeaveBelief {
+        /// The lease.
+        lease: u64,
+        /// The world.
+        world: u32,
+        /// What the bytes are; at most 256 bytes.
+        kind: String,
+        /// Where the part begins: 0 begins a new belief.
+        offset: u64,
+        /// Length of the whole.
+        length: u64,
+        /// The part in base64, at most [`MAX_BELIEF_PART`] bytes.
+        data: String,
+    },
+    /// What belief was left about a world as it is now?
+    Belief {
+        /// The world.
+        world: u32,
+        /// Where the part asked for begins.
+        #[serde(default)]
+        offset: u64,
+    },
     /// What is going on?
     // Braces, so that unknown keys are refused here too.
     Status {},
@@ -75,12 +133,36 @@ pub enum Reply {
     Hello(Box<ServerInfo>),
     /// To `acquire` and `renew`.
     Lease(LeaseInfo),
-    /// To `release` and `shutdown`.
+    /// To `release`, `leave_belief` and `shutdown`.
     Done,
     /// To `reset`: the worlds as they are now.
     Reset {
         /// One entry per world that was reset, in the order asked.
         worlds: Vec<WorldInfo>,
+    },
+    /// To `snapshot`: the file was written.
+    Snapshot {
+        /// The file.
+        path: String,
+        /// Its length.
+        n_bytes: u64,
+        /// The worlds in it, as they were.
+        worlds: Vec<WorldInfo>,
+    },
+    /// To `restore` and `fork`: the worlds as they are now.
+    Restored {
+        /// One entry per world that was replaced.
+        worlds: Vec<WorldInfo>,
+    },
+    /// To `belief`.
+    Belief {
+        /// What it is, and about which step.
+        #[serde(flatten)]
+        info: BeliefInfo,
+        /// Where the part begins.
+        offset: u64,
+        /// The part in base64; empty at the end.
+        data: String,
     },
     /// To `status`.
     Status(ServerStatus),
@@ -153,6 +235,21 @@ pub struct LeaseInfo {
     pub ttl_millis: u64,
     /// The worlds it covers, as they are now.
     pub worlds: Vec<WorldInfo>,
+}
+
+/// A belief that was left.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct BeliefInfo {
+    /// What the bytes are.
+    pub kind: String,
+    /// Seed of the episode it is about.
+    pub seed: u64,
+    /// That episode.
+    pub episode: u64,
+    /// The step at which it was left.
+    pub step: u64,
+    /// Its length in bytes.
+    pub length: u64,
 }
 
 /// Where one world stands.

@@ -29,6 +29,8 @@ pub enum Operation {
     Step = 1,
     /// Return the last results and frames again, changing nothing; needs no lease.
     Observe = 2,
+    /// Return the results and frames of an earlier step k; needs no lease.
+    Recall = 3,
 }
 
 /// Answer to a request; every rejection has its own code and changes nothing.
@@ -70,6 +72,10 @@ pub enum Status {
     BadObjective = 15,
     /// The agent that was asked ends: it was told to, or cannot go on; detail: 0.
     AgentEnds = 16,
+    /// A file that cannot be read or written, or is refused; detail: 0.
+    BadFile = 17,
+    /// A frame or a belief that the server does not keep; detail: the oldest step kept, or the present one.
+    NotKept = 18,
 }
 
 /// A number that is no [`Status`] or no [`Operation`].
@@ -91,7 +97,7 @@ pub struct StepRequest {
     pub version: u32,
     /// An [`Operation`].
     pub operation: u32,
-    /// The lease from `acquire`; ignored by `Observe`.
+    /// The lease from `acquire`; ignored by `Observe` and `Recall`.
     pub lease: u64,
     /// Chosen by the client, returned in the answer.
     pub sequence: u64,
@@ -99,7 +105,7 @@ pub struct StepRequest {
     pub first_world: u32,
     /// Number of consecutive worlds.
     pub n_worlds: u32,
-    /// Moves in each path; 0 for `Observe`.
+    /// Moves in each path; 0 for `Observe` and `Recall`.
     pub n_moves: u32,
     /// [`FLAG_FULL_COVERAGE`] or 0.
     pub flags: u32,
@@ -107,8 +113,8 @@ pub struct StepRequest {
     pub listener_low: u64,
     /// High half of that id.
     pub listener_high: u64,
-    /// 0.
-    pub reserved: u64,
+    /// The step k to recall; 0 for other operations.
+    pub step: u64,
 }
 
 /// Header of a `step` answer; the payload is `n_worlds` [`StepResult`]s, then `n_worlds` frames
@@ -263,6 +269,7 @@ impl TryFrom<u32> for Operation {
         match value {
             1 => Ok(Self::Step),
             2 => Ok(Self::Observe),
+            3 => Ok(Self::Recall),
             _ => Err(UnknownCode {
                 what: "operation",
                 value,
@@ -273,7 +280,7 @@ impl TryFrom<u32> for Operation {
 
 impl Status {
     /// Every status, in the order of its code.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 19] = [
         Self::Ok,
         Self::VersionMismatch,
         Self::UnknownOperation,
@@ -291,6 +298,8 @@ impl Status {
         Self::UnknownFlags,
         Self::BadObjective,
         Self::AgentEnds,
+        Self::BadFile,
+        Self::NotKept,
     ];
 
     /// What to tell a client of another version.
@@ -307,7 +316,7 @@ impl Status {
             Self::Ok => "ok".into(),
             Self::VersionMismatch => Self::version_mismatch(VERSION, detail),
             Self::UnknownOperation => {
-                format!("operation: expected 1 (step) or 2 (observe), got {detail}")
+                format!("operation: expected 1 (step), 2 (observe) or 3 (recall), got {detail}")
             }
             Self::Malformed => "malformed control message".into(),
             Self::NoSuchWorld => format!(
@@ -339,6 +348,8 @@ impl Status {
             }
             Self::BadObjective => format!("objective: expected 0 to {}", detail.saturating_sub(1)),
             Self::AgentEnds => "the agent ends".into(),
+            Self::BadFile => "the file cannot be used".into(),
+            Self::NotKept => format!("not kept: the oldest step kept is {detail}"),
         }
     }
 }
@@ -390,10 +401,10 @@ mod tests {
             assert_eq!(Status::try_from(code as u32), Ok(status));
         }
         assert_eq!(
-            Status::try_from(17),
+            Status::try_from(19),
             Err(UnknownCode {
                 what: "status",
-                value: 17
+                value: 19
             })
         );
     }

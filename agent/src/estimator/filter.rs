@@ -67,6 +67,16 @@ impl Filter {
         &self.belief
     }
 
+    /// Believes something else of the same shape.
+    ///
+    /// # Panics
+    /// If the shape is another.
+    pub fn set_belief(&mut self, belief: Belief) {
+        let dim = |belief: &Belief| belief.probabilities().dim();
+        assert_eq!(dim(&belief), dim(&self.belief), "belief: another shape");
+        self.belief = belief;
+    }
+
     /// Bayes' rule on the visited cells, `p = B(y) u / (b(y)' u)` (eq. 5); `p = u` elsewhere.
     ///
     /// # Errors

@@ -89,6 +89,16 @@ impl LearnedFilter {
         &self.tables
     }
 
+    /// Believes something else of the same shape.
+    ///
+    /// # Panics
+    /// If the shape is another.
+    pub fn set_belief(&mut self, belief: Belief) {
+        let dim = |belief: &Belief| belief.probabilities().dim();
+        assert_eq!(dim(&belief), dim(&self.belief), "belief: another shape");
+        self.belief = belief;
+    }
+
     /// Bayes' rule on the visited cells (eq. 5).
     ///
     /// # Errors

@@ -15,6 +15,10 @@ from emberwatch.programs import unused_instance
 settings.register_profile("emberwatch", deadline=None)
 settings.load_profile("emberwatch")
 
+# A shell may start this with signals ignored, which children would inherit.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
 #: A whole test, seconds.
 DEADLINE = 90
 

@@ -4,6 +4,7 @@ import gc
 import os
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -435,3 +436,42 @@ def test_a_forgotten_client_leaves_no_descriptor(server: Callable[..., Server]) 
     for _ in range(5):
         Client(started.instance)
     assert n_open() == before
+
+
+def test_a_world_that_is_written_down_goes_on_bit_for_bit(server: Start, tmp_path: Path) -> None:
+    client = server(worlds=3, seed=4).connect()
+    lease = client.acquire(0, 2)
+    first = lease.step(paths(2, seed=1))
+    second = lease.step(paths(2, seed=2))
+    written = client.snapshot(tmp_path / "lab.snapshot", 0, 2)
+    assert [world.step for world in written] == [2, 2]
+    ahead = lease.step(paths(2, seed=3))
+    assert [world.step for world in lease.restore(tmp_path / "lab.snapshot")] == [2, 2]
+    for step, seen in ((1, first), (2, second)):
+        kept = client.recall(step, 0, 2)
+        assert (kept.frames == seen.frames).all() and (kept.results == seen.results).all()
+    assert (lease.step(paths(2, seed=3)).frames == ahead.frames).all()
+    other = client.acquire(2, 1)
+    (copy,) = other.fork(1, 2)
+    assert (copy.world, copy.step) == (2, 3)
+    both = lease.step(paths(2, seed=5))
+    alone = other.step(paths(2, seed=5)[1])
+    assert (alone.frames[0] == both.frames[1]).all()
+    refused(lambda: other.restore(tmp_path / "none"), errors.BadFileError, 0)
+    refused(lambda: client.recall(9), errors.NotKeptError, 0)
+    with pytest.raises(errors.SettingError, match="step: expected"):
+        client.recall(-1)
+
+
+def test_a_belief_that_is_left_is_found_at_its_step_alone(server: Start) -> None:
+    client = server().connect()
+    lease = client.acquire()
+    assert client.belief() is None
+    data = bytes(range(256)) * 8
+    lease.leave_belief("numbers", data)
+    left = client.belief()
+    assert left is not None
+    assert (left.kind, left.step, left.data) == ("numbers", 0, data)
+    lease.step(paths(1))
+    assert client.belief() is None
+    refused(lambda: lease.leave_belief("numbers", bytes(35 * 64 + 1)), errors.MalformedError, 0)

@@ -22,6 +22,7 @@ import emberwatch.client
 from emberwatch import errors, observer, wire
 from emberwatch.client import Client, Lease, ServerInfo, ServerStatus, WorldInfo, WorldStatus
 from emberwatch.errors import GarbledAnswerError, RefusedError
+from emberwatch.replies import LeftBeliefInfo
 
 LAYOUTS = document.layouts()
 SCALARS = {"u16": ctypes.c_uint16, "u32": ctypes.c_uint32, "u64": ctypes.c_uint64}
@@ -36,6 +37,10 @@ HEADERS = [
 ]
 EXAMPLES = document.examples()
 HELLO = next(message for message in EXAMPLES if message.get("reply") == "hello")
+LEFT = next(message for message in EXAMPLES if message.get("reply") == "belief")
+
+#: The belief of that example.
+ONE = bytes([0, 0, 128, 63])
 
 
 def replies(kind: str) -> list[dict[str, Any]]:
@@ -152,7 +157,7 @@ def test_a_refusal_says_the_detail_that_the_table_gives_it() -> None:
 
 
 def test_an_unknown_status_is_a_refusal() -> None:
-    for code in (17, 2**32 - 1):
+    for code in (19, 2**32 - 1):
         error = errors.refusal(code, 3)
         assert (type(error), error.detail) == (RefusedError, 3)
         assert str(code) in str(error)
@@ -174,7 +179,8 @@ def test_the_limits_are_the_documented_ones() -> None:
 def test_the_values_are_the_documented_ones() -> None:
     rows = document.table("| kind | name | code |")
     codes = {(kind, name): int(code) for kind, name, code, _ in rows}
-    assert (codes["operation", "step"], codes["operation", "observe"]) == (wire.STEP, wire.OBSERVE)
+    operations = [codes["operation", name] for name in ("step", "observe", "recall")]
+    assert operations == [wire.STEP, wire.OBSERVE, wire.RECALL]
     assert sum(kind == "move" for kind, _ in codes) == wire.N_MOVES
     for sentence in (
         f"The version is {wire.VERSION}.",
@@ -238,6 +244,11 @@ def test_the_documented_requests_are_what_a_client_sends() -> None:
         sent(lease.renew),
         sent(lambda: lease.reset([42]), replies("reset")[0]),
         sent(wired.client.status, replies("status")[0]),
+        sent(lambda: wired.client.snapshot("/tmp/lab.snapshot"), replies("snapshot")[0]),
+        sent(lambda: lease.restore("/tmp/lab.snapshot"), replies("restored")[0]),
+        sent(lambda: lease.fork(0, 1), replies("restored")[1]),
+        sent(lambda: lease.leave_belief(LEFT["kind"], ONE)),
+        sent(wired.client.belief, LEFT),
         sent(lease.release),
         sent(wired.client.shutdown),
     ]
@@ -258,6 +269,8 @@ def test_the_documented_replies_become_records() -> None:
     assert lease.start == (WorldInfo(world=0, step=0, seed=0, episode=0, robot=(0, 0)),)
     wired.say(replies("reset")[0])
     assert lease.reset() == (WorldInfo(world=0, step=0, seed=42, episode=1, robot=(0, 0)),)
+    wired.say(LEFT)
+    assert wired.client.belief() == (LEFT["kind"], 1, 2, ONE)
     wired.say(replies("status")[0])
     status = wired.client.status()
     assert (status.pid, status.n_steps, status.worlds[0].holder_pid) == (14661, 2, 14683)
@@ -273,10 +286,12 @@ def test_unknown_keys_of_a_reply_are_ignored() -> None:
     assert Wired(colour="red").client.info.n_worlds == 1
 
 
-@pytest.mark.parametrize("kind", [ServerInfo, ServerStatus, WorldInfo, WorldStatus])
+@pytest.mark.parametrize("kind", [ServerInfo, ServerStatus, WorldInfo, WorldStatus, LeftBeliefInfo]
+)
 def test_a_record_has_every_documented_key(kind: type[Any]) -> None:
     messages = {ServerInfo: HELLO, ServerStatus: replies("status")[0]}
     messages |= {WorldInfo: replies("reset")[0]["worlds"][0]}
+    messages |= {LeftBeliefInfo: LEFT}
     messages |= {WorldStatus: replies("status")[0]["worlds"][0]}
     names = {field.name for field in dataclasses.fields(kind)}
     assert names == set(messages[kind]) - {"reply"}

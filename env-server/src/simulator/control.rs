@@ -1,6 +1,7 @@
 //! Control requests: parse, check, answer now or when worlds are ready.
 
-use super::{ResetOrder, Simulator, Slot};
+use super::{FileOrder, ResetOrder, Simulator, Slot};
+use crate::files::Job;
 use crate::lease::{Claim, ClientId, Refusal};
 use protocol::channels::MAX_CLIENTS;
 use protocol::control::{
@@ -9,6 +10,7 @@ use protocol::control::{
 use protocol::message::{Status, StepResult, VERSION};
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
+use std::ops::Range;
 use std::time::{Duration, Instant};
 
 /// Longest lease a client may ask for: a day.
@@ -23,6 +25,10 @@ pub enum Outcome {
     Answer(Reply),
     /// Resets to carry out, and an answer when the worlds it names are ready.
     Later(Vec<ResetOrder>, Awaited),
+    /// Worlds to publish, and an answer now.
+    Changed(Range<usize>, Reply),
+    /// Work on a file, and an answer when it is done.
+    File(Job, FileOrder),
     /// An answer now, then the end of the server.
     Shutdown,
 }
@@ -145,6 +151,31 @@ impl Simulator {
                 Outcome::Answer(Reply::Done)
             }
             Request::Reset { lease, worlds } => self.order_resets(now, client, lease, &worlds)?,
+            Request::Snapshot {
+                first_world,
+                n_worlds,
+                path,
+            } => self.order_snapshot(first_world, n_worlds, path)?,
+            Request::Restore {
+                lease,
+                first_world,
+                n_worlds,
+                from,
+                path,
+            } => self.order_restore(now, client, lease, (first_world, n_worlds, from), path)?,
+            Request::Fork { lease, from, to } => self.fork(now, client, lease, (from, to))?,
+            Request::LeaveBelief {
+                lease,
+                world,
+                kind,
+                offset,
+                length,
+                data,
+            } => {
+                let part = (&*kind, offset, length);
+                self.leave_belief(now, client, (lease, world), part, &data)?
+            }
+            Request::Belief { world, offset } => self.belief(world, offset)?,
             Request::Status {} => Outcome::Answer(Reply::Status(self.status(surroundings))),
             Request::Shutdown {} => Outcome::Shutdown,
         })
@@ -233,7 +264,7 @@ impl Simulator {
         }
     }
 
-    fn world_info(&self, world: usize) -> WorldInfo {
+    pub(super) fn world_info(&self, world: usize) -> WorldInfo {
         let result = match &self.slots[world] {
             Slot::Ready(episode) => episode.result(),
             Slot::Resetting(last) => last,
@@ -313,7 +344,7 @@ fn mismatch(client: u32) -> Reply {
     }
 }
 
-fn malformed(message: String) -> Reply {
+pub(super) fn malformed(message: String) -> Reply {
     Reply::Error {
         status: Status::Malformed,
         detail: 0,
@@ -321,7 +352,7 @@ fn malformed(message: String) -> Reply {
     }
 }
 
-fn refusal(refusal: Refusal) -> Reply {
+pub(super) fn refusal(refusal: Refusal) -> Reply {
     Reply::refusal(refusal.status, refusal.detail)
 }
 

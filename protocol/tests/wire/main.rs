@@ -66,7 +66,7 @@ fn layouts() -> Vec<Layout> {
             flags,
             listener_low,
             listener_high,
-            reserved,
+            step,
         }),
         layout!(StepReply {
             version,

@@ -6,7 +6,9 @@ Every call has a timeout in seconds; everything returned is a copy.
 
 from __future__ import annotations
 
+import os
 import threading
+from base64 import b64decode, b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
@@ -17,10 +19,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
 from emberwatch.channels import Closing, Node
-from emberwatch.errors import InvalidActionError, SettingError, refusal
+from emberwatch.errors import (
+    GarbledAnswerError,
+    InvalidActionError,
+    NotKeptError,
+    SettingError,
+    refusal,
+)
 from emberwatch.ports import Bell, RequestPort
 from emberwatch.replies import (
     Grant,
+    LeftBelief,
+    LeftBeliefInfo,
     ServerInfo,
     ServerStatus,
     WorldInfo,
@@ -36,6 +46,10 @@ STEP_TIMEOUT: Final = 5.0
 
 #: Default timeout of what may wait for a burn-in, seconds.
 RESET_TIMEOUT: Final = 120.0
+
+
+#: Most bytes of a belief in one message.
+_BELIEF_PART: Final = 1 << 19
 
 
 class Client(Closing):
@@ -119,6 +133,75 @@ class Client(Closing):
         """The last results and frames again. Needs no lease and changes nothing."""
         return self.exchange(wire.OBSERVE, 0, first_world, n_worlds, 0, b"", timeout=timeout)
 
+    def recall(
+        self,
+        step: int,
+        first_world: int = 0,
+        n_worlds: int = 1,
+        *,
+        timeout: float = STEP_TIMEOUT,
+    ) -> StepAnswer:
+        """The results and frames of an earlier step k of the episode. Needs no lease.
+
+        Raises:
+            NotKeptError: If the server does not keep it any more; `detail` is the oldest step kept.
+        """
+        if not 0 <= step < 2**64:
+            raise SettingError(f"step: expected an integer within 0 to 2**64 - 1, got {step!r}")
+        return self.exchange(
+            wire.RECALL, 0, first_world, n_worlds, 0, b"", step=step, timeout=timeout
+        )
+
+    def snapshot(
+        self,
+        path: str | os.PathLike[str],
+        first_world: int = 0,
+        n_worlds: int | None = None,
+        *,
+        timeout: float = RESET_TIMEOUT,
+    ) -> tuple[WorldInfo, ...]:
+        """Writes worlds to a file on the server's host; `Lease.restore` reads it. Needs no lease.
+
+        Args:
+            path: The file; a relative path is one from this process's folder.
+            first_world: The first world.
+            n_worlds: How many; None: all from the first.
+            timeout: How long to wait for the answer, seconds.
+
+        Returns:
+            The worlds in the file, as they were.
+
+        Raises:
+            BadFileError: If it cannot be written.
+        """
+        request = {
+            "op": "snapshot",
+            "first_world": first_world,
+            "n_worlds": self.info.n_worlds - first_world if n_worlds is None else n_worlds,
+            "path": os.path.abspath(path),
+        }
+        return records(WorldInfo, self.control(request, timeout=timeout))
+
+    def belief(self, world: int = 0, *, timeout: float = STEP_TIMEOUT) -> LeftBelief | None:
+        """What belief was left about a world as it stands; None if there is none."""
+        data = b""
+        while True:
+            request = {"op": "belief", "world": world, "offset": len(data)}
+            try:
+                reply = self.control(request, timeout=timeout)
+            except NotKeptError:
+                return None
+            info = record(LeftBeliefInfo, reply)
+            try:
+                part = b64decode(info.data, validate=True)
+            except ValueError as error:
+                raise GarbledAnswerError(
+                    f"answer to 'belief': expected base64, got {error}"
+                ) from None
+            data += part
+            if len(data) >= info.length or not part:
+                return LeftBelief(info.kind, info.episode, info.step, data)
+
     def status(self, *, timeout: float = STEP_TIMEOUT) -> ServerStatus:
         """What is going on."""
         reply = self.control({"op": "status"}, timeout=timeout)
@@ -158,6 +241,7 @@ class Client(Closing):
         flags: int,
         paths: bytes,
         *,
+        step: int = 0,
         timeout: float,
     ) -> StepAnswer:
         """Sends one request on `step` as it is; `Lease.step` and `observe` are easier.
@@ -180,7 +264,7 @@ class Client(Closing):
                 flags,
                 self._bell.listener_low,
                 self._bell.listener_high,
-                0,
+                step,
             )
             reply, payload = self._step.exchange(header, paths, "a step", timeout)
         if reply.status != 0:
@@ -291,6 +375,67 @@ class Lease:
         ]
         request = {"op": "reset", "lease": self.number, "worlds": pairs}
         return records(WorldInfo, self.client.control(request, timeout=timeout))
+
+    def restore(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        worlds: range | None = None,
+        first: int = 0,
+        timeout: float = RESET_TIMEOUT,
+    ) -> tuple[WorldInfo, ...]:
+        """Puts the worlds of a snapshot file in the place of its own: they go on bit for bit.
+
+        Args:
+            path: The file, written by `Client.snapshot` or `emberwatch-server snapshot`.
+            worlds: Only these worlds, consecutive; None: all of the lease.
+            first: The first of the file's worlds that is read.
+            timeout: How long to wait for the answer, seconds.
+
+        Raises:
+            BadFileError: If the file is damaged, too short, or of a server with other settings.
+        """
+        chosen = self.worlds if worlds is None else self._part(worlds)
+        request = {
+            "op": "restore",
+            "lease": self.number,
+            "first_world": chosen.start,
+            "n_worlds": len(chosen),
+            "from": first,
+            "path": os.path.abspath(path),
+        }
+        return records(WorldInfo, self.client.control(request, timeout=timeout))
+
+    def fork(
+        self, source: int, target: int, *, timeout: float = STEP_TIMEOUT
+    ) -> tuple[WorldInfo, ...]:
+        """Puts a copy of any world in the place of one of its own: both have the same future."""
+        request = {"op": "fork", "lease": self.number, "from": source, "to": target}
+        return records(WorldInfo, self.client.control(request, timeout=timeout))
+
+    def leave_belief(
+        self, kind: str, data: bytes, *, world: int | None = None, timeout: float = STEP_TIMEOUT
+    ) -> None:
+        """Leaves bytes about a world as it stands to whoever acts on it next (`Client.belief`).
+
+        Args:
+            kind: Says to other agents what the bytes are, in at most 256 bytes.
+            data: At most 64 bytes per cell.
+            world: Which world; None: the first of the lease.
+            timeout: How long to wait for each answer, seconds.
+        """
+        for offset in range(0, max(len(data), 1), _BELIEF_PART):
+            part = data[offset : offset + _BELIEF_PART]
+            request = {
+                "op": "leave_belief",
+                "lease": self.number,
+                "world": self.worlds.start if world is None else world,
+                "kind": kind,
+                "offset": offset,
+                "length": len(data),
+                "data": b64encode(part).decode(),
+            }
+            self.client.control(request, timeout=timeout)
 
     def _part(self, worlds: range) -> range:
         """Checks worlds to step: consecutive, of this lease."""

@@ -165,6 +165,18 @@ class AgentEndsError(RefusedError):
     name = "agent_ends"
 
 
+class BadFileError(RefusedError):
+    """A file on the server's host cannot be written or read, or is no snapshot of its worlds."""
+
+    name = "bad_file"
+
+
+class NotKeptError(RefusedError):
+    """A step's frame, or a belief, that the server does not keep; `detail` is the oldest step kept."""
+
+    name = "not_kept"
+
+
 #: The error of each status code, from code 1.
 REFUSALS: tuple[type[RefusedError], ...] = (
     VersionMismatchError,
@@ -183,6 +195,8 @@ REFUSALS: tuple[type[RefusedError], ...] = (
     UnknownFlagsError,
     BadObjectiveError,
     AgentEndsError,
+    BadFileError,
+    NotKeptError,
 )
 
 
@@ -205,7 +219,7 @@ def _explain(kind: type[RefusedError], detail: int) -> str:
     sentences = {
         "version_mismatch": "protocol version mismatch: the server speaks {}; "
         "use a client and a server of one release",
-        "unknown_operation": "operation: expected 1 (step) or 2 (observe), got {}",
+        "unknown_operation": "operation: expected 1 (step), 2 (observe) or 3 (recall), got {}",
         "malformed": "malformed control message",
         "wrong_length": "wrong payload length: expected {} bytes",
         "wrong_path_length": "wrong path length: the server flies {} moves a step",
@@ -218,6 +232,8 @@ def _explain(kind: type[RefusedError], detail: int) -> str:
         "not_permitted": 'full frames need a server with coverage "client" or "full"',
         "unknown_flags": "flags: expected 0 or 1 (full coverage), got {}",
         "bad_objective": "objective: expected one below {}",
+        "bad_file": "the file cannot be used",
+        "not_kept": "not kept: the oldest step kept is {}",
         "agent_ends": "the agent ends",
     }
     return sentences[kind.name].format(detail)

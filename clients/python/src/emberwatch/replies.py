@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, TypeVar, cast, get_origin, get_type_hints
+from typing import Any, NamedTuple, TypeVar, cast, get_origin, get_type_hints
 
 from emberwatch import wire
 from emberwatch.errors import GarbledAnswerError, refusal
@@ -86,6 +86,35 @@ class Grant:
 
     lease: int
     ttl_millis: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LeftBeliefInfo:
+    """The reply to `belief`."""
+
+    kind: str
+    seed: int
+    episode: int
+    step: int
+    length: int
+    offset: int
+    data: str
+
+
+class LeftBelief(NamedTuple):
+    """What an agent left about a world to the next.
+
+    Attributes:
+        kind: Says what the bytes are.
+        episode: The episode it is about.
+        step: The step k at which it was left: the present one.
+        data: The bytes.
+    """
+
+    kind: str
+    episode: int
+    step: int
+    data: bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

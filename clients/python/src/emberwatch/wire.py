@@ -24,6 +24,7 @@ UNOBSERVED: Final = 255
 #: Operations of `step`.
 STEP: Final = 1
 OBSERVE: Final = 2
+RECALL: Final = 3
 
 #: Flag of a step that asks for every cell.
 FULL_COVERAGE: Final = 1
@@ -64,7 +65,7 @@ class StepRequest(Header):
         ("flags", _U32),
         ("listener_low", _U64),
         ("listener_high", _U64),
-        ("reserved", _U64),
+        ("step", _U64),
     ]
 
 

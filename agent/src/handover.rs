@@ -1,0 +1,91 @@
+//! How an agent goes on with what another believed: from the belief that it left with the server, or
+//! else from the frames that the server keeps.
+
+use crate::agent::Agent;
+use crate::belief::Belief;
+use crate::client::{Client, Observation};
+use crate::run::RunError;
+use protocol::Probabilities;
+use protocol::connection::ConnectionError;
+use protocol::message::Status;
+
+/// Gives an agent what is known of a world before its present frame; returns whether that frame is in it
+/// already, and the belief about X_{k+1}.
+///
+/// # Errors
+/// [`RunError`].
+pub fn resume(
+    client: &mut Client,
+    agent: &mut Agent,
+    present: &Observation,
+) -> Result<bool, RunError> {
+    let step = present.result.step;
+    if let Some(kind) = agent.belief_kind().map(str::to_owned)
+        && let Some(belief) = belief_left(client, &kind, agent.belief())?
+    {
+        tracing::info!(step, "going on from the belief that was left");
+        agent.take_over(belief);
+        return Ok(true);
+    }
+    if !agent.sees_frames() {
+        return Ok(false);
+    }
+    let first = first_kept(client, step)?;
+    for past in first..step {
+        let seen = client.recall(client.worlds(), past)?.remove(0);
+        agent.correct(&seen.frame, None)?;
+        agent.predict();
+    }
+    if first < step {
+        tracing::info!(first, step, "going on from the frames that were kept");
+    }
+    Ok(false)
+}
+
+/// Leaves an agent's belief about X_{k+1} to the next one.
+///
+/// # Errors
+/// [`ConnectionError`].
+pub fn leave(client: &mut Client, agent: &Agent) -> Result<(), ConnectionError> {
+    let Some(kind) = agent.belief_kind() else {
+        return Ok(());
+    };
+    let numbers = agent.belief().as_slice();
+    let bytes: Vec<u8> = numbers.iter().flat_map(|p| p.to_le_bytes()).collect();
+    match client.leave_belief(kind, &bytes) {
+        // A server that keeps no beliefs.
+        Err(ConnectionError::Refused {
+            status: Status::Malformed,
+            ..
+        }) => Ok(()),
+        left => left,
+    }
+}
+
+/// The belief that was left about the world as it stands, if it is of a kind and of the shape of one's
+/// own.
+fn belief_left(
+    client: &mut Client,
+    kind: &str,
+    own: &Belief,
+) -> Result<Option<Belief>, ConnectionError> {
+    let Some(bytes) = client.belief(kind)? else {
+        return Ok(None);
+    };
+    let (numbers, _) = bytes.as_chunks::<4>();
+    let numbers = numbers.iter().map(|&p| f32::from_le_bytes(p)).collect();
+    let belief = Probabilities::from_shape_vec(own.probabilities().dim(), numbers).ok();
+    Ok(belief.and_then(|belief| Belief::from_probabilities(belief).ok()))
+}
+
+/// The first step from which on all frames are kept; the present one where a server keeps none.
+fn first_kept(client: &mut Client, step: u64) -> Result<u64, ConnectionError> {
+    match client.recall(client.worlds(), 0) {
+        Ok(_) => Ok(0),
+        Err(ConnectionError::Refused { status, detail, .. }) => match status {
+            Status::NotKept => Ok(detail.min(step)),
+            _ => Ok(step),
+        },
+        Err(error) => Err(error),
+    }
+}

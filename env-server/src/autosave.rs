@@ -1,0 +1,112 @@
+//! Snapshots that a server writes of its own accord, and begins with.
+
+use crate::config::Checked;
+use crate::episode::Episode;
+use crate::files::{Files, Job, Place};
+use crate::snapshot::SnapshotError;
+use crate::snapshot::folder::{FileError, Folder, refused};
+use std::path::{Path, PathBuf};
+
+/// When to write the next one, and where.
+pub struct Autosave {
+    folder: Folder,
+    keep: usize,
+    /// World steps between two.
+    every: u64,
+    /// World steps at which the next is due.
+    due: u64,
+    /// The job that writes one.
+    writing: Option<u64>,
+}
+
+impl Autosave {
+    /// As the settings say; `None` if they want none.
+    ///
+    /// # Errors
+    /// [`FileError`] if the folder cannot be written to.
+    pub fn new(checked: &Checked) -> Result<Option<Self>, FileError> {
+        let config = &checked.config;
+        if config.snapshot_every == 0 {
+            return Ok(None);
+        }
+        let folder = Folder::new(Path::new(&config.snapshot_dir), &checked.instance);
+        folder.prepare()?;
+        let every = config.snapshot_every.saturating_mul(config.worlds.into());
+        Ok(Some(Self {
+            folder,
+            keep: config.snapshot_keep as usize,
+            every,
+            due: every,
+            writing: None,
+        }))
+    }
+
+    /// Whether one is to be written after so many world steps. Never two at once: a disk that is too
+    /// slow gets fewer.
+    pub fn is_due(&self, n_steps: u64) -> bool {
+        n_steps >= self.due && self.writing.is_none()
+    }
+
+    /// Orders one.
+    pub fn order(&mut self, n_steps: u64, bytes: Vec<u8>, files: &mut Files) {
+        self.due = n_steps.saturating_add(self.every);
+        let (folder, keep) = (self.folder.clone(), self.keep);
+        self.writing = Some(files.order(Job::Autosave {
+            folder,
+            keep,
+            bytes,
+        }));
+    }
+
+    /// Takes note that a job is done; returns whether it was one of these.
+    pub fn is_done(&mut self, job: u64) -> bool {
+        let is_own = self.writing == Some(job);
+        if is_own {
+            self.writing = None;
+        }
+        is_own
+    }
+}
+
+/// Worlds that a server begins with.
+pub struct FirstWorlds {
+    /// Their file.
+    pub path: PathBuf,
+    /// All of them.
+    pub worlds: Vec<Box<Episode>>,
+}
+
+/// The worlds that the settings want a server to begin with; `None`: new ones.
+///
+/// # Errors
+/// [`FileError`]; in a folder, damaged files are passed over as long as there is one that is whole.
+pub fn first_worlds(checked: &Checked, place: &Place) -> Result<Option<FirstWorlds>, FileError> {
+    if checked.config.restore.is_empty() {
+        return Ok(None);
+    }
+    let path = Path::new(&checked.config.restore);
+    let files = if path.is_dir() {
+        let files = Folder::new(path, &checked.instance).files()?;
+        files.into_iter().rev().map(|(_, path)| path).collect()
+    } else {
+        vec![path.to_owned()]
+    };
+    let mut damaged = None;
+    for path in files {
+        match place.load(&path, None) {
+            Ok(worlds) if worlds.len() == checked.config.worlds as usize => {
+                return Ok(Some(FirstWorlds { path, worlds }));
+            }
+            Ok(worlds) => {
+                let (expected, got) = (checked.config.worlds.to_string(), worlds.len());
+                return Err(refused(&path, SnapshotError::Worlds { expected, got }));
+            }
+            Err(error) if error.is_damaged => {
+                tracing::warn!("{error}");
+                damaged.get_or_insert(error);
+            }
+            Err(error) => return Err(error),
+        }
+    }
+    damaged.map_or(Ok(None), Err)
+}

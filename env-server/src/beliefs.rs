@@ -1,0 +1,101 @@
+//! Beliefs that agents leave for those who come after them: bytes that the server does not read.
+
+use protocol::control::BeliefInfo;
+use protocol::message::StepResult;
+
+/// Most bytes of a belief per cell of the grid: sixteen 32-bit numbers.
+const BYTES_PER_CELL: u64 = 64;
+
+/// The beliefs left, one per world at most.
+#[derive(Debug)]
+pub struct Beliefs {
+    n_cells: usize,
+    left: Vec<Option<Left>>,
+}
+
+#[derive(Debug)]
+struct Left {
+    info: BeliefInfo,
+    bytes: Vec<u8>,
+}
+
+/// A part of a belief that an agent leaves.
+#[derive(Debug)]
+pub struct Part<'a> {
+    /// Says what the bytes are, to other agents.
+    pub kind: &'a str,
+    /// Where the part begins.
+    pub offset: u64,
+    /// Length of the whole.
+    pub length: u64,
+    /// The part.
+    pub bytes: &'a [u8],
+}
+
+impl Beliefs {
+    /// No beliefs.
+    pub fn new(n_worlds: usize, n_cells: usize) -> Self {
+        Self {
+            n_cells,
+            left: (0..n_worlds).map(|_| None).collect(),
+        }
+    }
+
+    /// Takes the next part of a belief about a world that stands where a result says; the first begins
+    /// a new one.
+    ///
+    /// # Errors
+    /// What was expected and what was got.
+    pub fn add(&mut self, world: usize, at: &StepResult, part: &Part<'_>) -> Result<(), String> {
+        let longest = BYTES_PER_CELL * self.n_cells as u64;
+        if part.length > longest {
+            let got = part.length;
+            return Err(format!(
+                "length: expected at most {longest} bytes, got {got}"
+            ));
+        }
+        let info = BeliefInfo {
+            kind: part.kind.into(),
+            seed: at.seed,
+            episode: at.episode,
+            step: at.step,
+            length: part.length,
+        };
+        let left = &mut self.left[world];
+        if part.offset == 0 {
+            let bytes = Vec::with_capacity(part.length as usize);
+            *left = Some(Left {
+                info: info.clone(),
+                bytes,
+            });
+        }
+        let so_far = left.as_mut().filter(|left| left.info == info);
+        let expected = so_far.as_ref().map_or(0, |left| left.bytes.len() as u64);
+        let end = part.offset.saturating_add(part.bytes.len() as u64);
+        match so_far {
+            Some(left) if part.offset == expected && end <= part.length => {
+                left.bytes.extend_from_slice(part.bytes);
+                Ok(())
+            }
+            _ => {
+                let (offset, length) = (part.offset, part.length);
+                Err(format!(
+                    "offset: expected the next bytes, from {expected}, within {length}, got {offset} to {end}"
+                ))
+            }
+        }
+    }
+
+    /// The whole belief left about a world that stands where a result says.
+    pub fn of(&self, world: usize, at: &StepResult) -> Option<(&BeliefInfo, &[u8])> {
+        let Left { info, bytes } = self.left[world].as_ref()?;
+        let is_there = (info.seed, info.episode, info.step) == (at.seed, at.episode, at.step);
+        let is_whole = bytes.len() as u64 == info.length;
+        (is_there && is_whole).then_some((info, bytes))
+    }
+
+    /// Forgets what was left about a world that is another now.
+    pub fn forget(&mut self, world: usize) {
+        self.left[world] = None;
+    }
+}

@@ -1,0 +1,185 @@
+//! `snapshot`, `restore`, `fork`.
+
+use anyhow::{Result, bail};
+use clap::Args;
+use env_server::snapshot::folder::read;
+use protocol::Connection;
+use protocol::channels::Instance;
+use protocol::control::{Reply, Request, WorldInfo};
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// How long to wait: files may be large, and worlds in their burn-in.
+const TIMEOUT: Duration = Duration::from_secs(120);
+
+/// Write worlds to a file; needs no lease and disturbs nobody.
+#[derive(Args)]
+pub struct SnapshotCommand {
+    /// The file to write
+    file: PathBuf,
+    /// The server's instance name
+    #[arg(long, default_value = "default")]
+    instance: String,
+    /// The first world to write
+    #[arg(long, default_value_t = 0)]
+    first_world: u32,
+    /// How many worlds to write [default: all from the first]
+    #[arg(long)]
+    worlds: Option<u32>,
+}
+
+/// Put the worlds of a file in the place of a server's.
+#[derive(Args)]
+pub struct RestoreCommand {
+    /// The file to read
+    file: PathBuf,
+    /// The server's instance name
+    #[arg(long, default_value = "default")]
+    instance: String,
+    /// The first world to replace
+    #[arg(long, default_value_t = 0)]
+    first_world: u32,
+    /// The first of the file's worlds to read
+    #[arg(long, default_value_t = 0)]
+    from: u32,
+    /// How many worlds to read [default: all of the file's from the first]
+    #[arg(long)]
+    worlds: Option<u32>,
+    /// Take worlds that are held from their holders
+    #[arg(long)]
+    takeover: bool,
+}
+
+/// Put a copy of one world in the place of another.
+#[derive(Args)]
+pub struct ForkCommand {
+    /// The world to copy
+    from: u32,
+    /// The world to replace
+    to: u32,
+    /// The server's instance name
+    #[arg(long, default_value = "default")]
+    instance: String,
+    /// Take the world to replace from its holder
+    #[arg(long)]
+    takeover: bool,
+}
+
+impl SnapshotCommand {
+    /// Asks the server to write.
+    pub fn run(&self) -> Result<()> {
+        let mut server = connect(&self.instance)?;
+        let rest = server.info().n_worlds.saturating_sub(self.first_world);
+        let request = Request::Snapshot {
+            first_world: self.first_world,
+            n_worlds: self.worlds.unwrap_or(rest),
+            path: absolute(&self.file)?,
+        };
+        match server.control(&request, TIMEOUT)? {
+            Reply::Snapshot {
+                path,
+                n_bytes,
+                worlds,
+            } => {
+                let n_worlds = worlds.len();
+                tracing::info!(path, n_worlds, n_bytes, "written");
+                Ok(())
+            }
+            other => bail!("expected a snapshot, got {other:?}"),
+        }
+    }
+}
+
+impl RestoreCommand {
+    /// Acquires the worlds, has them replaced, and releases them.
+    pub fn run(&self) -> Result<()> {
+        // Says what is wrong with the file before any world is taken from anybody.
+        let in_file = read(&self.file)?.worlds.len() as u32;
+        let Some(rest) = in_file.checked_sub(self.from).filter(|rest| *rest > 0) else {
+            bail!(
+                "--from: expected a world below {in_file}, as the file has, got {}",
+                self.from
+            );
+        };
+        let (first_world, n_worlds) = (self.first_world, self.worlds.unwrap_or(rest));
+        let path = absolute(&self.file)?;
+        let mut server = connect(&self.instance)?;
+        replace(
+            &mut server,
+            first_world..first_world.saturating_add(n_worlds),
+            self.takeover,
+            |lease| Request::Restore {
+                lease,
+                first_world,
+                n_worlds,
+                from: self.from,
+                path,
+            },
+        )
+    }
+}
+
+impl ForkCommand {
+    /// Acquires the world to replace, has it replaced, and releases it.
+    pub fn run(&self) -> Result<()> {
+        let mut server = connect(&self.instance)?;
+        let (from, to) = (self.from, self.to);
+        replace(
+            &mut server,
+            to..to.saturating_add(1),
+            self.takeover,
+            |lease| Request::Fork { lease, from, to },
+        )
+    }
+}
+
+/// Replaces worlds under a lease.
+fn replace(
+    server: &mut Connection,
+    worlds: std::ops::Range<u32>,
+    takeover: bool,
+    request: impl FnOnce(u64) -> Request,
+) -> Result<()> {
+    let acquire = Request::Acquire {
+        first_world: worlds.start,
+        n_worlds: worlds.len() as u32,
+        takeover,
+        ttl_millis: Some(TIMEOUT.as_millis() as u64),
+    };
+    let Reply::Lease(lease) = server.control(&acquire, TIMEOUT)? else {
+        bail!("expected a lease");
+    };
+    let replaced = server.control(&request(lease.lease), TIMEOUT);
+    server.control(&Request::Release { lease: lease.lease }, TIMEOUT)?;
+    let Reply::Restored { worlds } = replaced? else {
+        bail!("expected worlds that were replaced");
+    };
+    for WorldInfo {
+        world,
+        step,
+        seed,
+        episode,
+        ..
+    } in worlds
+    {
+        tracing::info!(world, step, seed, episode, "replaced");
+    }
+    Ok(())
+}
+
+fn connect(instance: &str) -> Result<Connection> {
+    Ok(Connection::open(
+        &Instance::new(instance)?,
+        "emberwatch-server",
+        TIMEOUT,
+    )?)
+}
+
+/// A path as the server, which may run in another folder, can use it.
+fn absolute(path: &PathBuf) -> Result<String> {
+    let absolute = std::path::absolute(path)?;
+    match absolute.to_str() {
+        Some(path) => Ok(path.into()),
+        None => bail!("expected a file name in UTF-8, got {}", path.display()),
+    }
+}

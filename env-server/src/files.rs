@@ -1,0 +1,185 @@
+//! Snapshot files are written and read here, on a thread of its own, so that no disk delays a step.
+
+use crate::episode::{Episode, Rules};
+use crate::snapshot::folder::{FileError, Folder, read, refused, write};
+use crate::snapshot::{Settings, SnapshotError};
+use rustix::event::{EventfdFlags, eventfd};
+use rustix::io::Errno;
+use std::ops::Range;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::thread::JoinHandle;
+
+/// What to do with a file.
+#[derive(Debug)]
+pub enum Job {
+    /// Write a snapshot.
+    Save {
+        /// Where.
+        path: PathBuf,
+        /// What.
+        bytes: Vec<u8>,
+    },
+    /// Write the next of the server's own snapshots.
+    Autosave {
+        /// Where.
+        folder: Folder,
+        /// How many to keep.
+        keep: usize,
+        /// What.
+        bytes: Vec<u8>,
+    },
+    /// Read worlds of a snapshot.
+    Load {
+        /// Where.
+        path: PathBuf,
+        /// Which of its worlds.
+        worlds: Range<usize>,
+    },
+}
+
+/// What came of a job.
+pub enum Done {
+    /// A file was written.
+    Saved {
+        /// Where.
+        path: PathBuf,
+        /// Its length.
+        n_bytes: usize,
+    },
+    /// Worlds were read.
+    Loaded(Vec<Box<Episode>>),
+}
+
+/// A job's number, and what came of it.
+pub type Outcome = (u64, Result<Done, FileError>);
+
+/// What worlds must fit.
+#[derive(Debug, Clone)]
+pub struct Place {
+    /// The server's settings.
+    pub settings: Settings,
+    /// Its rules.
+    pub rules: Rules,
+    /// Moves in a path.
+    pub n_moves: usize,
+}
+
+/// The thread that works on files.
+pub struct Files {
+    jobs: Option<Sender<(u64, Job)>>,
+    n_jobs: u64,
+    done: Receiver<Outcome>,
+    /// Readable while `done` may hold something.
+    signal: Arc<OwnedFd>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Files {
+    /// Starts the thread.
+    ///
+    /// # Errors
+    /// The system's, when it gives no event descriptor or thread.
+    pub fn start(place: Place) -> std::io::Result<Self> {
+        let flags = EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK;
+        let signal = Arc::new(eventfd(0, flags).map_err(|errno: Errno| errno)?);
+        let (jobs, orders) = channel::<(u64, Job)>();
+        let (sender, done) = channel();
+        let bell = signal.clone();
+        let work = move || {
+            for (number, job) in orders {
+                // Errors mean that the server is gone, and with it whoever would read.
+                let _ = sender.send((number, job.carry_out(&place)));
+                let _ = rustix::io::write(&*bell, &1u64.to_ne_bytes());
+            }
+        };
+        let thread = std::thread::Builder::new()
+            .name("files".into())
+            .spawn(work)?;
+        Ok(Self {
+            jobs: Some(jobs),
+            n_jobs: 0,
+            done,
+            signal,
+            thread: Some(thread),
+        })
+    }
+
+    /// Orders a job; returns its number.
+    pub fn order(&mut self, job: Job) -> u64 {
+        self.n_jobs += 1;
+        if let Some(jobs) = &self.jobs {
+            let _ = jobs.send((self.n_jobs, job));
+        }
+        self.n_jobs
+    }
+
+    /// The jobs that are done since the last call.
+    pub fn finished(&self) -> Vec<Outcome> {
+        let _ = rustix::io::read(&*self.signal, &mut [0u8; 8]);
+        self.done.try_iter().collect()
+    }
+
+    /// Readable while a job is done.
+    pub fn descriptor(&self) -> BorrowedFd<'_> {
+        self.signal.as_fd()
+    }
+}
+
+impl Drop for Files {
+    /// Waits until what was ordered is written.
+    fn drop(&mut self) {
+        self.jobs = None;
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+impl Job {
+    fn carry_out(self, place: &Place) -> Result<Done, FileError> {
+        match self {
+            Self::Save { path, bytes } => {
+                write(&path, &bytes)?;
+                let n_bytes = bytes.len();
+                Ok(Done::Saved { path, n_bytes })
+            }
+            Self::Autosave {
+                folder,
+                keep,
+                bytes,
+            } => {
+                let path = folder.save(&bytes, keep)?;
+                let n_bytes = bytes.len();
+                Ok(Done::Saved { path, n_bytes })
+            }
+            Self::Load { path, worlds } => Ok(Done::Loaded(place.load(&path, Some(worlds))?)),
+        }
+    }
+}
+
+impl Place {
+    /// Worlds of a file; `None`: all.
+    ///
+    /// # Errors
+    /// [`FileError`].
+    pub fn load(
+        &self,
+        path: &Path,
+        worlds: Option<Range<usize>>,
+    ) -> Result<Vec<Box<Episode>>, FileError> {
+        let mut snapshot = read(path)?;
+        if let Some(worlds) = worlds {
+            let got = snapshot.worlds.len();
+            if worlds.end > got {
+                let expected = format!("at least {}", worlds.end);
+                return Err(refused(path, SnapshotError::Worlds { expected, got }));
+            }
+            snapshot.worlds = snapshot.worlds.drain(worlds).collect();
+        }
+        let restored = snapshot.restore(&self.settings, &self.rules, self.n_moves);
+        restored.map_err(|error| refused(path, error))
+    }
+}

@@ -1,0 +1,74 @@
+//! What a process uses.
+
+use std::path::{Path, PathBuf};
+
+/// Memory, descriptors and shared memory at one moment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Use {
+    /// Resident memory of the server, KiB.
+    pub resident: u64,
+    /// Its open descriptors.
+    pub descriptors: usize,
+    /// Files in shared memory and in the channels' folder that are this user's, of all instances.
+    pub files: usize,
+    /// KiB of those in shared memory that are in use.
+    pub shared: u64,
+}
+
+impl Use {
+    /// That of a server.
+    pub fn of(pid: u32) -> Self {
+        let status = std::fs::read_to_string(format!("/proc/{pid}/status")).expect("its status");
+        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+        let number = line.and_then(|line| line.split_whitespace().next()?.parse().ok());
+        let shared = files_under(Path::new("/dev/shm"));
+        let others = files_under(&protocol::channels::channel_directory());
+        Self {
+            resident: number.expect("a number of KiB"),
+            descriptors: std::fs::read_dir(format!("/proc/{pid}/fd"))
+                .expect("its descriptors")
+                .count(),
+            files: shared.len() + others.len(),
+            shared: shared.iter().map(|path| kibibytes(path)).sum(),
+        }
+    }
+}
+
+impl std::fmt::Display for Use {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self {
+            resident,
+            descriptors,
+            files,
+            shared,
+        } = self;
+        write!(
+            f,
+            "{resident} KiB resident, {descriptors} descriptors, {files} channel files, {shared} KiB shared"
+        )
+    }
+}
+
+/// The channels' files below a folder.
+fn files_under(folder: &Path) -> Vec<PathBuf> {
+    let Ok(entries) = std::fs::read_dir(folder) else {
+        return Vec::new();
+    };
+    let paths = entries.flatten().map(|entry| entry.path());
+    paths
+        .flat_map(|path| {
+            if path.is_dir() {
+                files_under(&path)
+            } else {
+                vec![path]
+            }
+        })
+        .filter(|path| path.to_string_lossy().contains("emberwatch"))
+        .collect()
+}
+
+/// What a file really takes.
+fn kibibytes(path: &Path) -> u64 {
+    use std::os::unix::fs::MetadataExt;
+    path.metadata().map_or(0, |metadata| metadata.blocks() / 2)
+}

@@ -1,0 +1,219 @@
+//! What the next agent believes: what the last one left, or what the kept frames tell.
+
+use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly};
+use crate::wire::{RawClient, Wire, step_header};
+use protocol::Move;
+use protocol::control::{Reply, Request, WorldSeed};
+use protocol::message::{FrameHeader, Operation, Status, StepRequest, split_step_payload};
+use protocol::observer::{Observer, Sample};
+use protocol::path::path_from_bytes;
+use rustix::process::Signal;
+
+/// A world with fires to find, and room for all their frames.
+const FLAGS: &str = "--height 16 --width 16 --moves 12 --burn-in 3000 --seed 3";
+
+/// Room for all frames of these tests.
+const ALL: &str = "--history 100000";
+
+fn run(server: &Server, flags: &[&str]) -> Program {
+    let common = ["run", "--instance", server.instance.name()];
+    Program::start("emberwatch-agent", &[&common[..], flags].concat())
+}
+
+/// The last paths flown until step `last`: as many as an observer is kept, more than 40.
+fn paths(observer: &Observer<FrameHeader>, last: u64) -> Vec<Vec<Move>> {
+    let samples = crate::harness::frames_until(observer, 0, last);
+    let flown = samples.iter().filter(|sample| sample.header.n_moves > 0);
+    let path = |sample: &Sample<FrameHeader>| {
+        let path = &sample.payload[16 * 16..];
+        path_from_bytes(path).expect("a path")
+    };
+    flown.map(path).collect()
+}
+
+/// What one agent flies that nobody disturbs.
+fn undisturbed(n_steps: u64, policy: &[&str]) -> Vec<Vec<Move>> {
+    let server = Server::start(FLAGS);
+    let observer = Observer::frames(&server.instance).expect("observe");
+    let steps = n_steps.to_string();
+    let ended = run(&server, &[policy, &["--steps", &steps]].concat()).wait(PATIENCE);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    paths(&observer, n_steps)
+}
+
+#[test]
+fn an_agent_that_takes_over_flies_as_the_other_would_have() {
+    for policy in [
+        ["--policy", "beam_exploit"],
+        ["--policy", "shooting_explore"],
+    ] {
+        let server = Server::start(&format!("{FLAGS} {ALL}"));
+        let observer = Observer::frames(&server.instance).expect("observe");
+        let first = run(&server, &[&policy[..], &["--steps", "0"]].concat());
+        let acts = || server.observe(0).0.step > 20;
+        assert!(eventually(PATIENCE, acts), "{}", first.stderr());
+        let second = run(
+            &server,
+            &[&policy[..], &["--takeover", "--steps", "20"]].concat(),
+        );
+        let ended = first.wait(PATIENCE);
+        assert_eq!(ended.code, Some(3), "{}", ended.stderr);
+        let ended = second.wait(PATIENCE);
+        assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+        assert!(
+            ended.stderr.contains("the frames that were kept"),
+            "{}",
+            ended.stderr
+        );
+        // The third comes after a release, and finds the second's belief.
+        let third = run(&server, &[&policy[..], &["--steps", "20"]].concat()).wait(PATIENCE);
+        assert_eq!(third.code, Some(0), "{}", third.stderr);
+        assert!(
+            third.stderr.contains("the belief that was left"),
+            "{}",
+            third.stderr
+        );
+        let last = server.observe(0).0.step;
+        assert_eq!(
+            paths(&observer, last),
+            undisturbed(last, &policy),
+            "{policy:?}"
+        );
+    }
+}
+
+#[test]
+fn an_agent_that_finds_only_some_frames_makes_do_with_them() {
+    let server = Server::start(&format!("{FLAGS} --history 5"));
+    let steps = ["--policy", "random_walk", "--steps", "30"];
+    assert_eq!(run(&server, &steps).wait(PATIENCE).code, Some(0));
+    let ended = run(&server, &["--steps", "2"]).wait(PATIENCE);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert!(
+        ended.stderr.contains("first=26 step=30"),
+        "{}",
+        ended.stderr
+    );
+    let forgetful = Server::start(&format!("{FLAGS} --history 0"));
+    assert_eq!(run(&forgetful, &steps).wait(PATIENCE).code, Some(0));
+    let ended = run(&forgetful, &["--steps", "2"]).wait(PATIENCE);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert!(!ended.stderr.contains("going on from"), "{}", ended.stderr);
+}
+
+#[test]
+fn kept_frames_are_those_that_were_answered() {
+    let server =
+        Server::start("--height 5 --width 7 --moves 6 --burn-in 20 --worlds 2 --history 4");
+    let mut client = server.acquire(0..2);
+    let mut seen = vec![client.observe(0..2).expect("observe")];
+    for k in 0..6 {
+        let paths = Paths::new(k).take(6, 2);
+        seen.push(client.step(0..2, &paths).expect("step"));
+    }
+    for step in 3..=6 {
+        assert_eq!(
+            client.recall(0..2, step).expect("recall"),
+            seen[step as usize]
+        );
+    }
+    let wire = Wire::open(&server.instance);
+    let recall = |step, n_worlds| StepRequest {
+        operation: Operation::Recall as u32,
+        n_worlds,
+        n_moves: 0,
+        step,
+        ..step_header(0, 6)
+    };
+    for step in [0, 2, 7, u64::MAX] {
+        let (reply, payload) = wire.step(recall(step, 2), &[]);
+        assert_eq!(
+            (reply.status, reply.detail),
+            (Status::NotKept as u32, 3),
+            "{step}"
+        );
+        assert!(payload.is_empty());
+    }
+    let (reply, _) = wire.step(recall(3, 2), &[1]);
+    assert_eq!(reply.status, Status::WrongLength as u32);
+    let (reply, _) = wire.step(recall(3, 3), &[]);
+    assert_eq!(reply.status, Status::NoSuchWorld as u32);
+    let seeds = [WorldSeed {
+        world: 1,
+        seed: Some(8),
+    }];
+    client.reset(&seeds).expect("reset");
+    let (reply, _) = wire.step(recall(3, 2), &[]);
+    assert_eq!((reply.status, reply.detail), (Status::NotKept as u32, 0));
+    let (reply, payload) = wire.step(recall(6, 1), &[]);
+    let (results, _) = split_step_payload(&reply, &payload).expect("a whole payload");
+    assert_eq!(results[0].step, 6);
+}
+
+#[test]
+fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_world_alone() {
+    let server = Server::start("--height 5 --width 7 --moves 6 --burn-in 20 --worlds 2");
+    let mut client = server.acquire(0..1);
+    fly(&mut client, Paths::new(0).next(6));
+    assert_eq!(client.belief("kind").expect("none yet"), None);
+    let bytes: Vec<u8> = (0..35 * 64).map(|n| n as u8).collect();
+    client.leave_belief("kind", &bytes).expect("leave");
+    assert_eq!(client.belief("kind").expect("belief"), Some(bytes.clone()));
+    assert_eq!(client.belief("another kind").expect("belief"), None);
+    let wire = Wire::open(&server.instance);
+    let lease = wire.acquire(1, 1).lease;
+    let leave = |lease, world, offset, length, data: &str| Request::LeaveBelief {
+        lease,
+        world,
+        kind: "kind".into(),
+        offset,
+        length,
+        data: data.into(),
+    };
+    for (request, status) in [
+        (leave(lease, 0, 0, 1, "AA=="), Status::NoLease),
+        (leave(lease, 7, 0, 1, "AA=="), Status::NoSuchWorld),
+        (leave(lease, 1, 0, 1, "A"), Status::Malformed),
+        (leave(lease, 1, 1, 2, "AA=="), Status::Malformed),
+        (leave(lease, 1, 0, 2241, "AA=="), Status::Malformed),
+        (leave(lease, 1, 0, 0, "AA=="), Status::Malformed),
+        (
+            leave(lease, 1, u64::MAX, u64::MAX, "AA=="),
+            Status::Malformed,
+        ),
+    ] {
+        let reply = wire.ask(&request);
+        assert_eq!(reply.status(), status, "{request:?}: {reply:?}");
+    }
+    // Half a belief is none.
+    assert_eq!(wire.ask(&leave(lease, 1, 0, 2, "AA==")), Reply::Done);
+    let ask = Request::Belief {
+        world: 1,
+        offset: 0,
+    };
+    assert_eq!(wire.ask(&ask).status(), Status::NotKept);
+    assert_eq!(wire.ask(&leave(lease, 1, 1, 2, "AQ==")), Reply::Done);
+    assert!(matches!(wire.ask(&ask), Reply::Belief { data, .. } if data == "AAE="));
+    fly(&mut client, Paths::new(1).next(6));
+    assert_eq!(client.belief("kind").expect("another step"), None);
+}
+
+#[test]
+fn an_agent_told_to_stop_leaves_its_belief() {
+    let server = Server::start(FLAGS);
+    let agent = run(&server, &["--steps", "0"]);
+    let acts = || server.observe(0).0.step > 5;
+    assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
+    agent.signal(Signal::TERM);
+    assert_eq!(agent.wait(PATIENCE).code, Some(0));
+    let mut connection = server.connect();
+    let ask = Request::Belief {
+        world: 0,
+        offset: 0,
+    };
+    let Reply::Belief { info, .. } = connection.control(&ask, PATIENCE).expect("a belief") else {
+        panic!("expected a belief");
+    };
+    assert_eq!(info.length, 3 * 16 * 16 * 4);
+    assert!(info.kind.starts_with("known_model "), "{}", info.kind);
+}

@@ -1,0 +1,320 @@
+//! Worlds that are written down and go on, bit for bit: snapshots, forks, servers that come back.
+
+use crate::harness::{
+    Ended, PATIENCE, Paths, SMALL, Server, eventually, fly, new_instance, reset, run, takeover,
+};
+use crate::wire::{RawClient, Wire};
+use agent::client::{Client, Observation};
+use protocol::control::{Reply, Request};
+use protocol::message::Status;
+use protocol::observer::Observer;
+use std::path::Path;
+use tempfile::TempDir;
+
+const N_MOVES: usize = 6;
+
+fn server_command(server: &Server, arguments: &[&str]) -> Ended {
+    let instance = ["--instance", server.instance.name()];
+    run(
+        "emberwatch-server",
+        &[arguments, &instance].concat(),
+        PATIENCE,
+    )
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().expect("a plain path")
+}
+
+/// The next few observations of a client's world, on paths of its own.
+fn future(client: &mut Client, seed: u64) -> Vec<Observation> {
+    let paths = Paths::new(seed).take(N_MOVES, 5);
+    paths.into_iter().map(|path| fly(client, path)).collect()
+}
+
+fn refused(ended: &Ended, words: &str) {
+    assert_eq!(ended.code, Some(1), "{}", ended.stderr);
+    assert!(ended.stderr.contains(words), "{words:?}: {}", ended.stderr);
+}
+
+#[test]
+fn a_restored_world_goes_on_bit_for_bit_and_so_does_what_it_remembers() {
+    let folder = TempDir::new().expect("a folder");
+    let file = folder.path().join("lab.snapshot");
+    let server = Server::start(&format!("{SMALL} --worlds 2 --seed 5 --start random"));
+    let mut client = server.acquire(0..2);
+    reset(&mut client, 70);
+    for paths in [
+        Paths::new(1).take(N_MOVES, 2),
+        Paths::new(2).take(N_MOVES, 2),
+    ] {
+        client.step(0..2, &paths).expect("step");
+    }
+    let before = client.observe(0..2).expect("observe");
+    let past = client.recall(0..2, 1).expect("recall");
+    let written = server_command(&server, &["snapshot", text(&file)]);
+    assert_eq!(written.code, Some(0), "{}", written.stderr);
+    let went_on: Vec<_> = (0..5)
+        .map(|n| {
+            client
+                .step(0..2, &Paths::new(9 + n).take(N_MOVES, 2))
+                .expect("step")
+        })
+        .collect();
+    let busy = server_command(&server, &["restore", text(&file)]);
+    refused(&busy, &format!("busy: held by pid {}", std::process::id()));
+    let restored = server_command(&server, &["restore", text(&file), "--takeover"]);
+    assert_eq!(restored.code, Some(0), "{}", restored.stderr);
+    let again = |server: &Server| {
+        let mut client = server.acquire(0..2);
+        assert_eq!(client.observe(0..2).expect("observe"), before);
+        assert_eq!(client.recall(0..2, 1).expect("recall"), past);
+        let future: Vec<_> = (0..5)
+            .map(|n| {
+                client
+                    .step(0..2, &Paths::new(9 + n).take(N_MOVES, 2))
+                    .expect("step")
+            })
+            .collect();
+        assert_eq!(future, went_on);
+        // Another reset to the seed that it began with gives what that gave.
+        reset(&mut client, 70);
+        client.observe(0..2).expect("observe")
+    };
+    let reset_here = again(&server);
+    let flags = format!(
+        "{SMALL} --worlds 2 --seed 9 --start random --restore {}",
+        text(&file)
+    );
+    assert_eq!(again(&Server::start(&flags)), reset_here);
+}
+
+#[test]
+fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
+    let folder = TempDir::new().expect("a folder");
+    let file = folder.path().join("lab.snapshot");
+    let server = Server::start(&format!("{SMALL} --worlds 3"));
+    let mut second = server.acquire(1..2);
+    fly(&mut second, Paths::new(3).next(N_MOVES));
+    let part = ["snapshot", text(&file), "--first-world", "1"];
+    assert_eq!(server_command(&server, &part).code, Some(0));
+    let observer = Observer::frames(&server.instance).expect("observe");
+    while observer
+        .receive(std::time::Duration::from_millis(300))
+        .expect("receive")
+        .is_some()
+    {}
+    let into_first = ["restore", text(&file), "--from", "0", "--worlds", "1"];
+    let ended = server_command(&server, &into_first);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    let shown = observer
+        .receive(PATIENCE)
+        .expect("receive")
+        .expect("a frame");
+    assert_eq!((shown.header.world, shown.header.result.step), (0, 1));
+    assert_eq!(server.observe(0), server.observe(1));
+    let mut first = server.acquire(0..1);
+    assert_eq!(future(&mut first, 4), future(&mut second, 4));
+    let beyond = ["restore", text(&file), "--from", "2"];
+    refused(
+        &server_command(&server, &beyond),
+        "--from: expected a world below 2",
+    );
+    let too_many = ["restore", text(&file), "--worlds", "3", "--takeover"];
+    refused(
+        &server_command(&server, &too_many),
+        "worlds: expected at least 3, got 2",
+    );
+    let nowhere = ["restore", text(&file), "--first-world", "2", "--takeover"];
+    refused(
+        &server_command(&server, &nowhere),
+        "the server has worlds 0 to 2",
+    );
+}
+
+#[test]
+fn a_fork_has_the_future_of_its_world_and_a_life_of_its_own() {
+    let server = Server::start(&format!("{SMALL} --worlds 3"));
+    let mut original = server.acquire(0..1);
+    fly(&mut original, Paths::new(1).next(N_MOVES));
+    let ended = server_command(&server, &["fork", "0", "2"]);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    let mut copy = server.acquire(2..3);
+    assert_eq!(future(&mut copy, 5), future(&mut original, 5));
+    let elsewhere = future(&mut copy, 6);
+    assert_ne!(
+        elsewhere,
+        future(&mut original, 7),
+        "their robots fly on their own"
+    );
+    refused(
+        &server_command(&server, &["fork", "0", "2"]),
+        "busy: held by pid",
+    );
+    refused(
+        &server_command(&server, &["fork", "0", "3"]),
+        "no such world",
+    );
+    refused(
+        &server_command(&server, &["fork", "7", "1"]),
+        "no such world",
+    );
+    let wire = Wire::open(&server.instance);
+    let lease = wire.acquire(1, 1).lease;
+    let stolen = wire.ask(&Request::Fork {
+        lease,
+        from: 1,
+        to: 0,
+    });
+    assert_eq!(stolen.status(), Status::NoLease, "{stolen:?}");
+}
+
+#[test]
+fn a_file_that_is_none_is_refused_by_name_and_changes_nothing() {
+    let folder = TempDir::new().expect("a folder");
+    let file = folder.path().join("lab.snapshot");
+    let server = Server::start(SMALL);
+    let mut client = server.acquire(0..1);
+    fly(&mut client, Paths::new(1).next(N_MOVES));
+    assert_eq!(
+        server_command(&server, &["snapshot", text(&file)]).code,
+        Some(0)
+    );
+    let whole = std::fs::read(&file).expect("the snapshot");
+    let before = server.observe(0);
+    let check = |bytes: &[u8], words: &str| {
+        let other = folder.path().join("other");
+        std::fs::write(&other, bytes).expect("write");
+        let restore = ["restore", text(&other), "--takeover"];
+        refused(&server_command(&server, &restore), words);
+        let wire = Wire::open(&server.instance);
+        let request = Request::Acquire {
+            first_world: 0,
+            n_worlds: 1,
+            takeover: true,
+            ttl_millis: None,
+        };
+        let Reply::Lease(lease) = wire.ask(&request) else {
+            panic!("expected a lease");
+        };
+        let request = Request::Restore {
+            lease: lease.lease,
+            first_world: 0,
+            n_worlds: 1,
+            from: 0,
+            path: text(&other).into(),
+        };
+        let Reply::Error {
+            status, message, ..
+        } = wire.ask(&request)
+        else {
+            panic!("expected a refusal of {words:?}");
+        };
+        assert_eq!(status, Status::BadFile);
+        assert!(message.contains(words), "{words:?}: {message}");
+        assert_eq!(server.observe(0), before);
+    };
+    check(b"", "another kind of file");
+    check(
+        b"PNG and so on, long enough to be a file",
+        "another kind of file",
+    );
+    check(&whole[..whole.len() - 1], "damaged: expected");
+    let mut version = whole.clone();
+    version[8] = 2;
+    check(&version, "expected a snapshot of version 1, got version 2");
+    let mut damaged = whole.clone();
+    damaged[whole.len() / 2] ^= 1;
+    check(&damaged, "damaged: expected the checksum");
+    for (path, words) in [
+        ("/no/such/file", "snapshot file /no/such/file"),
+        ("/dev/zero", "expected a regular file"),
+        ("relative", "path: expected an absolute one"),
+    ] {
+        let wire = Wire::open(&server.instance);
+        let request = Request::Snapshot {
+            first_world: 0,
+            n_worlds: 1,
+            path: path.into(),
+        };
+        let reply = format!("{:?}", wire.ask(&request));
+        assert!(reply.contains(words), "{reply}");
+        let ended = server_command(&server, &["restore", path, "--takeover"]);
+        assert_eq!(ended.code, Some(1), "{path}: {}", ended.stderr);
+    }
+    let other = Server::start("--height 5 --width 8 --moves 6 --burn-in 20");
+    let foreign = server_command(&other, &["restore", text(&file)]);
+    refused(&foreign, "width: expected 8 as this server's, got 7");
+    let flags = format!("{SMALL} --worlds 2 --restore {}", text(&file));
+    let flags: Vec<&str> = flags.split_whitespace().collect();
+    let ended = Server::start_without_waiting(&new_instance(), &flags)
+        .program
+        .wait(PATIENCE);
+    refused(&ended, "worlds: expected 2, got 1");
+}
+
+#[test]
+fn a_killed_server_comes_back_where_its_last_snapshot_left_it() {
+    let folder = TempDir::new().expect("a folder");
+    let flags = format!(
+        "{SMALL} --worlds 2 --snapshot-every 10 --snapshot-keep 2 --snapshot-dir {0} --restore {0}",
+        text(folder.path())
+    );
+    let (instance, undisturbed) = (
+        new_instance(),
+        Server::start(&format!("{SMALL} --worlds 2")),
+    );
+    let mut expected = undisturbed.acquire(0..2);
+    let path = |k: u64| Paths::new(k).take(N_MOVES, 2);
+    let expected: Vec<_> = (0..100)
+        .map(|k| expected.step(0..2, &path(k)).expect("step"))
+        .collect();
+    let mut at = 0;
+    for round in 1..=3 {
+        let server = Server::start_on(&instance, &flags);
+        let mut client = Client::acquire(&instance, &takeover(0..2)).expect("acquire");
+        let stands = client.observe(0..2).expect("observe")[0].result.step;
+        assert!(stands <= at && stands + 20 > at, "{stands} after {at}");
+        for k in stands..25 * round {
+            let seen = client.step(0..2, &path(k)).expect("step");
+            assert_eq!(seen, expected[k as usize], "step {k}");
+        }
+        at = 25 * round;
+        // At least two a round: after 10 steps, and when that was written or 10 steps later.
+        let names = || {
+            let entries = std::fs::read_dir(folder.path()).expect("the folder");
+            let names = entries.map(|entry| entry.expect("an entry").file_name());
+            let mut names: Vec<String> = names.map(|name| name.to_string_lossy().into()).collect();
+            names.retain(|name| name.ends_with(".snapshot"));
+            names.sort();
+            names
+        };
+        let least = format!("{}-{:012}.snapshot", instance.name(), 2 * round);
+        let written = || names().last().is_some_and(|newest| *newest >= least);
+        assert!(eventually(PATIENCE, written), "{:?}", names());
+        assert!(eventually(PATIENCE, || names().len() == 2), "{:?}", names());
+        server.kill();
+    }
+    let server = Server::start_on(&instance, &flags);
+    let stands = server.observe(0).0.step;
+    let stopped = server_command(&server, &["stop"]);
+    assert_eq!(stopped.code, Some(0), "{}", stopped.stderr);
+    drop(server.program.wait(PATIENCE));
+    // The newest file is damaged: the one before it serves.
+    let mut files: Vec<_> = std::fs::read_dir(folder.path())
+        .expect("the folder")
+        .map(|entry| entry.expect("an entry").path())
+        .collect();
+    files.sort();
+    std::fs::write(files.last().expect("a snapshot"), "EMBRSNAPnonsense").expect("write");
+    let server = Server::start_on(&instance, &flags);
+    assert_eq!(
+        server.observe(0).0.step,
+        stands,
+        "{}",
+        server.program.stderr()
+    );
+    server
+        .program
+        .wait_for_words("another kind of file", PATIENCE);
+}
