@@ -286,8 +286,7 @@ def test_unknown_keys_of_a_reply_are_ignored() -> None:
     assert Wired(colour="red").client.info.n_worlds == 1
 
 
-@pytest.mark.parametrize("kind", [ServerInfo, ServerStatus, WorldInfo, WorldStatus, LeftBeliefInfo]
-)
+@pytest.mark.parametrize("kind", [ServerInfo, ServerStatus, WorldInfo, WorldStatus, LeftBeliefInfo])
 def test_a_record_has_every_documented_key(kind: type[Any]) -> None:
     messages = {ServerInfo: HELLO, ServerStatus: replies("status")[0]}
     messages |= {WorldInfo: replies("reset")[0]["worlds"][0]}

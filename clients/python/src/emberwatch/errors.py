@@ -172,7 +172,7 @@ class BadFileError(RefusedError):
 
 
 class NotKeptError(RefusedError):
-    """A step's frame, or a belief, that the server does not keep; `detail` is the oldest step kept."""
+    """A step's frame, or a belief, that is not kept; `detail` is the oldest step that is."""
 
     name = "not_kept"
 
