@@ -3,7 +3,7 @@
 use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly};
 use crate::wire::{RawClient, Wire, step_header};
 use protocol::Move;
-use protocol::control::{Reply, Request, WorldSeed};
+use protocol::control::{LeftPart, Reply, Request, WorldSeed};
 use protocol::message::{FrameHeader, Operation, Status, StepRequest, split_step_payload};
 use protocol::observer::{Observer, Sample};
 use protocol::path::path_from_bytes;
@@ -94,7 +94,7 @@ fn an_agent_that_finds_only_some_frames_makes_do_with_them() {
         "{}",
         ended.stderr
     );
-    let forgetful = Server::start(&format!("{FLAGS} --history 0"));
+    let forgetful = Server::start(&format!("{FLAGS} --history 1"));
     assert_eq!(run(&forgetful, &steps).wait(PATIENCE).code, Some(0));
     let ended = run(&forgetful, &["--steps", "2"]).wait(PATIENCE);
     assert_eq!(ended.code, Some(0), "{}", ended.stderr);
@@ -157,19 +157,26 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_world_alone() 
     fly(&mut client, Paths::new(0).next(6));
     assert_eq!(client.belief("kind").expect("none yet"), None);
     let bytes: Vec<u8> = (0..35 * 64).map(|n| n as u8).collect();
-    client.leave_belief("kind", &bytes).expect("leave");
+    let at = client.observe(0..1).expect("observe")[0].result;
+    client.leave_belief(&at, "kind", &bytes).expect("leave");
     assert_eq!(client.belief("kind").expect("belief"), Some(bytes.clone()));
     assert_eq!(client.belief("another kind").expect("belief"), None);
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(1, 1).lease;
-    let leave = |lease, world, offset, length, data: &str| Request::LeaveBelief {
-        lease,
-        world,
-        kind: "kind".into(),
-        offset,
-        length,
-        data: data.into(),
+    let part = |lease, world, step, offset, length, data: &str| {
+        Request::LeaveBelief(LeftPart {
+            lease,
+            world,
+            episode: 0,
+            step,
+            kind: "kind".into(),
+            offset,
+            length,
+            data: data.into(),
+        })
     };
+    let leave =
+        |lease, world, offset, length, data: &str| part(lease, world, 0, offset, length, data);
     for (request, status) in [
         (leave(lease, 0, 0, 1, "AA=="), Status::NoLease),
         (leave(lease, 7, 0, 1, "AA=="), Status::NoSuchWorld),
@@ -177,6 +184,7 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_world_alone() 
         (leave(lease, 1, 1, 2, "AA=="), Status::Malformed),
         (leave(lease, 1, 0, 2241, "AA=="), Status::Malformed),
         (leave(lease, 1, 0, 0, "AA=="), Status::Malformed),
+        (part(lease, 1, 1, 0, 1, "AA=="), Status::Malformed),
         (
             leave(lease, 1, u64::MAX, u64::MAX, "AA=="),
             Status::Malformed,
@@ -192,6 +200,9 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_world_alone() 
         offset: 0,
     };
     assert_eq!(wire.ask(&ask).status(), Status::NotKept);
+    // What is refused takes nothing away.
+    let refused = wire.ask(&leave(lease, 1, 0, 1, "AAAA"));
+    assert_eq!(refused.status(), Status::Malformed);
     assert_eq!(wire.ask(&leave(lease, 1, 1, 2, "AQ==")), Reply::Done);
     assert!(matches!(wire.ask(&ask), Reply::Belief { data, .. } if data == "AAE="));
     fly(&mut client, Paths::new(1).next(6));

@@ -229,6 +229,7 @@ fn a_file_that_is_none_is_refused_by_name_and_changes_nothing() {
     for (path, words) in [
         ("/no/such/file", "snapshot file /no/such/file"),
         ("/dev/zero", "expected a regular file"),
+        ("/dev/null", "expected a regular file"),
         ("relative", "path: expected an absolute one"),
     ] {
         let wire = Wire::open(&server.instance);
@@ -317,4 +318,85 @@ fn a_killed_server_comes_back_where_its_last_snapshot_left_it() {
     server
         .program
         .wait_for_words("another kind of file", PATIENCE);
+}
+
+#[test]
+fn nothing_but_snapshots_is_replaced_and_no_other_run_s() {
+    let folder = TempDir::new().expect("a folder");
+    let (notes, link) = (folder.path().join("notes"), folder.path().join("link"));
+    std::fs::write(&notes, "kept").expect("write");
+    std::os::unix::fs::symlink(&notes, &link).expect("a link");
+    let server = Server::start(SMALL);
+    for path in [&notes, &link, &folder.path().to_path_buf()] {
+        let ended = server_command(&server, &["snapshot", text(path)]);
+        refused(&ended, "expected");
+    }
+    assert_eq!(std::fs::read_to_string(&notes).expect("read"), "kept");
+    // A link where the file is written at first leads nowhere else.
+    let file = folder.path().join("lab.snapshot");
+    let part = format!("lab.snapshot.{}.part", server.program.pid());
+    std::os::unix::fs::symlink(&notes, folder.path().join(part)).expect("a link");
+    for _ in 0..2 {
+        let ended = server_command(&server, &["snapshot", text(&file)]);
+        assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    }
+    assert_eq!(std::fs::read_to_string(&notes).expect("read"), "kept");
+    let flags = format!(
+        "{SMALL} --snapshot-every 10 --snapshot-dir {}",
+        text(folder.path())
+    );
+    let instance = new_instance();
+    let first = Server::start_on(&instance, &flags);
+    assert_eq!(server_command(&first, &["stop"]).code, Some(0));
+    drop(first.program.wait(PATIENCE));
+    let flags: Vec<&str> = flags.split_whitespace().collect();
+    let second = Server::start_without_waiting(&instance, &flags);
+    refused(
+        &second.program.wait(PATIENCE),
+        "or --restore, got 1 of another run",
+    );
+}
+
+#[test]
+fn a_world_in_its_burn_in_begins_anew_after_a_restart() {
+    let folder = TempDir::new().expect("a folder");
+    let flags = format!(
+        "--height 32 --width 32 --moves 6 --burn-in 100000 --worlds 2 --snapshot-every 10 \
+         --snapshot-dir {0} --restore {0}",
+        text(folder.path())
+    );
+    let instance = new_instance();
+    let server = Server::start_on(&instance, &flags);
+    let mut stepping = server.acquire(0..1);
+    let wire = Wire::open(&server.instance);
+    let lease = wire.acquire(1, 1).lease;
+    let worlds = vec![protocol::control::WorldSeed {
+        world: 1,
+        seed: Some(77),
+    }];
+    let text = serde_json::to_vec(&Request::Reset { lease, worlds }).expect("a request");
+    let pending = wire
+        .send_control(crate::wire::control_header(1), &text)
+        .expect("send");
+    for k in 0..20 {
+        fly(&mut stepping, Paths::new(k).next(N_MOVES));
+    }
+    assert!(
+        server.status().worlds[1].resetting,
+        "too quick to prove anything"
+    );
+    let entries = || {
+        std::fs::read_dir(folder.path())
+            .expect("the folder")
+            .flatten()
+    };
+    let written = || entries().any(|entry| entry.path().extension() == Some("snapshot".as_ref()));
+    assert!(eventually(PATIENCE, written));
+    server.kill();
+    drop(pending);
+    let server = Server::start_on(&instance, &flags);
+    let worlds = server.status().worlds;
+    assert!((10..=20).contains(&worlds[0].info.step), "{worlds:?}");
+    let begun = &worlds[1].info;
+    assert_eq!((begun.seed, begun.episode, begun.step), (77, 1, 0));
 }

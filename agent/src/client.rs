@@ -5,7 +5,7 @@ use base64::engine::general_purpose::STANDARD as BASE64;
 use protocol::channels::Instance;
 use protocol::connection::{ConnectionError, StepAnswer, unexpected};
 use protocol::control::{
-    LeaseInfo, MAX_BELIEF_PART, Reply, Request, ServerInfo, WorldInfo, WorldSeed,
+    LeaseInfo, LeftPart, MAX_BELIEF_PART, Reply, Request, ServerInfo, WorldInfo, WorldSeed,
 };
 use protocol::message::{FLAG_FULL_COVERAGE, Operation, StepRequest, StepResult};
 use protocol::path::path_to_bytes;
@@ -160,20 +160,27 @@ impl Client {
         self.observations(&answer)
     }
 
-    /// Leaves a belief about the first world to whoever acts on it next.
+    /// Leaves a belief about the first world, as it stands after a result, to whoever acts on it next.
     ///
     /// # Errors
     /// [`ConnectionError`].
-    pub fn leave_belief(&mut self, kind: &str, bytes: &[u8]) -> Result<(), ConnectionError> {
+    pub fn leave_belief(
+        &mut self,
+        at: &StepResult,
+        kind: &str,
+        bytes: &[u8],
+    ) -> Result<(), ConnectionError> {
         for (index, part) in bytes.chunks(MAX_BELIEF_PART).enumerate() {
-            let request = Request::LeaveBelief {
+            let request = Request::LeaveBelief(LeftPart {
                 lease: self.lease,
                 world: self.worlds.start,
+                episode: at.episode,
+                step: at.step,
                 kind: kind.into(),
                 offset: (index * MAX_BELIEF_PART) as u64,
                 length: bytes.len() as u64,
                 data: BASE64.encode(part),
-            };
+            });
             self.connection.control(&request, STEP_TIMEOUT)?;
         }
         Ok(())
@@ -185,7 +192,7 @@ impl Client {
     /// [`ConnectionError`].
     pub fn belief(&mut self, kind: &str) -> Result<Option<Vec<u8>>, ConnectionError> {
         let world = self.worlds.start;
-        let mut bytes = Vec::new();
+        let (mut first, mut bytes) = (None, Vec::new());
         loop {
             let offset = bytes.len() as u64;
             let request = Request::Belief { world, offset };
@@ -193,8 +200,12 @@ impl Client {
                 Ok(Reply::Belief { info, data, .. }) if info.kind == kind => {
                     let part = BASE64.decode(data).map_err(|error| garbled(&error))?;
                     bytes.extend_from_slice(&part);
-                    if bytes.len() as u64 >= info.length || part.is_empty() {
-                        return Ok(Some(bytes));
+                    let (is_last, is_whole) = (part.is_empty(), bytes.len() as u64 == info.length);
+                    if *first.get_or_insert_with(|| info.clone()) != info {
+                        return Ok(None); // Another one was left meanwhile.
+                    }
+                    if is_last || is_whole {
+                        return Ok(is_whole.then_some(bytes));
                     }
                 }
                 // Of another kind, none, or a server that knows no beliefs.

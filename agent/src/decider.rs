@@ -179,7 +179,7 @@ impl Decider {
     /// # Errors
     /// [`RunError::Connection`].
     pub fn release(mut self) -> Result<(), RunError> {
-        leave(&mut self.client, &self.agent)?;
+        leave(&mut self.client, &self.agent, &self.observation)?;
         Ok(self.client.release()?)
     }
 

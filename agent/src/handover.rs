@@ -9,6 +9,9 @@ use protocol::Probabilities;
 use protocol::connection::ConnectionError;
 use protocol::message::Status;
 
+/// Frames that are recalled before the lease is renewed: much less than the shortest lease takes.
+const RENEW_AFTER: u64 = 500;
+
 /// Gives an agent what is known of a world before its present frame; returns whether that frame is in it
 /// already, and the belief about X_{k+1}.
 ///
@@ -32,7 +35,14 @@ pub fn resume(
     }
     let first = first_kept(client, step)?;
     for past in first..step {
-        let seen = client.recall(client.worlds(), past)?.remove(0);
+        if past % RENEW_AFTER == RENEW_AFTER - 1 {
+            client.renew()?; // Recalling is no use of the lease.
+        }
+        let Ok(mut seen) = client.recall(client.worlds(), past) else {
+            client.renew()?; // Says so if the world is another's by now.
+            break;
+        };
+        let seen = seen.remove(0);
         agent.correct(&seen.frame, None)?;
         agent.predict();
     }
@@ -42,17 +52,21 @@ pub fn resume(
     Ok(false)
 }
 
-/// Leaves an agent's belief about X_{k+1} to the next one.
+/// Leaves an agent's belief about X_{k+1}, after its last observation, to the next one.
 ///
 /// # Errors
 /// [`ConnectionError`].
-pub fn leave(client: &mut Client, agent: &Agent) -> Result<(), ConnectionError> {
+pub fn leave(
+    client: &mut Client,
+    agent: &Agent,
+    present: &Observation,
+) -> Result<(), ConnectionError> {
     let Some(kind) = agent.belief_kind() else {
         return Ok(());
     };
     let numbers = agent.belief().as_slice();
     let bytes: Vec<u8> = numbers.iter().flat_map(|p| p.to_le_bytes()).collect();
-    match client.leave_belief(kind, &bytes) {
+    match client.leave_belief(&present.result, kind, &bytes) {
         // A server that keeps no beliefs.
         Err(ConnectionError::Refused {
             status: Status::Malformed,

@@ -112,7 +112,7 @@ pub struct Summary {
 /// # Errors
 /// [`RunError`]; a lost lease is one.
 pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
-    let mut summary = Summary::default();
+    let (mut summary, mut is_in_step) = (Summary::default(), true);
     let mut attached = Attached::attach(mission, mission.takeover)?;
     while !stop.load(Ordering::Relaxed) && (mission.steps == 0 || summary.steps < mission.steps) {
         match attached.step() {
@@ -125,16 +125,27 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
                 tracing::warn!("{error}; waiting for it to come back");
                 match attach_again(mission, stop)? {
                     Some(again) => attached = again,
-                    None => break,
+                    None => {
+                        is_in_step = false;
+                        break;
+                    }
                 }
             }
             Err(error) => return Err(error),
         }
     }
     let Attached {
-        mut client, agent, ..
+        mut client,
+        agent,
+        observation,
+        ..
     } = attached;
-    let released = leave(&mut client, &agent).and_then(|()| client.release());
+    // After an outage nobody knows where the world stands.
+    let left = match is_in_step {
+        true => leave(&mut client, &agent, &observation),
+        false => Ok(()),
+    };
+    let released = left.and_then(|()| client.release());
     match released.map_err(RunError::from) {
         Err(error) if !is_outage(&error) => Err(error),
         _ => Ok(summary),

@@ -123,7 +123,7 @@ fn snapshot(criterion: &mut Criterion) {
     group.bench_function("from bytes", |bencher| {
         bencher.iter(|| {
             let snapshot = decode(&bytes).expect("a snapshot");
-            snapshot.restore(&place.settings, &place.rules, place.n_moves)
+            snapshot.restore(&place.settings, &place.rules)
         });
     });
     group.finish();

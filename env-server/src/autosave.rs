@@ -1,10 +1,9 @@
 //! Snapshots that a server writes of its own accord, and begins with.
 
 use crate::config::Checked;
-use crate::episode::Episode;
 use crate::files::{Files, Job, Place};
-use crate::snapshot::SnapshotError;
 use crate::snapshot::folder::{FileError, Folder, refused};
+use crate::snapshot::{RestoredWorld, SnapshotError};
 use std::path::{Path, PathBuf};
 
 /// When to write the next one, and where.
@@ -31,6 +30,10 @@ impl Autosave {
         }
         let folder = Folder::new(Path::new(&config.snapshot_dir), &checked.instance);
         folder.prepare()?;
+        let n_files = folder.files()?.len();
+        if n_files > 0 && config.restore.is_empty() {
+            return Err(folder.not_empty(n_files));
+        }
         let every = config.snapshot_every.saturating_mul(config.worlds.into());
         Ok(Some(Self {
             folder,
@@ -47,9 +50,14 @@ impl Autosave {
         n_steps >= self.due && self.writing.is_none()
     }
 
+    /// Lets one go.
+    pub fn skip(&mut self, n_steps: u64) {
+        self.due = n_steps.saturating_add(self.every);
+    }
+
     /// Orders one.
     pub fn order(&mut self, n_steps: u64, bytes: Vec<u8>, files: &mut Files) {
-        self.due = n_steps.saturating_add(self.every);
+        self.skip(n_steps);
         let (folder, keep) = (self.folder.clone(), self.keep);
         self.writing = Some(files.order(Job::Autosave {
             folder,
@@ -73,7 +81,7 @@ pub struct FirstWorlds {
     /// Their file.
     pub path: PathBuf,
     /// All of them.
-    pub worlds: Vec<Box<Episode>>,
+    pub worlds: Vec<RestoredWorld>,
 }
 
 /// The worlds that the settings want a server to begin with; `None`: new ones.
@@ -107,6 +115,9 @@ pub fn first_worlds(checked: &Checked, place: &Place) -> Result<Option<FirstWorl
             }
             Err(error) => return Err(error),
         }
+    }
+    if damaged.is_none() {
+        tracing::info!(folder = %path.display(), "nothing to restore: the worlds begin anew");
     }
     damaged.map_or(Ok(None), Err)
 }

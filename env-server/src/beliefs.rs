@@ -1,6 +1,6 @@
 //! Beliefs that agents leave for those who come after them: bytes that the server does not read.
 
-use protocol::control::BeliefInfo;
+use protocol::control::{BeliefInfo, MAX_BELIEF_PART};
 use protocol::message::StepResult;
 
 /// Most bytes of a belief per cell of the grid: sixteen 32-bit numbers.
@@ -54,6 +54,12 @@ impl Beliefs {
                 "length: expected at most {longest} bytes, got {got}"
             ));
         }
+        if part.bytes.len() > MAX_BELIEF_PART {
+            let got = part.bytes.len();
+            return Err(format!(
+                "data: expected at most {MAX_BELIEF_PART} bytes, got {got}"
+            ));
+        }
         let info = BeliefInfo {
             kind: part.kind.into(),
             seed: at.seed,
@@ -62,28 +68,25 @@ impl Beliefs {
             length: part.length,
         };
         let left = &mut self.left[world];
+        let so_far = left
+            .as_ref()
+            .filter(|left| left.info == info && part.offset > 0);
+        let expected = so_far.map_or(0, |left| left.bytes.len() as u64);
+        let end = part.offset.saturating_add(part.bytes.len() as u64);
+        if part.offset != expected || end > part.length {
+            let (offset, length) = (part.offset, part.length);
+            return Err(format!(
+                "offset: expected the next bytes, from {expected}, within {length}, got {offset} to {end}"
+            ));
+        }
         if part.offset == 0 {
             let bytes = Vec::with_capacity(part.length as usize);
-            *left = Some(Left {
-                info: info.clone(),
-                bytes,
-            });
+            *left = Some(Left { info, bytes });
         }
-        let so_far = left.as_mut().filter(|left| left.info == info);
-        let expected = so_far.as_ref().map_or(0, |left| left.bytes.len() as u64);
-        let end = part.offset.saturating_add(part.bytes.len() as u64);
-        match so_far {
-            Some(left) if part.offset == expected && end <= part.length => {
-                left.bytes.extend_from_slice(part.bytes);
-                Ok(())
-            }
-            _ => {
-                let (offset, length) = (part.offset, part.length);
-                Err(format!(
-                    "offset: expected the next bytes, from {expected}, within {length}, got {offset} to {end}"
-                ))
-            }
+        if let Some(left) = left {
+            left.bytes.extend_from_slice(part.bytes);
         }
+        Ok(())
     }
 
     /// The whole belief left about a world that stands where a result says.

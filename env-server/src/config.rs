@@ -50,11 +50,11 @@ pub struct ServerConfig {
     pub lease_millis: u64,
     /// Threads that simulate; 0: one per core.
     pub threads: usize,
-    /// Steps of each world whose frames are kept for agents that come later, 0 to 1,000,000.
+    /// Steps of each world whose frames are kept for agents that come later, 1 to 1,000,000.
     pub history: u32,
     /// Begin with the worlds of this snapshot file, or of the last in this folder; empty: anew.
     pub restore: String,
-    /// Write a snapshot after so many steps of all worlds together, per world; 0: never.
+    /// Write a snapshot each so many steps of all worlds together, times their number; 0: never.
     pub snapshot_every: u64,
     /// The folder for these snapshots.
     pub snapshot_dir: String,
@@ -119,7 +119,7 @@ pub struct ServerFlags {
     /// Begin with the worlds of this snapshot file, or of the last in this folder, if there is one
     #[arg(long, value_name = "FILE|FOLDER")]
     pub restore: Option<String>,
-    /// Write a snapshot each so many steps, and one at the end [default: 0, never]
+    /// Write a snapshot each so many steps of all worlds, and one at the end [default: 0, never]
     #[arg(long, value_name = "STEPS")]
     pub snapshot_every: Option<u64>,
     /// The folder for these snapshots
@@ -269,7 +269,7 @@ impl ServerConfig {
         in_range("lease_millis", self.lease_millis, 100, 86_400_000)?;
         in_range("threads", self.threads as u64, 0, 256)?;
         in_range("burn_in", self.burn_in, 0, 1 << 40)?;
-        in_range("history", self.history.into(), 0, 1_000_000)?;
+        in_range("history", self.history.into(), 1, 1_000_000)?;
         in_range("snapshot_keep", self.snapshot_keep.into(), 1, 1_000_000)?;
         if (self.snapshot_every == 0) != self.snapshot_dir.is_empty() {
             let got = format!("{} and {:?}", self.snapshot_every, self.snapshot_dir);

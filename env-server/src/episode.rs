@@ -50,6 +50,8 @@ pub struct Rules {
     pub start: Start,
     /// Steps whose frames are kept.
     pub history: usize,
+    /// Moves in a path.
+    pub n_moves: usize,
     sensor: Sensor,
     dynamics: Dynamics,
 }
@@ -90,6 +92,7 @@ impl Rules {
             max_steps,
             start,
             history: 0,
+            n_moves: 0,
             sensor: Sensor::new(model),
             dynamics: Dynamics::new(model, shape)?,
         })
@@ -110,8 +113,13 @@ impl Rules {
 impl Episode {
     /// A new world at k = 0.
     pub fn new(rules: &Rules, seed: u64) -> Self {
+        Self::numbered(rules, seed, 0)
+    }
+
+    /// A new world at k = 0 that was reset before.
+    pub fn numbered(rules: &Rules, seed: u64, episode: u64) -> Self {
         let world = World::new(rules.dynamics.clone(), seed, rules.burn_in);
-        Self::beginning(rules, world, 0)
+        Self::beginning(rules, world, episode)
     }
 
     /// Starts over with a seed: the frame is empty, the robot at its start, k = 0.
@@ -121,7 +129,7 @@ impl Episode {
         } else {
             World::new(rules.dynamics.clone(), seed, rules.burn_in)
         };
-        *self = Self::beginning(rules, world, self.result.episode + 1);
+        *self = Self::beginning(rules, world, self.result.episode.wrapping_add(1));
     }
 
     /// Flies a path and moves the world once; `coverage` says what the frame shows.
@@ -175,6 +183,11 @@ impl Episode {
         let oldest = || self.history.all().next().map(|seen| seen.result.step);
         let seen = self.history.step(step);
         seen.ok_or_else(|| oldest().unwrap_or(self.result.step))
+    }
+
+    /// About how many bytes a snapshot of it takes.
+    pub fn n_bytes(&self) -> usize {
+        3 * self.frame.as_bytes().len() + self.history.n_bytes() + self.path.len() + 256
     }
 
     /// The hidden states, shape `[H, W]`.
@@ -234,13 +247,15 @@ impl Episode {
                 states,
             )
         };
+        let mut kept = History::new(rules.history, rules.n_moves);
+        history.into_iter().for_each(|seen| kept.keep(seen));
         let n_observations = rules.n_observations;
         let frame = Frame::from_bytes(rules.shape, n_observations, &frame);
         Ok(Self {
             world: world(result.step, states),
             beginning: world(0, beginning),
             frame: frame.map_err(|error| Misfit(error.to_string()))?,
-            history: History::with(rules.history, history),
+            history: kept,
             path: path_from_bytes(&path).map_err(|error| Misfit(error.to_string()))?,
             path_start,
             robot: Cell {
@@ -263,7 +278,7 @@ impl Episode {
             ..StepResult::default()
         };
         let (beginning, frame) = (world.clone(), Frame::empty(rules.shape));
-        let mut history = History::new(rules.history);
+        let mut history = History::new(rules.history, rules.n_moves);
         history.push(&result, &frame, Some(&[]));
         Self {
             world,

@@ -1,16 +1,19 @@
 //! Snapshot files are written and read here, on a thread of its own, so that no disk delays a step.
 
-use crate::episode::{Episode, Rules};
+use crate::episode::Rules;
 use crate::snapshot::folder::{FileError, Folder, read, refused, write};
-use crate::snapshot::{Settings, SnapshotError};
+use crate::snapshot::{RestoredWorld, Settings, SnapshotError};
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::io::Errno;
 use std::ops::Range;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, Sender, channel};
-use std::thread::JoinHandle;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::time::{Duration, Instant};
+
+/// Most jobs at a time.
+const MAX_JOBS: u64 = 16;
 
 /// What to do with a file.
 #[derive(Debug)]
@@ -50,7 +53,7 @@ pub enum Done {
         n_bytes: usize,
     },
     /// Worlds were read.
-    Loaded(Vec<Box<Episode>>),
+    Loaded(Vec<RestoredWorld>),
 }
 
 /// A job's number, and what came of it.
@@ -63,18 +66,16 @@ pub struct Place {
     pub settings: Settings,
     /// Its rules.
     pub rules: Rules,
-    /// Moves in a path.
-    pub n_moves: usize,
 }
 
 /// The thread that works on files.
 pub struct Files {
     jobs: Option<Sender<(u64, Job)>>,
     n_jobs: u64,
+    n_done: u64,
     done: Receiver<Outcome>,
     /// Readable while `done` may hold something.
     signal: Arc<OwnedFd>,
-    thread: Option<JoinHandle<()>>,
 }
 
 impl Files {
@@ -95,15 +96,15 @@ impl Files {
                 let _ = rustix::io::write(&*bell, &1u64.to_ne_bytes());
             }
         };
-        let thread = std::thread::Builder::new()
+        std::thread::Builder::new()
             .name("files".into())
             .spawn(work)?;
         Ok(Self {
             jobs: Some(jobs),
             n_jobs: 0,
+            n_done: 0,
             done,
             signal,
-            thread: Some(thread),
         })
     }
 
@@ -116,25 +117,41 @@ impl Files {
         self.n_jobs
     }
 
+    /// Whether there is room for another job: clients that give up leave theirs behind.
+    pub fn has_room(&self) -> bool {
+        self.n_jobs - self.n_done < MAX_JOBS
+    }
+
     /// The jobs that are done since the last call.
-    pub fn finished(&self) -> Vec<Outcome> {
+    pub fn finished(&mut self) -> Vec<Outcome> {
         let _ = rustix::io::read(&*self.signal, &mut [0u8; 8]);
-        self.done.try_iter().collect()
+        let finished: Vec<Outcome> = self.done.try_iter().collect();
+        self.n_done += finished.len() as u64;
+        finished
+    }
+
+    /// Ends the thread once it has done its jobs, and waits for that, but no longer than a while; returns
+    /// what came of them.
+    ///
+    /// # Errors
+    /// What it had done by then.
+    pub fn finish(mut self, limit: Duration) -> Result<Vec<Outcome>, Vec<Outcome>> {
+        self.jobs = None;
+        let deadline = Instant::now() + limit;
+        let mut finished = Vec::new();
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            match self.done.recv_timeout(left) {
+                Ok(outcome) => finished.push(outcome),
+                Err(RecvTimeoutError::Disconnected) => return Ok(finished),
+                Err(RecvTimeoutError::Timeout) => return Err(finished),
+            }
+        }
     }
 
     /// Readable while a job is done.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         self.signal.as_fd()
-    }
-}
-
-impl Drop for Files {
-    /// Waits until what was ordered is written.
-    fn drop(&mut self) {
-        self.jobs = None;
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
     }
 }
 
@@ -169,7 +186,7 @@ impl Place {
         &self,
         path: &Path,
         worlds: Option<Range<usize>>,
-    ) -> Result<Vec<Box<Episode>>, FileError> {
+    ) -> Result<Vec<RestoredWorld>, FileError> {
         let mut snapshot = read(path)?;
         if let Some(worlds) = worlds {
             let got = snapshot.worlds.len();
@@ -179,7 +196,7 @@ impl Place {
             }
             snapshot.worlds = snapshot.worlds.drain(worlds).collect();
         }
-        let restored = snapshot.restore(&self.settings, &self.rules, self.n_moves);
+        let restored = snapshot.restore(&self.settings, &self.rules);
         restored.map_err(|error| refused(path, error))
     }
 }

@@ -5,10 +5,16 @@ use protocol::frame::UNOBSERVED;
 use protocol::message::StepResult;
 use std::collections::VecDeque;
 
-/// The frames of consecutive steps, the last one the world's present; bounded.
-#[derive(Debug, Clone, Default)]
+/// Least room for a world's frames, bytes: full frames share it, however many steps are to be kept.
+const LEAST_ROOM: usize = 1 << 20;
+
+/// The frames of consecutive steps, the last one the world's present; bounded in steps and in bytes.
+#[derive(Debug, Clone)]
 pub struct History {
-    capacity: usize,
+    n_steps: usize,
+    /// Bytes that the frames may take.
+    room: usize,
+    n_bytes: usize,
     seen: VecDeque<Seen>,
 }
 
@@ -24,34 +30,20 @@ pub struct Seen {
 }
 
 impl History {
-    /// Room for the frames of this many steps.
-    pub fn new(capacity: usize) -> Self {
+    /// Room for the frames of so many steps, at least of the present one, as seen on paths.
+    pub fn new(n_steps: usize, n_moves: usize) -> Self {
+        let n_steps = n_steps.max(1);
         Self {
-            capacity,
+            n_steps,
+            room: LEAST_ROOM.max(n_steps.saturating_mul(size_of::<Seen>() + 5 * n_moves)),
+            n_bytes: 0,
             seen: VecDeque::new(),
         }
     }
 
-    /// Those frames, the oldest first.
-    pub fn with(capacity: usize, seen: impl IntoIterator<Item = Seen>) -> Self {
-        let mut history = Self::new(capacity);
-        history.seen.extend(seen);
-        while history.seen.len() > capacity {
-            history.seen.pop_front();
-        }
-        history
-    }
-
     /// Keeps a step; forgets the oldest if there is no room.
     pub fn push(&mut self, result: &StepResult, frame: &Frame, visited: Option<&[usize]>) {
-        if self.capacity == 0 {
-            return;
-        }
-        let mut seen = if self.seen.len() < self.capacity {
-            Seen::default()
-        } else {
-            self.seen.pop_front().unwrap_or_default()
-        };
+        let mut seen = self.make_room().unwrap_or_default();
         let bytes = frame.as_bytes();
         seen.result = *result;
         seen.cells.clear();
@@ -63,7 +55,32 @@ impl History {
             }
             None => seen.values.extend_from_slice(bytes),
         }
+        self.keep(seen);
+    }
+
+    /// Keeps what a step showed.
+    pub fn keep(&mut self, seen: Seen) {
+        self.n_bytes += seen.n_bytes();
         self.seen.push_back(seen);
+        while self.seen.len() > 1 && (self.seen.len() > self.n_steps || self.n_bytes > self.room) {
+            self.forget();
+        }
+    }
+
+    /// The oldest step if another one would be too many.
+    fn make_room(&mut self) -> Option<Seen> {
+        (self.seen.len() >= self.n_steps).then(|| self.forget())?
+    }
+
+    fn forget(&mut self) -> Option<Seen> {
+        let seen = self.seen.pop_front()?;
+        self.n_bytes -= seen.n_bytes();
+        Some(seen)
+    }
+
+    /// Bytes that the frames take.
+    pub fn n_bytes(&self) -> usize {
+        self.n_bytes
     }
 
     /// Those kept, the oldest first.
@@ -80,6 +97,10 @@ impl History {
 }
 
 impl Seen {
+    fn n_bytes(&self) -> usize {
+        size_of::<Self>() + 4 * self.cells.len() + self.values.len()
+    }
+
     /// Writes the frame, one byte per cell of `frame`.
     pub fn write_frame(&self, frame: &mut [u8]) {
         if self.cells.is_empty() && !self.values.is_empty() {
@@ -101,7 +122,7 @@ mod tests {
     #[test]
     fn the_last_frames_are_kept_as_they_were() {
         let shape = Shape::new(2, 3).expect("test shape");
-        let mut history = History::new(3);
+        let mut history = History::new(3, 6);
         let mut frames = Vec::new();
         for step in 0..5 {
             let mut frame = Frame::empty(shape);
@@ -129,8 +150,20 @@ mod tests {
             assert_eq!(seen.result.step, step);
             assert_eq!(bytes, frames[step as usize].as_bytes());
         }
-        let mut nothing = History::new(0);
-        nothing.push(&StepResult::default(), &frames[0], None);
-        assert_eq!(nothing.all().len(), 0);
+        // At least the present is kept, and no more than there is room for.
+        let mut present = History::new(0, 6);
+        frames
+            .iter()
+            .for_each(|frame| present.push(&StepResult::default(), frame, None));
+        assert_eq!(present.all().len(), 1);
+        let large = Frame::empty(Shape::new(512, 1024).expect("test shape"));
+        let mut few = History::new(256, 64);
+        for _ in 0..5 {
+            few.push(&StepResult::default(), &large, None);
+        }
+        assert_eq!(
+            (few.all().len(), few.n_bytes() / large.as_bytes().len()),
+            (1, 1)
+        );
     }
 }

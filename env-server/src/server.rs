@@ -42,6 +42,9 @@ const CONTROL_FIRST: u64 = 64;
 /// How often a server that is greeting observers shows them more.
 const GREETING_TICK: Duration = Duration::from_millis(5);
 
+/// How long a server that ends waits for its files.
+const LAST_FILES: Duration = Duration::from_secs(10);
+
 /// Over how long the step rate is measured.
 const RATE_WINDOW: Duration = Duration::from_secs(1);
 
@@ -87,8 +90,9 @@ pub fn serve(
     while !stop.load(Ordering::Relaxed) && !server.is_over {
         server.turn()?;
     }
-    server.save_last();
-    tracing::info!(n_steps = server.simulator.n_steps(), "stopped");
+    let n_steps = server.simulator.n_steps();
+    server.end()?;
+    tracing::info!(n_steps, "stopped");
     Ok(())
 }
 
@@ -150,10 +154,10 @@ impl Server {
         let place = simulator.place();
         if let Some(FirstWorlds { path, worlds }) = first_worlds(&settings, &place)? {
             tracing::info!(file = %path.display(), "restored");
-            orders.clear();
-            for (world, episode) in worlds.into_iter().enumerate() {
-                simulator.finish_reset(world, episode);
-            }
+            let worlds = worlds.into_iter().enumerate();
+            orders = worlds
+                .filter_map(|(world, restored)| simulator.begin_with(world, restored))
+                .collect();
         }
         let not_started = |problem: String| ServeError::Threads { n_threads, problem };
         let files = Files::start(place).map_err(|error| not_started(error.to_string()))?;
@@ -292,9 +296,14 @@ impl Server {
                 self.send_reply(&request, &reply);
                 self.publish(worlds);
             }
-            Outcome::File(job, order) => {
+            Outcome::File(job, order) if self.files.has_room() => {
                 let number = self.files.order(job);
                 self.file_orders.insert(number, (request, order));
+            }
+            Outcome::File(_, order) => {
+                self.simulator.forget_file(now, &order);
+                let message = "too many files at a time: try again later".into();
+                self.send_reply(&request, &bad_file(message));
             }
             Outcome::Shutdown => {
                 self.send_reply(&request, &Reply::Done);
@@ -331,10 +340,10 @@ impl Server {
     /// Everything that no request asks for.
     fn look_around(&mut self, now: Instant) {
         self.last_tick = now;
-        self.take_resets(now);
-        self.take_files(now);
         self.forget_abandoned(now);
         self.bury_the_dead();
+        self.take_resets(now);
+        self.take_files(now);
         self.is_over |= self.keeper.as_ref().is_some_and(Keeper::has_ended);
         for pid in self.simulator.expire(now) {
             tracing::warn!(pid, "a lease expired");
@@ -357,21 +366,45 @@ impl Server {
 
     fn save_if_due(&mut self) {
         let n_steps = self.simulator.n_steps();
-        if let Some(autosave) = &mut self.autosave
-            && autosave.is_due(n_steps)
-            && let Some(bytes) = self.simulator.snapshot(self.simulator.worlds())
+        if self
+            .autosave
+            .as_ref()
+            .is_some_and(|autosave| autosave.is_due(n_steps))
         {
-            autosave.order(n_steps, bytes, &mut self.files);
+            self.save();
         }
     }
 
-    /// What a server that ends leaves to the next.
-    fn save_last(&mut self) {
+    fn save(&mut self) {
+        let Some(autosave) = &mut self.autosave else {
+            return;
+        };
         let n_steps = self.simulator.n_steps();
-        if let Some(autosave) = &mut self.autosave
-            && let Some(bytes) = self.simulator.snapshot(self.simulator.worlds())
-        {
-            autosave.order(n_steps, bytes, &mut self.files);
+        match self.simulator.snapshot(self.simulator.worlds()) {
+            Ok(bytes) => autosave.order(n_steps, bytes, &mut self.files),
+            Err(error) => {
+                autosave.skip(n_steps);
+                tracing::warn!("not saved: {error}");
+            }
+        }
+    }
+
+    /// Leaves a last snapshot, and everything in order, before others may take the instance.
+    fn end(mut self) -> Result<(), ServeError> {
+        self.save();
+        let (finished, is_late) = match self.files.finish(LAST_FILES) {
+            Ok(finished) => (finished, false),
+            Err(finished) => (finished, true),
+        };
+        if is_late {
+            tracing::warn!("files were not written within {LAST_FILES:?}");
+        }
+        let failed = finished
+            .into_iter()
+            .filter_map(|(_, outcome)| outcome.err());
+        match failed.last() {
+            Some(error) if self.autosave.is_some() => Err(error.into()),
+            _ => Ok(()),
         }
     }
 
@@ -408,11 +441,7 @@ impl Server {
             Ok(Done::Saved { path, n_bytes }) => self.simulator.saved(order, &path, n_bytes),
             Err(error) => {
                 self.simulator.forget_file(now, order);
-                Reply::Error {
-                    status: Status::BadFile,
-                    detail: 0,
-                    message: error.to_string(),
-                }
+                bad_file(error.to_string())
             }
         }
     }
@@ -463,6 +492,14 @@ impl Rate {
                 per_second,
             };
         }
+    }
+}
+
+fn bad_file(message: String) -> Reply {
+    Reply::Error {
+        status: Status::BadFile,
+        detail: 0,
+        message,
     }
 }
 

@@ -50,7 +50,11 @@ pub struct Simulator {
 enum Slot {
     Ready(Box<Episode>),
     /// On its way through burn-in; this is where it stood before.
-    Resetting(StepResult),
+    Resetting {
+        last: StepResult,
+        seed: u64,
+        episode: u64,
+    },
 }
 
 /// A world to reset, taken out of the simulator.
@@ -58,7 +62,9 @@ pub struct ResetOrder {
     /// The world.
     pub world: usize,
     /// Its episode, if it had one before.
-    pub episode: Option<Box<Episode>>,
+    pub before: Option<Box<Episode>>,
+    /// The number of its new one, if it had none.
+    pub episode: u64,
     /// Its new seed.
     pub seed: u64,
 }
@@ -90,19 +96,18 @@ impl Simulator {
             config.max_steps,
             config.start,
         )?;
-        rules.history = config.history as usize;
+        (rules.history, rules.n_moves) = (config.history as usize, config.moves);
         let settings = Settings::of(&checked);
         let beliefs = Beliefs::new(config.worlds as usize, checked.shape.n_cells());
         let (n_worlds, first_seed) = (config.worlds as usize, config.seed);
-        let slots = (0..n_worlds)
-            .map(|_| Slot::Resetting(StepResult::default()))
-            .collect();
         let start = |world: usize| ResetOrder {
             world,
-            episode: None,
+            before: None,
+            episode: 0,
             seed: first_seed.wrapping_add(world as u64),
         };
-        let orders = (0..n_worlds).map(start).collect();
+        let orders: Vec<ResetOrder> = (0..n_worlds).map(start).collect();
+        let slots = orders.iter().map(Slot::resetting).collect();
         let leases = Leases::new(n_worlds);
         Ok((
             Self {
@@ -197,7 +202,7 @@ impl Simulator {
     pub fn episode(&self, world: usize) -> Option<&Episode> {
         match self.slots.get(world)? {
             Slot::Ready(episode) => Some(episode),
-            Slot::Resetting(_) => None,
+            Slot::Resetting { .. } => None,
         }
     }
 
@@ -362,11 +367,22 @@ impl Simulator {
     }
 }
 
+impl Slot {
+    /// A world on its way through the burn-in of a new one.
+    fn resetting(order: &ResetOrder) -> Self {
+        Self::Resetting {
+            last: StepResult::default(),
+            seed: order.seed,
+            episode: order.episode,
+        }
+    }
+}
+
 impl ResetOrder {
     /// Brings the world to k = 0: the slow part, for any thread.
     pub fn carry_out(self, rules: &Rules) -> (usize, Box<Episode>) {
-        let episode = match self.episode {
-            None => Box::new(Episode::new(rules, self.seed)),
+        let episode = match self.before {
+            None => Box::new(Episode::numbered(rules, self.seed, self.episode)),
             Some(mut episode) => {
                 episode.reset(rules, self.seed);
                 episode

@@ -4,15 +4,17 @@
 //! worlds as bincode writes them. All of it is in the byte order of the host; a file of the other order
 //! is one of an unknown version.
 
+mod check;
 pub mod folder;
 
 use crate::config::Checked;
 use crate::episode::{Episode, Rules};
 use crate::history::Seen;
-use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
+use bincode::config::{Configuration, Fixint, LittleEndian};
+use bincode::error::DecodeError;
 use bincode::{Decode, Encode};
+use protocol::Cell;
 use protocol::message::{RESULT_BYTES, StepResult};
-use protocol::{Cell, Coverage};
 use std::fmt::Display;
 use thiserror::Error;
 
@@ -25,17 +27,12 @@ pub const VERSION: u32 = 1;
 /// Magic, version, checksum and length.
 const HEADER_BYTES: usize = 8 + 4 + 4 + 8;
 
-/// Largest file that is read: 4 GiB, more than a thousand worlds of 512 x 512 cells need.
+/// Largest file: 4 GiB.
 pub const MAX_BYTES: u64 = 1 << 32;
 
-/// Largest k in a file: no absolute step can overflow.
-const MAX_STEP: u64 = 1 << 62;
-
-/// bincode's way of writing: integers of fixed size, and no more memory than the file is long.
-const FORM: Configuration<LittleEndian, Fixint, Limit<{ MAX_BYTES as usize }>> =
-    bincode::config::standard()
-        .with_fixed_int_encoding()
-        .with_limit::<{ MAX_BYTES as usize }>();
+/// bincode's way of writing: integers of fixed size.
+const FORM: Configuration<LittleEndian, Fixint> =
+    bincode::config::standard().with_fixed_int_encoding();
 
 /// The settings of a server that its worlds depend on.
 #[derive(Debug, Clone, PartialEq, Eq, Encode, Decode)]
@@ -52,7 +49,42 @@ pub struct Snapshot {
     /// The settings.
     pub settings: Settings,
     /// The worlds.
-    pub worlds: Vec<WorldSnapshot>,
+    pub worlds: Vec<StoredWorld>,
+}
+
+/// A world in a file.
+#[derive(Debug, Clone, PartialEq)]
+pub enum StoredWorld {
+    /// At some step.
+    Ready(Box<WorldSnapshot>),
+    /// In the burn-in of an episode.
+    Beginning(Beginning),
+}
+
+/// A world that a server may go on with.
+pub enum RestoredWorld {
+    /// At some step.
+    Ready(Box<Episode>),
+    /// Before the burn-in of an episode.
+    Beginning(Beginning),
+}
+
+/// A world to write.
+#[derive(Debug, Clone, Copy)]
+pub enum WorldToWrite<'a> {
+    /// At some step.
+    Ready(&'a Episode),
+    /// In the burn-in of an episode.
+    Beginning(Beginning),
+}
+
+/// An episode that is yet to be simulated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Beginning {
+    /// Its seed.
+    pub seed: u64,
+    /// Its number.
+    pub episode: u64,
 }
 
 /// One world: all that decides its future, and what it shows now.
@@ -144,6 +176,9 @@ pub enum SnapshotError {
         /// The file's.
         got: String,
     },
+    /// More than a file may hold.
+    #[error("expected a snapshot of at most {MAX_BYTES} bytes, got worlds of {0}")]
+    TooLarge(u64),
     /// More or fewer worlds than there is room for.
     #[error("worlds: expected {expected}, got {got}")]
     Worlds {
@@ -220,9 +255,17 @@ impl Settings {
 }
 
 /// Worlds as the bytes of a file.
-pub fn encode<'a>(settings: &Settings, worlds: impl Iterator<Item = &'a Episode>) -> Vec<u8> {
-    let worlds: Vec<Written<'_>> = worlds.map(Episode::written).collect();
-    let mut bytes = vec![0; HEADER_BYTES];
+///
+/// # Errors
+/// [`SnapshotError::TooLarge`].
+pub fn encode(settings: &Settings, worlds: &[WorldToWrite<'_>]) -> Result<Vec<u8>, SnapshotError> {
+    let n_bytes: u64 = worlds.iter().map(WorldToWrite::n_bytes).sum();
+    if n_bytes > MAX_BYTES {
+        return Err(SnapshotError::TooLarge(n_bytes));
+    }
+    let worlds: Vec<_> = worlds.iter().map(WorldToWrite::written).collect();
+    let mut bytes = Vec::with_capacity(n_bytes as usize + HEADER_BYTES + settings.model.len());
+    bytes.resize(HEADER_BYTES, 0);
     // Only a writer can fail, and memory does not.
     let _ = bincode::encode_into_std_write((settings, worlds), &mut bytes, FORM);
     let body = &bytes[HEADER_BYTES..];
@@ -231,7 +274,7 @@ pub fn encode<'a>(settings: &Settings, worlds: impl Iterator<Item = &'a Episode>
     bytes[8..12].copy_from_slice(&VERSION.to_ne_bytes());
     bytes[12..16].copy_from_slice(&checksum.to_ne_bytes());
     bytes[16..24].copy_from_slice(&length.to_ne_bytes());
-    bytes
+    Ok(bytes)
 }
 
 /// The worlds in the bytes of a file, whole or not at all.
@@ -240,30 +283,54 @@ pub fn encode<'a>(settings: &Settings, worlds: impl Iterator<Item = &'a Episode>
 /// [`SnapshotError`]; whether the worlds can be is checked when they are restored.
 pub fn decode(bytes: &[u8]) -> Result<Snapshot, SnapshotError> {
     let body = checked_body(bytes)?;
-    let malformed = |error: &dyn Display| SnapshotError::Malformed(error.to_string());
-    type Contents = (Settings, Vec<Read>);
-    let (contents, length): (Contents, usize) =
-        bincode::decode_from_slice(body, FORM).map_err(|error| malformed(&error))?;
+    let ((settings, worlds), length) =
+        decode_body(body).map_err(|error| SnapshotError::Malformed(error.to_string()))?;
     if length != body.len() {
         let rest = body.len() - length;
-        return Err(malformed(&format!("{rest} bytes behind the last world")));
+        let problem = format!("{rest} bytes behind the last world");
+        return Err(SnapshotError::Malformed(problem));
     }
-    let (settings, worlds) = contents;
-    let worlds = worlds.into_iter().enumerate().map(|(world, read)| {
-        let snapshot = read.check();
-        snapshot.map_err(|misfit| SnapshotError::World { world, misfit })
-    });
+    let stored = |(seed, episode, read): (u64, u64, Option<Read>)| match read {
+        None => Ok(StoredWorld::Beginning(Beginning { seed, episode })),
+        Some(read) => Ok(StoredWorld::Ready(Box::new(read.check()?))),
+    };
+    let worlds = worlds.into_iter().enumerate();
+    let worlds = worlds
+        .map(|(world, read)| stored(read).map_err(|misfit| SnapshotError::World { world, misfit }));
     Ok(Snapshot {
         settings,
         worlds: worlds.collect::<Result<_, _>>()?,
     })
 }
 
+/// What a file holds.
+type Contents = (Settings, Vec<(u64, u64, Option<Read>)>);
+
+/// Reads contents, and how many bytes they took. bincode believes lengths up to a limit, and limits are
+/// part of its types: the least that will do, so that a small file cannot ask for much memory.
+fn decode_body(body: &[u8]) -> Result<(Contents, usize), DecodeError> {
+    match body.len() {
+        0..0x1_0000 => bincode::decode_from_slice(body, FORM.with_limit::<0x10_0000>()),
+        0..0x100_0000 => bincode::decode_from_slice(body, FORM.with_limit::<0x1000_0000>()),
+        _ => bincode::decode_from_slice(body, FORM.with_limit::<{ 8 * MAX_BYTES as usize }>()),
+    }
+}
+
 fn checked_body(bytes: &[u8]) -> Result<&[u8], SnapshotError> {
-    if bytes.len() < HEADER_BYTES || bytes[..8] != MAGIC {
+    let (header, body) = bytes.split_at(HEADER_BYTES.min(bytes.len()));
+    let expected = checked_length(header, body.len() as u64)?;
+    let got = crc32fast::hash(body);
+    if expected != got {
+        return Err(SnapshotError::Checksum { expected, got });
+    }
+    Ok(body)
+}
+
+/// Checks a header, and that so many bytes behind it are as many as it says; returns their checksum.
+fn checked_length(header: &[u8], got: u64) -> Result<u32, SnapshotError> {
+    if header.len() < HEADER_BYTES || header[..8] != MAGIC {
         return Err(SnapshotError::Foreign);
     }
-    let (header, body) = bytes.split_at(HEADER_BYTES);
     let word = |from: usize| {
         let bytes = header[from..from + 4].try_into();
         u32::from_ne_bytes(bytes.expect("invariant: four bytes"))
@@ -272,19 +339,37 @@ fn checked_body(bytes: &[u8]) -> Result<&[u8], SnapshotError> {
         return Err(SnapshotError::Version(word(8)));
     }
     let length = header[16..24].try_into().expect("invariant: eight bytes");
-    let (expected, got) = (u64::from_ne_bytes(length), body.len() as u64);
+    let expected = u64::from_ne_bytes(length);
     if expected != got {
         return Err(SnapshotError::Length { expected, got });
     }
-    let (expected, got) = (word(12), crc32fast::hash(body));
-    if expected != got {
-        return Err(SnapshotError::Checksum { expected, got });
+    if got > MAX_BYTES {
+        return Err(SnapshotError::TooLarge(got));
     }
-    Ok(body)
+    Ok(word(12))
+}
+
+impl<'a> WorldToWrite<'a> {
+    fn n_bytes(&self) -> u64 {
+        match self {
+            Self::Ready(episode) => episode.n_bytes() as u64,
+            Self::Beginning(_) => 24,
+        }
+    }
+
+    fn written(&self) -> (u64, u64, Option<Written<'a>>) {
+        match *self {
+            Self::Beginning(Beginning { seed, episode }) => (seed, episode, None),
+            Self::Ready(episode) => {
+                let result = episode.result();
+                (result.seed, result.episode, Some(episode.written()))
+            }
+        }
+    }
 }
 
 impl Snapshot {
-    /// Episodes of some of the worlds under a server's rules.
+    /// Worlds that go on under a server's rules.
     ///
     /// # Errors
     /// [`SnapshotError`] if it was taken under other settings or holds a world that cannot be.
@@ -292,113 +377,25 @@ impl Snapshot {
         self,
         settings: &Settings,
         rules: &Rules,
-        n_moves: usize,
-    ) -> Result<Vec<Box<Episode>>, SnapshotError> {
+    ) -> Result<Vec<RestoredWorld>, SnapshotError> {
         self.settings.check(settings)?;
+        let restore = |stored| {
+            Ok(match stored {
+                StoredWorld::Beginning(beginning) => RestoredWorld::Beginning(beginning),
+                StoredWorld::Ready(world) => {
+                    RestoredWorld::Ready(Box::new(Episode::restore(rules, *world)?))
+                }
+            })
+        };
         let worlds = self.worlds.into_iter().enumerate();
-        let restore = |(world, snapshot): (usize, WorldSnapshot)| {
-            let episode = match snapshot.path.len() {
-                0 => Episode::restore(rules, snapshot),
-                got if got == n_moves => Episode::restore(rules, snapshot),
-                got => Err(Misfit(format!(
-                    "path: expected 0 or {n_moves} moves, got {got}"
-                ))),
-            };
-            let episode = episode.map_err(|misfit| SnapshotError::World { world, misfit });
-            episode.map(Box::new)
-        };
-        worlds.map(restore).collect()
-    }
-}
-
-impl WorldSnapshot {
-    /// Checks everything that an episode takes for granted.
-    ///
-    /// # Errors
-    /// [`Misfit`] names the first thing that is wrong.
-    pub fn check(&self, rules: &Rules) -> Result<(), Misfit> {
-        let n_cells = rules.shape.n_cells();
-        let expect = |what: &str, holds: bool, expected: String, got: String| {
-            let text = || Misfit(format!("{what}: expected {expected}, got {got}"));
-            if holds { Ok(()) } else { Err(text()) }
-        };
-        for (what, states) in [("states", &self.states), ("first states", &self.beginning)] {
-            let got = states.len();
-            expect(what, got == n_cells, n_cells.to_string(), got.to_string())?;
-            let most = states.iter().copied().max().unwrap_or(0);
-            let n_states = rules.n_states;
-            let fine = usize::from(most) < n_states;
-            expect(
-                what,
-                fine,
-                format!("states below {n_states}"),
-                most.to_string(),
-            )?;
-        }
-        let robot = Cell {
-            row: self.result.row as usize,
-            col: self.result.col as usize,
-        };
-        for (what, cell) in [("robot", robot), ("start of the path", self.path_start)] {
-            let fine = rules.shape.contains(cell);
-            expect(
-                what,
-                fine,
-                format!("a cell of {}", rules.shape),
-                cell.to_string(),
-            )?;
-        }
-        let step = self.result.step;
-        expect(
-            "step",
-            step <= MAX_STEP,
-            format!("at most {MAX_STEP}"),
-            step.to_string(),
-        )?;
-        let coverage = self.result.coverage;
-        let fine = Coverage::try_from(coverage).is_ok();
-        expect("coverage", fine, "0, 1 or 2".into(), coverage.to_string())?;
-        let first = (step + 1).saturating_sub(self.history.len() as u64);
-        for (index, seen) in self.history.iter().enumerate() {
-            let (expected, got) = (first + index as u64, seen.result.step);
-            expect(
-                "history",
-                got == expected,
-                format!("step {expected}"),
-                got.to_string(),
-            )?;
-            seen.check(rules)?;
-        }
-        Ok(())
+        let worlds = worlds.map(|(world, stored)| {
+            restore(stored).map_err(|misfit| SnapshotError::World { world, misfit })
+        });
+        worlds.collect()
     }
 }
 
 impl Seen {
-    fn check(&self, rules: &Rules) -> Result<(), Misfit> {
-        let n_cells = rules.shape.n_cells();
-        let is_whole = self.cells.is_empty() && self.values.len() == n_cells;
-        if !is_whole && self.cells.len() != self.values.len() {
-            let (expected, got) = (self.cells.len(), self.values.len());
-            return Err(Misfit(format!(
-                "history: expected {expected} values, got {got}"
-            )));
-        }
-        if let Some(cell) = self.cells.iter().find(|&&cell| cell as usize >= n_cells) {
-            let text = format!("history: expected cells below {n_cells}, got {cell}");
-            return Err(Misfit(text));
-        }
-        let most = rules.n_observations;
-        if let Some(value) = self
-            .values
-            .iter()
-            .find(|&&value| usize::from(value) >= most)
-        {
-            let text = format!("history: expected observations below {most}, got {value}");
-            return Err(Misfit(text));
-        }
-        Ok(())
-    }
-
     /// Result, cells and values, as they are written.
     pub fn written(&self) -> (&[u8], &[u8], &[u8]) {
         let cells = bytemuck::cast_slice(&self.cells);
@@ -449,135 +446,4 @@ fn read_cells(bytes: &[u8]) -> Result<Vec<u32>, Misfit> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::config::ServerConfig;
-    use protocol::Move;
-
-    fn settings() -> (Settings, Rules) {
-        let config = ServerConfig {
-            height: 3,
-            width: 5,
-            moves: 2,
-            burn_in: 300,
-            ..ServerConfig::default()
-        };
-        let checked = config.check().expect("valid settings");
-        let mut rules = Rules::new(&checked.model, checked.shape, 300, 0, checked.config.start)
-            .expect("valid model");
-        rules.history = 4;
-        (Settings::of(&checked), rules)
-    }
-
-    fn episodes(rules: &Rules) -> Vec<Episode> {
-        let mut episodes = vec![Episode::new(rules, 1), Episode::new(rules, 2)];
-        for _ in 0..6 {
-            episodes[1].step(rules, &[Move::Right, Move::Down], Coverage::Path);
-        }
-        episodes[1].step(rules, &[Move::Right, Move::Left], Coverage::Full);
-        episodes
-    }
-
-    #[test]
-    fn what_is_read_is_what_was_written() {
-        let (settings, rules) = settings();
-        let episodes = episodes(&rules);
-        let bytes = encode(&settings, episodes.iter());
-        let snapshot = decode(&bytes).expect("a snapshot");
-        let restored = snapshot.restore(&settings, &rules, 2).expect("a fit");
-        assert_eq!(restored.len(), 2);
-        let again = encode(&settings, restored.iter().map(|episode| &**episode));
-        assert_eq!(again, bytes);
-    }
-
-    #[test]
-    fn every_cut_and_every_flipped_bit_is_noticed() {
-        let (settings, rules) = settings();
-        let bytes = encode(&settings, episodes(&rules).iter());
-        for length in 0..bytes.len() {
-            assert!(decode(&bytes[..length]).is_err(), "cut to {length}");
-        }
-        for bit in 0..8 * bytes.len() {
-            let mut damaged = bytes.clone();
-            damaged[bit / 8] ^= 1 << (bit % 8);
-            assert!(decode(&damaged).is_err(), "bit {bit}");
-        }
-        let mut longer = bytes.clone();
-        longer.push(0);
-        assert!(matches!(decode(&longer), Err(SnapshotError::Length { .. })));
-    }
-
-    /// A change to the world of an otherwise good file.
-    fn misfit(change: impl FnOnce(&mut WorldSnapshot), words: &str) {
-        let (settings, rules) = settings();
-        let bytes = encode(&settings, episodes(&rules).iter());
-        let mut snapshot = decode(&bytes).expect("a snapshot");
-        change(&mut snapshot.worlds[1]);
-        let error = snapshot.restore(&settings, &rules, 2).err();
-        let error = error.expect("a misfit").to_string();
-        assert!(error.starts_with("world 1 of the file"), "{error}");
-        assert!(error.contains(words), "{words:?}: {error}");
-    }
-
-    #[test]
-    fn a_world_that_cannot_be_is_refused() {
-        misfit(
-            |world| world.states[3] = 3,
-            "states: expected states below 3, got 3",
-        );
-        misfit(
-            |world| world.beginning.truncate(14),
-            "first states: expected 15, got 14",
-        );
-        misfit(
-            |world| world.frame[0] = 3,
-            "expected an observation below 3 or 255",
-        );
-        misfit(|world| world.path = vec![4, 0], "move");
-        misfit(
-            |world| world.path = vec![0],
-            "path: expected 0 or 2 moves, got 1",
-        );
-        misfit(
-            |world| world.result.row = 3,
-            "robot: expected a cell of 3 x 5, got (3, ",
-        );
-        misfit(|world| world.path_start.col = 5, "start of the path");
-        misfit(
-            |world| world.result.step = u64::MAX,
-            "step: expected at most",
-        );
-        misfit(|world| world.result.coverage = 3, "coverage");
-        misfit(
-            |world| world.history[0].result.step = 9,
-            "history: expected step 4, got 9",
-        );
-        misfit(
-            |world| world.history[1].cells[0] = 15,
-            "cells below 15, got 15",
-        );
-        misfit(
-            |world| world.history[1].values[0] = 3,
-            "observations below 3, got 3",
-        );
-        misfit(|world| world.history[1].values.push(0), "values");
-    }
-
-    #[test]
-    fn the_first_other_setting_is_named() {
-        let (ours, _) = settings();
-        let mut theirs = ours.clone();
-        theirs.others[3].1 = "9".into();
-        let error = theirs.check(&ours).expect_err("another burn-in");
-        let expected = "burn_in: expected 300 as this server's, got 9";
-        assert_eq!(error.to_string(), expected);
-        theirs.model = theirs.model.replace("0.1", "0.2");
-        assert!(
-            theirs
-                .check(&ours)
-                .expect_err("a model")
-                .to_string()
-                .starts_with("model: ")
-        );
-    }
-}
+mod tests;

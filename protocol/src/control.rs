@@ -85,20 +85,7 @@ pub enum Request {
         to: u32,
     },
     /// Leave the next part of a belief about a world to whoever acts on it next.
-    LeaveBelief {
-        /// The lease.
-        lease: u64,
-        /// The world.
-        world: u32,
-        /// What the bytes are; at most 256 bytes.
-        kind: String,
-        /// Where the part begins: 0 begins a new belief.
-        offset: u64,
-        /// Length of the whole.
-        length: u64,
-        /// The part in base64, at most [`MAX_BELIEF_PART`] bytes.
-        data: String,
-    },
+    LeaveBelief(LeftPart),
     /// What belief was left about a world as it is now?
     Belief {
         /// The world.
@@ -235,6 +222,28 @@ pub struct LeaseInfo {
     pub ttl_millis: u64,
     /// The worlds it covers, as they are now.
     pub worlds: Vec<WorldInfo>,
+}
+
+/// A part of a belief that is left, and where the world stands that it is about.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LeftPart {
+    /// The lease.
+    pub lease: u64,
+    /// The world.
+    pub world: u32,
+    /// The episode.
+    pub episode: u64,
+    /// Its present step.
+    pub step: u64,
+    /// What the bytes are; at most 256 bytes.
+    pub kind: String,
+    /// Where the part begins: 0 begins a new belief.
+    pub offset: u64,
+    /// Length of the whole.
+    pub length: u64,
+    /// The part in base64, at most [`MAX_BELIEF_PART`] bytes.
+    pub data: String,
 }
 
 /// A belief that was left.

@@ -468,10 +468,12 @@ def test_a_belief_that_is_left_is_found_at_its_step_alone(server: Start) -> None
     lease = client.acquire()
     assert client.belief() is None
     data = bytes(range(256)) * 8
-    lease.leave_belief("numbers", data)
+    lease.leave_belief(lease.observe().result(), "numbers", data)
     left = client.belief()
     assert left is not None
     assert (left.kind, left.step, left.data) == ("numbers", 0, data)
-    lease.step(paths(1))
+    past = lease.observe().result()
+    result = lease.step(paths(1)).result()
     assert client.belief() is None
-    refused(lambda: lease.leave_belief("numbers", bytes(35 * 64 + 1)), errors.MalformedError, 0)
+    for at, size in ((past, 1), (result, 35 * 64 + 1)):
+        refused(lambda: lease.leave_belief(at, "numbers", bytes(size)), errors.MalformedError, 0)  # noqa: B023

@@ -39,6 +39,9 @@ EXAMPLES = document.examples()
 HELLO = next(message for message in EXAMPLES if message.get("reply") == "hello")
 LEFT = next(message for message in EXAMPLES if message.get("reply") == "belief")
 
+#: Where the world stands in that example.
+RESULT = SimpleNamespace(episode=1, step=2)
+
 #: The belief of that example.
 ONE = bytes([0, 0, 128, 63])
 
@@ -247,7 +250,7 @@ def test_the_documented_requests_are_what_a_client_sends() -> None:
         sent(lambda: wired.client.snapshot("/tmp/lab.snapshot"), replies("snapshot")[0]),
         sent(lambda: lease.restore("/tmp/lab.snapshot"), replies("restored")[0]),
         sent(lambda: lease.fork(0, 1), replies("restored")[1]),
-        sent(lambda: lease.leave_belief(LEFT["kind"], ONE)),
+        sent(lambda: lease.leave_belief(RESULT, LEFT["kind"], ONE)),
         sent(wired.client.belief, LEFT),
         sent(lease.release),
         sent(wired.client.shutdown),

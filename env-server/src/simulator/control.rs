@@ -164,17 +164,7 @@ impl Simulator {
                 path,
             } => self.order_restore(now, client, lease, (first_world, n_worlds, from), path)?,
             Request::Fork { lease, from, to } => self.fork(now, client, lease, (from, to))?,
-            Request::LeaveBelief {
-                lease,
-                world,
-                kind,
-                offset,
-                length,
-                data,
-            } => {
-                let part = (&*kind, offset, length);
-                self.leave_belief(now, client, (lease, world), part, &data)?
-            }
+            Request::LeaveBelief(part) => self.leave_belief(now, client, &part)?,
             Request::Belief { world, offset } => self.belief(world, offset)?,
             Request::Status {} => Outcome::Answer(Reply::Status(self.status(surroundings))),
             Request::Shutdown {} => Outcome::Shutdown,
@@ -254,20 +244,28 @@ impl Simulator {
     fn take_for_reset(&mut self, order: &WorldSeed) -> Option<ResetOrder> {
         let world = order.world as usize;
         let last = *self.episode(world)?.result();
-        match std::mem::replace(&mut self.slots[world], Slot::Resetting(last)) {
-            Slot::Ready(episode) => Some(ResetOrder {
+        let seed = order.seed.unwrap_or_else(|| next_seed(&last));
+        let episode = last.episode.wrapping_add(1);
+        let slot = Slot::Resetting {
+            last,
+            seed,
+            episode,
+        };
+        match std::mem::replace(&mut self.slots[world], slot) {
+            Slot::Ready(before) => Some(ResetOrder {
                 world,
-                episode: Some(episode),
-                seed: order.seed.unwrap_or_else(|| next_seed(&last)),
+                before: Some(before),
+                episode,
+                seed,
             }),
-            Slot::Resetting(_) => None,
+            Slot::Resetting { .. } => None,
         }
     }
 
     pub(super) fn world_info(&self, world: usize) -> WorldInfo {
         let result = match &self.slots[world] {
             Slot::Ready(episode) => episode.result(),
-            Slot::Resetting(last) => last,
+            Slot::Resetting { last, .. } => last,
         };
         let StepResult {
             step,

@@ -1,15 +1,15 @@
 //! Control requests about worlds as a whole: snapshot, restore, fork, and beliefs that are left.
 
 use super::control::{Outcome, malformed, refusal};
-use super::{Simulator, Slot};
+use super::{ResetOrder, Simulator, Slot};
 use crate::beliefs::Part;
 use crate::episode::Episode;
 use crate::files::{Job, Place};
 use crate::lease::ClientId;
-use crate::snapshot::encode;
+use crate::snapshot::{Beginning, RestoredWorld, SnapshotError, WorldToWrite, encode};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
-use protocol::control::{MAX_BELIEF_PART, Reply, WorldInfo};
+use protocol::control::{LeftPart, MAX_BELIEF_PART, Reply, WorldInfo};
 use protocol::message::{Status, StepResult};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -37,14 +37,44 @@ impl Simulator {
         Place {
             settings: self.settings.clone(),
             rules: self.rules.clone(),
-            n_moves: self.checked.config.moves,
         }
     }
 
-    /// Worlds as the bytes of a snapshot file; `None` while one is being reset.
-    pub fn snapshot(&self, worlds: Range<usize>) -> Option<Vec<u8>> {
-        let episodes: Option<Vec<&Episode>> = worlds.map(|world| self.episode(world)).collect();
-        Some(encode(&self.settings, episodes?.into_iter()))
+    /// Worlds as the bytes of a snapshot file.
+    ///
+    /// # Errors
+    /// [`SnapshotError::TooLarge`].
+    pub fn snapshot(&self, worlds: Range<usize>) -> Result<Vec<u8>, SnapshotError> {
+        let slots = self.slots[worlds].iter();
+        let worlds: Vec<_> = slots
+            .map(|slot| match slot {
+                Slot::Ready(episode) => WorldToWrite::Ready(episode),
+                &Slot::Resetting { seed, episode, .. } => {
+                    WorldToWrite::Beginning(Beginning { seed, episode })
+                }
+            })
+            .collect();
+        encode(&self.settings, &worlds)
+    }
+
+    /// Begins with a world of a file; returns the reset that it still needs.
+    pub fn begin_with(&mut self, world: usize, restored: RestoredWorld) -> Option<ResetOrder> {
+        match restored {
+            RestoredWorld::Ready(episode) => {
+                self.put(world, episode);
+                None
+            }
+            RestoredWorld::Beginning(Beginning { seed, episode }) => {
+                let order = ResetOrder {
+                    world,
+                    before: None,
+                    episode,
+                    seed,
+                };
+                self.slots[world] = Slot::resetting(&order);
+                Some(order)
+            }
+        }
     }
 
     /// Puts worlds of a file in the place of those that a client waits for.
@@ -52,7 +82,7 @@ impl Simulator {
         &mut self,
         now: Instant,
         order: &FileOrder,
-        episodes: Vec<Box<Episode>>,
+        restored: Vec<RestoredWorld>,
     ) -> Reply {
         let FileOrder::Restored {
             lease,
@@ -67,6 +97,17 @@ impl Simulator {
         if let Err(lost) = may.and_then(|()| self.check_present(worlds)) {
             return refusal(lost);
         }
+        let episodes = restored.into_iter().map(|world| match world {
+            RestoredWorld::Ready(episode) => Some(episode),
+            RestoredWorld::Beginning(_) => None,
+        });
+        let Some(episodes) = episodes.collect::<Option<Vec<Box<Episode>>>>() else {
+            return Reply::Error {
+                status: Status::BadFile,
+                detail: 0,
+                message: "snapshot file: expected worlds at a step, got one in its burn-in".into(),
+            };
+        };
         for (world, episode) in worlds.clone().zip(episodes) {
             self.put(world, episode);
         }
@@ -102,7 +143,12 @@ impl Simulator {
         let worlds = self.range(first, n).map_err(refusal)?;
         let path = absolute(path)?;
         self.check_present(&worlds).map_err(refusal)?;
-        let bytes = self.snapshot(worlds.clone()).unwrap_or_default();
+        let bytes = self.snapshot(worlds.clone());
+        let bytes = bytes.map_err(|error| Reply::Error {
+            status: Status::BadFile,
+            detail: 0,
+            message: error.to_string(),
+        })?;
         let worlds = worlds.map(|world| self.world_info(world)).collect();
         let order = FileOrder::Saved(worlds);
         Ok(Outcome::File(Job::Save { path, bytes }, order))
@@ -158,27 +204,31 @@ impl Simulator {
         &mut self,
         now: Instant,
         client: ClientId,
-        (lease, world): (u64, u32),
-        (kind, offset, length): (&str, u64, u64),
-        data: &str,
+        left: &LeftPart,
     ) -> Result<Outcome, Reply> {
-        let worlds = self.range(world, 1).map_err(refusal)?;
+        let worlds = self.range(left.world, 1).map_err(refusal)?;
         self.leases
-            .use_lease(now, lease, client, &worlds)
+            .use_lease(now, left.lease, client, &worlds)
             .map_err(refusal)?;
         let at = self.present(worlds.start)?;
-        if kind.len() > 256 {
-            let got = kind.len();
+        if (left.episode, left.step) != (at.episode, at.step) {
+            return Err(wrong(&format!(
+                "episode and step: expected {} and {}, where the world stands, got {} and {}",
+                at.episode, at.step, left.episode, left.step
+            )));
+        }
+        if left.kind.len() > 256 {
+            let got = left.kind.len();
             return Err(wrong(&format!(
                 "kind: expected at most 256 bytes, got {got}"
             )));
         }
-        let bytes = BASE64.decode(data);
+        let bytes = BASE64.decode(&left.data);
         let bytes = bytes.map_err(|error| wrong(&format!("data: expected base64, got {error}")))?;
         let part = Part {
-            kind,
-            offset,
-            length,
+            kind: &left.kind,
+            offset: left.offset,
+            length: left.length,
             bytes: &bytes,
         };
         let added = self.beliefs.add(worlds.start, &at, &part);
@@ -190,7 +240,11 @@ impl Simulator {
         let world = self.range(world, 1).map_err(refusal)?.start;
         let at = self.present(world)?;
         let Some((info, bytes)) = self.beliefs.of(world, &at) else {
-            return Err(Reply::refusal(Status::NotKept, at.step));
+            return Err(Reply::Error {
+                status: Status::NotKept,
+                detail: at.step,
+                message: format!("no belief was left about world {world} at step {}", at.step),
+            });
         };
         let start = usize::try_from(offset).map_or(bytes.len(), |offset| offset.min(bytes.len()));
         let end = bytes.len().min(start + MAX_BELIEF_PART);

@@ -21,7 +21,10 @@ impl Use {
         let status = std::fs::read_to_string(format!("/proc/{pid}/status")).expect("its status");
         let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
         let number = line.and_then(|line| line.split_whitespace().next()?.parse().ok());
-        let shared = files_under(Path::new("/dev/shm"));
+        let own = format!("emberwatch_{}_", rustix::process::getuid().as_raw());
+        let is_own = |path: &PathBuf| path.to_string_lossy().contains(&own);
+        let mut shared = files_under(Path::new("/dev/shm"));
+        shared.retain(is_own);
         let others = files_under(&protocol::channels::channel_directory());
         Self {
             resident: number.expect("a number of KiB"),
@@ -49,21 +52,17 @@ impl std::fmt::Display for Use {
     }
 }
 
-/// The channels' files below a folder.
+/// The files below a folder.
 fn files_under(folder: &Path) -> Vec<PathBuf> {
     let Ok(entries) = std::fs::read_dir(folder) else {
         return Vec::new();
     };
     let paths = entries.flatten().map(|entry| entry.path());
     paths
-        .flat_map(|path| {
-            if path.is_dir() {
-                files_under(&path)
-            } else {
-                vec![path]
-            }
+        .flat_map(|path| match path.is_dir() {
+            true => files_under(&path),
+            false => vec![path],
         })
-        .filter(|path| path.to_string_lossy().contains("emberwatch"))
         .collect()
 }
 

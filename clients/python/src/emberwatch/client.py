@@ -39,7 +39,7 @@ from emberwatch.replies import (
     record,
     records,
 )
-from emberwatch.wire import StepAnswer
+from emberwatch.wire import StepAnswer, StepResult
 
 #: Default timeout of a step, seconds.
 STEP_TIMEOUT: Final = 5.0
@@ -184,7 +184,7 @@ class Client(Closing):
 
     def belief(self, world: int = 0, *, timeout: float = STEP_TIMEOUT) -> LeftBelief | None:
         """What belief was left about a world as it stands; None if there is none."""
-        data = b""
+        data, first = b"", None
         while True:
             request = {"op": "belief", "world": world, "offset": len(data)}
             try:
@@ -198,9 +198,18 @@ class Client(Closing):
                 raise GarbledAnswerError(
                     f"answer to 'belief': expected base64, got {error}"
                 ) from None
+            whole = (info.kind, info.episode, info.step, info.length)
+            first = first or whole
+            if whole != first:
+                data, first = b"", None  # another one was left meanwhile
+                continue
             data += part
-            if len(data) >= info.length or not part:
+            if len(data) == info.length:
                 return LeftBelief(info.kind, info.episode, info.step, data)
+            if not part or len(data) > info.length:
+                raise GarbledAnswerError(
+                    f"answer to 'belief': expected {info.length} bytes, got {len(data)}"
+                )
 
     def status(self, *, timeout: float = STEP_TIMEOUT) -> ServerStatus:
         """What is going on."""
@@ -414,11 +423,18 @@ class Lease:
         return records(WorldInfo, self.client.control(request, timeout=timeout))
 
     def leave_belief(
-        self, kind: str, data: bytes, *, world: int | None = None, timeout: float = STEP_TIMEOUT
+        self,
+        result: StepResult,
+        kind: str,
+        data: bytes,
+        *,
+        world: int | None = None,
+        timeout: float = STEP_TIMEOUT,
     ) -> None:
         """Leaves bytes about a world as it stands to whoever acts on it next (`Client.belief`).
 
         Args:
+            result: The world's last result; another step is refused.
             kind: Says to other agents what the bytes are, in at most 256 bytes.
             data: At most 64 bytes per cell.
             world: Which world; None: the first of the lease.
@@ -430,6 +446,8 @@ class Lease:
                 "op": "leave_belief",
                 "lease": self.number,
                 "world": self.worlds.start if world is None else world,
+                "episode": result.episode,
+                "step": result.step,
                 "kind": kind,
                 "offset": offset,
                 "length": len(data),

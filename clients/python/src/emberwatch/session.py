@@ -155,7 +155,7 @@ class Session:
             raise ClosedError("truth: expected an open session made with truth=True")
         first = answer.first_world - self.settings.world
         results = [answer.result(index) for index in range(len(answer.frames))]
-        moments = [(result.episode, result.step) for result in results]
+        moments = [(result.seed, result.episode, result.step) for result in results]
         return self._truth.at(moments, self.settings.timeout, first)
 
     def open(self, seed: int | None) -> None:

@@ -72,5 +72,5 @@ class HiddenStates:
         if 0 <= index < len(self._moments):
             if truth.states.shape != self._states.shape[1:]:
                 raise GarbledAnswerError(f"truth: got a grid of {truth.states.shape}")
-            self._moments[index] = (truth.episode, truth.step)
+            self._moments[index] = (truth.seed, truth.episode, truth.step)
             self._states[index] = truth.states

@@ -1,0 +1,207 @@
+//! Snapshots that are whole, damaged and forged.
+
+use super::*;
+use crate::config::ServerConfig;
+use protocol::{Coverage, Move};
+
+const BEGINNING: Beginning = Beginning {
+    seed: 7,
+    episode: 3,
+};
+
+fn settings() -> (Settings, Rules) {
+    let config = ServerConfig {
+        height: 3,
+        width: 5,
+        moves: 2,
+        burn_in: 300,
+        ..ServerConfig::default()
+    };
+    let checked = config.check().expect("valid settings");
+    let mut rules = Rules::new(&checked.model, checked.shape, 300, 0, checked.config.start)
+        .expect("valid model");
+    (rules.history, rules.n_moves) = (4, 2);
+    (Settings::of(&checked), rules)
+}
+
+fn episodes(rules: &Rules) -> Vec<Episode> {
+    let mut episodes = vec![Episode::new(rules, 1), Episode::new(rules, 2)];
+    for _ in 0..6 {
+        episodes[1].step(rules, &[Move::Right, Move::Down], Coverage::Path);
+    }
+    episodes[1].step(rules, &[Move::Right, Move::Left], Coverage::Full);
+    episodes
+}
+
+fn bytes(settings: &Settings, episodes: &[Episode]) -> Vec<u8> {
+    let mut worlds: Vec<_> = episodes.iter().map(WorldToWrite::Ready).collect();
+    worlds.push(WorldToWrite::Beginning(BEGINNING));
+    encode(settings, &worlds).expect("small")
+}
+
+#[test]
+fn what_is_read_is_what_was_written() {
+    let (settings, rules) = settings();
+    let written = bytes(&settings, &episodes(&rules));
+    let snapshot = decode(&written).expect("a snapshot");
+    let mut restored = snapshot.restore(&settings, &rules).expect("a fit");
+    let last = restored.pop().expect("three worlds");
+    assert!(matches!(last, RestoredWorld::Beginning(BEGINNING)));
+    let episodes = restored.into_iter().map(|world| match world {
+        RestoredWorld::Ready(episode) => *episode,
+        RestoredWorld::Beginning(_) => panic!("expected a world at a step"),
+    });
+    let episodes: Vec<Episode> = episodes.collect();
+    assert_eq!(bytes(&settings, &episodes), written);
+}
+
+/// As a hostile author would write it: any body, with a header that fits.
+fn sealed(body: &[u8]) -> Vec<u8> {
+    let mut bytes = MAGIC.to_vec();
+    bytes.extend(VERSION.to_ne_bytes());
+    bytes.extend(crc32fast::hash(body).to_ne_bytes());
+    bytes.extend((body.len() as u64).to_ne_bytes());
+    bytes.extend(body);
+    bytes
+}
+
+#[test]
+fn a_changed_body_with_a_checksum_that_fits_is_refused_or_a_world_that_can_be() {
+    let (settings, rules) = settings();
+    let whole = bytes(&settings, &episodes(&rules));
+    let body = &whole[HEADER_BYTES..];
+    let mut n_restored = 0;
+    for at in 0..body.len() {
+        for byte in [0, 1, 3, 127, 255] {
+            let mut changed = body.to_vec();
+            changed[at] = byte;
+            let snapshot = decode(&sealed(&changed));
+            let restored = snapshot.and_then(|snapshot| snapshot.restore(&settings, &rules));
+            for world in restored.into_iter().flatten() {
+                if let RestoredWorld::Ready(mut episode) = world {
+                    n_restored += 1;
+                    episode.step(&rules, &[Move::Left, Move::Up], Coverage::Path);
+                    episode.reset(&rules, 5);
+                }
+            }
+        }
+    }
+    assert!(n_restored > 1000, "{n_restored}: nearly all were refused");
+    // A length that no memory holds.
+    let mut claims = body.to_vec();
+    claims[..8].copy_from_slice(&u64::MAX.to_ne_bytes());
+    assert!(matches!(
+        decode(&sealed(&claims)),
+        Err(SnapshotError::Malformed(_))
+    ));
+}
+
+#[test]
+fn every_cut_and_every_flipped_bit_is_noticed() {
+    let (settings, rules) = settings();
+    let bytes = bytes(&settings, &episodes(&rules));
+    for length in 0..bytes.len() {
+        assert!(decode(&bytes[..length]).is_err(), "cut to {length}");
+    }
+    for bit in 0..8 * bytes.len() {
+        let mut damaged = bytes.clone();
+        damaged[bit / 8] ^= 1 << (bit % 8);
+        assert!(decode(&damaged).is_err(), "bit {bit}");
+    }
+    let mut longer = bytes.clone();
+    longer.push(0);
+    assert!(matches!(decode(&longer), Err(SnapshotError::Length { .. })));
+}
+
+/// A change to the world of an otherwise good file.
+fn misfit(change: impl FnOnce(&mut WorldSnapshot), words: &str) {
+    let (settings, rules) = settings();
+    let bytes = bytes(&settings, &episodes(&rules));
+    let mut snapshot = decode(&bytes).expect("a snapshot");
+    let StoredWorld::Ready(world) = &mut snapshot.worlds[1] else {
+        panic!("expected a world at a step");
+    };
+    change(world);
+    let error = snapshot.restore(&settings, &rules).err();
+    let error = error.expect("a misfit").to_string();
+    assert!(error.starts_with("world 1 of the file"), "{error}");
+    assert!(error.contains(words), "{words:?}: {error}");
+}
+
+#[test]
+fn a_world_that_cannot_be_is_refused() {
+    misfit(
+        |world| world.states[3] = 3,
+        "states: expected states below 3, got 3",
+    );
+    misfit(
+        |world| world.beginning.truncate(14),
+        "first states: expected 15, got 14",
+    );
+    misfit(
+        |world| world.frame[0] = 3,
+        "expected an observation below 3 or 255",
+    );
+    misfit(|world| world.path = vec![4, 0], "move");
+    misfit(
+        |world| world.path = vec![0],
+        "path: expected 0 or 2 moves, got 1",
+    );
+    misfit(
+        |world| world.result.row = 3,
+        "robot: expected a cell of 3 x 5, got (3, ",
+    );
+    misfit(|world| world.path_start.col = 5, "start of the path");
+    misfit(
+        |world| world.result.step = u64::MAX,
+        "step: expected at most",
+    );
+    misfit(|world| world.result.coverage = 3, "coverage");
+    misfit(
+        |world| world.result.reward = f64::NAN,
+        "reward: expected a number",
+    );
+    misfit(
+        |world| world.result.truncated = 1,
+        "ends: expected [0, 0], got [0, 1]",
+    );
+    misfit(
+        |world| world.result.episode = u64::MAX,
+        "episode: expected at most",
+    );
+    misfit(
+        |world| world.history.clear(),
+        "history: expected 1 to 8 steps, got 0",
+    );
+    misfit(
+        |world| world.history[0].result.step = 9,
+        "history: expected seed, episode and step [2, 0, 4], got [2, 0, 9]",
+    );
+    misfit(
+        |world| world.history[1].cells[0] = 15,
+        "cells below 15, got 15",
+    );
+    misfit(
+        |world| world.history[1].values[0] = 3,
+        "observations below 3, got 3",
+    );
+    misfit(|world| world.history[1].values.push(0), "values");
+}
+
+#[test]
+fn the_first_other_setting_is_named() {
+    let (ours, _) = settings();
+    let mut theirs = ours.clone();
+    theirs.others[3].1 = "9".into();
+    let error = theirs.check(&ours).expect_err("another burn-in");
+    let expected = "burn_in: expected 300 as this server's, got 9";
+    assert_eq!(error.to_string(), expected);
+    theirs.model = theirs.model.replace("0.1", "0.2");
+    assert!(
+        theirs
+            .check(&ours)
+            .expect_err("a model")
+            .to_string()
+            .starts_with("model: ")
+    );
+}
