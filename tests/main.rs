@@ -24,5 +24,7 @@ mod learner;
 mod lease;
 mod python;
 mod restart;
+mod security;
+mod siege;
 mod training;
 mod wire;
