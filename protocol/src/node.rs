@@ -139,11 +139,10 @@ mod tests {
 
     #[test]
     fn a_directory_that_others_may_write_to_is_refused() {
-        use std::os::unix::fs::PermissionsExt;
         let path = std::env::temp_dir().join(format!("emberwatch-test-{}", std::process::id()));
         own_directory(&path).expect("a new directory");
         own_directory(&path).expect("the same again");
-        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o777)).expect("chmod");
+        std::fs::set_permissions(&path, Permissions::from_mode(0o777)).expect("chmod");
         assert!(own_directory(&path).is_err());
         std::fs::remove_dir(&path).expect("clean up");
     }
