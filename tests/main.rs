@@ -25,6 +25,8 @@ mod learner;
 mod lease;
 mod python;
 mod restart;
+mod security;
+mod siege;
 mod snapshots;
 mod training;
 mod wire;

@@ -327,7 +327,11 @@ pub fn read_any(
     contents.map_err(|problem| problem.of(path))
 }
 
-fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>, Problem> {
+/// A checkpoint of a kind of learner as bytes.
+///
+/// # Errors
+/// [`Problem`].
+pub fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>, Problem> {
     let form = |error: safetensors::SafeTensorError| Problem::Form(error.to_string());
     let Contents {
         tensors,
@@ -357,7 +361,11 @@ fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>, Problem> {
     }
 }
 
-fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Contents), Problem> {
+/// The checkpoint of one of some kinds that bytes are, and which.
+///
+/// # Errors
+/// [`Problem`].
+pub fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Contents), Problem> {
     let form = |error: safetensors::SafeTensorError| Problem::Form(error.to_string());
     let file = SafeTensors::deserialize(bytes).map_err(form)?;
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(form)?;

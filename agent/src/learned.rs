@@ -43,24 +43,40 @@ impl Learned {
         let mut learned = Self::default();
         for path in paths {
             let (kind, contents) = checkpoint::read_any(path, &KINDS)?;
-            let twice = match kind {
-                learner::KIND => {
-                    let progress = learner::Progress::from_contents(&contents, None);
-                    let model = progress.map_err(|problem| problem.of(path))?.learned();
-                    learned.filter.replace(model).is_some()
-                }
-                decisions::KIND => learned.decisions.replace(Arc::new(contents)).is_some(),
-                _ => {
-                    let progress = network::Progress::read(&contents);
-                    let network = progress.map_err(|problem| problem.of(path))?.learned();
-                    learned.network.replace(Arc::new(network)).is_some()
-                }
-            };
-            if twice {
-                return Err(Problem::Twice(kind).of(path));
-            }
+            let added = learned.add(kind, contents);
+            added.map_err(|problem| problem.of(path))?;
         }
         Ok(learned)
+    }
+
+    /// What one checkpoint holds, of whatever kind.
+    ///
+    /// # Errors
+    /// [`Problem`].
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, Problem> {
+        let (kind, contents) = checkpoint::decode(&KINDS, bytes)?;
+        let mut learned = Self::default();
+        learned.add(kind, contents)?;
+        Ok(learned)
+    }
+
+    fn add(&mut self, kind: &'static str, contents: Contents) -> Result<(), Problem> {
+        let twice = match kind {
+            learner::KIND => {
+                let model = learner::Progress::from_contents(&contents, None)?.learned();
+                self.filter.replace(model).is_some()
+            }
+            decisions::KIND => self.decisions.replace(Arc::new(contents)).is_some(),
+            _ => {
+                let network = network::Progress::read(&contents)?.learned();
+                self.network.replace(Arc::new(network)).is_some()
+            }
+        };
+        if twice {
+            Err(Problem::Twice(kind))
+        } else {
+            Ok(())
+        }
     }
 }
 

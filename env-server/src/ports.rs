@@ -12,8 +12,8 @@ use iceoryx2::service::dynamic_config::request_response::ClientDetails;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use protocol::channels::{
     Channel, ChannelError, ControlService, FRAME_BUFFER, FrameService, Ipc, MAX_CLIENTS,
-    MAX_OBSERVERS, MAX_TRUTH_READERS, RequestResponse, Services, StepService, TRUTH_BUFFER,
-    TruthService, create_node, ipc_error,
+    MAX_OBSERVERS, MAX_TRUTH_READERS, RequestResponse, SHARED_MEMORY, Services, StepService,
+    TRUTH_BUFFER, TruthService, create_node, ipc_error,
 };
 use protocol::message::{FrameHeader, Header, RESULT_BYTES, StepReply, StepRequest, TruthHeader};
 use protocol::responder::{
@@ -32,9 +32,6 @@ const MESSAGE_OVERHEAD: usize = 512;
 
 /// Shared memory for everything of fixed size: control messages, events, tables.
 const FIXED_BYTES: u64 = 8 << 20;
-
-/// Where shared memory lives.
-const SHARED_MEMORY: &str = "/dev/shm";
 
 /// Why the server cannot take its place.
 #[derive(Debug, Error)]

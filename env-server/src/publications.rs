@@ -28,9 +28,12 @@ impl Publications {
     pub fn greet(&mut self, ports: &Ports, simulator: &Simulator) {
         let observers = ports.observer_ids();
         let has_new = observers.iter().any(|id| !self.observers.contains(id));
+        if observers != self.observers {
+            // Also lets go of those who have left.
+            ports.connect_observers();
+        }
         self.observers = observers;
         if has_new {
-            ports.connect_observers();
             self.greeting = simulator.worlds();
         }
         // In portions: more at once would run over the buffers of those who are greeted.

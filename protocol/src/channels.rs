@@ -14,7 +14,7 @@ use iceoryx2::service::port_factory::{PortFactory, event, publish_subscribe, req
 use std::fmt::Debug;
 use thiserror::Error;
 
-pub use crate::node::{channel_directory, create_node, node_config};
+pub use crate::node::{SHARED_MEMORY, channel_directory, create_node, node_config};
 
 /// Most clients at a time on each of `step` and `control`.
 pub const MAX_CLIENTS: usize = 16;

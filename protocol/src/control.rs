@@ -11,6 +11,10 @@ pub const MAX_CONTROL_BYTES: usize = 1 << 20;
 /// Most bytes of a belief in one message, before they are written in base64.
 pub const MAX_BELIEF_PART: usize = 1 << 19;
 
+/// Longest reason in a refusal, characters: it may quote a word of the request, which is as long as its
+/// client likes.
+const MAX_REASON: usize = 300;
+
 /// What a client asks on the control channel.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "op", rename_all = "snake_case", deny_unknown_fields)]
@@ -321,7 +325,10 @@ pub fn parse<T: DeserializeOwned>(text: &[u8]) -> Result<T, String> {
             "expected at most {MAX_CONTROL_BYTES} bytes, got {got}"
         )));
     }
-    serde_json::from_slice(text).map_err(|error| malformed(error.to_string()))
+    serde_json::from_slice(text).map_err(|error| {
+        let reason = error.to_string();
+        malformed(reason.chars().take(MAX_REASON).collect())
+    })
 }
 
 impl Reply {
@@ -378,6 +385,19 @@ mod tests {
             Some(Request::Status {})
         );
         assert!(serde_json::from_str::<Request>(r#"{"op":"renew","lease":1,"extra":2}"#).is_err());
+    }
+
+    #[test]
+    fn a_reason_is_short_whatever_it_quotes() {
+        for word in ["x".repeat(MAX_CONTROL_BYTES - 9), "é".repeat(100_000)] {
+            let reason = parse::<Request>(format!(r#"{{"op":"{word}"}}"#).as_bytes());
+            let reason = reason.expect_err("no operation");
+            assert!(
+                reason.chars().count() < MAX_REASON + 50,
+                "{} bytes",
+                reason.len()
+            );
+        }
     }
 
     #[test]

@@ -3,20 +3,30 @@
 use crate::channels::{ChannelError, Ipc, ipc_error};
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::prelude::{Config, FileName, Path, SemanticString, SignalHandlingMode};
-use std::fs::DirBuilder;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::fs::{DirBuilder, Permissions};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::PathBuf;
+
+/// Where iceoryx2 keeps shared memory: a folder that every user may write to.
+pub const SHARED_MEMORY: &str = "/dev/shm";
 
 /// Makes this process known to iceoryx2, under the user's own directory and prefix.
 ///
 /// # Errors
-/// [`ChannelError`] if the directory is somebody else's or the node cannot be created.
+/// [`ChannelError`] if the directory, or shared memory of this prefix, is somebody else's, or the node
+/// cannot be created.
 pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
     iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
+    let shared_memory = std::path::Path::new(SHARED_MEMORY);
+    let config = node_config()?;
+    own_segments(shared_memory, &prefix())?;
     let node = NodeBuilder::new()
-        .config(&node_config()?)
+        .config(&config)
         .signal_handling_mode(SignalHandlingMode::Disabled);
-    node.create().map_err(ipc_error("create a node"))
+    let node = node.create().map_err(ipc_error("create a node"))?;
+    // Of the first node of all, iceoryx2 lets everybody write to the counter of nodes.
+    own_segments(shared_memory, &prefix())?;
+    Ok(node)
 }
 
 /// The directory of this user's channel files: `/tmp/emberwatch-<uid>/`.
@@ -36,20 +46,55 @@ pub fn node_config() -> Result<Config, ChannelError> {
     own_directory(&directory)?;
     let path = Path::new(directory.as_os_str().as_encoded_bytes())
         .map_err(ipc_error("set the root path"))?;
-    let prefix = format!("emberwatch_{}_", rustix::process::getuid().as_raw());
-    let prefix = FileName::new(prefix.as_bytes()).map_err(ipc_error("set the prefix"))?;
+    let prefix = FileName::new(prefix().as_bytes()).map_err(ipc_error("set the prefix"))?;
     let mut config = Config::default();
     config.global.set_root_path(&path);
     config.global.prefix = prefix;
     Ok(config)
 }
 
-/// Makes the directory, for this user alone, or checks that it is this user's.
-fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
-    let wrong = |problem: String| ChannelError::Directory {
+/// What names of this user's shared memory begin with.
+fn prefix() -> String {
+    format!("emberwatch_{}_", rustix::process::getuid().as_raw())
+}
+
+fn wrong(path: &std::path::Path, problem: String) -> ChannelError {
+    ChannelError::Directory {
         path: path.display().to_string(),
         problem,
-    };
+    }
+}
+
+/// Checks that shared memory of this prefix is this user's, and closes it to all others.
+fn own_segments(folder: &std::path::Path, prefix: &str) -> Result<(), ChannelError> {
+    let entries = std::fs::read_dir(folder).map_err(|error| wrong(folder, error.to_string()))?;
+    for entry in entries.flatten() {
+        let name = entry.file_name();
+        let found = match name.as_encoded_bytes().starts_with(prefix.as_bytes()) {
+            true => entry.metadata(),
+            false => continue,
+        };
+        // What is gone by now belonged to a process that ended.
+        let Ok(found) = found else { continue };
+        if !found.is_file() || found.uid() != rustix::process::getuid().as_raw() {
+            let problem = "expected shared memory of this user, got something of user";
+            return Err(wrong(&entry.path(), format!("{problem} {}", found.uid())));
+        }
+        if found.mode() & 0o077 != 0 {
+            match std::fs::set_permissions(entry.path(), Permissions::from_mode(0o600)) {
+                Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                    return Err(wrong(&entry.path(), error.to_string()));
+                }
+                _ => {}
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Makes the directory, for this user alone, or checks that it is this user's.
+fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
+    let wrong = |problem: String| wrong(path, problem);
     match DirBuilder::new().mode(0o700).create(path) {
         Ok(()) => return Ok(()),
         Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
@@ -71,12 +116,33 @@ mod tests {
     use super::*;
 
     #[test]
+    fn shared_memory_of_the_prefix_is_closed_to_others() {
+        let folder = std::env::temp_dir().join(format!("emberwatch-shm-{}", std::process::id()));
+        std::fs::create_dir(&folder).expect("a new directory");
+        let make = |name: &str| {
+            std::fs::write(folder.join(name), "").expect("a file");
+            let open = Permissions::from_mode(0o666);
+            std::fs::set_permissions(folder.join(name), open).expect("chmod");
+        };
+        let mode = |name: &str| folder.join(name).metadata().expect("there").mode() & 0o777;
+        make("emberwatch_1_a");
+        make("emberwatch_10_a");
+        own_segments(&folder, "emberwatch_1_").expect("all are this user's");
+        assert_eq!(
+            (mode("emberwatch_1_a"), mode("emberwatch_10_a")),
+            (0o600, 0o666)
+        );
+        std::fs::create_dir(folder.join("emberwatch_1_b")).expect("no segment");
+        assert!(own_segments(&folder, "emberwatch_1_").is_err());
+        std::fs::remove_dir_all(&folder).expect("clean up");
+    }
+
+    #[test]
     fn a_directory_that_others_may_write_to_is_refused() {
-        use std::os::unix::fs::PermissionsExt;
         let path = std::env::temp_dir().join(format!("emberwatch-test-{}", std::process::id()));
         own_directory(&path).expect("a new directory");
         own_directory(&path).expect("the same again");
-        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o777)).expect("chmod");
+        std::fs::set_permissions(&path, Permissions::from_mode(0o777)).expect("chmod");
         assert!(own_directory(&path).is_err());
         std::fs::remove_dir(&path).expect("clean up");
     }

@@ -1,1 +1,3 @@
-//! Tests of the real processes together.
+//! Hostile input for everything that reads bytes from outside: [`fuzz`].
+
+pub mod fuzz;

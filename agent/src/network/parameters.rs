@@ -62,13 +62,12 @@ pub struct Tensors {
 impl Tensors {
     /// What Adam moves, all zero.
     pub fn parameters(shape: &NetworkShape) -> Self {
-        let mut list = List::default();
-        list.encoder(shape);
-        list.recurrence(shape);
-        list.decoder(shape);
-        let dims = vec![shape.n_observations, shape.n_states];
-        list.add(OBSERVATION, dims, Initial::Normal);
-        list.zeros()
+        List::of_parameters(shape).zeros()
+    }
+
+    /// How many numbers those are; none is made.
+    pub fn n_parameters(shape: &NetworkShape) -> usize {
+        List::of_parameters(shape).length
     }
 
     /// The running statistics of every batch normalisation, as at the start.
@@ -182,6 +181,16 @@ struct List {
 }
 
 impl List {
+    fn of_parameters(shape: &NetworkShape) -> Self {
+        let mut list = Self::default();
+        list.encoder(shape);
+        list.recurrence(shape);
+        list.decoder(shape);
+        let dims = vec![shape.n_observations, shape.n_states];
+        list.add(OBSERVATION, dims, Initial::Normal);
+        list
+    }
+
     fn add(&mut self, name: &str, dims: Vec<usize>, initial: Initial) {
         let end = self.length + dims.iter().product::<usize>();
         self.entries.push(Entry {

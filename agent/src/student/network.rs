@@ -14,7 +14,7 @@ use crate::config::AgentConfig;
 use crate::learned::{LearnedNetwork, likelihood};
 use crate::metrics::Tick;
 use crate::network::dqn::Track;
-use crate::network::{Autoencoder, Dqn, Replay, Transition};
+use crate::network::{Autoencoder, Dqn, NetworkShape, Replay, Tensors, Transition};
 use crate::planner::{Objective, Planner, PlanningProblem};
 use crate::policy::Policy;
 use crate::reward::{RewardEstimate, met};
@@ -70,10 +70,7 @@ struct Decision {
 impl Progress {
     /// Before the first frame.
     pub fn first(site: &Site, config: &AgentConfig) -> Self {
-        let n_states = match config.autoencoder.states {
-            0 => site.n_observations,
-            states => states,
-        };
+        let n_states = network_shape(site.shape, site.n_observations, config).n_states;
         let settings = config.autoencoder.settings();
         let (seed, grid) = (config.seed, site.shape);
         let autoencoder = Autoencoder::new(settings, grid, n_states, site.n_observations, seed);
@@ -173,8 +170,10 @@ impl Progress {
             let expected = format!("1 to {MAX_VALUES}");
             return Err(wrong("observations", &expected, observations.to_string()));
         }
+        let shape = shape.map_err(|error| wrong("height", "a grid", error.to_string()))?;
+        check_size(contents, &network_shape(shape, observations, &config))?;
         let site = Site {
-            shape: shape.map_err(|error| wrong("height", "a grid", error.to_string()))?,
+            shape,
             n_observations: observations,
             n_moves: 0,
             worlds: 0..1,
@@ -228,6 +227,39 @@ impl Progress {
         }
         Ok(())
     }
+}
+
+/// The network that settings ask for.
+fn network_shape(grid: Shape, n_observations: usize, config: &AgentConfig) -> NetworkShape {
+    let settings = config.autoencoder.settings();
+    NetworkShape {
+        grid,
+        n_states: match config.autoencoder.states {
+            0 => n_observations,
+            states => states,
+        },
+        n_observations,
+        encoding: settings.encoding,
+        hidden: settings.hidden,
+    }
+}
+
+/// Refuses sizes whose numbers are not in the file: a few words could ask for all memory otherwise.
+fn check_size(contents: &Contents, shape: &NetworkShape) -> Result<(), Problem> {
+    let expected = Tensors::n_parameters(shape) + shape.n_states * shape.grid.n_cells();
+    let tensors = contents.tensors.values();
+    let got: usize = tensors.map(|tensor| tensor.numbers.len()).sum();
+    if got >= expected {
+        return Ok(());
+    }
+    Err(Problem::Value {
+        name: "tensors".into(),
+        expected: format!(
+            "the {expected} numbers or more of a network on a {} grid",
+            shape.grid
+        ),
+        got: got.to_string(),
+    })
 }
 
 /// Means of squares, whose roots are taken.

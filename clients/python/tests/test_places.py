@@ -92,6 +92,21 @@ def test_the_directory_is_created_for_this_user_alone(tmp_path: Path) -> None:
     assert place.stat().st_mode & 0o777 == 0o700
 
 
+def test_shared_memory_of_our_prefix_is_ours_and_closed_to_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("emberwatch_1_a", "emberwatch_10_a"):
+        (tmp_path / name).touch()
+        (tmp_path / name).chmod(0o666)
+    channels._own_segments(tmp_path, "emberwatch_1_")
+    assert (tmp_path / "emberwatch_1_a").stat().st_mode & 0o777 == 0o600
+    assert (tmp_path / "emberwatch_10_a").stat().st_mode & 0o777 == 0o666
+    owner = tmp_path.stat().st_uid
+    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+    with pytest.raises(errors.ChannelError, match=f"something of user {owner}"):
+        channels._own_segments(tmp_path, "emberwatch_1_")
+
+
 def _refuses(place: Path, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(channels, "directory", lambda: place)
     with pytest.raises(errors.ChannelError, match=words) as raised:

@@ -1,6 +1,5 @@
 //! Model files: refused, or they run.
 
-use crate::damage::{NUMBERS, damage, damaged};
 use crate::models::random_model;
 use ndarray::{Array3, Axis};
 use proptest::collection::vec;
@@ -8,6 +7,30 @@ use proptest::prelude::*;
 use proptest::sample::select;
 use protocol::model::{ModelFile, parse_color};
 use protocol::{Dynamics, Model, Shape, Transition};
+
+/// Numbers that break what is not checked.
+const NUMBERS: [&str; 20] = [
+    "nan",
+    "-nan",
+    "inf",
+    "-inf",
+    "1e308",
+    "1e200",
+    "1e101",
+    "1e100",
+    "1e30",
+    "1e-30",
+    "1e-45",
+    "1e-100",
+    "1e-101",
+    "1e-320",
+    "-1e-320",
+    "-0.0",
+    "0",
+    "1",
+    "-1",
+    "9223372036854775807",
+];
 
 proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..Default::default() })]
@@ -18,12 +41,6 @@ proptest! {
             && text.starts_with('#')
             && text[1..].bytes().all(|byte| byte.is_ascii_hexdigit());
         prop_assert_eq!(parse_color(&text).is_some(), is_color);
-    }
-
-    #[test]
-    fn a_damaged_model_file_is_refused_or_runs(damage in vec(damage(), 1..4)) {
-        let text = toml::to_string(Model::wildfire().file()).expect("models serialise");
-        check_model_text(&damage.iter().fold(text, damaged));
     }
 
     #[test]
@@ -79,12 +96,6 @@ fn a_model_file_of_any_size_is_refused_before_memory_is_asked_for() {
     assert!(Model::from_toml(&(wildfire.clone() + &state.repeat(10_000))).is_err());
     let entry = "[[kernel]]\nfrom = \"fire\"\nto = \"fire\"\nweights = []\n";
     assert!(Model::from_toml(&(wildfire + &entry.repeat(10_000))).is_err());
-}
-
-fn check_model_text(text: &str) {
-    if let Ok(model) = Model::from_toml(text) {
-        check_file(model.file().clone());
-    }
 }
 
 /// A model that is accepted can be simulated and filtered on every grid that it is accepted on.

@@ -25,6 +25,9 @@ iox2: Final[Any] = importlib.import_module("iceoryx2")
 
 _BYTES: Final[Any] = iox2.Slice[ctypes.c_uint8]
 
+#: Where iceoryx2 keeps shared memory: a folder that every user may write to.
+_SHARED_MEMORY: Final = Path("/dev/shm")
+
 iox2.set_log_level(iox2.LogLevel.Fatal)
 
 
@@ -52,7 +55,11 @@ class Node:
         self._forked = False
         builder = iox2.NodeBuilder.new().signal_handling_mode(iox2.SignalHandlingMode.Disabled)
         with guard("create a node"):
-            self.node: Any = builder.config(_config()).create(iox2.ServiceType.Ipc)
+            config = _config()
+            _own_segments(_SHARED_MEMORY, _prefix())
+            self.node: Any = builder.config(config).create(iox2.ServiceType.Ipc)
+            # Of the first node of all, iceoryx2 lets everybody write to the counter of nodes.
+            _own_segments(_SHARED_MEMORY, _prefix())
         self.keep(self.node)
         _nodes.add(self)
 
@@ -196,8 +203,28 @@ def directory() -> Path:
 def _config() -> Any:
     config = iox2.config.default()
     config.global_cfg.root_path = iox2.Path.new(f"{_own_directory(directory())}/")
-    config.global_cfg.prefix = iox2.FileName.new(f"emberwatch_{os.getuid()}_")
+    config.global_cfg.prefix = iox2.FileName.new(_prefix())
     return config
+
+
+def _prefix() -> str:
+    return f"emberwatch_{os.getuid()}_"
+
+
+def _own_segments(folder: Path, prefix: str) -> None:
+    """Checks that shared memory of this prefix is ours, and closes it to all others."""
+    for path in folder.glob(f"{prefix}*"):
+        try:
+            found = path.lstat()
+            if not stat.S_ISREG(found.st_mode) or found.st_uid != os.getuid():
+                raise ChannelError(
+                    f"{path}: expected shared memory of this user, got something of user "
+                    f"{found.st_uid}"
+                )
+            if found.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+                path.chmod(0o600)
+        except FileNotFoundError:  # It belonged to a process that ended.
+            continue
 
 
 def _own_directory(path: Path) -> Path:

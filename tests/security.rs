@@ -1,0 +1,200 @@
+//! What another user can do to ours: nothing but get in the way, and be told of.
+//!
+//! A thread plays the other user, which only root may let it do; elsewhere those tests say so and pass.
+
+use crate::harness::{SMALL, Server, frames_until};
+use iceoryx2::node::NodeBuilder;
+use iceoryx2::prelude::{Config, FileName, Path as IpcPath, SemanticString};
+use protocol::channels::{ChannelError, SHARED_MEMORY, Services, channel_directory, create_node};
+use protocol::observer::Observer;
+use rustix::process::{Gid, Uid, getuid};
+use rustix::thread::{set_thread_groups, set_thread_res_gid, set_thread_res_uid};
+use std::fs::{DirBuilder, File, OpenOptions, remove_dir, remove_file};
+use std::io::{ErrorKind, Write};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::channel;
+
+/// Users whom nobody is.
+const USERS: [u32; 3] = [64_001, 64_002, 64_003];
+
+/// Does something as another user, without groups; `None` if this process may not.
+fn as_user<T: Send>(user: u32, act: impl FnOnce() -> T + Send) -> Option<T> {
+    let become_user = || {
+        let (uid, gid) = (Uid::from_raw(user), Gid::from_raw(user));
+        set_thread_groups(&[])?;
+        set_thread_res_gid(gid, gid, gid)?;
+        set_thread_res_uid(uid, uid, uid)
+    };
+    let done = std::thread::scope(|scope| {
+        let thread = scope.spawn(|| become_user().ok().map(|()| act()));
+        thread.join().expect("what the other user expects")
+    });
+    if done.is_none() {
+        // Past the test harness, which keeps what passing tests print.
+        let note = "skipped: this process may not act as another user; run the tests as root\n";
+        let _ = std::io::stderr().write_all(note.as_bytes());
+    }
+    done
+}
+
+/// Everything of this user's channels: files in its directory and in shared memory.
+fn places() -> (Vec<PathBuf>, Vec<PathBuf>) {
+    let mut files = vec![channel_directory()];
+    let mut next = 0;
+    while let Some(path) = files.get(next).cloned() {
+        let below = std::fs::read_dir(path).into_iter().flatten().flatten();
+        files.extend(below.map(|entry| entry.path()));
+        next += 1;
+    }
+    let prefix = format!("emberwatch_{}_", getuid().as_raw());
+    let segments = std::fs::read_dir(SHARED_MEMORY)
+        .expect("shared memory")
+        .flatten();
+    let own = segments.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix));
+    (files, own.map(|entry| entry.path()).collect())
+}
+
+/// A path's mode, if it has not gone meanwhile: other tests come and go.
+fn mode(path: &Path) -> Option<u32> {
+    std::fs::symlink_metadata(path)
+        .ok()
+        .map(|found| found.mode() & 0o777)
+}
+
+#[test]
+fn everything_is_closed_to_others() {
+    let server = Server::start(&format!("{SMALL} --publish-truth"));
+    let observer = Observer::frames(&server.instance).expect("observe");
+    let _client = server.acquire(0..1);
+    frames_until(&observer, 0, 0);
+    assert_eq!(mode(&channel_directory()), Some(0o700));
+    let (files, segments) = places();
+    assert!(
+        files.len() > 10 && segments.len() > 10,
+        "{files:?} {segments:?}"
+    );
+    for segment in segments {
+        let mode = mode(&segment).unwrap_or(0);
+        assert_eq!(mode & 0o077, 0, "{} has mode {mode:o}", segment.display());
+    }
+}
+
+#[test]
+fn another_user_cannot_connect_observe_read_or_remove() {
+    let server = Server::start(SMALL);
+    let _client = server.acquire(0..1);
+    let (files, segments) = places();
+    let ours = (
+        channel_directory(),
+        format!("emberwatch_{}_", getuid().as_raw()),
+    );
+    as_user(USERS[0], || {
+        let denied = |path: &Path, result: std::io::Result<()>| match result {
+            Err(error) if error.kind() == ErrorKind::NotFound => {}
+            Err(error) => assert_eq!(
+                error.kind(),
+                ErrorKind::PermissionDenied,
+                "{}",
+                path.display()
+            ),
+            Ok(()) => panic!("another user got at {}", path.display()),
+        };
+        for path in files
+            .iter()
+            .chain(&segments)
+            .filter(|path| **path != ours.0)
+        {
+            denied(path, File::open(path).map(drop));
+            denied(path, OpenOptions::new().write(true).open(path).map(drop));
+        }
+        denied(&ours.0, std::fs::read_dir(&ours.0).map(drop));
+        // Removing is up to the folder: ours, and one whose sticky bit is set.
+        let removed = remove_file(&segments[0]).expect_err("a segment that is ours");
+        assert!(matches!(
+            removed.kind(),
+            ErrorKind::PermissionDenied | ErrorKind::NotFound
+        ));
+        let mut config = Config::default();
+        let root = ours.0.as_os_str().as_encoded_bytes();
+        config
+            .global
+            .set_root_path(&IpcPath::new(root).expect("a path"));
+        config.global.prefix = FileName::new(ours.1.as_bytes()).expect("a prefix");
+        let node = NodeBuilder::new()
+            .config(&config)
+            .create::<protocol::channels::Ipc>();
+        assert!(node.is_err(), "another user's node among ours");
+        let node = create_node().expect("its own place is free");
+        let services = Services {
+            node: &node,
+            instance: &server.instance,
+        };
+        let step = services.open_step();
+        assert!(
+            matches!(step, Err(ChannelError::NoServer { .. })),
+            "our server from its own place"
+        );
+    });
+    clean_up(USERS[0]);
+}
+
+#[test]
+fn who_takes_our_place_first_gets_in_the_way_and_is_told_of() {
+    let [user, other, _] = USERS.map(|user| user + 10);
+    let directory = PathBuf::from(format!("/tmp/emberwatch-{user}"));
+    let segment = Path::new(SHARED_MEMORY).join(format!("emberwatch_{user}_squatter"));
+    let refused = |place: &Path| {
+        let refusal = create_node()
+            .map(drop)
+            .expect_err("not our own")
+            .to_string();
+        assert!(refusal.contains(&*place.to_string_lossy()), "{refusal}");
+    };
+    as_user(other, || {
+        DirBuilder::new()
+            .mode(0o777)
+            .create(&directory)
+            .expect("the name is free")
+    });
+    as_user(user, || refused(&directory));
+    as_user(other, || remove_dir(&directory).expect("its own"));
+    as_user(other, || {
+        std::os::unix::fs::symlink("/tmp", &directory).expect("the name is free")
+    });
+    as_user(user, || refused(&directory));
+    as_user(other, || remove_file(&directory).expect("its own"));
+    as_user(other, || File::create(&segment).expect("the name is free"));
+    as_user(user, || refused(&segment));
+    as_user(other, || remove_file(&segment).expect("its own"));
+    as_user(user, || drop(create_node().expect("nobody is in the way")));
+    clean_up(user);
+}
+
+#[test]
+fn the_first_node_of_a_user_leaves_nothing_open() {
+    let user = USERS[2];
+    let (tell, told) = channel();
+    as_user(user, || {
+        drop(create_node().expect("a node"));
+        tell.send(places().1).expect("the test waits");
+    });
+    for segment in told.try_iter().flatten() {
+        assert_eq!(mode(&segment), Some(0o600), "{}", segment.display());
+    }
+    clean_up(user);
+}
+
+/// Removes what a user who is nobody left.
+fn clean_up(user: u32) {
+    let _ = std::fs::remove_dir_all(format!("/tmp/emberwatch-{user}"));
+    let prefix = format!("emberwatch_{user}_");
+    for entry in std::fs::read_dir(SHARED_MEMORY)
+        .expect("shared memory")
+        .flatten()
+    {
+        if entry.file_name().to_string_lossy().starts_with(&prefix) {
+            let _ = remove_file(entry.path());
+        }
+    }
+}

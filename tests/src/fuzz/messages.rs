@@ -1,0 +1,239 @@
+//! What a client, an observer or a learner reads: answers, frames, replies.
+
+use super::Seed;
+use bytemuck::{Pod, bytes_of};
+use protocol::control::{LeaseInfo, Reply, ServerStatus, WorldInfo, WorldStatus, parse};
+use protocol::decisions;
+use protocol::message::{
+    FrameHeader, RESULT_BYTES, Status, StepReply, StepResult, VERSION, split_step_payload,
+};
+use protocol::path::{fly, path_from_bytes, path_to_bytes};
+use protocol::{Cell, Coverage, Frame, Shape, UNOBSERVED};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use std::collections::HashSet;
+use std::fmt::Debug;
+
+/// Observations of the model that frames are of.
+const N_OBSERVATIONS: usize = 3;
+
+/// A header from the first bytes, and the rest; `None` if there are too few.
+pub fn split_header<H: Pod>(bytes: &[u8]) -> Option<(H, &[u8])> {
+    let (header, payload) = bytes.split_at_checked(size_of::<H>())?;
+    Some((bytemuck::pod_read_unaligned(header), payload))
+}
+
+/// A step's answer: what splits is every byte of it, and frames hold what was observed or nothing.
+pub fn step_answer(bytes: &[u8]) -> bool {
+    let Some((reply, payload)) = split_header::<StepReply>(bytes) else {
+        return false;
+    };
+    if let Ok(status) = Status::try_from(reply.status) {
+        assert_eq!(status as u32, reply.status);
+        assert!(!status.explain(reply.detail).is_empty());
+    }
+    let Ok((results, frames)) = split_step_payload(&reply, payload) else {
+        return false;
+    };
+    assert_eq!(results.len(), reply.n_worlds as usize);
+    let again: Vec<u8> = results.iter().flat_map(bytes_of).copied().collect();
+    assert_eq!([&again, frames].concat(), payload);
+    for result in &results {
+        if let Ok(coverage) = Coverage::try_from(result.coverage) {
+            assert_eq!(coverage as u32, result.coverage);
+        }
+    }
+    let Ok(shape) = Shape::new(reply.height as usize, reply.width as usize) else {
+        return false;
+    };
+    let frames = frames.chunks_exact(shape.n_cells());
+    !results.is_empty() && frames.map(|frame| is_frame(shape, frame)).min() == Some(true)
+}
+
+/// A sample of `frames`: a frame, then a path that stays on the grid.
+pub fn frame(bytes: &[u8]) -> bool {
+    let Some((header, payload)) = split_header::<FrameHeader>(bytes) else {
+        return false;
+    };
+    let Ok(shape) = Shape::new(header.height as usize, header.width as usize) else {
+        return false;
+    };
+    let Some((values, path)) = payload.split_at_checked(shape.n_cells()) else {
+        return false;
+    };
+    let (row, col) = (header.start_row as usize, header.start_col as usize);
+    let is_whole = path.len() == header.n_moves as usize && is_frame(shape, values);
+    is_whole
+        && row < shape.height()
+        && col < shape.width()
+        && is_path(shape, Cell { row, col }, path)
+}
+
+fn is_frame(shape: Shape, values: &[u8]) -> bool {
+    let valid = |&value: &u8| value == UNOBSERVED || usize::from(value) < N_OBSERVATIONS;
+    let decoded = Frame::from_bytes(shape, N_OBSERVATIONS, values);
+    assert_eq!(decoded.is_ok(), values.iter().all(valid));
+    decoded.is_ok_and(|frame| {
+        assert_eq!(frame.as_bytes(), values);
+        true
+    })
+}
+
+fn is_path(shape: Shape, start: Cell, bytes: &[u8]) -> bool {
+    let Ok(path) = path_from_bytes(bytes) else {
+        assert!(bytes.iter().any(|&byte| byte > 3));
+        return false;
+    };
+    assert_eq!(path_to_bytes(&path), bytes);
+    let flight = fly(shape, start, &path);
+    let distinct: HashSet<usize> = flight.visited.iter().copied().collect();
+    assert_eq!(distinct.len(), flight.visited.len());
+    assert!(distinct.iter().all(|&cell| cell < shape.n_cells()));
+    assert!(flight.end.row < shape.height() && flight.end.col < shape.width());
+    true
+}
+
+/// A reply on `control`.
+pub fn control_reply(bytes: &[u8]) -> bool {
+    let reply = survives::<Reply>(bytes);
+    reply.is_some_and(|reply| reply.status() == Status::Ok)
+}
+
+/// A request or a reply of a learner's `decisions`.
+pub fn decision(bytes: &[u8]) -> bool {
+    // Beyond the largest 32-bit float a number is read as infinite, which JSON cannot write.
+    if let Ok(decisions::Reply::Decision(decision)) = parse(bytes)
+        && !decision.summary.iter().all(|number| number.is_finite())
+    {
+        return false;
+    }
+    let reply = survives::<decisions::Reply>(bytes);
+    survives::<decisions::Request>(bytes).is_some() || reply.is_some()
+}
+
+/// What is parsed is written, and is the same when it is parsed again.
+pub fn survives<T: Serialize + DeserializeOwned + PartialEq + Debug>(bytes: &[u8]) -> Option<T> {
+    let value = parse::<T>(bytes).ok()?;
+    let text = serde_json::to_vec(&value).expect("what was parsed is written");
+    assert_eq!(parse::<T>(&text).as_ref(), Ok(&value));
+    Some(value)
+}
+
+pub fn step_answer_seeds() -> Vec<Seed> {
+    let header = StepReply {
+        version: VERSION,
+        n_worlds: 2,
+        height: 1,
+        width: 3,
+        ..StepReply::default()
+    };
+    let result = StepResult {
+        step: 1,
+        reward: 2.0,
+        coverage: 1,
+        ..StepResult::default()
+    };
+    let answer = [
+        bytes_of(&header),
+        bytes_of(&result),
+        bytes_of(&result),
+        &[0, 255, 2, 255, 1, 255],
+    ];
+    assert_eq!(answer.concat().len(), 64 + 2 * RESULT_BYTES + 6);
+    let refusal = StepReply {
+        status: Status::NoLease as u32,
+        n_worlds: 0,
+        detail: 1,
+        ..header
+    };
+    vec![
+        ("two_worlds", answer.concat()),
+        ("refusal", bytes_of(&refusal).to_vec()),
+    ]
+}
+
+pub fn frame_seeds() -> Vec<Seed> {
+    let header = FrameHeader {
+        version: VERSION,
+        height: 2,
+        width: 3,
+        n_moves: 4,
+        ..FrameHeader::default()
+    };
+    let step = [bytes_of(&header), &[255, 1, 2, 0, 255, 255, 3, 3, 1, 0]].concat();
+    let reset = [
+        bytes_of(&FrameHeader {
+            n_moves: 0,
+            ..header
+        }),
+        &[255; 6],
+    ]
+    .concat();
+    vec![("step", step), ("reset", reset)]
+}
+
+pub fn control_reply_seeds() -> Vec<Seed> {
+    let world = WorldInfo {
+        world: 0,
+        step: 2,
+        seed: 42,
+        episode: 1,
+        robot: [2, 4],
+    };
+    let lease = LeaseInfo {
+        lease: 5_179_721,
+        ttl_millis: 60_000,
+        worlds: vec![world.clone()],
+    };
+    let status = ServerStatus {
+        pid: 14_661,
+        uptime_millis: 925,
+        n_steps: 2,
+        steps_per_second: 0.5,
+        n_refused: 0,
+        n_clients: 1,
+        n_observers: 0,
+        worlds: vec![WorldStatus {
+            info: world,
+            holder_pid: Some(14_683),
+            resetting: false,
+        }],
+    };
+    let hello = r#"{"reply":"hello","protocol":1,"build":"0.1.0","pid":1,"height":3,"width":5,"n_moves":4,"n_worlds":1,"n_observations":1,"observations":["fire"],"model":null,"burn_in":500,"max_steps":0,"max_clients":16,"coverage":"path","publish_truth":false,"lease_millis":30000}"#;
+    vec![
+        ("hello", hello.into()),
+        ("lease", json(&Reply::Lease(lease))),
+        ("status", json(&Reply::Status(status))),
+        ("error", json(&Reply::refusal(Status::Busy, 14_683))),
+    ]
+}
+
+pub fn decision_seeds() -> Vec<Seed> {
+    let decision = decisions::Decision {
+        step: 3,
+        reward: 1.5,
+        n_target_cells: 9,
+        n_visited: 4,
+        n_hits: 1,
+        robot: [0, 2],
+        terminated: false,
+        truncated: false,
+        seed: 7,
+        episode: 1,
+        objective: Some(2),
+        summary: vec![0.25, 0.5],
+    };
+    vec![
+        ("decision", json(&decisions::Reply::Decision(decision))),
+        (
+            "error",
+            json(&decisions::Reply::refusal(Status::BadObjective, 4)),
+        ),
+        ("decide", json(&decisions::Request::Decide { objective: 1 })),
+        ("reset", json(&decisions::Request::Reset { seed: Some(1) })),
+    ]
+}
+
+pub fn json(value: &impl Serialize) -> Vec<u8> {
+    serde_json::to_vec(value).expect("messages serialise")
+}
