@@ -23,6 +23,8 @@ mod hostile;
 mod learner;
 mod lease;
 mod python;
+mod recording;
+mod replays;
 mod restart;
 mod training;
 mod wire;

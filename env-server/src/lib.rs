@@ -3,6 +3,7 @@
 //! One step, in reading order: [`world`] (hidden states), [`sensor`] (noise), [`episode`] (path,
 //! reward, frame), [`lease`] (who may act), [`simulator`] (request in, answer out), [`ports`] and
 //! [`server`] (shared memory and the loop). [`resets`] and [`liveness`] keep slow things off that loop.
+//! [`recorder`] keeps what a server publishes; [`replay`] publishes it again.
 
 pub mod config;
 pub mod episode;
@@ -10,6 +11,8 @@ pub mod lease;
 pub mod liveness;
 pub mod ports;
 pub mod publications;
+pub mod recorder;
+pub mod replay;
 pub mod resets;
 pub mod sensor;
 pub mod server;
