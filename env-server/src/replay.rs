@@ -20,11 +20,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
-/// Samples that are published without a pause: half of an observer's buffer.
+/// Samples that are published at once: two bursts fit an observer's buffer.
 const BURST: usize = FRAME_BUFFER / 2;
 
-/// The pause: observers look every 200 us, and a machine is sometimes busy.
-const PAUSE: Duration = Duration::from_millis(1);
+/// How long a burst takes at least: observers look every 200 us, and a machine is sometimes busy.
+const BURST_TIME: Duration = Duration::from_millis(1);
 
 /// How often a replay that waits looks for observers and for the end.
 const TICK: Duration = Duration::from_millis(50);
@@ -97,7 +97,8 @@ pub fn replay(order: &Order, stop: &AtomicBool) -> Result<(), ReplayError> {
         stop,
         ports,
         stage: Stage::new(survey.info, survey.totals.n_truths > 0),
-        n_in_a_row: 0,
+        n_in_burst: 0,
+        burst_began: Instant::now(),
         is_over: false,
         _janitor: Janitor::start(),
     };
@@ -129,8 +130,8 @@ struct Replay<'a> {
     stop: &'a AtomicBool,
     ports: Ports,
     stage: Stage,
-    /// Samples since the last pause.
-    n_in_a_row: usize,
+    n_in_burst: usize,
+    burst_began: Instant,
     is_over: bool,
     _janitor: Janitor,
 }
@@ -195,10 +196,10 @@ impl Replay<'_> {
                 self.stage.show(&record.event);
             } else if time >= self.order.from {
                 self.wait_until_due(began, time - self.order.from)?;
+                if self.ends() {
+                    break;
+                }
                 self.publish(record);
-            }
-            if self.ends() {
-                break;
             }
         }
         Ok(())
@@ -209,19 +210,18 @@ impl Replay<'_> {
         let speed = self.order.speed.unwrap_or(f64::INFINITY);
         let due = Duration::try_from_secs_f64(time.as_secs_f64() / speed).unwrap_or(Duration::MAX);
         while !self.ends() && began.elapsed() < due {
-            self.n_in_a_row = 0;
             let left = due.saturating_sub(began.elapsed());
             self.attend(Instant::now() + left.min(TICK))?;
         }
-        if self.n_in_a_row >= BURST {
-            self.n_in_a_row = 0;
-            self.attend(Instant::now() + PAUSE)?;
+        if self.n_in_burst == BURST {
+            self.attend(self.burst_began + BURST_TIME)?;
+            (self.n_in_burst, self.burst_began) = (0, Instant::now());
         }
         Ok(())
     }
 
     fn publish(&mut self, record: Record) {
-        self.n_in_a_row += 1;
+        self.n_in_burst += 1;
         self.stage.show(&record.event);
         match record.event {
             Event::Frame(sample) => self

@@ -6,8 +6,7 @@ use protocol::control::{CoverageRule, ServerInfo};
 use protocol::message::{FrameHeader, StepResult, TruthHeader};
 use protocol::observer::Sample;
 use protocol::recording::{
-    Event, FileHeader, Kind, MAX_STORED_BYTES, Reader, Record, RecordHeader, RecordingError,
-    Totals, Writer,
+    Event, Kind, MAX_STORED_BYTES, Reader, Record, RecordHeader, RecordingError, Totals, Writer,
 };
 use std::io::{Cursor, Write};
 
