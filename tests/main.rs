@@ -24,6 +24,8 @@ mod hostile;
 mod learner;
 mod lease;
 mod python;
+mod recording;
+mod replays;
 mod restart;
 mod security;
 mod siege;

@@ -4,6 +4,7 @@
 //! reward, frame), [`lease`] (who may act), [`simulator`] (request in, answer out), [`ports`] and
 //! [`server`] (shared memory and the loop). [`resets`], [`files`] and [`liveness`] keep slow things off
 //! that loop. [`snapshot`] writes worlds down, [`history`] and [`beliefs`] keep what the next agent needs.
+//! [`recorder`] keeps what a server publishes; [`replay`] publishes it again.
 
 pub mod autosave;
 pub mod beliefs;
@@ -15,6 +16,8 @@ pub mod lease;
 pub mod liveness;
 pub mod ports;
 pub mod publications;
+pub mod recorder;
+pub mod replay;
 pub mod resets;
 pub mod sensor;
 pub mod server;

@@ -11,7 +11,7 @@ use iceoryx2::service::dynamic_config::publish_subscribe::SubscriberDetails;
 use iceoryx2::service::dynamic_config::request_response::ClientDetails;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use protocol::channels::{
-    Channel, ChannelError, ControlService, FRAME_BUFFER, FrameService, Ipc, MAX_CLIENTS,
+    Channel, ChannelError, ControlService, FRAME_BUFFER, FrameService, Instance, Ipc, MAX_CLIENTS,
     MAX_OBSERVERS, MAX_TRUTH_READERS, RequestResponse, SHARED_MEMORY, Services, StepService,
     TRUTH_BUFFER, TruthService, create_node, ipc_error,
 };
@@ -61,6 +61,21 @@ pub enum PortError {
     Channel(#[from] ChannelError),
 }
 
+/// What messages must fit the ports, and where these are.
+#[derive(Debug, Clone)]
+pub struct Place {
+    /// The instance.
+    pub instance: Instance,
+    /// Most cells of a frame, or of hidden states.
+    pub n_cells: usize,
+    /// Most moves in a path.
+    pub n_moves: usize,
+    /// Longest answer on `step`, bytes.
+    pub answer_bytes: usize,
+    /// Whether to publish hidden states.
+    pub publish_truth: bool,
+}
+
 /// All ports of a server.
 pub struct Ports {
     step: Server<Ipc, [u8], StepRequest, [u8], StepReply>,
@@ -82,28 +97,43 @@ impl Ports {
     /// # Errors
     /// [`PortError`].
     pub fn open(checked: &Checked) -> Result<Self, PortError> {
-        check_shared_memory(checked)?;
+        let n_cells = checked.shape.n_cells();
+        Self::open_at(&Place {
+            instance: checked.instance.clone(),
+            n_cells,
+            n_moves: checked.config.moves,
+            answer_bytes: checked.config.worlds as usize * (RESULT_BYTES + n_cells),
+            publish_truth: checked.config.publish_truth,
+        })
+    }
+
+    /// The same for whoever is no simulator.
+    ///
+    /// # Errors
+    /// [`PortError`].
+    pub fn open_at(place: &Place) -> Result<Self, PortError> {
+        check_shared_memory(place)?;
         let node = create_node()?;
         node.try_cleanup_dead_nodes();
         let services = Services {
             node: &node,
-            instance: &checked.instance,
+            instance: &place.instance,
         };
         let (control_service, step_service) = (services.create_control()?, services.create_step()?);
         let control = control_server(&control_service);
-        let control = control.map_err(|error| taken(checked, &control_service, error))?;
+        let control = control.map_err(|error| taken(place, &control_service, error))?;
         let step = step_service
             .server_builder()
-            .initial_max_slice_len(answer_bytes(checked));
+            .initial_max_slice_len(place.answer_bytes.max(1));
         let step = step.max_loaned_responses_per_request(1).create();
-        let step = step.map_err(|error| taken(checked, &step_service, error))?;
+        let step = step.map_err(|error| taken(place, &step_service, error))?;
         let frame_service = services.frames()?;
         let frames = frame_service
             .publisher_builder()
-            .initial_max_slice_len(frame_bytes(checked))
+            .initial_max_slice_len(place.n_cells + place.n_moves)
             .max_loaned_samples(1);
         let frames = frames.create().map_err(ipc_error("publish frames"))?;
-        let truth_service = if checked.config.publish_truth {
+        let truth_service = if place.publish_truth {
             Some(services.truth()?)
         } else {
             None
@@ -111,7 +141,7 @@ impl Ports {
         let truth = truth_service.as_ref().map(|service| {
             let publisher = service
                 .publisher_builder()
-                .initial_max_slice_len(checked.shape.n_cells());
+                .initial_max_slice_len(place.n_cells);
             publisher
                 .max_loaned_samples(1)
                 .create()
@@ -257,46 +287,31 @@ impl Ports {
 }
 
 fn taken<Q: Header, R: Header>(
-    checked: &Checked,
+    place: &Place,
     service: &RequestResponse<Q, R>,
     error: ServerCreateError,
 ) -> PortError {
     match holder(service, &error) {
         Some(pid) => PortError::AlreadyRunning {
-            instance: checked.instance.name().into(),
+            instance: place.instance.name().into(),
             pid,
         },
         None => ipc_error("create a server")(error).into(),
     }
 }
 
-fn answer_bytes(checked: &Checked) -> usize {
-    checked.config.worlds as usize * (RESULT_BYTES + checked.shape.n_cells())
-}
-
-fn frame_bytes(checked: &Checked) -> usize {
-    checked.shape.n_cells() + checked.config.moves
-}
-
 /// A full `/dev/shm` kills with SIGBUS whoever writes to it: look before.
-fn check_shared_memory(checked: &Checked) -> Result<(), PortError> {
+fn check_shared_memory(place: &Place) -> Result<(), PortError> {
     let bytes =
         |n_messages: usize, length: usize| (n_messages * (length + MESSAGE_OVERHEAD)) as u64;
     // Chunks as iceoryx2 counts them: 2 requests in flight x (buffered + borrowed + loaned).
-    let answers = bytes(MAX_CLIENTS * 2 * 3, answer_bytes(checked));
-    let frames = bytes(MAX_OBSERVERS * (FRAME_BUFFER + 1) + 2, frame_bytes(checked));
-    let truth = bytes(
-        MAX_TRUTH_READERS * (TRUTH_BUFFER + 1) + 2,
-        checked.shape.n_cells(),
+    let answers = bytes(MAX_CLIENTS * 2 * 3, place.answer_bytes);
+    let frames = bytes(
+        MAX_OBSERVERS * (FRAME_BUFFER + 1) + 2,
+        place.n_cells + place.n_moves,
     );
-    let needed = FIXED_BYTES
-        + answers
-        + frames
-        + if checked.config.publish_truth {
-            truth
-        } else {
-            0
-        };
+    let truth = bytes(MAX_TRUTH_READERS * (TRUTH_BUFFER + 1) + 2, place.n_cells);
+    let needed = FIXED_BYTES + answers + frames + if place.publish_truth { truth } else { 0 };
     let Ok(status) = rustix::fs::statvfs(SHARED_MEMORY) else {
         return Ok(());
     };

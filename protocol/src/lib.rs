@@ -4,7 +4,7 @@
 //! Read [`grid`], [`model`], [`dynamics`] (the world) and [`transition`] (beliefs) for the model of
 //! the paper; [`path`] and [`frame`] for what a robot does and sees; [`message`], [`control`] and
 //! [`decisions`] for what travels; [`channels`], [`connection`], [`responder`], [`observer`] and
-//! [`wait`] for how. PROTOCOL.md says
+//! [`wait`] for how, and [`recording`] for keeping it in a file. PROTOCOL.md says
 //! the same for other languages. Words: a *world* is the hidden state of one grid; a *step* `k` flies
 //! one path and moves the world once; a *frame* is what was seen; a *lease* is the right to act.
 
@@ -24,6 +24,7 @@ pub mod observer;
 pub mod path;
 pub mod program;
 pub mod randomness;
+pub mod recording;
 pub mod responder;
 pub mod transition;
 pub mod wait;

@@ -64,7 +64,7 @@ pub enum Status {
     Resetting = 11,
     /// A world was truncated and must be reset first; detail: the world.
     EpisodeOver = 12,
-    /// Full frames were asked of a server that gives none; detail: 0.
+    /// Full frames were asked of a server that gives none, or acting of a replay; detail: 0.
     NotPermitted = 13,
     /// A flag that the server does not know; detail: the flags received.
     UnknownFlags = 14,
@@ -341,7 +341,9 @@ impl Status {
             }
             Self::EpisodeOver => format!("world {detail} was truncated: reset it first"),
             Self::NotPermitted => {
-                "full frames need a server with coverage \"client\" or \"full\"".into()
+                "not permitted: full frames need a server with coverage \"client\" or \"full\", and a \
+                 replay takes no steps"
+                    .into()
             }
             Self::UnknownFlags => {
                 format!("flags: expected 0 or {FLAG_FULL_COVERAGE} (full coverage), got {detail}")

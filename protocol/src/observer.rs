@@ -8,6 +8,8 @@ use crate::message::{FrameHeader, Header, TruthHeader};
 use crate::wait::Waiter;
 use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::prelude::PayloadHeader;
+use std::cell::Cell;
 use std::time::Duration;
 
 /// How long an observer sleeps between two looks: publishing wakes nobody, so that observers cost
@@ -26,6 +28,7 @@ pub struct Sample<H> {
 /// Reads one channel of an instance, before, while and after a server runs.
 pub struct Observer<H: Header> {
     subscriber: Subscriber<Ipc, [u8], H>,
+    publisher: Cell<Option<u32>>,
     waiter: Waiter,
     _node: Node<Ipc>,
 }
@@ -52,6 +55,7 @@ impl Observer<FrameHeader> {
         wake_server(&services)?;
         Ok(Self {
             subscriber,
+            publisher: Cell::new(None),
             waiter: Waiter::default(),
             _node: node,
         })
@@ -79,6 +83,7 @@ impl Observer<TruthHeader> {
         wake_server(&services)?;
         Ok(Self {
             subscriber,
+            publisher: Cell::new(None),
             waiter: Waiter::default(),
             _node: node,
         })
@@ -108,10 +113,19 @@ impl<H: Header> Observer<H> {
             .subscriber
             .receive()
             .map_err(ipc_error("receive a sample"))?;
-        Ok(sample.map(|sample| Sample {
-            header: *sample.user_header(),
-            payload: sample.payload().to_vec(),
+        Ok(sample.map(|sample| {
+            let pid = sample.header().node_id().pid::<Ipc>();
+            self.publisher.set(pid.ok().map(|id| id.value() as u32));
+            Sample {
+                header: *sample.user_header(),
+                payload: sample.payload().to_vec(),
+            }
         }))
+    }
+
+    /// The process that published the sample received last, the server's.
+    pub fn publisher(&self) -> Option<u32> {
+        self.publisher.get()
     }
 }
 

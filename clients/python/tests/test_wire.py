@@ -441,9 +441,9 @@ def test_random_samples_are_read_whole_or_refused_whole(
     header = wire.FrameHeader(height=height, width=width, n_moves=n_moves)
     truth = wire.TruthHeader(height=height, width=width)
     try:
-        frame = observer._frame(header, bytearray(payload), 0)
+        frame = observer.frame_from_sample(header, bytearray(payload), 0)
         assert (frame.frame.shape, frame.path.shape) == ((height, width), (n_moves,))
-        states = observer._truth(truth, bytearray(payload), 0).states
+        states = observer.truth_from_sample(truth, bytearray(payload), 0).states
         assert states.shape == (height, width)
     except GarbledAnswerError:
         pass

@@ -40,12 +40,6 @@ pub fn documented_struct(name: &'static str) -> (Layout, String) {
         .filter_map(|word| word.parse().ok())
         .collect();
     let (_, table) = table.split_once("| offset |").expect("a byte table");
-    let field = |row: Vec<String>| Field {
-        offset: row[0].parse().expect("an offset"),
-        size: row[1].parse().expect("a size"),
-        of: row[2].clone(),
-        name: row[3].clone(),
-    };
     let layout = Layout {
         name,
         type_name: parts[0],
@@ -54,6 +48,20 @@ pub fn documented_struct(name: &'static str) -> (Layout, String) {
         fields: rows(table).into_iter().map(field).collect(),
     };
     (layout, parts[2].into())
+}
+
+/// The fields in the one byte table whose header line begins like this.
+pub fn fields_under(header: &str) -> Vec<Field> {
+    rows_under(header).into_iter().map(field).collect()
+}
+
+fn field(row: Vec<String>) -> Field {
+    Field {
+        offset: row[0].parse().expect("an offset"),
+        size: row[1].parse().expect("a size"),
+        of: row[2].clone(),
+        name: row[3].clone(),
+    }
 }
 
 /// The fenced blocks of a language: what follows the language on the fence's line, and the text.

@@ -16,27 +16,37 @@ use protocol::message::{
     StepRequest, StepResult, TruthHeader, VERSION, split_step_payload,
 };
 use protocol::path::{MAX_MOVES, path_from_bytes, path_to_bytes};
+use protocol::recording::{
+    self, FileHeader, Kind, MAX_BODY_BYTES, MAX_STORED_BYTES, RecordHeader, Totals,
+};
 use protocol::{Coverage, Frame, Move, Shape, UNOBSERVED};
 use serde_json::Value;
 use std::collections::BTreeSet;
 
-/// The layout of a struct; a field that is not listed does not compile.
-macro_rules! layout {
+/// The fields of a struct; one that is not listed does not compile.
+macro_rules! fields {
     ($name:ident { $($field:ident),* $(,)? }) => {{
         let $name { $($field),* } = $name::default();
+        vec![$(Field {
+            name: stringify!($field).into(),
+            offset: std::mem::offset_of!($name, $field),
+            size: size_of_val(&$field),
+            of: type_of(&$field),
+        }),*]
+    }};
+}
+
+/// The layout of a struct.
+macro_rules! layout {
+    ($name:ident { $($field:ident),* $(,)? }) => {
         Layout {
             name: stringify!($name),
             type_name: type_name::<$name>(),
             size: size_of::<$name>(),
             alignment: align_of::<$name>(),
-            fields: vec![$(Field {
-                name: stringify!($field).into(),
-                offset: std::mem::offset_of!($name, $field),
-                size: size_of_val(&$field),
-                of: type_of(&$field),
-            }),*],
+            fields: fields!($name { $($field),* }),
         }
-    }};
+    };
 }
 
 #[expect(unsafe_code, reason = "iceoryx2 marks the name unsafe to override")]
@@ -49,6 +59,7 @@ fn type_name<T: ZeroCopySend>() -> &'static str {
 fn type_of<T>(_: &T) -> String {
     match std::any::type_name::<T>() {
         "[u64; 2]" => "u64[2]".into(),
+        "[u8; 8]" => "u8[8]".into(),
         name => name.rsplit("::").next().unwrap_or(name).into(),
     }
 }
@@ -299,6 +310,46 @@ fn every_service_is_documented() {
     let names = known.map(|channel| instance.service_name(channel).to_string());
     let known = names.map(|name| name.replace("emberwatch/v1/x/", ""));
     assert_eq!(documented, BTreeSet::from(known));
+}
+
+#[test]
+fn a_recording_is_laid_out_as_documented() {
+    let file = fields!(FileHeader {
+        magic,
+        version,
+        reserved,
+    });
+    let record = fields!(RecordHeader {
+        nanos,
+        kind,
+        length,
+        n_lost,
+        checksum,
+    });
+    assert_eq!(document::fields_under("| file offset |"), file);
+    assert_eq!(document::fields_under("| record offset |"), record);
+    let kinds = [Kind::Server, Kind::Frame, Kind::Truth, Kind::End];
+    let known = kinds.map(|kind| (format!("{kind:?}").to_lowercase(), kind as u32));
+    let documented: Vec<(String, u32)> = rows_under("| record kind | code |")
+        .into_iter()
+        .map(|row| (row[0].clone(), row[1].parse().expect("a code")))
+        .collect();
+    assert_eq!(documented, known);
+    for sentence in [
+        format!("`{}` in ASCII", recording::MAGIC.escape_ascii()),
+        format!("{}; refuse any other", recording::VERSION),
+        format!("version 1 is {}", recording::VERSION.swap_bytes()),
+        format!("has {} bytes, struct `=QIIII`", size_of::<RecordHeader>()),
+        format!("stored, at most {MAX_STORED_BYTES} |"),
+        format!("of at most {MAX_BODY_BYTES} bytes"),
+    ] {
+        assert!(PROTOCOL.contains(&sentence), "{sentence:?} is not there");
+    }
+    let [end] = lines_of_fences(" end")[..] else {
+        panic!("expected one example of an end")
+    };
+    let totals: Totals = serde_json::from_str(end).expect("an end");
+    assert_eq!(serde_json::to_string(&totals).expect("serialises"), end);
 }
 
 #[test]

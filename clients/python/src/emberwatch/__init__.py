@@ -10,6 +10,7 @@ Without Gymnasium, `connect` talks to a running server and `observe` reads what 
 
 import gymnasium
 
+from emberwatch import recording
 from emberwatch.client import Client, Lease, connect
 from emberwatch.decisions import Decisions
 from emberwatch.env import WildfireEnv
@@ -41,6 +42,7 @@ __all__ = [
     "WorldInfo",
     "connect",
     "observe",
+    "recording",
 ]
 
 #: Steps after which an episode is truncated, unless `gymnasium.make` is told otherwise.

@@ -142,7 +142,7 @@ class EpisodeOverError(RefusedError):
 
 
 class NotPermittedError(RefusedError):
-    """A full frame was asked of a server that shows paths only."""
+    """A full frame was asked of a server that shows paths only, or a replay was to act."""
 
     name = "not_permitted"
 
@@ -229,7 +229,8 @@ def _explain(kind: type[RefusedError], detail: int) -> str:
         "busy": "busy: held by pid {}; wait for its release or take the worlds over",
         "resetting": "world {} is being reset; wait for the answer to the reset",
         "episode_over": "world {} was truncated: reset it first",
-        "not_permitted": 'full frames need a server with coverage "client" or "full"',
+        "not_permitted": 'not permitted: full frames need a server with coverage "client" or '
+        '"full", and a replay takes no steps',
         "unknown_flags": "flags: expected 0 or 1 (full coverage), got {}",
         "bad_objective": "objective: expected one below {}",
         "bad_file": "the file cannot be used",

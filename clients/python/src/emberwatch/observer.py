@@ -158,7 +158,7 @@ class Observer(_Reader):
             header, payload, lost = sample
             n_lost += lost
             if self._world is None or header.world == self._world:
-                return _frame(header, payload, n_lost)
+                return frame_from_sample(header, payload, n_lost)
 
     def __iter__(self) -> Iterator[Frame]:
         """Yields frames as they come, until none comes for `timeout`; without one, for ever."""
@@ -193,7 +193,7 @@ class TruthReader(_Reader):
         sample = self._sample(timeout)
         if sample is None:
             return None
-        return _truth(*sample)
+        return truth_from_sample(*sample)
 
 
 def observe(
@@ -218,7 +218,12 @@ def observe(
     return Observer(instance, world=world, timeout=timeout)
 
 
-def _frame(header: Any, payload: bytearray, n_lost: int) -> Frame:
+def frame_from_sample(header: Any, payload: bytearray, n_lost: int) -> Frame:
+    """A frame out of a sample's header and payload, which it keeps.
+
+    Raises:
+        GarbledAnswerError: If the lengths do not agree.
+    """
     n_cells = header.height * header.width
     _check_length(len(payload), n_cells + header.n_moves)
     return Frame(
@@ -231,7 +236,12 @@ def _frame(header: Any, payload: bytearray, n_lost: int) -> Frame:
     )
 
 
-def _truth(header: Any, payload: bytearray, n_lost: int) -> Truth:
+def truth_from_sample(header: Any, payload: bytearray, n_lost: int) -> Truth:
+    """Hidden states out of a sample's header and payload, which they keep.
+
+    Raises:
+        GarbledAnswerError: If the lengths do not agree.
+    """
     _check_length(len(payload), header.height * header.width)
     return Truth(
         world=header.world,

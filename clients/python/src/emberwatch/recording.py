@@ -1,0 +1,223 @@
+"""Reads recordings, the files of `emberwatch-server record` (PROTOCOL.md section 14).
+
+Such as `for record in emberwatch.recording.read("lab.recording", world=0): ...`. It needs no server
+and opens no shared memory.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Final, NoReturn
+
+from emberwatch import wire
+from emberwatch.errors import EmberwatchError, GarbledAnswerError
+from emberwatch.observer import Frame, Truth, frame_from_sample, truth_from_sample
+from emberwatch.replies import ServerInfo
+from emberwatch.replies import record as record_from_reply
+
+#: The first bytes of every recording, and the version of the format.
+MAGIC: Final = b"EMBERREC"
+VERSION: Final = 1
+
+#: Longest body, bytes: inflated, and as stored.
+MAX_BODY_BYTES: Final = 16_781_416
+MAX_STORED_BYTES: Final = 16_797_868
+
+#: The beginning of a file, and of each record.
+FILE_HEADER: Final = struct.Struct("=8sII")
+RECORD_HEADER: Final = struct.Struct("=QIIII")
+
+#: Kinds of records.
+SERVER: Final = 1
+FRAME: Final = 2
+TRUTH: Final = 3
+END: Final = 4
+
+
+class RecordingError(EmberwatchError):
+    """A file is no recording of this version, or is damaged: the message names the byte."""
+
+
+class RecordingCutWarning(UserWarning):
+    """A recording ends without an end. Every record before is whole."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Record:
+    """A record, checked.
+
+    Attributes:
+        seconds: Time since the recording began.
+        server: The server that it is of.
+        sample: A frame or hidden states; its `n_lost` counts the samples of that channel that the
+            recorder missed right before it, of all worlds.
+    """
+
+    seconds: float
+    server: ServerInfo
+    sample: Frame | Truth
+
+
+def read(path: str | os.PathLike[str], *, world: int | None = None) -> Iterator[Record]:
+    """Reads a recording: an iterator of its frames and hidden states, in order.
+
+    Hidden states come before the frame of their step. They are for evaluation and pictures, never
+    for learners.
+
+    Args:
+        path: The file.
+        world: Only this world; None: all.
+
+    Yields:
+        Each record, as copies of your own.
+
+    Raises:
+        RecordingError: If the file is no recording, or damaged; after everything before the damage.
+        OSError: If it cannot be read.
+
+    Warns:
+        RecordingCutWarning: After the last whole record of a file that was cut short.
+    """
+    with Path(path).open("rb") as file:
+        reader = _Reader(file, os.fspath(path))
+        for record in reader.records():
+            if world is None or record.sample.world == world:
+                yield record
+
+
+class _Reader:
+    """What is known while reading a file."""
+
+    def __init__(self, file: BinaryIO, name: str) -> None:
+        self._file = file
+        self._name = name
+        self._offset = 0
+        self._nanos = 0
+        self._server: ServerInfo | None = None
+        self._totals: dict[str, int] = dict.fromkeys(
+            ["n_servers", "n_frames", "n_truths", "n_lost_frames", "n_lost_truths"], 0
+        )
+
+    def records(self) -> Iterator[Record]:
+        head = self._file.read(FILE_HEADER.size)
+        if not (head.startswith(MAGIC) or MAGIC.startswith(head)):
+            start = head[: len(MAGIC)]
+            raise RecordingError(
+                f"{self._name}: not a recording: expected it to begin with {MAGIC}, got {start}"
+            )
+        if len(head) < FILE_HEADER.size:
+            self._cut(len(head))
+            return
+        _, version, reserved = FILE_HEADER.unpack(head)
+        if version != VERSION:
+            raise RecordingError(
+                f"{self._name}: recording version: expected {VERSION}, got {version}"
+            )
+        if reserved != 0:
+            raise RecordingError(f"{self._name}: expected 0 in byte 12 to 15, got {reserved}")
+        self._offset = len(head)
+        while True:
+            head = self._file.read(RECORD_HEADER.size)
+            if len(head) < RECORD_HEADER.size:
+                self._cut(len(head))
+                return
+            nanos, kind, length, n_lost, checksum = RECORD_HEADER.unpack(head)
+            if length > MAX_STORED_BYTES:
+                self._damaged(f"body: expected at most {MAX_STORED_BYTES} bytes, got {length}")
+            stored = self._file.read(length)
+            if len(stored) < length:
+                self._cut(len(head) + len(stored))
+                return
+            expected = zlib.crc32(stored, zlib.crc32(head[:-4]))
+            if checksum != expected:
+                self._damaged(f"checksum: expected {expected:#010x}, got {checksum:#010x}")
+            body = self._inflate(stored)
+            if kind == END:
+                self._check_end(body)
+                return
+            if nanos < self._nanos:
+                self._damaged(f"time: expected at least {self._nanos} ns, got {nanos}")
+            self._nanos = nanos
+            sample = self._take(kind, body, n_lost)
+            self._offset += len(head) + length
+            if sample is not None and self._server is not None:
+                yield Record(seconds=nanos / 1e9, server=self._server, sample=sample)
+
+    def _take(self, kind: int, body: bytearray, n_lost: int) -> Frame | Truth | None:
+        """The sample in a body; `None` for a server, of which it takes note."""
+        try:
+            if kind == SERVER:
+                self._totals["n_servers"] += 1
+                self._server = record_from_reply(ServerInfo, json.loads(body))
+                return None
+            if kind == FRAME:
+                header = wire.FrameHeader.from_buffer_copy(body)
+                sample = frame_from_sample(header, body[ctypes.sizeof(header) :], n_lost)
+            elif kind == TRUTH:
+                header = wire.TruthHeader.from_buffer_copy(body)
+                sample = truth_from_sample(header, body[ctypes.sizeof(header) :], n_lost)
+            else:
+                self._damaged(f"kind: expected 1 to 4, got {kind}")
+        except (ValueError, RecursionError, GarbledAnswerError) as error:
+            self._damaged(str(error))
+        self._check_sample(header)
+        name = "frames" if kind == FRAME else "truths"
+        self._totals[f"n_{name}"] += 1
+        self._totals[f"n_lost_{name}"] += n_lost
+        return sample
+
+    def _check_sample(self, header: Any) -> None:
+        server = self._server
+        if server is None:
+            self._damaged("expected a server before its samples, got a sample")
+        if header.version != wire.VERSION:
+            self._damaged(f"sample version: expected {wire.VERSION}, got {header.version}")
+        grid = header.height, header.width
+        if grid != (server.height, server.width):
+            self._damaged(f"grid: expected {(server.height, server.width)}, got {grid}")
+        n_moves = getattr(header, "n_moves", 0)
+        if n_moves not in (0, server.n_moves):
+            self._damaged(f"path: expected 0 or {server.n_moves} moves, got {n_moves}")
+        if header.world >= server.n_worlds:
+            self._damaged(f"world: expected one below {server.n_worlds}, got {header.world}")
+
+    def _inflate(self, stored: bytes) -> bytearray:
+        inflater = zlib.decompressobj(wbits=-zlib.MAX_WBITS)
+        try:
+            body = bytearray(inflater.decompress(stored, MAX_BODY_BYTES + 1))
+        except zlib.error as error:
+            self._damaged(f"body: expected deflate, got {error}")
+        if len(body) > MAX_BODY_BYTES or not inflater.eof or inflater.unused_data:
+            self._damaged(f"body: expected one deflate stream of at most {MAX_BODY_BYTES} bytes")
+        return body
+
+    def _check_end(self, body: bytearray) -> None:
+        try:
+            totals = json.loads(body)
+        except (ValueError, RecursionError) as error:
+            self._damaged(str(error))
+        if totals != self._totals:
+            self._damaged(f"totals: expected {self._totals}, got {totals}")
+        if self._file.read(1):
+            self._damaged("expected nothing behind the end, got more bytes")
+
+    def _cut(self, got: int) -> None:
+        warnings.warn(
+            f"{self._name}: the recording was cut short: expected a whole record at byte "
+            f"{self._offset}, got {got} bytes",
+            RecordingCutWarning,
+            stacklevel=4,
+        )
+
+    def _damaged(self, problem: str) -> NoReturn:
+        raise RecordingError(
+            f"{self._name}: the recording is damaged at byte {self._offset}: {problem}"
+        )

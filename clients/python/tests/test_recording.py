@@ -1,0 +1,211 @@
+"""Recordings: what Python reads of them, and what it says when something is missing."""
+
+import json
+import re
+import struct
+import subprocess
+import warnings
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import document
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from processes import PATIENCE, Server, eventually
+
+import emberwatch
+from emberwatch import errors, programs, recording, wire
+from emberwatch.observer import Frame, Truth
+from emberwatch.recording import Record, RecordingCutWarning, RecordingError
+
+INFO = document.examples()[1]
+TOTALS = {"n_servers": 1, "n_frames": 2, "n_truths": 1, "n_lost_frames": 3, "n_lost_truths": 0}
+FILE_HEADER = recording.FILE_HEADER.pack(b"EMBERREC", 1, 0)
+
+
+def deflated(body: bytes) -> bytes:
+    compressor = zlib.compressobj(wbits=-15)
+    return compressor.compress(body) + compressor.flush()
+
+
+def packed(kind: int, stored: bytes, n_lost: int = 0, nanos: int = 1_500_000_000) -> bytes:
+    head = struct.pack("=QIII", nanos, kind, len(stored), n_lost)
+    return head + struct.pack("=I", zlib.crc32(head + stored)) + stored
+
+
+def frame(sequence: int, n_lost: int = 0, **changes: int) -> bytes:
+    sizes = {"height": 3, "width": 5, "n_moves": 4} | changes
+    header = wire.FrameHeader(version=1, sequence=sequence, **sizes)
+    return packed(2, deflated(bytes(header) + b"\xff" * 14 + b"\2" + b"\0\1\2\3"), n_lost)
+
+
+SERVER = packed(1, deflated(json.dumps(INFO).encode()), nanos=0)
+HIDDEN = packed(
+    3, deflated(bytes(wire.TruthHeader(version=1, height=3, width=5, step=7)) + bytes(15))
+)
+END = packed(4, deflated(json.dumps(TOTALS).encode()))
+PARTS = [FILE_HEADER, SERVER, frame(0), HIDDEN, frame(4, n_lost=3), END]
+GOOD = b"".join(PARTS)
+
+
+def read(path: Path, content: bytes) -> list[Record]:
+    path.write_bytes(content)
+    return list(recording.read(path))
+
+
+def refused(path: Path, content: bytes, words: str) -> None:
+    with pytest.raises(RecordingError, match=re.escape(words)):
+        read(path, content)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "test.recording"
+
+
+def test_the_format_is_the_documented_one() -> None:
+    for header, struct_ in (
+        ("| file offset |", recording.FILE_HEADER),
+        ("| record offset |", recording.RECORD_HEADER),
+    ):
+        rows = document.table(header)
+        assert sum(int(row[1]) for row in rows) == struct_.size
+        assert [int(row[0]) for row in rows] == [
+            sum(int(row[1]) for row in rows[:i]) for i in range(len(rows))
+        ]
+    kinds = {row[0]: int(row[1]) for row in document.table("| record kind | code |")}
+    named = (recording.SERVER, recording.FRAME, recording.TRUTH, recording.END)
+    assert kinds == dict(zip(("server", "frame", "truth", "end"), named, strict=True))
+    for sentence in (
+        f"`{recording.MAGIC.decode()}` in ASCII",
+        f"{recording.VERSION}; refuse any other",
+        f"stored, at most {recording.MAX_STORED_BYTES} |",
+        f"of at most {recording.MAX_BODY_BYTES} bytes",
+        f"struct `{recording.RECORD_HEADER.format}`",
+    ):
+        assert sentence in document.PROTOCOL
+
+
+def test_a_recording_is_read_in_order_with_its_losses(path: Path) -> None:
+    first, hidden, last = read(path, GOOD)
+    assert isinstance(first.sample, Frame) and isinstance(hidden.sample, Truth)
+    assert first.seconds == 1.5 and first.server.n_moves == 4
+    assert (first.sample.n_lost, last.sample.n_lost) == (0, 3)
+    assert first.sample.frame.tolist() == [[255] * 5, [255] * 5, [255] * 4 + [2]]
+    assert first.sample.path.tolist() == [0, 1, 2, 3]
+    assert hidden.sample.step == 7 and not hidden.sample.states.any()
+    first.sample.frame[:] = 1  # your own to write to
+
+
+def test_a_recording_cut_anywhere_is_read_up_to_its_last_whole_record(path: Path) -> None:
+    ends = np.cumsum([len(part) for part in PARTS])
+    for length in range(len(GOOD)):
+        whole = int((ends <= length).sum())
+        offset = ends[whole - 1] if whole else 0
+        words = f"cut short: expected a whole record at byte {offset}, got {length - offset} bytes"
+        with pytest.warns(RecordingCutWarning, match=words):
+            assert len(read(path, GOOD[:length])) == max(0, whole - 2)
+
+
+def test_a_changed_byte_anywhere_is_noticed(path: Path) -> None:
+    for position in range(len(GOOD)):
+        content = bytearray(GOOD)
+        content[position] ^= 0x10
+        with pytest.raises((RecordingError, RecordingCutWarning)), warnings.catch_warnings():
+            warnings.simplefilter("error")
+            read(path, bytes(content))
+
+
+@pytest.mark.parametrize(
+    "content, words",
+    [
+        (b"PK\3\4 and so on, at length", "expected it to begin with b'EMBERREC', got b'PK"),
+        (b"EMBERREC\2" + bytes(7), "version: expected 1, got 2"),
+        (b"EMBERREC\0\0\0\1" + bytes(4), "version: expected 1, got 16777216"),
+        (b"EMBERREC\1\0\0\0\1\0\0\0", "expected 0 in byte 12 to 15, got 1"),
+        (FILE_HEADER + frame(0), "at byte 16: expected a server before its samples"),
+        (FILE_HEADER + packed(5, deflated(b"")), "kind: expected 1 to 4, got 5"),
+        (FILE_HEADER + packed(2, deflated(b"short")), "Buffer size too small"),
+        (FILE_HEADER + packed(1, deflated(b"{}")), "expected a key"),
+        (FILE_HEADER + packed(1, deflated(b"[" * 100_000)), "at byte 16"),
+        (FILE_HEADER + packed(1, b"\xff\xff"), "expected deflate"),
+        (FILE_HEADER + packed(1, deflated(b"{}") + b"more"), "one deflate stream"),
+        (FILE_HEADER + packed(2, deflated(bytes(50 << 20))), "of at most 16781416 bytes"),
+        (FILE_HEADER + struct.pack("=QIIII", 0, 2, 2**32 - 1, 0, 0), "bytes, got 4294967295"),
+        (FILE_HEADER + SERVER + frame(0, n_moves=3), "expected 18 bytes, got 19"),
+        (FILE_HEADER + SERVER + frame(0, height=5, width=3), "grid: expected (3, 5), got (5, 3)"),
+        (FILE_HEADER + SERVER + frame(0, world=1), "world: expected one below 1, got 1"),
+        (FILE_HEADER + SERVER + frame(0) + END, "totals: expected"),
+        (FILE_HEADER + frame(0)[:0] + SERVER + HIDDEN + SERVER, "time: expected at least"),
+        (GOOD + b"x", "nothing behind the end"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_is_no_recording_is_refused(path: Path, content: bytes, words: str) -> None:
+    refused(path, content, words)
+
+
+@given(st.binary(max_size=200), st.booleans(), st.integers(0, 5))
+def test_random_bytes_are_never_read_whole(
+    tmp_path_factory: pytest.TempPathFactory, noise: bytes, packs: bool, kind: int
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "noise.recording"
+    content = FILE_HEADER + (packed(kind, deflated(noise)) if packs else noise)
+    with pytest.raises((RecordingError, RecordingCutWarning)), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read(path, content)
+
+
+@contextmanager
+def program(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
+    """Runs `emberwatch-server` with these arguments; ends it."""
+    process = subprocess.Popen([programs.find("emberwatch-server"), *map(str, arguments)])
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait(PATIENCE)
+
+
+def test_what_a_recorder_wrote_is_what_the_server_answered(
+    path: Path, server: Callable[..., Server]
+) -> None:
+    started = server(worlds=2, publish_truth="true")
+    flags = ("--instance", started.instance, "--out", path, "--truth", "--steps", 20)
+    with program("record", *flags) as recorder:
+        assert eventually(lambda: started.status().n_observers == 1)
+        lease = started.connect().acquire(1)
+        paths = np.random.default_rng(0).integers(0, 4, (20, 6))
+        answers = [lease.step(moves) for moves in paths]
+        assert recorder.wait(PATIENCE) == 0
+    samples = [record.sample for record in recording.read(path, world=1)]
+    frames = [it for it in samples if isinstance(it, Frame) and it.result.step > 0]
+    truths = {it.step: it for it in samples if isinstance(it, Truth)}
+    assert len(frames) == len(answers) == 20
+    for frame_, answer, moves in zip(frames, answers, paths, strict=True):
+        assert frame_.result == answer.result() and frame_.n_lost == 0
+        assert (frame_.frame == answer.frames[0]).all() and (frame_.path == moves).all()
+        n_fires = int((truths[frame_.result.step].states == 2).sum())
+        assert n_fires == frame_.result.n_target_cells
+
+
+def test_a_replay_is_observed_like_a_server_and_refuses_to_act(path: Path) -> None:
+    path.write_bytes(GOOD)
+    instance = programs.unused_instance()
+    with program("replay", path, "--instance", instance, "--loop") as replay:
+        with emberwatch.observe(instance, timeout=PATIENCE) as observer:
+            seen = [frame.n_lost for frame, _ in zip(observer, range(4), strict=False)]
+            with emberwatch.connect(instance) as client:
+                assert client.info.pid == replay.pid
+                with pytest.raises(errors.NotPermittedError, match="a recording is replayed"):
+                    client.acquire()
+                with pytest.raises(errors.NotPermittedError, match="takes no steps"):
+                    client.observe()
+                client.shutdown()
+        assert replay.wait(PATIENCE) == 0
+    # What the recorder lost is missing here too; a smaller number is a new round.
+    assert seen == [0, 3, 0, 3]

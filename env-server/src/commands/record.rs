@@ -1,0 +1,74 @@
+//! `record`: what an instance publishes, into a file.
+
+use anyhow::{Context, Result};
+use clap::Args;
+use env_server::recorder::{Order, Summary, record};
+use protocol::channels::Instance;
+use protocol::program::stop_on_signals;
+use std::path::PathBuf;
+
+/// Observe an instance and write what is published to a file.
+#[derive(Args)]
+pub struct RecordCommand {
+    /// The server's instance name; the server may start later, and again
+    #[arg(long, default_value = "default")]
+    instance: String,
+    /// The file to write
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Write over a file that exists
+    #[arg(long)]
+    force: bool,
+    /// Record hidden states too, where the server publishes them (`--publish-truth`)
+    #[arg(long)]
+    truth: bool,
+    /// World steps to record; 0: until stopped
+    #[arg(long, default_value_t = 0)]
+    steps: u64,
+    /// The worlds to record, such as 0,2,3 [default: all]
+    #[arg(long, value_delimiter = ',', value_name = "WORLD,...")]
+    worlds: Vec<u32>,
+}
+
+impl RecordCommand {
+    /// Records until stopped, or until the steps are recorded.
+    pub fn run(&self) -> Result<()> {
+        let stop = stop_on_signals().context("handle signals")?;
+        let order = Order {
+            instance: Instance::new(&self.instance)?,
+            out: self.out.clone(),
+            overwrite: self.force,
+            truth: self.truth,
+            n_steps: self.steps,
+            worlds: self.worlds.clone(),
+        };
+        report(&record(&order, &stop)?);
+        Ok(())
+    }
+}
+
+fn report(summary: &Summary) {
+    let totals = &summary.totals;
+    tracing::info!(
+        records = totals.n_servers + totals.n_frames + totals.n_truths,
+        servers = totals.n_servers,
+        frames = totals.n_frames,
+        truths = totals.n_truths,
+        steps = summary.n_steps,
+        bytes = summary.n_bytes,
+        "recorded"
+    );
+    if totals.n_lost_frames + totals.n_lost_truths > 0 {
+        tracing::warn!(
+            frames = totals.n_lost_frames,
+            truths = totals.n_lost_truths,
+            "samples were lost: they came faster than they could be read"
+        );
+    }
+    if summary.n_unknown > 0 {
+        tracing::warn!(
+            samples = summary.n_unknown,
+            "not recorded: their server did not say who it is"
+        );
+    }
+}

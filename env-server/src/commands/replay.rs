@@ -1,0 +1,66 @@
+//! `replay`: a recording, published again.
+
+use anyhow::{Context, Result};
+use clap::Args;
+use env_server::replay::{Order, replay};
+use protocol::channels::Instance;
+use protocol::program::stop_on_signals;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// Publish a recording as its server did.
+#[derive(Args)]
+pub struct ReplayCommand {
+    /// The recording
+    file: PathBuf,
+    /// The instance to publish on
+    #[arg(long, default_value = "default")]
+    instance: String,
+    /// How many times as fast as recorded, or `max`: as fast as observers can follow
+    #[arg(long, default_value = "1", value_parser = parse_speed, value_name = "FACTOR|max")]
+    speed: Speed,
+    /// Leave out this much of the beginning, seconds
+    #[arg(long, default_value = "0", value_parser = parse_seconds, value_name = "SECONDS")]
+    from: Duration,
+    /// Begin anew at the end, until stopped
+    #[arg(long = "loop")]
+    repeat: bool,
+    /// Begin at once, rather than when there is an observer
+    #[arg(long)]
+    no_wait: bool,
+}
+
+/// How fast to replay; `None`: no waiting for the recorded times.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Speed(Option<f64>);
+
+impl ReplayCommand {
+    /// Replays until the end, or until stopped.
+    pub fn run(&self) -> Result<()> {
+        let stop = stop_on_signals().context("handle signals")?;
+        let order = Order {
+            file: self.file.clone(),
+            instance: Instance::new(&self.instance)?,
+            speed: self.speed.0,
+            from: self.from,
+            repeat: self.repeat,
+            at_once: self.no_wait,
+        };
+        Ok(replay(&order, &stop)?)
+    }
+}
+
+fn parse_speed(text: &str) -> Result<Speed, String> {
+    match text.parse::<f64>() {
+        _ if text == "max" => Ok(Speed(None)),
+        Ok(factor) if factor.is_finite() && factor > 0.0 => Ok(Speed(Some(factor))),
+        _ => Err("expected a number above 0, or max".into()),
+    }
+}
+
+fn parse_seconds(text: &str) -> Result<Duration, String> {
+    let seconds = text.parse::<f64>().ok();
+    seconds
+        .and_then(|seconds| Duration::try_from_secs_f64(seconds).ok())
+        .ok_or_else(|| "expected seconds, at least 0".into())
+}

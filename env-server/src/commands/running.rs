@@ -1,0 +1,92 @@
+//! `status` and `stop`: questions to a running server.
+
+use super::print;
+use anyhow::Result;
+use clap::Args;
+use protocol::Connection;
+use protocol::channels::Instance;
+use protocol::control::{Reply, Request, ServerStatus};
+use std::time::Duration;
+
+/// How long to wait for the server.
+const TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Ask a running server what is going on.
+#[derive(Args)]
+pub struct StatusCommand {
+    #[command(flatten)]
+    target: Target,
+}
+
+/// Stop a running server.
+#[derive(Args)]
+pub struct StopCommand {
+    #[command(flatten)]
+    target: Target,
+}
+
+#[derive(Args)]
+struct Target {
+    /// The server's instance name
+    #[arg(long, default_value = "default")]
+    instance: String,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+impl StatusCommand {
+    /// Prints the answer.
+    pub fn run(&self) -> Result<()> {
+        match self.target.ask(&Request::Status {})? {
+            Reply::Status(status) if self.target.json => {
+                print(&(serde_json::to_string_pretty(&status)? + "\n"))
+            }
+            Reply::Status(status) => print(&describe(&self.target.instance, &status)),
+            other => anyhow::bail!("expected a status, got {other:?}"),
+        }
+    }
+}
+
+impl StopCommand {
+    /// Returns when the server has answered that it ends.
+    pub fn run(&self) -> Result<()> {
+        self.target.ask(&Request::Shutdown {}).map(|_| ())
+    }
+}
+
+impl Target {
+    fn ask(&self, request: &Request) -> Result<Reply> {
+        let instance = Instance::new(&self.instance)?;
+        let mut connection = Connection::open(&instance, "emberwatch-server", TIMEOUT)?;
+        Ok(connection.control(request, TIMEOUT)?)
+    }
+}
+
+fn describe(instance: &str, status: &ServerStatus) -> String {
+    let uptime = Duration::from_millis(status.uptime_millis).as_secs();
+    let mut text = format!(
+        "instance {instance}: pid {}, up {uptime} s, {} steps, {:.0} steps/s, {} refused requests, {} clients, {} observers\n",
+        status.pid,
+        status.n_steps,
+        status.steps_per_second,
+        status.n_refused,
+        status.n_clients,
+        status.n_observers
+    );
+    text += "world  step        seed                  episode  robot         holder\n";
+    for world in &status.worlds {
+        let holder = match (world.resetting, world.holder_pid) {
+            (true, _) => "(resetting)".into(),
+            (false, Some(pid)) => format!("pid {pid}"),
+            (false, None) => "-".into(),
+        };
+        let info = &world.info;
+        let robot = format!("({}, {})", info.robot[0], info.robot[1]);
+        text += &format!(
+            "{:<6} {:<11} {:<21} {:<8} {robot:<13} {holder}\n",
+            info.world, info.step, info.seed, info.episode
+        );
+    }
+    text
+}

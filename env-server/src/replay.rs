@@ -1,0 +1,308 @@
+//! Publishes a recording again, as its server did: the same headers and bytes, in the recorded order.
+//!
+//! The file is read twice: once to check all of it before anybody sees anything, once to publish it.
+
+mod stage;
+
+use crate::liveness::Janitor;
+use crate::ports::{Place, PortError, Ports};
+use protocol::channels::{ChannelError, FRAME_BUFFER, Instance, ipc_error};
+use protocol::control::{Reply, ServerInfo};
+use protocol::message::{Status, StepReply, VERSION};
+use protocol::recording::{Event, Reader, Record, RecordingError, Totals};
+use protocol::responder::{ActiveControl, listener_id, wait_until_taken};
+use protocol::wait::sleep_until_event;
+use stage::{Act, Audience, Stage};
+use std::fs::File;
+use std::io::BufReader;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+use thiserror::Error;
+
+/// Samples that are published at once: two bursts fit an observer's buffer.
+const BURST: usize = FRAME_BUFFER / 2;
+
+/// How long a burst takes at least: observers look every 200 us, and a machine is sometimes busy.
+const BURST_TIME: Duration = Duration::from_millis(1);
+
+/// How often a replay that waits looks for observers and for the end.
+const TICK: Duration = Duration::from_millis(50);
+
+/// How long observers may take to read the last samples.
+const FAREWELL: Duration = Duration::from_millis(500);
+
+/// What to replay, and how.
+#[derive(Debug)]
+pub struct Order {
+    /// The recording.
+    pub file: PathBuf,
+    /// The instance to publish on.
+    pub instance: Instance,
+    /// How many times as fast as it was recorded; `None`: as fast as observers can follow.
+    pub speed: Option<f64>,
+    /// What to leave out at the beginning.
+    pub from: Duration,
+    /// Whether to begin anew at the end, for ever.
+    pub repeat: bool,
+    /// Whether to begin without an observer.
+    pub at_once: bool,
+}
+
+/// Why a replay failed.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ReplayError {
+    /// The file cannot be replayed.
+    #[error("recording {}: {problem}", path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        problem: RecordingError,
+    },
+    /// There is nothing to publish.
+    #[error("recording {}: expected samples from {from:?} on, got none", path.display())]
+    Empty {
+        /// The file.
+        path: PathBuf,
+        /// Where to begin.
+        from: Duration,
+    },
+    /// The server's place could not be taken.
+    #[error(transparent)]
+    Port(#[from] PortError),
+    /// A channel failed.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+}
+
+/// Replays until the end, `stop`, or a client's `shutdown`.
+///
+/// # Errors
+/// [`ReplayError`]. A recording that was cut short is replayed as far as it goes, with a warning.
+pub fn replay(order: &Order, stop: &AtomicBool) -> Result<(), ReplayError> {
+    let survey = Survey::of(order)?;
+    let ports = Ports::open_at(&survey.place)?;
+    let instance = order.instance.name();
+    tracing::info!(
+        instance,
+        frames = survey.totals.n_frames,
+        truths = survey.totals.n_truths,
+        lost = survey.totals.n_lost_frames + survey.totals.n_lost_truths,
+        "replaying"
+    );
+    let mut replay = Replay {
+        order,
+        stop,
+        ports,
+        stage: Stage::new(survey.info, survey.totals.n_truths > 0),
+        n_in_burst: 0,
+        burst_began: Instant::now(),
+        is_over: false,
+        _janitor: Janitor::start(),
+    };
+    if !order.at_once {
+        tracing::info!("waiting for an observer");
+        while !replay.ends() && replay.ports.observers() == (0, 0) {
+            replay.attend(Instant::now() + TICK)?;
+        }
+    }
+    replay.publish_all()?;
+    while order.repeat && !replay.ends() {
+        replay.publish_all()?;
+    }
+    replay.attend(Instant::now() + FAREWELL)?;
+    tracing::info!(steps = replay.stage.n_steps(), "replayed");
+    Ok(())
+}
+
+/// What a look through the whole file tells.
+struct Survey {
+    place: Place,
+    /// The first server.
+    info: ServerInfo,
+    totals: Totals,
+}
+
+struct Replay<'a> {
+    order: &'a Order,
+    stop: &'a AtomicBool,
+    ports: Ports,
+    stage: Stage,
+    n_in_burst: usize,
+    burst_began: Instant,
+    is_over: bool,
+    _janitor: Janitor,
+}
+
+impl Survey {
+    fn of(order: &Order) -> Result<Self, ReplayError> {
+        let mut place = Place {
+            instance: order.instance.clone(),
+            n_cells: 0,
+            n_moves: 0,
+            answer_bytes: 0,
+            publish_truth: false,
+        };
+        let (mut first, mut is_empty) = (None, true);
+        let mut reader = open(&order.file)?;
+        for record in reader.by_ref() {
+            let record = match record {
+                Ok(record) => record,
+                Err(cut @ RecordingError::Cut { .. }) => {
+                    tracing::warn!(file = %order.file.display(), "{cut}; replaying what is there");
+                    break;
+                }
+                Err(problem) => return Err(file_error(&order.file, problem)),
+            };
+            match record.event {
+                Event::Server(info) => {
+                    place.n_cells = place.n_cells.max(info.height * info.width);
+                    place.n_moves = place.n_moves.max(info.n_moves);
+                    first.get_or_insert(*info);
+                }
+                _ => is_empty &= Duration::from_nanos(record.nanos) < order.from,
+            }
+        }
+        let totals = reader.totals();
+        place.publish_truth = totals.n_truths > 0;
+        match first {
+            Some(info) if !is_empty => Ok(Self {
+                place,
+                info,
+                totals,
+            }),
+            _ => Err(ReplayError::Empty {
+                path: order.file.clone(),
+                from: order.from,
+            }),
+        }
+    }
+}
+
+impl Replay<'_> {
+    /// Publishes the recording once.
+    fn publish_all(&mut self) -> Result<(), ReplayError> {
+        let began = Instant::now();
+        for record in open(&self.order.file)? {
+            let record = match record {
+                Ok(record) => record,
+                Err(RecordingError::Cut { .. }) => break,
+                Err(problem) => return Err(file_error(&self.order.file, problem)),
+            };
+            let time = Duration::from_nanos(record.nanos);
+            if let Event::Server(_) = record.event {
+                self.stage.show(&record.event);
+            } else if time >= self.order.from {
+                self.wait_until_due(began, time - self.order.from)?;
+                if self.ends() {
+                    break;
+                }
+                self.publish(record);
+            }
+        }
+        Ok(())
+    }
+
+    /// Waits until a moment of the recording, and gives observers time to follow.
+    fn wait_until_due(&mut self, began: Instant, time: Duration) -> Result<(), ReplayError> {
+        let speed = self.order.speed.unwrap_or(f64::INFINITY);
+        let due = Duration::try_from_secs_f64(time.as_secs_f64() / speed).unwrap_or(Duration::MAX);
+        while !self.ends() && began.elapsed() < due {
+            let left = due.saturating_sub(began.elapsed());
+            self.attend(Instant::now() + left.min(TICK))?;
+        }
+        if self.n_in_burst == BURST {
+            self.attend(self.burst_began + BURST_TIME)?;
+            (self.n_in_burst, self.burst_began) = (0, Instant::now());
+        }
+        Ok(())
+    }
+
+    fn publish(&mut self, record: Record) {
+        self.n_in_burst += 1;
+        self.stage.show(&record.event);
+        match record.event {
+            Event::Frame(sample) => self
+                .ports
+                .publish_frame(sample.header, &sample.payload, &[]),
+            Event::Truth(sample) => self.ports.publish_truth(sample.header, &sample.payload),
+            Event::Server(_) => {}
+        }
+    }
+
+    fn ends(&self) -> bool {
+        self.is_over || self.stop.load(Ordering::Relaxed)
+    }
+
+    /// Answers requests until a moment, or the end.
+    fn attend(&mut self, until: Instant) -> Result<(), ReplayError> {
+        loop {
+            self.ports.connect_observers();
+            while let Some(request) = self.ports.receive_step() {
+                let asked = *request.user_header();
+                let reply = StepReply {
+                    version: VERSION,
+                    status: self.stage.refuse_step(asked.version) as u32,
+                    sequence: asked.sequence,
+                    first_world: asked.first_world,
+                    detail: if asked.version == VERSION {
+                        0
+                    } else {
+                        VERSION.into()
+                    },
+                    ..StepReply::default()
+                };
+                let listener = listener_id(asked.listener_low, asked.listener_high);
+                self.ports.answers().send(&request, reply, &[], listener);
+            }
+            while let Some(request) = self.ports.receive_control() {
+                self.answer(request);
+            }
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() || self.ends() {
+                return Ok(());
+            }
+            if !self.ports.drain()? {
+                sleep_until_event(&[self.ports.descriptor()], left).map_err(ipc_error("sleep"))?;
+            }
+        }
+    }
+
+    fn answer(&mut self, request: ActiveControl) {
+        let audience = Audience {
+            n_clients: self.ports.n_clients(),
+            n_observers: self.ports.observers().0,
+        };
+        let version = request.user_header().version;
+        let (reply, act) = self.stage.answer(version, request.payload(), &audience);
+        self.send(&request, &reply);
+        if act == Act::End {
+            wait_until_taken(&[request]);
+            tracing::info!("a client asked to shut down");
+            self.is_over = true;
+        }
+    }
+
+    fn send(&mut self, request: &ActiveControl, reply: &Reply) {
+        if reply.status() != Status::Ok {
+            tracing::debug!(status = ?reply.status(), "refused a control request");
+        }
+        self.ports
+            .answers()
+            .send_json(request, reply.status(), reply);
+    }
+}
+
+fn open(path: &Path) -> Result<Reader<BufReader<File>>, ReplayError> {
+    let file = File::open(path).map_err(|error| file_error(path, error.into()))?;
+    Reader::new(BufReader::new(file)).map_err(|problem| file_error(path, problem))
+}
+
+fn file_error(path: &Path, problem: RecordingError) -> ReplayError {
+    ReplayError::File {
+        path: path.into(),
+        problem,
+    }
+}

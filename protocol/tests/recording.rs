@@ -1,0 +1,389 @@
+//! Recordings: what was written is what is read, and what is missing or damaged is said.
+
+use proptest::collection::vec;
+use proptest::prelude::*;
+use protocol::control::{CoverageRule, ServerInfo};
+use protocol::message::{FrameHeader, StepResult, TruthHeader};
+use protocol::observer::Sample;
+use protocol::recording::{
+    Event, Kind, MAX_STORED_BYTES, Reader, Record, RecordHeader, RecordingError, Totals, Writer,
+};
+use std::io::{Cursor, Write};
+
+fn server(height: usize, width: usize, n_moves: usize) -> Event {
+    Event::Server(Box::new(ServerInfo {
+        protocol: 1,
+        build: "0.1.0".into(),
+        pid: 7,
+        height,
+        width,
+        n_moves,
+        n_worlds: 3,
+        n_observations: 3,
+        observations: vec!["normal".into(), "latent".into(), "fire".into()],
+        model: None,
+        burn_in: 20,
+        max_steps: 0,
+        max_clients: 16,
+        coverage: CoverageRule::Path,
+        publish_truth: true,
+        lease_millis: 30_000,
+    }))
+}
+
+fn frame(sequence: u64, (height, width): (usize, usize), payload: Vec<u8>) -> Event {
+    let header = FrameHeader {
+        version: 1,
+        world: sequence as u32 % 3,
+        sequence,
+        height: height as u32,
+        width: width as u32,
+        n_moves: (payload.len() - height * width) as u32,
+        result: StepResult {
+            step: sequence,
+            reward: 1.5,
+            ..StepResult::default()
+        },
+        ..FrameHeader::default()
+    };
+    Event::Frame(Sample { header, payload })
+}
+
+fn truth(sequence: u64, (height, width): (usize, usize), payload: Vec<u8>) -> Event {
+    let header = TruthHeader {
+        version: 1,
+        world: sequence as u32 % 3,
+        sequence,
+        height: height as u32,
+        width: width as u32,
+        ..TruthHeader::default()
+    };
+    Event::Truth(Sample { header, payload })
+}
+
+/// A server, hidden states, frames, and a second server of another grid.
+fn example() -> Vec<Record> {
+    let events = [
+        server(2, 3, 4),
+        truth(0, (2, 3), vec![0, 1, 2, 2, 1, 0]),
+        frame(0, (2, 3), vec![255; 6]),
+        frame(4, (2, 3), vec![255, 0, 1, 2, 255, 255, 0, 1, 2, 3]),
+        server(1, 2, 1),
+        frame(0, (1, 2), vec![255, 1, 3]),
+    ];
+    let nanos = [5, 5, 6, 1 << 40, 1 << 40, u64::MAX];
+    let n_lost = [0, 0, 0, 3, 0, 0];
+    let parts = events.into_iter().zip(nanos).zip(n_lost);
+    parts
+        .map(|((event, nanos), n_lost)| Record {
+            nanos,
+            n_lost,
+            event,
+        })
+        .collect()
+}
+
+fn written(records: &[Record]) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let mut writer = Writer::new(&mut bytes).expect("begin");
+    for record in records {
+        writer.write(record).expect("write");
+    }
+    writer.finish().expect("finish");
+    let n_bytes = writer.n_bytes();
+    assert_eq!(bytes.len() as u64, n_bytes);
+    bytes
+}
+
+/// How long a recording of these records is before its end is written.
+fn length_without_end(records: &[Record]) -> usize {
+    let mut writer = Writer::new(Vec::new()).expect("begin");
+    for record in records {
+        writer.write(record).expect("write");
+    }
+    writer.n_bytes() as usize
+}
+
+/// The records that can be read, and the error that ends them, if any.
+fn read(bytes: &[u8]) -> (Vec<Record>, Option<RecordingError>) {
+    let reader = match Reader::new(bytes) {
+        Ok(reader) => reader,
+        Err(error) => return (Vec::new(), Some(error)),
+    };
+    let mut records = Vec::new();
+    for record in reader {
+        match record {
+            Ok(record) => records.push(record),
+            Err(error) => return (records, Some(error)),
+        }
+    }
+    (records, None)
+}
+
+fn check_refused(bytes: &[u8], words: &str) {
+    let (_, error) = read(bytes);
+    let said = error.expect("refused").to_string();
+    assert!(said.contains(words), "{said:?} does not say {words:?}");
+}
+
+/// A record of these bytes, with the right checksum.
+fn raw_record(kind: u32, body: &[u8]) -> Vec<u8> {
+    let mut encoder = flate2::write::DeflateEncoder::new(Vec::new(), flate2::Compression::fast());
+    encoder.write_all(body).expect("compress");
+    sealed(kind, &encoder.finish().expect("compress"))
+}
+
+fn sealed(kind: u32, stored: &[u8]) -> Vec<u8> {
+    let mut header = RecordHeader {
+        nanos: u64::MAX,
+        kind,
+        length: stored.len() as u32,
+        ..RecordHeader::default()
+    };
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(&bytemuck::bytes_of(&header)[..20]);
+    hasher.update(stored);
+    header.checksum = hasher.finalize();
+    [bytemuck::bytes_of(&header), stored].concat()
+}
+
+#[test]
+fn what_was_written_is_read_with_its_losses() {
+    let bytes = written(&example());
+    assert_eq!(read(&bytes).0, example());
+    let mut reader = Reader::new(&bytes[..]).expect("begin");
+    assert!(reader.by_ref().all(|record| record.is_ok()));
+    let expected = Totals {
+        n_servers: 2,
+        n_frames: 3,
+        n_truths: 1,
+        n_lost_frames: 3,
+        n_lost_truths: 0,
+    };
+    assert_eq!(reader.totals(), expected);
+}
+
+#[test]
+fn a_recording_cut_anywhere_is_read_up_to_its_last_whole_record_and_says_so() {
+    let bytes = written(&example());
+    let ends: Vec<usize> = (0..=example().len())
+        .map(|n_records| length_without_end(&example()[..n_records]))
+        .collect();
+    for length in 0..bytes.len() {
+        let (records, error) = read(&bytes[..length]);
+        let n_whole = ends.iter().filter(|&&end| end <= length).count();
+        let offset = if n_whole == 0 { 0 } else { ends[n_whole - 1] };
+        assert_eq!(records, example()[..n_whole.saturating_sub(1)], "{length}");
+        match error {
+            Some(RecordingError::Cut { offset: said, got }) => {
+                assert_eq!((said, got), (offset as u64, (length - offset) as u64));
+            }
+            other => panic!("cut after {length} bytes: {other:?}"),
+        }
+    }
+}
+
+#[test]
+fn a_flipped_bit_anywhere_is_noticed() {
+    let bytes = written(&example());
+    for position in 0..bytes.len() {
+        for bit in 0..8 {
+            let mut damaged = bytes.clone();
+            damaged[position] ^= 1 << bit;
+            let (records, error) = read(&damaged);
+            assert!(error.is_some(), "byte {position}, bit {bit}");
+            assert_eq!(records, example()[..records.len()]);
+        }
+    }
+}
+
+#[test]
+fn a_record_that_is_missing_is_noticed() {
+    let bytes = written(&example());
+    let first = length_without_end(&example()[..2]);
+    let second = length_without_end(&example()[..3]);
+    let without = [&bytes[..first], &bytes[second..]].concat();
+    check_refused(&without, "totals: expected");
+}
+
+#[test]
+fn other_files_are_refused_by_what_they_begin_with() {
+    check_refused(
+        b"PK\x03\x04 and so on, long enough",
+        "got \"PK\\\\x03\\\\x04 and\"",
+    );
+    check_refused(
+        b"E",
+        "cut short: expected a whole record at byte 0, got 1 bytes",
+    );
+    let mut bytes = written(&example());
+    bytes[8..12].copy_from_slice(&1u32.to_be_bytes());
+    check_refused(&bytes, "version: expected 1, got 16777216");
+    bytes[8..16].copy_from_slice(&[1, 0, 0, 0, 2, 0, 0, 0]);
+    check_refused(&bytes, "expected 0 in byte 12 to 15, got 2");
+}
+
+#[test]
+fn a_hostile_record_is_refused_by_where_it_is() {
+    let whole = written(&example());
+    let beginning = &whole[..16];
+    let check = |record: &[u8], words: &str| {
+        check_refused(&[beginning, record].concat(), "at byte 16");
+        check_refused(&[beginning, record].concat(), words);
+    };
+    let mut liar = RecordHeader {
+        kind: 2,
+        length: MAX_STORED_BYTES as u32,
+        ..RecordHeader::default()
+    };
+    check(bytemuck::bytes_of(&liar), "got 24 bytes");
+    liar.length = u32::MAX;
+    check(bytemuck::bytes_of(&liar), "bytes, got 4294967295");
+    check(&raw_record(2, &vec![0; 100 << 20]), "bytes, got more");
+    check(&sealed(2, b"\xff\xff"), "expected deflate");
+    let twice = [&raw_record(1, b"")[24..], b"more"].concat();
+    check(&sealed(1, &twice), "4 bytes behind it");
+    check(&raw_record(5, b""), "kind: expected 1 to 4, got 5");
+    check(&raw_record(1, b"{\"protocol\":1}"), "JSON: missing field");
+    check(&raw_record(2, &[0; 103]), "expected 104 bytes, got 103");
+    check(&raw_record(3, &[0; 48]), "expected a server before");
+    check(&[raw_record(4, b"{}")].concat(), "JSON: missing field");
+    check_refused(&[&whole[..], b"x"].concat(), "nothing behind the end");
+    let again = [&whole[..], &whole[16..]].concat();
+    check_refused(&again, "nothing behind the end");
+}
+
+#[test]
+fn a_writer_refuses_what_a_reader_would() {
+    let mut writer = Writer::new(Vec::new()).expect("begin");
+    let mut check = |nanos: u64, event: Event, words: &str| {
+        let record = Record {
+            nanos,
+            n_lost: 0,
+            event,
+        };
+        let result = writer.write(&record);
+        match words {
+            "" => result.expect("written"),
+            words => {
+                let said = result.expect_err("refused").to_string();
+                assert!(said.contains(words), "{said:?} does not say {words:?}");
+            }
+        }
+    };
+    check(1, frame(0, (2, 3), vec![0; 6]), "expected a server before");
+    check(1, server(0, 3, 1), "got 0 x 3");
+    check(1, server(2, 3, 5000), "at most 4096, got 5000");
+    check(1, server(2, 3, 4), "");
+    check(0, server(2, 3, 4), "time: expected at least 1 ns, got 0");
+    check(
+        2,
+        frame(0, (3, 2), vec![0; 6]),
+        "grid: expected 2 x 3, got 3 x 2",
+    );
+    check(
+        2,
+        frame(0, (2, 3), vec![0; 7]),
+        "expected 0 or 4 moves, got 1",
+    );
+    let Event::Truth(mut sample) = truth(0, (2, 3), vec![0; 6]) else {
+        unreachable!("truth() makes a truth")
+    };
+    sample.payload.pop();
+    check(2, Event::Truth(sample.clone()), "expected 6, got 5");
+    sample.payload.push(0);
+    sample.header.world = 3;
+    check(2, Event::Truth(sample.clone()), "below 3, got 3");
+    sample.header.world = 2;
+    sample.header.version = 9;
+    check(2, Event::Truth(sample), "version: expected 1, got 9");
+    check(2, frame(0, (2, 3), vec![0; 10]), "");
+}
+
+#[test]
+fn a_reader_goes_back_to_a_position() {
+    let bytes = written(&example());
+    let mut reader = Reader::new(Cursor::new(bytes)).expect("begin");
+    let mut positions = vec![reader.position()];
+    while let Some(record) = reader.next() {
+        record.expect("whole");
+        positions.push(reader.position());
+    }
+    for (skipped, position) in positions.iter().enumerate().take(7).rev() {
+        reader.go_to(position).expect("seek");
+        let rest: Result<Vec<Record>, _> = reader.by_ref().collect();
+        assert_eq!(rest.expect("whole"), example()[skipped..]);
+    }
+}
+
+#[test]
+fn every_kind_has_its_number() {
+    let kinds = [Kind::Server, Kind::Frame, Kind::Truth, Kind::End];
+    assert_eq!(kinds.map(|kind| kind as u32), [1, 2, 3, 4]);
+}
+
+/// Records of a random grid, each a frame or hidden states of any bytes.
+fn records() -> impl Strategy<Value = Vec<Record>> {
+    let sample = (any::<bool>(), any::<u32>(), 0..1u64 << 50, any::<bool>());
+    (1usize..20, 1usize..20, 0usize..9, vec(sample, 0..9)).prop_flat_map(
+        |(height, width, n_moves, samples)| {
+            let grid = (height, width);
+            let first = Record {
+                nanos: 0,
+                n_lost: 0,
+                event: server(height, width, n_moves),
+            };
+            let mut nanos = 0;
+            let made = samples.into_iter().enumerate().map(
+                move |(sequence, (is_frame, n_lost, wait, has_path))| {
+                    nanos += wait;
+                    let path = if is_frame && has_path { n_moves } else { 0 };
+                    let length = height * width + path;
+                    (
+                        Just((sequence as u64, nanos, n_lost, is_frame)),
+                        vec(any::<u8>(), length),
+                    )
+                },
+            );
+            made.collect::<Vec<_>>().prop_map(move |made| {
+                let rest = made
+                    .into_iter()
+                    .map(|((sequence, nanos, n_lost, is_frame), bytes)| {
+                        let event = if is_frame {
+                            frame(sequence, grid, bytes)
+                        } else {
+                            truth(sequence, grid, bytes)
+                        };
+                        Record {
+                            nanos,
+                            n_lost,
+                            event,
+                        }
+                    });
+                std::iter::once(first.clone()).chain(rest).collect()
+            })
+        },
+    )
+}
+
+proptest! {
+    #[test]
+    fn any_records_come_back(records in records()) {
+        let (read, error) = read(&written(&records));
+        prop_assert!(error.is_none(), "{error:?}");
+        prop_assert_eq!(read, records);
+    }
+
+    #[test]
+    fn random_bytes_are_refused(bytes in vec(any::<u8>(), 0..300), has_header in any::<bool>()) {
+        let header = &written(&[])[..16];
+        let bytes = if has_header { [header, &bytes].concat() } else { bytes };
+        prop_assert!(read(&bytes).1.is_some());
+    }
+
+    #[test]
+    fn random_bodies_are_refused(kind in 0u32..6, body in vec(any::<u8>(), 0..300), packed: bool) {
+        let record = if packed { raw_record(kind, &body) } else { sealed(kind, &body) };
+        prop_assert!(read(&[&written(&[])[..16], &record].concat()).1.is_some());
+    }
+}

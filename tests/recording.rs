@@ -1,0 +1,342 @@
+//! Recorders: what they keep, and what they and their files say when something is missing.
+
+use crate::commands::{SERVER, check_table};
+use crate::harness::{
+    Ended, PATIENCE, Paths, Program, SMALL, Server, eventually, fly, new_instance,
+};
+use protocol::channels::Instance;
+use protocol::control::{CoverageRule, ServerInfo};
+use protocol::message::{FrameHeader, Header, TruthHeader};
+use protocol::observer::{Observer, Sample};
+use protocol::recording::{Event, Reader, Record, RecordingError, Writer};
+use rustix::process::Signal;
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use tempfile::TempDir;
+
+/// A folder of a test's own, and a file in it that is not there yet.
+pub fn new_file() -> (TempDir, PathBuf) {
+    let folder = TempDir::new().expect("a folder");
+    let file = folder.path().join("test.recording");
+    (folder, file)
+}
+
+pub fn text(path: &Path) -> &str {
+    path.to_str().expect("a plain path")
+}
+
+/// Starts a recorder and waits until it observes.
+pub fn start_recorder(instance: &Instance, file: &Path, flags: &[&str]) -> Program {
+    let own = ["record", "--instance", instance.name(), "--out", text(file)];
+    let recorder = Program::start(SERVER, &[&own, flags].concat());
+    recorder.wait_for_words("recording", PATIENCE);
+    recorder
+}
+
+pub fn start_replay(instance: &Instance, file: &Path, flags: &[&str]) -> Program {
+    let own = ["replay", text(file), "--instance", instance.name()];
+    Program::start(SERVER, &[&own, flags].concat())
+}
+
+pub fn stop(recorder: Program) -> Ended {
+    recorder.signal(Signal::TERM);
+    let ended = recorder.wait(PATIENCE);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert!(ended.stderr.contains("recorded"), "{}", ended.stderr);
+    ended
+}
+
+/// The whole records of a file, and the error that ends them, if any.
+pub fn read(file: &Path) -> (Vec<Record>, Option<RecordingError>) {
+    let mut reader = Reader::new(File::open(file).expect("the file")).expect("a recording");
+    let mut error = None;
+    let whole = reader.by_ref().map_while(|record| match record {
+        Ok(record) => Some(record),
+        Err(problem) => {
+            error = Some(problem);
+            None
+        }
+    });
+    (whole.collect(), error)
+}
+
+pub fn read_whole(file: &Path) -> Vec<Record> {
+    let (records, error) = read(file);
+    assert!(error.is_none(), "{error:?}");
+    records
+}
+
+pub fn frames(records: &[Record]) -> Vec<Sample<FrameHeader>> {
+    let frame = |record: &Record| match &record.event {
+        Event::Frame(sample) => Some(sample.clone()),
+        _ => None,
+    };
+    records.iter().filter_map(frame).collect()
+}
+
+pub fn truths(records: &[Record]) -> Vec<Sample<TruthHeader>> {
+    let truth = |record: &Record| match &record.event {
+        Event::Truth(sample) => Some(sample.clone()),
+        _ => None,
+    };
+    records.iter().filter_map(truth).collect()
+}
+
+/// Waits until a file holds the frame of a step of world 0.
+fn wait_for_step(file: &Path, step: u64) {
+    let is_there = || {
+        let frames = frames(&read(file).0);
+        frames.iter().any(|frame| frame.header.result.step == step)
+    };
+    assert!(eventually(PATIENCE, is_there), "no step {step} in the file");
+}
+
+/// Reads so many samples.
+pub fn take<H: Header>(observer: &Observer<H>, n_samples: usize) -> Vec<Sample<H>> {
+    let next = |index| {
+        let sample = observer.receive(PATIENCE).expect("receive");
+        sample.unwrap_or_else(|| panic!("sample {index} of {n_samples} did not come"))
+    };
+    (0..n_samples).map(next).collect()
+}
+
+/// A recording of frames of 2 x 3 cells, so many milliseconds apart.
+pub fn write_recording(file: &Path, n_frames: u64, millis_apart: u64) -> Vec<Sample<FrameHeader>> {
+    let mut writer = Writer::new(File::create(file).expect("create")).expect("begin");
+    let info = ServerInfo {
+        protocol: 1,
+        build: "0.1.0".into(),
+        pid: 1,
+        height: 2,
+        width: 3,
+        n_moves: 1,
+        n_worlds: 1,
+        n_observations: 3,
+        observations: vec!["normal".into(), "latent".into(), "fire".into()],
+        model: None,
+        burn_in: 0,
+        max_steps: 0,
+        max_clients: 16,
+        coverage: CoverageRule::Path,
+        publish_truth: false,
+        lease_millis: 30_000,
+    };
+    let mut write = |nanos: u64, event: Event| {
+        let record = Record {
+            nanos,
+            n_lost: 0,
+            event,
+        };
+        writer.write(&record).expect("write");
+    };
+    write(0, Event::Server(Box::new(info)));
+    let mut samples = Vec::new();
+    for sequence in 0..n_frames {
+        let mut header = FrameHeader {
+            version: 1,
+            sequence,
+            height: 2,
+            width: 3,
+            n_moves: 1,
+            ..FrameHeader::default()
+        };
+        header.result.step = sequence;
+        let payload = vec![255, 0, 255, 255, 1, 255, 3];
+        let sample = Sample { header, payload };
+        write(
+            sequence * millis_apart * 1_000_000,
+            Event::Frame(sample.clone()),
+        );
+        samples.push(sample);
+    }
+    writer.finish().expect("finish");
+    samples
+}
+
+#[test]
+fn a_killed_recorder_leaves_whole_records_and_readers_say_where_they_end() {
+    let server = Server::start(SMALL);
+    let (_folder, file) = new_file();
+    let recorder = start_recorder(&server.instance, &file, &[]);
+    let mut client = server.acquire(0..1);
+    let mut paths = Paths::new(0);
+    for _ in 0..30 {
+        fly(&mut client, paths.next(6));
+    }
+    // Written within a second or so, though nobody asks for it.
+    wait_for_step(&file, 30);
+    recorder.signal(Signal::KILL);
+    assert_eq!(recorder.wait(PATIENCE).code, None);
+    let (records, error) = read(&file);
+    let length = file.metadata().expect("the file").len();
+    match error {
+        Some(RecordingError::Cut { offset, got }) => assert_eq!(offset + got, length),
+        other => panic!("expected a cut, got {other:?}"),
+    }
+    let instance = new_instance();
+    let observer = Observer::frames(&instance).expect("observe");
+    let replay = start_replay(&instance, &file, &["--speed", "max"]);
+    let recorded = frames(&records);
+    assert_eq!(take(&observer, recorded.len()), recorded);
+    let ended = replay.wait(PATIENCE);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert!(ended.stderr.contains("cut short"), "{}", ended.stderr);
+}
+
+#[test]
+fn a_recorder_comes_before_the_server_and_stays_for_the_next() {
+    let instance = new_instance();
+    let (_folder, file) = new_file();
+    let recorder = start_recorder(&instance, &file, &["--truth"]);
+    recorder.wait_for_words("no server yet", PATIENCE);
+    for (seed, flags) in [
+        (11, SMALL),
+        (12, "--height 3 --width 4 --moves 2 --burn-in 20"),
+    ] {
+        let server = Server::start_on(&instance, &format!("{flags} --seed {seed} --publish-truth"));
+        let n_moves = server.info().n_moves;
+        let mut client = server.acquire(0..1);
+        for step in 1..=3 {
+            fly(&mut client, Paths::new(step).next(n_moves));
+        }
+        let is_there = || {
+            let frames = frames(&read(&file).0);
+            let mut results = frames.iter().map(|frame| frame.header.result);
+            results.any(|result| (result.seed, result.step) == (seed, 3))
+        };
+        assert!(eventually(PATIENCE, is_there), "{}", recorder.stderr());
+        server.kill();
+    }
+    let ended = stop(recorder);
+    assert!(ended.stderr.contains("servers=2"), "{}", ended.stderr);
+    let mut seed = 10;
+    let mut heights = Vec::new();
+    for record in read_whole(&file) {
+        match record.event {
+            Event::Server(info) => {
+                seed += 1;
+                heights.push(info.height);
+            }
+            Event::Frame(sample) => assert_eq!(sample.header.result.seed, seed),
+            Event::Truth(sample) => assert_eq!(sample.header.seed, seed),
+        }
+    }
+    assert_eq!(heights, [5, 3]);
+}
+
+#[test]
+fn what_a_recorder_misses_is_said_by_it_and_by_the_file() {
+    let server = Server::start(SMALL);
+    let (_folder, file) = new_file();
+    let recorder = start_recorder(&server.instance, &file, &[]);
+    let mut client = server.acquire(0..1);
+    let mut paths = Paths::new(0);
+    fly(&mut client, paths.next(6));
+    wait_for_step(&file, 1);
+    recorder.signal(Signal::STOP);
+    let mut last = 1;
+    // Stopping takes a moment: what was read before is not lost.
+    for _ in 0..400 {
+        last = fly(&mut client, paths.next(6)).result.step;
+    }
+    recorder.signal(Signal::CONT);
+    wait_for_step(&file, last);
+    let ended = stop(recorder);
+    assert!(
+        ended.stderr.contains("samples were lost"),
+        "{}",
+        ended.stderr
+    );
+    let records = read_whole(&file);
+    let recorded = frames(&records);
+    let gaps = recorded.windows(2).map(|pair| {
+        let [before, after] = [0, 1].map(|index| pair[index].header.sequence);
+        after - before - 1
+    });
+    let n_lost: u64 = gaps.sum();
+    assert!(n_lost > 0);
+    let said: u64 = records.iter().map(|record| u64::from(record.n_lost)).sum();
+    assert_eq!(said, n_lost);
+}
+
+#[test]
+fn a_recorder_ends_after_its_steps_with_its_worlds_alone() {
+    let server = Server::start(&format!("{SMALL} --worlds 3 --publish-truth"));
+    let (_folder, file) = new_file();
+    std::fs::write(&file, "something else").expect("write");
+    let flags = ["--steps", "4", "--worlds", "0,2", "--truth", "--force"];
+    let recorder = start_recorder(&server.instance, &file, &flags);
+    let mut client = server.acquire(0..3);
+    for step in 0..2 {
+        let worlds = client.worlds();
+        let paths = Paths::new(step).take(6, 3);
+        client.step(worlds, &paths).expect("step");
+    }
+    let ended = recorder.wait(PATIENCE);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert!(ended.stderr.contains("steps=4"), "{}", ended.stderr);
+    let records = read_whole(&file);
+    assert!(records.iter().all(|record| record.n_lost == 0));
+    assert!(frames(&records).iter().all(|frame| frame.header.world != 1));
+    for world in [0, 2] {
+        let is_last =
+            |truth: &Sample<TruthHeader>| (truth.header.world, truth.header.step) == (world, 2);
+        assert!(truths(&records).iter().any(is_last), "world {world}");
+    }
+}
+
+#[test]
+fn wrong_input_is_named() {
+    let (folder, good) = new_file();
+    write_recording(&good, 2, 0);
+    let bytes = std::fs::read(&good).expect("read");
+    let write = |name: &str, bytes: &[u8]| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, bytes).expect("write");
+        path
+    };
+    let mut damaged = bytes.clone();
+    damaged[60] ^= 4;
+    let damaged = write("damaged", &damaged);
+    let mut newer = bytes.clone();
+    newer[8] = 2;
+    let newer = write("newer", &newer);
+    let foreign = write("foreign", b"a text that is no recording");
+    let start = write("start", &bytes[..16]);
+    let table = r#"
+record => --out
+record --out / => --out / | --force
+record --out /no/such => --out /no/such: No such file
+record --out GOOD => --out | expected a new file | --force
+record --instance a/b --out o => instance name | "a/b"
+record --worlds x --out o => --worlds | 'x'
+record --steps -1 --out o => -1
+replay => FILE
+replay no/such => recording no/such: No such file
+replay / => recording /: Is a directory
+replay FOREIGN => not a recording | got "a text t"
+replay NEWER => recording version: expected 1, got 2
+replay DAMAGED => damaged at byte 16: checksum: expected
+replay START => expected samples from 0ns on, got none
+replay GOOD --from 9 => expected samples from 9s on, got none
+replay GOOD --from -1 => -1
+replay GOOD --from x => --from | expected seconds
+replay GOOD --instance a/b => instance name | "a/b"
+replay GOOD --speed 0 => --speed | above 0, or max
+replay GOOD --speed=-1 => --speed | above 0, or max
+replay GOOD --speed nan => --speed | above 0, or max
+replay GOOD --speed fast => --speed | above 0, or max
+"#;
+    let files = [
+        ("GOOD", &good),
+        ("FOREIGN", &foreign),
+        ("NEWER", &newer),
+        ("DAMAGED", &damaged),
+        ("START", &start),
+    ];
+    let table = files.iter().fold(table.to_owned(), |table, (name, path)| {
+        table.replace(name, text(path))
+    });
+    check_table(SERVER, &table);
+    assert_eq!(std::fs::read(&good).expect("read"), bytes, "left as it was");
+}
