@@ -311,7 +311,7 @@ type Contents = (Settings, Vec<(u64, u64, Option<Read>)>);
 fn decode_body(body: &[u8]) -> Result<(Contents, usize), DecodeError> {
     match body.len() {
         0..0x1_0000 => bincode::decode_from_slice(body, FORM.with_limit::<0x10_0000>()),
-        0..0x100_0000 => bincode::decode_from_slice(body, FORM.with_limit::<0x1000_0000>()),
+        0x1_0000..0x100_0000 => bincode::decode_from_slice(body, FORM.with_limit::<0x1000_0000>()),
         _ => bincode::decode_from_slice(body, FORM.with_limit::<{ 8 * MAX_BYTES as usize }>()),
     }
 }

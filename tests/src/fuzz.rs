@@ -8,6 +8,7 @@ mod files;
 mod messages;
 pub mod mutation;
 mod requests;
+mod worlds;
 
 use std::path::{Path, PathBuf};
 
@@ -38,7 +39,7 @@ pub struct Target {
 pub type Seed = (&'static str, Vec<u8>);
 
 /// All of them.
-pub const TARGETS: [Target; 8] = [
+pub const TARGETS: [Target; 10] = [
     message("step_request", requests::step, requests::step_seeds),
     message(
         "control_request",
@@ -59,6 +60,8 @@ pub const TARGETS: [Target; 8] = [
     message("decision", messages::decision, messages::decision_seeds),
     file("model", files::model, files::model_seeds),
     file("checkpoint", files::checkpoint, files::checkpoint_seeds),
+    file("snapshot", worlds::snapshot, worlds::snapshot_seeds),
+    file("recording", worlds::recording, worlds::recording_seeds),
 ];
 
 type Body = fn(&[u8]) -> bool;

@@ -217,6 +217,16 @@ impl Siege {
                 );
                 !is_refused
             }
+            Outcome::Changed(worlds, reply) => {
+                assert!(worlds.end <= HOME, "a fork into the victim's world");
+                assert_eq!(reply.status(), Status::Ok);
+                true
+            }
+            // No file is written or read: as if the disk had failed.
+            Outcome::File(_, order) => {
+                self.simulator.forget_file(self.now, &order);
+                true
+            }
             Outcome::Shutdown => {
                 assert_eq!(request, Ok(Request::Shutdown {}));
                 true
@@ -339,12 +349,18 @@ pub fn step_seeds() -> Vec<Seed> {
         n_moves: 0,
         ..step_request(0, 0, N_WORLDS)
     };
+    let recall = StepRequest {
+        operation: Operation::Recall as u32,
+        step: 1,
+        ..observe
+    };
     let victims = step_request(11, HOME as u32, 1);
     vec![
         ("one_world", [bytes_of(&one), &[0, 1, 2, 3]].concat()),
         ("three_worlds", [bytes_of(&all), &[3; 3 * N_MOVES]].concat()),
         ("full_frame", [bytes_of(&full), &[1, 1, 3, 3]].concat()),
         ("observe", bytes_of(&observe).to_vec()),
+        ("recall", bytes_of(&recall).to_vec()),
         ("stolen_lease", [bytes_of(&victims), &[0; N_MOVES]].concat()),
     ]
 }
@@ -370,6 +386,20 @@ pub fn control_seeds() -> Vec<Seed> {
             r#"2{"op":"reset","lease":LEASE,"worlds":[{"world":1,"seed":3},{"world":0}]}"#,
         ),
         ("reset_none", r#"4{"op":"reset","lease":LEASE,"worlds":[]}"#),
+        (
+            "snapshot",
+            r#"0{"op":"snapshot","first_world":0,"n_worlds":4,"path":"/a"}"#,
+        ),
+        (
+            "restore",
+            r#"2{"op":"restore","lease":LEASE,"first_world":0,"n_worlds":2,"from":1,"path":"/a"}"#,
+        ),
+        ("fork", r#"2{"op":"fork","lease":LEASE,"from":3,"to":1}"#),
+        (
+            "leave_belief",
+            r#"2{"op":"leave_belief","lease":LEASE,"world":0,"episode":0,"step":0,"kind":"k","offset":0,"length":2,"data":"AAE="}"#,
+        ),
+        ("belief", r#"2{"op":"belief","world":0,"offset":0}"#),
         ("status", r#"p{"op":"status"}"#),
         ("shutdown", r#"0{"op":"shutdown"}"#),
     ];

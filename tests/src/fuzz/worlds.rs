@@ -1,0 +1,146 @@
+//! Files of worlds: snapshots and recordings.
+
+use super::Seed;
+use env_server::config::{Checked, ServerConfig};
+use env_server::episode::{Episode, Rules};
+use env_server::snapshot::{Beginning, RestoredWorld, Settings, WorldToWrite, decode, encode};
+use protocol::control::ServerInfo;
+use protocol::message::{FrameHeader, VERSION};
+use protocol::observer::Sample;
+use protocol::recording::{Event, Reader, Record, Writer};
+use protocol::{Coverage, Move};
+use std::sync::OnceLock;
+
+/// Bytes in front of a snapshot's body.
+const HEADER_BYTES: usize = 24;
+
+struct Place {
+    settings: Settings,
+    rules: Rules,
+}
+
+fn place() -> &'static Place {
+    static PLACE: OnceLock<Place> = OnceLock::new();
+    PLACE.get_or_init(|| {
+        let config = ServerConfig {
+            height: 2,
+            width: 3,
+            moves: 2,
+            burn_in: 5,
+            ..ServerConfig::default()
+        };
+        let checked: Checked = config.check().expect("valid settings");
+        let start = checked.config.start;
+        let rules = Rules::new(&checked.model, checked.shape, 5, 0, start);
+        let mut rules = rules.expect("valid model");
+        (rules.history, rules.n_moves) = (3, 2);
+        let settings = Settings::of(&checked);
+        Place { settings, rules }
+    })
+}
+
+/// A snapshot: refused, or its worlds can be flown in and reset. Its checksum is mended, which keeps damage
+/// out but nobody who means harm.
+pub fn snapshot(bytes: &[u8]) -> bool {
+    let mut bytes = bytes.to_vec();
+    if bytes.len() >= HEADER_BYTES {
+        let (header, body) = bytes.split_at_mut(HEADER_BYTES);
+        header[12..16].copy_from_slice(&crc32fast::hash(body).to_ne_bytes());
+        header[16..24].copy_from_slice(&(body.len() as u64).to_ne_bytes());
+    }
+    let Place { settings, rules } = place();
+    let restored = decode(&bytes).and_then(|snapshot| snapshot.restore(settings, rules));
+    let Ok(worlds) = restored else { return false };
+    for world in worlds {
+        if let RestoredWorld::Ready(mut episode) = world {
+            let again = encode(settings, &[WorldToWrite::Ready(&episode)]).expect("small");
+            assert!(decode(&again).is_ok());
+            if !episode.is_over() {
+                episode.step(rules, &[Move::Left, Move::Down], Coverage::Path);
+            }
+            let step = episode.result().step;
+            assert!(episode.recall(step).is_ok() && episode.recall(step + 1).is_err());
+            episode.reset(rules, 5);
+        }
+    }
+    true
+}
+
+/// A recording: every record is whole, and the reader ends.
+pub fn recording(bytes: &[u8]) -> bool {
+    let Ok(reader) = Reader::new(bytes) else {
+        return false;
+    };
+    let mut n_records = 0;
+    let mut is_whole = true;
+    for record in reader {
+        n_records += 1;
+        is_whole &= record.is_ok();
+        assert!(n_records <= bytes.len(), "more records than bytes");
+    }
+    is_whole
+}
+
+pub fn snapshot_seeds() -> Vec<Seed> {
+    let Place { settings, rules } = place();
+    let mut flown = Episode::new(rules, 3);
+    for coverage in [
+        Coverage::Path,
+        Coverage::Full,
+        Coverage::Path,
+        Coverage::Path,
+    ] {
+        flown.step(rules, &[Move::Right, Move::Down], coverage);
+    }
+    let beginning = WorldToWrite::Beginning(Beginning {
+        seed: 1,
+        episode: 2,
+    });
+    let new = Episode::new(rules, 4);
+    let written = |worlds: &[WorldToWrite<'_>]| encode(settings, worlds).expect("small");
+    vec![
+        ("flown", written(&[WorldToWrite::Ready(&flown)])),
+        (
+            "three",
+            written(&[
+                WorldToWrite::Ready(&new),
+                beginning,
+                WorldToWrite::Ready(&flown),
+            ]),
+        ),
+        ("none", written(&[])),
+    ]
+}
+
+pub fn recording_seeds() -> Vec<Seed> {
+    let text = r#"{"protocol":1,"build":"0.1.0","pid":7,"height":2,"width":3,"n_moves":2,"n_worlds":1,
+        "n_observations":3,"observations":["normal","latent","fire"],"model":null,"burn_in":5,"max_steps":0,
+        "max_clients":16,"coverage":"path","publish_truth":false,"lease_millis":30000}"#;
+    let info: ServerInfo = serde_json::from_str(text).expect("what a server says");
+    let header = FrameHeader {
+        version: VERSION,
+        height: 2,
+        width: 3,
+        n_moves: 2,
+        ..FrameHeader::default()
+    };
+    let payload = vec![255, 0, 255, 255, 1, 255, 3, 1];
+    let events = [
+        Event::Server(Box::new(info)),
+        Event::Frame(Sample { header, payload }),
+    ];
+    let mut bytes = Vec::new();
+    let mut writer = Writer::new(&mut bytes).expect("memory");
+    for (nanos, event) in events.into_iter().enumerate() {
+        let record = Record {
+            nanos: nanos as u64,
+            n_lost: 0,
+            event,
+        };
+        writer.write(&record).expect("a record that may be");
+    }
+    writer.finish().expect("memory");
+    drop(writer);
+    let cut = bytes[..bytes.len() - 5].to_vec();
+    vec![("frame", bytes), ("cut", cut)]
+}
