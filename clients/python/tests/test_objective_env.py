@@ -124,7 +124,7 @@ def test_truth_is_not_waited_for_longer_than_the_timeout(server: Callable[..., S
     _, info = env.reset(seed=1000)
     assert info["truth"].shape == (5, 7)
     with pytest.raises(errors.RequestTimeoutError):
-        env._truths.at([(9, 9)], 0.2)
+        env._truths.at([(9, 9, 9)], 0.2)
     env.close()
 
 

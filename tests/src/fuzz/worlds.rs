@@ -14,6 +14,10 @@ use std::sync::OnceLock;
 /// Bytes in front of a snapshot's body.
 const HEADER_BYTES: usize = 24;
 
+/// Bytes in front of a recording's records, and of each record's body.
+const RECORDING_HEADER: usize = 16;
+const RECORD_HEADER: usize = 24;
+
 struct Place {
     settings: Settings,
     rules: Rules,
@@ -66,9 +70,11 @@ pub fn snapshot(bytes: &[u8]) -> bool {
     true
 }
 
-/// A recording: every record is whole, and the reader ends.
+/// A recording: refused, or read to its end. Its checksums are mended, too.
 pub fn recording(bytes: &[u8]) -> bool {
-    let Ok(reader) = Reader::new(bytes) else {
+    let mut bytes = bytes.to_vec();
+    mend(&mut bytes);
+    let Ok(reader) = Reader::new(&*bytes) else {
         return false;
     };
     let mut n_records = 0;
@@ -79,6 +85,22 @@ pub fn recording(bytes: &[u8]) -> bool {
         assert!(n_records <= bytes.len(), "more records than bytes");
     }
     is_whole
+}
+
+/// Writes the checksum of each record that is whole.
+fn mend(bytes: &mut [u8]) {
+    let mut rest = bytes.get_mut(RECORDING_HEADER..).unwrap_or_default();
+    while let Some((header, behind)) = rest.split_first_chunk_mut::<RECORD_HEADER>() {
+        let length = u32::from_ne_bytes([header[12], header[13], header[14], header[15]]);
+        let Some((body, next)) = behind.split_at_mut_checked(length as usize) else {
+            break;
+        };
+        let mut hasher = crc32fast::Hasher::new();
+        hasher.update(&header[..RECORD_HEADER - 4]);
+        hasher.update(body);
+        header[RECORD_HEADER - 4..].copy_from_slice(&hasher.finalize().to_ne_bytes());
+        rest = next;
+    }
 }
 
 pub fn snapshot_seeds() -> Vec<Seed> {

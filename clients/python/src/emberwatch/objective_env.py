@@ -265,7 +265,7 @@ class WildfireObjectiveEnv(WorldEnv):
 
     def _seen(self, decision: Decision) -> tuple[NDArray[np.float32], dict[str, Any]]:
         info = reported(decision)
-        moment = (decision.episode, decision.step)
+        moment = (decision.seed, decision.episode, decision.step)
         if self._truths is not None:
             timeout = self._session.settings.timeout
             self._truth = truth = self._truths.at([moment], timeout)[0]
@@ -277,14 +277,14 @@ class WildfireObjectiveEnv(WorldEnv):
             self._draw()
         return np.array(decision.summary, np.float32), info
 
-    def _await_frame(self, reader: Observer, moment: tuple[int, int]) -> Frame:
-        """The published frame of a moment: `(episode, step)`."""
+    def _await_frame(self, reader: Observer, moment: tuple[int, int, int]) -> Frame:
+        """The published frame of a moment: `(seed, episode, step)`."""
         deadline = time.perf_counter() + self._session.settings.timeout
         while True:
             frame = reader.receive(max(0.0, deadline - time.perf_counter()))
             if frame is None:
                 raise RequestTimeoutError("no frame was published in time")
-            if (frame.result.episode, frame.result.step) == moment:
+            if (frame.result.seed, frame.result.episode, frame.result.step) == moment:
                 return frame
 
     def _draw(self) -> Any:

@@ -28,16 +28,16 @@ class HiddenStates:
         """
         self._reader = TruthReader(instance)
         self._first = settings.world
-        self._moments: list[tuple[int, int]] = [(-1, -1)] * n_worlds
+        self._moments: list[tuple[int, int, int]] = [(-1, -1, -1)] * n_worlds
         self._states = np.zeros((n_worlds, shape.height, shape.width), np.uint8)
 
     def at(
-        self, moments: Sequence[tuple[int, int]], timeout: float, first: int = 0
+        self, moments: Sequence[tuple[int, int, int]], timeout: float, first: int = 0
     ) -> NDArray[np.uint8]:
         """The states of the worlds from `first` on at these moments, `(n, H, W)`; a copy.
 
         Args:
-            moments: Episode and step of each world.
+            moments: Seed, episode and step of each world.
             timeout: How long to wait for them, seconds.
             first: The first of these worlds, counted from 0.
 
