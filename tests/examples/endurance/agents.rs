@@ -109,7 +109,11 @@ fn collect(instance: &Instance, stop: &AtomicBool) -> Vec<Sample<FrameHeader>> {
     let lost = frames
         .windows(2)
         .filter(|pair| pair[1].header.sequence != pair[0].header.sequence + 1);
-    assert_eq!(lost.count(), 0, "the observer of this check was too slow");
+    assert_eq!(
+        lost.count(),
+        0,
+        "the observer of this check was too slow: give it a core of its own"
+    );
     frames
 }
 
