@@ -199,8 +199,7 @@ fn connections_that_are_left_half_open_take_no_more_than_their_places() {
                     instance: &server.instance,
                 };
                 let step = client(&services.open_step().expect("the service"));
-                let wake = services.wake(Channel::WakeClient).expect("the service");
-                let listener = wake.listener_builder().create().expect("a listener");
+                let listener = services.listener(Channel::WakeClient).expect("a listener");
                 ports.push((step.expect("a place"), listener, node));
             }
             let crowded = Wire::try_open(&server.instance);

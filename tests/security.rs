@@ -5,7 +5,9 @@
 use crate::harness::{SMALL, Server, frames_until};
 use iceoryx2::node::NodeBuilder;
 use iceoryx2::prelude::{Config, FileName, Path as IpcPath, SemanticString};
-use protocol::channels::{ChannelError, SHARED_MEMORY, Services, channel_directory, create_node};
+use protocol::channels::{
+    Channel, ChannelError, Instance, SHARED_MEMORY, Services, channel_directory, create_node,
+};
 use protocol::observer::Observer;
 use rustix::process::{Gid, Uid, getuid};
 use rustix::thread::{set_thread_groups, set_thread_res_gid, set_thread_res_uid};
@@ -14,6 +16,7 @@ use std::io::{ErrorKind, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::channel;
+use std::time::Duration;
 
 /// Users whom nobody is.
 const USERS: [u32; 3] = [64_001, 64_002, 64_003];
@@ -89,6 +92,7 @@ fn another_user_cannot_connect_observe_read_or_remove() {
         channel_directory(),
         format!("emberwatch_{}_", getuid().as_raw()),
     );
+    clean_up(USERS[0]);
     as_user(USERS[0], || {
         let denied = |path: &Path, result: std::io::Result<()>| match result {
             Err(error) if error.kind() == ErrorKind::NotFound => {}
@@ -151,6 +155,7 @@ fn who_takes_our_place_first_gets_in_the_way_and_is_told_of() {
             .to_string();
         assert!(refusal.contains(&*place.to_string_lossy()), "{refusal}");
     };
+    clean_up(user);
     as_user(other, || {
         DirBuilder::new()
             .mode(0o777)
@@ -175,6 +180,7 @@ fn who_takes_our_place_first_gets_in_the_way_and_is_told_of() {
 fn the_first_node_of_a_user_leaves_nothing_open() {
     let user = USERS[2];
     let (tell, told) = channel();
+    clean_up(user);
     as_user(user, || {
         drop(create_node().expect("a node"));
         tell.send(places().1).expect("the test waits");
@@ -183,6 +189,33 @@ fn the_first_node_of_a_user_leaves_nothing_open() {
         assert_eq!(mode(&segment), Some(0o600), "{}", segment.display());
     }
     clean_up(user);
+}
+
+/// iceoryx2 changes it while it binds a listener, and two at once could change it for good.
+#[test]
+fn threads_that_listen_leave_the_umask_as_it_was() {
+    let umask = || {
+        let status = std::fs::read_to_string("/proc/self/status").expect("proc");
+        let line = status.lines().find(|line| line.starts_with("Umask:"));
+        line.expect("a umask").to_owned()
+    };
+    let listen = || {
+        let node = create_node().expect("a node");
+        let services = Services {
+            node: &node,
+            instance: &Instance::new("umask").expect("a name"),
+        };
+        for _ in 0..500 {
+            drop(services.listener(Channel::WakeClient).expect("a listener"));
+        }
+    };
+    std::thread::scope(|scope| (0..4).for_each(|_| drop(scope.spawn(listen))));
+    let listens = |mask: &String| mask.ends_with("0177"); // another test, now or by a lost race
+    let all_listen = (0..5_000).all(|_| {
+        std::thread::sleep(Duration::from_millis(1));
+        listens(&umask())
+    });
+    assert!(!all_listen, "{}", umask());
 }
 
 /// Removes what a user who is nobody left.

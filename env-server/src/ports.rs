@@ -147,16 +147,12 @@ impl Ports {
                 .create()
                 .map_err(ipc_error("publish the truth"))
         });
-        let listener = services
-            .wake(Channel::WakeServer)?
-            .listener_builder()
-            .create();
         Ok(Self {
             step,
             control,
             frames,
             truth: truth.transpose()?,
-            listener: listener.map_err(ipc_error("create a listener"))?,
+            listener: services.listener(Channel::WakeServer)?,
             answers: Answers::new(&services)?,
             control_service,
             step_service,

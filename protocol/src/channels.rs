@@ -7,11 +7,13 @@ use crate::message::{
     ControlReply, ControlRequest, FrameHeader, Header, StepReply, StepRequest, TruthHeader,
 };
 use iceoryx2::node::Node;
+use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::{ServiceName, ipc};
 use iceoryx2::service::builder::request_response as request_response_builder;
 use iceoryx2::service::builder::request_response::RequestResponseOpenError;
 use iceoryx2::service::port_factory::{PortFactory, event, publish_subscribe, request_response};
 use std::fmt::Debug;
+use std::sync::{Mutex, PoisonError};
 use thiserror::Error;
 
 pub use crate::node::{SHARED_MEMORY, channel_directory, create_node, node_config};
@@ -316,6 +318,21 @@ impl Services<'_> {
         builder
             .open_or_create()
             .map_err(ipc_error("open a wake channel"))
+    }
+
+    /// What is woken by a wake service.
+    ///
+    /// # Errors
+    /// [`ChannelError::Ipc`].
+    pub fn listener(&self, channel: Channel) -> Result<Listener<Ipc>, ChannelError> {
+        // iceoryx2 0.10 changes the umask of the process while it binds a listener's socket: of two
+        // threads at once, the second would put back what the first had changed it to, for good.
+        static BINDING: Mutex<()> = Mutex::new(());
+        let wake = self.wake(channel)?;
+        let _alone = BINDING.lock().unwrap_or_else(PoisonError::into_inner);
+        wake.listener_builder()
+            .create()
+            .map_err(ipc_error("create a listener"))
     }
 
     fn create<Q: Header, R: Header>(

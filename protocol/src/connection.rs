@@ -132,11 +132,7 @@ impl Connection {
             .notifier_builder()
             .create()
             .map_err(ipc_error("create a notifier"))?;
-        let listener = services
-            .wake(Channel::WakeClient)?
-            .listener_builder()
-            .create()
-            .map_err(ipc_error("create a listener"))?;
+        let listener = services.listener(Channel::WakeClient)?;
         let control = control_service
             .client_builder()
             .initial_max_slice_len(CONTROL_SLICE);

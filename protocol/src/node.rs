@@ -96,19 +96,25 @@ fn own_segments(folder: &std::path::Path, prefix: &str) -> Result<(), ChannelErr
 fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
     let wrong = |problem: String| wrong(path, problem);
     match DirBuilder::new().mode(0o700).create(path) {
-        Ok(()) => return Ok(()),
-        Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
-        Err(error) => return Err(wrong(error.to_string())),
+        Err(error) if error.kind() != std::io::ErrorKind::AlreadyExists => {
+            return Err(wrong(error.to_string()));
+        }
+        _ => {}
     }
     let bare = path.components().as_path(); // without the trailing slash, so that a link is seen
     let found = std::fs::symlink_metadata(bare).map_err(|error| wrong(error.to_string()))?;
     let mine = found.is_dir() && found.uid() == rustix::process::getuid().as_raw();
-    if mine && found.mode() & 0o022 == 0 {
-        return Ok(());
+    if !mine || found.mode() & 0o022 != 0 {
+        return Err(wrong(
+            "expected a directory that belongs to this user and that others cannot write to".into(),
+        ));
     }
-    Err(wrong(
-        "expected a directory that belongs to this user and that others cannot write to".into(),
-    ))
+    // Whatever umask it was made under.
+    match found.mode() & 0o777 {
+        0o700 => Ok(()),
+        _ => std::fs::set_permissions(path, Permissions::from_mode(0o700))
+            .map_err(|error| wrong(error.to_string())),
+    }
 }
 
 #[cfg(test)]
@@ -142,6 +148,9 @@ mod tests {
         let path = std::env::temp_dir().join(format!("emberwatch-test-{}", std::process::id()));
         own_directory(&path).expect("a new directory");
         own_directory(&path).expect("the same again");
+        std::fs::set_permissions(&path, Permissions::from_mode(0o600)).expect("chmod");
+        own_directory(&path).expect("what a umask took is given back");
+        assert_eq!(path.metadata().expect("there").mode() & 0o777, 0o700);
         std::fs::set_permissions(&path, Permissions::from_mode(0o777)).expect("chmod");
         assert!(own_directory(&path).is_err());
         std::fs::remove_dir(&path).expect("clean up");

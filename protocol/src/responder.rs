@@ -178,12 +178,11 @@ impl Responder {
             },
             None => ipc_error("create a server")(error).into(),
         })?;
-        let wake = services.wake(Channel::WakeAgent(world))?;
-        let listener = wake.listener_builder().create();
+        let listener = services.listener(Channel::WakeAgent(world))?;
         Ok(Self {
             server,
             answers: Answers::new(&services)?,
-            listener: listener.map_err(ipc_error("create a listener"))?,
+            listener,
             _node: node,
         })
     }

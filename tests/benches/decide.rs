@@ -63,11 +63,10 @@ impl Learner {
         let port = service.client_builder().initial_max_slice_len(4096);
         let port = port.allocation_strategy(AllocationStrategy::PowerOfTwo);
         let agent = services.wake(Channel::WakeAgent(0))?;
-        let own = services.wake(Channel::WakeClient)?;
         Ok(Self {
             port: port.create().expect("a client"),
             agent: agent.notifier_builder().create().expect("a notifier"),
-            listener: own.listener_builder().create().expect("a listener"),
+            listener: services.listener(Channel::WakeClient)?,
             waiter: Waiter::default(),
             _node: node,
         })
