@@ -1,0 +1,100 @@
+// What can be pressed: pause, scrub, world, theme, and a recording's player; and the keys for them.
+
+import { write } from "/elements.js";
+import { whole } from "/words.js";
+
+const byId = (id) => document.getElementById(id);
+
+/** Wires the controls to `act`; `picture()` gives the picture that is shown. */
+export function createControls({ view, act }, picture) {
+  const scrub = byId("scrub");
+  const shownSerial = () => picture()?.shown?.serial ?? null;
+  const toggle = () => act.seek(view.at == null ? shownSerial() : null);
+
+  byId("pause").addEventListener("click", toggle);
+  scrub.addEventListener("input", () => act.seek(Number(scrub.value)));
+  byId("world").addEventListener("change", (event) => act.world(Number(event.target.value)));
+  for (const choice of document.querySelectorAll("input[name=theme]")) {
+    choice.addEventListener("change", () => act.theme(choice.value));
+  }
+  byId("play").addEventListener("click", () => act.player({ playing: !picture().player.playing }));
+  byId("speed").addEventListener("change", (event) => act.player({ speed: Number(event.target.value) }));
+  addEventListener("keydown", (event) => pressed(event, { toggle, seek: (key, size) => move(key, size) }));
+
+  function move(key, size) {
+    const { kept } = picture() ?? {};
+    const from = view.at ?? shownSerial();
+    if (!kept || from == null) return;
+    const to = { ArrowLeft: from - size, ArrowRight: from + size, Home: kept.first, End: kept.last }[key];
+    act.seek(Math.min(Math.max(to, kept.first), kept.last));
+  }
+
+  return { draw: (next) => draw(next, view) };
+}
+
+// Keys work wherever the focus is, except where they mean something else.
+function pressed(event, { toggle, seek }) {
+  if (event.ctrlKey || event.altKey || event.metaKey) return;
+  const { target, key } = event;
+  if (target.closest("select, input[type=radio]")) return;
+  if (key === " " && !target.closest("button")) {
+    event.preventDefault();
+    toggle();
+  } else if (["ArrowLeft", "ArrowRight", "Home", "End"].includes(key)) {
+    event.preventDefault();
+    seek(key, event.shiftKey ? 10 : 1);
+  }
+}
+
+function draw(picture, view) {
+  drawPause(picture, view);
+  drawScrub(picture, view);
+  drawWorlds(picture, view);
+  drawPlayer(picture.player);
+  for (const choice of document.querySelectorAll("input[name=theme]")) choice.checked = choice.value === view.theme;
+}
+
+function drawPause(picture, { at }) {
+  const button = byId("pause");
+  const isLive = at == null;
+  button.dataset.live = isLive;
+  const newest = picture.source === "live" ? "Go live" : "Follow";
+  write(button, isLive ? "Pause" : newest);
+}
+
+function drawScrub({ kept, shown }, { at }) {
+  const scrub = byId("scrub");
+  scrub.disabled = !kept;
+  if (!kept) return;
+  scrub.min = kept.first;
+  scrub.max = kept.last;
+  const serial = shown?.serial ?? kept.last;
+  scrub.value = serial;
+  scrub.style.setProperty("--share", kept.last > kept.first ? (serial - kept.first) / (kept.last - kept.first) : 1);
+  scrub.setAttribute("aria-valuetext", `entry ${whole(serial)}, step ${whole(shown?.step)}${at == null ? ", newest" : ""}`);
+  write(byId("serial"), whole(serial));
+  const isGone = at != null && at < kept.first;
+  byId("transport").classList.toggle("has-lost-entry", isGone);
+  write(byId("kept"), isGone
+    ? `oldest kept: entry ${whole(at)} is no longer`
+    : at == null ? `newest of ${whole(kept.last - kept.first + 1)}` : `${whole(kept.last - serial)} behind`);
+}
+
+function drawWorlds({ info, world }, view) {
+  const select = byId("world");
+  const count = Math.max(info?.n_worlds ?? 1, view.world + 1, world + 1);
+  if (select.options.length !== count) {
+    select.replaceChildren(...Array.from({ length: count }, (_, i) => new Option(String(i), String(i))));
+  }
+  select.value = String(view.world);
+}
+
+function drawPlayer(player) {
+  byId("player").hidden = !player;
+  if (!player) return;
+  write(byId("play"), player.playing && !player.ended ? "Hold playback" : "Play");
+  byId("play").disabled = player.ended;
+  const speed = byId("speed");
+  if (document.activeElement !== speed) speed.value = String(player.speed);
+  write(byId("clock"), player.ended ? "ended" : `${player.seconds.toFixed(1)} s`);
+}

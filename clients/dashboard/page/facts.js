@@ -1,0 +1,101 @@
+// What the page says in words: state, note, facts, and what is missing.
+
+import { write } from "/elements.js";
+import { short, stateNames, targetName, text, whole } from "/words.js";
+
+const byId = (id) => document.getElementById(id);
+
+/** Writes a picture's words. */
+export function createFacts() {
+  const announce = byId("announce");
+  let said = "";
+
+  // A change of state is said aloud, once.
+  function say(sentence) {
+    if (sentence === said) return;
+    said = sentence;
+    announce.textContent = sentence;
+  }
+
+  return {
+    draw(picture) {
+      drawState(picture.state, picture.note);
+      drawServer(picture);
+      drawWorld(picture);
+      drawAgent(picture);
+      drawEmpty(picture);
+      say(picture.note ?? `${picture.state}, world ${picture.world}`);
+    },
+    /** The dashboard itself went away: what was drawn last stays. */
+    gone() {
+      drawState("gone", "The dashboard is gone; reconnecting every second.");
+      say("dashboard gone, reconnecting");
+    },
+    failed(error) {
+      drawState("unreadable", `The dashboard sent what this page cannot read: ${error.message}`);
+    },
+  };
+}
+
+function drawState(state, note) {
+  write(byId("state"), state === "gone" ? "dashboard gone, reconnecting" : state);
+  byId("state-pill").dataset.state = state;
+  byId("note").hidden = !note;
+  write(byId("note"), note ?? "");
+}
+
+function drawServer({ status, lost, instance, source }) {
+  const isLive = source === "live";
+  write(byId("source"), isLive ? "instance" : "recording");
+  write(byId("instance"), instance);
+  write(byId("rate"), short(status?.steps_per_second));
+  write(byId("observers"), whole(status?.n_observers));
+  write(byId("lost"), whole(lost?.frames));
+  byId("lost-fact").classList.toggle("is-alarming", lost?.frames > 0);
+}
+
+function drawWorld(picture) {
+  const { shown, status, world } = picture;
+  write(byId("step"), whole(shown?.step));
+  write(byId("reward"), short(shown?.reward));
+  write(byId("hits"), shown ? `${targetName(picture)} in ${whole(shown.n_hits)} of ${whole(shown.n_visited)} cells` : "");
+  write(byId("seed"), text(shown?.seed));
+  write(byId("episode"), ending(shown));
+  write(byId("holder"), holder(status?.worlds?.find((other) => other.world === world)));
+}
+
+function ending(shown) {
+  if (!shown) return text(null);
+  return `${shown.episode}${shown.truncated ? ", truncated" : shown.terminated ? ", ended" : ""}`;
+}
+
+function holder(world) {
+  if (!world) return text(null);
+  return world.resetting ? "burning in" : text(world.holder_pid ?? "nobody");
+}
+
+function drawAgent({ agent }) {
+  write(byId("policy"), text(agent?.policy));
+  write(byId("objective"), text(agent?.objective));
+  write(byId("belief-from"), text(agent?.belief_from));
+  write(byId("plan"), agent?.plan_millis == null ? text(null) : `${short(agent.plan_millis)} ms`);
+}
+
+// Before anything is known there is nothing to lay out: a word on how to begin.
+function drawEmpty(picture) {
+  const { instance, source, info, shown } = picture;
+  const isEmpty = !info || !shown;
+  byId("empty").hidden = !isEmpty;
+  for (const id of ["facts", "stage", "transport"]) byId(id).hidden = isEmpty;
+  if (!isEmpty) return;
+  write(byId("empty-instance"), instance);
+  const isLive = source === "live";
+  byId("empty").classList.toggle("is-recording", !isLive);
+  write(byId("empty-command"), `emberwatch-server --instance ${instance}`);
+}
+
+/** The page's title: what a tab shows. */
+export function titleOf(picture) {
+  if (!picture?.shown) return "Emberwatch";
+  return `k ${whole(picture.shown.step)} · ${picture.info?.model ?? stateNames(picture).join("/")} · Emberwatch`;
+}

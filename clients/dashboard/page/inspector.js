@@ -1,0 +1,98 @@
+// One cell in numbers: the one pointed at, else the one that the robot is on.
+
+import { make, swatch } from "/elements.js";
+import { NEVER, rampColor, stateColor } from "/palette.js";
+import { beliefNames, observationNames, stateNames } from "/words.js";
+
+// Long enough that a screen reader is not flooded while keys are held.
+const QUIET_MILLIS = 400;
+
+/** The inspector's element and its functions. */
+export function createInspector(announcer) {
+  const root = make("section", "inspector");
+  root.setAttribute("aria-label", "one cell in numbers");
+  const title = make("h3");
+  const list = make("dl");
+  root.append(title, list);
+  let timer = 0;
+  let shownKey = "";
+
+  function draw(picture, view, theme) {
+    const at = view.cell ?? robotCell(picture);
+    if (!at) return;
+    const rows = rowsOf(picture, at);
+    const heading = `row ${at.row}, col ${at.col}`;
+    const key = JSON.stringify([heading, rows, Boolean(view.cell), theme]);
+    if (key === shownKey) return;
+    shownKey = key;
+    title.replaceChildren(make("b", "", {}, heading), make("span", "hint", {}, view.cell ? "" : "the robot's cell"));
+    list.replaceChildren(...rows.map((row) => rowElement(row, theme)));
+  }
+
+  /** Says the cell aloud once the keys rest. */
+  function say(picture, cell) {
+    clearTimeout(timer);
+    timer = setTimeout(() => {
+      const facts = rowsOf(picture, cell).map(({ name, value }) => `${name} ${value}`);
+      announcer.textContent = `row ${cell.row}, column ${cell.col}: ${facts.join(", ")}`;
+    }, QUIET_MILLIS);
+  }
+
+  return { root, draw, say };
+}
+
+function robotCell({ shown }) {
+  return shown && { row: shown.robot[0], col: shown.robot[1] };
+}
+
+function rowsOf(picture, { row, col }) {
+  const { info, arrays } = picture;
+  const at = row * info.width + col;
+  const rows = [];
+  if (arrays.truth) rows.push(named("state", arrays.truth[at], stateNames(picture)));
+  if (arrays.seen) rows.push(named("seen", arrays.seen[at], observationNames(picture)));
+  if (arrays.age && arrays.seen?.[at] !== NEVER) rows.push({ name: "age", value: ageText(arrays.age[at]) });
+  const cells = info.height * info.width;
+  beliefNames(picture).forEach((name, state) => {
+    const share = arrays.belief[state * cells + at] / 255;
+    rows.push({ name: `p(${name})`, value: share.toFixed(2), share, ramp: "belief" });
+  });
+  if (arrays.entropy) rows.push(entropyRow(arrays.entropy[at], beliefNames(picture).length));
+  return rows;
+}
+
+function named(name, value, names) {
+  if (value === NEVER) return { name, value: "never" };
+  return { name, value: names[value] ?? `value ${value}`, index: value };
+}
+
+function ageText(age) {
+  if (age === 0) return "this step";
+  return age === 255 ? "255+ steps" : `${age} step${age === 1 ? "" : "s"}`;
+}
+
+function entropyRow(value, states) {
+  const share = value / 255;
+  return { name: "entropy", value: `${(share * Math.log(Math.max(states, 2))).toFixed(2)} nats`, share, ramp: "entropy" };
+}
+
+function rowElement({ name, value, index, share, ramp }, theme) {
+  const row = make("div");
+  const term = make("dt", "", {}, name);
+  const answer = make("dd");
+  if (index !== undefined) answer.append(swatch(stateColor(index)));
+  answer.append(value);
+  row.append(term, answer);
+  if (share !== undefined) row.append(bar(share, ramp, theme));
+  return row;
+}
+
+function bar(share, ramp, theme) {
+  const track = make("i", "bar");
+  const fill = make("i");
+  fill.style.width = `${share * 100}%`;
+  // From a third of the ramp upwards, as its beginning would not be seen on the background.
+  fill.style.background = `rgb(${rampColor(ramp, theme, 0.35 + 0.4 * share).join(" ")})`;
+  track.append(fill);
+  return track;
+}

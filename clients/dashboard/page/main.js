@@ -1,0 +1,88 @@
+// Wires the page: pictures come in, are drawn, and the next is asked for. Reading order: wire.js,
+// socket.js, view.js, then what draws: panels.js, charts.js, facts.js, controls.js.
+
+import { createCharts } from "/charts.js";
+import { createControls } from "/controls.js";
+import { createFacts, titleOf } from "/facts.js";
+import { createInspector } from "/inspector.js";
+import { createLayout } from "/layout.js";
+import { createLegend } from "/legend.js";
+import * as colours from "/palette.js";
+import { createPanels } from "/panels.js";
+import { connect } from "/socket.js";
+import { askOf, createView, themeOf } from "/view.js";
+import { shapeOf } from "/wire.js";
+
+// Descriptions and title change at a pace that can be followed.
+const DESCRIBE_MILLIS = 2000;
+
+const byId = (id) => document.getElementById(id);
+let picture = null;
+let described = 0;
+let isRedrawDue = false;
+
+const { view, act } = createView({ asks: () => link?.hurry(), changed: redraw });
+const inspector = createInspector(byId("announce-cell"));
+const panels = createPanels(byId("panels"), { point, inspector: inspector.root });
+const charts = createCharts(byId("charts"), { hover: act.hover, seek: act.seek });
+const legend = createLegend(byId("legend"), byId("ramps"));
+const facts = createFacts();
+const controls = createControls({ view, act }, () => picture);
+const layout = createLayout(
+  { stage: byId("stage"), field: document.querySelector(".field"), panels: byId("panels") }, panels.places);
+
+// For reading back what is on the screen, and how it was coloured.
+window.emberwatch = { picture: null, drawn: 0, colours };
+
+const link = connect({
+  ask: () => askOf(view, charts.bins()),
+  show,
+  superseded: (next) => next.world !== view.world,
+  up: (isUp) => { if (!isUp) facts.gone(); },
+  failed(error) { facts.failed(error); console.error(error); },
+});
+
+function show(next) {
+  picture = next;
+  // A server that began anew counts from the start again: nothing is left of the entry looked at.
+  if (view.at != null && next.kept && view.at > next.kept.last) view.at = null;
+  draw();
+  window.emberwatch.picture = picture;
+  window.emberwatch.drawn += 1;
+}
+
+function draw() {
+  const theme = themeOf(view);
+  facts.draw(picture);
+  controls.draw(picture);
+  if (!picture.info || !picture.shown) return;
+  const isRebuilt = panels.build(picture);
+  if (legend.draw(picture, theme) || isRebuilt) layout.shape(shapeOf(picture));
+  panels.draw(picture, view, theme);
+  charts.draw(picture, view);
+  inspector.draw(picture, view, theme);
+  describe(isRebuilt);
+}
+
+function describe(isDue) {
+  const now = performance.now();
+  if (!isDue && now - described < DESCRIBE_MILLIS) return;
+  described = now;
+  panels.describe(picture);
+  charts.describe(picture);
+  document.title = titleOf(picture);
+}
+
+// What the visitor points at is drawn at once, at most once a frame, without a new picture.
+function redraw() {
+  if (isRedrawDue || !picture) return;
+  isRedrawDue = true;
+  requestAnimationFrame(() => { isRedrawDue = false; draw(); });
+}
+
+function point(cell, isByKey = false) {
+  act.cell(cell);
+  if (isByKey && picture?.shown) inspector.say(picture, cell);
+}
+
+addEventListener("resize", redraw);

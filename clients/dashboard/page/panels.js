@@ -1,0 +1,141 @@
+// The grids: one canvas with a pixel per cell for each, a second one above it for marks.
+
+import { make } from "/elements.js";
+import { drawMarks } from "/overlay.js";
+import { rampTable, seenTable, valueTable } from "/palette.js";
+import { beliefNames, panelSentence, stateNames } from "/words.js";
+import { shapeOf } from "/wire.js";
+
+const OBSERVED = [
+  { id: "truth", kind: "truth", title: "truth", hint: "hidden from the agent" },
+  { id: "seen", kind: "seen", title: "seen so far", hint: "older is paler" },
+  { id: "frame", kind: "frame", title: "this path", hint: "what the robot saw" },
+];
+const ENTROPY = { id: "entropy", kind: "entropy", title: "entropy", hint: "of the belief" };
+
+/** The panels in `parent`; `point(cell)` is called with the cell that is pointed at, or null. */
+export function createPanels(parent, { point, inspector }) {
+  let built = { key: "", panels: [] };
+
+  /** Builds panels anew when their number, names or shape change. Tells whether it did. */
+  function build(picture) {
+    const beliefs = beliefNames(picture);
+    const key = JSON.stringify([shapeOf(picture), beliefs, stateNames(picture).length]);
+    if (key === built.key) return false;
+    const panels = OBSERVED.map((panel) => element(panel, picture, point));
+    const believed = beliefs.map((name, state) => element(
+      { id: `belief-${state}`, kind: "belief", title: "belief", name, state, hint: `p(${name})` }, picture, point));
+    if (beliefs.length > 0) believed.push(element(ENTROPY, picture, point));
+    const row = believed.map((panel) => panel.figure);
+    parent.replaceChildren(...panels.map((panel) => panel.figure), inspector, ...(row.length ? row : [noBelief()]));
+    built = { key, panels: [...panels, ...believed], columns: Math.max(OBSERVED.length, row.length || 4, 4) };
+    return true;
+  }
+
+  return {
+    build,
+    /** How many places there are, the inspector's included; and how many one row would like to hold. */
+    places: () => ({ count: built.panels.length + (built.panels.length > 3 ? 1 : 2), columns: built.columns }),
+    draw: (picture, view, theme) => built.panels.forEach((panel) => paint(panel, picture, view, theme)),
+    describe: (picture) => built.panels.forEach((panel) => describe(panel, picture)),
+  };
+}
+
+function element(panel, picture, point) {
+  const { height, width } = shapeOf(picture);
+  const figure = make("figure", "panel", { panel: panel.id });
+  const caption = make("figcaption");
+  caption.append(make("b", "", {}, panel.name ? `${panel.title}: ${panel.name}` : panel.title));
+  caption.append(make("span", "hint", {}, panel.name ? "" : panel.hint));
+  const grid = make("div", "grid");
+  grid.tabIndex = 0;
+  grid.setAttribute("role", "group");
+  grid.setAttribute("aria-label", `cells of ${caption.firstChild.textContent}: arrow keys move`);
+  const cells = make("canvas", "cells", { testid: `panel-${panel.id}` });
+  cells.setAttribute("role", "img");
+  cells.width = width;
+  cells.height = height;
+  const marks = make("canvas", "marks", { testid: `overlay-${panel.id}` });
+  marks.setAttribute("aria-hidden", "true");
+  const absent = make("p", "absent");
+  grid.append(cells, marks, absent);
+  figure.append(caption, grid);
+  listen(grid, { height, width }, point);
+  const context = cells.getContext("2d");
+  return { ...panel, figure, cells, marks, absent, context, image: context.createImageData(width, height) };
+}
+
+function paint(panel, picture, view, theme) {
+  const values = valuesOf(panel, picture);
+  panel.absent.textContent = values ? "" : absence(panel, picture);
+  panel.figure.classList.toggle("is-absent", !values);
+  if (values) {
+    const pixels = new Uint32Array(panel.image.data.buffer);
+    fill(pixels, values, panel, picture, theme);
+    panel.context.putImageData(panel.image, 0, 0);
+  }
+  drawMarks(panel.marks, picture, { cell: view.cell, hasPath: panel.kind === "frame" && Boolean(values) });
+}
+
+function fill(pixels, values, { kind }, { arrays }, theme) {
+  if (kind === "seen" && arrays.age) {
+    const table = seenTable(theme);
+    for (let i = 0; i < pixels.length; i += 1) pixels[i] = table[(values[i] << 8) | arrays.age[i]];
+    return;
+  }
+  const isRamp = kind === "belief" || kind === "entropy";
+  const table = isRamp ? rampTable(theme, kind) : valueTable(theme);
+  for (let i = 0; i < pixels.length; i += 1) pixels[i] = table[values[i]];
+}
+
+function valuesOf({ kind, state }, { arrays, info }) {
+  if (kind !== "belief") return arrays[kind];
+  const cells = info.height * info.width;
+  return arrays.belief?.subarray(state * cells, (state + 1) * cells);
+}
+
+function absence({ kind }, picture) {
+  if (kind === "truth" && picture.source === "recording") return "This recording holds no hidden states.";
+  if (kind === "truth" && !picture.info.publish_truth) return "The server does not publish it: --publish-truth";
+  if (kind === "entropy") return "Not known for this entry.";
+  return "Nothing yet on this world.";
+}
+
+function noBelief() {
+  return make("p", "absent no-belief", {}, "No agent publishes its belief on this world.");
+}
+
+function describe(panel, picture) {
+  const sentence = valuesOf(panel, picture) ? panelSentence(panel, picture) : `${panel.title}: not known`;
+  panel.cells.setAttribute("aria-label", sentence);
+}
+
+function listen(grid, shape, point) {
+  const at = (event) => {
+    const box = grid.getBoundingClientRect();
+    point(inside(shape, {
+      row: Math.floor(((event.clientY - box.top) / box.height) * shape.height),
+      col: Math.floor(((event.clientX - box.left) / box.width) * shape.width),
+    }));
+  };
+  let held = { row: shape.height >> 1, col: shape.width >> 1 };
+  const steps = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
+  grid.addEventListener("pointermove", at);
+  grid.addEventListener("pointerdown", at);
+  grid.addEventListener("pointerleave", () => point(null));
+  grid.addEventListener("focus", () => grid.matches(":focus-visible") && point(held, true));
+  grid.addEventListener("blur", () => point(null));
+  grid.addEventListener("keydown", (event) => {
+    const step = steps[event.key];
+    if (!step) return;
+    event.preventDefault();
+    event.stopPropagation();
+    const size = event.shiftKey ? 10 : 1;
+    held = inside(shape, { row: held.row + step[0] * size, col: held.col + step[1] * size });
+    point(held, true);
+  });
+}
+
+function inside({ height, width }, { row, col }) {
+  return { row: Math.min(Math.max(row, 0), height - 1), col: Math.min(Math.max(col, 0), width - 1) };
+}

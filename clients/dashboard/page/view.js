@@ -1,0 +1,71 @@
+// What the visitor wants to see: world, entry, theme, pointed-at cell. The address's hash keeps world
+// and theme, so that a link or a reload brings them back.
+
+const THEMES = ["auto", "light", "dark"];
+const darkness = matchMedia("(prefers-color-scheme: dark)");
+
+/** The view, with `asks()` called when another picture is wanted and `changed()` when only looks change. */
+export function createView({ asks, changed }) {
+  const view = {
+    ...readHash(),
+    /** Serial of the entry to look at; null: the newest. */
+    at: null,
+    /** The cell pointed at, { row, col }; null: none. */
+    cell: null,
+    /** Serial pointed at in a chart; null: none. */
+    hover: null,
+    /** For the next ask only: a recording's speed, and whether it plays. */
+    player: { speed: null, playing: null },
+  };
+
+  const act = {
+    seek(serial) { view.at = serial; view.hover = null; asks(); changed(); },
+    world(world) { if (world !== view.world) { view.world = world; view.at = null; writeHash(view); asks(); } },
+    theme(theme) { view.theme = theme; writeHash(view); applyTheme(view); changed(); },
+    cell(cell) { view.cell = cell; changed(); },
+    hover(serial) { if (serial !== view.hover) { view.hover = serial; changed(); } },
+    player(wish) { Object.assign(view.player, wish); asks(); },
+  };
+
+  darkness.addEventListener("change", changed);
+  addEventListener("hashchange", () => {
+    const { world, theme } = readHash();
+    act.world(world);
+    act.theme(theme);
+  });
+  applyTheme(view);
+  return { view, act };
+}
+
+/** The theme in effect, "light" or "dark". */
+export function themeOf(view) {
+  if (view.theme !== "auto") return view.theme;
+  return darkness.matches ? "dark" : "light";
+}
+
+/** The next ask; wishes about a recording are told once. */
+export function askOf(view, bins) {
+  const { speed, playing } = view.player;
+  view.player = { speed: null, playing: null };
+  return { world: view.world, at: view.at, bins, speed, playing };
+}
+
+function readHash() {
+  const hash = new URLSearchParams(location.hash.slice(1));
+  const world = Number(hash.get("world"));
+  const theme = hash.get("theme");
+  return {
+    world: Number.isInteger(world) && world >= 0 ? world : 0,
+    theme: THEMES.includes(theme) ? theme : "auto",
+  };
+}
+
+function writeHash({ world, theme }) {
+  history.replaceState(null, "", `#world=${world}&theme=${theme}`);
+}
+
+// Style sheets know "auto" as no attribute at all.
+function applyTheme({ theme }) {
+  if (theme === "auto") delete document.documentElement.dataset.theme;
+  else document.documentElement.dataset.theme = theme;
+}
