@@ -78,7 +78,7 @@ function drawAgent({ agent }) {
   write(byId("policy"), text(agent?.policy));
   write(byId("objective"), text(agent?.objective));
   write(byId("belief-from"), text(agent?.belief_from));
-  write(byId("plan"), agent?.plan_millis == null ? text(null) : `${short(agent.plan_millis)} ms`);
+  write(byId("plan"), agent?.plan_millis == null ? text(null) : `${Number(agent.plan_millis.toPrecision(2))} ms`);
 }
 
 // Before anything is known there is nothing to lay out: a word on how to begin.

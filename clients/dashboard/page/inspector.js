@@ -25,7 +25,7 @@ export function createInspector(announcer) {
     const key = JSON.stringify([heading, rows, Boolean(view.cell), theme]);
     if (key === shownKey) return;
     shownKey = key;
-    title.replaceChildren(make("b", "", {}, heading), make("span", "hint", {}, view.cell ? "" : "the robot's cell"));
+    title.replaceChildren(make("b", "", {}, heading), make("span", "hint", {}, view.cell ? "" : "robot"));
     list.replaceChildren(...rows.map((row) => rowElement(row, theme)));
   }
 

@@ -12,7 +12,8 @@ export function drawMarks(canvas, picture, { cell, hasPath }) {
   const drawn = prepare(canvas);
   if (!drawn) return;
   const shape = shapeOf(picture);
-  const frame = { ...drawn, cell: { x: drawn.width / shape.width, y: drawn.height / shape.height } };
+  const ink = getComputedStyle(canvas).getPropertyValue("--ink");
+  const frame = { ...drawn, ink, cell: { x: drawn.width / shape.width, y: drawn.height / shape.height } };
   if (hasPath && picture.shown) {
     drawPath(frame, picture.shown.path);
     drawStart(frame, picture.shown.start);
@@ -26,13 +27,14 @@ function middle({ cell }, [row, col]) {
 }
 
 function drawPath(frame, path) {
-  const { context, ratio, cell } = frame;
+  const { context, ratio, cell, ink } = frame;
   context.beginPath();
   for (const place of path) context.lineTo(...middle(frame, place));
   context.lineJoin = "round";
   context.lineCap = "round";
   context.lineWidth = Math.min(Math.max(cell.x * 0.26, ratio), 3 * ratio);
-  context.strokeStyle = DARK;
+  // Over cells of a pixel or two there is more background than cells around the line.
+  context.strokeStyle = cell.x < 2 * ratio ? ink : DARK;
   context.stroke();
 }
 

@@ -9,12 +9,12 @@ const UNSEEN = { light: "#e2e2e2", dark: "#2b2f36" };
 // Nine stops from 0 to 1, evenly spaced; OKLab lightness changes by the same amount between any two.
 const RAMPS = {
   belief: {
-    light: ["#f9f8e1", "#d0e2b3", "#94cf95", "#58b791", "#0a9c8f", "#037c86", "#005d77", "#004069", "#0d2156"],
-    dark: ["#161d2b", "#123651", "#00536a", "#00717a", "#009185", "#35b085", "#7fc982", "#c0de8b", "#f8f3a3"],
+    light: ["#f9f8e1", "#c6e4be", "#87d0ab", "#4cb6a6", "#039aa0", "#057a91", "#005c80", "#003e6f", "#0d2156"],
+    dark: ["#161d2b", "#1d3450", "#0d4f75", "#046e89", "#038e97", "#23af9b", "#70cb95", "#b8e095", "#f8f3a3"],
   },
   entropy: {
-    light: ["#fff5e8", "#f5d4bc", "#ecaf99", "#dd8c86", "#c66b7e", "#a84f7c", "#813d76", "#5a2d69", "#361e57"],
-    dark: ["#1e1b25", "#3f2946", "#6a345e", "#944467", "#b95c69", "#db7868", "#f39c6d", "#fec488", "#ffedc8"],
+    light: ["#fff5e8", "#fcdbc2", "#fbbda6", "#f3a099", "#e38598", "#cc6f9c", "#a9629c", "#865796", "#644c8a"],
+    dark: ["#1e1b25", "#382340", "#592855", "#79315d", "#97405e", "#b2525b", "#c86958", "#d38762", "#dba475"],
   },
 };
 

@@ -7,9 +7,9 @@ import { beliefNames, panelSentence, stateNames } from "/words.js";
 import { shapeOf } from "/wire.js";
 
 const OBSERVED = [
-  { id: "truth", kind: "truth", title: "truth", hint: "hidden from the agent" },
-  { id: "seen", kind: "seen", title: "seen so far", hint: "older is paler" },
-  { id: "frame", kind: "frame", title: "this path", hint: "what the robot saw" },
+  { id: "truth", kind: "truth", title: "truth", hint: "hidden" },
+  { id: "seen", kind: "seen", title: "seen so far", hint: "older fades" },
+  { id: "frame", kind: "frame", title: "this path", hint: "seen in this step" },
 ];
 const ENTROPY = { id: "entropy", kind: "entropy", title: "entropy", hint: "of the belief" };
 
@@ -28,14 +28,18 @@ export function createPanels(parent, { point, inspector }) {
     if (beliefs.length > 0) believed.push(element(ENTROPY, picture, point));
     const row = believed.map((panel) => panel.figure);
     parent.replaceChildren(...panels.map((panel) => panel.figure), inspector, ...(row.length ? row : [noBelief()]));
-    built = { key, panels: [...panels, ...believed], columns: Math.max(OBSERVED.length, row.length || 4, 4) };
+    built = { key, panels: [...panels, ...believed], states: beliefs.length };
     return true;
   }
 
   return {
     build,
-    /** How many places there are, the inspector's included; and how many one row would like to hold. */
-    places: () => ({ count: built.panels.length + (built.panels.length > 3 ? 1 : 2), columns: built.columns }),
+    /** For the layout: panels, lines of the inspector, columns that hold all beliefs in one row. */
+    places: () => ({
+      panels: built.panels.length,
+      lines: OBSERVED.length + (built.states && built.states + 1),
+      regular: Math.max(built.states + 1, OBSERVED.length + 1),
+    }),
     draw: (picture, view, theme) => built.panels.forEach((panel) => paint(panel, picture, view, theme)),
     describe: (picture) => built.panels.forEach((panel) => describe(panel, picture)),
   };

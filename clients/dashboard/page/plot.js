@@ -24,7 +24,8 @@ export function drawLine(canvas, plot) {
   drawRows(frame, at, y, (value) => tickText(value, step));
   drawColumns(frame, axis);
   const runs = runsOf(values, axis.bridge);
-  drawArea(frame, runs, values, y);
+  // An area stands for an amount, so only where the axis begins at zero.
+  if (at[0] === 0) drawArea(frame, runs, values, y);
   drawRuns(frame, runs, values, y);
   drawCursor(frame, axis, plot.cursor, values, y);
 }
