@@ -17,7 +17,10 @@ export function createControls({ view, act }, picture) {
   for (const choice of document.querySelectorAll("input[name=theme]")) {
     choice.addEventListener("change", () => act.theme(choice.value));
   }
-  byId("play").addEventListener("click", () => act.player({ playing: !picture().player.playing }));
+  byId("play").addEventListener("click", () => {
+    const { playing, ended } = picture().player;
+    act.player({ playing: ended || !playing });
+  });
   byId("speed").addEventListener("change", (event) => act.player({ speed: Number(event.target.value) }));
   addEventListener("keydown", (event) => pressed(event, { toggle, seek: (key, size) => move(key, size) }));
 
@@ -92,8 +95,7 @@ function drawWorlds({ info, world }, view) {
 function drawPlayer(player) {
   byId("player").hidden = !player;
   if (!player) return;
-  write(byId("play"), player.playing && !player.ended ? "Hold playback" : "Play");
-  byId("play").disabled = player.ended;
+  write(byId("play"), player.ended ? "Play again" : player.playing ? "Hold playback" : "Play on");
   const speed = byId("speed");
   if (document.activeElement !== speed) speed.value = String(player.speed);
   write(byId("clock"), player.ended ? "ended" : `${player.seconds.toFixed(1)} s`);

@@ -18,11 +18,11 @@ export function createFacts() {
   }
 
   return {
-    draw(picture) {
+    draw(picture, view) {
       drawState(picture.state, picture.note);
       drawServer(picture);
       drawWorld(picture);
-      drawAgent(picture);
+      drawAgent(picture, view.at == null);
       drawEmpty(picture);
       say(picture.note ?? `${picture.state}, world ${picture.world}`);
     },
@@ -74,8 +74,10 @@ function holder(world) {
   return world.resetting ? "burning in" : text(world.holder_pid ?? "nobody");
 }
 
-function drawAgent({ agent }) {
+function drawAgent({ agent, source }, isNewest) {
+  const isSilent = isNewest && source === "live" && agent?.is_live === false;
   write(byId("policy"), text(agent?.policy));
+  write(byId("silent"), isSilent ? "silent" : "");
   write(byId("objective"), text(agent?.objective));
   write(byId("belief-from"), text(agent?.belief_from));
   write(byId("plan"), agent?.plan_millis == null ? text(null) : `${Number(agent.plan_millis.toPrecision(2))} ms`);
@@ -83,14 +85,16 @@ function drawAgent({ agent }) {
 
 // Before anything is known there is nothing to lay out: a word on how to begin.
 function drawEmpty(picture) {
-  const { instance, source, info, shown } = picture;
+  const { instance, source, info, shown, world } = picture;
   const isEmpty = !info || !shown;
   byId("empty").hidden = !isEmpty;
   for (const id of ["facts", "stage", "transport"]) byId(id).hidden = isEmpty;
+  byId("server").hidden = !info;
   if (!isEmpty) return;
-  write(byId("empty-instance"), instance);
-  const isLive = source === "live";
-  byId("empty").classList.toggle("is-recording", !isLive);
+  const isAwaited = !info && source === "live";
+  write(byId("empty-lead"), isAwaited ? "Waiting for a server on instance" : "Waiting for the first step of");
+  write(byId("empty-of"), isAwaited || !info ? instance : `world ${world}`);
+  byId("empty-start").hidden = !isAwaited;
   write(byId("empty-command"), `emberwatch-server --instance ${instance}`);
 }
 

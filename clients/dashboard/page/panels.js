@@ -2,7 +2,6 @@
 
 import { make } from "/elements.js";
 import { drawMarks } from "/overlay.js";
-import { rampTable, seenTable, valueTable } from "/palette.js";
 import { beliefNames, panelSentence, stateNames } from "/words.js";
 import { shapeOf } from "/wire.js";
 
@@ -40,7 +39,7 @@ export function createPanels(parent, { point, inspector }) {
       lines: OBSERVED.length + (built.states && built.states + 1),
       regular: Math.max(built.states + 1, OBSERVED.length + 1),
     }),
-    draw: (picture, view, theme) => built.panels.forEach((panel) => paint(panel, picture, view, theme)),
+    draw: (picture, view, palette) => built.panels.forEach((panel) => paint(panel, picture, view, palette)),
     describe: (picture) => built.panels.forEach((panel) => describe(panel, picture)),
   };
 }
@@ -69,27 +68,35 @@ function element(panel, picture, point) {
   return { ...panel, figure, cells, marks, absent, context, image: context.createImageData(width, height) };
 }
 
-function paint(panel, picture, view, theme) {
+function paint(panel, picture, view, palette) {
   const values = valuesOf(panel, picture);
-  panel.absent.textContent = values ? "" : absence(panel, picture);
+  const [reason, flag] = values ? [""] : absence(panel, picture);
+  if (panel.absent.dataset.reason !== reason) {
+    panel.absent.dataset.reason = reason;
+    panel.absent.replaceChildren(reason, ...(flag ? [make("code", "", {}, flag)] : []));
+  }
   panel.figure.classList.toggle("is-absent", !values);
   if (values) {
     const pixels = new Uint32Array(panel.image.data.buffer);
-    fill(pixels, values, panel, picture, theme);
+    fill(pixels, values, panel, picture, palette);
     panel.context.putImageData(panel.image, 0, 0);
   }
   drawMarks(panel.marks, picture, { cell: view.cell, hasPath: panel.kind === "frame" && Boolean(values) });
 }
 
-function fill(pixels, values, { kind }, { arrays }, theme) {
+function fill(pixels, values, { kind }, { arrays }, palette) {
   if (kind === "seen" && arrays.age) {
-    const table = seenTable(theme);
+    const table = palette.seenTable;
     for (let i = 0; i < pixels.length; i += 1) pixels[i] = table[(values[i] << 8) | arrays.age[i]];
     return;
   }
-  const isRamp = kind === "belief" || kind === "entropy";
-  const table = isRamp ? rampTable(theme, kind) : valueTable(theme);
+  const table = tableOf(kind, palette);
   for (let i = 0; i < pixels.length; i += 1) pixels[i] = table[values[i]];
+}
+
+function tableOf(kind, palette) {
+  if (kind === "belief" || kind === "entropy") return palette.rampTable(kind);
+  return kind === "truth" ? palette.stateTable : palette.frameTable;
 }
 
 function valuesOf({ kind, state }, { arrays, info }) {
@@ -99,10 +106,10 @@ function valuesOf({ kind, state }, { arrays, info }) {
 }
 
 function absence({ kind }, picture) {
-  if (kind === "truth" && picture.source === "recording") return "This recording holds no hidden states.";
-  if (kind === "truth" && !picture.info.publish_truth) return "The server does not publish it: --publish-truth";
-  if (kind === "entropy") return "Not known for this entry.";
-  return "Nothing yet on this world.";
+  if (kind === "truth" && picture.source === "recording") return ["This recording holds no hidden states."];
+  if (kind === "truth" && !picture.info.publish_truth) return ["The server keeps it to itself. To see it, start the server with ", "--publish-truth"];
+  if (kind === "entropy") return ["Not known for this entry."];
+  return ["Not known for this entry."];
 }
 
 function noBelief() {

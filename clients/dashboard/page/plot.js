@@ -23,10 +23,11 @@ export function drawLine(canvas, plot) {
   const y = vertical(frame, at[0], at.at(-1));
   drawRows(frame, at, y, (value) => tickText(value, step));
   drawColumns(frame, axis);
-  const runs = runsOf(values, axis.bridge);
+  const runs = runsOf(values, axis.bridge).map((run) =>
+    run.map((bin) => [x(frame, axis.binShare(bin)), y(values[bin])]));
   // An area stands for an amount, so only where the axis begins at zero.
-  if (at[0] === 0) drawArea(frame, runs, values, y);
-  drawRuns(frame, runs, values, y);
+  if (at[0] === 0) drawArea(frame, runs);
+  drawRuns(frame, runs);
   drawCursor(frame, axis, plot.cursor, values, y);
 }
 
@@ -136,33 +137,32 @@ function blocksOf(values, bridge) {
   return blocks;
 }
 
-function trace(frame, run, values, y) {
-  const { context } = frame;
+function trace({ context }, run) {
   context.beginPath();
-  for (const i of run) context.lineTo(x(frame, (i + 0.5) / values.length), y(values[i]));
+  for (const point of run) context.lineTo(...point);
 }
 
-function drawArea(frame, runs, values, y) {
+function drawArea(frame, runs) {
   const { context, height, em, color } = frame;
   context.fillStyle = color("--line-soft");
   for (const run of runs) {
-    trace(frame, run, values, y);
-    context.lineTo(x(frame, (run.at(-1) + 0.5) / values.length), height - MARGIN * em);
-    context.lineTo(x(frame, (run[0] + 0.5) / values.length), height - MARGIN * em);
+    trace(frame, run);
+    context.lineTo(run.at(-1)[0], height - MARGIN * em);
+    context.lineTo(run[0][0], height - MARGIN * em);
     context.fill();
   }
 }
 
-function drawRuns(frame, runs, values, y) {
+function drawRuns(frame, runs) {
   const { context, color } = frame;
   context.strokeStyle = color("--line");
   context.fillStyle = color("--line");
   context.lineWidth = 1.6;
   context.lineJoin = "round";
   for (const run of runs) {
-    trace(frame, run, values, y);
+    trace(frame, run);
     if (run.length > 1) context.stroke();
-    else context.fillRect(x(frame, (run[0] + 0.5) / values.length) - 1, y(values[run[0]]) - 1, 2, 2);
+    else context.fillRect(run[0][0] - 1.5, run[0][1] - 1.5, 3, 3);
   }
 }
 
