@@ -9,7 +9,7 @@ use crate::learned::{Learned, LearnedNetwork};
 use crate::learner::LearnedModel;
 use crate::network::{self as networks, Autoencoder};
 use crate::planner::{CellValues, Objective, Plan, Planner, PlanningProblem, Target};
-use crate::policy::{EstimatorKind, Policy};
+use crate::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::student::decisions::Decisions;
 use protocol::model::ModelError;
 use protocol::{Cell, Frame, Grid, Model, Probabilities, Shape, Transition};
@@ -27,8 +27,19 @@ pub struct Agent {
     decider: Option<Decider>,
     /// The state that pays most, where that is learned.
     target: Option<usize>,
+    /// What the last path was for.
+    aim: Aim,
+    /// Names of the belief's states.
+    state_names: Vec<String>,
     n_moves: usize,
     seed: u64,
+}
+
+/// What a path was for.
+enum Aim {
+    Nothing,
+    Objective(Target),
+    Action(String),
 }
 
 /// Chooses what a path is for (paper eq. 17): what the DQN values most.
@@ -150,6 +161,7 @@ impl Agent {
             EstimatorKind::NextTruth => Estimator::NextTruth(prior),
         };
         let belief_kind = belief_kind(&estimator, &task);
+        let n_states = estimator.belief().n_states();
         let target = task.learned.target(policy.estimator);
         let mut objective = config.objective(policy);
         if let (Target::State(state), Some(target)) = (&mut objective.target, target) {
@@ -167,6 +179,8 @@ impl Agent {
             planner: config.planner(policy),
             decider,
             target,
+            aim: Aim::Nothing,
+            state_names: state_names(policy.estimator, task.model, n_states),
             n_moves: task.n_moves,
             seed: task.seed,
         })
@@ -202,12 +216,14 @@ impl Agent {
 
     /// As [`Self::plan`], for an action other than the policy's.
     pub fn plan_action(&mut self, action: &Action, robot: Cell, step: u64) -> Plan {
+        self.aim = Aim::Action(action.name.clone());
         let (belief, random) = (self.estimator.belief(), (self.seed, step));
         action.plan(&mut *self.planner, belief, robot, self.n_moves, random)
     }
 
     /// As [`Self::plan`], for an objective other than the policy's.
     pub fn plan_for(&mut self, objective: Objective, robot: Cell, step: u64) -> Plan {
+        self.aim = Aim::Objective(objective.target);
         let values: CellValues = objective.values(self.estimator.belief());
         let problem = PlanningProblem {
             start: robot,
@@ -296,6 +312,23 @@ impl Agent {
         }
     }
 
+    /// What the last path was for, in a word or two: a state, `entropy`, `coverage` or an action.
+    pub fn aim(&self) -> String {
+        match &self.aim {
+            _ if self.policy.planner == PlannerKind::RandomWalk => "random moves".into(),
+            Aim::Nothing => "nothing yet".into(),
+            Aim::Objective(Target::State(state)) => self.state_names[*state].clone(),
+            Aim::Objective(Target::Entropy) => "entropy".into(),
+            Aim::Objective(Target::Coverage) => "coverage".into(),
+            Aim::Action(name) => name.clone(),
+        }
+    }
+
+    /// Names of the belief's states.
+    pub fn state_names(&self) -> &[String] {
+        &self.state_names
+    }
+
     /// The policy.
     pub fn policy(&self) -> &Policy {
         &self.policy
@@ -320,6 +353,19 @@ impl Estimator {
             | Self::Autoencoder(_, belief) => belief,
             Self::KnownModel(filter) => filter.belief(),
             Self::Learned(filter) => filter.belief(),
+        }
+    }
+}
+
+/// The model's names, or numbers where a learner called the states what it liked.
+fn state_names(kind: EstimatorKind, model: &Model, n_states: usize) -> Vec<String> {
+    match kind {
+        EstimatorKind::Learned | EstimatorKind::Autoencoder => (0..n_states)
+            .map(|state| format!("state {state}"))
+            .collect(),
+        _ => {
+            let states = model.file().states.iter();
+            states.map(|state| state.name.clone()).collect()
         }
     }
 }

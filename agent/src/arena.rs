@@ -23,6 +23,7 @@ const LEASE: Duration = Duration::from_secs(3600);
 
 /// Worlds of one server, held for a comparison.
 pub struct Arena {
+    instance: Instance,
     client: Client,
     truth: TruthFeed,
     model: Model,
@@ -94,6 +95,7 @@ impl Arena {
         let model = Model::from_toml(model)?;
         let truth = TruthFeed::open(instance, client.shape())?;
         Ok(Self {
+            instance: instance.clone(),
             client,
             truth,
             model,
@@ -101,6 +103,16 @@ impl Arena {
             scouts: n_main..used,
             spare,
         })
+    }
+
+    /// The server's instance.
+    pub fn instance(&self) -> &Instance {
+        &self.instance
+    }
+
+    /// The main worlds.
+    pub fn worlds(&self) -> Range<u32> {
+        self.main.clone()
     }
 
     /// The model.

@@ -5,6 +5,7 @@ use crate::arena::{Arena, ArenaError};
 use crate::belief::Belief;
 use crate::client::Observation;
 use crate::config::AgentConfig;
+use crate::feed::{Feed, View};
 use crate::learned::Learned;
 use crate::planner::Plan;
 use crate::policy::{EstimatorKind, Policy};
@@ -87,6 +88,10 @@ struct Run {
     seed: u64,
     tally: Tally,
     moment: Option<Moment>,
+    /// Time that the last plan took.
+    planning: Duration,
+    /// The posterior after the last frame, while it is shown.
+    posterior: Option<Belief>,
 }
 
 /// Sums over the steps of a run.
@@ -119,6 +124,7 @@ pub fn compare(
         fire_cells: Vec::new(),
         moment: None,
     };
+    let mut feed = Feed::open(arena.instance(), &prior);
     let game = |policy, seeds| Match {
         comparison,
         policy,
@@ -134,7 +140,7 @@ pub fn compare(
     for policy in &comparison.policies {
         for batch in seeds.chunks(arena.batch_size()) {
             let game = game(policy, batch);
-            let mut runs = game.play(arena, progress)?;
+            let mut runs = game.play(arena, &mut feed, progress)?;
             if batch[0] == comparison.seeds.start {
                 results.fire_cells.clone_from(&runs[0].tally.fire_cells);
                 results.moment = runs[0].moment.take().or(results.moment);
@@ -159,11 +165,15 @@ impl Match<'_> {
     fn play(
         &self,
         arena: &mut Arena,
+        feed: &mut Feed,
         progress: &dyn Fn(&str, u64),
     ) -> Result<Vec<Run>, CompareError> {
         let mut runs = self.start(arena)?;
         for step in 0..self.comparison.steps {
-            self.step(arena, &mut runs, step)?;
+            self.step(arena, &mut runs, step, feed.is_due())?;
+            for (world, run) in arena.worlds().zip(&mut runs) {
+                run.show(feed, world);
+            }
             progress(&self.policy.name, runs.len() as u64);
         }
         Ok(runs)
@@ -182,6 +192,8 @@ impl Match<'_> {
                 seed,
                 tally: Tally::default(),
                 moment: None,
+                planning: Duration::ZERO,
+                posterior: None,
             })
         };
         worlds
@@ -190,7 +202,13 @@ impl Match<'_> {
             .map_err(|problem| self.wrong(problem))
     }
 
-    fn step(&self, arena: &mut Arena, runs: &mut [Run], step: u64) -> Result<(), CompareError> {
+    fn step(
+        &self,
+        arena: &mut Arena,
+        runs: &mut [Run],
+        step: u64,
+        is_shown: bool,
+    ) -> Result<(), CompareError> {
         if self.policy.estimator == EstimatorKind::NextTruth {
             let next = arena.foresee(self.seeds, step + 1)?;
             let foreseen = runs
@@ -206,7 +224,10 @@ impl Match<'_> {
         let target = arena.model().target_state();
         let seen = runs.par_iter_mut().zip(plans).zip(observations).zip(truths);
         let taken = seen.map(|(((run, plan), observation), truth)| {
-            run.take_in(&plan, observation, truth, target, is_last)
+            let taken = run.take_in(&plan, observation, truth, target, is_last);
+            run.posterior = is_shown.then(|| run.agent.belief().clone());
+            run.agent.predict();
+            taken
         });
         taken
             .collect::<Result<(), AgentError>>()
@@ -239,7 +260,8 @@ impl Run {
     fn plan(&mut self, step: u64) -> Plan {
         let start = Instant::now();
         let plan = self.agent.plan(self.observation.robot(), step);
-        self.tally.planning += start.elapsed();
+        self.planning = start.elapsed();
+        self.tally.planning += self.planning;
         plan
     }
 
@@ -265,8 +287,20 @@ impl Run {
         if is_last && self.agent.policy().estimator == EstimatorKind::KnownModel {
             self.moment = Some(self.moment(&before, plan, truth));
         }
-        self.agent.predict();
         Ok(())
+    }
+
+    /// Shows the belief that was kept for it.
+    fn show(&mut self, feed: &mut Feed, world: u32) {
+        if let Some(belief) = self.posterior.take() {
+            feed.show(&View {
+                world,
+                result: &self.observation.result,
+                belief: &belief,
+                agent: &self.agent,
+                planning: self.planning,
+            });
+        }
     }
 
     fn moment(&self, before: &Observation, plan: &Plan, truth: Grid<u8>) -> Moment {

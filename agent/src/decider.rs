@@ -7,6 +7,7 @@ use crate::belief::Belief;
 use crate::client::{Claim, Client, Observation};
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
+use crate::feed::{Feed, View};
 use crate::handover::{leave, resume};
 use crate::learned::Learned;
 use crate::planner::Objective;
@@ -51,6 +52,8 @@ pub struct Decider {
     last: Decision,
     last_use: Instant,
     info: AgentInfo,
+    feed: Feed,
+    planning: Duration,
 }
 
 impl Decider {
@@ -77,8 +80,10 @@ impl Decider {
             &observation,
         )?;
         if !resume(&mut client, &mut agent, &observation)? {
-            take_in(&mut agent, &observation)?;
+            agent.correct(&observation.frame, None)?;
+            agent.predict();
         }
+        let feed = Feed::open(&task.instance, agent.belief());
         let info = agent_info(task, &model, &choices, &client);
         let last = decision(&agent, &observation, &client, None);
         Ok(Self {
@@ -92,6 +97,8 @@ impl Decider {
             last,
             last_use,
             info,
+            feed,
+            planning: Duration::ZERO,
         })
     }
 
@@ -122,7 +129,7 @@ impl Decider {
             &self.choices,
             &self.observation,
         )?;
-        take_in(&mut self.agent, &self.observation)?;
+        self.take_in()?;
         self.last = decision(&self.agent, &self.observation, &self.client, None);
         Ok(&self.last)
     }
@@ -136,11 +143,13 @@ impl Decider {
             return Ok(None);
         };
         let (robot, step) = (self.observation.robot(), self.observation.result.step);
+        let start = Instant::now();
         let plan = self.agent.plan_for(target, robot, step);
+        self.planning = start.elapsed();
         let worlds = self.client.worlds();
         self.observation = self.client.step(worlds, &[plan.moves])?.remove(0);
         self.last_use = Instant::now();
-        take_in(&mut self.agent, &self.observation)?;
+        self.take_in()?;
         self.last = decision(
             &self.agent,
             &self.observation,
@@ -183,6 +192,21 @@ impl Decider {
         Ok(self.client.release()?)
     }
 
+    fn take_in(&mut self) -> Result<(), RunError> {
+        self.agent.correct(&self.observation.frame, None)?;
+        if self.feed.is_due() {
+            self.feed.show(&View {
+                world: self.client.worlds().start,
+                result: &self.observation.result,
+                belief: self.agent.belief(),
+                agent: &self.agent,
+                planning: self.planning,
+            });
+        }
+        self.agent.predict();
+        Ok(())
+    }
+
     fn objective(&self, index: u64) -> Option<Objective> {
         let choice = self.choices.get(usize::try_from(index).ok()?)?;
         Some(self.config.objective(choice))
@@ -212,12 +236,6 @@ fn agent(
     };
     // Any choice will do: each has the same estimator and planner.
     Ok(Agent::new(&choices[0], config, task)?)
-}
-
-fn take_in(agent: &mut Agent, observation: &Observation) -> Result<(), RunError> {
-    agent.correct(&observation.frame, None)?;
-    agent.predict();
-    Ok(())
 }
 
 fn decision(

@@ -6,6 +6,7 @@ use crate::client::{Claim, Client, Observation, server_info, shape_of};
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
 use crate::estimator::Prior;
+use crate::feed::{Feed, View};
 use crate::handover::{leave, resume};
 use crate::learned::Learned;
 use crate::policy::{EstimatorKind, Policy, UnknownPolicy};
@@ -115,7 +116,7 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
     let (mut summary, mut is_in_step) = (Summary::default(), true);
     let mut attached = Attached::attach(mission, mission.takeover)?;
     while !stop.load(Ordering::Relaxed) && (mission.steps == 0 || summary.steps < mission.steps) {
-        match attached.step() {
+        match attached.step(summary.steps + 1 == mission.steps) {
             Ok(reward) => {
                 summary.steps += 1;
                 summary.reward += reward;
@@ -158,6 +159,8 @@ struct Attached {
     truth: Option<TruthFeed>,
     agent: Agent,
     observation: Observation,
+    feed: Feed,
+    planning: Duration,
     report: Report,
 }
 
@@ -211,6 +214,7 @@ impl Attached {
         } else {
             None
         };
+        let feed = Feed::open(&mission.instance, agent.belief());
         let report = Report {
             since: Instant::now(),
             last: Summary::default(),
@@ -220,32 +224,45 @@ impl Attached {
             truth,
             agent,
             observation,
+            feed,
+            planning: Duration::ZERO,
             report,
         };
         let present = &attached.observation;
         if !resume(&mut attached.client, &mut attached.agent, present)? {
-            attached.take_in()?;
+            attached.take_in(false)?;
         }
         Ok(attached)
     }
 
-    /// Plans, flies, corrects, predicts; returns the reward.
-    fn step(&mut self) -> Result<f64, RunError> {
+    /// Plans, flies, corrects, predicts; returns the reward. The last belief is shown in any case.
+    fn step(&mut self, is_last: bool) -> Result<f64, RunError> {
+        let start = Instant::now();
         let plan = self
             .agent
             .plan(self.observation.robot(), self.observation.result.step);
+        self.planning = start.elapsed();
         self.observation = self
             .client
             .step(self.client.worlds(), &[plan.moves])?
             .remove(0);
-        self.take_in()?;
+        self.take_in(is_last)?;
         Ok(self.observation.result.reward)
     }
 
-    fn take_in(&mut self) -> Result<(), RunError> {
+    fn take_in(&mut self, is_last: bool) -> Result<(), RunError> {
         let truth = self.read_truth()?;
         self.agent
             .correct(&self.observation.frame, truth.as_ref())?;
+        if self.feed.is_due() || is_last {
+            self.feed.show(&View {
+                world: self.client.worlds().start,
+                result: &self.observation.result,
+                belief: self.agent.belief(),
+                agent: &self.agent,
+                planning: self.planning,
+            });
+        }
         self.agent.predict();
         Ok(())
     }

@@ -23,7 +23,7 @@ use thiserror::Error;
 /// Samples that are published at once: two bursts fit an observer's buffer.
 const BURST: usize = FRAME_BUFFER / 2;
 
-/// How long a burst takes at least: observers look every 200 us, and a machine is sometimes busy.
+/// How long a burst takes at least: observers look every 500 us, and a machine is sometimes busy.
 const BURST_TIME: Duration = Duration::from_millis(1);
 
 /// How often a replay that waits looks for observers and for the end.

@@ -4,11 +4,13 @@
 //! prefix of the user's own, so that users never meet and no stray configuration file is read.
 
 use crate::message::{
-    ControlReply, ControlRequest, FrameHeader, Header, StepReply, StepRequest, TruthHeader,
+    AgentHeader, ControlReply, ControlRequest, FrameHeader, Header, StepReply, StepRequest,
+    TruthHeader,
 };
 use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::prelude::{ServiceName, ipc};
+use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenOrCreateError;
 use iceoryx2::service::builder::request_response as request_response_builder;
 use iceoryx2::service::builder::request_response::RequestResponseOpenError;
 use iceoryx2::service::port_factory::{PortFactory, event, publish_subscribe, request_response};
@@ -33,6 +35,12 @@ pub const FRAME_BUFFER: usize = 64;
 /// Hidden states that a reader may fall behind: a batch of this many worlds is never lost.
 pub const TRUTH_BUFFER: usize = 128;
 
+/// Most readers of `agent` at a time.
+pub const MAX_AGENT_READERS: usize = 4;
+
+/// Beliefs that a reader may fall behind before it loses the oldest: pictures want the newest only.
+pub const AGENT_BUFFER: usize = 4;
+
 /// Most processes attached to an instance at a time.
 pub const MAX_NODES: usize = 64;
 
@@ -53,6 +61,9 @@ pub type FrameService = publish_subscribe::PortFactory<Ipc, [u8], FrameHeader>;
 
 /// The `truth` service.
 pub type TruthService = publish_subscribe::PortFactory<Ipc, [u8], TruthHeader>;
+
+/// The `agent` service.
+pub type AgentService = publish_subscribe::PortFactory<Ipc, [u8], AgentHeader>;
 
 /// A wake service.
 pub type WakeService = event::PortFactory<Ipc>;
@@ -116,6 +127,8 @@ pub enum Channel {
     Frames,
     /// Hidden states, publish-subscribe.
     Truth,
+    /// What agents believe, publish-subscribe.
+    Agent,
     /// Wakes the server, event.
     WakeServer,
     /// Wakes clients, event.
@@ -177,6 +190,7 @@ impl Channel {
             Self::Control => "control".into(),
             Self::Frames => "frames".into(),
             Self::Truth => "truth".into(),
+            Self::Agent => "agent".into(),
             Self::WakeServer => "wake-server".into(),
             Self::WakeClient => "wake-client".into(),
             Self::Decisions(world) => format!("decisions-{world}"),
@@ -255,24 +269,7 @@ impl Services<'_> {
     /// # Errors
     /// [`ChannelError::Ipc`].
     pub fn frames(&self) -> Result<FrameService, ChannelError> {
-        let builder = self
-            .node
-            .service_builder(&self.instance.service_name(Channel::Frames));
-        let builder = builder
-            .publish_subscribe::<[u8]>()
-            .user_header::<FrameHeader>();
-        let builder = builder
-            .max_publishers(1)
-            .max_subscribers(MAX_OBSERVERS)
-            .max_nodes(MAX_NODES);
-        let builder = builder
-            .history_size(1)
-            .subscriber_max_buffer_size(FRAME_BUFFER);
-        let builder = builder
-            .subscriber_max_borrowed_samples(1)
-            .enable_safe_overflow(true);
-        builder
-            .open_or_create()
+        self.publications(Channel::Frames, 1, MAX_OBSERVERS, FRAME_BUFFER)
             .map_err(ipc_error("open the frames channel"))
     }
 
@@ -281,25 +278,17 @@ impl Services<'_> {
     /// # Errors
     /// [`ChannelError::Ipc`].
     pub fn truth(&self) -> Result<TruthService, ChannelError> {
-        let builder = self
-            .node
-            .service_builder(&self.instance.service_name(Channel::Truth));
-        let builder = builder
-            .publish_subscribe::<[u8]>()
-            .user_header::<TruthHeader>();
-        let builder = builder
-            .max_publishers(1)
-            .max_subscribers(MAX_TRUTH_READERS)
-            .max_nodes(MAX_NODES);
-        let builder = builder
-            .history_size(1)
-            .subscriber_max_buffer_size(TRUTH_BUFFER);
-        let builder = builder
-            .subscriber_max_borrowed_samples(1)
-            .enable_safe_overflow(true);
-        builder
-            .open_or_create()
+        self.publications(Channel::Truth, 1, MAX_TRUTH_READERS, TRUTH_BUFFER)
             .map_err(ipc_error("open the truth channel"))
+    }
+
+    /// The `agent` service, which agents and readers create alike.
+    ///
+    /// # Errors
+    /// [`ChannelError::Ipc`].
+    pub fn agent(&self) -> Result<AgentService, ChannelError> {
+        self.publications(Channel::Agent, MAX_CLIENTS, MAX_AGENT_READERS, AGENT_BUFFER)
+            .map_err(ipc_error("open the agent channel"))
     }
 
     /// A wake service.
@@ -333,6 +322,28 @@ impl Services<'_> {
         wake.listener_builder()
             .create()
             .map_err(ipc_error("create a listener"))
+    }
+
+    fn publications<H: Header>(
+        &self,
+        channel: Channel,
+        n_publishers: usize,
+        n_readers: usize,
+        buffer: usize,
+    ) -> Result<publish_subscribe::PortFactory<Ipc, [u8], H>, PublishSubscribeOpenOrCreateError>
+    {
+        let name = self.instance.service_name(channel);
+        let builder = self.node.service_builder(&name);
+        let builder = builder.publish_subscribe::<[u8]>().user_header::<H>();
+        let builder = builder
+            .max_publishers(n_publishers)
+            .max_subscribers(n_readers)
+            .max_nodes(MAX_NODES);
+        let builder = builder.history_size(1).subscriber_max_buffer_size(buffer);
+        let builder = builder
+            .subscriber_max_borrowed_samples(1)
+            .enable_safe_overflow(true);
+        builder.open_or_create()
     }
 
     fn create<Q: Header, R: Header>(

@@ -21,6 +21,7 @@ mod mixture;
 pub mod model;
 mod node;
 pub mod observer;
+pub mod outlook;
 pub mod path;
 pub mod program;
 pub mod randomness;

@@ -259,6 +259,34 @@ pub struct TruthHeader {
     pub width: u32,
 }
 
+/// Header of a sample on `agent`; the payload is a belief (`n_states * height * width` floats), then
+/// JSON, an [`crate::outlook::Intent`].
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("emberwatch.v1.AgentHeader")]
+pub struct AgentHeader {
+    /// [`VERSION`].
+    pub version: u32,
+    /// The world.
+    pub world: u32,
+    /// Number of samples that this agent published before this one: a gap is a loss.
+    pub sequence: u64,
+    /// Number of resets of this world since the server started.
+    pub episode: u64,
+    /// Step index k of the state that the belief is about.
+    pub step: u64,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Grid height H.
+    pub height: u32,
+    /// Grid width W.
+    pub width: u32,
+    /// Number of states S of the belief.
+    pub n_states: u32,
+    /// The agent's process.
+    pub pid: u32,
+}
+
 /// Bytes of one [`StepResult`] in a payload.
 pub const RESULT_BYTES: usize = size_of::<StepResult>();
 

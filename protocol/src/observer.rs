@@ -1,20 +1,21 @@
-//! An observer's side of `frames` and `truth`: it reads, never acts, and never slows the server.
+//! An observer's side of `frames`, `truth` and `agent`: it reads, never acts, and never slows the server.
 
 use crate::channels::{
-    Channel, ChannelError, FRAME_BUFFER, Instance, Ipc, Services, TRUTH_BUFFER, create_node,
-    ipc_error,
+    AGENT_BUFFER, Channel, ChannelError, FRAME_BUFFER, Instance, Ipc, Services, TRUTH_BUFFER,
+    create_node, ipc_error,
 };
-use crate::message::{FrameHeader, Header, TruthHeader};
-use crate::wait::Waiter;
+use crate::message::{AgentHeader, FrameHeader, Header, TruthHeader};
 use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::PayloadHeader;
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use std::cell::Cell;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-/// How long an observer sleeps between two looks: publishing wakes nobody, so that observers cost
-/// the server no system call.
-const LOOK_INTERVAL: Duration = Duration::from_micros(200);
+/// How long an observer sleeps between two looks: publishing wakes nobody, so that observers cost the
+/// server no system call. Nor do they spin: sixteen that did would take two cores from it. At 128,000 frames a
+/// second this fills [`FRAME_BUFFER`].
+const LOOK_INTERVAL: Duration = Duration::from_micros(500);
 
 /// A sample copied out of shared memory.
 #[derive(Debug, Clone, PartialEq)]
@@ -29,8 +30,7 @@ pub struct Sample<H> {
 pub struct Observer<H: Header> {
     subscriber: Subscriber<Ipc, [u8], H>,
     publisher: Cell<Option<u32>>,
-    waiter: Waiter,
-    _node: Node<Ipc>,
+    node: Node<Ipc>,
 }
 
 impl Observer<FrameHeader> {
@@ -39,26 +39,15 @@ impl Observer<FrameHeader> {
     /// # Errors
     /// [`ChannelError`], also when there are too many observers.
     pub fn frames(instance: &Instance) -> Result<Self, ChannelError> {
-        let node = create_node()?;
-        let services = Services {
-            node: &node,
+        let refusal = "observe frames (are there more than 16 observers?)";
+        let observer = Self::new(
             instance,
-        };
-        let subscriber = services
-            .frames()?
-            .subscriber_builder()
-            .buffer_size(FRAME_BUFFER)
-            .create();
-        let subscriber = subscriber.map_err(ipc_error(
-            "observe frames (are there more than 16 observers?)",
-        ))?;
-        wake_server(&services)?;
-        Ok(Self {
-            subscriber,
-            publisher: Cell::new(None),
-            waiter: Waiter::default(),
-            _node: node,
-        })
+            |services| services.frames(),
+            FRAME_BUFFER,
+            refusal,
+        )?;
+        wake_server(&observer.node, instance)?;
+        Ok(observer)
     }
 }
 
@@ -68,40 +57,59 @@ impl Observer<TruthHeader> {
     /// # Errors
     /// [`ChannelError`], also when there are too many readers.
     pub fn truth(instance: &Instance) -> Result<Self, ChannelError> {
-        let node = create_node()?;
-        let services = Services {
-            node: &node,
-            instance,
-        };
-        let subscriber = services
-            .truth()?
-            .subscriber_builder()
-            .buffer_size(TRUTH_BUFFER)
-            .create();
-        let subscriber =
-            subscriber.map_err(ipc_error("read the truth (are there more than 4 readers?)"))?;
-        wake_server(&services)?;
-        Ok(Self {
-            subscriber,
-            publisher: Cell::new(None),
-            waiter: Waiter::default(),
-            _node: node,
-        })
+        let refusal = "read the truth (are there more than 4 readers?)";
+        let observer = Self::new(instance, |services| services.truth(), TRUTH_BUFFER, refusal)?;
+        wake_server(&observer.node, instance)?;
+        Ok(observer)
+    }
+}
+
+impl Observer<AgentHeader> {
+    /// Reads what the agents of an instance believe; [`crate::outlook::Outlook`] checks each sample.
+    ///
+    /// # Errors
+    /// [`ChannelError`], also when there are too many readers.
+    pub fn agents(instance: &Instance) -> Result<Self, ChannelError> {
+        let refusal = "read the agents' beliefs (are there more than 4 readers?)";
+        Self::new(instance, |services| services.agent(), AGENT_BUFFER, refusal)
     }
 }
 
 impl<H: Header> Observer<H> {
+    fn new(
+        instance: &Instance,
+        service: impl FnOnce(&Services<'_>) -> Result<PortFactory<Ipc, [u8], H>, ChannelError>,
+        buffer: usize,
+        refusal: &'static str,
+    ) -> Result<Self, ChannelError> {
+        let node = create_node()?;
+        let service = service(&Services {
+            node: &node,
+            instance,
+        })?;
+        let subscriber = service.subscriber_builder().buffer_size(buffer).create();
+        Ok(Self {
+            subscriber: subscriber.map_err(ipc_error(refusal))?,
+            publisher: Cell::new(None),
+            node,
+        })
+    }
+
     /// The next sample; `None` if none came in time. Gaps in the headers' sequence numbers are
     /// samples that this observer was too slow for.
     ///
     /// # Errors
     /// [`ChannelError::Ipc`].
     pub fn receive(&self, timeout: Duration) -> Result<Option<Sample<H>>, ChannelError> {
-        let poll = || self.try_receive();
-        self.waiter.wait(timeout, poll, |remaining| {
+        let start = Instant::now();
+        loop {
+            let sample = self.try_receive()?;
+            let remaining = timeout.saturating_sub(start.elapsed());
+            if sample.is_some() || remaining.is_zero() {
+                return Ok(sample);
+            }
             std::thread::sleep(remaining.min(LOOK_INTERVAL));
-            Ok(())
-        })
+        }
     }
 
     /// The next sample, if there is one already.
@@ -123,14 +131,15 @@ impl<H: Header> Observer<H> {
         }))
     }
 
-    /// The process that published the sample received last, the server's.
+    /// The process that published the sample received last: the server's, or an agent's.
     pub fn publisher(&self) -> Option<u32> {
         self.publisher.get()
     }
 }
 
 /// Lets a sleeping server notice the new observer now rather than at its next tick.
-fn wake_server(services: &Services<'_>) -> Result<(), ChannelError> {
+fn wake_server(node: &Node<Ipc>, instance: &Instance) -> Result<(), ChannelError> {
+    let services = Services { node, instance };
     let notifier = services
         .wake(Channel::WakeServer)?
         .notifier_builder()

@@ -5,11 +5,13 @@ use std::path::{Path, PathBuf};
 
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
-/// Directories all of whose Rust or Python files are listed.
-const SOURCES: [&str; 5] = [
+/// Directories all of whose Rust, Python or JavaScript files are listed.
+const SOURCES: [&str; 7] = [
     "protocol/src",
     "env-server/src",
     "agent/src",
+    "clients/dashboard/src",
+    "clients/dashboard/page",
     "tests/src",
     "clients/python/src/emberwatch",
 ];
@@ -36,7 +38,7 @@ fn listed() -> BTreeSet<String> {
     files
 }
 
-/// The Rust and Python files below a directory, relative to the root.
+/// The source files below a directory, relative to the root.
 fn source_files(directory: &str) -> Vec<String> {
     let entries = std::fs::read_dir(root().join(directory)).expect("a source directory");
     let below = |entry: std::io::Result<std::fs::DirEntry>| {
@@ -52,7 +54,7 @@ fn source_files(directory: &str) -> Vec<String> {
 }
 
 fn is_source(name: &str) -> bool {
-    name.ends_with(".rs") || name.ends_with(".py")
+    [".rs", ".py", ".js"].iter().any(|end| name.ends_with(end))
 }
 
 #[test]

@@ -34,6 +34,7 @@ HEADERS = [
     wire.ControlReply,
     wire.FrameHeader,
     wire.TruthHeader,
+    wire.AgentHeader,
 ]
 EXAMPLES = document.examples()
 HELLO = next(message for message in EXAMPLES if message.get("reply") == "hello")

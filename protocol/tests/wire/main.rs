@@ -5,15 +5,15 @@ mod document;
 use document::{Field, Layout, PROTOCOL, documented_struct, fences, rows_under};
 use iceoryx2::prelude::ZeroCopySend;
 use protocol::channels::{
-    Channel, FRAME_BUFFER, Instance, MAX_CLIENTS, MAX_NODES, MAX_OBSERVERS, MAX_TRUTH_READERS,
-    TRUTH_BUFFER,
+    AGENT_BUFFER, Channel, FRAME_BUFFER, Instance, MAX_AGENT_READERS, MAX_CLIENTS, MAX_NODES,
+    MAX_OBSERVERS, MAX_TRUTH_READERS, TRUTH_BUFFER,
 };
 use protocol::control::{MAX_CONTROL_BYTES, Reply, Request};
 use protocol::decisions;
 use protocol::grid::MAX_SIDE;
 use protocol::message::{
-    ControlReply, ControlRequest, FLAG_FULL_COVERAGE, FrameHeader, Operation, Status, StepReply,
-    StepRequest, StepResult, TruthHeader, VERSION, split_step_payload,
+    AgentHeader, ControlReply, ControlRequest, FLAG_FULL_COVERAGE, FrameHeader, Operation, Status,
+    StepReply, StepRequest, StepResult, TruthHeader, VERSION, split_step_payload,
 };
 use protocol::path::{MAX_MOVES, path_from_bytes, path_to_bytes};
 use protocol::recording::{
@@ -140,6 +140,18 @@ fn layouts() -> Vec<Layout> {
             height,
             width,
         }),
+        layout!(AgentHeader {
+            version,
+            world,
+            sequence,
+            episode,
+            step,
+            seed,
+            height,
+            width,
+            n_states,
+            pid,
+        }),
     ]
 }
 
@@ -214,8 +226,10 @@ fn every_limit_is_documented() {
         ("MAX_CLIENTS", MAX_CLIENTS),
         ("MAX_OBSERVERS", MAX_OBSERVERS),
         ("MAX_TRUTH_READERS", MAX_TRUTH_READERS),
+        ("MAX_AGENT_READERS", MAX_AGENT_READERS),
         ("FRAME_BUFFER", FRAME_BUFFER),
         ("TRUTH_BUFFER", TRUTH_BUFFER),
+        ("AGENT_BUFFER", AGENT_BUFFER),
         ("MAX_NODES", MAX_NODES),
         ("MAX_CONTROL_BYTES", MAX_CONTROL_BYTES),
         ("MAX_MOVES", MAX_MOVES),

@@ -16,7 +16,7 @@ from emberwatch.decisions import Decisions
 from emberwatch.env import WildfireEnv
 from emberwatch.moves_env import WildfireMovesEnv
 from emberwatch.objective_env import WildfireObjectiveEnv
-from emberwatch.observer import Frame, Observer, Truth, TruthReader, observe
+from emberwatch.observer import Frame, Observer, Outlook, OutlookReader, Truth, TruthReader, observe
 from emberwatch.replies import Decision, DecisionsInfo, ServerInfo, ServerStatus, WorldInfo
 from emberwatch.vector_env import WildfireVectorEnv
 from emberwatch.wire import StepAnswer, StepResult
@@ -29,6 +29,8 @@ __all__ = [
     "Frame",
     "Lease",
     "Observer",
+    "Outlook",
+    "OutlookReader",
     "ServerInfo",
     "ServerStatus",
     "StepAnswer",

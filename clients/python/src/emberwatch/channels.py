@@ -117,16 +117,22 @@ class Node:
         return max(versions - {wire.VERSION}, default=None)
 
     def open_publications(
-        self, service: str, header: type[wire.Header], readers: int, buffer: int
+        self,
+        service: str,
+        header: type[wire.Header],
+        readers: int,
+        buffer: int,
+        *,
+        publishers: int = 1,
     ) -> Any:
-        """Opens or creates `frames` or `truth`.
+        """Opens or creates `frames`, `truth` or `agent`.
 
         Raises:
             ChannelError: If iceoryx2 fails.
         """
         builder = self.node.service_builder(self._name(service)).publish_subscribe(_BYTES)
-        builder = builder.user_header(header).max_publishers(1).max_subscribers(readers)
-        builder = builder.max_nodes(wire.MAX_NODES).history_size(1)
+        builder = builder.user_header(header).max_publishers(publishers)
+        builder = builder.max_subscribers(readers).max_nodes(wire.MAX_NODES).history_size(1)
         builder = builder.subscriber_max_buffer_size(buffer).subscriber_max_borrowed_samples(1)
         with guard(f"open {service} on instance {self.instance!r}"):
             return self.keep(builder.enable_safe_overflow(True).open_or_create())

@@ -6,7 +6,7 @@ Such as `for frame in emberwatch.observe("lab", timeout=10): print(frame.result.
 from __future__ import annotations
 
 import ctypes
-import os
+import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,11 +20,8 @@ from emberwatch.channels import Closing, Node, guard
 from emberwatch.errors import GarbledAnswerError, SettingError
 from emberwatch.wire import StepResult
 
-#: How long to sleep between two looks, seconds: publishing wakes nobody.
-_LOOK: Final = 200e-6
-
-#: How long to look and yield before the first sleep, seconds.
-_YIELD: Final = 50e-6
+#: How long to sleep between two looks, seconds: publishing wakes nobody, and who spins takes from the server.
+_LOOK: Final = 500e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -69,24 +66,66 @@ class Truth:
     n_lost: int
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outlook:
+    """What an agent believes of a world and wants there, copied.
+
+    Attributes:
+        world: The world.
+        episode: Resets of the world since the server started.
+        step: k of the state that the belief is about.
+        seed: Seed of the episode.
+        belief: The belief after that step's frame, `(S, H, W)`, float32, each in 0..=1.
+        states: Names of its states.
+        policy: The agent's policy.
+        belief_from: Where the belief comes from.
+        objective: What the last path was for.
+        plan_millis: Time that its plan took, milliseconds.
+        pid: The agent's process.
+        n_lost: Samples of this agent that this reader missed since the last one it got.
+    """
+
+    world: int
+    episode: int
+    step: int
+    seed: int
+    belief: NDArray[np.float32]
+    states: tuple[str, ...]
+    policy: str
+    belief_from: str
+    objective: str
+    plan_millis: float
+    pid: int
+    n_lost: int
+
+
 class _Reader(Closing):
     """A subscriber of one channel."""
 
     def __init__(
-        self, instance: str, service: str, header: type[wire.Header], limits: tuple[int, int]
+        self,
+        instance: str,
+        service: str,
+        header: type[wire.Header],
+        limits: tuple[int, int],
+        *,
+        publishers: int = 1,
     ) -> None:
         self._header = header
-        self._next: int | None = None
+        self._next: dict[int, int] = {}
         self._node = Node(instance)
         try:
             self._node.clean_up()
             readers, buffer = limits
-            factory = self._node.open_publications(service, header, readers, buffer)
+            factory = self._node.open_publications(
+                service, header, readers, buffer, publishers=publishers
+            )
             with guard(f"read {service} (are there more than {readers} readers?)"):
                 port = factory.subscriber_builder().buffer_size(buffer).create()
                 self._subscriber: Any = self._node.keep(port)
-                wake = self._node.keep(self._node.open_wake("wake-server").notifier_builder())
-                self._node.keep(wake.create()).notify()
+                if publishers == 1:  # the server, which shows where its worlds are
+                    wake = self._node.keep(self._node.open_wake("wake-server").notifier_builder())
+                    self._node.keep(wake.create()).notify()
         except BaseException:
             self._node.close()
             raise
@@ -113,10 +152,7 @@ class _Reader(Closing):
             waited = time.perf_counter() - start
             if not waited < timeout:
                 return None
-            if waited < _YIELD:
-                os.sched_yield()
-            else:
-                time.sleep(min(_LOOK, timeout - waited))
+            time.sleep(min(_LOOK, timeout - waited))
         size = ctypes.sizeof(self._header)
         header: Any = self._header.from_buffer_copy(ctypes.string_at(sample.user_header_ptr, size))
         if header.version != wire.VERSION:
@@ -124,9 +160,10 @@ class _Reader(Closing):
                 f"sample: expected version {wire.VERSION}, got {header.version}"
             )
         payload = bytearray(ctypes.string_at(sample.payload_ptr, sample.payload().len()))
-        # A smaller number than expected is a new server's.
-        lost = 0 if self._next is None else max(0, header.sequence - self._next)
-        self._next = header.sequence + 1
+        # A smaller number than expected is a new server's. Each agent counts its own.
+        publisher = getattr(header, "pid", 0)
+        lost = max(0, header.sequence - self._next.get(publisher, header.sequence))
+        self._next[publisher] = header.sequence + 1
         return header, payload, lost
 
 
@@ -196,6 +233,29 @@ class TruthReader(_Reader):
         return truth_from_sample(*sample)
 
 
+class OutlookReader(_Reader):
+    """Reads what the agents of an instance believe; they show it now and then, while somebody reads."""
+
+    def __init__(self, instance: str = "default") -> None:
+        """Subscribes.
+
+        Raises:
+            ChannelError: If iceoryx2 fails, also when there are more than 4 readers.
+        """
+        limits = (wire.MAX_AGENT_READERS, wire.AGENT_BUFFER)
+        publishers = wire.MAX_CLIENTS
+        super().__init__(instance, "agent", wire.AgentHeader, limits, publishers=publishers)
+
+    def receive(self, timeout: float) -> Outlook | None:
+        """The next one; `None` if none comes within so many seconds.
+
+        Raises:
+            GarbledAnswerError: If what comes makes no sense.
+        """
+        sample = self._sample(timeout)
+        return None if sample is None else outlook_from_sample(*sample)
+
+
 def observe(
     instance: str = "default", *, world: int | None = None, timeout: float | None = None
 ) -> Observer:
@@ -251,6 +311,36 @@ def truth_from_sample(header: Any, payload: bytearray, n_lost: int) -> Truth:
         states=np.frombuffer(payload, np.uint8).reshape(header.height, header.width),
         n_lost=n_lost,
     )
+
+
+def outlook_from_sample(header: Any, payload: bytearray, n_lost: int) -> Outlook:
+    """An outlook out of a sample's header and payload, which it keeps.
+
+    Raises:
+        GarbledAnswerError: If the lengths do not agree, or the text is not what it should be.
+    """
+    shape = (header.n_states, header.height, header.width)
+    n_bytes = 4 * header.n_states * header.height * header.width
+    if len(payload) < n_bytes:
+        raise GarbledAnswerError(f"sample: expected {n_bytes} bytes or more, got {len(payload)}")
+    try:
+        intent: dict[str, Any] = json.loads(payload[n_bytes:])
+        return Outlook(
+            world=header.world,
+            episode=header.episode,
+            step=header.step,
+            seed=header.seed,
+            belief=np.frombuffer(payload, np.float32, n_bytes // 4).reshape(shape),
+            states=tuple(str(state) for state in intent["states"]),
+            policy=str(intent["policy"]),
+            belief_from=str(intent["belief_from"]),
+            objective=str(intent["objective"]),
+            plan_millis=float(intent["plan_millis"]),
+            pid=header.pid,
+            n_lost=n_lost,
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise GarbledAnswerError(f"sample: expected an agent's intent, got {error!r}") from error
 
 
 def _check_length(got: int, expected: int) -> None:

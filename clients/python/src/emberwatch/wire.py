@@ -33,10 +33,13 @@ FULL_COVERAGE: Final = 1
 N_MOVES: Final = 4
 
 #: Limits of section 1.
+MAX_CLIENTS: Final = 16
 MAX_OBSERVERS: Final = 16
 MAX_TRUTH_READERS: Final = 4
+MAX_AGENT_READERS: Final = 4
 FRAME_BUFFER: Final = 64
 TRUTH_BUFFER: Final = 128
+AGENT_BUFFER: Final = 4
 MAX_NODES: Final = 64
 
 _U16, _U32, _U64, _F64 = ctypes.c_uint16, ctypes.c_uint32, ctypes.c_uint64, ctypes.c_double
@@ -133,6 +136,23 @@ class TruthHeader(Header):
         ("seed", _U64),
         ("height", _U32),
         ("width", _U32),
+    ]
+
+
+class AgentHeader(Header):
+    """In front of an agent's belief and what it wants."""
+
+    _fields_ = [
+        ("version", _U32),
+        ("world", _U32),
+        ("sequence", _U64),
+        ("episode", _U64),
+        ("step", _U64),
+        ("seed", _U64),
+        ("height", _U32),
+        ("width", _U32),
+        ("n_states", _U32),
+        ("pid", _U32),
     ]
 
 

@@ -1,0 +1,84 @@
+//! Shows beliefs to whoever looks on, at the pace of eyes: the agent's side of the channel `agent`.
+
+use crate::agent::Agent;
+use crate::belief::Belief;
+use protocol::channels::Instance;
+use protocol::message::{AgentHeader, StepResult};
+use protocol::outlook::{Intent, Showcase};
+use std::time::{Duration, Instant};
+
+/// Time between two beliefs of a world that are shown: no screen is faster, and each costs a copy.
+const INTERVAL: Duration = Duration::from_millis(20);
+
+/// What agents of one process show.
+pub struct Feed {
+    showcase: Option<Showcase>,
+    shown: Option<Instant>,
+}
+
+/// One world's belief, the posterior after the frame of `result`.
+pub struct View<'a> {
+    /// The world.
+    pub world: u32,
+    /// Where it stands.
+    pub result: &'a StepResult,
+    /// What is believed of it.
+    pub belief: &'a Belief,
+    /// Who believes it.
+    pub agent: &'a Agent,
+    /// Time that its last plan took.
+    pub planning: Duration,
+}
+
+impl Feed {
+    /// Opens the channel for beliefs like this one. Without a channel, which is told once, nothing is shown:
+    /// acting does not depend on being seen.
+    pub fn open(instance: &Instance, belief: &Belief) -> Self {
+        // The intent is some hundred bytes of text.
+        let n_bytes = belief.probabilities().len() * size_of::<f32>() + 1024;
+        let showcase = Showcase::open(instance, n_bytes)
+            .inspect_err(|error| tracing::warn!("beliefs are not shown: {error}"))
+            .ok();
+        Self {
+            showcase,
+            shown: None,
+        }
+    }
+
+    /// Whether it is time to show beliefs, and anybody looks.
+    pub fn is_due(&self) -> bool {
+        self.shown.is_none_or(|shown| shown.elapsed() >= INTERVAL) && self.is_watched()
+    }
+
+    /// Whether anybody looks.
+    pub fn is_watched(&self) -> bool {
+        self.showcase.as_ref().is_some_and(Showcase::is_watched)
+    }
+
+    /// Shows a world's belief.
+    pub fn show(&mut self, view: &View<'_>) {
+        let Some(showcase) = &mut self.showcase else {
+            return;
+        };
+        self.shown = Some(Instant::now());
+        let policy = view.agent.policy();
+        let about = AgentHeader {
+            world: view.world,
+            episode: view.result.episode,
+            step: view.result.step,
+            seed: view.result.seed,
+            ..AgentHeader::default()
+        };
+        let intent = Intent {
+            policy: policy.name.clone(),
+            belief_from: policy.estimator.label().into(),
+            objective: view.agent.aim(),
+            states: view.agent.state_names().to_vec(),
+            plan_millis: view.planning.as_secs_f64() * 1e3,
+        };
+        if let Err(error) = showcase.show(about, view.belief.probabilities(), &intent) {
+            tracing::warn!("beliefs are no longer shown: {error}");
+            self.showcase = None;
+        }
+    }
+}

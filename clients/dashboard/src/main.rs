@@ -1,0 +1,120 @@
+//! `emberwatch-dashboard`: a web page that shows what happens on an instance, or what a recording holds.
+
+use anyhow::{Context, Result};
+use clap::Parser;
+use dashboard::scene::{Scene, Stage};
+use dashboard::{player, server, watcher};
+use protocol::channels::Instance;
+use protocol::program::{Keeper, start_logging, stop_on_signals};
+use std::io::Write;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+use tokio::net::TcpListener;
+
+/// How often the program looks whether to end.
+const TICK: Duration = Duration::from_millis(50);
+
+/// Shows an Emberwatch instance, or a recording, in a browser. Reads, never acts.
+#[derive(Parser)]
+#[command(name = "emberwatch-dashboard", version)]
+struct Cli {
+    /// The instance to watch; its server may start later, end and come back
+    #[arg(long, default_value = "default")]
+    instance: String,
+    /// Play this recording instead
+    #[arg(long, value_name = "FILE", conflicts_with = "instance")]
+    recording: Option<PathBuf>,
+    /// Where browsers reach the page; port 0 takes a free one. Whoever reaches it sees everything
+    #[arg(long, default_value = "127.0.0.1:8600", value_name = "ADDRESS:PORT")]
+    listen: SocketAddr,
+    /// A host name that browsers may call this machine by, beside its addresses; may be given for each
+    #[arg(long, value_name = "HOST")]
+    name: Vec<String>,
+    /// Open the page in the default browser
+    #[arg(long)]
+    open: bool,
+    /// End when this process ends
+    #[arg(long, value_name = "PID")]
+    exit_with: Option<i32>,
+}
+
+fn main() -> ExitCode {
+    start_logging();
+    match run(&Cli::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            tracing::error!("{error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(cli: &Cli) -> Result<()> {
+    let keeper = cli.exit_with.map(Keeper::watch).transpose()?;
+    let stop = stop_on_signals().context("handle signals")?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("start the web server")?;
+    let bound = runtime.block_on(TcpListener::bind(cli.listen));
+    let listener = bound.with_context(|| {
+        format!(
+            "--listen: expected a free port, got {}; 0 takes any",
+            cli.listen
+        )
+    })?;
+    let address = listener.local_addr().context("the page's address")?;
+    let stage = start(cli, &stop)?;
+    announce(address, cli.open)?;
+    let end = async {
+        while !stop.load(Ordering::Relaxed) && !keeper.as_ref().is_some_and(Keeper::has_ended) {
+            tokio::time::sleep(TICK).await;
+        }
+        stop.store(true, Ordering::Relaxed);
+        Ok(())
+    };
+    let served = runtime.block_on(async {
+        tokio::select! {
+            served = server::serve(listener, stage, &cli.name) => served,
+            ended = end => ended,
+        }
+    });
+    served.context("serve the page")
+}
+
+/// Begins to watch, or to play.
+fn start(cli: &Cli, stop: &Arc<AtomicBool>) -> Result<Arc<Stage>> {
+    match &cli.recording {
+        Some(file) => {
+            let stage = Arc::new(Stage::new(Scene::new(&file.display().to_string())));
+            player::play(file, &stage, stop)?;
+            Ok(stage)
+        }
+        None => {
+            let instance = Instance::new(&cli.instance)?;
+            let stage = Arc::new(Stage::new(Scene::new(instance.name())));
+            watcher::watch(&instance, &stage, stop)?;
+            Ok(stage)
+        }
+    }
+}
+
+/// Tells where the page is, and opens it if asked.
+fn announce(address: SocketAddr, open: bool) -> Result<()> {
+    let url = format!("http://{address}/");
+    let mut out = std::io::stdout();
+    writeln!(out, "{url}")
+        .and_then(|()| out.flush())
+        .context("write to standard output")?;
+    if open {
+        let opener = std::process::Command::new("xdg-open").arg(&url).spawn();
+        if let Err(error) = opener {
+            tracing::warn!("no browser was opened ({error}): open {url}");
+        }
+    }
+    Ok(())
+}

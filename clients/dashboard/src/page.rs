@@ -1,0 +1,46 @@
+//! The page, as it is in this program: no build step, nothing fetched from elsewhere.
+
+/// A file of the page.
+#[derive(Debug, Clone, Copy)]
+pub struct Asset {
+    /// Where browsers ask for it.
+    pub path: &'static str,
+    /// What it is.
+    pub content_type: &'static str,
+    /// What is in it.
+    pub text: &'static str,
+}
+
+macro_rules! assets {
+    ($($path:literal $file:literal $kind:literal),* $(,)?) => {
+        [$(Asset {
+            path: $path,
+            content_type: concat!($kind, "; charset=utf-8"),
+            text: include_str!(concat!("../page/", $file)),
+        }),*]
+    };
+}
+
+/// Every file of the page.
+pub const ASSETS: [Asset; 20] = assets![
+    "/" "index.html" "text/html",
+    "/page.css" "page.css" "text/css",
+    "/icon.svg" "icon.svg" "image/svg+xml",
+    "/charts.js" "charts.js" "text/javascript",
+    "/controls.js" "controls.js" "text/javascript",
+    "/elements.js" "elements.js" "text/javascript",
+    "/facts.js" "facts.js" "text/javascript",
+    "/inspector.js" "inspector.js" "text/javascript",
+    "/layout.js" "layout.js" "text/javascript",
+    "/legend.js" "legend.js" "text/javascript",
+    "/main.js" "main.js" "text/javascript",
+    "/overlay.js" "overlay.js" "text/javascript",
+    "/palette.js" "palette.js" "text/javascript",
+    "/panels.js" "panels.js" "text/javascript",
+    "/plot.js" "plot.js" "text/javascript",
+    "/scale.js" "scale.js" "text/javascript",
+    "/socket.js" "socket.js" "text/javascript",
+    "/view.js" "view.js" "text/javascript",
+    "/wire.js" "wire.js" "text/javascript",
+    "/words.js" "words.js" "text/javascript",
+];

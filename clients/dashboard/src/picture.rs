@@ -1,0 +1,384 @@
+//! One picture for a browser: what it asked for, what it gets. Pure.
+//!
+//! A picture is a `u32` length, so many bytes of JSON (a [`Header`]), and the arrays that the JSON lists; the
+//! JSON is padded with spaces and each array with zeros, so that all arrays begin at multiples of eight bytes.
+//! Numbers are little-endian.
+
+use crate::album::{Entry, Strip};
+use crate::scene::{Info, Lost, Player, Scene};
+use protocol::Cell;
+use protocol::control::{ServerStatus, WorldStatus};
+use protocol::frame::UNOBSERVED;
+use serde::{Deserialize, Serialize};
+use std::time::{Duration, Instant};
+
+/// Least and most points of a time series.
+const BINS: (usize, usize) = (16, 2000);
+
+/// No objective.
+const NO_OBJECTIVE: u8 = 255;
+
+/// Most objectives with a colour of their own.
+const MAX_OBJECTIVES: usize = 255;
+
+/// A step with a belief is shown rather than a newer one without for so long.
+const BELIEF_LAG: Duration = Duration::from_millis(500);
+
+/// What a browser wants to see.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Ask {
+    /// The world.
+    pub world: u32,
+    /// Serial number of a step; `None`: the newest.
+    pub at: Option<u64>,
+    /// Points wanted of each time series.
+    pub bins: usize,
+    /// A recording's new speed, as [`Player::speed`].
+    #[serde(default)]
+    pub speed: Option<f64>,
+    /// Whether a recording shall run.
+    #[serde(default)]
+    pub playing: Option<bool>,
+}
+
+/// What a picture says beside its arrays.
+#[derive(Debug, Serialize)]
+struct Header<'a> {
+    instance: &'a str,
+    source: &'static str,
+    state: &'static str,
+    note: Option<&'a str>,
+    info: Option<&'a Info>,
+    status: Option<Status<'a>>,
+    world: u32,
+    kept: Option<Range>,
+    shown: Option<Shown>,
+    agent: Option<AgentFacts<'a>>,
+    lost: Lost,
+    player: Option<&'a Player>,
+    objectives: Vec<&'a str>,
+    series: Option<Series>,
+    arrays: Vec<Listing>,
+}
+
+#[derive(Debug, Serialize)]
+struct Range {
+    first: u64,
+    last: u64,
+}
+
+#[derive(Debug, Serialize)]
+struct Status<'a> {
+    steps_per_second: f64,
+    n_steps: u64,
+    n_observers: usize,
+    n_clients: usize,
+    n_refused: u64,
+    uptime_millis: u64,
+    worlds: &'a [WorldStatus],
+}
+
+#[derive(Debug, Serialize)]
+struct Shown {
+    serial: u64,
+    /// As text: browsers keep 53 bits of a number.
+    seed: String,
+    episode: u64,
+    step: u64,
+    reward: f64,
+    n_visited: u32,
+    n_hits: u32,
+    n_target_cells: u32,
+    robot: [u32; 2],
+    start: [usize; 2],
+    path: Vec<[usize; 2]>,
+    coverage: &'static str,
+    terminated: bool,
+    truncated: bool,
+    log_loss: Option<f64>,
+    brier: Option<f64>,
+}
+
+#[derive(Debug, Serialize)]
+struct AgentFacts<'a> {
+    pid: u32,
+    policy: &'a str,
+    belief_from: &'a str,
+    objective: &'a str,
+    plan_millis: f64,
+    states: &'a [String],
+    is_live: bool,
+}
+
+#[derive(Debug, Serialize)]
+struct Series {
+    first: u64,
+    last: u64,
+    bins: usize,
+    first_step: u64,
+    last_step: u64,
+}
+
+#[derive(Debug, Serialize)]
+struct Listing {
+    name: &'static str,
+    #[serde(rename = "type")]
+    kind: &'static str,
+    length: usize,
+}
+
+/// The arrays of a picture.
+#[derive(Default)]
+struct Arrays {
+    listings: Vec<Listing>,
+    bytes: Vec<u8>,
+}
+
+/// The picture that a browser asked for; `now` tells whether an agent still shows its belief.
+pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
+    let strip = scene.album.strip(ask.world);
+    let chosen = strip.and_then(|strip| match ask.at {
+        Some(serial) => strip.nearest(serial),
+        None => newest(strip),
+    });
+    let mut arrays = Arrays::default();
+    let (mut objectives, mut series) = (Vec::new(), None);
+    if let (Some(strip), Some((serial, entry))) = (strip, chosen) {
+        arrays.add_grids(strip, serial, entry);
+        (objectives, series) = arrays.add_series(strip, ask.bins.clamp(BINS.0, BINS.1));
+    }
+    let is_live = |entry: &Entry| now.duration_since(entry.at) < 4 * BELIEF_LAG;
+    let header = Header {
+        instance: &scene.instance,
+        source: match scene.player {
+            Some(_) => "recording",
+            None => "live",
+        },
+        state: if scene.is_serving {
+            "serving"
+        } else {
+            "waiting"
+        },
+        note: scene.note.as_deref(),
+        info: scene.info.as_ref(),
+        status: scene.status.as_ref().map(Status::of),
+        world: ask.world,
+        kept: strip
+            .and_then(Strip::kept)
+            .map(|(first, last)| Range { first, last }),
+        shown: chosen.map(|(serial, entry)| Shown::of(serial, entry)),
+        agent: chosen.and_then(|(_, entry)| AgentFacts::of(entry, is_live(entry))),
+        lost: scene.lost,
+        player: scene.player.as_ref(),
+        objectives,
+        series,
+        arrays: arrays.listings,
+    };
+    let mut bytes = framed(&header);
+    bytes.extend(arrays.bytes);
+    bytes
+}
+
+/// The newest step, or the newest with a belief if that is hardly older.
+fn newest(strip: &Strip) -> Option<(u64, &Entry)> {
+    let (_, last) = strip.kept()?;
+    let newest = strip.nearest(last)?;
+    let is_recent = |entry: &&Entry| newest.1.at.duration_since(entry.at) < BELIEF_LAG;
+    let mut recent = (0..).zip(strip.back_from(last).take_while(is_recent));
+    let believed = recent.find(|(_, entry)| entry.belief.is_some());
+    Some(believed.map_or(newest, |(back, entry)| (last - back, entry)))
+}
+
+/// The length and the JSON.
+fn framed(header: &Header<'_>) -> Vec<u8> {
+    let mut text = serde_json::to_vec(header).expect("invariant: a header serialises");
+    text.resize((text.len() + 4).next_multiple_of(8) - 4, b' ');
+    let mut bytes = (text.len() as u32).to_le_bytes().to_vec();
+    bytes.extend(text);
+    bytes
+}
+
+impl Arrays {
+    fn add(&mut self, name: &'static str, kind: &'static str, length: usize, bytes: &[u8]) {
+        self.listings.push(Listing { name, kind, length });
+        self.bytes.extend(bytes);
+        self.bytes.resize(self.bytes.len().next_multiple_of(8), 0);
+    }
+
+    fn add_bytes(&mut self, name: &'static str, bytes: &[u8]) {
+        self.add(name, "u8", bytes.len(), bytes);
+    }
+
+    fn add_floats(&mut self, name: &'static str, numbers: &[f32]) {
+        let bytes: Vec<u8> = numbers.iter().flat_map(|x| x.to_le_bytes()).collect();
+        self.add(name, "f32", numbers.len(), &bytes);
+    }
+
+    fn add_grids(&mut self, strip: &Strip, serial: u64, entry: &Entry) {
+        if let Some(truth) = &entry.truth {
+            self.add_bytes("truth", truth);
+        }
+        let mut frame = vec![UNOBSERVED; entry.shape.n_cells()];
+        for &(cell, value) in &entry.seen {
+            frame[cell as usize] = value;
+        }
+        self.add_bytes("frame", &frame);
+        let (seen, age) = memory(strip, serial, entry);
+        self.add_bytes("seen", &seen);
+        self.add_bytes("age", &age);
+        if let Some(belief) = &entry.belief {
+            self.add_bytes("belief", &belief.levels);
+            self.add_bytes("entropy", &belief.entropy);
+        }
+    }
+
+    /// Means of so many stretches of all that is kept; the objective is each stretch's last.
+    fn add_series<'a>(
+        &mut self,
+        strip: &'a Strip,
+        n_bins: usize,
+    ) -> (Vec<&'a str>, Option<Series>) {
+        let n_entries = strip.entries().len();
+        let mut objectives: Vec<&str> = Vec::new();
+        let mut means = [(); 3].map(|()| vec![(0f64, 0u32); n_bins]);
+        let mut chosen = vec![NO_OBJECTIVE; n_bins];
+        for (index, entry) in strip.entries().enumerate() {
+            let bin = index * n_bins / n_entries;
+            let belief = entry.belief.as_ref();
+            let log_loss = belief.and_then(|belief| Some(belief.score?.log_loss));
+            let values = [
+                (!entry.moves.is_empty()).then_some(entry.result.reward),
+                Some(entry.result.n_target_cells.into()),
+                log_loss,
+            ];
+            for (mean, value) in means.iter_mut().zip(values) {
+                if let Some(value) = value {
+                    mean[bin] = (mean[bin].0 + value, mean[bin].1 + 1);
+                }
+            }
+            if let Some(belief) = belief {
+                chosen[bin] = number_of(&belief.intent.objective, &mut objectives);
+            }
+        }
+        let names = ["series_reward", "series_target", "series_log_loss"];
+        for (name, mean) in names.into_iter().zip(means) {
+            let means = mean.iter().map(|(sum, n)| (sum / f64::from(*n)) as f32);
+            self.add_floats(name, &means.collect::<Vec<_>>());
+        }
+        self.add_bytes("series_objective", &chosen);
+        (objectives, Series::of(strip, n_bins))
+    }
+}
+
+/// An objective's number among those met so far.
+fn number_of<'a>(objective: &'a str, objectives: &mut Vec<&'a str>) -> u8 {
+    let known = objectives.iter().position(|known| *known == objective);
+    let number = known.unwrap_or_else(|| {
+        if objectives.len() < MAX_OBJECTIVES {
+            objectives.push(objective);
+        }
+        objectives.len() - 1
+    });
+    number as u8
+}
+
+/// What each cell showed last up to a step of its episode, and how many steps before (at most 255).
+fn memory(strip: &Strip, serial: u64, last: &Entry) -> (Vec<u8>, Vec<u8>) {
+    let n_cells = last.shape.n_cells();
+    let (mut seen, mut age) = (vec![UNOBSERVED; n_cells], vec![u8::MAX; n_cells]);
+    let is_same = |entry: &&Entry| {
+        let (then, now) = (&entry.result, &last.result);
+        (then.seed, then.episode, entry.shape) == (now.seed, now.episode, last.shape)
+            && then.step <= now.step
+    };
+    let mut n_unseen = n_cells;
+    for entry in strip.back_from(serial).take_while(is_same) {
+        let steps = (last.result.step - entry.result.step).min(255) as u8;
+        for &(cell, value) in &entry.seen {
+            let cell = cell as usize;
+            if seen[cell] == UNOBSERVED {
+                (seen[cell], age[cell]) = (value, steps);
+                n_unseen -= 1;
+            }
+        }
+        if n_unseen == 0 {
+            break;
+        }
+    }
+    (seen, age)
+}
+
+impl<'a> Status<'a> {
+    fn of(status: &'a ServerStatus) -> Self {
+        Self {
+            steps_per_second: status.steps_per_second,
+            n_steps: status.n_steps,
+            n_observers: status.n_observers,
+            n_clients: status.n_clients,
+            n_refused: status.n_refused,
+            uptime_millis: status.uptime_millis,
+            worlds: &status.worlds,
+        }
+    }
+}
+
+impl Shown {
+    fn of(serial: u64, entry: &Entry) -> Self {
+        let result = &entry.result;
+        let pair = |cell: Cell| [cell.row, cell.col];
+        let score = entry.belief.as_ref().and_then(|belief| belief.score);
+        Self {
+            serial,
+            seed: result.seed.to_string(),
+            episode: result.episode,
+            step: result.step,
+            reward: result.reward,
+            n_visited: result.n_visited,
+            n_hits: result.n_hits,
+            n_target_cells: result.n_target_cells,
+            robot: [result.row, result.col],
+            start: pair(entry.start),
+            path: entry.path().into_iter().map(pair).collect(),
+            coverage: match result.coverage {
+                0 => "nothing",
+                1 => "path",
+                _ => "full",
+            },
+            terminated: result.terminated != 0,
+            truncated: result.truncated != 0,
+            log_loss: score.map(|score| score.log_loss),
+            brier: score.map(|score| score.brier),
+        }
+    }
+}
+
+impl<'a> AgentFacts<'a> {
+    fn of(entry: &'a Entry, is_live: bool) -> Option<Self> {
+        let belief = entry.belief.as_ref()?;
+        let intent = &belief.intent;
+        Some(Self {
+            pid: belief.pid,
+            policy: &intent.policy,
+            belief_from: &intent.belief_from,
+            objective: &intent.objective,
+            plan_millis: intent.plan_millis,
+            states: &intent.states,
+            is_live,
+        })
+    }
+}
+
+impl Series {
+    fn of(strip: &Strip, bins: usize) -> Option<Self> {
+        let (first, last) = strip.kept()?;
+        let step = |serial| strip.nearest(serial).map(|(_, entry)| entry.result.step);
+        Some(Self {
+            first,
+            last,
+            bins,
+            first_step: step(first)?,
+            last_step: step(last)?,
+        })
+    }
+}

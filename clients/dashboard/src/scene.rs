@@ -1,0 +1,167 @@
+//! All that there is to show, shared between what watches and what answers browsers.
+
+use crate::album::{Album, States};
+use protocol::Model;
+use protocol::control::{CoverageRule, ServerInfo, ServerStatus};
+use serde::Serialize;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use tokio::sync::watch;
+
+/// What is watched, and how far it is.
+#[derive(Debug)]
+pub struct Scene {
+    /// The steps.
+    pub album: Album,
+    /// The instance's name; of a recording, its file's.
+    pub instance: String,
+    /// Whether a server is there.
+    pub is_serving: bool,
+    /// One sentence for people.
+    pub note: Option<String>,
+    /// What the server said of itself.
+    pub info: Option<Info>,
+    /// What it says now and then.
+    pub status: Option<ServerStatus>,
+    /// What was missed.
+    pub lost: Lost,
+    /// The recording that is played.
+    pub player: Option<Player>,
+}
+
+/// Samples missed since watching began.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct Lost {
+    /// Of `frames`.
+    pub frames: u64,
+    /// Of `truth`.
+    pub truth: u64,
+    /// Of `agent`.
+    pub agent: u64,
+}
+
+/// A recording as it plays.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Player {
+    /// The file.
+    pub file: String,
+    /// Time since the recording began, seconds.
+    pub seconds: f64,
+    /// How many times as fast as it was recorded; 0: as fast as possible.
+    pub speed: f64,
+    /// Whether it runs.
+    pub playing: bool,
+    /// Whether it has come to its end; to play it then begins anew.
+    pub ended: bool,
+    /// Why it ended early.
+    pub error: Option<String>,
+}
+
+/// What a server said of itself, as far as pictures need it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Info {
+    pid: u32,
+    height: usize,
+    width: usize,
+    n_moves: usize,
+    n_worlds: u32,
+    model: Option<String>,
+    states: Option<Vec<String>>,
+    state_colours: Option<Vec<String>>,
+    target_state: Option<usize>,
+    observations: Vec<String>,
+    observation_colours: Option<Vec<String>>,
+    burn_in: u64,
+    max_steps: u64,
+    coverage: CoverageRule,
+    publish_truth: bool,
+}
+
+/// A scene with many readers.
+#[derive(Debug)]
+pub struct Stage {
+    scene: Mutex<Scene>,
+    changes: watch::Sender<u64>,
+}
+
+impl Scene {
+    /// Nothing seen yet.
+    pub fn new(instance: &str) -> Self {
+        Self {
+            album: Album::default(),
+            instance: instance.into(),
+            is_serving: false,
+            note: None,
+            info: None,
+            status: None,
+            lost: Lost::default(),
+            player: None,
+        }
+    }
+
+    /// The model's states, if they are known.
+    pub fn states(&self) -> Option<States> {
+        let info = self.info.as_ref()?;
+        Some(States {
+            names: info.states.clone()?,
+            target: info.target_state?,
+        })
+    }
+}
+
+impl Info {
+    /// Reads the model, if the server reveals it; one that makes no sense counts as hidden.
+    pub fn new(info: &ServerInfo) -> Self {
+        let model = info.model.as_deref().map(Model::from_toml);
+        let model = model.and_then(Result::ok);
+        let file = model.as_ref().map(Model::file);
+        let names = |of: fn(&protocol::model::StateEntry) -> &String| {
+            file.map(|file| file.states.iter().map(of).cloned().collect())
+        };
+        let colours = file.map(|file| file.observations.iter());
+        Self {
+            pid: info.pid,
+            height: info.height,
+            width: info.width,
+            n_moves: info.n_moves,
+            n_worlds: info.n_worlds,
+            model: model.as_ref().map(|model| model.name().to_owned()),
+            states: names(|state| &state.name),
+            state_colours: names(|state| &state.color),
+            target_state: model.as_ref().map(Model::target_state),
+            observations: info.observations.clone(),
+            observation_colours: colours.map(|all| all.map(|one| one.color.clone()).collect()),
+            burn_in: info.burn_in,
+            max_steps: info.max_steps,
+            coverage: info.coverage,
+            publish_truth: info.publish_truth,
+        }
+    }
+}
+
+impl Stage {
+    /// Shares a scene.
+    pub fn new(scene: Scene) -> Self {
+        Self {
+            scene: Mutex::new(scene),
+            changes: watch::Sender::new(0),
+        }
+    }
+
+    /// Reads the scene.
+    pub fn look(&self) -> MutexGuard<'_, Scene> {
+        // Whoever panicked while changing it left counts and pictures, nothing that others rely on.
+        self.scene.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Changes the scene, and tells all who wait for that.
+    pub fn change<T>(&self, act: impl FnOnce(&mut Scene) -> T) -> T {
+        let done = act(&mut self.look());
+        self.changes.send_modify(|n| *n += 1);
+        done
+    }
+
+    /// Tells of each change.
+    pub fn changes(&self) -> watch::Receiver<u64> {
+        self.changes.subscribe()
+    }
+}

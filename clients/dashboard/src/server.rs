@@ -1,0 +1,212 @@
+//! The web server: the page, and one WebSocket for each browser that looks.
+//!
+//! A browser asks for each picture, so it is never sent more than it draws. Pages of other sites get nothing:
+//! the `Host` must be an address of this machine (else a name that somebody else controls could point here), and
+//! the `Origin` of a WebSocket must be this very server.
+
+use crate::page::ASSETS;
+use crate::picture::{Ask, picture};
+use crate::scene::{Scene, Stage};
+use axum::Router;
+use axum::extract::ws::{Message, WebSocket, WebSocketUpgrade};
+use axum::extract::{Request, State};
+use axum::http::header::{
+    CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HOST, ORIGIN, REFERRER_POLICY,
+    X_CONTENT_TYPE_OPTIONS,
+};
+use axum::http::{HeaderMap, StatusCode};
+use axum::middleware::{Next, from_fn_with_state};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use tokio::net::TcpListener;
+use tokio::sync::Semaphore;
+
+/// Time between two pictures at least: thirty a second.
+const PICTURE_INTERVAL: Duration = Duration::from_millis(33);
+
+/// Time after which a picture is sent though nothing has changed.
+const PATIENCE: Duration = Duration::from_millis(500);
+
+/// Longest message of a browser, bytes.
+const MAX_ASK_BYTES: usize = 4096;
+
+/// Most browsers at a time.
+const MAX_BROWSERS: usize = 32;
+
+/// Greatest speed of a recording.
+const MAX_SPEED: f64 = 1e6;
+
+/// What the page may load: what is in this program.
+const POLICY: &str = "default-src 'self'; img-src 'self' data:; style-src 'self'; script-src 'self'; \
+     connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
+
+/// What every request needs.
+#[derive(Clone)]
+struct Service {
+    stage: Arc<Stage>,
+    names: Arc<[String]>,
+    places: Arc<Semaphore>,
+}
+
+/// Serves for ever. `names` are host names besides addresses and `localhost` that browsers may call this
+/// server by.
+///
+/// # Errors
+/// The system's.
+pub async fn serve(
+    listener: TcpListener,
+    stage: Arc<Stage>,
+    names: &[String],
+) -> std::io::Result<()> {
+    let service = Service {
+        stage,
+        names: names.into(),
+        places: Arc::new(Semaphore::new(MAX_BROWSERS)),
+    };
+    let mut router = Router::new().route("/socket", get(socket));
+    for asset in ASSETS {
+        let headers = [
+            (CONTENT_TYPE, asset.content_type),
+            (CACHE_CONTROL, "no-cache"),
+            (CONTENT_SECURITY_POLICY, POLICY),
+            (X_CONTENT_TYPE_OPTIONS, "nosniff"),
+            (REFERRER_POLICY, "no-referrer"),
+        ];
+        router = router.route(
+            asset.path,
+            get(move || async move { (headers, asset.text) }),
+        );
+    }
+    let router = router
+        .layer(from_fn_with_state(service.clone(), only_own_pages))
+        .with_state(service);
+    axum::serve(listener, router).await
+}
+
+/// Refuses requests that come from pages of other sites.
+async fn only_own_pages(State(service): State<Service>, request: Request, next: Next) -> Response {
+    match check(request.headers(), &service.names) {
+        Ok(()) => next.run(request).await,
+        Err(problem) => {
+            tracing::warn!("{problem}");
+            (StatusCode::FORBIDDEN, problem).into_response()
+        }
+    }
+}
+
+fn check(headers: &HeaderMap, names: &[String]) -> Result<(), String> {
+    let text = |name| headers.get(name).map(|value| value.to_str().unwrap_or("?"));
+    let host = text(HOST).unwrap_or("");
+    if !is_own(host, names) {
+        return Err(format!(
+            "Host: expected an address, localhost or a name given with --name, got {host:?}"
+        ));
+    }
+    match text(ORIGIN) {
+        Some(origin) if origin != format!("http://{host}") => Err(format!(
+            "Origin: expected \"http://{host}\", got {origin:?}"
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// Whether a host, with its port or without, is no name that others could point here.
+fn is_own(host: &str, names: &[String]) -> bool {
+    let name = match host.rsplit_once(':') {
+        Some((name, port)) if port.bytes().all(|digit| digit.is_ascii_digit()) => name,
+        _ => host,
+    };
+    let address = name.trim_start_matches('[').trim_end_matches(']');
+    name == "localhost" || address.parse::<IpAddr>().is_ok() || names.iter().any(|own| own == name)
+}
+
+async fn socket(State(service): State<Service>, upgrade: WebSocketUpgrade) -> Response {
+    let Ok(place) = service.places.clone().try_acquire_owned() else {
+        let problem = format!("expected at most {MAX_BROWSERS} browsers");
+        return (StatusCode::SERVICE_UNAVAILABLE, problem).into_response();
+    };
+    let stage = service.stage;
+    upgrade
+        .max_message_size(MAX_ASK_BYTES)
+        .on_upgrade(async move |socket| {
+            answer(socket, &stage).await;
+            drop(place);
+        })
+}
+
+/// Answers each ask with one picture, until the browser leaves or says what makes no sense.
+async fn answer(mut socket: WebSocket, stage: &Stage) {
+    let mut changes = stage.changes();
+    let mut sent = Instant::now() - PICTURE_INTERVAL;
+    while let Some(Ok(message)) = socket.recv().await {
+        let text = match message {
+            Message::Text(text) => text,
+            Message::Ping(_) | Message::Pong(_) => continue,
+            Message::Binary(_) | Message::Close(_) => return,
+        };
+        let ask: Ask = match serde_json::from_str(&text) {
+            Ok(ask) => ask,
+            Err(error) => {
+                tracing::warn!("a browser asked for what makes no sense: {error}");
+                return;
+            }
+        };
+        order(stage, &ask);
+        tokio::time::sleep(PICTURE_INTERVAL.saturating_sub(sent.elapsed())).await;
+        // A change since the last picture ends this at once.
+        let _ = tokio::time::timeout(PATIENCE, changes.changed()).await;
+        sent = Instant::now();
+        let bytes = picture(&stage.look(), &ask, sent);
+        if socket.send(Message::Binary(bytes.into())).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// Tells a recording's player what the browser wants of it.
+fn order(stage: &Stage, ask: &Ask) {
+    if ask.speed.is_none() && ask.playing.is_none() {
+        return;
+    }
+    stage.change(|scene: &mut Scene| {
+        let Some(player) = &mut scene.player else {
+            return;
+        };
+        if let Some(speed) = ask.speed.filter(|speed| speed.is_finite()) {
+            player.speed = speed.clamp(0.0, MAX_SPEED);
+        }
+        player.playing = ask.playing.unwrap_or(player.playing);
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use axum::http::HeaderValue;
+
+    #[test]
+    fn only_own_pages_are_answered() {
+        let names = ["lab.example".to_owned()];
+        let refused = |host: &'static str, origin: Option<&'static str>| {
+            let mut headers = HeaderMap::new();
+            headers.insert(HOST, HeaderValue::from_static(host));
+            if let Some(origin) = origin {
+                headers.insert(ORIGIN, HeaderValue::from_static(origin));
+            }
+            check(&headers, &names).is_err()
+        };
+        assert!(!refused("127.0.0.1:8600", None));
+        assert!(!refused("127.0.0.1:8600", Some("http://127.0.0.1:8600")));
+        assert!(!refused("[::1]:8600", Some("http://[::1]:8600")));
+        assert!(!refused("localhost", Some("http://localhost")));
+        assert!(!refused("lab.example:80", None));
+        assert!(refused("evil.example:8600", None));
+        assert!(refused("127.0.0.1:8600", Some("http://evil.example")));
+        assert!(refused("127.0.0.1:8600", Some("http://127.0.0.1:8601")));
+        assert!(refused("127.0.0.1:8600", Some("null")));
+        assert!(refused("", None));
+    }
+}
