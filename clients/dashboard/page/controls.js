@@ -95,7 +95,7 @@ function drawWorlds({ info, world }, view) {
 function drawPlayer(player) {
   byId("player").hidden = !player;
   if (!player) return;
-  write(byId("play"), player.ended ? "Play again" : player.playing ? "Hold playback" : "Play on");
+  write(byId("play"), player.ended ? "Play again" : player.playing ? "Stop playing" : "Play on");
   const speed = byId("speed");
   if (document.activeElement !== speed) speed.value = String(player.speed);
   write(byId("clock"), player.ended ? "ended" : `${player.seconds.toFixed(1)} s`);

@@ -19,12 +19,12 @@ export function createFacts() {
 
   return {
     draw(picture, view) {
-      drawState(picture.state, picture.note);
+      drawState(picture.state, isToldLarge(picture) ? null : picture.note ?? picture.player?.error);
       drawServer(picture);
       drawWorld(picture);
       drawAgent(picture, view.at == null);
       drawEmpty(picture);
-      say(picture.note ?? `${picture.state}, world ${picture.world}`);
+      say(picture.note ?? picture.player?.error ?? `${picture.state}, world ${picture.world}`);
     },
     /** The dashboard itself went away: what was drawn last stays. */
     gone() {
@@ -35,6 +35,11 @@ export function createFacts() {
       drawState("unreadable", `The dashboard sent what this page cannot read: ${error.message}`);
     },
   };
+}
+
+// Before the first server the whole page says that one is waited for.
+function isToldLarge({ state, source, info }) {
+  return state === "waiting" && source === "live" && !info;
 }
 
 function drawState(state, note) {
@@ -48,6 +53,8 @@ function drawServer({ status, lost, instance, source }) {
   const isLive = source === "live";
   write(byId("source"), isLive ? "instance" : "recording");
   write(byId("instance"), instance);
+  byId("instance").title = instance;
+  for (const fact of document.querySelectorAll(".of-server")) fact.hidden = !isLive;
   write(byId("rate"), short(status?.steps_per_second));
   write(byId("observers"), whole(status?.n_observers));
   write(byId("lost"), whole(lost?.frames));

@@ -8,7 +8,7 @@ import { shapeOf } from "/wire.js";
 const OBSERVED = [
   { id: "truth", kind: "truth", title: "truth", hint: "hidden" },
   { id: "seen", kind: "seen", title: "seen so far", hint: "older fades" },
-  { id: "frame", kind: "frame", title: "this path", hint: "seen in this step" },
+  { id: "frame", kind: "frame", title: "this path", hint: "seen just now" },
 ];
 const ENTROPY = { id: "entropy", kind: "entropy", title: "entropy", hint: "of the belief" };
 
