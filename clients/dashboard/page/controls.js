@@ -72,8 +72,9 @@ function drawScrub({ kept, shown }, { at }) {
   scrub.min = kept.first;
   scrub.max = kept.last;
   const serial = shown?.serial ?? kept.last;
-  scrub.value = serial;
-  scrub.style.setProperty("--share", kept.last > kept.first ? (serial - kept.first) / (kept.last - kept.first) : 1);
+  // Live, the newest belief is shown, which may be a few steps old: that is still the end.
+  scrub.value = at == null ? kept.last : serial;
+  scrub.style.setProperty("--share", kept.last > kept.first ? (scrub.value - kept.first) / (kept.last - kept.first) : 1);
   scrub.setAttribute("aria-valuetext", `entry ${whole(serial)}, step ${whole(shown?.step)}${at == null ? ", newest" : ""}`);
   write(byId("serial"), whole(serial));
   const isGone = at != null && at < kept.first;

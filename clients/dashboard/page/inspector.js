@@ -83,16 +83,14 @@ function rowElement({ name, value, color, share, ramp }, palette) {
   if (color) answer.append(swatch(palette[color[0]][color[1]]));
   answer.append(value);
   row.append(term, answer);
-  if (share !== undefined) row.append(bar(share, ramp, palette.theme));
+  if (share !== undefined) addBar(row, share, ramp, palette.theme);
   return row;
 }
 
-function bar(share, ramp, theme) {
-  const track = make("i", "bar");
-  const fill = make("i");
-  fill.style.width = `${share * 100}%`;
+// The style sheet draws it: a list of terms may hold nothing but terms and answers.
+function addBar(row, share, ramp, theme) {
+  row.className = "has-bar";
+  row.style.setProperty("--share", `${share * 100}%`);
   // From a third of the ramp upwards, as its beginning would not be seen on the background.
-  fill.style.background = `rgb(${rampColor(ramp, theme, 0.35 + 0.4 * share).join(" ")})`;
-  track.append(fill);
-  return track;
+  row.style.setProperty("--bar", `rgb(${rampColor(ramp, theme, 0.35 + 0.4 * share).join(" ")})`);
 }

@@ -26,6 +26,13 @@ function middle({ cell }, [row, col]) {
   return [(col + 0.5) * cell.x, (row + 0.5) * cell.y];
 }
 
+/** The middle of a cell, as far inside as a mark of that size needs. */
+function inside(frame, place, radius) {
+  const [x, y] = middle(frame, place);
+  const fit = (at, size) => Math.min(Math.max(at, radius), size - radius);
+  return [fit(x, frame.width), fit(y, frame.height)];
+}
+
 function drawPath(frame, path) {
   const { context, ratio, cell, ink } = frame;
   context.beginPath();
@@ -41,7 +48,7 @@ function drawPath(frame, path) {
 function drawStart(frame, place) {
   const { context, ratio, cell } = frame;
   const side = Math.max(cell.x * 0.9, 6 * ratio);
-  const [x, y] = middle(frame, place);
+  const [x, y] = inside(frame, place, side / 2 + ratio);
   context.fillStyle = LIGHT;
   context.fillRect(x - side / 2, y - side / 2, side, side);
   context.strokeStyle = DARK;
@@ -52,7 +59,7 @@ function drawStart(frame, place) {
 function drawRobot(frame, place) {
   const { context, ratio, cell } = frame;
   const radius = Math.max(cell.x * 0.85, 5 * ratio);
-  const [x, y] = middle(frame, place);
+  const [x, y] = inside(frame, place, radius + 1.5 * ratio);
   disc(context, x, y, radius + 1.5 * ratio, DARK);
   disc(context, x, y, radius, LIGHT);
   disc(context, x, y, radius * 0.42, DARK);

@@ -25,6 +25,9 @@ const RAMPS = {
   },
 };
 
+// Before an agent has planned its first path.
+const IDLE = { name: "nothing yet", color: "#8b93a0" };
+
 // For objectives that name no state; apart from the wildfire's colours.
 const OBJECTIVES = ["#8a63b8", "#009e73", "#cc79a7", "#56b4e9", "#8c510a"];
 
@@ -66,9 +69,10 @@ function make(ownStates, ownObservations, theme) {
 
 /** The colour of an objective: that of the state it names, else one of its own. */
 export function objectiveColor(name, { objectives, names, palette }) {
+  if (name === IDLE.name) return IDLE.color;
   const stateOf = (objective) => names.findIndex((state) => objective.includes(state));
   if (stateOf(name) >= 0) return palette.states[stateOf(name)];
-  const others = objectives.filter((other) => stateOf(other) < 0);
+  const others = objectives.filter((other) => stateOf(other) < 0 && other !== IDLE.name);
   return OBJECTIVES[Math.max(0, others.indexOf(name)) % OBJECTIVES.length];
 }
 

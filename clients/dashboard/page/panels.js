@@ -14,11 +14,11 @@ const ENTROPY = { id: "entropy", kind: "entropy", title: "entropy", hint: "of th
 
 /** The panels in `parent`; `point(cell)` is called with the cell that is pointed at, or null. */
 export function createPanels(parent, { point, inspector }) {
-  let built = { key: "", panels: [] };
+  let built = { key: "", world: null, beliefs: [], panels: [] };
 
   /** Builds panels anew when their number, names or shape change. Tells whether it did. */
   function build(picture) {
-    const beliefs = beliefNames(picture);
+    const beliefs = namesOf(picture);
     const key = JSON.stringify([shapeOf(picture), beliefs, stateNames(picture).length]);
     if (key === built.key) return false;
     const panels = OBSERVED.map((panel) => element(panel, picture, point));
@@ -27,8 +27,15 @@ export function createPanels(parent, { point, inspector }) {
     if (beliefs.length > 0) believed.push(element(ENTROPY, picture, point));
     const row = believed.map((panel) => panel.figure);
     parent.replaceChildren(...panels.map((panel) => panel.figure), inspector, ...(row.length ? row : [noBelief()]));
-    built = { key, panels: [...panels, ...believed], states: beliefs.length };
+    built = { key, world: picture.world, beliefs, panels: [...panels, ...believed] };
     return true;
+  }
+
+  // Agents show a belief now and then, so entries without one lie between those with: panels stay.
+  function namesOf(picture) {
+    const names = beliefNames(picture);
+    if (names.length > 0 || picture.objectives.length === 0) return names;
+    return built.world === picture.world && built.beliefs.length ? built.beliefs : stateNames(picture);
   }
 
   return {
@@ -36,8 +43,8 @@ export function createPanels(parent, { point, inspector }) {
     /** For the layout: panels, lines of the inspector, columns that hold all beliefs in one row. */
     places: () => ({
       panels: built.panels.length,
-      lines: OBSERVED.length + (built.states && built.states + 1),
-      regular: Math.max(built.states + 1, OBSERVED.length + 1),
+      lines: OBSERVED.length + (built.beliefs.length && built.beliefs.length + 1),
+      regular: Math.max(built.beliefs.length + 1, OBSERVED.length + 1),
     }),
     draw: (picture, view, palette) => built.panels.forEach((panel) => paint(panel, picture, view, palette)),
     describe: (picture) => built.panels.forEach((panel) => describe(panel, picture)),
@@ -108,8 +115,8 @@ function valuesOf({ kind, state }, { arrays, info }) {
 function absence({ kind }, picture) {
   if (kind === "truth" && picture.source === "recording") return ["This recording holds no hidden states."];
   if (kind === "truth" && !picture.info.publish_truth) return ["The server keeps it to itself. To see it, start the server with ", "--publish-truth"];
-  if (kind === "entropy") return ["Not known for this entry."];
-  return ["Not known for this entry."];
+  if (kind === "belief" || kind === "entropy") return ["No belief was shown at this step."];
+  return ["Not known for this step."];
 }
 
 function noBelief() {

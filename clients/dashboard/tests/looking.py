@@ -25,7 +25,8 @@ class Look:
     def __init__(self, page: Page) -> None:
         """Listens to everything that goes wrong."""
         self.page = page
-        self.allowed: list[str] = []
+        # Reading pixels back, as only tests do, is slow and said to be.
+        self.allowed = ["willReadFrequently"]
         self._complaints: list[str] = []
         page.on("console", self._hear)
         page.on("pageerror", lambda error: self._complaints.append(f"error: {error}"))
@@ -84,7 +85,15 @@ class Look:
 
     def eventually(self, holds: Callable[[], object], what: str) -> None:
         """Waits until something holds."""
-        eventually(holds, what)
+        try:
+            eventually(holds, what)
+        except AssertionError as error:
+            error.add_note(f"The page shows {self._situation()}")
+            raise
+
+    def _situation(self) -> str:
+        return self.page.evaluate("""JSON.stringify(window.emberwatch?.picture, (name, value) =>
+            name === "path" || ArrayBuffer.isView(value) ? value.length : value)""")
 
     def wait_for_steps(self, count: int = 3) -> None:
         """Waits until so many further steps were shown."""

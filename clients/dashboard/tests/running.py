@@ -94,6 +94,11 @@ class Programs:
             Program(self._path("server"), flags({"instance": instance} | settings), instance)
         )
 
+    def is_serving(self, instance: str) -> bool:
+        """Whether a server answers there."""
+        command = [self._path("server"), "status", f"--instance={instance}"]
+        return subprocess.run(command, capture_output=True, timeout=PATIENCE).returncode == 0
+
     def agent(self, instance: str, **settings: object) -> Program:
         """An agent that acts on a world until it is stopped."""
         return self._keep(

@@ -3,6 +3,7 @@
 import base64
 import http.client
 import os
+from contextlib import closing
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
@@ -13,12 +14,13 @@ DESK = {"viewport": {"width": 1280, "height": 720}}
 
 def answer(port: int, path: str, **headers: str) -> http.client.HTTPResponse:
     """The answer to a request with exactly these headers."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    connection.putrequest("GET", path, skip_host=True)
-    for name, value in headers.items():
-        connection.putheader(name.replace("_", "-"), value)
-    connection.endheaders()
-    return connection.getresponse()
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
+        connection.putrequest("GET", path, skip_host=True)
+        for name, value in headers.items():
+            connection.putheader(name.replace("_", "-"), value)
+        connection.endheaders()
+        with connection.getresponse() as response:
+            return response
 
 
 def handshake(port: int, **headers: str) -> int:

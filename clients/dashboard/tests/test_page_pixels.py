@@ -158,7 +158,7 @@ def check_panels(look, theme, states, observations, unseen) -> None:
     truth = of_values(look.array("truth").reshape(grid), states, unseen)
     check_pixels(look, "panel-truth", truth)
     seen = of_values(look.array("seen").reshape(grid), observations, unseen)
-    share = 0.4 + 0.6 * 2 ** (-look.array("age").reshape(*grid, 1) / 24)
+    share = 0.4 + 0.6 * 2 ** (-look.array("age").astype(float).reshape(*grid, 1) / 24)
     check_pixels(look, "panel-seen", rgb(unseen) + (seen - rgb(unseen)) * share)
     for state, levels in enumerate(look.array("belief").reshape(-1, *grid)):
         check_pixels(look, f"panel-belief-{state}", ramp(BELIEF[theme], levels))

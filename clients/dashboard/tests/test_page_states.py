@@ -107,7 +107,7 @@ def test_another_agent_takes_over(watched, programs):
 
 def test_a_dashboard_that_goes_is_waited_for(watched, programs):
     server, dashboard, look = watched
-    look.allowed = [r"WebSocket connection to .* failed"]
+    look.allowed.append("WebSocket connection to .* failed")
     dashboard.kill()
     look.eventually(lambda: "dashboard gone" in look.text("state"), "gone")
     assert look.at("panel-truth").is_visible(), "the last picture stays"

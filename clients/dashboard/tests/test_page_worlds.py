@@ -54,8 +54,8 @@ def test_a_slow_browser_gets_fewer_pictures_and_the_newest(programs, open_page):
     look = open_page(programs.dashboard(server.instance))
     client = look.page.context.new_cdp_session(look.page)
     client.send("Emulation.setCPUThrottlingRate", {"rate": 30})
+    look.eventually(lambda: look.picture(".shown"), "the world before its first step")
     agent = programs.agent(server.instance, steps=4000)
-    look.wait_for_steps()
     agent.wait()
     drawn = look.drawn()
     look.eventually(lambda: look.picture(".shown.step") == 4000, "the newest step")
@@ -64,9 +64,11 @@ def test_a_slow_browser_gets_fewer_pictures_and_the_newest(programs, open_page):
 
 
 def test_one_cell_is_the_same_in_all_panels(watched):
-    _, _, look = watched
+    server, _, look = watched
     look.page.keyboard.press("Space")
     look.eventually(lambda: look.at("pause").text_content() != "Pause", "paused")
+    server.kill()
+    look.eventually(lambda: look.text("state") == "waiting", "nothing moves")
     look.at("panel-belief-1").hover(position={"x": 5, "y": 5})
     inspector = look.page.get_by_label("one cell in numbers")
     look.eventually(lambda: "row 0, col 0" in inspector.text_content(), "the cell pointed at")
