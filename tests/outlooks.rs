@@ -27,9 +27,10 @@ fn until(observer: &Observer<AgentHeader>, wanted: impl Fn(&Outlook) -> bool) ->
 fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
     let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 2000");
     let observer = Observer::agents(&server.instance).expect("observe");
-    let ended = run(&server, &["--steps", "50", "--policy", "beam_explore"]).wait(PATIENCE);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    let agent = run(&server, &["--steps", "50", "--policy", "beam_explore"]);
     let shown = until(&observer, |outlook| outlook.header.step == 50);
+    let ended = agent.wait(PATIENCE);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
     for Outlook {
         header,
         belief,
