@@ -5,7 +5,7 @@ use crate::say;
 use protocol::Probabilities;
 use protocol::channels::Instance;
 use protocol::control::{Reply, Request};
-use protocol::message::{AgentHeader, Operation, StepRequest, split_step_payload};
+use protocol::message::{AgentHeader, Operation, StepRequest};
 use protocol::observer::Observer;
 use protocol::outlook::{Intent, Showcase};
 use protocol::path::path_to_bytes;
@@ -109,8 +109,7 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
         }
         // As an agent shows its beliefs: at most each 20 ms.
         if n % 40 == 0 && showcase.is_watched() {
-            let (results, _) =
-                split_step_payload(&answer.reply, &answer.payload).expect("a result");
+            let results = &answer.results;
             let about = AgentHeader {
                 step: results[0].step,
                 seed: results[0].seed,
