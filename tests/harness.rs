@@ -321,14 +321,15 @@ pub fn repository() -> PathBuf {
     tests.parent().expect("tests lies in the repository").into()
 }
 
-fn program_path(name: &str) -> PathBuf {
+/// The program of a name, as built from the present sources.
+pub fn program_path(name: &str) -> PathBuf {
     let test = std::env::current_exe().expect("this program's path");
     let target = test.ancestors().nth(2).expect("target/<profile>/deps/test");
     let path = target.join(name);
-    let package = if name == "emberwatch-server" {
-        "env-server"
-    } else {
-        "agent"
+    let package = match name {
+        "emberwatch-server" => "env-server",
+        "emberwatch-dashboard" => "clients/dashboard",
+        _ => "agent",
     };
     let sources = [package, "protocol"].map(|package| repository().join(package).join("src"));
     let newest = sources

@@ -23,6 +23,7 @@ mod harness;
 mod hostile;
 mod learner;
 mod lease;
+mod outlooks;
 mod python;
 mod recording;
 mod replays;

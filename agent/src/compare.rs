@@ -150,6 +150,7 @@ pub fn compare(
                 .extend(runs.into_iter().map(Run::into_policy_run));
         }
     }
+    feed.end();
     Ok(results)
 }
 

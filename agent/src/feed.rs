@@ -10,6 +10,9 @@ use std::time::{Duration, Instant};
 /// Time between two beliefs of a world that are shown: no screen is faster, and each costs a copy.
 const INTERVAL: Duration = Duration::from_millis(20);
 
+/// How long readers may take to fetch what was shown last: it goes with the process.
+const FAREWELL: Duration = Duration::from_millis(100);
+
 /// What agents of one process show.
 pub struct Feed {
     showcase: Option<Showcase>,
@@ -53,6 +56,13 @@ impl Feed {
     /// Whether anybody looks.
     pub fn is_watched(&self) -> bool {
         self.showcase.as_ref().is_some_and(Showcase::is_watched)
+    }
+
+    /// Ends, when readers have had time to fetch what was shown last.
+    pub fn end(self) {
+        if self.shown.is_some() && self.is_watched() {
+            std::thread::sleep(FAREWELL);
+        }
     }
 
     /// Shows a world's belief.

@@ -1,10 +1,12 @@
-//! A server of our own: found, started, waited for, and stopped whatever happens.
+//! A server or a dashboard of our own: found, started, waited for, and stopped whatever happens.
 
 use protocol::channels::{ChannelError, Instance};
 use protocol::connection::{Connection, ConnectionError};
+use std::io::{BufRead, BufReader};
+use std::net::SocketAddr;
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
-use std::process::{Child, Command};
+use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
@@ -27,8 +29,10 @@ pub enum LaunchError {
         problem: String,
     },
     /// It ended at once; its own words stand above.
-    #[error("the server ended with {status} before it served")]
+    #[error("the {what} ended with {status} before it served")]
     Ended {
+        /// Server or dashboard.
+        what: &'static str,
         /// Its exit status.
         status: String,
     },
@@ -43,8 +47,17 @@ pub enum LaunchError {
 /// A running server of ours; dropping it stops it.
 pub struct OwnServer {
     instance: Instance,
-    child: Child,
+    program: OwnProgram,
 }
+
+/// A running dashboard of ours; dropping it stops it.
+pub struct OwnDashboard {
+    url: String,
+    _program: OwnProgram,
+}
+
+/// A child process; dropping it stops it.
+struct OwnProgram(Child);
 
 impl OwnServer {
     /// Starts `emberwatch-server` with the given arguments on an instance of its own, and waits until
@@ -53,23 +66,13 @@ impl OwnServer {
     /// # Errors
     /// [`LaunchError`].
     pub fn start(program: Option<PathBuf>, arguments: &[String]) -> Result<Self, LaunchError> {
-        let pid = std::process::id().to_string();
-        let instance = Instance::new(&format!("private-{pid}"))?;
-        let program = program.unwrap_or_else(beside_this_program);
-        let mut command = Command::new(&program);
+        let instance = Instance::new(&format!("private-{}", std::process::id()))?;
+        let mut command = private(program.unwrap_or_else(|| beside_this("emberwatch-server")));
         command
-            .args(["--instance", instance.name(), "--exit-with", &pid])
-            .args(arguments)
-            // A terminal's Ctrl-C is for this program, which still needs the server then.
-            .process_group(0);
-        if std::env::var_os("RUST_LOG").is_none() {
-            command.env("RUST_LOG", "warn");
-        }
-        let child = command.spawn().map_err(|error| LaunchError::Start {
-            program: program.display().to_string(),
-            problem: error.to_string(),
-        })?;
-        let mut server = Self { instance, child };
+            .args(["--instance", instance.name()])
+            .args(arguments);
+        let program = OwnProgram::start(&mut command)?;
+        let mut server = Self { instance, program };
         server.wait_until_it_answers()?;
         Ok(server)
     }
@@ -91,8 +94,9 @@ impl OwnServer {
                 Err(error) if Instant::now() > deadline => return Err(error.into()),
                 Err(_) => std::thread::sleep(Duration::from_millis(10)),
             }
-            if let Ok(Some(status)) = self.child.try_wait() {
+            if let Ok(Some(status)) = self.program.0.try_wait() {
                 return Err(LaunchError::Ended {
+                    what: "server",
                     status: status.to_string(),
                 });
             }
@@ -100,17 +104,72 @@ impl OwnServer {
     }
 }
 
-impl Drop for OwnServer {
+impl OwnDashboard {
+    /// Starts `emberwatch-dashboard` for an instance; browsers reach its page at `address`. It ends with this
+    /// process, however that ends.
+    ///
+    /// # Errors
+    /// [`LaunchError`], also when the address is taken: its own words stand above.
+    pub fn start(instance: &Instance, address: SocketAddr) -> Result<Self, LaunchError> {
+        let mut command = private(beside_this("emberwatch-dashboard"));
+        let address = address.to_string();
+        command
+            .args([
+                "--instance",
+                instance.name(),
+                "--listen",
+                &address,
+                "--open",
+            ])
+            .stdout(Stdio::piped());
+        let mut program = OwnProgram::start(&mut command)?;
+        let mut url = String::new();
+        if let Some(out) = program.0.stdout.take() {
+            // It says where its page is, or ends.
+            let _ = BufReader::new(out).read_line(&mut url);
+        }
+        match url.trim() {
+            "" => Err(LaunchError::Ended {
+                what: "dashboard",
+                status: program
+                    .0
+                    .wait()
+                    .map_or_else(|e| e.to_string(), |s| s.to_string()),
+            }),
+            url => Ok(Self {
+                url: url.into(),
+                _program: program,
+            }),
+        }
+    }
+
+    /// Where its page is.
+    pub fn url(&self) -> &str {
+        &self.url
+    }
+}
+
+impl OwnProgram {
+    fn start(command: &mut Command) -> Result<Self, LaunchError> {
+        let child = command.spawn().map_err(|error| LaunchError::Start {
+            program: command.get_program().display().to_string(),
+            problem: error.to_string(),
+        })?;
+        Ok(Self(child))
+    }
+}
+
+impl Drop for OwnProgram {
     fn drop(&mut self) {
-        if let Some(pid) = rustix::process::Pid::from_raw(self.child.id() as i32) {
-            // A server that has ended already is what we want.
+        if let Some(pid) = rustix::process::Pid::from_raw(self.0.id() as i32) {
+            // A program that has ended already is what we want.
             let _ = rustix::process::kill_process(pid, rustix::process::Signal::TERM);
         }
         let deadline = Instant::now() + STOP_TIMEOUT;
-        while matches!(self.child.try_wait(), Ok(None)) {
+        while matches!(self.0.try_wait(), Ok(None)) {
             if Instant::now() > deadline {
-                let _ = self.child.kill();
-                let _ = self.child.wait();
+                let _ = self.0.kill();
+                let _ = self.0.wait();
                 return;
             }
             std::thread::sleep(Duration::from_millis(5));
@@ -118,8 +177,20 @@ impl Drop for OwnServer {
     }
 }
 
-fn beside_this_program() -> PathBuf {
-    let name = "emberwatch-server";
+/// A program that ends with this one, and is quiet unless asked.
+fn private(program: PathBuf) -> Command {
+    let mut command = Command::new(program);
+    command
+        .args(["--exit-with", &std::process::id().to_string()])
+        // A terminal's Ctrl-C is for this program, which still needs the other then.
+        .process_group(0);
+    if std::env::var_os("RUST_LOG").is_none() {
+        command.env("RUST_LOG", "warn");
+    }
+    command
+}
+
+fn beside_this(name: &str) -> PathBuf {
     let beside = std::env::current_exe()
         .ok()
         .and_then(|path| Some(path.parent()?.join(name)));

@@ -139,6 +139,7 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
         mut client,
         agent,
         observation,
+        feed,
         ..
     } = attached;
     // After an outage nobody knows where the world stands.
@@ -147,6 +148,7 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
         false => Ok(()),
     };
     let released = left.and_then(|()| client.release());
+    feed.end();
     match released.map_err(RunError::from) {
         Err(error) if !is_outage(&error) => Err(error),
         _ => Ok(summary),

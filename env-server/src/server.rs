@@ -1,8 +1,10 @@
 //! The loop: receive, check the lease, step, answer, publish.
 
+mod later;
+
 use crate::autosave::{Autosave, FirstWorlds, first_worlds};
 use crate::config::Checked;
-use crate::files::{Done, Files};
+use crate::files::Files;
 use crate::liveness::{Clients, Janitor};
 use crate::ports::{ActiveStep, PortError, Ports};
 use crate::publications::Publications;
@@ -41,9 +43,6 @@ const CONTROL_FIRST: u64 = 64;
 
 /// How often a server that is greeting observers shows them more.
 const GREETING_TICK: Duration = Duration::from_millis(5);
-
-/// How long a server that ends waits for its files.
-const LAST_FILES: Duration = Duration::from_secs(10);
 
 /// Over how long the step rate is measured.
 const RATE_WINDOW: Duration = Duration::from_secs(1);
@@ -296,15 +295,7 @@ impl Server {
                 self.send_reply(&request, &reply);
                 self.publish(worlds);
             }
-            Outcome::File(job, order) if self.files.has_room() => {
-                let number = self.files.order(job);
-                self.file_orders.insert(number, (request, order));
-            }
-            Outcome::File(_, order) => {
-                self.simulator.forget_file(now, &order);
-                let message = "too many files at a time: try again later".into();
-                self.send_reply(&request, &bad_file(message));
-            }
+            Outcome::File(job, order) => self.order_file(now, request, job, order),
             Outcome::Shutdown => {
                 self.send_reply(&request, &Reply::Done);
                 wait_until_taken(&[request]);
@@ -321,15 +312,6 @@ impl Server {
         self.ports
             .answers()
             .send_json(request, reply.status(), reply);
-    }
-
-    fn answer_awaiting(&mut self, now: Instant) {
-        for (request, awaited) in std::mem::take(&mut self.awaiting) {
-            match self.simulator.answer_awaited(now, &awaited) {
-                Some(reply) => self.send_reply(&request, &reply),
-                None => self.awaiting.push((request, awaited)),
-            }
-        }
     }
 
     fn publish(&mut self, worlds: Range<usize>) {
@@ -350,120 +332,6 @@ impl Server {
         }
         self.publications.greet(&self.ports, &self.simulator);
         self.rate.update(now, self.simulator.n_steps());
-    }
-
-    fn take_resets(&mut self, now: Instant) {
-        let finished = self.resets.finished();
-        if finished.is_empty() {
-            return;
-        }
-        for (world, episode) in finished {
-            self.simulator.finish_reset(world, episode);
-            self.publish(world..world + 1);
-        }
-        self.answer_awaiting(now);
-    }
-
-    fn save_if_due(&mut self) {
-        let n_steps = self.simulator.n_steps();
-        if self
-            .autosave
-            .as_ref()
-            .is_some_and(|autosave| autosave.is_due(n_steps))
-        {
-            self.save();
-        }
-    }
-
-    fn save(&mut self) {
-        let Some(autosave) = &mut self.autosave else {
-            return;
-        };
-        let n_steps = self.simulator.n_steps();
-        match self.simulator.snapshot(self.simulator.worlds()) {
-            Ok(bytes) => autosave.order(n_steps, bytes, &mut self.files),
-            Err(error) => {
-                autosave.skip(n_steps);
-                tracing::warn!("not saved: {error}");
-            }
-        }
-    }
-
-    /// Leaves a last snapshot, and everything in order, before others may take the instance.
-    fn end(mut self) -> Result<(), ServeError> {
-        self.save();
-        let (finished, is_late) = match self.files.finish(LAST_FILES) {
-            Ok(finished) => (finished, false),
-            Err(finished) => (finished, true),
-        };
-        if is_late {
-            tracing::warn!("files were not written within {LAST_FILES:?}");
-        }
-        let failed = finished
-            .into_iter()
-            .filter_map(|(_, outcome)| outcome.err());
-        match failed.last() {
-            Some(error) if self.autosave.is_some() => Err(error.into()),
-            _ => Ok(()),
-        }
-    }
-
-    fn take_files(&mut self, now: Instant) {
-        for (number, outcome) in self.files.finished() {
-            if let Some(autosave) = &mut self.autosave
-                && autosave.is_done(number)
-            {
-                if let Err(error) = outcome {
-                    tracing::warn!("not saved: {error}");
-                }
-                self.save_if_due(); // Steps may have gone on meanwhile, and stopped.
-                continue;
-            }
-            let Some((request, order)) = self.file_orders.remove(&number) else {
-                continue; // Its client gave up.
-            };
-            let reply = self.file_reply(now, &order, outcome);
-            self.send_reply(&request, &reply);
-            if let (FileOrder::Restored { worlds, .. }, Status::Ok) = (order, reply.status()) {
-                self.publish(worlds);
-            }
-        }
-    }
-
-    fn file_reply(
-        &mut self,
-        now: Instant,
-        order: &FileOrder,
-        outcome: Result<Done, FileError>,
-    ) -> Reply {
-        match outcome {
-            Ok(Done::Loaded(episodes)) => self.simulator.finish_restore(now, order, episodes),
-            Ok(Done::Saved { path, n_bytes }) => self.simulator.saved(order, &path, n_bytes),
-            Err(error) => {
-                self.simulator.forget_file(now, order);
-                bad_file(error.to_string())
-            }
-        }
-    }
-
-    /// Lets go of requests whose clients no longer wait: until then, iceoryx2 hands out none of the
-    /// same client's next ones.
-    fn forget_abandoned(&mut self, now: Instant) {
-        let simulator = &mut self.simulator;
-        self.awaiting.retain(|(request, awaited)| {
-            let is_awaited = request.is_connected();
-            if !is_awaited {
-                simulator.forget_awaited(now, awaited);
-            }
-            is_awaited
-        });
-        self.file_orders.retain(|_, (request, order)| {
-            let is_awaited = request.is_connected();
-            if !is_awaited {
-                simulator.forget_file(now, order);
-            }
-            is_awaited
-        });
     }
 
     fn bury_the_dead(&mut self) {
@@ -492,14 +360,6 @@ impl Rate {
                 per_second,
             };
         }
-    }
-}
-
-fn bad_file(message: String) -> Reply {
-    Reply::Error {
-        status: Status::BadFile,
-        detail: 0,
-        message,
     }
 }
 

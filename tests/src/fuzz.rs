@@ -39,7 +39,7 @@ pub struct Target {
 pub type Seed = (&'static str, Vec<u8>);
 
 /// All of them.
-pub const TARGETS: [Target; 10] = [
+pub const TARGETS: [Target; 11] = [
     message("step_request", requests::step, requests::step_seeds),
     message(
         "control_request",
@@ -52,6 +52,7 @@ pub const TARGETS: [Target; 10] = [
         messages::step_answer_seeds,
     ),
     message("frame", messages::frame, messages::frame_seeds),
+    message("outlook", messages::outlook, messages::outlook_seeds),
     message(
         "control_reply",
         messages::control_reply,

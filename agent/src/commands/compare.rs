@@ -6,6 +6,7 @@ use agent::agent::AgentError;
 use agent::arena::Arena;
 use agent::compare::{Comparison, Moment, Results, compare};
 use agent::config::AgentFlags;
+use agent::launch::OwnDashboard;
 use agent::learned::Learned;
 use agent::policy::{EstimatorKind, Policy};
 use agent::report::{
@@ -16,6 +17,7 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::Model;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 /// Compare policies on the same worlds.
@@ -38,6 +40,9 @@ pub struct CompareCommand {
     /// Draw ladder.png, rewards.png and snapshot.png into this directory
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
+    /// Show it in a browser while it runs, at this address
+    #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1:8600")]
+    watch: Option<SocketAddr>,
     #[command(flatten)]
     worlds: WorldFlags,
     #[command(flatten)]
@@ -54,6 +59,13 @@ impl CompareCommand {
             self.policies(model, &learned).map(|_| ())
         })?;
         let arena = &mut worlds.arena;
+        let dashboard = self
+            .watch
+            .map(|address| OwnDashboard::start(arena.instance(), address))
+            .transpose()?;
+        if let Some(dashboard) = &dashboard {
+            tracing::info!("watch at {}", dashboard.url());
+        }
         let comparison = Comparison {
             policies: self.policies(arena.model(), &learned)?,
             seeds: self.worlds.seeds.clone(),

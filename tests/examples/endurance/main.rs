@@ -2,13 +2,14 @@
 //! stopped, hours of coming and going.
 //!
 //! `cargo run --release -p tests --example endurance -- agents 1000 | servers 200 | observers 5 |
-//! soak 3600 FOLDER`
+//! dashboard 5 64 | soak 3600 FOLDER`
 
 #[expect(dead_code, reason = "the tests use all of it")]
 #[path = "../../harness.rs"]
 mod harness;
 
 mod agents;
+mod dashboard;
 mod meter;
 mod observers;
 mod servers;
@@ -27,10 +28,11 @@ fn main() {
         ["agents", n] => agents::kill(number(n)),
         ["servers", n] => servers::kill(number(n)),
         ["observers", n] => observers::compare(number(n)),
+        ["dashboard", rounds, side] => dashboard::compare(number(rounds), number(side)),
         ["observe", instance] => observers::observe(instance),
         ["soak", seconds, folder] => soak::soak(number(seconds), folder.as_ref()),
         _ => panic!(
-            "expected agents N, servers N, observers ROUNDS or soak SECONDS FOLDER, got {words:?}"
+            "expected agents N, servers N, observers ROUNDS, dashboard ROUNDS SIDE or soak SECONDS FOLDER, got {words:?}"
         ),
     }
 }

@@ -2,10 +2,12 @@
 
 use crate::harness::{Paths, Server};
 use crate::say;
+use protocol::Probabilities;
 use protocol::channels::Instance;
 use protocol::control::{Reply, Request};
-use protocol::message::{Operation, StepRequest};
+use protocol::message::{AgentHeader, Operation, StepRequest};
 use protocol::observer::Observer;
+use protocol::outlook::{Intent, Showcase};
 use protocol::path::path_to_bytes;
 use rustix::process::{Pid, Signal, kill_process};
 use std::process::{Child, Command, Stdio};
@@ -15,8 +17,8 @@ const N_STEPS: usize = 20_000;
 
 const TIMEOUT: Duration = Duration::from_secs(20);
 
-/// An observer's process; killed on drop.
-struct Process(Child);
+/// A process; killed on drop.
+pub struct Process(pub Child);
 
 impl Drop for Process {
     fn drop(&mut self) {
@@ -27,31 +29,50 @@ impl Drop for Process {
 
 /// Prints the server's own time and the round trip for each number of observers, some rounds over.
 pub fn compare(n_rounds: usize) {
-    say("observers   server p50     p99   round trip p50     p99, us; the mean of all rounds");
-    let numbers = [0, 1, 4, 16];
-    let mut sums = [[0.0; 4]; 4];
+    let audiences = [0, 1, 4, 16].map(|n_observers| {
+        let attend = move |server: &Server| -> Vec<Process> {
+            (0..n_observers).map(|n| start(server, n == 1)).collect()
+        };
+        (format!("{n_observers} observers"), attend)
+    });
+    table(n_rounds, "--burn-in 1000", &audiences);
+}
+
+/// Prints median and 99th percentile of the server's own time and of the round trip beside each audience: the
+/// median over rounds, and the least and the greatest.
+pub fn table<A, T>(n_rounds: usize, flags: &str, audiences: &[(String, A)])
+where
+    A: Fn(&Server) -> T,
+{
+    say(&format!(
+        "{:<28}{:>20}{:>20}{:>24}{:>24}",
+        "us: median (least-most)", "server p50", "p99", "round trip p50", "p99"
+    ));
+    let mut rounds = vec![Vec::new(); audiences.len()];
     for _ in 0..n_rounds {
-        for (n_observers, sums) in numbers.iter().zip(&mut sums) {
-            let times = measure(*n_observers);
-            sums.iter_mut()
-                .zip(times)
-                .for_each(|(sum, time)| *sum += time);
+        for ((_, attend), times) in audiences.iter().zip(&mut rounds) {
+            times.push(measure(flags, attend));
         }
     }
-    for (n_observers, sums) in numbers.iter().zip(sums) {
-        let [a, b, c, d] = sums.map(|sum| sum / n_rounds as f64);
-        say(&format!(
-            "{n_observers:>9} {a:>12.1} {b:>7.1} {c:>16.1} {d:>7.1}"
-        ));
+    for ((name, _), times) in audiences.iter().zip(&rounds) {
+        let column = |index: usize| {
+            let mut column: Vec<f64> = times.iter().map(|times| times[index]).collect();
+            column.sort_by(f64::total_cmp);
+            let (least, most) = (column[0], column[column.len() - 1]);
+            format!("{:.1} ({least:.1}-{most:.1})", column[column.len() / 2])
+        };
+        let [a, b, c, d] = [0, 1, 2, 3].map(column);
+        say(&format!("{name:<28}{a:>20}{b:>20}{c:>24}{d:>24}"));
     }
 }
 
 /// Median and 99th percentile of the server's time for a step, then of the round trip, us.
-fn measure(n_observers: usize) -> [f64; 4] {
-    let server = Server::start("--burn-in 1000");
-    let _observers: Vec<Process> = (0..n_observers).map(|n| start(&server, n == 1)).collect();
+fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
+    let server = Server::start(flags);
+    let _audience = attend(&server);
     std::thread::sleep(Duration::from_millis(500));
     let mut connection = server.connect();
+    let info = connection.info().clone();
     let acquire = Request::Acquire {
         first_world: 0,
         n_worlds: 1,
@@ -65,14 +86,17 @@ fn measure(n_observers: usize) -> [f64; 4] {
         operation: Operation::Step as u32,
         lease: lease.lease,
         n_worlds: 1,
-        n_moves: 64,
+        n_moves: info.n_moves as u32,
         ..StepRequest::default()
     };
+    let belief = Probabilities::from_elem((3, info.height, info.width), 1.0 / 3.0);
+    let mut showcase =
+        Showcase::open(&server.instance, 4 * belief.len() + 1024).expect("the agent channel");
     let mut paths = Paths::new(0);
     let (mut work, mut trips) = (Vec::new(), Vec::new());
     let mut last = Instant::now();
     for n in 0..N_STEPS {
-        let path = path_to_bytes(&paths.next(64));
+        let path = path_to_bytes(&paths.next(info.n_moves));
         // As an agent that plans for a while: 2,000 steps a second, not as many as there can be.
         while last.elapsed() < Duration::from_micros(500) {
             std::hint::spin_loop();
@@ -82,6 +106,18 @@ fn measure(n_observers: usize) -> [f64; 4] {
         if n > N_STEPS / 10 {
             work.push(answer.reply.simulation_nanos as f64 / 1e3);
             trips.push(last.elapsed().as_secs_f64() * 1e6);
+        }
+        // As an agent shows its beliefs: at most each 20 ms.
+        if n % 40 == 0 && showcase.is_watched() {
+            let results = &answer.results;
+            let about = AgentHeader {
+                step: results[0].step,
+                seed: results[0].seed,
+                episode: results[0].episode,
+                ..AgentHeader::default()
+            };
+            let shown = showcase.show(about, &belief, &Intent::default());
+            shown.expect("a belief is shown");
         }
     }
     let at = |times: &mut Vec<f64>, q: f64| {

@@ -5,8 +5,11 @@ use bytemuck::{Pod, bytes_of};
 use protocol::control::{LeaseInfo, Reply, ServerStatus, WorldInfo, WorldStatus, parse};
 use protocol::decisions;
 use protocol::message::{
-    FrameHeader, RESULT_BYTES, Status, StepReply, StepResult, VERSION, split_step_payload,
+    AgentHeader, FrameHeader, RESULT_BYTES, Status, StepReply, StepResult, VERSION,
+    split_step_payload,
 };
+use protocol::observer::Sample;
+use protocol::outlook::{Intent, Outlook};
 use protocol::path::{fly, path_from_bytes, path_to_bytes};
 use protocol::{Cell, Coverage, Frame, Shape, UNOBSERVED};
 use serde::Serialize;
@@ -93,6 +96,22 @@ fn is_path(shape: Shape, start: Cell, bytes: &[u8]) -> bool {
     true
 }
 
+/// A sample of `agent`: a belief of as many numbers as its header says, and what the agent wants.
+pub fn outlook(bytes: &[u8]) -> bool {
+    let Some((header, payload)) = split_header::<AgentHeader>(bytes) else {
+        return false;
+    };
+    let payload = payload.to_vec();
+    let Ok(outlook) = Outlook::try_from(&Sample { header, payload }) else {
+        return false;
+    };
+    let dimensions = [header.n_states, header.height, header.width].map(|n| n as usize);
+    assert_eq!(outlook.belief.shape(), dimensions);
+    let is_probability = |p: &f32| (0.0..=1.0).contains(p);
+    assert!(outlook.belief.iter().all(is_probability));
+    true
+}
+
 /// A reply on `control`.
 pub fn control_reply(bytes: &[u8]) -> bool {
     let reply = survives::<Reply>(bytes);
@@ -170,6 +189,27 @@ pub fn frame_seeds() -> Vec<Seed> {
     ]
     .concat();
     vec![("step", step), ("reset", reset)]
+}
+
+pub fn outlook_seeds() -> Vec<Seed> {
+    let header = AgentHeader {
+        version: VERSION,
+        height: 2,
+        width: 3,
+        n_states: 2,
+        ..AgentHeader::default()
+    };
+    let intent = Intent {
+        policy: "beam_exploit".into(),
+        states: vec!["normal".into(), "fire".into()],
+        ..Intent::default()
+    };
+    let belief = [0.25f32, 0.75].map(|p| [p; 6]).concat();
+    let belief: Vec<u8> = belief.iter().flat_map(|p| p.to_ne_bytes()).collect();
+    vec![(
+        "belief",
+        [bytes_of(&header), &belief, &json(&intent)].concat(),
+    )]
 }
 
 pub fn control_reply_seeds() -> Vec<Seed> {

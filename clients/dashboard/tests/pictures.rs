@@ -1,0 +1,223 @@
+//! What browsers get, from what was published.
+
+use dashboard::album::{Album, MAX_ENTRIES, States};
+use dashboard::picture::{Ask, picture};
+use dashboard::scene::Scene;
+use protocol::Probabilities;
+use protocol::message::{AgentHeader, FrameHeader, StepResult, TruthHeader};
+use protocol::observer::Sample;
+use protocol::outlook::{Intent, Outlook};
+use serde_json::Value;
+use std::time::Instant;
+
+/// A frame of a 2 x 3 world: the robot flew right along the upper row and saw the values.
+fn frame(step: u64, values: [u8; 6]) -> Sample<FrameHeader> {
+    let header = FrameHeader {
+        height: 2,
+        width: 3,
+        n_moves: 2,
+        result: StepResult {
+            step,
+            seed: u64::MAX,
+            col: 2,
+            reward: step as f64,
+            coverage: 1,
+            ..StepResult::default()
+        },
+        ..FrameHeader::default()
+    };
+    let payload = [&values[..], &[3, 3]].concat();
+    Sample { header, payload }
+}
+
+fn truth(step: u64, states: [u8; 6]) -> Sample<TruthHeader> {
+    let header = TruthHeader {
+        step,
+        seed: u64::MAX,
+        height: 2,
+        width: 3,
+        ..TruthHeader::default()
+    };
+    let payload = states.to_vec();
+    Sample { header, payload }
+}
+
+/// Certain of state 1 in the left column, of nothing elsewhere.
+fn outlook(step: u64) -> Outlook {
+    let p = |(state, _, col): (usize, usize, usize)| match (col, state) {
+        (0, 1) => 1.0,
+        (0, _) => 0.0,
+        _ => 0.5,
+    };
+    Outlook {
+        header: AgentHeader {
+            step,
+            seed: u64::MAX,
+            ..AgentHeader::default()
+        },
+        belief: Probabilities::from_shape_fn((2, 2, 3), p),
+        intent: Intent {
+            objective: "fire".into(),
+            states: vec!["calm".into(), "fire".into()],
+            ..Intent::default()
+        },
+    }
+}
+
+fn states() -> States {
+    States {
+        names: vec!["calm".into(), "fire".into()],
+        target: 1,
+    }
+}
+
+fn ask(at: Option<u64>) -> Ask {
+    Ask {
+        world: 0,
+        at,
+        bins: 16,
+        speed: None,
+        playing: None,
+    }
+}
+
+/// The JSON of a picture, and its arrays as bytes.
+fn read(album: Album, at: Option<u64>) -> (Value, impl Fn(&str) -> Vec<u8>) {
+    let mut scene = Scene::new("test");
+    scene.album = album;
+    let bytes = picture(&scene, &ask(at), Instant::now());
+    let n = u32::from_le_bytes(bytes[..4].try_into().expect("four bytes")) as usize;
+    let header: Value = serde_json::from_slice(&bytes[4..4 + n]).expect("JSON");
+    assert_eq!((4 + n) % 8, 0);
+    let listings = header["arrays"].as_array().expect("a list").clone();
+    let arrays = move |name: &str| {
+        let mut offset = 4 + n;
+        for listing in &listings {
+            let size = if listing["type"] == "f32" { 4 } else { 1 };
+            let length = size * listing["length"].as_u64().expect("a length") as usize;
+            if listing["name"] == name {
+                return bytes[offset..offset + length].to_vec();
+            }
+            offset += length.next_multiple_of(8);
+        }
+        panic!("no {name} in {listings:?}");
+    };
+    (header, arrays)
+}
+
+#[test]
+fn a_picture_joins_frame_truth_and_belief_of_a_step() {
+    let mut album = Album::default();
+    let now = Instant::now();
+    album.add_frame(&frame(1, [255, 0, 1, 255, 255, 255]), now);
+    album.add_frame(&frame(2, [255, 1, 0, 255, 255, 255]), now);
+    album.add_truth(&truth(2, [1, 1, 0, 1, 0, 0]));
+    album.add_belief(&outlook(2), Some(&states()));
+    let (header, array) = read(album, None);
+    assert_eq!(header["shown"]["step"], 2);
+    assert_eq!(header["shown"]["seed"], u64::MAX.to_string());
+    assert_eq!(
+        header["shown"]["path"],
+        serde_json::json!([[0, 0], [0, 1], [0, 2]])
+    );
+    assert_eq!(array("frame"), [255, 1, 0, 255, 255, 255]);
+    assert_eq!(array("truth"), [1, 1, 0, 1, 0, 0]);
+    assert_eq!(
+        array("belief"),
+        [0, 128, 128, 0, 128, 128, 255, 128, 128, 255, 128, 128]
+    );
+    assert_eq!(array("entropy"), [0, 255, 255, 0, 255, 255]);
+    // Four cells of six cost ln 2, two nothing.
+    let log_loss = header["shown"]["log_loss"].as_f64().expect("a number");
+    assert!(
+        (log_loss - 4.0 / 6.0 * 2f64.ln()).abs() < 1e-6,
+        "{log_loss}"
+    );
+    assert!((header["shown"]["brier"].as_f64().expect("a number") - 1.0 / 6.0).abs() < 1e-6);
+}
+
+#[test]
+fn what_was_seen_is_remembered_with_its_age() {
+    let mut album = Album::default();
+    album.add_frame(&frame(1, [255, 0, 1, 255, 255, 255]), Instant::now());
+    album.add_frame(&frame(4, [255, 1, 255, 255, 255, 255]), Instant::now());
+    let (_, array) = read(album, None);
+    assert_eq!(array("seen"), [255, 1, 1, 255, 255, 255]);
+    assert_eq!(array("age"), [255, 0, 3, 255, 255, 255]);
+}
+
+#[test]
+fn an_episode_that_begins_anew_remembers_nothing() {
+    let mut album = Album::default();
+    album.add_frame(&frame(5, [255, 0, 1, 255, 255, 255]), Instant::now());
+    album.add_frame(&frame(1, [255; 6]), Instant::now());
+    let (_, array) = read(album, None);
+    assert_eq!(array("seen"), [255; 6]);
+}
+
+#[test]
+fn the_last_few_thousand_steps_are_kept() {
+    let mut album = Album::default();
+    let n = MAX_ENTRIES as u64 + 10;
+    for step in 1..=n {
+        album.add_frame(&frame(step, [255; 6]), Instant::now());
+    }
+    album.add_frame(&frame(n, [255; 6]), Instant::now()); // shown again, as to one who has just come
+    let (header, array) = read(album, Some(3));
+    assert_eq!(
+        header["kept"],
+        serde_json::json!({"first": 10, "last": n - 1})
+    );
+    assert_eq!(header["shown"]["serial"], 10);
+    let first: [u8; 4] = array("series_reward")[..4].try_into().expect("a float");
+    let mean = (11 + 10 + MAX_ENTRIES as u64 / 16) as f32 / 2.0;
+    assert_eq!(f32::from_le_bytes(first), mean);
+}
+
+#[test]
+fn a_step_with_a_belief_is_shown_rather_than_a_slightly_newer_one() {
+    let mut album = Album::default();
+    let now = Instant::now();
+    album.add_frame(&frame(1, [255; 6]), now);
+    album.add_belief(&outlook(1), None);
+    album.add_frame(&frame(2, [255; 6]), now);
+    let (header, _) = read(album, None);
+    assert_eq!(header["shown"]["step"], 1);
+    assert_eq!(header["shown"]["log_loss"], Value::Null);
+    assert_eq!(header["agent"]["objective"], "fire");
+}
+
+#[test]
+fn what_makes_no_sense_is_left_out() {
+    let mut album = Album::default();
+    let good = frame(1, [255; 6]);
+    let change = |act: fn(&mut Sample<FrameHeader>)| {
+        let mut sample = good.clone();
+        act(&mut sample);
+        sample
+    };
+    for bad in [
+        change(|sample| sample.header.height = 0),
+        change(|sample| sample.header.height = u32::MAX),
+        change(|sample| sample.header.start_row = 2),
+        change(|sample| sample.header.n_moves = 3),
+        change(|sample| sample.payload[7] = 4),
+        change(|sample| sample.payload.truncate(3)),
+    ] {
+        album.add_frame(&bad, Instant::now());
+    }
+    assert!(album.strip(0).is_none());
+    album.add_truth(&truth(1, [0; 6]));
+    album.add_belief(&outlook(1), None);
+    album.add_frame(&good, Instant::now());
+    let mut short = truth(1, [0; 6]);
+    short.payload.pop();
+    album.add_truth(&short);
+    let (header, _) = read(album, Some(u64::MAX));
+    assert_eq!(header["shown"]["serial"], 0);
+    let names = header["arrays"].to_string();
+    assert!(
+        !names.contains("truth") && !names.contains("belief"),
+        "{names}"
+    );
+}

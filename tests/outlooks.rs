@@ -1,0 +1,67 @@
+//! What agents show of their beliefs, to whoever looks.
+
+use crate::harness::{PATIENCE, Program, Server, eventually};
+use protocol::message::AgentHeader;
+use protocol::observer::Observer;
+use protocol::outlook::Outlook;
+use std::time::Instant;
+
+fn run(server: &Server, flags: &[&str]) -> Program {
+    let common = ["run", "--instance", server.instance.name()];
+    Program::start("emberwatch-agent", &[&common[..], flags].concat())
+}
+
+/// Reads until one is as wanted.
+fn until(observer: &Observer<AgentHeader>, wanted: impl Fn(&Outlook) -> bool) -> Vec<Outlook> {
+    let (mut all, start) = (Vec::<Outlook>::new(), Instant::now());
+    while !all.last().is_some_and(&wanted) {
+        let remaining = PATIENCE.saturating_sub(start.elapsed());
+        let sample = observer.receive(remaining).expect("receive");
+        let sample = sample.expect("an agent that shows its belief");
+        all.push(Outlook::try_from(&sample).expect("an outlook"));
+    }
+    all
+}
+
+#[test]
+fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
+    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 2000");
+    let observer = Observer::agents(&server.instance).expect("observe");
+    let agent = run(&server, &["--steps", "50", "--policy", "beam_explore"]);
+    let shown = until(&observer, |outlook| outlook.header.step == 50);
+    let ended = agent.wait(PATIENCE);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    for Outlook {
+        header,
+        belief,
+        intent,
+    } in &shown
+    {
+        assert_eq!(belief.dim(), (3, 16, 24));
+        let sums = belief.sum_axis(ndarray::Axis(0));
+        assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-4));
+        assert_eq!(intent.policy, "beam_explore");
+        assert_eq!(intent.states, ["normal", "latent", "fire"]);
+        assert!(
+            header.step == 0 || intent.objective == "entropy",
+            "{intent:?}"
+        );
+    }
+    // The posterior is sure of what was seen on the last path: 98 of 100 fires look like one.
+    let last = &shown[shown.len() - 1].belief;
+    let surest = last.iter().copied().fold(0.0, f32::max);
+    assert!(surest > 0.9, "{surest}");
+}
+
+#[test]
+fn beliefs_that_nobody_looks_at_are_not_shown() {
+    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 200");
+    let agent = run(&server, &[]);
+    let acts = || server.observe(0).0.step > 100;
+    assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
+    let observer = Observer::agents(&server.instance).expect("observe");
+    let shown = until(&observer, |_| true);
+    assert_eq!(shown[0].header.sequence, 0);
+    assert!(shown[0].header.step > 100, "a belief of before");
+    assert_eq!(shown[0].header.pid, agent.pid());
+}
