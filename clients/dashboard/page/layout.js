@@ -7,10 +7,13 @@
 const WORTHWHILE = 0.8;
 // A regular layout reads best: another must be larger by this to be preferred.
 const REGULAR_MERIT = 1.15;
-// Heights and widths of the inspector's parts, in rem: its title, a line, and when lines part in two columns.
+// Sizes in rem, as in the style sheet: the inspector's title, a line of it, its columns of lines with the gap
+// between them, and the least width of a panel's column, which its caption needs.
 const TITLE = 1.7;
 const LINE = 1.72;
-const TWO_COLUMNS = 19;
+const LANE = 9;
+const LANE_GAP = 1.2;
+const CAPTION_WIDTH = 8;
 // Panels before the inspector in a regular layout.
 const OBSERVED = 3;
 
@@ -21,7 +24,9 @@ const OBSERVED = 3;
  * height Infinity the page scrolls and `forced` columns are taken.
  */
 export function fit({ area, shape, places, forced, gap, caption, ratio, rem }) {
-  const choices = area.height === Infinity ? [forced] : range(2, places.panels + 1);
+  const least = CAPTION_WIDTH * rem + gap;
+  const most = Math.max(2, Math.floor((area.width + gap) / least));
+  const choices = area.height === Infinity ? [forced] : range(2, Math.min(places.panels + 1, most));
   let best = null;
   for (const columns of choices) {
     const placed = place(columns, places);
@@ -47,7 +52,8 @@ function sizeFor({ area, shape, placed, gap, caption, ratio, rem, lines }) {
   };
   const size = sized(free, shape, ratio);
   const width = placed.span * (size.width + gap) - gap;
-  const inspector = (TITLE + LINE * Math.ceil(lines / (width >= TWO_COLUMNS * rem ? 2 : 1))) * rem;
+  const lanes = Math.max(1, Math.floor((width / rem + LANE_GAP) / (LANE + LANE_GAP)));
+  const inspector = (TITLE + LINE * Math.ceil(lines / lanes)) * rem;
   const excess = inspector - (size.height + caption);
   if (excess <= 0 || area.height === Infinity || placed.rows === 1) return size;
   const left = (area.height - inspector - (placed.rows - 1) * gap) / (placed.rows - 1) - caption;
@@ -79,7 +85,7 @@ export function createLayout({ stage, field, panels }, places) {
       area: number("--stacked") ? { width: stage.clientWidth, height: Infinity } : beside(style, number("--charts") * rem),
       shape, places: places(), forced: number("--columns"), gap, caption: number("--caption") * rem, ratio: devicePixelRatio, rem,
     });
-    apply(fitted, gap);
+    apply(fitted, gap, Math.max(fitted.width, number("--stacked") ? 0 : CAPTION_WIDTH * rem));
   }
 
   // What legends and charts leave.
@@ -90,12 +96,13 @@ export function createLayout({ stage, field, panels }, places) {
     return { width: stage.clientWidth - chartsWidth - parseFloat(style.columnGap), height: stage.clientHeight - used };
   }
 
-  function apply({ width, height, columns, span, isCrisp, isRegular }, gap) {
+  function apply({ width, height, columns, span, isCrisp, isRegular }, gap, column) {
+    stage.style.setProperty("--column-width", `${column}px`);
     stage.style.setProperty("--panel-width", `${width}px`);
     stage.style.setProperty("--panel-height", `${height}px`);
     stage.style.setProperty("--panel-columns", columns);
     stage.style.setProperty("--inspector-span", span);
-    stage.style.setProperty("--field-width", `${columns * (width + gap) - gap}px`);
+    stage.style.setProperty("--field-width", `${columns * (column + gap) - gap}px`);
     panels.classList.toggle("is-smooth", !isCrisp);
     panels.classList.toggle("is-regular", isRegular);
   }

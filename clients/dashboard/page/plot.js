@@ -46,8 +46,7 @@ export function drawStrip(canvas, plot) {
     if (value >= colors.length) continue;
     const left = x(frame, from / values.length);
     frame.context.fillStyle = colors[value];
-    // Half a pixel wider, as neighbours of one colour would show a seam.
-    frame.context.fillRect(left, 0, x(frame, to / values.length) - left + 0.5, height);
+    frame.context.fillRect(left, 0, Math.max(1, x(frame, to / values.length) - left), height);
   }
   drawSteps(frame, axis);
   drawCursor({ ...frame, height }, axis, plot.cursor);
@@ -137,10 +136,14 @@ function usualGap(known) {
   return usual > 1 ? usual : 1 / LONG;
 }
 
-/** Blocks of one objective: each lasts until the next sample of its run. */
+/** Blocks of one objective: each lasts until the run's next sample of another. */
 function blocksOf(values, bridge) {
-  return runsOf(values, (value) => value !== NEVER, bridge).flatMap((run) =>
-    run.map((from, i) => ({ from, to: run[i + 1] ?? from + 1, value: values[from] })));
+  const blocks = [];
+  for (const run of runsOf(values, (value) => value !== NEVER, bridge)) {
+    const turns = run.filter((bin, i) => i === 0 || values[bin] !== values[run[i - 1]]);
+    turns.forEach((from, i) => blocks.push({ from, to: turns[i + 1] ?? run.at(-1) + 1, value: values[from] }));
+  }
+  return blocks;
 }
 
 function trace({ context }, run) {
