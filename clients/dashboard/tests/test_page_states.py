@@ -102,7 +102,7 @@ def test_another_agent_takes_over(watched, programs):
     assert look.text("policy") == "beam_exploit"
     programs.agent(server.instance, policy="shooting_explore", takeover=True)
     look.eventually(lambda: look.text("policy") == "shooting_explore", "the new policy")
-    assert look.text("objective") == "entropy"
+    look.eventually(lambda: look.text("objective") == "entropy", "what its first path is for")
 
 
 def test_a_dashboard_that_goes_is_waited_for(watched, programs):
