@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from looking import Look
@@ -84,12 +85,21 @@ def open_page(chromium: Browser) -> Iterator[Callable[..., Look]]:
     assert complaints == []
 
 
-@pytest.fixture
-def watched(programs: Programs, open_page: Callable[..., Look]) -> tuple[Program, Dashboard, Look]:
+class Watched(NamedTuple):
     """A server that publishes its truth, an agent, and a page that shows what it believes."""
+
+    server: Program
+    dashboard: Dashboard
+    agent: Program
+    look: Look
+
+
+@pytest.fixture
+def watched(programs: Programs, open_page: Callable[..., Look]) -> Watched:
+    """All that there is to see."""
     server = programs.server(publish_truth=True)
     dashboard = programs.dashboard(server.instance)
-    programs.agent(server.instance)
+    agent = programs.agent(server.instance)
     look = open_page(dashboard)
     look.eventually(lambda: look.has("belief", "truth"), "a belief is shown")
-    return server, dashboard, look
+    return Watched(server, dashboard, agent, look)

@@ -87,7 +87,7 @@ def test_axe_finds_nothing_serious_while_waiting(programs, open_page, theme):
 
 
 def test_every_control_is_reached_by_tab(watched):
-    _, _, look = watched
+    look = watched.look
     reached = set()
     for _ in range(40):
         look.page.keyboard.press("Tab")
@@ -98,7 +98,7 @@ def test_every_control_is_reached_by_tab(watched):
 
 
 def test_canvases_tell_what_they_show(watched):
-    _, _, look = watched
+    look = watched.look
     label = look.at("panel-truth").get_attribute("aria-label")
     assert "cells in state fire at step" in label
     look.eventually(

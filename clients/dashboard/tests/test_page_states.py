@@ -20,8 +20,10 @@ def test_waits_for_a_server_and_then_shows_what_happens(programs, open_page):
     assert not command.is_visible()
 
 
-def test_pause_scrub_and_live(watched):
-    _, _, look = watched
+def test_pause_scrub_and_live(watched, programs):
+    look = watched.look
+    # Its thousands of steps a second would push what is looked at out of what is kept.
+    watched.agent.interrupt()
     look.at("pause").click()
     paused = settled_serial(look)
     drawn = look.drawn()
@@ -30,6 +32,7 @@ def test_pause_scrub_and_live(watched):
     look.at("scrub").focus()
     look.page.keyboard.press("Home")
     look.eventually(lambda: look.picture(".shown.serial") == look.picture(".kept.first"), "oldest")
+    programs.agent(watched.server.instance)
     look.at("pause").click()
     look.eventually(lambda: look.picture(".shown.serial") > paused, "live again")
     look.wait_for_steps()
@@ -53,9 +56,10 @@ def settled_serial(look) -> int:
     return serial
 
 
-def test_keys_pause_and_scrub_from_anywhere(watched):
-    _, _, look = watched
+def test_keys_pause_and_scrub_from_anywhere(watched, programs):
+    look = watched.look
     look.eventually(lambda: look.picture(".kept.last") > look.picture(".kept.first") + 30, "steps")
+    watched.agent.interrupt()
     look.page.keyboard.press("Space")
     at = settled_serial(look)
     for key, by in [("ArrowLeft", -1), ("Shift+ArrowLeft", -10), ("ArrowRight", 1)]:
@@ -66,6 +70,7 @@ def test_keys_pause_and_scrub_from_anywhere(watched):
     look.eventually(lambda: look.picture(".shown.serial") == look.picture(".kept.first"), "first")
     look.page.keyboard.press("End")
     look.eventually(lambda: look.picture(".shown.serial") > at, "the newest when it was pressed")
+    programs.agent(watched.server.instance)
     look.page.keyboard.press("Space")
     look.wait_for_steps()
 
@@ -85,7 +90,7 @@ def test_an_entry_that_is_no_longer_kept_is_told(programs, open_page):
 
 
 def test_a_server_that_is_killed_is_waited_for(watched, programs):
-    server, _, look = watched
+    server, look = watched.server, watched.look
     server.kill()
     look.eventually(lambda: look.text("state") == "waiting", "waiting")
     assert look.text("note") != ""
@@ -98,7 +103,7 @@ def test_a_server_that_is_killed_is_waited_for(watched, programs):
 
 
 def test_another_agent_takes_over(watched, programs):
-    server, _, look = watched
+    server, look = watched.server, watched.look
     assert look.text("policy") == "beam_exploit"
     programs.agent(server.instance, policy="shooting_explore", takeover=True)
     look.eventually(lambda: look.text("policy") == "shooting_explore", "the new policy")
@@ -106,7 +111,7 @@ def test_another_agent_takes_over(watched, programs):
 
 
 def test_a_dashboard_that_goes_is_waited_for(watched, programs):
-    server, dashboard, look = watched
+    server, dashboard, _, look = watched
     look.allowed.append("WebSocket connection to .* failed")
     dashboard.kill()
     look.eventually(lambda: "dashboard gone" in look.text("state"), "gone")

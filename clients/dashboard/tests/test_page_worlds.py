@@ -63,7 +63,7 @@ def test_a_slow_browser_gets_fewer_pictures_and_the_newest(programs, open_page):
 
 
 def test_one_cell_is_the_same_in_all_panels(watched):
-    server, _, look = watched
+    server, look = watched.server, watched.look
     look.page.keyboard.press("Space")
     look.eventually(lambda: look.at("pause").text_content() != "Pause", "paused")
     server.kill()
@@ -87,7 +87,7 @@ def test_one_cell_is_the_same_in_all_panels(watched):
 
 @pytest.mark.parametrize("chart", ["reward", "target", "log-loss", "objective"])
 def test_charts_tell_values_and_seek(watched, chart):
-    _, _, look = watched
+    look = watched.look
     look.eventually(lambda: look.picture(".kept.last") > 20, "some steps")
     canvas = look.at(f"chart-{chart}")
     canvas.hover(position={"x": 120, "y": 20})
