@@ -22,9 +22,9 @@ export function createCharts(parent, { hover, seek }) {
   return {
     /** Bins worth asking for: as many as there are pixels to draw them on. */
     bins: () => Math.min(Math.max(Math.round(charts[0].canvas.clientWidth || 300), 16), 2000),
-    draw(picture, view) {
+    draw(picture, view, palette) {
       axis = picture.series && across(picture.series);
-      charts.forEach((chart) => chart.draw(chart, picture, axis, view));
+      charts.forEach((chart) => chart.draw(chart, picture, axis, view, palette));
     },
     describe: (picture) => charts.forEach((chart) => chart.describe(chart, picture)),
   };
@@ -72,11 +72,11 @@ function lineChart(line) {
 
 function stripChart() {
   return frame("objective", {
-    draw(chart, picture, axis, view) {
+    draw(chart, picture, axis, view, palette) {
       const values = picture.arrays.series_objective;
       const names = picture.objectives ?? [];
       write(chart.parts.title, "objective");
-      const colors = names.map((name) => objectiveColor(name, names, stateNames(picture)));
+      const colors = names.map((name) => objectiveColor(name, { objectives: names, names: stateNames(picture), palette }));
       writeNames(chart, names, colors);
       const isEmpty = !values || !axis || names.length === 0;
       write(chart.absent, isEmpty ? "no agent tells its objective" : "");

@@ -17,7 +17,10 @@ export function createControls({ view, act }, picture) {
   for (const choice of document.querySelectorAll("input[name=theme]")) {
     choice.addEventListener("change", () => act.theme(choice.value));
   }
-  byId("play").addEventListener("click", () => act.player({ playing: !picture().player.playing }));
+  byId("play").addEventListener("click", () => {
+    const { playing, ended } = picture().player;
+    act.player({ playing: ended || !playing });
+  });
   byId("speed").addEventListener("change", (event) => act.player({ speed: Number(event.target.value) }));
   addEventListener("keydown", (event) => pressed(event, { toggle, seek: (key, size) => move(key, size) }));
 
@@ -69,8 +72,9 @@ function drawScrub({ kept, shown }, { at }) {
   scrub.min = kept.first;
   scrub.max = kept.last;
   const serial = shown?.serial ?? kept.last;
-  scrub.value = serial;
-  scrub.style.setProperty("--share", kept.last > kept.first ? (serial - kept.first) / (kept.last - kept.first) : 1);
+  // Live, the newest belief is shown, which may be a few steps old: that is still the end.
+  scrub.value = at == null ? kept.last : serial;
+  scrub.style.setProperty("--share", kept.last > kept.first ? (scrub.value - kept.first) / (kept.last - kept.first) : 1);
   scrub.setAttribute("aria-valuetext", `entry ${whole(serial)}, step ${whole(shown?.step)}${at == null ? ", newest" : ""}`);
   write(byId("serial"), whole(serial));
   const isGone = at != null && at < kept.first;
@@ -92,8 +96,7 @@ function drawWorlds({ info, world }, view) {
 function drawPlayer(player) {
   byId("player").hidden = !player;
   if (!player) return;
-  write(byId("play"), player.playing && !player.ended ? "Hold playback" : "Play");
-  byId("play").disabled = player.ended;
+  write(byId("play"), player.ended ? "Play again" : player.playing ? "Stop playing" : "Play on");
   const speed = byId("speed");
   if (document.activeElement !== speed) speed.value = String(player.speed);
   write(byId("clock"), player.ended ? "ended" : `${player.seconds.toFixed(1)} s`);

@@ -18,13 +18,13 @@ export function createFacts() {
   }
 
   return {
-    draw(picture) {
-      drawState(picture.state, picture.note);
+    draw(picture, view) {
+      drawState(picture.state, isToldLarge(picture) ? null : picture.note ?? picture.player?.error);
       drawServer(picture);
       drawWorld(picture);
-      drawAgent(picture);
+      drawAgent(picture, view.at == null);
       drawEmpty(picture);
-      say(picture.note ?? `${picture.state}, world ${picture.world}`);
+      say(picture.note ?? picture.player?.error ?? `${picture.state}, world ${picture.world}`);
     },
     /** The dashboard itself went away: what was drawn last stays. */
     gone() {
@@ -35,6 +35,11 @@ export function createFacts() {
       drawState("unreadable", `The dashboard sent what this page cannot read: ${error.message}`);
     },
   };
+}
+
+// Before the first server the whole page says that one is waited for.
+function isToldLarge({ state, source, info }) {
+  return state === "waiting" && source === "live" && !info;
 }
 
 function drawState(state, note) {
@@ -48,6 +53,8 @@ function drawServer({ status, lost, instance, source }) {
   const isLive = source === "live";
   write(byId("source"), isLive ? "instance" : "recording");
   write(byId("instance"), instance);
+  byId("instance").title = instance;
+  for (const fact of document.querySelectorAll(".of-server")) fact.hidden = !isLive;
   write(byId("rate"), short(status?.steps_per_second));
   write(byId("observers"), whole(status?.n_observers));
   write(byId("lost"), whole(lost?.frames));
@@ -74,23 +81,27 @@ function holder(world) {
   return world.resetting ? "burning in" : text(world.holder_pid ?? "nobody");
 }
 
-function drawAgent({ agent }) {
+function drawAgent({ agent, source }, isNewest) {
+  const isSilent = isNewest && source === "live" && agent?.is_live === false;
   write(byId("policy"), text(agent?.policy));
+  write(byId("silent"), isSilent ? "silent" : "");
   write(byId("objective"), text(agent?.objective));
   write(byId("belief-from"), text(agent?.belief_from));
-  write(byId("plan"), agent?.plan_millis == null ? text(null) : `${short(agent.plan_millis)} ms`);
+  write(byId("plan"), agent?.plan_millis == null ? text(null) : `${Number(agent.plan_millis.toPrecision(2))} ms`);
 }
 
 // Before anything is known there is nothing to lay out: a word on how to begin.
 function drawEmpty(picture) {
-  const { instance, source, info, shown } = picture;
+  const { instance, source, info, shown, world } = picture;
   const isEmpty = !info || !shown;
   byId("empty").hidden = !isEmpty;
   for (const id of ["facts", "stage", "transport"]) byId(id).hidden = isEmpty;
+  byId("server").hidden = !info;
   if (!isEmpty) return;
-  write(byId("empty-instance"), instance);
-  const isLive = source === "live";
-  byId("empty").classList.toggle("is-recording", !isLive);
+  const isAwaited = !info && source === "live";
+  write(byId("empty-lead"), isAwaited ? "Waiting for a server on instance" : "Waiting for the first step of");
+  write(byId("empty-of"), isAwaited || !info ? instance : `world ${world}`);
+  byId("empty-start").hidden = !isAwaited;
   write(byId("empty-command"), `emberwatch-server --instance ${instance}`);
 }
 

@@ -1,7 +1,7 @@
 // One cell in numbers: the one pointed at, else the one that the robot is on.
 
 import { make, swatch } from "/elements.js";
-import { NEVER, rampColor, stateColor } from "/palette.js";
+import { NEVER, rampColor } from "/palette.js";
 import { beliefNames, observationNames, stateNames } from "/words.js";
 
 // Long enough that a screen reader is not flooded while keys are held.
@@ -17,16 +17,16 @@ export function createInspector(announcer) {
   let timer = 0;
   let shownKey = "";
 
-  function draw(picture, view, theme) {
+  function draw(picture, view, palette) {
     const at = view.cell ?? robotCell(picture);
     if (!at) return;
     const rows = rowsOf(picture, at);
     const heading = `row ${at.row}, col ${at.col}`;
-    const key = JSON.stringify([heading, rows, Boolean(view.cell), theme]);
+    const key = JSON.stringify([heading, rows, Boolean(view.cell), palette.theme]);
     if (key === shownKey) return;
     shownKey = key;
-    title.replaceChildren(make("b", "", {}, heading), make("span", "hint", {}, view.cell ? "" : "the robot's cell"));
-    list.replaceChildren(...rows.map((row) => rowElement(row, theme)));
+    title.replaceChildren(make("b", "", {}, heading), make("span", "hint", {}, view.cell ? "" : "robot"));
+    list.replaceChildren(...rows.map((row) => rowElement(row, palette)));
   }
 
   /** Says the cell aloud once the keys rest. */
@@ -49,8 +49,8 @@ function rowsOf(picture, { row, col }) {
   const { info, arrays } = picture;
   const at = row * info.width + col;
   const rows = [];
-  if (arrays.truth) rows.push(named("state", arrays.truth[at], stateNames(picture)));
-  if (arrays.seen) rows.push(named("seen", arrays.seen[at], observationNames(picture)));
+  if (arrays.truth) rows.push(named("state", arrays.truth[at], stateNames(picture), "states"));
+  if (arrays.seen) rows.push(named("seen", arrays.seen[at], observationNames(picture), "observations"));
   if (arrays.age && arrays.seen?.[at] !== NEVER) rows.push({ name: "age", value: ageText(arrays.age[at]) });
   const cells = info.height * info.width;
   beliefNames(picture).forEach((name, state) => {
@@ -61,9 +61,9 @@ function rowsOf(picture, { row, col }) {
   return rows;
 }
 
-function named(name, value, names) {
+function named(name, value, names, of) {
   if (value === NEVER) return { name, value: "never" };
-  return { name, value: names[value] ?? `value ${value}`, index: value };
+  return { name, value: names[value] ?? `value ${value}`, color: [of, value] };
 }
 
 function ageText(age) {
@@ -76,23 +76,21 @@ function entropyRow(value, states) {
   return { name: "entropy", value: `${(share * Math.log(Math.max(states, 2))).toFixed(2)} nats`, share, ramp: "entropy" };
 }
 
-function rowElement({ name, value, index, share, ramp }, theme) {
+function rowElement({ name, value, color, share, ramp }, palette) {
   const row = make("div");
   const term = make("dt", "", {}, name);
   const answer = make("dd");
-  if (index !== undefined) answer.append(swatch(stateColor(index)));
+  if (color) answer.append(swatch(palette[color[0]][color[1]]));
   answer.append(value);
   row.append(term, answer);
-  if (share !== undefined) row.append(bar(share, ramp, theme));
+  if (share !== undefined) addBar(row, share, ramp, palette.theme);
   return row;
 }
 
-function bar(share, ramp, theme) {
-  const track = make("i", "bar");
-  const fill = make("i");
-  fill.style.width = `${share * 100}%`;
+// The style sheet draws it: a list of terms may hold nothing but terms and answers.
+function addBar(row, share, ramp, theme) {
+  row.className = "has-bar";
+  row.style.setProperty("--share", `${share * 100}%`);
   // From a third of the ramp upwards, as its beginning would not be seen on the background.
-  fill.style.background = `rgb(${rampColor(ramp, theme, 0.35 + 0.4 * share).join(" ")})`;
-  track.append(fill);
-  return track;
+  row.style.setProperty("--bar", `rgb(${rampColor(ramp, theme, 0.35 + 0.4 * share).join(" ")})`);
 }

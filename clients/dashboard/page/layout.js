@@ -1,28 +1,57 @@
 // How large panels are: as large as fits, in whole screen pixels per cell where that costs little.
+//
+// Where there is room, the beliefs and the entropy share one row, below the row of what is observed
+// with the inspector at its end ("regular"); else panels follow each other and the inspector comes last.
 
 // A whole number of pixels per cell is crisper; beyond this loss of size it is not worth it.
 const WORTHWHILE = 0.8;
+// A regular layout reads best: another must be larger by this to be preferred.
+const REGULAR_MERIT = 1.15;
+// Heights and widths of the inspector's parts, in rem: its title, a line, and when lines part in two columns.
+const TITLE = 1.7;
+const LINE = 1.72;
+const TWO_COLUMNS = 19;
+// Panels before the inspector in a regular layout.
+const OBSERVED = 3;
 
 /**
- * Columns and the panels' size in CSS pixels for `count` places in an area.
+ * The best layout of panels within `area`: columns, the panels' size in CSS pixels, the inspector's span.
  *
- * `area.height` may be Infinity: then the page scrolls and `columns` are taken as they are.
+ * `places` counts panels, the inspector's lines, and the columns of a regular layout. In an area of
+ * height Infinity the page scrolls and `forced` columns are taken.
  */
-export function fit({ area, shape, count, columns, gap, caption, ratio }) {
-  const choices = area.height === Infinity ? [columns] : range(Math.min(2, count), count);
+export function fit({ area, shape, places, forced, gap, caption, ratio, rem }) {
+  const choices = area.height === Infinity ? [forced] : range(2, places.panels + 1);
   let best = null;
-  for (const choice of choices) {
-    const rows = Math.ceil(count / choice);
-    const free = {
-      x: (area.width - (choice - 1) * gap) / choice,
-      y: (area.height - (rows - 1) * gap) / rows - caption,
-    };
-    const size = sized(free, shape, ratio);
-    // The row of beliefs in one row reads best, so that it wins unless another is clearly larger.
-    const merit = size.width * (choice === columns ? 1.15 : 1);
-    if (!best || merit > best.merit) best = { columns: choice, ...size, merit };
+  for (const columns of choices) {
+    const placed = place(columns, places);
+    const size = sizeFor({ area, shape, placed, gap, caption, ratio, rem, lines: places.lines });
+    const merit = size.width * (placed.isRegular ? REGULAR_MERIT : 1);
+    if (!best || merit > best.merit) best = { ...placed, ...size, merit };
   }
   return best;
+}
+
+function place(columns, { panels, regular }) {
+  const isRegular = columns === regular;
+  if (isRegular) return { columns, isRegular, span: columns - OBSERVED, rows: 1 + Math.ceil((panels - OBSERVED || 1) / columns) };
+  const over = panels % columns;
+  return { columns, isRegular, span: columns - over, rows: Math.floor(panels / columns) + 1 };
+}
+
+// The row that the inspector is in may have to be higher than the panels: then they give way.
+function sizeFor({ area, shape, placed, gap, caption, ratio, rem, lines }) {
+  const free = {
+    x: (area.width - (placed.columns - 1) * gap) / placed.columns,
+    y: (area.height - (placed.rows - 1) * gap) / placed.rows - caption,
+  };
+  const size = sized(free, shape, ratio);
+  const width = placed.span * (size.width + gap) - gap;
+  const inspector = (TITLE + LINE * Math.ceil(lines / (width >= TWO_COLUMNS * rem ? 2 : 1))) * rem;
+  const excess = inspector - (size.height + caption);
+  if (excess <= 0 || area.height === Infinity || placed.rows === 1) return size;
+  const left = (area.height - inspector - (placed.rows - 1) * gap) / (placed.rows - 1) - caption;
+  return sized({ x: free.x, y: Math.min(free.y, left) }, shape, ratio);
 }
 
 function sized(free, { height, width }, ratio) {
@@ -36,39 +65,39 @@ function range(from, to) {
   return Array.from({ length: to - from + 1 }, (_, i) => from + i);
 }
 
-/** Keeps `panels` fitted within `stage`: `layOut()` after anything that changes how much fits. */
+/** Keeps `panels` fitted within `stage`: call `layOut()` after anything that changes how much fits. */
 export function createLayout({ stage, field, panels }, places) {
   let shape = null;
 
   function layOut() {
     if (!shape || stage.clientWidth === 0) return;
     const style = getComputedStyle(stage);
+    const number = (name) => parseFloat(style.getPropertyValue(name));
+    const rem = parseFloat(getComputedStyle(document.documentElement).fontSize);
     const gap = parseFloat(getComputedStyle(panels).columnGap);
-    const { count, columns } = places();
-    const isStacked = style.getPropertyValue("--stacked").trim() === "1";
-    const wanted = isStacked ? Number(style.getPropertyValue("--columns")) : columns;
-    const room = area({ isStacked, style });
-    const caption = parseFloat(style.getPropertyValue("--caption")) * rem();
-    const fitted = fit({ area: room, shape, count, columns: wanted, gap, caption, ratio: devicePixelRatio });
-    panels.style.setProperty("--panel-width", `${fitted.width}px`);
-    panels.style.setProperty("--panel-height", `${fitted.height}px`);
-    panels.style.setProperty("--panel-columns", fitted.columns);
-    panels.classList.toggle("is-smooth", !fitted.isCrisp);
-    panels.classList.toggle("is-regular", fitted.columns === columns);
+    const fitted = fit({
+      area: number("--stacked") ? { width: stage.clientWidth, height: Infinity } : beside(style, number("--charts") * rem),
+      shape, places: places(), forced: number("--columns"), gap, caption: number("--caption") * rem, ratio: devicePixelRatio, rem,
+    });
+    apply(fitted, gap);
   }
 
   // What legends and charts leave.
-  function area({ isStacked, style }) {
-    if (isStacked) return { width: stage.clientWidth, height: Infinity };
-    const others = [...field.children].filter((child) => child !== panels && child.offsetParent);
-    const gaps = parseFloat(getComputedStyle(field).rowGap) || 0;
-    const used = others.reduce((sum, child) =>
-      sum + (getComputedStyle(child).position === "absolute" ? 0 : child.offsetHeight + gaps), 0);
-    const chartsWidth = parseFloat(style.getPropertyValue("--charts")) * rem();
-    return {
-      width: stage.clientWidth - chartsWidth - parseFloat(style.columnGap),
-      height: stage.clientHeight - used,
-    };
+  function beside(style, chartsWidth) {
+    const rowGap = parseFloat(getComputedStyle(field).rowGap);
+    const others = [...field.children].filter((child) => child !== panels && child.offsetHeight > 1);
+    const used = others.reduce((sum, child) => sum + child.offsetHeight + rowGap, 0);
+    return { width: stage.clientWidth - chartsWidth - parseFloat(style.columnGap), height: stage.clientHeight - used };
+  }
+
+  function apply({ width, height, columns, span, isCrisp, isRegular }, gap) {
+    stage.style.setProperty("--panel-width", `${width}px`);
+    stage.style.setProperty("--panel-height", `${height}px`);
+    stage.style.setProperty("--panel-columns", columns);
+    stage.style.setProperty("--inspector-span", span);
+    stage.style.setProperty("--field-width", `${columns * (width + gap) - gap}px`);
+    panels.classList.toggle("is-smooth", !isCrisp);
+    panels.classList.toggle("is-regular", isRegular);
   }
 
   new ResizeObserver(layOut).observe(stage);
@@ -76,8 +105,4 @@ export function createLayout({ stage, field, panels }, places) {
     layOut,
     shape(next) { shape = next; layOut(); },
   };
-}
-
-function rem() {
-  return parseFloat(getComputedStyle(document.documentElement).fontSize);
 }

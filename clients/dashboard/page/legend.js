@@ -1,21 +1,22 @@
 // What colours and marks mean.
 
 import { make, swatch } from "/elements.js";
-import { rampStops, stateColor, unseenColor } from "/palette.js";
+import { rampStops } from "/palette.js";
 import { beliefNames, observationNames, stateNames } from "/words.js";
 
 /** The legends above and below the panels; drawn anew only when they change. */
 export function createLegend(list, ramps) {
   let drawn = "";
   return {
-    draw(picture, theme) {
+    draw(picture, palette) {
       const states = stateNames(picture);
       const observations = observationNames(picture);
       const believed = beliefNames(picture).length;
-      const key = JSON.stringify([states, observations, believed, theme]);
+      const { theme } = palette;
+      const key = JSON.stringify([states, observations, believed, theme, palette.states]);
       if (key === drawn) return false;
       drawn = key;
-      list.replaceChildren(...values(states, observations), ...marks(theme));
+      list.replaceChildren(...values(states, observations, palette), ...marks(palette));
       ramps.replaceChildren(...(believed ? [
         ramp("belief", theme, "belief: probability of the state", ["0", "0.25", "0.5", "0.75", "1"]),
         ramp("entropy", theme, "entropy of a cell, nats", entropyTicks(believed)),
@@ -25,15 +26,16 @@ export function createLegend(list, ramps) {
   };
 }
 
-function values(states, observations) {
-  if (states.join() === observations.join() || observations.length === 0) return states.map(value);
-  // States and observations share colours by number, so both names of a colour are told.
-  return [word("state"), ...states.map(value), word("observed"), ...observations.map(value)];
+function values(states, observations, palette) {
+  const ofStates = states.map((name, i) => value(name, palette.states[i]));
+  if (states.join() === observations.join() || observations.length === 0) return ofStates;
+  const ofObservations = observations.map((name, i) => value(name, palette.observations[i]));
+  return [word("state"), ...ofStates, word("observed"), ...ofObservations];
 }
 
-function value(name, index) {
+function value(name, color) {
   const item = make("li");
-  item.append(swatch(stateColor(index)), name);
+  item.append(swatch(color), name);
   return item;
 }
 
@@ -41,10 +43,8 @@ function word(text) {
   return make("li", "word", {}, text);
 }
 
-function marks(theme) {
-  const unseen = make("li");
-  unseen.append(swatch(unseenColor(theme)), "not observed");
-  return [unseen, mark("path"), mark("start"), mark("robot")];
+function marks(palette) {
+  return [value("not observed", palette.unseen), mark("path"), mark("start"), mark("robot")];
 }
 
 function mark(name) {

@@ -46,21 +46,23 @@ function show(next) {
   picture = next;
   // A server that began anew counts from the start again: nothing is left of the entry looked at.
   if (view.at != null && next.kept && view.at > next.kept.last) view.at = null;
+  // So does a link to a world that this server has not.
+  if (next.info && view.world >= next.info.n_worlds) act.world(0);
   draw();
   window.emberwatch.picture = picture;
   window.emberwatch.drawn += 1;
 }
 
 function draw() {
-  const theme = themeOf(view);
-  facts.draw(picture);
+  const palette = colours.paletteOf(picture, themeOf(view));
+  facts.draw(picture, view);
   controls.draw(picture);
   if (!picture.info || !picture.shown) return;
   const isRebuilt = panels.build(picture);
-  if (legend.draw(picture, theme) || isRebuilt) layout.shape(shapeOf(picture));
-  panels.draw(picture, view, theme);
-  charts.draw(picture, view);
-  inspector.draw(picture, view, theme);
+  if (legend.draw(picture, palette) || isRebuilt) layout.shape(shapeOf(picture));
+  panels.draw(picture, view, palette);
+  charts.draw(picture, view, palette);
+  inspector.draw(picture, view, palette);
   describe(isRebuilt);
 }
 

@@ -12,7 +12,8 @@ export function drawMarks(canvas, picture, { cell, hasPath }) {
   const drawn = prepare(canvas);
   if (!drawn) return;
   const shape = shapeOf(picture);
-  const frame = { ...drawn, cell: { x: drawn.width / shape.width, y: drawn.height / shape.height } };
+  const ink = getComputedStyle(canvas).getPropertyValue("--ink");
+  const frame = { ...drawn, ink, cell: { x: drawn.width / shape.width, y: drawn.height / shape.height } };
   if (hasPath && picture.shown) {
     drawPath(frame, picture.shown.path);
     drawStart(frame, picture.shown.start);
@@ -25,21 +26,29 @@ function middle({ cell }, [row, col]) {
   return [(col + 0.5) * cell.x, (row + 0.5) * cell.y];
 }
 
+/** The middle of a cell, as far inside as a mark of that size needs. */
+function inside(frame, place, radius) {
+  const [x, y] = middle(frame, place);
+  const fit = (at, size) => Math.min(Math.max(at, radius), size - radius);
+  return [fit(x, frame.width), fit(y, frame.height)];
+}
+
 function drawPath(frame, path) {
-  const { context, ratio, cell } = frame;
+  const { context, ratio, cell, ink } = frame;
   context.beginPath();
   for (const place of path) context.lineTo(...middle(frame, place));
   context.lineJoin = "round";
   context.lineCap = "round";
   context.lineWidth = Math.min(Math.max(cell.x * 0.26, ratio), 3 * ratio);
-  context.strokeStyle = DARK;
+  // Over cells of a pixel or two there is more background than cells around the line.
+  context.strokeStyle = cell.x < 2 * ratio ? ink : DARK;
   context.stroke();
 }
 
 function drawStart(frame, place) {
   const { context, ratio, cell } = frame;
   const side = Math.max(cell.x * 0.9, 6 * ratio);
-  const [x, y] = middle(frame, place);
+  const [x, y] = inside(frame, place, side / 2 + ratio);
   context.fillStyle = LIGHT;
   context.fillRect(x - side / 2, y - side / 2, side, side);
   context.strokeStyle = DARK;
@@ -50,7 +59,7 @@ function drawStart(frame, place) {
 function drawRobot(frame, place) {
   const { context, ratio, cell } = frame;
   const radius = Math.max(cell.x * 0.85, 5 * ratio);
-  const [x, y] = middle(frame, place);
+  const [x, y] = inside(frame, place, radius + 1.5 * ratio);
   disc(context, x, y, radius + 1.5 * ratio, DARK);
   disc(context, x, y, radius, LIGHT);
   disc(context, x, y, radius * 0.42, DARK);

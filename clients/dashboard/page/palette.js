@@ -1,22 +1,32 @@
 // Colours of states, of what was seen, of beliefs and of objectives, and the tables that turn
 // array values into pixels. Lightness carries the order, so that all of it reads in grey too.
 
-// The wildfire's three, then further ones that stay apart under the common colour blindnesses
-// (Okabe and Ito 2008, with a brown for their orange).
-const STATES = ["#3a6ea5", "#e0b03c", "#c8381c", "#009e73", "#cc79a7", "#56b4e9", "#8c510a", "#f0e442"];
-const UNSEEN = { light: "#e2e2e2", dark: "#2b2f36" };
+// For models that keep their colours to themselves: the wildfire's three, then further ones that stay
+// apart under the common colour blindnesses (Okabe and Ito 2008, with a brown for their orange).
+const COLORS = ["#3b6ea5", "#e3b23c", "#c8371b", "#009e73", "#cc79a7", "#56b4e9", "#8c510a", "#f0e442"];
+
+// Greys for what was not observed, the preferred one first.
+const UNSEEN = {
+  light: ["#e2e2e2", "#b8b8b8", "#808080", "#484848"],
+  dark: ["#2b2f36", "#14171b", "#5a616c", "#a0a6b0"],
+};
+// Squared distance at which two colours are told apart at a glance: 60 of 255 in each channel.
+const APART = 3 * 60 * 60;
 
 // Nine stops from 0 to 1, evenly spaced; OKLab lightness changes by the same amount between any two.
 const RAMPS = {
   belief: {
-    light: ["#f9f8e1", "#d0e2b3", "#94cf95", "#58b791", "#0a9c8f", "#037c86", "#005d77", "#004069", "#0d2156"],
-    dark: ["#161d2b", "#123651", "#00536a", "#00717a", "#009185", "#35b085", "#7fc982", "#c0de8b", "#f8f3a3"],
+    light: ["#f9f8e1", "#c6e4be", "#87d0ab", "#4cb6a6", "#039aa0", "#057a91", "#005c80", "#003e6f", "#0d2156"],
+    dark: ["#161d2b", "#1d3450", "#0d4f75", "#046e89", "#038e97", "#23af9b", "#70cb95", "#b8e095", "#f8f3a3"],
   },
   entropy: {
-    light: ["#fff5e8", "#f5d4bc", "#ecaf99", "#dd8c86", "#c66b7e", "#a84f7c", "#813d76", "#5a2d69", "#361e57"],
-    dark: ["#1e1b25", "#3f2946", "#6a345e", "#944467", "#b95c69", "#db7868", "#f39c6d", "#fec488", "#ffedc8"],
+    light: ["#fff5e8", "#fcdbc2", "#fbbda6", "#f3a099", "#e38598", "#cc6f9c", "#a9629c", "#865796", "#644c8a"],
+    dark: ["#1e1b25", "#382340", "#592855", "#79315d", "#97405e", "#b2525b", "#c86958", "#d38762", "#dba475"],
   },
 };
+
+// Before an agent has planned its first path.
+const IDLE = { name: "nothing yet", color: "#8b93a0" };
 
 // For objectives that name no state; apart from the wildfire's colours.
 const OBJECTIVES = ["#8a63b8", "#009e73", "#cc79a7", "#56b4e9", "#8c510a"];
@@ -29,21 +39,40 @@ export const NEVER = 255;
 const OLDEST_SHARE = 0.4;
 const HALF_AGE = 24;
 
-/** The colour of a state or observation, as "#rrggbb". */
-export function stateColor(index) {
-  return STATES[index % STATES.length];
+/**
+ * The colours of a picture's model under a theme: `states` and `observations` as "#rrggbb" by number,
+ * `unseen`, and tables of pixels: `stateTable` and `frameTable` by value, `seenTable` by
+ * `value * 256 + age`, `rampTable(name)` by value 0..255.
+ */
+export function paletteOf(picture, theme) {
+  const { state_colours: states, observation_colours: observations } = picture.info ?? {};
+  return remembered([theme, states, observations], () => make(states, observations, theme));
 }
 
-/** The colour of cells where nothing was observed. */
-export function unseenColor(theme) {
-  return UNSEEN[theme];
+function make(ownStates, ownObservations, theme) {
+  const states = colorsOf(ownStates);
+  const observations = colorsOf(ownObservations);
+  const unseen = unlike([...(ownStates ?? COLORS), ...(ownObservations ?? [])], UNSEEN[theme]);
+  const value = (colors) => (at) => channels(at === NEVER ? unseen : colors[at % colors.length]);
+  const seen = value(observations);
+  return {
+    theme,
+    states,
+    observations,
+    unseen,
+    stateTable: table(256, value(states)),
+    frameTable: table(256, seen),
+    seenTable: table(65536, (at) => faded(seen(at >> 8), channels(unseen), at & 255)),
+    rampTable: (name) => remembered([theme, name], () => table(256, (at) => rampColor(name, theme, at / 255))),
+  };
 }
 
 /** The colour of an objective: that of the state it names, else one of its own. */
-export function objectiveColor(name, objectives, states) {
-  const named = states.findIndex((state) => name.includes(state));
-  if (named >= 0) return stateColor(named);
-  const others = objectives.filter((other) => !states.some((state) => other.includes(state)));
+export function objectiveColor(name, { objectives, names, palette }) {
+  if (name === IDLE.name) return IDLE.color;
+  const stateOf = (objective) => names.findIndex((state) => objective.includes(state));
+  if (stateOf(name) >= 0) return palette.states[stateOf(name)];
+  const others = objectives.filter((other) => stateOf(other) < 0 && other !== IDLE.name);
   return OBJECTIVES[Math.max(0, others.indexOf(name)) % OBJECTIVES.length];
 }
 
@@ -65,25 +94,27 @@ export function rampStops(name, theme) {
   return RAMPS[name][theme];
 }
 
-/** The colour of an observation made `age` steps ago. */
-export function seenColor(value, age, theme) {
-  const unseen = channels(UNSEEN[theme]);
-  if (value === NEVER) return unseen;
-  const share = OLDEST_SHARE + (1 - OLDEST_SHARE) * 2 ** (-age / HALF_AGE);
-  return blend(unseen, channels(stateColor(value)), share);
+// The model's own colours first; what they lack comes from here.
+function colorsOf(own) {
+  return [...(own ?? []), ...COLORS.slice(own?.length ?? 0)];
 }
 
-/** Pixels by state or observation, 256 of them. */
-export const valueTable = remembered((theme) =>
-  table(256, (value) => seenColor(value, 0, theme)));
+/** The first grey that is well apart from all colours, else the one furthest from them. */
+function unlike(colors, greys) {
+  const nearest = (grey) => Math.min(...colors.map((color) => distance(color, grey)));
+  return greys.find((grey) => nearest(grey) >= APART)
+    ?? greys.reduce((best, grey) => (nearest(grey) > nearest(best) ? grey : best));
+}
 
-/** Pixels by observation and age: at `value * 256 + age`. */
-export const seenTable = remembered((theme) =>
-  table(65536, (at) => seenColor(at >> 8, at & 255, theme)));
+function distance(one, other) {
+  const [a, b] = [channels(one), channels(other)];
+  return a.reduce((sum, channel, i) => sum + (channel - b[i]) ** 2, 0);
+}
 
-/** Pixels of a ramp by value, 0..255. */
-export const rampTable = remembered((theme, name) =>
-  table(256, (value) => rampColor(name, theme, value / 255)));
+// An observation made `age` steps ago.
+function faded(color, unseen, age) {
+  return blend(unseen, color, OLDEST_SHARE + (1 - OLDEST_SHARE) * 2 ** (-age / HALF_AGE));
+}
 
 function blend(from, to, share) {
   return from.map((channel, i) => Math.round(channel + (to[i] - channel) * share));
@@ -99,11 +130,10 @@ function table(length, color) {
   return pixels;
 }
 
-function remembered(make) {
-  const made = new Map();
-  return (...key) => {
-    const name = key.join(" ");
-    if (!made.has(name)) made.set(name, make(...key));
-    return made.get(name);
-  };
+const made = new Map();
+
+function remembered(key, build) {
+  const name = JSON.stringify(key);
+  if (!made.has(name)) made.set(name, build());
+  return made.get(name);
 }

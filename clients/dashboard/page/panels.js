@@ -2,24 +2,23 @@
 
 import { make } from "/elements.js";
 import { drawMarks } from "/overlay.js";
-import { rampTable, seenTable, valueTable } from "/palette.js";
 import { beliefNames, panelSentence, stateNames } from "/words.js";
 import { shapeOf } from "/wire.js";
 
 const OBSERVED = [
-  { id: "truth", kind: "truth", title: "truth", hint: "hidden from the agent" },
-  { id: "seen", kind: "seen", title: "seen so far", hint: "older is paler" },
-  { id: "frame", kind: "frame", title: "this path", hint: "what the robot saw" },
+  { id: "truth", kind: "truth", title: "truth", hint: "hidden" },
+  { id: "seen", kind: "seen", title: "seen so far", hint: "older fades" },
+  { id: "frame", kind: "frame", title: "this path", hint: "seen just now" },
 ];
 const ENTROPY = { id: "entropy", kind: "entropy", title: "entropy", hint: "of the belief" };
 
 /** The panels in `parent`; `point(cell)` is called with the cell that is pointed at, or null. */
 export function createPanels(parent, { point, inspector }) {
-  let built = { key: "", panels: [] };
+  let built = { key: "", world: null, beliefs: [], panels: [] };
 
   /** Builds panels anew when their number, names or shape change. Tells whether it did. */
   function build(picture) {
-    const beliefs = beliefNames(picture);
+    const beliefs = namesOf(picture);
     const key = JSON.stringify([shapeOf(picture), beliefs, stateNames(picture).length]);
     if (key === built.key) return false;
     const panels = OBSERVED.map((panel) => element(panel, picture, point));
@@ -28,15 +27,26 @@ export function createPanels(parent, { point, inspector }) {
     if (beliefs.length > 0) believed.push(element(ENTROPY, picture, point));
     const row = believed.map((panel) => panel.figure);
     parent.replaceChildren(...panels.map((panel) => panel.figure), inspector, ...(row.length ? row : [noBelief()]));
-    built = { key, panels: [...panels, ...believed], columns: Math.max(OBSERVED.length, row.length || 4, 4) };
+    built = { key, world: picture.world, beliefs, panels: [...panels, ...believed] };
     return true;
+  }
+
+  // Agents show a belief now and then, so entries without one lie between those with: panels stay.
+  function namesOf(picture) {
+    const names = beliefNames(picture);
+    if (names.length > 0 || picture.objectives.length === 0) return names;
+    return built.world === picture.world && built.beliefs.length ? built.beliefs : stateNames(picture);
   }
 
   return {
     build,
-    /** How many places there are, the inspector's included; and how many one row would like to hold. */
-    places: () => ({ count: built.panels.length + (built.panels.length > 3 ? 1 : 2), columns: built.columns }),
-    draw: (picture, view, theme) => built.panels.forEach((panel) => paint(panel, picture, view, theme)),
+    /** For the layout: panels, lines of the inspector, columns that hold all beliefs in one row. */
+    places: () => ({
+      panels: built.panels.length,
+      lines: OBSERVED.length + (built.beliefs.length && built.beliefs.length + 1),
+      regular: Math.max(built.beliefs.length + 1, OBSERVED.length + 1),
+    }),
+    draw: (picture, view, palette) => built.panels.forEach((panel) => paint(panel, picture, view, palette)),
     describe: (picture) => built.panels.forEach((panel) => describe(panel, picture)),
   };
 }
@@ -65,27 +75,35 @@ function element(panel, picture, point) {
   return { ...panel, figure, cells, marks, absent, context, image: context.createImageData(width, height) };
 }
 
-function paint(panel, picture, view, theme) {
+function paint(panel, picture, view, palette) {
   const values = valuesOf(panel, picture);
-  panel.absent.textContent = values ? "" : absence(panel, picture);
+  const [reason, flag] = values ? [""] : absence(panel, picture);
+  if (panel.absent.dataset.reason !== reason) {
+    panel.absent.dataset.reason = reason;
+    panel.absent.replaceChildren(reason, ...(flag ? [make("code", "", {}, flag)] : []));
+  }
   panel.figure.classList.toggle("is-absent", !values);
   if (values) {
     const pixels = new Uint32Array(panel.image.data.buffer);
-    fill(pixels, values, panel, picture, theme);
+    fill(pixels, values, panel, picture, palette);
     panel.context.putImageData(panel.image, 0, 0);
   }
   drawMarks(panel.marks, picture, { cell: view.cell, hasPath: panel.kind === "frame" && Boolean(values) });
 }
 
-function fill(pixels, values, { kind }, { arrays }, theme) {
+function fill(pixels, values, { kind }, { arrays }, palette) {
   if (kind === "seen" && arrays.age) {
-    const table = seenTable(theme);
+    const table = palette.seenTable;
     for (let i = 0; i < pixels.length; i += 1) pixels[i] = table[(values[i] << 8) | arrays.age[i]];
     return;
   }
-  const isRamp = kind === "belief" || kind === "entropy";
-  const table = isRamp ? rampTable(theme, kind) : valueTable(theme);
+  const table = tableOf(kind, palette);
   for (let i = 0; i < pixels.length; i += 1) pixels[i] = table[values[i]];
+}
+
+function tableOf(kind, palette) {
+  if (kind === "belief" || kind === "entropy") return palette.rampTable(kind);
+  return kind === "truth" ? palette.stateTable : palette.frameTable;
 }
 
 function valuesOf({ kind, state }, { arrays, info }) {
@@ -95,10 +113,10 @@ function valuesOf({ kind, state }, { arrays, info }) {
 }
 
 function absence({ kind }, picture) {
-  if (kind === "truth" && picture.source === "recording") return "This recording holds no hidden states.";
-  if (kind === "truth" && !picture.info.publish_truth) return "The server does not publish it: --publish-truth";
-  if (kind === "entropy") return "Not known for this entry.";
-  return "Nothing yet on this world.";
+  if (kind === "truth" && picture.source === "recording") return ["This recording holds no hidden states."];
+  if (kind === "truth" && !picture.info.publish_truth) return ["The server keeps it to itself. To see it, start the server with ", "--publish-truth"];
+  if (kind === "belief" || kind === "entropy") return ["No belief was shown at this step."];
+  return ["Not known for this step."];
 }
 
 function noBelief() {

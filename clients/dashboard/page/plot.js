@@ -1,10 +1,14 @@
 // Draws a chart's canvas: grid, line or strip, cursor. Colours come from the style sheet.
 
 import { prepare } from "/elements.js";
+import { NEVER } from "/palette.js";
 import { extent, tickText, ticks } from "/scale.js";
 
 // Room left of the plots for the ticks' text, in the canvas's font size.
 const LEFT = 3.1;
+// Agents are sampled now and then: what lies between two samples is drawn unless it is so many times as
+// long as is usual between them.
+const LONG = 4;
 // Half of a tick's text stands out above and below its line.
 const MARGIN = 0.6;
 // Pixels between two ticks, so that their texts stay apart.
@@ -23,9 +27,11 @@ export function drawLine(canvas, plot) {
   const y = vertical(frame, at[0], at.at(-1));
   drawRows(frame, at, y, (value) => tickText(value, step));
   drawColumns(frame, axis);
-  const runs = runsOf(values, axis.bridge);
-  drawArea(frame, runs, values, y);
-  drawRuns(frame, runs, values, y);
+  const runs = runsOf(values, (value) => !Number.isNaN(value), axis.bridge).map((run) =>
+    run.map((bin) => [x(frame, axis.binShare(bin)), y(values[bin])]));
+  // An area stands for an amount, so only where the axis begins at zero.
+  if (at[0] === 0) drawArea(frame, runs);
+  drawRuns(frame, runs);
   drawCursor(frame, axis, plot.cursor, values, y);
 }
 
@@ -40,7 +46,8 @@ export function drawStrip(canvas, plot) {
     if (value >= colors.length) continue;
     const left = x(frame, from / values.length);
     frame.context.fillStyle = colors[value];
-    frame.context.fillRect(left, 0, Math.max(1, x(frame, to / values.length) - left), height);
+    // Half a pixel wider, as neighbours of one colour would show a seam.
+    frame.context.fillRect(left, 0, x(frame, to / values.length) - left + 0.5, height);
   }
   drawSteps(frame, axis);
   drawCursor({ ...frame, height }, axis, plot.cursor);
@@ -111,57 +118,57 @@ function drawSteps(frame, axis) {
   }
 }
 
-/** Stretches [from, to] of bins that a line joins: NaN parts them, unless no entry falls into it. */
-function runsOf(values, bridge) {
+/** The bins with a value in runs that a line joins: long gaps part them. */
+function runsOf(values, isKnown, bridge) {
+  const known = [...values.keys()].filter((bin) => isKnown(values[bin]));
+  const gap = Math.max(bridge, LONG * usualGap(known));
   const runs = [];
-  let last = -Infinity;
-  for (let i = 0; i < values.length; i += 1) {
-    if (Number.isNaN(values[i])) continue;
-    if (i - last <= bridge) runs.at(-1).push(i);
-    else runs.push([i]);
-    last = i;
-  }
+  known.forEach((bin, i) => {
+    if (i > 0 && bin - known[i - 1] <= gap) runs.at(-1).push(bin);
+    else runs.push([bin]);
+  });
   return runs;
 }
 
+// The median: 1 where all bins are known, so that there a few missing ones are seen as a gap.
+function usualGap(known) {
+  const gaps = known.slice(1).map((bin, i) => bin - known[i]).sort((a, b) => a - b);
+  const usual = gaps[gaps.length >> 1] ?? 1;
+  return usual > 1 ? usual : 1 / LONG;
+}
+
+/** Blocks of one objective: each lasts until the next sample of its run. */
 function blocksOf(values, bridge) {
-  const blocks = [];
-  for (let i = 0; i < values.length; i += 1) {
-    if (values[i] === 255) continue;
-    const before = blocks.at(-1);
-    if (before && before.value === values[i] && i - before.to < bridge) before.to = i + 1;
-    else blocks.push({ from: i, to: i + 1, value: values[i] });
-  }
-  return blocks;
+  return runsOf(values, (value) => value !== NEVER, bridge).flatMap((run) =>
+    run.map((from, i) => ({ from, to: run[i + 1] ?? from + 1, value: values[from] })));
 }
 
-function trace(frame, run, values, y) {
-  const { context } = frame;
+function trace({ context }, run) {
   context.beginPath();
-  for (const i of run) context.lineTo(x(frame, (i + 0.5) / values.length), y(values[i]));
+  for (const point of run) context.lineTo(...point);
 }
 
-function drawArea(frame, runs, values, y) {
+function drawArea(frame, runs) {
   const { context, height, em, color } = frame;
   context.fillStyle = color("--line-soft");
   for (const run of runs) {
-    trace(frame, run, values, y);
-    context.lineTo(x(frame, (run.at(-1) + 0.5) / values.length), height - MARGIN * em);
-    context.lineTo(x(frame, (run[0] + 0.5) / values.length), height - MARGIN * em);
+    trace(frame, run);
+    context.lineTo(run.at(-1)[0], height - MARGIN * em);
+    context.lineTo(run[0][0], height - MARGIN * em);
     context.fill();
   }
 }
 
-function drawRuns(frame, runs, values, y) {
+function drawRuns(frame, runs) {
   const { context, color } = frame;
   context.strokeStyle = color("--line");
   context.fillStyle = color("--line");
   context.lineWidth = 1.6;
   context.lineJoin = "round";
   for (const run of runs) {
-    trace(frame, run, values, y);
+    trace(frame, run);
     if (run.length > 1) context.stroke();
-    else context.fillRect(x(frame, (run[0] + 0.5) / values.length) - 1, y(values[run[0]]) - 1, 2, 2);
+    else context.fillRect(run[0][0] - 1.5, run[0][1] - 1.5, 3, 3);
   }
 }
 

@@ -40,7 +40,9 @@ export function across(series) {
     serial: (number) => number - (isPlain ? series.first_step - first : 0),
     share: (serial) => (serial - first + 0.5) / count,
     at: (share) => Math.min(Math.max(Math.floor(first + share * count), first), last),
-    bin: (serial) => Math.min(Math.floor(((serial - first + 0.5) / count) * bins), bins - 1),
+    bin: (serial) => Math.floor(((serial - first) * bins) / count),
+    /** Where a bin lies: with fewer entries than bins, where its entry does. */
+    binShare: (bin) => (count < bins ? Math.ceil((bin * count) / bins) + 0.5 : ((bin + 0.5) * count) / bins) / count,
     // With fewer entries than bins there are bins that no entry falls into: no gaps.
     bridge: Math.ceil(bins / count),
   };

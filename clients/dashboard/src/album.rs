@@ -19,11 +19,16 @@ const MAX_BYTES: usize = 256 << 20;
 /// How many of the last steps late hidden states and beliefs are looked for in.
 const MAX_DELAY: usize = 512;
 
+/// How many hidden states are held for frames that have not come yet: channels are read one after the
+/// other, and a recording may have them in either order.
+const MAX_EARLY: usize = 64;
+
 /// What is known of each world.
 #[derive(Debug, Default)]
 pub struct Album {
     worlds: BTreeMap<u32, Strip>,
     n_bytes: usize,
+    early: VecDeque<(u32, Key, Box<[u8]>)>,
 }
 
 /// The kept steps of one world; each has a serial number, in the order of arrival.
@@ -113,10 +118,13 @@ impl Album {
 
     /// Adds a frame; what makes no sense, and what was shown already, is left out.
     pub fn add_frame(&mut self, sample: &Sample<FrameHeader>, at: Instant) {
-        let Some(entry) = Entry::from_sample(sample, at) else {
+        let Some(mut entry) = Entry::from_sample(sample, at) else {
             return;
         };
-        let strip = self.worlds.entry(sample.header.world).or_default();
+        let world = sample.header.world;
+        let early = self.early_truth(world, entry.key());
+        entry.truth = early.filter(|truth| truth.len() == entry.shape.n_cells());
+        let strip = self.worlds.entry(world).or_default();
         if strip
             .entries
             .back()
@@ -147,6 +155,9 @@ impl Album {
             step: header.step,
         };
         let Some(entry) = self.entry(header.world, key) else {
+            let early = (header.world, key, sample.payload.clone().into());
+            self.early.truncate(MAX_EARLY - 1);
+            self.early.push_front(early);
             return;
         };
         if entry.truth.is_none() && sample.payload.len() == entry.shape.n_cells() {
@@ -192,6 +203,13 @@ impl Album {
         let n_bytes = belief.n_bytes();
         let replaced = entry.belief.replace(belief);
         self.n_bytes = self.n_bytes + n_bytes - replaced.map_or(0, |old| old.n_bytes());
+    }
+
+    /// Takes the hidden states that came before their frame.
+    fn early_truth(&mut self, world: u32, key: Key) -> Option<Box<[u8]>> {
+        let mut places = self.early.iter();
+        let place = places.position(|(of, at, _)| (*of, *at) == (world, key))?;
+        self.early.remove(place).map(|(_, _, truth)| truth)
     }
 
     fn entry(&mut self, world: u32, key: Key) -> Option<&mut Entry> {

@@ -141,7 +141,8 @@ async fn socket(State(service): State<Service>, upgrade: WebSocketUpgrade) -> Re
 async fn answer(mut socket: WebSocket, stage: &Stage) {
     let mut changes = stage.changes();
     let mut sent = Instant::now() - PICTURE_INTERVAL;
-    while let Some(Ok(message)) = socket.recv().await {
+    let (mut early, mut before) = (None, None);
+    while let Some(message) = next_message(&mut socket, &mut early).await {
         let text = match message {
             Message::Text(text) => text,
             Message::Ping(_) | Message::Pong(_) => continue,
@@ -156,13 +157,32 @@ async fn answer(mut socket: WebSocket, stage: &Stage) {
         };
         order(stage, &ask);
         tokio::time::sleep(PICTURE_INTERVAL.saturating_sub(sent.elapsed())).await;
-        // A change since the last picture ends this at once.
-        let _ = tokio::time::timeout(PATIENCE, changes.changed()).await;
+        // Who asks for something else than before is answered though nothing has changed.
+        let wanted = Some((ask.world, ask.at));
+        if before == wanted {
+            tokio::select! {
+                // A change since the last picture ends this at once, and so does the next ask.
+                _ = tokio::time::timeout(PATIENCE, changes.changed()) => {}
+                message = socket.recv() => match message {
+                    Some(Ok(message)) => early = Some(message),
+                    _ => return,
+                },
+            }
+        }
+        before = wanted;
         sent = Instant::now();
         let bytes = picture(&stage.look(), &ask, sent);
         if socket.send(Message::Binary(bytes.into())).await.is_err() {
             return;
         }
+    }
+}
+
+/// The next message: one that came while its predecessor was answered, or one that comes.
+async fn next_message(socket: &mut WebSocket, early: &mut Option<Message>) -> Option<Message> {
+    match early.take() {
+        Some(message) => Some(message),
+        None => socket.recv().await?.ok(),
     }
 }
 

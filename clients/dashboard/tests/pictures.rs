@@ -106,6 +106,18 @@ fn read(album: Album, at: Option<u64>) -> (Value, impl Fn(&str) -> Vec<u8>) {
 }
 
 #[test]
+fn hidden_states_wait_for_their_frame() {
+    let mut album = Album::default();
+    album.add_truth(&truth(1, [1, 0, 0, 0, 0, 0]));
+    album.add_truth(&truth(2, [0, 1, 0, 0, 0, 0]));
+    for step in 1..=2 {
+        album.add_frame(&frame(step, [1, 0, 255, 255, 255, 255]), Instant::now());
+    }
+    let (_, arrays) = read(album, None);
+    assert_eq!(arrays("truth"), [0, 1, 0, 0, 0, 0]);
+}
+
+#[test]
 fn a_picture_joins_frame_truth_and_belief_of_a_step() {
     let mut album = Album::default();
     let now = Instant::now();
@@ -207,7 +219,7 @@ fn what_makes_no_sense_is_left_out() {
         album.add_frame(&bad, Instant::now());
     }
     assert!(album.strip(0).is_none());
-    album.add_truth(&truth(1, [0; 6]));
+    album.add_truth(&truth(2, [0; 6])); // of a frame that never comes
     album.add_belief(&outlook(1), None);
     album.add_frame(&good, Instant::now());
     let mut short = truth(1, [0; 6]);

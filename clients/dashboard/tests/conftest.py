@@ -1,0 +1,95 @@
+"""A deadline for each test, programs that end with it, and a browser whose errors fail it."""
+
+import os
+import shutil
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from looking import Look
+from playwright.sync_api import Browser, BrowserContext, sync_playwright
+from running import Dashboard, Program, Programs
+
+#: A whole test, seconds; a busy machine is no bug.
+DEADLINE = 120
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Where the programs and the browser are, and where pictures go."""
+    parser.addoption("--programs", type=Path, default=ROOT / "target/debug")
+    parser.addoption("--chromium", default=shutil.which("chromium"))
+    parser.addoption("--screenshots", type=Path, default=ROOT / "target/screenshots")
+
+
+@pytest.fixture(autouse=True)
+def deadline() -> Iterator[None]:
+    """A test that hangs fails."""
+
+    def late(_number: int, _frame: object) -> None:
+        raise TimeoutError(f"still running after {DEADLINE} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(DEADLINE)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture(scope="session")
+def chromium(request: pytest.FixtureRequest) -> Iterator[Browser]:
+    """The system's browser."""
+    path = request.config.getoption("--chromium")
+    if path is None:
+        pytest.fail("expected `chromium` on the PATH (apt-get install chromium), or --chromium")
+    # A root user's browser, as in containers, has no sandbox.
+    flags = ["--no-sandbox"] if os.geteuid() == 0 else []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=flags)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def programs(request: pytest.FixtureRequest) -> Iterator[Programs]:
+    """Starts the programs: `programs.server(worlds=4)`; all end with the test."""
+    with ExitStack() as stack:
+        yield Programs(request.config.getoption("--programs"), stack)
+
+
+@pytest.fixture
+def open_page(chromium: Browser) -> Iterator[Callable[..., Look]]:
+    """Opens a dashboard's page: `open_page(dashboard, hash="#world=2", color_scheme="dark")`.
+
+    At the end of the test the page must not have complained, but about what the test allowed.
+    """
+    looks: list[Look] = []
+    contexts: list[BrowserContext] = []
+
+    def open_one(dashboard: Dashboard, *, hash: str = "", **settings: object) -> Look:
+        context = chromium.new_context(**{"viewport": {"width": 1280, "height": 720}} | settings)
+        contexts.append(context)
+        look = Look(context.new_page())
+        looks.append(look)
+        look.page.goto(dashboard.url + hash)
+        return look
+
+    yield open_one
+    complaints = [complaint for look in looks for complaint in look.complaints()]
+    for context in contexts:
+        context.close()
+    assert complaints == []
+
+
+@pytest.fixture
+def watched(programs: Programs, open_page: Callable[..., Look]) -> tuple[Program, Dashboard, Look]:
+    """A server that publishes its truth, an agent, and a page that shows what it believes."""
+    server = programs.server(publish_truth=True)
+    dashboard = programs.dashboard(server.instance)
+    programs.agent(server.instance)
+    look = open_page(dashboard)
+    look.eventually(lambda: look.has("belief", "truth"), "a belief is shown")
+    return server, dashboard, look

@@ -1,0 +1,103 @@
+"""What a browser shows: its texts, its pixels, and the picture that they were drawn from."""
+
+import base64
+import re
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from playwright.sync_api import Locator, Page
+from running import eventually
+
+#: Bytes of an expression's typed array or canvas, as base64.
+_BYTES = """bytes => {
+  let text = "";
+  for (let i = 0; i < bytes.length; i += 8192) {
+    text += String.fromCharCode(...bytes.subarray(i, i + 8192));
+  }
+  return btoa(text);
+}"""
+
+
+class Look:
+    """A page, looked at. `allowed` are patterns of complaints that the test provokes."""
+
+    def __init__(self, page: Page) -> None:
+        """Listens to everything that goes wrong."""
+        self.page = page
+        # Reading pixels back, as only tests do, is slow and said to be.
+        self.allowed = ["willReadFrequently"]
+        self._complaints: list[str] = []
+        page.on("console", self._hear)
+        page.on("pageerror", lambda error: self._complaints.append(f"error: {error}"))
+
+    def _hear(self, message) -> None:
+        if message.type in ("error", "warning"):
+            self._complaints.append(f"{message.type}: {message.text}")
+
+    def complaints(self) -> list[str]:
+        """What was said on the console, policy violations included, that no test allowed."""
+        return [
+            complaint
+            for complaint in self._complaints
+            if not any(re.search(pattern, complaint) for pattern in self.allowed)
+        ]
+
+    def at(self, testid: str) -> Locator:
+        """The element of a test hook."""
+        return self.page.get_by_test_id(testid)
+
+    def text(self, testid: str) -> str:
+        """Its text."""
+        return self.at(testid).text_content().strip()
+
+    def number(self, testid: str) -> float:
+        """Its text as a number; NaN while there is none."""
+        text = self.text(testid).replace(",", "")
+        return float(text) if re.fullmatch(r"-?[0-9.]+", text) else float("nan")
+
+    def picture(self, expression: str = "") -> object:
+        """A part of the last drawn picture, such as `.shown.step`; None if it is not there."""
+        return self.page.evaluate(f"window.emberwatch?.picture{expression.replace('.', '?.')}")
+
+    def drawn(self) -> int:
+        """How many pictures were drawn."""
+        return self.page.evaluate("window.emberwatch?.drawn ?? 0")
+
+    def has(self, *arrays: str) -> bool:
+        """Whether the picture has these arrays."""
+        return all(self.picture(f".arrays.{name}.length") for name in arrays)
+
+    def array(self, name: str) -> NDArray[np.uint8]:
+        """An array of bytes of the picture."""
+        return self._bytes(f"window.emberwatch.picture.arrays.{name}")
+
+    def pixels(self, testid: str) -> NDArray[np.uint8]:
+        """A canvas's pixels, `(H, W, 4)`, as they were drawn."""
+        canvas = f"document.querySelector('[data-testid={testid}]')"
+        height, width = self.page.evaluate(f"[{canvas}.height, {canvas}.width]")
+        image = f"{canvas}.getContext('2d').getImageData(0, 0, {width}, {height}).data"
+        return self._bytes(image).reshape(height, width, 4)
+
+    def _bytes(self, expression: str) -> NDArray[np.uint8]:
+        text = self.page.evaluate(f"({_BYTES})({expression})")
+        return np.frombuffer(base64.b64decode(text), np.uint8)
+
+    def eventually(self, holds: Callable[[], object], what: str) -> None:
+        """Waits until something holds."""
+        try:
+            eventually(holds, what)
+        except AssertionError as error:
+            error.add_note(f"The page shows {self._situation()}")
+            raise
+
+    def _situation(self) -> str:
+        return self.page.evaluate("""JSON.stringify(window.emberwatch?.picture, (name, value) =>
+            name === "path" || ArrayBuffer.isView(value) ? value.length : value)""")
+
+    def wait_for_steps(self, count: int = 3) -> None:
+        """Waits until so many further steps were shown."""
+        first = self.picture(".shown.step") or 0
+        self.eventually(
+            lambda: (self.picture(".shown.step") or 0) >= first + count, f"{count} more steps"
+        )

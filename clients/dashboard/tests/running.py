@@ -1,0 +1,138 @@
+"""The real programs as child processes, on instances of their own."""
+
+import itertools
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+#: How long anything may take that should take much less, seconds.
+PATIENCE = 30.0
+
+_numbers = itertools.count()
+
+
+def unused_instance() -> str:
+    """A name that no other instance has."""
+    return f"page-{os.getpid()}-{next(_numbers)}"
+
+
+class Program:
+    """A running program; killed with the test."""
+
+    def __init__(self, path: Path, arguments: list[str], instance: str = "") -> None:
+        """Starts it. What it prints to standard output can be read with `line`."""
+        assert path.is_file(), f"expected {path}: cargo build --workspace"
+        self.instance = instance
+        environment = {"RUST_LOG": "error"} | os.environ
+        self._process = subprocess.Popen(
+            [str(path), *arguments],
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+            start_new_session=True,
+        )
+
+    def line(self) -> str:
+        """The next line that it prints."""
+        late = threading.Timer(PATIENCE, self._process.kill)
+        late.start()
+        line = self._process.stdout.readline()
+        late.cancel()
+        assert line, "the program ended without a word"
+        return line.strip()
+
+    def interrupt(self) -> None:
+        """Asks it to end; returns when it has."""
+        self._process.send_signal(signal.SIGINT)
+        self.wait()
+
+    def wait(self) -> int:
+        """Waits for its end: the exit code."""
+        return self._process.wait(PATIENCE)
+
+    def kill(self) -> None:
+        """Ends it as no handler can prevent; returns when it has ended."""
+        self._process.kill()
+        self._process.wait(PATIENCE)
+        self._process.stdout.close()
+
+
+class Dashboard(Program):
+    """A running dashboard."""
+
+    def __init__(self, path: Path, arguments: list[str], port: int) -> None:
+        """Starts it and waits until it tells where its page is."""
+        super().__init__(path, [*arguments, f"--listen=127.0.0.1:{port}"])
+        self.url = self.line()
+        self.port = int(self.url.rstrip("/").rpartition(":")[2])
+
+
+class Programs:
+    """Starts programs that end with a test."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        """They are in this folder."""
+        self._folder = folder
+        self._stack = stack
+
+    def server(self, instance: str | None = None, **settings: object) -> Program:
+        """A server, by default with a small world that is quickly burnt in."""
+        instance = instance or unused_instance()
+        settings = {
+            "height": 24,
+            "width": 32,
+            "moves": 24,
+            "burn_in": 500,
+            "exit_with": os.getpid(),
+        } | settings
+        return self._keep(
+            Program(self._path("server"), flags({"instance": instance} | settings), instance)
+        )
+
+    def is_serving(self, instance: str) -> bool:
+        """Whether a server answers there."""
+        command = [self._path("server"), "status", f"--instance={instance}"]
+        return subprocess.run(command, capture_output=True, timeout=PATIENCE).returncode == 0
+
+    def agent(self, instance: str, **settings: object) -> Program:
+        """An agent that acts on a world until it is stopped."""
+        return self._keep(
+            Program(self._path("agent"), ["run", *flags({"instance": instance} | settings)])
+        )
+
+    def record(self, instance: str, out: Path, *, steps: int) -> Program:
+        """A recorder of hidden states too, of so many steps."""
+        settings = {"instance": instance, "out": out, "steps": steps}
+        return self._keep(Program(self._path("server"), ["record", "--truth", *flags(settings)]))
+
+    def dashboard(self, instance: str = "", *, recording: Path | None = None, port: int = 0):
+        """A dashboard of an instance, or of a recording."""
+        source = {"recording": recording} if recording else {"instance": instance}
+        arguments = flags(source | {"exit_with": os.getpid()})
+        return self._keep(Dashboard(self._path("dashboard"), arguments, port))
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"emberwatch-{name}"
+
+    def _keep(self, program: Program):
+        self._stack.callback(program.kill)
+        return program
+
+
+def flags(settings: dict[str, object]) -> list[str]:
+    """Settings as command-line flags."""
+    pairs = [(f"--{name.replace('_', '-')}", value) for name, value in settings.items()]
+    return [name if value is True else f"{name}={value}" for name, value in pairs]
+
+
+def eventually(holds: Callable[[], object], what: str, limit: float = PATIENCE) -> None:
+    """Looks until something holds; fails if it does not in time."""
+    end = time.monotonic() + limit
+    while not holds():
+        assert time.monotonic() < end, f"expected within {limit} s: {what}"
+        time.sleep(0.02)

@@ -1,0 +1,126 @@
+"""Who may connect, and who can use the page: other sites, screen readers, keys, small screens."""
+
+import base64
+import http.client
+import os
+from contextlib import closing
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+
+PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 3, "has_touch": True}
+DESK = {"viewport": {"width": 1280, "height": 720}}
+
+
+def answer(port: int, path: str, **headers: str) -> http.client.HTTPResponse:
+    """The answer to a request with exactly these headers."""
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
+        connection.putrequest("GET", path, skip_host=True)
+        for name, value in headers.items():
+            connection.putheader(name.replace("_", "-"), value)
+        connection.endheaders()
+        with connection.getresponse() as response:
+            return response
+
+
+def handshake(port: int, **headers: str) -> int:
+    """The status that a WebSocket's handshake is answered with."""
+    key = base64.b64encode(os.urandom(16)).decode()
+    upgrade = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec_WebSocket_Version": "13"}
+    return answer(port, "/socket", Sec_WebSocket_Key=key, **upgrade, **headers).status
+
+
+def test_other_sites_are_refused(programs):
+    port = programs.dashboard("page-alone").port
+    own = f"127.0.0.1:{port}"
+    assert answer(port, "/", Host=own).status == 200
+    assert answer(port, "/", Host=f"localhost:{port}").status == 200
+    assert answer(port, "/", Host="evil.example").status == 403
+    assert answer(port, "/", Host=f"evil.example:{port}").status == 403
+    assert handshake(port, Host=own, Origin=f"http://{own}") == 101
+    assert handshake(port, Host=own) == 101
+    assert handshake(port, Host=own, Origin="http://evil.example") == 403
+    assert handshake(port, Host=own, Origin="null") == 403
+    assert handshake(port, Host="evil.example", Origin="http://evil.example") == 403
+    assert handshake(port, Host=own, Origin=f"http://127.0.0.1:{port + 1}") == 403
+
+
+def test_the_page_says_what_it_may_load(programs):
+    reply = answer(port := programs.dashboard("page-alone").port, "/", Host=f"127.0.0.1:{port}")
+    policy = reply.headers["Content-Security-Policy"]
+    assert "default-src 'self'" in policy
+    assert "unsafe" not in policy
+    assert "frame-ancestors 'none'" in policy
+
+
+def serious(look) -> list[str]:
+    """What axe holds to be serious or critical."""
+    found = Axe().run(look.page).response["violations"]
+    return [
+        f"{problem['id']}: {problem['help']}: {node['html']}"
+        for problem in found
+        if problem["impact"] in ("serious", "critical")
+        for node in problem["nodes"]
+    ]
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("screen", [DESK, PHONE], ids=["desk", "phone"])
+def test_axe_finds_nothing_serious(programs, open_page, theme, screen):
+    server = programs.server(publish_truth=True)
+    dashboard = programs.dashboard(server.instance)
+    look = open_page(dashboard, color_scheme=theme, **screen)
+    programs.agent(server.instance)
+    look.eventually(lambda: look.has("belief", "truth"), "a belief is shown")
+    assert serious(look) == []
+    look.page.keyboard.press("Space")
+    server.kill()
+    look.eventually(lambda: look.text("state") == "waiting", "waiting")
+    assert serious(look) == []
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_axe_finds_nothing_serious_while_waiting(programs, open_page, theme):
+    look = open_page(programs.dashboard("page-alone"), color_scheme=theme)
+    look.eventually(lambda: look.text("state") == "waiting", "waiting")
+    assert serious(look) == []
+
+
+def test_every_control_is_reached_by_tab(watched):
+    _, _, look = watched
+    reached = set()
+    for _ in range(40):
+        look.page.keyboard.press("Tab")
+        reached.add(look.page.evaluate("document.activeElement.dataset.testid ?? ''"))
+        name = look.page.evaluate("document.activeElement.getAttribute('aria-label') ?? ''")
+        reached.add(name.partition(":")[0])
+    assert {"world-select", "pause", "scrub", "cells of truth", "cells of entropy"} <= reached
+
+
+def test_canvases_tell_what_they_show(watched):
+    _, _, look = watched
+    label = look.at("panel-truth").get_attribute("aria-label")
+    assert "cells in state fire at step" in label
+    look.eventually(
+        lambda: look.at("panel-truth").get_attribute("aria-label") != label, "it is kept true"
+    )
+    assert "mean" in look.at("chart-reward").get_attribute("aria-label")
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("screen", [DESK, PHONE], ids=["desk", "phone"])
+def test_it_fits(request, programs, open_page, theme, screen):
+    """A picture of it is kept for people to look at."""
+    server = programs.server(height=64, width=64, moves=64, burn_in=12000, publish_truth=True)
+    look = open_page(programs.dashboard(server.instance), color_scheme=theme, **screen)
+    programs.agent(server.instance)
+    look.eventually(lambda: look.has("belief", "truth"), "a belief is shown")
+    look.wait_for_steps(300)
+    assert look.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    is_phone = screen is PHONE
+    if not is_phone:
+        assert look.page.evaluate("document.documentElement.scrollHeight <= innerHeight")
+    folder = request.config.getoption("--screenshots")
+    folder.mkdir(parents=True, exist_ok=True)
+    name = f"{'phone' if is_phone else 'desk'}-{theme}.png"
+    look.page.screenshot(path=folder / name, full_page=is_phone)

@@ -1,0 +1,187 @@
+"""Every pixel against what other readers of the instance got, coloured by a table of our own."""
+
+import tomllib
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from running import PATIENCE, eventually
+
+import emberwatch
+from emberwatch import OutlookReader, TruthReader
+
+STEPS = 30
+UNOBSERVED = 255
+
+# Nine stops from 0 to 1, linear in between.
+BELIEF = {
+    "light": "f9f8e1 c6e4be 87d0ab 4cb6a6 039aa0 057a91 005c80 003e6f 0d2156",
+    "dark": "161d2b 1d3450 0d4f75 046e89 038e97 23af9b 70cb95 b8e095 f8f3a3",
+}
+ENTROPY = {
+    "light": "fff5e8 fcdbc2 fbbda6 f3a099 e38598 cc6f9c a9629c 865796 644c8a",
+    "dark": "1e1b25 382340 592855 79315d 97405e b2525b c86958 d38762 dba475",
+}
+UNSEEN = {"light": "e2e2e2", "dark": "2b2f36"}
+
+
+def rgb(color: str) -> np.ndarray:
+    """Three numbers of a colour, with or without #."""
+    return np.array(list(bytes.fromhex(color.lstrip("#"))), float)
+
+
+def ramp(stops: str, levels: np.ndarray) -> np.ndarray:
+    """Colours of 0..255 on a ramp."""
+    table = np.array([rgb(stop) for stop in stops.split()])
+    at = levels / 255 * (len(table) - 1)
+    channels = [np.interp(at, range(len(table)), table[:, channel]) for channel in range(3)]
+    return np.stack(channels, axis=-1)
+
+
+def of_values(values: np.ndarray, colors: list[str], unseen: str) -> np.ndarray:
+    """Colours of states or observations."""
+    table = np.zeros((256, 3))
+    table[: len(colors)] = [rgb(color) for color in colors]
+    table[UNOBSERVED] = rgb(unseen)
+    return table[values]
+
+
+def check_pixels(look, panel: str, expected: np.ndarray) -> None:
+    """A panel's pixels are those colours, to rounding of halves."""
+    pixels = look.pixels(panel).astype(float)
+    assert (pixels[..., 3] == 255).all()
+    assert pixels.shape[:2] == expected.shape[:2]
+    worst = np.abs(pixels[..., :3] - expected).max()
+    assert worst <= 0.5 + 1e-9, f"{panel}: expected the colours of its array, got {worst} off"
+
+
+class Witness:
+    """What the Python package saw: frames of all steps, truth and belief of the last."""
+
+    def __init__(self, instance: str, stack: ExitStack) -> None:
+        """Reads from now on."""
+        self._frames = stack.enter_context(emberwatch.observe(instance))
+        self._truth = stack.enter_context(TruthReader(instance))
+        self._outlook = stack.enter_context(OutlookReader(instance))
+
+    def watch(self, last: int) -> None:
+        """Reads until that step."""
+        self.frames = {}
+        while last not in self.frames:
+            frame = self._frames.receive(PATIENCE)
+            assert frame is not None and frame.n_lost == 0
+            self.frames[frame.result.step] = frame
+        self.truth = self._last(self._truth, last)
+        self.outlook = self._last(self._outlook, last)
+
+    @staticmethod
+    def _last(reader, step: int):
+        while True:
+            sample = reader.receive(PATIENCE)
+            assert sample is not None, f"expected a sample of step {step}"
+            if sample.step == step:
+                return sample
+
+    def seen(self, last: int) -> tuple[np.ndarray, np.ndarray]:
+        """Each cell's latest observation, and its age in steps."""
+        shape = self.frames[last].frame.shape
+        seen, age = np.full(shape, UNOBSERVED, np.uint8), np.full(shape, 255, np.uint8)
+        for step in sorted(self.frames):
+            visited = self.frames[step].frame != UNOBSERVED
+            seen[visited] = self.frames[step].frame[visited]
+            age[visited] = last - step
+        return seen, age
+
+
+@pytest.mark.parametrize(
+    ("model", "shape"), [("wildfire", (24, 32)), ("config/models/road-ice.toml", (24, 40))]
+)
+def test_panels_show_what_was_published(programs, open_page, model, shape):
+    named = {"wildfire": "config/models/wildfire.toml"}.get(model, model)
+    colors = tomllib.loads((ROOT / named).read_text())
+    states = [state["color"] for state in colors["states"]]
+    observations = [value["color"] for value in colors["observations"]]
+    path = str(ROOT / model) if model.endswith(".toml") else model
+    height, width = shape
+    server = programs.server(
+        model=path, height=height, width=width, moves=30, seed=5, publish_truth=True
+    )
+    look = open_page(programs.dashboard(server.instance))
+    look.eventually(lambda: look.text("state") == "serving", "serving")
+    with ExitStack() as stack:
+        witness = Witness(server.instance, stack)
+        programs.agent(server.instance, steps=STEPS)
+        witness.watch(STEPS)
+    look.eventually(
+        lambda: look.picture(".shown.step") == STEPS and look.has("belief", "truth"),
+        f"step {STEPS} with its belief",
+    )
+    check_arrays(look, witness)
+    unseen = UNSEEN | ({"light": "484848"} if "road-ice" in model else {})
+    for theme in ("light", "dark"):
+        look.page.get_by_label(theme).check(force=True)
+        check_panels(look, theme, states, observations, unseen[theme])
+
+
+def check_arrays(look, witness: Witness) -> None:
+    """The picture's arrays are what was published."""
+    frame = witness.frames[STEPS]
+    result = frame.result
+    assert look.picture(".shown.robot") == [result.row, result.col]
+    assert look.number("step") == STEPS
+    assert look.number("reward") == pytest.approx(result.reward)
+    np.testing.assert_array_equal(look.array("truth"), witness.truth.states.ravel())
+    np.testing.assert_array_equal(look.array("frame"), frame.frame.ravel())
+    seen, age = witness.seen(STEPS)
+    np.testing.assert_array_equal(look.array("seen"), seen.ravel())
+    np.testing.assert_array_equal(look.array("age"), age.ravel())
+    belief = witness.outlook.belief.astype(float)
+    check_levels(look.array("belief"), 255 * belief)
+    logarithms = np.log(belief, where=belief > 0, out=np.zeros_like(belief))
+    check_levels(look.array("entropy"), -255 * (belief * logarithms).sum(0) / np.log(len(belief)))
+
+
+def check_levels(levels: np.ndarray, exact: np.ndarray) -> None:
+    """Rounded numbers are within half a level (and what single precision loses) of exact ones."""
+    assert np.abs(levels - exact.ravel()).max() <= 0.5 + 1e-3
+
+
+def check_panels(look, theme, states, observations, unseen) -> None:
+    """The pixels are what the arrays are to be coloured like."""
+    grid = look.pixels("panel-frame").shape[:2]
+    # The page draws anew in its next frame.
+    frame = of_values(look.array("frame").reshape(grid), observations, unseen)
+    eventually(
+        lambda: np.abs(look.pixels("panel-frame")[..., :3] - frame).max() < 1, f"the theme {theme}"
+    )
+    truth = of_values(look.array("truth").reshape(grid), states, unseen)
+    check_pixels(look, "panel-truth", truth)
+    seen = of_values(look.array("seen").reshape(grid), observations, unseen)
+    share = 0.4 + 0.6 * 2 ** (-look.array("age").astype(float).reshape(*grid, 1) / 24)
+    check_pixels(look, "panel-seen", rgb(unseen) + (seen - rgb(unseen)) * share)
+    for state, levels in enumerate(look.array("belief").reshape(-1, *grid)):
+        check_pixels(look, f"panel-belief-{state}", ramp(BELIEF[theme], levels))
+    entropy = look.array("entropy").reshape(grid)
+    check_pixels(look, "panel-entropy", ramp(ENTROPY[theme], entropy))
+
+
+@pytest.mark.parametrize("stops", [*BELIEF.values(), *ENTROPY.values()])
+def test_ramps_are_perceptually_even(stops):
+    lightness = [oklab_lightness(rgb(stop) / 255) for stop in stops.split()]
+    steps = np.diff(lightness)
+    # Stops are rounded to bytes and kept within the screen's gamut.
+    assert np.abs(steps - steps.mean()).max() < 0.1 * abs(steps.mean())
+
+
+def oklab_lightness(color: np.ndarray) -> float:
+    """L of OKLab, of an sRGB colour."""
+    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+    cones = np.array(
+        [
+            [0.4122214708, 0.5363325363, 0.0514459929],
+            [0.2119034982, 0.6806995451, 0.1073969566],
+            [0.0883024619, 0.2817188376, 0.6299787005],
+        ]
+    )
+    return float(np.array([0.2104542553, 0.7936177850, -0.0040720468]) @ np.cbrt(cones @ linear))

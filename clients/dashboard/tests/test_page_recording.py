@@ -1,0 +1,42 @@
+"""A recording: it plays, waits, goes fast, ends, and begins again."""
+
+from running import eventually
+
+
+def test_a_recording_plays_to_its_end(programs, open_page, tmp_path):
+    server = programs.server(publish_truth=True)
+    eventually(lambda: programs.is_serving(server.instance), "a server")
+    file = tmp_path / "short.recording"
+    recorder = programs.record(server.instance, file, steps=60)
+    programs.agent(server.instance)
+    assert recorder.wait() == 0
+    look = open_page(programs.dashboard(recording=file))
+    look.eventually(lambda: look.picture(".source") == "recording", "a recording")
+    look.at("speed").select_option("0")
+    look.eventually(lambda: look.picture(".player.speed") == 0, "as fast as possible")
+    look.eventually(lambda: look.text("clock") == "ended", "its end")
+    assert look.picture(".kept.last") > look.picture(".kept.first")
+    assert look.has("frame", "seen")
+    scrub_at_rest(look)
+    look.at("speed").select_option("0.25")
+    look.at("play").click()
+    look.eventually(lambda: look.picture(".player.ended") is False, "again")
+    look.at("play").click()
+    look.eventually(lambda: look.picture(".player.playing") is False, "stopped")
+    seconds = look.picture(".player.seconds")
+    drawn = look.drawn()
+    look.eventually(lambda: look.drawn() > drawn + 2, "pictures while stopped")
+    assert look.picture(".player.seconds") == seconds
+
+
+def scrub_at_rest(look) -> None:
+    """Entries of the past are shown though nothing happens."""
+    first = look.picture(".kept.first")
+    look.page.keyboard.press("Home")
+    look.eventually(lambda: look.picture(".shown.serial") == first, "the first entry")
+    look.page.keyboard.press("ArrowRight")
+    look.eventually(lambda: look.picture(".shown.serial") == first + 1, "the second")
+    look.eventually(lambda: look.has("truth"), "its hidden states")
+    look.page.keyboard.press("Space")
+    last = look.picture(".kept.last")
+    look.eventually(lambda: look.picture(".shown.serial") == last, "the newest")

@@ -1,0 +1,117 @@
+"""Servers and agents that come and go; pause, scrub and live."""
+
+from running import eventually, unused_instance
+
+
+def test_waits_for_a_server_and_then_shows_what_happens(programs, open_page):
+    instance = unused_instance()
+    look = open_page(programs.dashboard(instance))
+    look.eventually(lambda: look.text("state") == "waiting", "waiting")
+    command = look.page.get_by_text(f"emberwatch-server --instance {instance}", exact=True)
+    assert command.is_visible()
+    programs.server(instance, publish_truth=True)
+    look.eventually(lambda: look.text("state") == "serving", "serving")
+    programs.agent(instance)
+    look.wait_for_steps()
+    look.eventually(lambda: look.text("policy") == "beam_exploit", "a policy")
+    look.eventually(lambda: look.number("holder") > 0, "a holder")
+    assert look.number("step") > 0
+    assert look.number("observers") >= 1
+    assert not command.is_visible()
+
+
+def test_pause_scrub_and_live(watched):
+    _, _, look = watched
+    look.at("pause").click()
+    paused = settled_serial(look)
+    drawn = look.drawn()
+    look.eventually(lambda: look.drawn() > drawn + 2, "pictures while paused")
+    assert look.picture(".shown.serial") == paused
+    look.at("scrub").focus()
+    look.page.keyboard.press("Home")
+    look.eventually(lambda: look.picture(".shown.serial") == look.picture(".kept.first"), "oldest")
+    look.at("pause").click()
+    look.eventually(lambda: look.picture(".shown.serial") > paused, "live again")
+    look.wait_for_steps()
+
+
+def settled_serial(look) -> int:
+    """The serial looked at, once the page has it on the slider as well."""
+    look.eventually(
+        lambda: (
+            look.at("pause").text_content() != "Pause"
+            and look.number("serial") == look.picture(".shown.serial")
+        ),
+        "paused",
+    )
+    before = None
+    serial = look.picture(".shown.serial")
+    while serial != before:
+        drawn, before = look.drawn(), serial
+        look.eventually(lambda drawn=drawn: look.drawn() > drawn + 1, "two pictures")
+        serial = look.picture(".shown.serial")
+    return serial
+
+
+def test_keys_pause_and_scrub_from_anywhere(watched):
+    _, _, look = watched
+    look.eventually(lambda: look.picture(".kept.last") > look.picture(".kept.first") + 30, "steps")
+    look.page.keyboard.press("Space")
+    at = settled_serial(look)
+    for key, by in [("ArrowLeft", -1), ("Shift+ArrowLeft", -10), ("ArrowRight", 1)]:
+        look.page.keyboard.press(key)
+        at += by
+        look.eventually(lambda at=at: look.picture(".shown.serial") == at, f"{key} goes to {at}")
+    look.page.keyboard.press("Home")
+    look.eventually(lambda: look.picture(".shown.serial") == look.picture(".kept.first"), "first")
+    look.page.keyboard.press("End")
+    look.eventually(lambda: look.picture(".shown.serial") > at, "the newest when it was pressed")
+    look.page.keyboard.press("Space")
+    look.wait_for_steps()
+
+
+def test_an_entry_that_is_no_longer_kept_is_told(programs, open_page):
+    # Thousands of steps a second: a path costs a small world nothing.
+    server = programs.server(height=4, width=4, moves=2, burn_in=0)
+    look = open_page(programs.dashboard(server.instance))
+    programs.agent(server.instance, policy="random_walk")
+    look.wait_for_steps()
+    look.page.keyboard.press("Space")
+    at = settled_serial(look)
+    look.eventually(lambda: look.picture(".kept.first") > at, "it fell out of what is kept")
+    look.eventually(lambda: look.page.get_by_text("is no longer").is_visible(), "said so")
+    oldest = "emberwatch.picture.shown.serial - emberwatch.picture.kept.first"
+    assert look.page.evaluate(oldest) == 0, "the oldest is shown"
+
+
+def test_a_server_that_is_killed_is_waited_for(watched, programs):
+    server, _, look = watched
+    server.kill()
+    look.eventually(lambda: look.text("state") == "waiting", "waiting")
+    assert look.text("note") != ""
+    assert look.at("panel-truth").is_visible(), "the last picture stays"
+    programs.server(server.instance, publish_truth=True, seed=9)
+    look.eventually(lambda: look.text("state") == "serving", "serving")
+    programs.agent(server.instance)
+    look.eventually(lambda: look.picture(".shown.seed") == "9", "the new server's world")
+    look.wait_for_steps()
+
+
+def test_another_agent_takes_over(watched, programs):
+    server, _, look = watched
+    assert look.text("policy") == "beam_exploit"
+    programs.agent(server.instance, policy="shooting_explore", takeover=True)
+    look.eventually(lambda: look.text("policy") == "shooting_explore", "the new policy")
+    assert look.text("objective") == "entropy"
+
+
+def test_a_dashboard_that_goes_is_waited_for(watched, programs):
+    server, dashboard, look = watched
+    look.allowed.append("WebSocket connection to .* failed")
+    dashboard.kill()
+    look.eventually(lambda: "dashboard gone" in look.text("state"), "gone")
+    assert look.at("panel-truth").is_visible(), "the last picture stays"
+    drawn = look.drawn()
+    programs.dashboard(server.instance, port=dashboard.port)
+    look.eventually(lambda: look.text("state") == "serving", "serving again")
+    eventually(lambda: look.drawn() > drawn + 3, "pictures again")
