@@ -8,8 +8,9 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from looking import Look
 from playwright.sync_api import Browser, BrowserContext, sync_playwright
+
+from looking import Look
 from running import Dashboard, Program, Programs
 
 #: A whole test, seconds; a busy machine is no bug.
