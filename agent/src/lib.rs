@@ -31,6 +31,7 @@ pub mod run;
 pub mod scoring;
 pub mod student;
 pub mod summary;
+pub mod tensorboard;
 pub mod train;
 pub mod truth;
 

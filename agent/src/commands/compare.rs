@@ -10,7 +10,7 @@ use agent::learned::Learned;
 use agent::policy::{EstimatorKind, Policy};
 use agent::report::{
     Snapshot, draw_ladder, draw_rewards, draw_snapshot, figures::FIRE_CELLS_PER_STEP, render_table,
-    write_csv,
+    write_csv, write_events,
 };
 use anyhow::{Context, Result, ensure};
 use clap::Args;
@@ -38,6 +38,9 @@ pub struct CompareCommand {
     /// Draw ladder.png, rewards.png and snapshot.png into this directory
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
+    /// Write rewards step by step for TensorBoard into this directory, a run of each policy
+    #[arg(long, value_name = "DIR")]
+    tensorboard: Option<PathBuf>,
     #[command(flatten)]
     worlds: WorldFlags,
     #[command(flatten)]
@@ -65,6 +68,9 @@ impl CompareCommand {
         write(&render_table(&results.runs, &self.baseline))?;
         if let Some(path) = &self.csv {
             write_csv(path, &results.runs)?;
+        }
+        if let Some(directory) = &self.tensorboard {
+            write_events(directory, &results.runs)?;
         }
         if let Some(directory) = &self.figures {
             self.draw(directory, arena, &comparison, &results)?;
@@ -108,7 +114,8 @@ impl CompareCommand {
             );
             make_folder_of(path)?;
         }
-        self.figures.as_deref().map_or(Ok(()), make_folder)
+        let folders = [self.figures.as_deref(), self.tensorboard.as_deref()];
+        folders.into_iter().flatten().try_for_each(make_folder)
     }
 
     fn policies(&self, model: &Model, learned: &Learned) -> Result<Vec<Policy>> {

@@ -4,13 +4,16 @@
 //! Read [`statistics`] first, then [`table`], [`csv`] and [`figures`]. [`training`] turns metrics into curves.
 
 pub mod csv;
+pub mod events;
 pub mod figures;
 mod number;
+pub mod picture;
 pub mod statistics;
 pub mod table;
 pub mod training;
 
 pub use self::csv::write_csv;
+pub use self::events::write_events;
 pub use self::figures::{Snapshot, draw_ladder, draw_rewards, draw_snapshot};
 pub use self::table::render_table;
 

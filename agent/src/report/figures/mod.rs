@@ -8,7 +8,7 @@ mod canvas;
 pub mod curves;
 mod ladder;
 mod legend;
-mod palette;
+pub(crate) mod palette;
 mod panels;
 mod rewards;
 mod snapshot;
