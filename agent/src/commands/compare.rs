@@ -35,7 +35,7 @@ pub struct CompareCommand {
     /// Write one line per policy and world to this file
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
-    /// Draw ladder.png, rewards.png and snapshot.png into this directory
+    /// Draw ladder and rewards as .png and .svg, and snapshot.png, into this directory
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
     /// Write rewards step by step for TensorBoard into this directory, a run of each policy
@@ -86,15 +86,12 @@ impl CompareCommand {
         results: &Results,
     ) -> Result<()> {
         let label = axis_label(arena.model());
-        draw_ladder(&directory.join("ladder.png"), &results.runs, &label)?;
-        let first = self.worlds.seeds.start;
-        draw_rewards(
-            &directory.join("rewards.png"),
-            &results.runs,
-            first,
-            &label,
-            Some(&results.fire_cells),
-        )?;
+        for kind in ["png", "svg"] {
+            let path = |name: &str| directory.join(name).with_extension(kind);
+            draw_ladder(&path("ladder"), &results.runs, &label)?;
+            let fire_cells = Some(&*results.fire_cells);
+            draw_rewards(&path("rewards"), &results.runs, &label, fire_cells)?;
+        }
         match &results.moment {
             Some(moment) => draw_moment(&directory.join("snapshot.png"), arena, moment)?,
             None => tracing::warn!("no snapshot: no policy among these has a belief of its own"),

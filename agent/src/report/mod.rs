@@ -73,14 +73,6 @@ pub enum ReportError {
         /// The number.
         got: f64,
     },
-    /// A world that no policy ran on with its rewards kept.
-    #[error("rewards of world seed {world_seed}: expected one of the recorded worlds {known:?}")]
-    UnknownWorld {
-        /// The world asked for.
-        world_seed: u64,
-        /// The worlds there are.
-        known: Vec<u64>,
-    },
     /// Parts of a snapshot that do not belong together.
     #[error("snapshot: {what}: expected {expected}, got {got}")]
     Snapshot {

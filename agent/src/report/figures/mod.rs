@@ -8,6 +8,7 @@ mod canvas;
 pub mod curves;
 mod ladder;
 mod legend;
+mod lettering;
 pub(crate) mod palette;
 mod panels;
 mod rewards;
