@@ -15,6 +15,7 @@ pub mod decider;
 pub mod decisions;
 pub mod estimator;
 pub mod evaluate;
+pub mod film;
 pub mod handover;
 pub mod launch;
 pub mod learned;

@@ -133,7 +133,7 @@ fn groups(runs: &[PolicyRun]) -> Vec<Group<'_>> {
 ///
 /// # Errors
 /// [`ReportError::Write`] names `path`.
-fn replace_file<E: Display>(
+pub(crate) fn replace_file<E: Display>(
     path: &Path,
     extension: &str,
     write: impl FnOnce(&Path) -> Result<(), E>,

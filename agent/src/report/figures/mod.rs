@@ -13,7 +13,7 @@ pub(crate) mod palette;
 mod panels;
 mod rewards;
 mod snapshot;
-mod text;
+pub(crate) mod text;
 
 pub use self::ladder::draw_ladder;
 pub use self::rewards::draw_rewards;
