@@ -76,6 +76,10 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
             "{name}"
         );
     }
+    for name in ["ladder.svg", "rewards.svg"] {
+        let text = std::fs::read_to_string(figures.join(name)).expect(name);
+        assert!(text.contains(">beam exploit"), "{name}");
+    }
     let settings = std::fs::read_to_string(figures.join("agent.toml")).expect("the settings");
     assert!(settings.contains("beam_width = 4"), "{settings}");
 }

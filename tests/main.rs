@@ -17,6 +17,7 @@ mod decisions;
 mod determinism;
 mod episodes;
 mod files;
+mod films;
 mod frames;
 mod handover;
 mod harness;

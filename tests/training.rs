@@ -6,6 +6,7 @@ use agent::checkpoint::{self, Contents};
 use agent::learner::KIND;
 use protocol::Move;
 use rustix::process::Signal;
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tempfile::TempDir;
@@ -141,6 +142,10 @@ fn other_worlds_begin_new_tracks_and_an_empty_replay() {
     let ended = place.train("out", &format!("{WORLDS} --steps 60 --resume"));
     let told = "beliefs begin anew worlds=2";
     assert!(ended.stderr.contains(told), "{}", ended.stderr);
+    let files = std::fs::read_dir(place.path("out")).expect("the folder");
+    let names = files.map(|file| file.expect("a file").file_name());
+    let is_of_tensorboard = |name: &OsString| name.to_string_lossy().contains(".tfevents.");
+    assert_eq!(names.filter(is_of_tensorboard).count(), 2, "a run each");
     let rows = place.rows("out");
     assert_eq!(rows[n_rows][1], "62", "world steps go on");
     let updates = |row: &Vec<String>| row[0].parse::<u64>().expect("a number");

@@ -30,12 +30,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
 fn panel(title: &str, config: &AgentConfig) -> Panel {
     let (model, dqn) = (config.autoencoder.step_size, config.dqn.step_size);
-    let curve = |name: &str, value: &dyn Fn(u64) -> f64| Curve {
-        name: name.into(),
-        points: (0..=ITERATIONS)
-            .step_by(100)
-            .map(|n| (n as f64, value(n)))
-            .collect(),
+    let curve = |name: &str, value: &dyn Fn(u64) -> f64| {
+        let points = (0..=ITERATIONS).step_by(100);
+        Curve::new(name, points.map(|n| (n as f64, value(n))).collect())
     };
     let at = |size: StepSize| move |n| size.at(n);
     Panel {

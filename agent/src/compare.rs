@@ -38,7 +38,7 @@ pub struct Comparison {
 pub struct Results {
     /// One run per policy and world, in the order of the policies.
     pub runs: Vec<PolicyRun>,
-    /// Cells in the state that pays most, per step of the first world: the same for all policies.
+    /// Cells in the state that pays most, per step, means over worlds: the same for all policies.
     pub fire_cells: Vec<f32>,
     /// The end of the first world's run of the last policy with a belief of its own.
     pub moment: Option<Moment>,
@@ -141,8 +141,11 @@ pub fn compare(
         for batch in seeds.chunks(arena.batch_size()) {
             let game = game(policy, batch);
             let mut runs = game.play(arena, &mut feed, progress)?;
+            if *policy == comparison.policies[0] {
+                let share = 1.0 / seeds.len() as f32;
+                results.add_fire(share, &runs);
+            }
             if batch[0] == comparison.seeds.start {
-                results.fire_cells.clone_from(&runs[0].tally.fire_cells);
                 results.moment = runs[0].moment.take().or(results.moment);
             }
             results
@@ -152,6 +155,16 @@ pub fn compare(
     }
     feed.end();
     Ok(results)
+}
+
+impl Results {
+    fn add_fire(&mut self, share: f32, runs: &[Run]) {
+        for cells in runs.iter().map(|run| &run.tally.fire_cells) {
+            self.fire_cells.resize(cells.len(), 0.0);
+            let both = self.fire_cells.iter_mut().zip(cells);
+            both.for_each(|(mean, cells)| *mean += share * cells);
+        }
+    }
 }
 
 /// One policy on one batch of worlds.

@@ -16,6 +16,7 @@ pub mod decisions;
 pub mod estimator;
 pub mod evaluate;
 pub mod feed;
+pub mod film;
 pub mod handover;
 pub mod launch;
 pub mod learned;
@@ -32,6 +33,7 @@ pub mod run;
 pub mod scoring;
 pub mod student;
 pub mod summary;
+pub mod tensorboard;
 pub mod train;
 pub mod truth;
 

@@ -138,12 +138,7 @@ impl Metrics {
         lessons: &[Lesson],
         n_updates: u64,
     ) -> Result<(), MetricsError> {
-        let nothing = Lesson {
-            number: n_updates,
-            loss: None,
-            rate: None,
-            more: vec![None; self.n_more],
-        };
+        let nothing = Lesson::nothing(n_updates, self.n_more);
         let nothing = lessons.is_empty().then_some(&nothing);
         for lesson in lessons.iter().chain(nothing) {
             let written = self.writer.write_record(row(tick, lesson));
@@ -167,15 +162,47 @@ impl Metrics {
 }
 
 fn row(tick: &Tick, lesson: &Lesson) -> Vec<String> {
+    let counts = [lesson.number, tick.world_steps].map(|count| count.to_string());
+    // The shortest form that reads back as the same number.
+    let text = |number: f64| format!("{number:?}");
+    let numbers = numbers(tick, lesson).map(|number| number.map_or(String::new(), text));
+    counts.into_iter().chain(numbers).collect()
+}
+
+/// What stands behind the two counts of a row.
+fn numbers<'a>(tick: &Tick, lesson: &'a Lesson) -> impl Iterator<Item = Option<f64>> + 'a {
     let held_out = (tick.score.n_seen > 0).then(|| tick.score.mean());
     let mean_reward = tick.reward / tick.n_worlds.max(1) as f64;
     let numbers = [lesson.loss, held_out, Some(mean_reward), lesson.rate];
-    let counts = [lesson.number, tick.world_steps].map(|count| count.to_string());
-    let numbers = numbers.iter().chain(&lesson.more);
-    // The shortest form that reads back as the same number.
-    let numbers =
-        numbers.map(|number| number.map_or(String::new(), |number| format!("{number:?}")));
-    counts.into_iter().chain(numbers).collect()
+    numbers.into_iter().chain(lesson.more.iter().copied())
+}
+
+/// A step's numbers by column, means over its rows; without `world_steps`, and without columns that have
+/// no number. `more`: columns of the learner's own.
+pub fn averages(
+    tick: &Tick,
+    lessons: &[Lesson],
+    n_updates: u64,
+    more: &[&'static str],
+) -> Vec<(&'static str, f64)> {
+    let nothing = [Lesson::nothing(n_updates, more.len())];
+    let lessons = if lessons.is_empty() {
+        &nothing
+    } else {
+        lessons
+    };
+    let rows: Vec<Vec<Option<f64>>> = lessons
+        .iter()
+        .map(|lesson| numbers(tick, lesson).collect())
+        .collect();
+    let mean = |(column, name): (usize, &&'static str)| {
+        let there: Vec<f64> = rows.iter().filter_map(|row| row[column]).collect();
+        let mean = there.iter().sum::<f64>() / there.len() as f64;
+        (!there.is_empty()).then_some((*name, mean))
+    };
+    let names = HEADER[2..].iter().chain(more).enumerate();
+    let counted = [(HEADER[0], n_updates as f64)];
+    counted.into_iter().chain(names.filter_map(mean)).collect()
 }
 
 /// The rows of a file, as numbers.
@@ -220,5 +247,38 @@ impl Rows {
         let at = self.names.iter().position(|known| known == name);
         let field = |row: &Vec<Option<f64>>| at.and_then(|at| row.get(at).copied().flatten());
         self.rows.iter().map(field).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn averages_are_over_the_updates_of_a_step() {
+        let lesson = |loss: f64, more: Option<f64>| Lesson {
+            number: 7,
+            loss: Some(loss),
+            rate: Some(0.1),
+            more: vec![more],
+        };
+        let tick = Tick {
+            world_steps: 32,
+            n_worlds: 16,
+            reward: 48.0,
+            score: Score::default(),
+        };
+        let lessons = [lesson(1.0, None), lesson(2.0, Some(5.0))];
+        let got = averages(&tick, &lessons, 7, &["dqn_loss"]);
+        let expected = [
+            ("update", 7.0),
+            ("loss", 1.5),
+            ("mean_reward", 3.0),
+            ("rate", 0.1),
+            ("dqn_loss", 5.0),
+        ];
+        assert_eq!(got, expected);
+        let without = averages(&tick, &[], 7, &["dqn_loss"]);
+        assert_eq!(without, [("update", 7.0), ("mean_reward", 3.0)]);
     }
 }

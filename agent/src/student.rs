@@ -4,6 +4,7 @@ pub mod decisions;
 pub mod filter;
 pub mod network;
 
+use crate::belief::Belief;
 use crate::checkpoint::Contents;
 use crate::client::Observation;
 use crate::estimator::{ZeroEvidence, learned_filter};
@@ -38,6 +39,18 @@ pub struct Lesson {
     pub rate: Option<f64>,
     /// What [`Student::columns`] names.
     pub more: Vec<Option<f64>>,
+}
+
+impl Lesson {
+    /// No update, after so many; `n_more`: length of [`Student::columns`].
+    pub fn nothing(number: u64, n_more: usize) -> Self {
+        Self {
+            number,
+            loss: None,
+            rate: None,
+            more: vec![None; n_more],
+        }
+    }
 }
 
 /// Why a student cannot go on.
@@ -122,6 +135,9 @@ pub trait Student {
 
     /// Updates of the model so far.
     fn n_updates(&self) -> u64;
+
+    /// What it predicts of its first world, and the state of that which it thinks pays most.
+    fn belief(&self) -> Option<(&Belief, usize)>;
 
     /// What a later run goes on from.
     fn contents(&self) -> Contents;

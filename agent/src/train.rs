@@ -4,6 +4,9 @@
 //! model that a server may reveal is read only where decisions are learned. One message steps all worlds.
 //! What is learned, and how it acts meanwhile, is a [`Student`]'s.
 
+mod events;
+
+use self::events::Events;
 use crate::checkpoint::{self, CheckpointError, Contents, Problem};
 use crate::client::{Claim, Client, Observation};
 use crate::config::{AgentConfig, ConfigError, LearnerKind};
@@ -16,6 +19,7 @@ use crate::student::decisions::{self, Decisions, DecisionsStudent};
 use crate::student::filter::FilterStudent;
 use crate::student::network::{self, NetworkStudent};
 use crate::student::{Site, Student, StudentError};
+use crate::tensorboard::EventsError;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::{CoverageRule, WorldSeed};
@@ -29,6 +33,9 @@ use thiserror::Error;
 
 /// The checkpoint's name in the folder of a training.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
+
+/// The folder of a run without learning, for TensorBoard.
+const FROZEN_EVENTS: &str = "frozen";
 
 /// How often a checkpoint is written while training goes on.
 const SAVE_INTERVAL: Duration = Duration::from_secs(30);
@@ -73,6 +80,9 @@ pub enum TrainError {
     /// The metrics.
     #[error(transparent)]
     Metrics(#[from] MetricsError),
+    /// The same for TensorBoard.
+    #[error(transparent)]
+    Events(#[from] EventsError),
     /// The settings.
     #[error(transparent)]
     Config(#[from] ConfigError),
@@ -211,6 +221,7 @@ struct Trainee {
     client: Client,
     student: Box<dyn Student>,
     metrics: Metrics,
+    events: Events,
     summary: TrainSummary,
     saved: Instant,
     told: Told,
@@ -239,6 +250,7 @@ impl Trainee {
         let mut client = Client::acquire(instance, &claim)?;
         let mut student = student(training, &client, contents.as_ref(), &place)?;
         let metrics = metrics(training, &*student)?;
+        let events = events(training, &*student)?;
         if training.freeze {
             student.freeze();
         }
@@ -263,6 +275,7 @@ impl Trainee {
             client,
             student,
             metrics,
+            events,
             summary: TrainSummary::default(),
             saved: now,
             told: Told::at(now, &TrainSummary::default()),
@@ -291,6 +304,7 @@ impl Trainee {
             self.summary.updates = self.student.n_updates();
             let n_updates = self.student.n_updates();
             self.metrics.add(&tick, &lessons, n_updates)?;
+            self.events.add(&tick, &lessons, &*self.student)?;
             self.report(&tick);
             if self.saved.elapsed() > SAVE_INTERVAL {
                 self.save(training)?;
@@ -331,18 +345,18 @@ impl Trainee {
         Ok(Ok(tick))
     }
 
-    /// Writes the checkpoint, unless nothing is learned.
+    /// Writes the checkpoint, unless nothing is learned, and the metrics.
     fn save(&mut self, training: &Training) -> Result<(), TrainError> {
         self.saved = Instant::now();
-        if training.freeze {
-            return Ok(self.metrics.flush()?);
+        if !training.freeze {
+            let mut contents = self.student.contents();
+            let settings = toml::to_string(&training.config)?;
+            contents.texts.insert("settings".into(), settings);
+            let place = training.out.join(CHECKPOINT);
+            checkpoint::write(&place, self.student.kind(), &contents)?;
         }
-        let mut contents = self.student.contents();
-        let settings = toml::to_string(&training.config)?;
-        contents.texts.insert("settings".into(), settings);
-        let place = training.out.join(CHECKPOINT);
-        checkpoint::write(&place, self.student.kind(), &contents)?;
-        Ok(self.metrics.flush()?)
+        self.metrics.flush()?;
+        Ok(self.events.flush()?)
     }
 
     fn report(&mut self, tick: &Tick) {
@@ -391,6 +405,15 @@ fn metrics(training: &Training, student: &dyn Student) -> Result<Metrics, Metric
         (true, _) => Metrics::begin(&training.out.join(FROZEN), columns),
         (false, true) => Metrics::go_on(&training.out.join(METRICS), columns, world_steps),
         (false, false) => Metrics::begin(&training.out.join(METRICS), columns),
+    }
+}
+
+/// The file of TensorBoard's events: a run without learning has a folder of its own, and begins anew.
+fn events(training: &Training, student: &dyn Student) -> Result<Events, EventsError> {
+    match (training.freeze, training.resume) {
+        (true, _) => Events::begin(&training.out.join(FROZEN_EVENTS), 0),
+        (false, true) => Events::begin(&training.out, student.world_steps()),
+        (false, false) => Events::begin(&training.out, 0),
     }
 }
 

@@ -11,7 +11,7 @@ use agent::learned::Learned;
 use agent::policy::{EstimatorKind, Policy};
 use agent::report::{
     Snapshot, draw_ladder, draw_rewards, draw_snapshot, figures::FIRE_CELLS_PER_STEP, render_table,
-    write_csv,
+    write_csv, write_events,
 };
 use anyhow::{Context, Result, ensure};
 use clap::Args;
@@ -37,12 +37,15 @@ pub struct CompareCommand {
     /// Write one line per policy and world to this file
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
-    /// Draw ladder.png, rewards.png and snapshot.png into this directory
+    /// Draw ladder and rewards as .png and .svg, and snapshot.png, into this directory
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
     /// Show it in a browser while it runs, at this address
     #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1:8600")]
     watch: Option<SocketAddr>,
+    /// Write rewards step by step for TensorBoard into this directory, a run of each policy
+    #[arg(long, value_name = "DIR")]
+    tensorboard: Option<PathBuf>,
     #[command(flatten)]
     worlds: WorldFlags,
     #[command(flatten)]
@@ -78,6 +81,9 @@ impl CompareCommand {
         if let Some(path) = &self.csv {
             write_csv(path, &results.runs)?;
         }
+        if let Some(directory) = &self.tensorboard {
+            write_events(directory, &results.runs)?;
+        }
         if let Some(directory) = &self.figures {
             self.draw(directory, arena, &comparison, &results)?;
         }
@@ -92,15 +98,12 @@ impl CompareCommand {
         results: &Results,
     ) -> Result<()> {
         let label = axis_label(arena.model());
-        draw_ladder(&directory.join("ladder.png"), &results.runs, &label)?;
-        let first = self.worlds.seeds.start;
-        draw_rewards(
-            &directory.join("rewards.png"),
-            &results.runs,
-            first,
-            &label,
-            Some(&results.fire_cells),
-        )?;
+        for kind in ["png", "svg"] {
+            let path = |name: &str| directory.join(name).with_extension(kind);
+            draw_ladder(&path("ladder"), &results.runs, &label)?;
+            let fire_cells = Some(&*results.fire_cells);
+            draw_rewards(&path("rewards"), &results.runs, &label, fire_cells)?;
+        }
         match &results.moment {
             Some(moment) => draw_moment(&directory.join("snapshot.png"), arena, moment)?,
             None => tracing::warn!("no snapshot: no policy among these has a belief of its own"),
@@ -120,7 +123,8 @@ impl CompareCommand {
             );
             make_folder_of(path)?;
         }
-        self.figures.as_deref().map_or(Ok(()), make_folder)
+        let folders = [self.figures.as_deref(), self.tensorboard.as_deref()];
+        folders.into_iter().flatten().try_for_each(make_folder)
     }
 
     fn policies(&self, model: &Model, learned: &Learned) -> Result<Vec<Policy>> {

@@ -4,13 +4,16 @@
 //! Read [`statistics`] first, then [`table`], [`csv`] and [`figures`]. [`training`] turns metrics into curves.
 
 pub mod csv;
+pub mod events;
 pub mod figures;
 mod number;
+pub mod picture;
 pub mod statistics;
 pub mod table;
 pub mod training;
 
 pub use self::csv::write_csv;
+pub use self::events::write_events;
 pub use self::figures::{Snapshot, draw_ladder, draw_rewards, draw_snapshot};
 pub use self::table::render_table;
 
@@ -69,14 +72,6 @@ pub enum ReportError {
         what: &'static str,
         /// The number.
         got: f64,
-    },
-    /// A world that no policy ran on with its rewards kept.
-    #[error("rewards of world seed {world_seed}: expected one of the recorded worlds {known:?}")]
-    UnknownWorld {
-        /// The world asked for.
-        world_seed: u64,
-        /// The worlds there are.
-        known: Vec<u64>,
     },
     /// Parts of a snapshot that do not belong together.
     #[error("snapshot: {what}: expected {expected}, got {got}")]
@@ -138,7 +133,7 @@ fn groups(runs: &[PolicyRun]) -> Vec<Group<'_>> {
 ///
 /// # Errors
 /// [`ReportError::Write`] names `path`.
-fn replace_file<E: Display>(
+pub(crate) fn replace_file<E: Display>(
     path: &Path,
     extension: &str,
     write: impl FnOnce(&Path) -> Result<(), E>,

@@ -2,15 +2,16 @@
 
 use super::ReportError;
 use super::figures::curves::{Curve, Page, Panel, Scale, draw_curves};
+use super::statistics::Estimate;
 use crate::metrics::{MetricsError, Rows};
 use std::path::Path;
 use thiserror::Error;
 
-/// The figure's name in the folder of a training.
-pub const FIGURE: &str = "training.png";
+/// The figure's names in the folder of a training.
+pub const FIGURES: [&str; 2] = ["training.png", "training.svg"];
 
 /// Points of a curve: each is the mean over a part of the rows.
-const POINTS: usize = 300;
+const POINTS: usize = 200;
 
 /// A figure that cannot be drawn.
 #[derive(Debug, Error)]
@@ -30,10 +31,7 @@ pub enum TrainingFigureError {
 /// [`TrainingFigureError`].
 pub fn draw_training(folder: &Path) -> Result<(), TrainingFigureError> {
     let rows = Rows::read(folder)?;
-    let curve = |column: &str, name: &str| Curve {
-        name: name.into(),
-        points: averages(&rows, column),
-    };
+    let curve = |column: &str, name: &str| averages(&rows, column, name);
     let panel = |title: &str, scale, curves| Panel {
         title: title.into(),
         scale,
@@ -71,34 +69,47 @@ pub fn draw_training(folder: &Path) -> Result<(), TrainingFigureError> {
         title: "Learning while acting".into(),
         note: match per_point {
             1 => "each row of metrics.csv".into(),
-            n => format!("means over {n} rows of metrics.csv each"),
+            n => format!(
+                "means over {n} rows of metrics.csv each; bands: ±1 standard error over those rows, as if \
+                 each were a draw of its own"
+            ),
         },
         axis: "world steps, of all worlds together".into(),
         panels,
     };
-    Ok(draw_curves(&folder.join(FIGURE), &page)?)
+    for name in FIGURES {
+        draw_curves(&folder.join(name), &page)?;
+    }
+    Ok(())
 }
 
-/// A column's means over equal parts of the rows, at the last world step of each.
-fn averages(rows: &Rows, column: &str) -> Vec<(f64, f64)> {
+/// A column's means over equal parts of the rows, at the last world step of each, with their standard
+/// errors where a part has several rows.
+fn averages(rows: &Rows, column: &str, name: &str) -> Curve {
     let (steps, values) = (rows.column("world_steps"), rows.column(column));
     let part = rows.len().div_ceil(POINTS).max(1);
     let parts = steps.chunks(part).zip(values.chunks(part));
     let average = |(steps, values): (&[Option<f64>], &[Option<f64>])| {
         let there: Vec<f64> = values.iter().flatten().copied().collect();
-        let mean = there.iter().sum::<f64>() / there.len() as f64;
         let last = steps.iter().flatten().last()?;
-        (!there.is_empty()).then_some((*last, mean))
+        Some((*last, Estimate::of(&there)?))
     };
-    parts.filter_map(average).collect()
+    let averages: Vec<(f64, Estimate)> = parts.filter_map(average).collect();
+    let error = |(_, average): &(f64, Estimate)| average.standard_error.unwrap_or(0.0);
+    let errors = averages.iter().map(error).collect();
+    Curve {
+        name: name.into(),
+        points: averages.iter().map(|it| (it.0, it.1.mean)).collect(),
+        errors: if part > 1 { errors } else { Vec::new() },
+    }
 }
 
 /// The model's step size as a share of the DQN's, where both are there (paper eq. 20).
 fn quotient([model, dqn]: &[Curve; 2]) -> Curve {
     let of_dqn = |x: f64| dqn.points.iter().find(|point| point.0 == x);
     let share = |&(x, rate): &(f64, f64)| Some((x, rate / of_dqn(x)?.1));
-    Curve {
-        name: "model / DQN".into(),
-        points: model.points.iter().filter_map(share).collect(),
-    }
+    Curve::new(
+        "model / DQN",
+        model.points.iter().filter_map(share).collect(),
+    )
 }

@@ -45,6 +45,8 @@ pub struct DecisionsStudent {
     decisions: Decisions,
     filter: Filter,
     likelihood: Array2<f64>,
+    /// The state that pays most.
+    target: usize,
     pilots: Vec<Pilot>,
     owed: f64,
     is_frozen: bool,
@@ -142,6 +144,7 @@ impl DecisionsStudent {
             decisions,
             filter,
             likelihood: model.likelihood().clone(),
+            target: model.target_state(),
             pilots: Vec::new(),
             owed: 0.0,
             is_frozen: false,
@@ -282,6 +285,11 @@ impl Student for DecisionsStudent {
 
     fn n_updates(&self) -> u64 {
         self.decisions.dqn.n_updates()
+    }
+
+    fn belief(&self) -> Option<(&Belief, usize)> {
+        let pilot = self.pilots.first()?;
+        Some((pilot.filter.belief(), self.target))
     }
 
     fn contents(&self) -> Contents {

@@ -2,6 +2,7 @@
 //! the belief of the filter as it is.
 
 use super::{Lesson, NotFinite, Site, Student, StudentError};
+use crate::belief::Belief;
 use crate::checkpoint::{Contents, Problem};
 use crate::client::Observation;
 use crate::config::AgentConfig;
@@ -173,6 +174,11 @@ impl Student for FilterStudent {
 
     fn n_updates(&self) -> u64 {
         self.learner.n_updates()
+    }
+
+    fn belief(&self) -> Option<(&Belief, usize)> {
+        let pilot = self.pilots.first()?;
+        Some((pilot.filter.belief(), self.learned.target))
     }
 
     fn contents(&self) -> Contents {

@@ -85,13 +85,16 @@ impl Progress {
         }
     }
 
+    /// The state that pays most, as far as rewards tell by now.
+    fn target(&self) -> usize {
+        let target = self.reward.target();
+        target.unwrap_or(self.reward.rewards.len() - 1)
+    }
+
     /// What is known by then.
     pub fn learned(self) -> LearnedNetwork {
         LearnedNetwork {
-            target: self
-                .reward
-                .target()
-                .unwrap_or(self.reward.rewards.len() - 1),
+            target: self.target(),
             autoencoder: self.autoencoder,
             dqn: self.dqn,
         }
@@ -480,6 +483,11 @@ impl Student for NetworkStudent {
 
     fn n_updates(&self) -> u64 {
         self.progress.autoencoder.n_updates()
+    }
+
+    fn belief(&self) -> Option<(&Belief, usize)> {
+        let belief = self.progress.autoencoder.prediction();
+        Some((belief, self.progress.target()))
     }
 
     fn contents(&self) -> Contents {

@@ -3,7 +3,7 @@
 use crate::synthetic::{Scene, ladder, model, noise, run, scene};
 use agent::report::figures::FIRE_CELLS_PER_STEP;
 use agent::report::figures::curves::{Curve, Page, Panel, Scale, draw_curves};
-use agent::report::training::{FIGURE, draw_training};
+use agent::report::training::{FIGURES, draw_training};
 use agent::report::{PolicyRun, ReportError, Snapshot, draw_ladder, draw_rewards, draw_snapshot};
 use protocol::{Cell, Model};
 use std::collections::HashSet;
@@ -39,10 +39,31 @@ fn check(path: &Path, height: Option<u32>) {
     assert_eq!(dirty, None);
 }
 
+/// Expects the same page as a small SVG file whose texts are texts.
+fn check_svg(path: &Path, height: u32, texts: &[&str]) {
+    let svg = std::fs::read_to_string(path).expect("a file");
+    let size = format!("width=\"2400\" height=\"{height}\" viewBox=\"0 0 2400 {height}\"");
+    assert!(svg.lines().next().is_some_and(|root| root.contains(&size)));
+    assert!(
+        svg.ends_with("</svg>\n") && svg.len() < 300_000,
+        "{} bytes",
+        svg.len()
+    );
+    for text in texts {
+        assert!(
+            svg.contains(&format!(">{text}</text>")),
+            "no {text:?} in {path:?}"
+        );
+    }
+}
+
 fn check_ladder(name: &str, runs: &[PolicyRun], n_rows: u32) {
-    let path = target(name);
+    let (path, height) = (target(name), 2 * (132 + 44 * n_rows + 72));
     draw_ladder(&path, runs, FIRE_CELLS_PER_STEP).expect("drawn");
-    check(&path, Some(2 * (132 + 44 * n_rows + 72)));
+    check(&path, Some(height));
+    let svg = path.with_extension("svg");
+    draw_ladder(&svg, runs, FIRE_CELLS_PER_STEP).expect("drawn");
+    check_svg(&svg, height, &[FIRE_CELLS_PER_STEP, "random walk"]);
 }
 
 #[test]
@@ -76,13 +97,18 @@ fn rewards_over_time() {
         .collect();
     let drawn = |name: &str, runs: &[PolicyRun], fire: Option<&[f32]>| {
         let path = target(name);
-        draw_rewards(&path, runs, 100, FIRE_CELLS_PER_STEP, fire).expect("drawn");
+        draw_rewards(&path, runs, FIRE_CELLS_PER_STEP, fire).expect("drawn");
         check(&path, Some(1400));
+        let svg = path.with_extension("svg");
+        draw_rewards(&svg, runs, FIRE_CELLS_PER_STEP, fire).expect("drawn");
+        check_svg(&svg, 1400, &[FIRE_CELLS_PER_STEP, "step k"]);
     };
     let runs = ladder(1, 1500);
     drawn("rewards", &runs, Some(&fire));
     drawn("rewards_three", &runs[4..7], None);
     drawn("rewards_long", &ladder(1, 25_000)[5..11], None);
+    drawn("rewards_worlds", &ladder(8, 1500), Some(&fire));
+    drawn("rewards_worlds_long", &ladder(3, 25_000), None);
     drawn("rewards_one_step", &ladder(1, 1), Some(&[0.0]));
     let mut dark = runs[..4].to_vec();
     dark.iter_mut().for_each(|run| run.rewards.fill(0.0));
@@ -174,20 +200,14 @@ fn results_that_cannot_be_drawn_are_errors() {
         Err(ReportError::Empty { what: "ladder" })
     );
     assert_eq!(
-        draw_rewards(&path, &[], 0, label, None),
+        draw_rewards(&path, &[], label, None),
         Err(ReportError::Empty { what: "rewards" })
     );
     let nan = draw_ladder(&path, &[run("beam", "truth", 3, f64::NAN)], label);
     let error = nan.expect_err("a NaN").to_string();
     assert!(error.contains("\"beam\" on world seed 3"), "{error}");
-    let unknown = draw_rewards(&path, &ladder(2, 5), 7, label, None);
-    assert_eq!(
-        unknown,
-        Err(ReportError::UnknownWorld {
-            world_seed: 7,
-            known: vec![100, 101]
-        })
-    );
+    let without = draw_rewards(&path, &[run("beam", "truth", 3, 1.0)], label, None);
+    assert_eq!(without, Err(ReportError::Empty { what: "rewards" }));
     let nowhere = draw_ladder(Path::new("/nonexistent/a.png"), &ladder(1, 1), label);
     assert!(
         matches!(nowhere, Err(ReportError::Write { .. })),
@@ -206,9 +226,8 @@ fn page(panels: Vec<Panel>) -> Page {
 
 #[test]
 fn curves_of_many_and_of_few_points() {
-    let curve = |name: &str, n: usize, value: fn(f64) -> f64| Curve {
-        name: name.into(),
-        points: (0..n).map(|x| (x as f64, value(x as f64))).collect(),
+    let curve = |name: &str, n: usize, value: fn(f64) -> f64| {
+        Curve::new(name, (0..n).map(|x| (x as f64, value(x as f64))).collect())
     };
     let panel = |scale, curves| Panel {
         title: "rate per update".into(),
@@ -216,7 +235,11 @@ fn curves_of_many_and_of_few_points() {
         curves,
     };
     let path = target("curves");
+    let mut banded = curve("its band reaches zero", 1000, |x| 1e-4 * (1.0 + x));
+    banded.errors = (0..1000).map(|x| 1e-4 * f64::from(x)).collect();
+    banded.errors[999] = 1.0;
     let logarithmic = vec![
+        banded,
         curve("vanishes", 1000, |x| 1e-3 / (1.0 + x)),
         curve("is zero at first", 1000, |x| (x - 10.0).max(0.0)),
     ];
@@ -255,7 +278,13 @@ fn a_training_is_drawn_from_its_metrics() {
     }
     std::fs::write(folder.join("metrics.csv"), text).expect("written");
     draw_training(&folder).expect("drawn");
-    check(&folder.join(FIGURE), Some(2 * (84 + 5 * 190 + 64)));
+    let height = 2 * (84 + 5 * 190 + 64);
+    check(&folder.join(FIGURES[0]), Some(height));
+    let texts = [
+        "reward per world step",
+        "world steps, of all worlds together",
+    ];
+    check_svg(&folder.join(FIGURES[1]), height, &texts);
     let missing = draw_training(Path::new("no/such")).expect_err("no metrics");
     assert!(
         missing

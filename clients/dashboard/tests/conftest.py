@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from looking import Look
 from playwright.sync_api import Browser, BrowserContext, sync_playwright
+
+from looking import Look
 from running import Dashboard, Program, Programs
 
 #: A whole test, seconds; a busy machine is no bug.

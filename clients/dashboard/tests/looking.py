@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 from playwright.sync_api import Locator, Page
+
 from running import eventually
 
 #: Bytes of an expression's typed array or canvas, as base64.

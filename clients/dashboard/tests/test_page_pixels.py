@@ -5,11 +5,11 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
-from conftest import ROOT
-from running import PATIENCE, eventually
 
 import emberwatch
+from conftest import ROOT
 from emberwatch import OutlookReader, TruthReader
+from running import PATIENCE, eventually
 
 STEPS = 30
 UNOBSERVED = 255

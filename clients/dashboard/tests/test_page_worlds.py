@@ -1,6 +1,7 @@
 """Large, oblong and many worlds; slow browsers; what is not published."""
 
 import pytest
+
 from running import eventually
 
 

@@ -9,9 +9,10 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 
-from emberwatch.client import Client, ServerStatus
+from emberwatch.client import Client
 from emberwatch.errors import EmberwatchError
 from emberwatch.programs import Program
+from emberwatch.replies import ServerStatus
 
 #: How long anything may take that should take milliseconds, seconds.
 PATIENCE = 20.0

@@ -1,5 +1,6 @@
 """Observers and truth readers: what is published, to whom, and what they miss."""
 
+import subprocess
 import time
 from collections.abc import Callable
 
@@ -8,8 +9,16 @@ import pytest
 from processes import PATIENCE, Server, eventually
 
 from emberwatch import errors, wire
-from emberwatch.observer import Frame, Observer, Truth, TruthReader, observe
-from emberwatch.programs import unused_instance
+from emberwatch.observer import (
+    Frame,
+    Observer,
+    OutlookReader,
+    Truth,
+    TruthReader,
+    observe,
+    outlook_from_sample,
+)
+from emberwatch.programs import find, unused_instance
 
 Start = Callable[..., Server]
 
@@ -118,10 +127,11 @@ def test_what_a_slow_observer_misses_is_counted(server: Start) -> None:
 def test_losses_among_other_worlds_are_counted(server: Start) -> None:
     started = server(worlds=2)
     lease = started.connect().acquire(0, 2)
-    with observe(started.instance, world=1) as observer:
+    with observe(started.instance, world=1) as observer, observe(started.instance) as other:
         frames_until(observer, 0, world=1)
         for k in range(wire.FRAME_BUFFER):
             lease.step(paths(k, 2))
+        frames_until(other, wire.FRAME_BUFFER, world=1)  # Published after the answer.
         # World 0 is published first, so that the gap ends at a sample of the other world.
         frames = frames_until(observer, wire.FRAME_BUFFER, world=1)
     assert len(frames) == wire.FRAME_BUFFER // 2
@@ -215,8 +225,37 @@ def test_a_closed_observer_is_no_longer_counted(server: Start) -> None:
     assert eventually(lambda: started.status().n_observers == 0)
 
 
+def test_an_agent_s_beliefs_are_read_until_its_last(server: Start) -> None:
+    started = server(height=16, width=24, moves=12, burn_in=500)
+    command = [str(find("emberwatch-agent")), "run", "--instance", started.instance]
+    with OutlookReader(started.instance) as reader:
+        agent = subprocess.Popen([*command, "--steps", "30"])
+        while True:
+            outlook = reader.receive(PATIENCE)
+            assert outlook is not None, "no belief about step 30"
+            np.testing.assert_allclose(outlook.belief.sum(axis=0), np.ones((16, 24)), atol=1e-4)
+            assert outlook.states == ("normal", "latent", "fire")
+            assert (outlook.policy, outlook.pid) == ("beam_exploit", agent.pid)
+            if outlook.step == 30:
+                break
+        assert outlook.objective == "fire"
+        assert agent.wait(PATIENCE) == 0
+
+
+def test_a_belief_that_makes_no_sense_is_refused() -> None:
+    header = wire.AgentHeader(n_states=2, height=1, width=1)
+    for payload in [b"", bytes(8), bytes(8) + b"[]", bytes(8) + b'{"policy": "p"}']:
+        with pytest.raises(errors.GarbledAnswerError, match="sample: expected"):
+            outlook_from_sample(header, bytearray(payload), 0)
+
+
 @pytest.mark.parametrize(
-    "make, limit", [(observe, wire.MAX_OBSERVERS), (TruthReader, wire.MAX_TRUTH_READERS)]
+    "make, limit",
+    [
+        (observe, wire.MAX_OBSERVERS),
+        (TruthReader, wire.MAX_TRUTH_READERS),
+        (OutlookReader, wire.MAX_AGENT_READERS),
+    ],
 )
 def test_one_too_many_is_told_the_limit_and_others_go_on(
     server: Start, make: Callable[..., Observer], limit: int
@@ -227,7 +266,7 @@ def test_one_too_many_is_told_the_limit_and_others_go_on(
         make(started.instance)
     started.connect().acquire().step(paths(0))
     for reader in readers:
-        assert reader.receive(PATIENCE) is not None
+        assert make is OutlookReader or reader.receive(PATIENCE) is not None
         reader.close()
     make(started.instance).close()
 

@@ -143,13 +143,12 @@ fn write(folder: &Path, rows: &[(f64, Use)]) {
     let panel = |title: &str, value: fn(&Use) -> f64| Panel {
         title: title.into(),
         scale: Scale::Linear,
-        curves: vec![Curve {
-            name: title.split(',').next().unwrap_or_default().into(),
-            points: rows
-                .iter()
+        curves: vec![Curve::new(
+            title.split(',').next().unwrap_or_default(),
+            rows.iter()
                 .map(|(seconds, used)| (*seconds, value(used)))
                 .collect(),
-        }],
+        )],
     };
     let page = Page {
         title: "A server while agents come and go".into(),

@@ -1,12 +1,14 @@
-//! A white page to draw on, in points from its upper left corner, saved as PNG.
+//! A white page to draw on, in points from its upper left corner, saved as PNG or SVG.
 //!
-//! A thin layer over plotters' bitmap backend: it doubles the resolution, places text, and keeps
-//! the first failure until the page is saved, so that drawing code reads as drawing.
+//! A thin layer over plotters' backends: it doubles the resolution, places text, and keeps the first
+//! failure until the page is saved, so that drawing code reads as drawing.
 
+use super::lettering::Lettering;
 use super::palette::{INK, PAPER};
 use super::text::{self, Weight};
 use crate::report::{ReportError, replace_file};
 use plotters::coord::Shift;
+use plotters::element::{Drawable, PointCollection};
 use plotters::prelude::*;
 use std::fmt::Display;
 use std::path::Path;
@@ -79,11 +81,19 @@ impl TextStyle {
 
 /// The page.
 pub struct Canvas<'a> {
-    area: DrawingArea<BitMapBackend<'a>, Shift>,
+    surface: Surface<'a>,
     failure: Option<String>,
 }
 
-/// Draws a page of the given size in points and puts it at `path` when it is complete.
+/// What a page is made of.
+enum Surface<'a> {
+    Pixels(DrawingArea<BitMapBackend<'a>, Shift>),
+    /// Texts are written by themselves, in the viewer's font.
+    Shapes(DrawingArea<SVGBackend<'a>, Shift>, Lettering),
+}
+
+/// Draws a page of the given size in points and puts it at `path` when it is complete: as SVG where the
+/// path ends so, else as PNG.
 ///
 /// # Errors
 /// [`ReportError::Write`] names `path`.
@@ -92,22 +102,67 @@ pub fn draw_page(
     size: Point,
     draw: impl FnOnce(&mut Canvas<'_>),
 ) -> Result<(), ReportError> {
+    let pixels = ((size.0 * SCALE) as u32, (size.1 * SCALE) as u32);
+    let is_svg = path.extension().is_some_and(|extension| extension == "svg");
+    if is_svg {
+        return replace_file(path, "svg", |temporary| {
+            let svg = draw_shapes(pixels, draw)?;
+            std::fs::write(temporary, svg).map_err(|error| error.to_string())
+        });
+    }
     replace_file(path, "png", |temporary| {
-        let pixels = ((size.0 * SCALE) as u32, (size.1 * SCALE) as u32);
-        let mut canvas = Canvas {
-            area: BitMapBackend::new(temporary, pixels).into_drawing_area(),
-            failure: None,
-        };
-        let filled = canvas.area.fill(&PAPER);
-        canvas.keep(filled);
-        draw(&mut canvas);
-        let saved = canvas.area.present();
-        canvas.keep(saved);
-        canvas.failure.map_or(Ok(()), Err)
+        let area = BitMapBackend::new(temporary, pixels).into_drawing_area();
+        Canvas::of(Surface::Pixels(area)).draw(draw).map(|_| ())
     })
 }
 
-impl Canvas<'_> {
+fn draw_shapes(pixels: (u32, u32), draw: impl FnOnce(&mut Canvas<'_>)) -> Result<String, String> {
+    let mut shapes = String::new();
+    let area = SVGBackend::with_string(&mut shapes, pixels).into_drawing_area();
+    let surface = Surface::Shapes(area, Lettering::default());
+    let lettering = match Canvas::of(surface).draw(draw)? {
+        Surface::Shapes(_, lettering) => lettering,
+        Surface::Pixels(_) => Lettering::default(),
+    };
+    Ok(lettering.over(&shapes))
+}
+
+impl<'a> Canvas<'a> {
+    fn of(surface: Surface<'a>) -> Self {
+        Self {
+            surface,
+            failure: None,
+        }
+    }
+
+    /// Draws everything.
+    fn draw(mut self, draw: impl FnOnce(&mut Self)) -> Result<Surface<'a>, String> {
+        let filled = match &self.surface {
+            Surface::Pixels(area) => area.fill(&PAPER).map_err(|error| error.to_string()),
+            Surface::Shapes(area, _) => area.fill(&PAPER).map_err(|error| error.to_string()),
+        };
+        self.keep(filled);
+        draw(&mut self);
+        let saved = match &self.surface {
+            Surface::Pixels(area) => area.present().map_err(|error| error.to_string()),
+            Surface::Shapes(area, _) => area.present().map_err(|error| error.to_string()),
+        };
+        self.keep(saved);
+        self.failure.map_or(Ok(self.surface), Err)
+    }
+
+    fn put<E>(&mut self, element: &E)
+    where
+        for<'b> &'b E: PointCollection<'b, (i32, i32)>,
+        E: Drawable<BitMapBackend<'a>> + Drawable<SVGBackend<'a>>,
+    {
+        let drawn = match &self.surface {
+            Surface::Pixels(area) => area.draw(element).map_err(|error| error.to_string()),
+            Surface::Shapes(area, _) => area.draw(element).map_err(|error| error.to_string()),
+        };
+        self.keep(drawn);
+    }
+
     /// Fills a rectangle.
     pub fn rectangle(&mut self, from: Point, to: Point, color: RGBColor) {
         let (from, to) = (pixel(from), pixel(to));
@@ -121,10 +176,7 @@ impl Canvas<'_> {
         }
         // A filled rectangle of plotters leaves out its lower right edges, unlike an outlined one.
         let corner = (at.0 + size.0, at.1 + size.1);
-        let drawn = self
-            .area
-            .draw(&Rectangle::new([at, corner], color.filled()));
-        self.keep(drawn);
+        self.put(&Rectangle::new([at, corner], color.filled()));
     }
 
     /// Outlines a rectangle, inside its bounds.
@@ -138,14 +190,15 @@ impl Canvas<'_> {
     /// A line through points, with round joints.
     pub fn line(&mut self, points: &[Point], width: f64, color: RGBColor) {
         let stroke = (width * SCALE).round().max(1.0) as u32;
+        if let Surface::Shapes(..) = self.surface {
+            let points: Vec<(i32, i32)> = points.iter().copied().map(pixel).collect();
+            return self.put(&PathElement::new(points, color.stroke_width(stroke)));
+        }
         for ends in points.windows(2) {
             // One segment at a time: plotters' mitred joints grow spikes at sharp angles.
             let ends = [pixel(ends[0]), pixel(ends[1])];
             if ends[0] != ends[1] {
-                let drawn = self
-                    .area
-                    .draw(&PathElement::new(ends, color.stroke_width(stroke)));
-                self.keep(drawn);
+                self.put(&PathElement::new(ends, color.stroke_width(stroke)));
             }
         }
         if stroke > 2 && points.len() > 2 {
@@ -157,18 +210,19 @@ impl Canvas<'_> {
 
     /// Fills a polygon.
     pub fn polygon(&mut self, points: &[Point], color: RGBColor) {
+        self.veil(points, color, 1.0);
+    }
+
+    /// Fills a polygon through which what is under it is seen, unless `opacity` is 1.
+    pub fn veil(&mut self, points: &[Point], color: RGBColor, opacity: f64) {
         let points: Vec<(i32, i32)> = points.iter().copied().map(pixel).collect();
-        let drawn = self.area.draw(&Polygon::new(points, color.filled()));
-        self.keep(drawn);
+        self.put(&Polygon::new(points, color.mix(opacity).filled()));
     }
 
     /// Fills a disc.
     pub fn disc(&mut self, center: Point, radius: f64, color: RGBColor) {
         let radius = (radius * SCALE).round() as i32;
-        let drawn = self
-            .area
-            .draw(&Circle::new(pixel(center), radius, color.filled()));
-        self.keep(drawn);
+        self.put(&Circle::new(pixel(center), radius, color.filled()));
     }
 
     /// Writes a text whose capitals are centred on the height of `at`.
@@ -179,19 +233,17 @@ impl Canvas<'_> {
             Align::Right => style.width(text),
         };
         let start = (((at.0 - shift) * SCALE) as f32, (at.1 * SCALE) as f32);
+        let (size, weight) = (style.pixels(), style.weight);
         let mut failure = Ok(());
-        text::rasterize(
-            text,
-            start,
-            style.pixels(),
-            style.weight,
-            |x, y, coverage| {
-                let color = style.color.mix(f64::from(coverage.min(1.0)));
+        match &mut self.surface {
+            Surface::Shapes(_, lettering) => lettering.add(text, start, style),
+            Surface::Pixels(area) => text::rasterize(text, start, size, weight, |x, y, part| {
+                let color = style.color.mix(f64::from(part.min(1.0)));
                 if failure.is_ok() {
-                    failure = self.area.draw_pixel((x, y), &color);
+                    failure = area.draw_pixel((x, y), &color);
                 }
-            },
-        );
+            }),
+        }
         self.keep(failure);
     }
 

@@ -5,6 +5,7 @@ use super::canvas::{Align, Canvas, Point, TextStyle, draw_page};
 use super::palette::{GRID, INK, LINES, MUTED, blend};
 use super::{MARGIN, WIDTH};
 use crate::report::ReportError;
+use plotters::style::RGBColor;
 use std::path::Path;
 
 /// Height of a panel with its title.
@@ -18,6 +19,8 @@ const GAP: f64 = 22.0;
 const TITLE: f64 = 30.0;
 const LABEL_GAP: f64 = 19.0;
 const LEADER: f64 = 26.0;
+/// How much a band hides of what is under it.
+const BAND: f64 = 0.2;
 /// Room for tick labels, left of all panels alike.
 const LEFT: f64 = MARGIN + 64.0;
 
@@ -37,6 +40,8 @@ pub struct Curve {
     pub name: String,
     /// Its points, from the least x to the greatest.
     pub points: Vec<(f64, f64)>,
+    /// Half the height of a band around it, a number a point; empty for none.
+    pub errors: Vec<f64>,
 }
 
 /// Curves of one unit.
@@ -63,13 +68,14 @@ pub struct Page {
     pub panels: Vec<Panel>,
 }
 
-/// Draws a page as a PNG file. Panels without a point are left out.
+/// Draws a page as a PNG or SVG file. Panels without a point are left out.
 ///
 /// # Errors
 /// [`ReportError::Empty`] without any point, [`ReportError::Write`] names the file.
 pub fn draw_curves(path: &Path, page: &Page) -> Result<(), ReportError> {
-    let panels: Vec<Panel> = page.panels.iter().filter_map(Panel::drawn).collect();
-    let most = panels.iter().flat_map(Panel::points).map(|point| point.0);
+    let panels: Vec<DrawnPanel> = page.panels.iter().filter_map(Panel::drawn).collect();
+    let points = panels.iter().flat_map(DrawnPanel::points);
+    let most = points.map(|point| point.0);
     let most = most.fold(0.0, f64::max);
     if panels.is_empty() {
         return Err(ReportError::Empty { what: "curves" });
@@ -105,36 +111,82 @@ pub fn draw_curves(path: &Path, page: &Page) -> Result<(), ReportError> {
 
 impl Panel {
     /// What can be drawn of it, with logarithms taken.
-    fn drawn(&self) -> Option<Self> {
-        let place = |&(x, y): &(f64, f64)| match self.scale {
-            Scale::Linear => (x, y),
-            Scale::Logarithmic => (x, y.log10()),
-        };
-        let curve = |curve: &Curve| {
-            let points = curve.points.iter().map(place);
-            let points: Vec<_> = points
-                .filter(|(x, y)| x.is_finite() && y.is_finite())
-                .collect();
-            let name = curve.name.clone();
-            (!points.is_empty()).then_some(Curve { name, points })
-        };
-        let curves: Vec<Curve> = self
+    fn drawn(&self) -> Option<DrawnPanel> {
+        let curves = self
             .curves
             .iter()
-            .filter_map(curve)
-            .take(LINES.len())
-            .collect();
-        (!curves.is_empty()).then(|| Self {
+            .filter_map(|curve| curve.drawn(self.scale));
+        let curves: Vec<Drawn> = curves.take(LINES.len()).collect();
+        (!curves.is_empty()).then(|| DrawnPanel {
             title: self.title.clone(),
             scale: self.scale,
             curves,
         })
     }
+}
 
+impl Curve {
+    /// A curve without a band.
+    pub fn new(name: &str, points: Vec<(f64, f64)>) -> Self {
+        Self {
+            name: name.into(),
+            points,
+            errors: Vec::new(),
+        }
+    }
+
+    /// What can be drawn of it; a band ends where its scale does.
+    fn drawn(&self, scale: Scale) -> Option<Drawn> {
+        let errors = self.errors.iter().copied().map(Some);
+        let errors = errors.chain(std::iter::repeat(None));
+        let (mut points, mut band) = (Vec::new(), Vec::new());
+        for (&(x, y), error) in self.points.iter().zip(errors) {
+            let at = scale.place(y);
+            if x.is_finite() && at.is_finite() {
+                points.push((x, at));
+                let edges = error.map(|error| [y - error, y + error].map(|y| scale.place(y)));
+                let edges = edges.filter(|edges| edges.iter().all(|edge| edge.is_finite()));
+                band.extend(edges.map(|edges| (x, edges)));
+            }
+        }
+        let name = self.name.clone();
+        (!points.is_empty()).then_some(Drawn { name, points, band })
+    }
+}
+
+impl Scale {
+    fn place(self, y: f64) -> f64 {
+        match self {
+            Self::Linear => y,
+            Self::Logarithmic => y.log10(),
+        }
+    }
+}
+
+/// A curve whose every number can be drawn, logarithms taken.
+struct Drawn {
+    name: String,
+    points: Vec<(f64, f64)>,
+    /// Lower and upper edge of the band.
+    band: Vec<(f64, [f64; 2])>,
+}
+
+/// Curves that can be drawn.
+struct DrawnPanel {
+    title: String,
+    scale: Scale,
+    curves: Vec<Drawn>,
+}
+
+impl DrawnPanel {
+    /// Of curves and bands.
     fn points(&self) -> impl Iterator<Item = (f64, f64)> + '_ {
+        let edges = |&(x, edges): &(f64, [f64; 2])| edges.map(|edge| (x, edge));
+        let band = move |curve: &Drawn| curve.band.iter().flat_map(edges).collect::<Vec<_>>();
+        let points = |curve: &Drawn| curve.points.clone();
         self.curves
             .iter()
-            .flat_map(|curve| curve.points.iter().copied())
+            .flat_map(move |curve| [points(curve), band(curve)].concat())
     }
 
     fn axis(&self) -> Axis {
@@ -169,7 +221,19 @@ impl Plot<'_> {
         (across, down)
     }
 
-    fn draw(&self, canvas: &mut Canvas<'_>, panel: &Panel) {
+    fn draw_band(&self, canvas: &mut Canvas<'_>, band: &[(f64, [f64; 2])], color: RGBColor) {
+        let lower = band.iter().map(|&(x, [lower, _])| self.place((x, lower)));
+        let upper = band
+            .iter()
+            .rev()
+            .map(|&(x, [_, upper])| self.place((x, upper)));
+        let area: Vec<Point> = lower.chain(upper).collect();
+        if area.len() > 3 {
+            canvas.veil(&area, color, BAND);
+        }
+    }
+
+    fn draw(&self, canvas: &mut Canvas<'_>, panel: &DrawnPanel) {
         for &tick in &self.values.ticks {
             let (_, y) = self.place((0.0, tick));
             let is_zero = tick == 0.0 && panel.scale == Scale::Linear;
@@ -180,6 +244,7 @@ impl Plot<'_> {
         }
         let mut ends = Vec::new();
         for (curve, &color) in panel.curves.iter().zip(&LINES) {
+            self.draw_band(canvas, &curve.band, color);
             let points: Vec<Point> = curve
                 .points
                 .iter()

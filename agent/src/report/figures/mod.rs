@@ -8,11 +8,12 @@ mod canvas;
 pub mod curves;
 mod ladder;
 mod legend;
-mod palette;
+mod lettering;
+pub(crate) mod palette;
 mod panels;
 mod rewards;
 mod snapshot;
-mod text;
+pub(crate) mod text;
 
 pub use self::ladder::draw_ladder;
 pub use self::rewards::draw_rewards;

@@ -1,13 +1,18 @@
-//! Rewards over time on one world: a moving average per policy, over the world's fire.
+//! Rewards over time: a moving average per policy, with its standard error over worlds, over the worlds'
+//! fire.
 
 use super::axis::{Axis, spread};
 use super::canvas::{Align, Canvas, Point, TextStyle, draw_page};
 use super::palette::{GRID, INK, LINES, MUTED, SHADE, blend};
 use super::{MARGIN, WIDTH, check_finite, short_names};
-use crate::report::{PolicyRun, ReportError, groups};
+use crate::report::statistics::Estimate;
+use crate::report::{Group, PolicyRun, ReportError, groups};
 use plotters::style::RGBColor;
 use std::collections::BTreeSet;
 use std::path::Path;
+
+/// How much a band hides of what is under it.
+const BAND: f64 = 0.16;
 
 const HEIGHT: f64 = 700.0;
 const TOP: f64 = 118.0;
@@ -19,8 +24,8 @@ const LEADER: f64 = 30.0;
 const LABEL_GAP: f64 = 21.0;
 /// Part of the height that the shaded fire may fill, to stay in the background.
 const SHADE_HEIGHT: f64 = 0.4;
-/// More points than a line is wide in pixels are not seen.
-const MAX_POINTS: usize = 800;
+/// More points are hardly seen, but fill files.
+const MAX_POINTS: usize = 500;
 /// The moving average spans about this part of the steps.
 const WINDOWS: usize = 40;
 
@@ -28,8 +33,10 @@ const WINDOWS: usize = 40;
 struct Line {
     name: String,
     color: RGBColor,
-    /// `(step, moving average)`.
+    /// `(step, moving average)`, means over worlds.
     points: Vec<(f64, f64)>,
+    /// Their standard errors over worlds; empty for one world.
+    errors: Vec<f64>,
 }
 
 /// Where steps and rewards lie on the page.
@@ -40,28 +47,24 @@ struct Plot {
     rewards: Axis,
 }
 
-/// Draws the rewards of up to eight policies (those with the highest mean) on one world to a PNG
-/// file; `fire_cells` is the world's number of burning cells per step, shaded in the background.
+/// Draws the rewards of up to eight policies (those with the highest mean), means over worlds, to a PNG or
+/// SVG file; `fire_cells` is the number of burning cells per step, shaded in the background.
 ///
 /// # Errors
-/// [`ReportError::Empty`] without runs, [`ReportError::UnknownWorld`] if no run with rewards is of
-/// that world, [`ReportError::NotFinite`] names a reward that cannot be drawn,
-/// [`ReportError::Write`] names the file.
+/// [`ReportError::Empty`] without rewards, [`ReportError::NotFinite`] names a reward that cannot be
+/// drawn, [`ReportError::Write`] names the file.
 pub fn draw_rewards(
     path: &Path,
     runs: &[PolicyRun],
-    world_seed: u64,
     axis_label: &str,
     fire_cells: Option<&[f32]>,
 ) -> Result<(), ReportError> {
-    let (runs, names) = runs_of_world(runs, world_seed)?;
-    for run in &runs {
-        check_finite(run, "reward", run.rewards.iter().copied().map(f64::from))?;
-    }
-    let n_steps = runs.iter().map(|run| run.rewards.len()).max().unwrap_or(0);
+    let recorded: Vec<PolicyRun> = recorded(runs)?;
+    let groups = groups(&recorded);
+    let n_steps = recorded.iter().map(|run| run.rewards.len()).max();
+    let n_steps = n_steps.unwrap_or(0);
     let window = window(n_steps);
-    let n_runs = runs.len();
-    let lines = lines(&runs, names, window);
+    let lines = lines(&groups, window);
     let fire = fire_cells
         .map(|cells| moving_average(cells, window))
         .unwrap_or_default();
@@ -71,9 +74,10 @@ pub fn draw_rewards(
         .collect();
     let plot = Plot::of(&lines, n_steps);
     draw_page(path, (WIDTH, HEIGHT), |canvas| {
-        draw_head(canvas, world_seed, window, &lines, n_runs);
+        draw_head(canvas, &recorded, window, (lines.len(), groups.len()));
         draw_fire(canvas, &plot, &fire);
         draw_axes(canvas, &plot, axis_label);
+        lines.iter().for_each(|line| draw_band(canvas, &plot, line));
         for line in &lines {
             let points: Vec<Point> = line.points.iter().map(|&at| plot.place(at)).collect();
             canvas.line(&points, 2.0, line.color);
@@ -85,46 +89,64 @@ pub fn draw_rewards(
     })
 }
 
-fn runs_of_world(
-    runs: &[PolicyRun],
-    world_seed: u64,
-) -> Result<(Vec<&PolicyRun>, Vec<String>), ReportError> {
-    if runs.is_empty() {
-        return Err(ReportError::Empty { what: "rewards" });
+/// The runs whose rewards were kept.
+fn recorded(runs: &[PolicyRun]) -> Result<Vec<PolicyRun>, ReportError> {
+    let recorded = runs.iter().filter(|run| !run.rewards.is_empty());
+    let recorded: Vec<PolicyRun> = recorded.cloned().collect();
+    for run in &recorded {
+        check_finite(run, "reward", run.rewards.iter().copied().map(f64::from))?;
     }
-    let recorded = |run: &&PolicyRun| !run.rewards.is_empty();
-    let groups = groups(runs);
-    let of_world = groups
-        .iter()
-        .zip(short_names(&groups))
-        .filter_map(|(group, name)| {
-            let mut runs = group.runs.iter().copied().filter(recorded);
-            Some((runs.find(|run| run.world_seed == world_seed)?, name))
-        });
-    let (found, names): (Vec<&PolicyRun>, Vec<String>) = of_world.unzip();
-    if found.is_empty() {
-        let known: BTreeSet<u64> = runs.iter().filter(recorded).map(|r| r.world_seed).collect();
-        let known = known.into_iter().collect();
-        return Err(ReportError::UnknownWorld { world_seed, known });
+    match recorded.is_empty() {
+        true => Err(ReportError::Empty { what: "rewards" }),
+        false => Ok(recorded),
     }
-    Ok((found, names))
 }
 
 /// The best policies' lines, from the highest mean down.
-fn lines(runs: &[&PolicyRun], names: Vec<String>, window: usize) -> Vec<Line> {
-    let mean = |run: &PolicyRun| {
-        let sum: f64 = run.rewards.iter().copied().map(f64::from).sum();
-        sum / run.rewards.len() as f64
+fn lines(groups: &[Group<'_>], window: usize) -> Vec<Line> {
+    let mean = |group: &Group<'_>| {
+        let rewards = || group.runs.iter().flat_map(|run| &run.rewards);
+        rewards().copied().map(f64::from).sum::<f64>() / rewards().count() as f64
     };
-    let mut ranked: Vec<(&PolicyRun, String)> = runs.iter().copied().zip(names).collect();
+    let names = short_names(groups);
+    let mut ranked: Vec<(&Group<'_>, String)> = groups.iter().zip(names).collect();
     ranked.sort_by(|a, b| mean(b.0).total_cmp(&mean(a.0)));
     let colored = ranked.into_iter().zip(LINES);
-    let line = |((run, name), color): ((&PolicyRun, String), RGBColor)| Line {
-        name: TextStyle::LABEL.fit(&name, LABEL_ROOM),
-        color,
-        points: moving_average(&run.rewards, window),
+    let line = |((group, name), color): ((&Group<'_>, String), RGBColor)| {
+        let name = TextStyle::LABEL.fit(&name, LABEL_ROOM);
+        Line::of(group, name, color, window)
     };
     colored.map(line).collect()
+}
+
+impl Line {
+    /// Over the steps that all worlds made.
+    fn of(group: &Group<'_>, name: String, color: RGBColor, window: usize) -> Self {
+        let lengths = group.runs.iter().map(|run| run.rewards.len());
+        let n_steps = lengths.min().unwrap_or(0);
+        let worlds = group.runs.iter().map(|run| &run.rewards[..n_steps]);
+        let worlds: Vec<_> = worlds
+            .map(|rewards| moving_average(rewards, window))
+            .collect();
+        let estimate = |at: usize| {
+            let values: Vec<f64> = worlds.iter().map(|averages| averages[at].1).collect();
+            Estimate::of(&values).map(|estimate| (worlds[0][at].0, estimate))
+        };
+        let n_points = worlds.first().map_or(0, Vec::len);
+        let points: Vec<(f64, Estimate)> = (0..n_points).filter_map(estimate).collect();
+        Self {
+            name,
+            color,
+            points: points.iter().map(|it| (it.0, it.1.mean)).collect(),
+            errors: points.iter().filter_map(|it| it.1.standard_error).collect(),
+        }
+    }
+
+    /// The edge of the band, so many errors from the line.
+    fn edge(&self, n_errors: f64) -> impl DoubleEndedIterator<Item = (f64, f64)> + '_ {
+        let points = self.points[..self.errors.len()].iter().zip(&self.errors);
+        points.map(move |(point, error)| (point.0, point.1 + n_errors * error))
+    }
 }
 
 /// A round number of steps, about a fortieth of all.
@@ -156,12 +178,11 @@ fn moving_average(values: &[f32], window: usize) -> Vec<(f64, f64)> {
 
 impl Plot {
     fn of(lines: &[Line], n_steps: usize) -> Self {
-        let values = || {
-            lines
-                .iter()
-                .flat_map(|line| line.points.iter().map(|point| point.1))
-        };
-        let rewards = Axis::covering(values(), 8);
+        let lines_and_bands = lines.iter().flat_map(|line| {
+            let edges = line.edge(-1.0).chain(line.edge(1.0));
+            line.points.iter().copied().chain(edges)
+        });
+        let rewards = Axis::covering(lines_and_bands.map(|point| point.1), 8);
         let widths = rewards
             .ticks
             .iter()
@@ -183,24 +204,35 @@ impl Plot {
 
 fn draw_head(
     canvas: &mut Canvas<'_>,
-    world_seed: u64,
+    runs: &[PolicyRun],
     window: usize,
-    lines: &[Line],
-    n_runs: usize,
+    (shown, n_policies): (usize, usize),
 ) {
-    let title = format!("Reward over time on world {world_seed}");
+    let worlds: BTreeSet<u64> = runs.iter().map(|run| run.world_seed).collect();
+    let title = match worlds.first() {
+        Some(seed) if worlds.len() == 1 => format!("Reward over time on world {seed}"),
+        _ => format!("Reward over time, mean over {} worlds", worlds.len()),
+    };
     canvas.text((MARGIN, 36.0), Align::Left, TextStyle::TITLE, &title);
-    let average = match window {
+    let mut note = match window {
         1 => "each step".to_string(),
         window => format!("moving average over the last {window} steps"),
     };
-    let note = match lines.len() {
-        shown if shown < n_runs => {
-            format!("{average}; the {shown} of {n_runs} policies with the highest mean reward")
-        }
-        _ => average,
-    };
+    if worlds.len() > 1 {
+        note += "; bands: ±1 standard error over worlds";
+    }
+    if shown < n_policies {
+        note += &format!("; the best {shown} of {n_policies} policies");
+    }
     canvas.text((MARGIN, 64.0), Align::Left, TextStyle::NOTE, &note);
+}
+
+fn draw_band(canvas: &mut Canvas<'_>, plot: &Plot, line: &Line) {
+    let edges = line.edge(1.0).chain(line.edge(-1.0).rev());
+    let area: Vec<Point> = edges.map(|at| plot.place(at)).collect();
+    if area.len() > 3 {
+        canvas.veil(&area, line.color, BAND);
+    }
 }
 
 fn draw_fire(canvas: &mut Canvas<'_>, plot: &Plot, fire: &[(f64, f64)]) {
@@ -217,7 +249,7 @@ fn draw_fire(canvas: &mut Canvas<'_>, plot: &Plot, fire: &[(f64, f64)]) {
         canvas.polygon(&area, SHADE);
     }
     let least = fire.iter().map(|point| point.1).fold(most, f64::min);
-    let note = format!("shaded: burning cells, {least:.0} to {most:.0}");
+    let note = format!("shaded: burning cells of a world, {least:.0} to {most:.0}");
     let right = WIDTH - MARGIN;
     let swatch = right - TextStyle::NOTE.width(&note) - 8.0;
     canvas.rectangle((swatch - 14.0, 57.0), (swatch, 71.0), SHADE);

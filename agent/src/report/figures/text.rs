@@ -8,7 +8,7 @@ use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
 use std::sync::LazyLock;
 
 /// Height of a capital letter as a fraction of the text size (Noto Sans, OS/2 table: 714 / 1000).
-const CAP_HEIGHT: f32 = 0.714;
+pub const CAP_HEIGHT: f32 = 0.714;
 
 /// What is put in place of the end of a text that is too long.
 const ELLIPSIS: char = '…';

@@ -11,9 +11,10 @@ Without Gymnasium, `connect` talks to a running server and `observe` reads what 
 import gymnasium
 
 from emberwatch import recording
-from emberwatch.client import Client, Lease, connect
+from emberwatch.client import Client, connect
 from emberwatch.decisions import Decisions
 from emberwatch.env import WildfireEnv
+from emberwatch.lease import Lease
 from emberwatch.moves_env import WildfireMovesEnv
 from emberwatch.objective_env import WildfireObjectiveEnv
 from emberwatch.observer import Frame, Observer, Outlook, OutlookReader, Truth, TruthReader, observe

@@ -10,9 +10,8 @@ from typing import Any, Final
 
 from emberwatch import wire
 from emberwatch.channels import Closing, Node
-from emberwatch.client import RESET_TIMEOUT, STEP_TIMEOUT
 from emberwatch.errors import NoServerError
-from emberwatch.ports import Bell, RequestPort
+from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT, Bell, RequestPort
 from emberwatch.replies import Decision, DecisionsInfo, ask, record
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from emberwatch.arguments import as_moves
 from emberwatch.base import WorldEnv
-from emberwatch.client import as_moves
 from emberwatch.observations import Observations, Parts
 from emberwatch.settings import Settings, WorldArguments
 from emberwatch.view import fly

@@ -10,8 +10,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from emberwatch import wire
+from emberwatch.arguments import as_choice
 from emberwatch.base import WorldEnv
-from emberwatch.client import as_choice
 from emberwatch.errors import ClosedError, SettingError
 from emberwatch.observations import Observations, assemble, check_parts
 from emberwatch.settings import Settings, WorldArguments

@@ -12,8 +12,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from emberwatch.arguments import as_choice, as_seed
 from emberwatch.base import WorldEnv, reported, wants_to_resume
-from emberwatch.client import RESET_TIMEOUT, as_choice, as_seed
 from emberwatch.decisions import Decisions
 from emberwatch.errors import (
     AgentEndsError,
@@ -25,6 +25,7 @@ from emberwatch.errors import (
     SettingError,
 )
 from emberwatch.observer import Frame, Observer
+from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program
 from emberwatch.replies import Decision
 from emberwatch.settings import Settings, WorldArguments, draw_seed

@@ -20,7 +20,8 @@ from emberwatch.channels import Closing, Node, guard
 from emberwatch.errors import GarbledAnswerError, SettingError
 from emberwatch.wire import StepResult
 
-#: How long to sleep between two looks, seconds: publishing wakes nobody, and who spins takes from the server.
+#: How long to sleep between two looks, seconds: publishing wakes nobody, and spinning would take
+#: a core from the server.
 _LOOK: Final = 500e-6
 
 
@@ -234,7 +235,7 @@ class TruthReader(_Reader):
 
 
 class OutlookReader(_Reader):
-    """Reads what the agents of an instance believe; they show it now and then, while somebody reads."""
+    """Reads what agents believe, which they show now and then while somebody reads."""
 
     def __init__(self, instance: str = "default") -> None:
         """Subscribes.

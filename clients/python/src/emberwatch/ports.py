@@ -31,6 +31,12 @@ _SPINS: Final = 12
 #: How long to look and yield before sleeping, seconds.
 _YIELD: Final = 45e-6
 
+#: Default timeout of a step, seconds.
+STEP_TIMEOUT: Final = 5.0
+
+#: Default timeout of what may wait for a burn-in, seconds.
+RESET_TIMEOUT: Final = 120.0
+
 #: A yield that takes longer went to a process that never sleeps, seconds.
 _LONG_YIELD: Final = 200e-6
 

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch import wire
-from emberwatch.client import RESET_TIMEOUT, Client, Lease, as_seed
+from emberwatch.arguments import as_seed
+from emberwatch.client import Client
 from emberwatch.errors import (
     ClosedError,
     EmberwatchError,
@@ -23,7 +24,9 @@ from emberwatch.errors import (
     ServerGoneError,
     SettingError,
 )
+from emberwatch.lease import Lease
 from emberwatch.model import Model
+from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program, unused_instance
 from emberwatch.settings import Settings, private_world, running_world
 from emberwatch.truth import HiddenStates

@@ -10,9 +10,9 @@ from typing import Any, Final, TypedDict
 
 import numpy as np
 
-from emberwatch.client import STEP_TIMEOUT
 from emberwatch.errors import SettingError
 from emberwatch.model import Model
+from emberwatch.ports import STEP_TIMEOUT
 from emberwatch.replies import ServerInfo
 
 #: Longest side of a grid and longest path of any server (PROTOCOL.md section 1).

@@ -13,8 +13,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from emberwatch.arguments import as_moves, as_seed
 from emberwatch.base import NOTHING_TO_DRAW, wants_to_resume
-from emberwatch.client import as_moves, as_seed
 from emberwatch.errors import SettingError
 from emberwatch.model import Model
 from emberwatch.observations import Observations, Parts

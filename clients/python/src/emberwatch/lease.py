@@ -1,0 +1,227 @@
+"""A lease: the right to act on some worlds, and what may be done with it."""
+
+from __future__ import annotations
+
+import os
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING, Final, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from emberwatch import wire
+from emberwatch.arguments import as_moves, as_seed
+from emberwatch.errors import InvalidActionError, SettingError
+from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
+from emberwatch.replies import Grant, WorldInfo, records
+from emberwatch.wire import StepAnswer, StepResult
+
+if TYPE_CHECKING:
+    from emberwatch.client import Client
+
+#: Most bytes of a belief in one message.
+_BELIEF_PART: Final = 1 << 19
+
+
+class Lease:
+    """The right to act on consecutive worlds. Ends by `release`, or leaving its `with`."""
+
+    def __init__(
+        self, client: Client, grant: Grant, start: tuple[WorldInfo, ...], worlds: range
+    ) -> None:
+        """Made by `Client.acquire`."""
+        self.client: Final = client
+        #: The server's number for it.
+        self.number: Final = grant.lease
+        #: It ends so many seconds after its last use.
+        self.ttl: Final = grant.ttl_millis / 1000
+        #: The worlds it covers.
+        self.worlds: Final = worlds
+        #: Where they stood when it was given.
+        self.start: Final = start
+        self._is_over = False
+
+    def step(
+        self,
+        paths: ArrayLike,
+        *,
+        worlds: range | None = None,
+        full: bool = False,
+        timeout: float = STEP_TIMEOUT,
+    ) -> StepAnswer:
+        """Flies one path in each world and moves the worlds from k to k + 1.
+
+        Args:
+            paths: Moves, integers: 0 up, 1 down, 2 left, 3 right; `(n_worlds, T)`, or `(T,)` for
+                one world.
+            worlds: Only these, consecutive; None: all of the lease.
+            full: Observe every cell; needs a server with coverage "client" or "full".
+            timeout: How long to wait for the answer, seconds.
+
+        Raises:
+            InvalidActionError: If the paths are not of that shape, type and range; nothing is sent.
+            LeaseLostError: If the lease ended or a world was taken over.
+            EpisodeOverError: If a world's episode was truncated: reset it.
+        """
+        chosen = self.worlds if worlds is None else self._part(worlds)
+        moves = as_moves(paths, len(chosen), self.client.info.n_moves)
+        return self.step_moves(moves, chosen, full=full, timeout=timeout)
+
+    def step_moves(
+        self, moves: NDArray[np.uint8], worlds: range, *, full: bool, timeout: float
+    ) -> StepAnswer:
+        """The same for moves that `as_moves` has checked."""
+        return self.client.exchange(
+            wire.STEP,
+            self.number,
+            worlds.start,
+            len(worlds),
+            wire.FULL_COVERAGE if full else 0,
+            moves.tobytes(),
+            timeout=timeout,
+        )
+
+    def observe(self, *, timeout: float = STEP_TIMEOUT) -> StepAnswer:
+        """The last results and frames of its worlds again."""
+        return self.client.observe(self.worlds.start, len(self.worlds), timeout=timeout)
+
+    def reset(
+        self,
+        seeds: Iterable[int | None] | None = None,
+        *,
+        worlds: Sequence[int] | None = None,
+        timeout: float = RESET_TIMEOUT,
+    ) -> tuple[WorldInfo, ...]:
+        """Begins new episodes: burn-in, k = 0, the robot at its start, empty frames.
+
+        Args:
+            seeds: One per world; None: the server derives the next from the world's last.
+            worlds: Only these worlds; None: all of the lease.
+            timeout: How long to wait for the burn-ins, seconds.
+
+        Returns:
+            Where the worlds stand, in the order asked.
+
+        Raises:
+            LeaseLostError: If the lease ended or a world was taken over.
+        """
+        chosen = list(self.worlds if worlds is None else worlds)
+        given = [None] * len(chosen) if seeds is None else list(seeds)
+        if len(given) != len(chosen):
+            raise InvalidActionError(f"seeds: expected {len(chosen)}, got {len(given)}")
+        pairs = [
+            {"world": world, "seed": None if seed is None else as_seed(seed)}
+            for world, seed in zip(chosen, given, strict=True)
+        ]
+        request = {"op": "reset", "lease": self.number, "worlds": pairs}
+        return records(WorldInfo, self.client.control(request, timeout=timeout))
+
+    def restore(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        worlds: range | None = None,
+        first: int = 0,
+        timeout: float = RESET_TIMEOUT,
+    ) -> tuple[WorldInfo, ...]:
+        """Puts the worlds of a snapshot file in the place of its own: they go on bit for bit.
+
+        Args:
+            path: The file, written by `Client.snapshot` or `emberwatch-server snapshot`.
+            worlds: Only these worlds, consecutive; None: all of the lease.
+            first: The first of the file's worlds that is read.
+            timeout: How long to wait for the answer, seconds.
+
+        Raises:
+            BadFileError: If the file is damaged, too short, or of a server with other settings.
+        """
+        chosen = self.worlds if worlds is None else self._part(worlds)
+        request = {
+            "op": "restore",
+            "lease": self.number,
+            "first_world": chosen.start,
+            "n_worlds": len(chosen),
+            "from": first,
+            "path": os.path.abspath(path),
+        }
+        return records(WorldInfo, self.client.control(request, timeout=timeout))
+
+    def fork(
+        self, source: int, target: int, *, timeout: float = STEP_TIMEOUT
+    ) -> tuple[WorldInfo, ...]:
+        """Puts a copy of any world in the place of one of its own: both have the same future."""
+        request = {"op": "fork", "lease": self.number, "from": source, "to": target}
+        return records(WorldInfo, self.client.control(request, timeout=timeout))
+
+    def leave_belief(
+        self,
+        result: StepResult,
+        kind: str,
+        data: bytes,
+        *,
+        world: int | None = None,
+        timeout: float = STEP_TIMEOUT,
+    ) -> None:
+        """Leaves bytes about a world as it stands to whoever acts on it next (`Client.belief`).
+
+        Args:
+            result: The world's last result; another step is refused.
+            kind: Says to other agents what the bytes are, in at most 256 bytes.
+            data: At most 64 bytes per cell.
+            world: Which world; None: the first of the lease.
+            timeout: How long to wait for each answer, seconds.
+        """
+        for offset in range(0, max(len(data), 1), _BELIEF_PART):
+            part = data[offset : offset + _BELIEF_PART]
+            request = {
+                "op": "leave_belief",
+                "lease": self.number,
+                "world": self.worlds.start if world is None else world,
+                "episode": result.episode,
+                "step": result.step,
+                "kind": kind,
+                "offset": offset,
+                "length": len(data),
+                "data": b64encode(part).decode(),
+            }
+            self.client.control(request, timeout=timeout)
+
+    def _part(self, worlds: range) -> range:
+        """Checks worlds to step: consecutive, of this lease."""
+        is_part = isinstance(worlds, range) and worlds.step == 1 and len(worlds) > 0  # pyright: ignore[reportUnnecessaryIsInstance]
+        if not is_part or worlds.start < self.worlds.start or worlds.stop > self.worlds.stop:
+            raise SettingError(
+                f"worlds: expected a range of consecutive worlds within {self.worlds}, got {worlds}"
+            )
+        return worlds
+
+    def renew(self, *, timeout: float = RESET_TIMEOUT) -> None:
+        """Starts the lease's clock again without acting."""
+        self.client.control({"op": "renew", "lease": self.number}, timeout=timeout)
+
+    def release(self, *, timeout: float = STEP_TIMEOUT) -> None:
+        """Gives the worlds back. Again is fine."""
+        if not self._is_over:
+            self._is_over = True
+            self.client.control({"op": "release", "lease": self.number}, timeout=timeout)
+
+    def __enter__(self) -> Self:
+        """Returns itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Releases it; after an error, without a second one."""
+        if kind is None:
+            self.release()
+            return
+        try:
+            self.release()
+        except Exception:
+            pass  # the first error says more
