@@ -4,7 +4,8 @@
 use crate::lease::ClientId;
 use iceoryx2::prelude::PayloadHeader;
 use iceoryx2::service::header::request_response::RequestHeader;
-use protocol::channels::{Ipc, create_node};
+use protocol::channels::Ipc;
+use protocol::dead_nodes::Undertaker;
 use protocol::wait::sleep_until_readable;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use std::collections::HashMap;
@@ -117,17 +118,16 @@ impl Drop for Janitor {
 }
 
 fn clean(requests: &Receiver<()>) {
-    let Ok(node) = create_node() else { return };
+    let Ok(undertaker) = Undertaker::new() else {
+        return;
+    };
     while !matches!(
         requests.recv_timeout(JANITOR_INTERVAL),
         Err(RecvTimeoutError::Disconnected)
     ) {
-        let state = node.try_cleanup_dead_nodes();
-        if state.cleanups > 0 {
-            tracing::debug!(
-                n_processes = state.cleanups,
-                "cleared away what dead processes left"
-            );
+        let n_nodes = undertaker.clear();
+        if n_nodes > 0 {
+            tracing::debug!(n_nodes, "cleared away what dead processes left");
         }
     }
 }

@@ -11,6 +11,7 @@
 pub mod channels;
 pub mod connection;
 pub mod control;
+pub mod dead_nodes;
 pub mod decisions;
 pub mod dynamics;
 pub mod frame;

@@ -54,7 +54,7 @@ pub fn node_config() -> Result<Config, ChannelError> {
 }
 
 /// What names of this user's shared memory begin with.
-fn prefix() -> String {
+pub(crate) fn prefix() -> String {
     format!("emberwatch_{}_", rustix::process::getuid().as_raw())
 }
 
