@@ -7,7 +7,9 @@
 
 mod colors;
 mod encoder;
+mod legend;
 mod page;
+mod pen;
 mod scenes;
 mod story;
 mod survey;

@@ -1,6 +1,8 @@
 //! A scene as a picture: truth, path, belief and entropy side by side, with what they mean.
 
-use super::colors::{BACKGROUND, Colors, FRAME, PEN, Tone, UNKNOWN, letter, shade};
+use super::colors::{BACKGROUND, Colors, FRAME, PEN, Tone, UNKNOWN, shade};
+use super::legend::{Entry, LINE, Mark, place};
+use super::pen::{Point, TEXT, TITLE, disc, fit, write, write_bold};
 use super::scenes::Scene;
 use crate::belief::EntropyKind;
 use crate::report::figures::text::{self, Weight};
@@ -11,23 +13,13 @@ use protocol::{Cell, Grid, Model, Shape};
 const MARGIN: usize = 14;
 /// Between panels.
 const GAP: usize = 16;
-/// Height of a line of text.
-const LINE: usize = 20;
-/// Pixels per em.
-const TEXT: f32 = 13.0;
-const TITLE: f32 = 16.0;
 /// Upper edge of the panels, below step and titles.
 const TOP: usize = MARGIN + 54;
 /// Narrowest room of a panel, for the sake of its title and legend.
 const LEAST_ROOM: usize = 150;
-/// Side of a colour in a legend.
-const SWATCH: usize = 11;
 /// The longer side of a panel where no scale is given, with cells of at most [`MOST_SCALE`] pixels.
 const SIDE: usize = 200;
 const MOST_SCALE: usize = 20;
-
-/// A point, pixels from the left and from the top.
-type Point = (usize, usize);
 
 /// How every scene of a film is laid out.
 pub struct Page<'a> {
@@ -291,79 +283,6 @@ impl<'a> Page<'a> {
     }
 }
 
-/// A mark of a legend.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Mark {
-    Color(u8),
-    Robot,
-    /// From 0 to what the name says.
-    Scale,
-}
-
-/// A mark with its name, and where it stands below its panel.
-struct Entry {
-    mark: Mark,
-    name: String,
-    at: Point,
-}
-
-fn place(marks: Vec<(Mark, String)>, room: usize) -> Vec<Entry> {
-    let (mut x, mut y) = (0, 0);
-    let mut entries = Vec::new();
-    for (mark, name) in marks {
-        let name = fit(&name, room.saturating_sub(mark.width()));
-        let width = mark.width() + text::width(&name, TEXT, Weight::Regular).ceil() as usize;
-        if x > 0 && x + width > room {
-            (x, y) = (0, y + LINE);
-        }
-        entries.push(Entry {
-            mark,
-            name,
-            at: (x, y),
-        });
-        x += width + 12;
-    }
-    entries
-}
-
-impl Mark {
-    /// Width with the space behind it.
-    fn width(self) -> usize {
-        match self {
-            Self::Color(_) | Self::Robot => SWATCH + 5,
-            Self::Scale => 12 + 64 + 6,
-        }
-    }
-}
-
-impl Entry {
-    /// `x`: its left edge; `y`: its middle.
-    fn draw(&self, picture: &mut Picture, (x, y): Point) {
-        let top = y - SWATCH / 2;
-        match self.mark {
-            Mark::Color(color) => {
-                picture.fill((x, top), (SWATCH, SWATCH), FRAME);
-                picture.fill((x + 1, top + 1), (SWATCH - 2, SWATCH - 2), color);
-            }
-            Mark::Robot => {
-                let center = (x + SWATCH / 2, y);
-                disc(picture, center, 4, PEN);
-                disc(picture, center, 2, BACKGROUND);
-            }
-            Mark::Scale => {
-                write(picture, (x, y), (TEXT, Tone::Plain), "0");
-                picture.fill((x + 11, top - 1), (66, SWATCH + 2), FRAME);
-                for column in 0..64 {
-                    let at = (x + 12 + column, top);
-                    picture.fill(at, (1, SWATCH), shade(column as f32 / 63.0));
-                }
-            }
-        }
-        let at = (x + self.mark.width(), y);
-        write(picture, at, (TEXT, Tone::Plain), &self.name);
-    }
-}
-
 /// What a scene must not hide, and whether it warns.
 fn small_print(scene: &Scene) -> (Tone, String) {
     let past = &scene.past;
@@ -389,51 +308,6 @@ fn small_print(scene: &Scene) -> (Tone, String) {
         ));
     }
     (Tone::Plain, parts.join("; "))
-}
-
-/// Writes a text whose capitals are centred on the height of `at`.
-fn write(picture: &mut Picture, at: Point, (size, tone): (f32, Tone), text: &str) {
-    ink(picture, at, (size, Weight::Regular, tone), text);
-}
-
-/// The same, larger and bold; returns where it ends.
-fn write_bold(picture: &mut Picture, at: Point, text: &str) -> usize {
-    ink(picture, at, (TITLE, Weight::Bold, Tone::Plain), text);
-    at.0 + text::width(text, TITLE, Weight::Bold).ceil() as usize
-}
-
-fn ink(picture: &mut Picture, at: Point, (size, weight, tone): (f32, Weight, Tone), text: &str) {
-    let start = (at.0 as f32, at.1 as f32);
-    text::rasterize(text, start, size, weight, |x, y, coverage| {
-        if let (Ok(x), Ok(y), Some(color)) = (
-            usize::try_from(x),
-            usize::try_from(y),
-            letter(coverage, tone),
-        ) {
-            picture.fill((x, y), (1, 1), color);
-        }
-    });
-}
-
-fn fit(text: &str, room: usize) -> String {
-    text::fit(text, room as f32, TEXT, Weight::Regular)
-}
-
-fn disc(picture: &mut Picture, center: Point, radius: isize, color: u8) {
-    for y in -radius..=radius {
-        for x in -radius..=radius {
-            // A quarter more than the radius: rounder at these sizes.
-            if x * x + y * y <= radius * radius + radius / 2 {
-                let at = (
-                    center.0.checked_add_signed(x),
-                    center.1.checked_add_signed(y),
-                );
-                if let (Some(x), Some(y)) = at {
-                    picture.fill((x, y), (1, 1), color);
-                }
-            }
-        }
-    }
 }
 
 fn plain(reward: f64) -> String {
