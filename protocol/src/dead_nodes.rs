@@ -2,12 +2,14 @@
 //!
 //! iceoryx2 0.10 clears away nodes that died in between. Three kinds stay for ever: a node without its details
 //! is looked for where the global configuration says; a folder that is not empty but for its details is not
-//! removed; and a folder without a monitor is not seen.
+//! removed; and one whose monitor was never finished is not seen.
 
 use crate::channels::{ChannelError, Ipc, ipc_error};
 use crate::node::{channel_directory, create_node, node_config, prefix};
 use iceoryx2::node::{Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config, FilePath, SemanticString};
+use std::fs::DirEntry;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -87,29 +89,33 @@ fn nodes_directory() -> PathBuf {
     channel_directory().join("nodes")
 }
 
-/// Folders of nodes that have no monitor and are older than `birth`.
+/// Nodes that are older than `birth` and whose monitor was never finished: that can be read only then.
 fn clear_unborn(nodes: &Path, prefix: &str, birth: Duration) -> usize {
     let entries = std::fs::read_dir(nodes).into_iter().flatten().flatten();
-    let is_unborn = |entry: &std::fs::DirEntry| {
+    let monitors = |entry: &DirEntry| {
         let name = entry.file_name();
         let name = name.to_string_lossy();
-        let is_node = !name.is_empty() && name.bytes().all(|digit| digit.is_ascii_digit());
-        let monitor = |end: &str| nodes.join(format!("{prefix}{name}.node_monitor{end}"));
+        ["", "_context", "_owner_lock"]
+            .map(|end| nodes.join(format!("{prefix}{name}.node_monitor{end}")))
+    };
+    let is_unborn = |entry: &DirEntry| {
+        let name = entry.file_name();
+        let is_node = name.as_encoded_bytes().iter().all(u8::is_ascii_digit);
         let age = entry.metadata().and_then(|metadata| metadata.modified());
         let age = age.ok().and_then(|modified| modified.elapsed().ok());
-        is_node
-            && age.is_some_and(|age| age > birth)
-            && !["", "_context", "_owner_lock"]
-                .iter()
-                .any(|end| monitor(end).exists())
+        let monitor = monitors(entry)[0].metadata();
+        let is_born = monitor.is_ok_and(|monitor| monitor.mode() & 0o400 != 0);
+        is_node && age.is_some_and(|age| age > birth) && !is_born
     };
-    let unborn = entries.filter(is_unborn);
-    unborn
-        .filter(|entry| {
-            empty(&entry.path());
-            std::fs::remove_dir(entry.path()).is_ok()
-        })
-        .count()
+    let mut n_cleared = 0;
+    for entry in entries.filter(is_unborn) {
+        empty(&entry.path());
+        for monitor in monitors(&entry) {
+            let _ = std::fs::remove_file(monitor);
+        }
+        n_cleared += usize::from(std::fs::remove_dir(entry.path()).is_ok());
+    }
+    n_cleared
 }
 
 /// Removes the files of a folder.
@@ -123,19 +129,26 @@ fn empty(folder: &Path) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs::Permissions;
+    use std::os::unix::fs::PermissionsExt;
 
     #[test]
-    fn folders_without_a_monitor_are_cleared_away_when_they_are_old() {
+    fn nodes_without_a_finished_monitor_are_cleared_away_when_they_are_old() {
         let nodes = std::env::temp_dir().join(format!("emberwatch-nodes-{}", std::process::id()));
-        for id in ["12", "34", "other"] {
+        for id in ["12", "34", "56", "other"] {
             std::fs::create_dir_all(nodes.join(id)).expect("a folder");
             std::fs::write(nodes.join(id).join("p_node.details"), "").expect("a file");
         }
-        std::fs::write(nodes.join("p_34.node_monitor_context"), "").expect("a file");
+        for (name, mode) in [("p_34.node_monitor", 0o600), ("p_56.node_monitor", 0o200)] {
+            std::fs::write(nodes.join(name), "").expect("a file");
+            std::fs::set_permissions(nodes.join(name), Permissions::from_mode(mode))
+                .expect("chmod");
+        }
         assert_eq!(clear_unborn(&nodes, "p_", Duration::from_secs(60)), 0);
         std::thread::sleep(Duration::from_millis(20));
-        assert_eq!(clear_unborn(&nodes, "p_", Duration::from_millis(1)), 1);
-        assert!(!nodes.join("12").exists());
+        assert_eq!(clear_unborn(&nodes, "p_", Duration::from_millis(1)), 2);
+        let gone = ["12", "56", "p_56.node_monitor"];
+        assert!(gone.iter().all(|name| !nodes.join(name).exists()));
         assert!(nodes.join("34").exists() && nodes.join("other").exists());
         std::fs::remove_dir_all(&nodes).expect("clean up");
     }
