@@ -184,7 +184,8 @@ impl Match<'_> {
     ) -> Result<Vec<Run>, CompareError> {
         let mut runs = self.start(arena)?;
         for step in 0..self.comparison.steps {
-            self.step(arena, &mut runs, step, feed.is_due())?;
+            let shown = feed.turn(runs.len());
+            self.step(arena, &mut runs, step, shown)?;
             for (world, run) in arena.worlds().zip(&mut runs) {
                 run.show(feed, world);
             }
@@ -221,7 +222,7 @@ impl Match<'_> {
         arena: &mut Arena,
         runs: &mut [Run],
         step: u64,
-        is_shown: bool,
+        shown: Option<usize>,
     ) -> Result<(), CompareError> {
         if self.policy.estimator == EstimatorKind::NextTruth {
             let next = arena.foresee(self.seeds, step + 1)?;
@@ -237,12 +238,14 @@ impl Match<'_> {
         let is_last = step + 1 == self.comparison.steps;
         let target = arena.model().target_state();
         let seen = runs.par_iter_mut().zip(plans).zip(observations).zip(truths);
-        let taken = seen.map(|(((run, plan), observation), truth)| {
-            let taken = run.take_in(&plan, observation, truth, target, is_last);
-            run.posterior = is_shown.then(|| run.agent.belief().clone());
-            run.agent.predict();
-            taken
-        });
+        let taken = seen
+            .enumerate()
+            .map(|(index, (((run, plan), observation), truth))| {
+                let taken = run.take_in(&plan, observation, truth, target, is_last);
+                run.posterior = (shown == Some(index)).then(|| run.agent.belief().clone());
+                run.agent.predict();
+                taken
+            });
         taken
             .collect::<Result<(), AgentError>>()
             .map_err(|problem| self.wrong(problem))

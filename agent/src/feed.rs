@@ -17,6 +17,8 @@ const FAREWELL: Duration = Duration::from_millis(100);
 pub struct Feed {
     showcase: Option<Showcase>,
     shown: Option<Instant>,
+    /// Worlds that were shown.
+    n_shown: usize,
 }
 
 /// One world's belief, the posterior after the frame of `result`.
@@ -45,12 +47,20 @@ impl Feed {
         Self {
             showcase,
             shown: None,
+            n_shown: 0,
         }
     }
 
     /// Whether it is time to show beliefs, and anybody looks.
     pub fn is_due(&self) -> bool {
-        self.shown.is_none_or(|shown| shown.elapsed() >= INTERVAL) && self.is_watched()
+        self.turn(1).is_some()
+    }
+
+    /// Which of several worlds is to be shown now, if any: one after the other, as a reader keeps few beliefs.
+    pub fn turn(&self, n_worlds: usize) -> Option<usize> {
+        let interval = INTERVAL / n_worlds.max(1) as u32;
+        let is_due = self.shown.is_none_or(|shown| shown.elapsed() >= interval);
+        (is_due && n_worlds > 0 && self.is_watched()).then(|| self.n_shown % n_worlds)
     }
 
     /// Whether anybody looks.
@@ -71,6 +81,7 @@ impl Feed {
             return;
         };
         self.shown = Some(Instant::now());
+        self.n_shown += 1;
         let policy = view.agent.policy();
         let about = AgentHeader {
             world: view.world,

@@ -39,6 +39,9 @@ use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 
+/// Most pixels of a picture: some are held at a time.
+const MOST_AREA: usize = 1 << 26;
+
 /// How long the last picture and that of a gap are shown at least, hundredths of a second.
 const PAUSE: u16 = 100;
 
@@ -161,7 +164,7 @@ pub enum FilmError {
     },
     /// Pictures that are too large.
     #[error(
-        "--scale: expected pictures of at most {MOST_PIXELS} pixels a side, got {width} x {height}"
+        "--scale: expected pictures of at most {MOST_PIXELS} pixels a side and {MOST_AREA} in all, got {width} x {height}"
     )]
     Size {
         /// Width in pixels.
@@ -186,12 +189,16 @@ pub fn film(order: &Order) -> Result<Summary, FilmError> {
     survey.warn(order);
     let model = known_model(&survey.server, order)?;
     let shape = Shape::new(survey.server.height, survey.server.width)?;
+    // Four panels beside each other, before anything is drawn: a page is held as a whole.
+    let scale = order.scale.unwrap_or(1);
+    let panels = (
+        shape.width().saturating_mul(4 * scale),
+        shape.height().saturating_mul(scale),
+    );
+    check_size(panels)?;
     let page = Page::new(&model, shape, order.world, order.scale, survey.has_truth);
     let size = page.size();
-    if size.0.max(size.1) > MOST_PIXELS {
-        let (width, height) = size;
-        return Err(FilmError::Size { width, height });
-    }
+    check_size(size)?;
     let story = Story::new(open(&order.recording)?, order.world);
     let selection = order.product.selection();
     let world = (&model, shape, survey.server.burn_in);
@@ -211,6 +218,13 @@ pub fn film(order: &Order) -> Result<Summary, FilmError> {
         n_bytes: bytes.len(),
         n_lost: survey.n_lost,
     })
+}
+
+fn check_size((width, height): (usize, usize)) -> Result<(), FilmError> {
+    match width.max(height) > MOST_PIXELS || width.saturating_mul(height) > MOST_AREA {
+        true => Err(FilmError::Size { width, height }),
+        false => Ok(()),
+    }
 }
 
 /// The model that the recording's server revealed, or else the one given.

@@ -123,18 +123,14 @@ impl OwnDashboard {
             ])
             .stdout(Stdio::piped());
         let mut program = OwnProgram::start(&mut command)?;
-        let mut url = String::new();
-        if let Some(out) = program.0.stdout.take() {
-            // It says where its page is, or ends.
-            let _ = BufReader::new(out).read_line(&mut url);
-        }
+        let url = program.first_line(START_TIMEOUT);
         match url.trim() {
             "" => Err(LaunchError::Ended {
                 what: "dashboard",
-                status: program
-                    .0
-                    .wait()
-                    .map_or_else(|e| e.to_string(), |s| s.to_string()),
+                status: match program.0.try_wait() {
+                    Ok(Some(status)) => status.to_string(),
+                    _ => format!("nothing to say for {START_TIMEOUT:?}"),
+                },
             }),
             url => Ok(Self {
                 url: url.into(),
@@ -156,6 +152,19 @@ impl OwnProgram {
             problem: error.to_string(),
         })?;
         Ok(Self(child))
+    }
+
+    /// The first line that it writes to its standard output; empty if it ends or takes too long.
+    fn first_line(&mut self, timeout: Duration) -> String {
+        let (tell, told) = std::sync::mpsc::channel();
+        if let Some(out) = self.0.stdout.take() {
+            std::thread::spawn(move || {
+                let mut line = String::new();
+                let _ = BufReader::new(out).read_line(&mut line);
+                let _ = tell.send(line);
+            });
+        }
+        told.recv_timeout(timeout).unwrap_or_default()
     }
 }
 

@@ -2,7 +2,8 @@
 //!
 //! A file is a row of TensorFlow's records: a length, the bytes, and a checksum behind each of the two. The
 //! bytes are protocol buffers of the types `Event` and `Summary`, of which few fields are needed, so they
-//! are written here. Steps of one file should rise: TensorBoard drops what comes again.
+//! are written here: the crate that does it (`tensorboard-rs`) brings protobuf 2 and image 0.23, long out of
+//! support. Steps of one file should rise: TensorBoard drops what comes again.
 
 use crc::{CRC_32_ISCSI, Crc};
 use std::fs::File;

@@ -18,6 +18,9 @@ use thiserror::Error;
 /// Most states of a belief that is shown.
 pub const MAX_STATES: u32 = 256;
 
+/// Longest text of what an agent wants, bytes.
+pub const MAX_INTENT_BYTES: usize = 65_536;
+
 /// What an agent wants, and how it goes about it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Intent {
@@ -160,6 +163,12 @@ impl TryFrom<&Sample<AgentHeader>> for Outlook {
                     "belief: expected {n_numbers} numbers, got {got} bytes"
                 ))
             })?;
+        if text.len() > MAX_INTENT_BYTES {
+            let got = text.len();
+            return Err(garbled(format!(
+                "intent: expected at most {MAX_INTENT_BYTES} bytes, got {got}"
+            )));
+        }
         let numbers: Vec<f32> = numbers
             .chunks_exact(size_of::<f32>())
             .map(bytemuck::pod_read_unaligned)

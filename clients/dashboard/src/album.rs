@@ -4,7 +4,7 @@ use protocol::frame::UNOBSERVED;
 use protocol::message::{AgentHeader, FrameHeader, StepResult, TruthHeader};
 use protocol::observer::Sample;
 use protocol::outlook::{Intent, Outlook};
-use protocol::path::{fly, path_from_bytes};
+use protocol::path::path_from_bytes;
 use protocol::{Cell, Move, Shape};
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Instant;
@@ -12,7 +12,7 @@ use std::time::Instant;
 /// Most steps that are kept of a world.
 pub const MAX_ENTRIES: usize = 4096;
 
-/// Most bytes that are kept of all worlds: 4,096 steps of six 64 x 64 worlds with all there is to see, or
+/// Most bytes that are kept of all worlds: 4,096 steps of three 64 x 64 worlds with all there is to see, or
 /// 800 of a 256 x 256 world.
 const MAX_BYTES: usize = 256 << 20;
 
@@ -22,6 +22,9 @@ const MAX_DELAY: usize = 512;
 /// How many hidden states are held for frames that have not come yet: channels are read one after the
 /// other, and a recording may have them in either order.
 const MAX_EARLY: usize = 64;
+
+/// Most bytes of those.
+const MAX_EARLY_BYTES: usize = 32 << 20;
 
 /// What is known of each world.
 #[derive(Debug, Default)]
@@ -137,13 +140,7 @@ impl Album {
         if strip.entries.len() > MAX_ENTRIES {
             self.n_bytes -= strip.forget_oldest();
         }
-        while self.n_bytes > MAX_BYTES {
-            let longest = self
-                .worlds
-                .values_mut()
-                .max_by_key(|strip| strip.entries.len());
-            self.n_bytes -= longest.map_or(self.n_bytes, Strip::forget_oldest);
-        }
+        self.make_room();
     }
 
     /// Adds hidden states to the step that they belong to, if that is kept.
@@ -158,16 +155,24 @@ impl Album {
             let early = (header.world, key, sample.payload.clone().into());
             self.early.truncate(MAX_EARLY - 1);
             self.early.push_front(early);
+            let held = |early: &VecDeque<(u32, Key, Box<[u8]>)>| -> usize {
+                early.iter().map(|(_, _, truth)| truth.len()).sum()
+            };
+            while held(&self.early) > MAX_EARLY_BYTES {
+                self.early.pop_back();
+            }
             return;
         };
         if entry.truth.is_none() && sample.payload.len() == entry.shape.n_cells() {
             entry.truth = Some(sample.payload.clone().into());
             self.n_bytes += sample.payload.len();
+            self.make_room();
         }
     }
 
-    /// Adds what an agent believed of a step, if that is kept. `states` are the model's.
-    pub fn add_belief(&mut self, outlook: &Outlook, states: Option<&States>) {
+    /// Adds what an agent believed of a step; `false` if that step is not there, yet or any more. `states` are
+    /// the model's.
+    pub fn add_belief(&mut self, outlook: &Outlook, states: Option<&States>) -> bool {
         let AgentHeader {
             seed,
             episode,
@@ -184,11 +189,11 @@ impl Album {
                 step,
             },
         ) else {
-            return;
+            return false;
         };
         let (_, height, width) = outlook.belief.dim();
         if (height, width) != entry.shape.dim() {
-            return;
+            return true; // It makes no sense, now or later.
         }
         let states = states.filter(|states| states.names == outlook.intent.states);
         let truth = entry.truth.as_deref();
@@ -203,6 +208,18 @@ impl Album {
         let n_bytes = belief.n_bytes();
         let replaced = entry.belief.replace(belief);
         self.n_bytes = self.n_bytes + n_bytes - replaced.map_or(0, |old| old.n_bytes());
+        self.make_room();
+        true
+    }
+
+    /// Forgets the oldest steps of the worlds that have most, until all fit.
+    fn make_room(&mut self) {
+        while self.n_bytes > MAX_BYTES {
+            let worlds = self.worlds.values_mut();
+            let longest = worlds.max_by_key(|strip| strip.entries.len());
+            self.n_bytes -= longest.map_or(self.n_bytes, Strip::forget_oldest);
+        }
+        self.worlds.retain(|_, strip| !strip.entries.is_empty());
     }
 
     /// Takes the hidden states that came before their frame.
@@ -262,12 +279,14 @@ impl Entry {
         let moves = path_from_bytes(path).ok()?;
         let is_seen = |(_, value): &(u32, &u8)| **value != UNOBSERVED;
         let seen = (0..).zip(values).filter(is_seen);
-        (shape.contains(start) && moves.len() == header.n_moves as usize).then(|| Self {
+        let mut seen: Vec<(u32, u8)> = seen.map(|(cell, &value)| (cell, value)).collect();
+        seen.shrink_to_fit();
+        (shape.contains(start) && moves.len() == header.n_moves as usize).then_some(Self {
             shape,
             result: header.result,
             start,
             moves,
-            seen: seen.map(|(cell, &value)| (cell, value)).collect(),
+            seen,
             truth: None,
             belief: None,
             at,
@@ -276,10 +295,10 @@ impl Entry {
 
     /// The cells of the path, its start first.
     pub fn path(&self) -> Vec<Cell> {
+        let mut cells = vec![self.start];
         let mut cell = self.start;
-        let mut cells = vec![cell];
         for step in &self.moves {
-            cell = fly(self.shape, cell, &[*step]).end;
+            cell = step.apply(cell, self.shape);
             cells.push(cell);
         }
         cells
@@ -307,7 +326,11 @@ impl Entry {
 
 impl Belief {
     fn n_bytes(&self) -> usize {
-        self.levels.len() + self.entropy.len()
+        let intent = &self.intent;
+        let words = [&intent.policy, &intent.belief_from, &intent.objective];
+        let words = words.into_iter().chain(&intent.states);
+        let n_words: usize = words.map(|word| size_of::<String>() + word.len()).sum();
+        self.levels.len() + self.entropy.len() + n_words
     }
 }
 

@@ -1,6 +1,6 @@
 //! `emberwatch-dashboard`: a web page that shows what happens on an instance, or what a recording holds.
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use clap::Parser;
 use dashboard::scene::{Scene, Stage};
 use dashboard::{player, server, watcher};
@@ -12,6 +12,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
 use std::time::Duration;
 use tokio::net::TcpListener;
 
@@ -68,13 +69,12 @@ fn run(cli: &Cli) -> Result<()> {
         )
     })?;
     let address = listener.local_addr().context("the page's address")?;
-    let stage = start(cli, &stop)?;
+    let (stage, threads) = start(cli, &stop)?;
     announce(address, cli.open)?;
     let end = async {
         while !stop.load(Ordering::Relaxed) && !keeper.as_ref().is_some_and(Keeper::has_ended) {
             tokio::time::sleep(TICK).await;
         }
-        stop.store(true, Ordering::Relaxed);
         Ok(())
     };
     let served = runtime.block_on(async {
@@ -83,22 +83,27 @@ fn run(cli: &Cli) -> Result<()> {
             ended = end => ended,
         }
     });
+    // Ports are closed by the threads that opened them.
+    stop.store(true, Ordering::Relaxed);
+    let ended = threads.into_iter().map(JoinHandle::join);
+    let n_panics = ended.filter(Result::is_err).count();
+    ensure!(n_panics == 0, "{n_panics} threads failed");
     served.context("serve the page")
 }
 
 /// Begins to watch, or to play.
-fn start(cli: &Cli, stop: &Arc<AtomicBool>) -> Result<Arc<Stage>> {
+fn start(cli: &Cli, stop: &Arc<AtomicBool>) -> Result<(Arc<Stage>, Vec<JoinHandle<()>>)> {
     match &cli.recording {
         Some(file) => {
             let stage = Arc::new(Stage::new(Scene::new(&file.display().to_string())));
-            player::play(file, &stage, stop)?;
-            Ok(stage)
+            let thread = player::play(file, &stage, stop)?;
+            Ok((stage, vec![thread]))
         }
         None => {
             let instance = Instance::new(&cli.instance)?;
             let stage = Arc::new(Stage::new(Scene::new(instance.name())));
-            watcher::watch(&instance, &stage, stop)?;
-            Ok(stage)
+            let threads = watcher::watch(&instance, &stage, stop)?;
+            Ok((stage, threads.into()))
         }
     }
 }

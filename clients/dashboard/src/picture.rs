@@ -82,6 +82,9 @@ struct Status<'a> {
 #[derive(Debug, Serialize)]
 struct Shown {
     serial: u64,
+    height: usize,
+    width: usize,
+    seen_since: u64,
     /// As text: browsers keep 53 bits of a number.
     seed: String,
     episode: u64,
@@ -143,9 +146,9 @@ pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
         None => newest(strip),
     });
     let mut arrays = Arrays::default();
-    let (mut objectives, mut series) = (Vec::new(), None);
+    let (mut objectives, mut series, mut since) = (Vec::new(), None, 0);
     if let (Some(strip), Some((serial, entry))) = (strip, chosen) {
-        arrays.add_grids(strip, serial, entry);
+        since = arrays.add_grids(strip, serial, entry);
         (objectives, series) = arrays.add_series(strip, ask.bins.clamp(BINS.0, BINS.1));
     }
     let is_live = |entry: &Entry| now.duration_since(entry.at) < 4 * BELIEF_LAG;
@@ -160,14 +163,14 @@ pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
         } else {
             "waiting"
         },
-        note: scene.note.as_deref(),
+        note: scene.note.as_deref().or(scene.trouble.as_deref()),
         info: scene.info.as_ref(),
         status: scene.status.as_ref().map(Status::of),
         world: ask.world,
         kept: strip
             .and_then(Strip::kept)
             .map(|(first, last)| Range { first, last }),
-        shown: chosen.map(|(serial, entry)| Shown::of(serial, entry)),
+        shown: chosen.map(|(serial, entry)| Shown::of(serial, entry, since)),
         agent: chosen.and_then(|(_, entry)| AgentFacts::of(entry, is_live(entry))),
         lost: scene.lost,
         player: scene.player.as_ref(),
@@ -215,7 +218,8 @@ impl Arrays {
         self.add(name, "f32", numbers.len(), &bytes);
     }
 
-    fn add_grids(&mut self, strip: &Strip, serial: u64, entry: &Entry) {
+    /// Returns the first step that `seen` remembers.
+    fn add_grids(&mut self, strip: &Strip, serial: u64, entry: &Entry) -> u64 {
         if let Some(truth) = &entry.truth {
             self.add_bytes("truth", truth);
         }
@@ -224,13 +228,14 @@ impl Arrays {
             frame[cell as usize] = value;
         }
         self.add_bytes("frame", &frame);
-        let (seen, age) = memory(strip, serial, entry);
-        self.add_bytes("seen", &seen);
-        self.add_bytes("age", &age);
+        let memory = Memory::of(strip, serial, entry);
+        self.add_bytes("seen", &memory.seen);
+        self.add_bytes("age", &memory.age);
         if let Some(belief) = &entry.belief {
             self.add_bytes("belief", &belief.levels);
             self.add_bytes("entropy", &belief.entropy);
         }
+        memory.since
     }
 
     /// Means of so many stretches of all that is kept; the objective is each stretch's last.
@@ -283,30 +288,45 @@ fn number_of<'a>(objective: &'a str, objectives: &mut Vec<&'a str>) -> u8 {
     number as u8
 }
 
-/// What each cell showed last up to a step of its episode, and how many steps before (at most 255).
-fn memory(strip: &Strip, serial: u64, last: &Entry) -> (Vec<u8>, Vec<u8>) {
-    let n_cells = last.shape.n_cells();
-    let (mut seen, mut age) = (vec![UNOBSERVED; n_cells], vec![u8::MAX; n_cells]);
-    let is_same = |entry: &&Entry| {
-        let (then, now) = (&entry.result, &last.result);
-        (then.seed, then.episode, entry.shape) == (now.seed, now.episode, last.shape)
-            && then.step <= now.step
-    };
-    let mut n_unseen = n_cells;
-    for entry in strip.back_from(serial).take_while(is_same) {
-        let steps = (last.result.step - entry.result.step).min(255) as u8;
-        for &(cell, value) in &entry.seen {
-            let cell = cell as usize;
-            if seen[cell] == UNOBSERVED {
-                (seen[cell], age[cell]) = (value, steps);
-                n_unseen -= 1;
+/// What each cell showed last.
+struct Memory {
+    /// The observation, [`UNOBSERVED`] if there was none.
+    seen: Vec<u8>,
+    /// How many steps before, at most 255.
+    age: Vec<u8>,
+    /// The first step that is remembered; 0: the episode's first.
+    since: u64,
+}
+
+impl Memory {
+    /// Of the steps of one run up to one of them: what is older in the album may be of another server.
+    fn of(strip: &Strip, serial: u64, last: &Entry) -> Self {
+        let n_cells = last.shape.n_cells();
+        let (mut seen, mut age) = (vec![UNOBSERVED; n_cells], vec![u8::MAX; n_cells]);
+        let (mut n_unseen, mut since) = (n_cells, last.result.step + 1);
+        for entry in strip.back_from(serial) {
+            let (then, now) = (&entry.result, &last.result);
+            let is_same =
+                (then.seed, then.episode, entry.shape) == (now.seed, now.episode, last.shape);
+            if !is_same || then.step >= since || n_unseen == 0 {
+                break;
+            }
+            since = then.step;
+            for &(cell, value) in &entry.seen {
+                let cell = cell as usize;
+                if seen[cell] == UNOBSERVED {
+                    (seen[cell], age[cell]) = (value, (now.step - then.step).min(255) as u8);
+                    n_unseen -= 1;
+                }
             }
         }
-        if n_unseen == 0 {
-            break;
+        let is_complete = n_unseen == 0 || since <= 1;
+        Self {
+            seen,
+            age,
+            since: if is_complete { 0 } else { since },
         }
     }
-    (seen, age)
 }
 
 impl<'a> Status<'a> {
@@ -324,12 +344,15 @@ impl<'a> Status<'a> {
 }
 
 impl Shown {
-    fn of(serial: u64, entry: &Entry) -> Self {
+    fn of(serial: u64, entry: &Entry, seen_since: u64) -> Self {
         let result = &entry.result;
         let pair = |cell: Cell| [cell.row, cell.col];
         let score = entry.belief.as_ref().and_then(|belief| belief.score);
         Self {
             serial,
+            height: entry.shape.height(),
+            width: entry.shape.width(),
+            seen_since,
             seed: result.seed.to_string(),
             episode: result.episode,
             step: result.step,

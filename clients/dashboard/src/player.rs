@@ -1,12 +1,13 @@
 //! Plays a recording onto the stage, at a speed that browsers choose.
 
-use crate::scene::{Info, Player, Scene, Stage};
+use crate::scene::{Info, Lost, Player, Scene, Stage};
 use protocol::recording::{Event, Reader, Record, RecordingError};
 use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
@@ -30,11 +31,15 @@ pub enum PlayError {
     Thread(#[from] std::io::Error),
 }
 
-/// Plays a recording on a thread of its own until `stop`.
+/// Plays a recording until `stop`, on the thread that is returned.
 ///
 /// # Errors
 /// [`PlayError::File`] if it cannot be opened or is no recording. What is wrong later on is shown.
-pub fn play(path: &Path, stage: &Arc<Stage>, stop: &Arc<AtomicBool>) -> Result<(), PlayError> {
+pub fn play(
+    path: &Path,
+    stage: &Arc<Stage>,
+    stop: &Arc<AtomicBool>,
+) -> Result<JoinHandle<()>, PlayError> {
     let mut reader = Some(open(path)?);
     let player = Player {
         file: path.display().to_string(),
@@ -50,7 +55,7 @@ pub fn play(path: &Path, stage: &Arc<Stage>, stop: &Arc<AtomicBool>) -> Result<(
     });
     let (path, stage, stop) = (path.to_owned(), stage.clone(), stop.clone());
     let thread = std::thread::Builder::new().name("player".into());
-    thread.spawn(move || {
+    let thread = thread.spawn(move || {
         while !stop.load(Ordering::Relaxed) {
             let reader = reader.take().map_or_else(|| open(&path), Ok);
             let played = reader.and_then(|reader| {
@@ -65,11 +70,10 @@ pub fn play(path: &Path, stage: &Arc<Stage>, stop: &Arc<AtomicBool>) -> Result<(
             while !stop.load(Ordering::Relaxed) && !is_playing(&stage) {
                 std::thread::sleep(TICK);
             }
-            stage.change(|scene| scene.album.clear());
-            change_player(&stage, |player| player.ended = false);
+            stage.change(begin_anew);
         }
-    })?;
-    Ok(())
+    });
+    Ok(thread?)
 }
 
 fn open(path: &Path) -> Result<Reader<BufReader<File>>, PlayError> {
@@ -81,6 +85,14 @@ fn open(path: &Path) -> Result<Reader<BufReader<File>>, PlayError> {
 fn wrong(path: &Path, problem: RecordingError) -> PlayError {
     let path = path.to_owned();
     PlayError::File { path, problem }
+}
+
+fn begin_anew(scene: &mut Scene) {
+    scene.album.clear();
+    scene.lost = Lost::default();
+    if let Some(player) = &mut scene.player {
+        (player.ended, player.error, player.seconds) = (false, None, 0.0);
+    }
 }
 
 fn is_playing(stage: &Stage) -> bool {

@@ -16,8 +16,10 @@ pub struct Scene {
     pub instance: String,
     /// Whether a server is there.
     pub is_serving: bool,
-    /// One sentence for people.
+    /// How the server is, in one sentence for people.
     pub note: Option<String>,
+    /// What of its channels cannot be read.
+    pub trouble: Option<String>,
     /// What the server said of itself.
     pub info: Option<Info>,
     /// What it says now and then.
@@ -91,6 +93,7 @@ impl Scene {
             instance: instance.into(),
             is_serving: false,
             note: None,
+            trouble: None,
             info: None,
             status: None,
             lost: Lost::default(),

@@ -8,6 +8,7 @@ use crate::page::ASSETS;
 use crate::picture::{Ask, picture};
 use crate::scene::{Scene, Stage};
 use axum::Router;
+use axum::body::Bytes;
 use axum::extract::ws::{Message, WebSocket, WebSocketUpgrade};
 use axum::extract::{Request, State};
 use axum::http::header::{
@@ -23,12 +24,19 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
+use tokio::time::timeout;
 
 /// Time between two pictures at least: thirty a second.
 const PICTURE_INTERVAL: Duration = Duration::from_millis(33);
 
 /// Time after which a picture is sent though nothing has changed.
 const PATIENCE: Duration = Duration::from_millis(500);
+
+/// How long a silent browser is left alone before it is asked whether it is there.
+const SILENCE: Duration = Duration::from_secs(20);
+
+/// How often it is asked before it counts as gone.
+const MAX_PINGS: u32 = 3;
 
 /// Longest message of a browser, bytes.
 const MAX_ASK_BYTES: usize = 4096;
@@ -131,6 +139,7 @@ async fn socket(State(service): State<Service>, upgrade: WebSocketUpgrade) -> Re
     let stage = service.stage;
     upgrade
         .max_message_size(MAX_ASK_BYTES)
+        .max_frame_size(MAX_ASK_BYTES)
         .on_upgrade(async move |socket| {
             answer(socket, &stage).await;
             drop(place);
@@ -162,7 +171,7 @@ async fn answer(mut socket: WebSocket, stage: &Stage) {
         if before == wanted {
             tokio::select! {
                 // A change since the last picture ends this at once, and so does the next ask.
-                _ = tokio::time::timeout(PATIENCE, changes.changed()) => {}
+                _ = timeout(PATIENCE, changes.changed()) => {}
                 message = socket.recv() => match message {
                     Some(Ok(message)) => early = Some(message),
                     _ => return,
@@ -172,18 +181,33 @@ async fn answer(mut socket: WebSocket, stage: &Stage) {
         before = wanted;
         sent = Instant::now();
         let bytes = picture(&stage.look(), &ask, sent);
-        if socket.send(Message::Binary(bytes.into())).await.is_err() {
+        if send(&mut socket, Message::Binary(bytes.into()))
+            .await
+            .is_none()
+        {
             return;
         }
     }
 }
 
-/// The next message: one that came while its predecessor was answered, or one that comes.
+/// The next message: one that came while its predecessor was answered, or one that comes; `None` if the
+/// browser has gone, or does not say that it is there.
 async fn next_message(socket: &mut WebSocket, early: &mut Option<Message>) -> Option<Message> {
-    match early.take() {
-        Some(message) => Some(message),
-        None => socket.recv().await?.ok(),
+    if let Some(message) = early.take() {
+        return Some(message);
     }
+    for _ in 0..MAX_PINGS {
+        match timeout(SILENCE, socket.recv()).await {
+            Ok(message) => return message?.ok(),
+            Err(_) => send(socket, Message::Ping(Bytes::new())).await?,
+        }
+    }
+    None
+}
+
+/// Sends a message; `None` if the browser does not take it.
+async fn send(socket: &mut WebSocket, message: Message) -> Option<()> {
+    timeout(SILENCE, socket.send(message)).await.ok()?.ok()
 }
 
 /// Tells a recording's player what the browser wants of it.

@@ -12,6 +12,7 @@ use protocol::outlook::Outlook;
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
@@ -23,6 +24,9 @@ const IDLE_INTERVAL: Duration = Duration::from_millis(10);
 
 /// Nothing comes if nothing came for so long.
 const IDLE_AFTER: Duration = Duration::from_secs(1);
+
+/// How long a belief waits for the frame that it is about: agents may be quicker than their server.
+const EARLY: Duration = Duration::from_millis(200);
 
 /// Most samples of a channel taken in at a look, so that browsers get their turn.
 const MOST_AT_ONCE: usize = 128;
@@ -40,15 +44,15 @@ const CLIENT_NAME: &str = "emberwatch-dashboard";
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum WatchError {
-    /// A channel cannot be had.
-    #[error(transparent)]
-    Channel(#[from] ChannelError),
+    /// The frames cannot be read.
+    #[error("{0}")]
+    Reader(String),
     /// A thread cannot be had.
     #[error("start a thread: {0}")]
     Thread(#[from] std::io::Error),
 }
 
-/// Fills the stage until `stop`.
+/// Fills the stage until `stop`, on the threads that are returned.
 ///
 /// # Errors
 /// [`WatchError`], also when there are too many observers.
@@ -56,23 +60,25 @@ pub fn watch(
     instance: &Instance,
     stage: &Arc<Stage>,
     stop: &Arc<AtomicBool>,
-) -> Result<(), WatchError> {
+) -> Result<[JoinHandle<()>; 2], WatchError> {
     let (ready, is_ready) = std::sync::mpsc::channel();
     let spawn = |name: &str| std::thread::Builder::new().name(name.into());
-    let (place, for_reader, until) = (instance.clone(), stage.clone(), stop.clone());
+    let (place, on, until) = (instance.clone(), stage.clone(), stop.clone());
     // Ports stay on the thread that made them.
-    spawn("reader").spawn(move || match Reader::open(&place) {
-        Ok(reader) => {
-            let _ = ready.send(Ok(()));
-            reader.read(&for_reader, &until);
+    let reader = spawn("reader").spawn(move || {
+        let opened = Reader::open(&place, &on);
+        let _ = ready.send(opened.as_ref().err().map(ToString::to_string));
+        if let Ok(reader) = opened {
+            read(reader, &place, &on, &until);
         }
-        Err(error) => drop(ready.send(Err(error))),
     })?;
-    if let Ok(Err(error)) = is_ready.recv() {
-        return Err(error.into());
+    match is_ready.recv() {
+        Ok(None) => {}
+        Ok(Some(problem)) => return Err(WatchError::Reader(problem)),
+        Err(_) => return Err(WatchError::Reader("it ended at once".into())),
     }
     let (place, stage, stop) = (instance.clone(), stage.clone(), stop.clone());
-    spawn("asker").spawn(move || {
+    let asker = spawn("asker").spawn(move || {
         while !stop.load(Ordering::Relaxed) {
             let problem = ask(&place, &stage, &stop);
             stage.change(|scene| {
@@ -83,7 +89,23 @@ pub fn watch(
             std::thread::sleep(ASK_INTERVAL);
         }
     })?;
-    Ok(())
+    Ok([reader, asker])
+}
+
+/// Reads until `stop`; opens what fails again.
+fn read(reader: Reader, instance: &Instance, stage: &Stage, stop: &AtomicBool) {
+    let mut reader = Ok(reader);
+    while !stop.load(Ordering::Relaxed) {
+        let failed = match reader {
+            Ok(reader) => reader.read(stage, stop).err(),
+            Err(error) => Some(error),
+        };
+        let Some(error) = failed else { return };
+        tracing::error!("{error}");
+        stage.change(|scene| scene.trouble = Some(error.to_string()));
+        std::thread::sleep(IDLE_AFTER);
+        reader = Reader::open(instance, stage);
+    }
 }
 
 /// Asks a server how it is until it is gone or `stop`.
@@ -113,8 +135,10 @@ fn status(connection: &mut Connection) -> Result<ServerStatus, ConnectionError> 
 /// The ports of an observer.
 struct Reader {
     frames: Observer<FrameHeader>,
-    truth: Observer<TruthHeader>,
-    agents: Observer<AgentHeader>,
+    truth: Option<Observer<TruthHeader>>,
+    agents: Option<Observer<AgentHeader>>,
+    /// Beliefs that came before their frames, and when.
+    early: Vec<(Outlook, Instant)>,
     frame_gaps: Gaps,
     truth_gaps: Gaps,
     agent_gaps: HashMap<u32, Gaps>,
@@ -129,7 +153,7 @@ struct Gaps {
 impl Gaps {
     /// Samples missing right before this one; another publisher begins a new row.
     fn before(&mut self, publisher: Option<u32>, sequence: u64) -> u64 {
-        let next = self.next.replace((publisher, sequence + 1));
+        let next = self.next.replace((publisher, sequence.wrapping_add(1)));
         match next {
             Some((before, next)) if before == publisher => sequence.saturating_sub(next),
             _ => 0,
@@ -138,67 +162,82 @@ impl Gaps {
 }
 
 impl Reader {
-    fn open(instance: &Instance) -> Result<Self, ChannelError> {
+    /// Opens the channels; those of hidden states and beliefs may be full, which is told and done without.
+    fn open(instance: &Instance, stage: &Stage) -> Result<Self, ChannelError> {
+        let frames = Observer::frames(instance)?;
+        let (truth, agents) = (Observer::truth(instance), Observer::agents(instance));
+        let trouble = [truth.as_ref().err(), agents.as_ref().err()];
+        let trouble: Vec<String> = trouble
+            .into_iter()
+            .flatten()
+            .map(ToString::to_string)
+            .collect();
+        trouble
+            .iter()
+            .for_each(|problem| tracing::warn!("{problem}"));
+        stage.change(|scene| scene.trouble = (!trouble.is_empty()).then(|| trouble.join("; ")));
         Ok(Self {
-            frames: Observer::frames(instance)?,
-            truth: Observer::truth(instance)?,
-            agents: Observer::agents(instance)?,
+            frames,
+            truth: truth.ok(),
+            agents: agents.ok(),
+            early: Vec::new(),
             frame_gaps: Gaps::default(),
             truth_gaps: Gaps::default(),
             agent_gaps: HashMap::new(),
         })
     }
 
-    fn read(mut self, stage: &Stage, stop: &AtomicBool) {
+    fn read(mut self, stage: &Stage, stop: &AtomicBool) -> Result<(), ChannelError> {
         let mut last = Instant::now();
         while !stop.load(Ordering::Relaxed) {
-            match self.look(stage) {
-                Ok(true) => last = Instant::now(),
-                Ok(false) => {}
-                Err(error) => {
-                    tracing::error!("{error}");
-                    stage.change(|scene| scene.note = Some(error.to_string()));
-                    return;
-                }
+            if self.look(stage)? {
+                last = Instant::now();
             }
             std::thread::sleep(match last.elapsed() < IDLE_AFTER {
                 true => LOOK_INTERVAL,
                 false => IDLE_INTERVAL,
             });
         }
+        Ok(())
     }
 
     /// Takes in what is there; whether anything was.
     fn look(&mut self, stage: &Stage) -> Result<bool, ChannelError> {
-        // Beliefs first: what they are about was published before them, so it is there when they are added.
-        let beliefs = all(&self.agents)?;
+        // Beliefs first: what they are about is published at about the same time, so it mostly is there then.
+        let beliefs = self.agents.as_ref().map_or(Ok(Vec::new()), all)?;
         let frames = all(&self.frames)?;
-        let truths = all(&self.truth)?;
+        let truths = self.truth.as_ref().map_or(Ok(Vec::new()), all)?;
         if beliefs.is_empty() && frames.is_empty() && truths.is_empty() {
             return Ok(false);
         }
-        let outlooks = beliefs.iter().map(Outlook::try_from);
-        let outlooks: Vec<Outlook> = outlooks
-            .filter_map(|outlook| outlook.inspect_err(|error| tracing::warn!("{error}")).ok())
-            .collect();
         let server = self.frames.publisher();
         let now = Instant::now();
         stage.change(|scene| {
             for frame in &frames {
-                scene.lost.frames += self.frame_gaps.before(server, frame.header.sequence);
+                let lost = self.frame_gaps.before(server, frame.header.sequence);
+                scene.lost.frames = scene.lost.frames.saturating_add(lost);
                 scene.album.add_frame(frame, now);
             }
             for truth in &truths {
-                scene.lost.truth += self.truth_gaps.before(server, truth.header.sequence);
+                let lost = self.truth_gaps.before(server, truth.header.sequence);
+                scene.lost.truth = scene.lost.truth.saturating_add(lost);
                 scene.album.add_truth(truth);
             }
-            let states = scene.states();
-            for outlook in &outlooks {
-                let (pid, sequence) = (outlook.header.pid, outlook.header.sequence);
+            for belief in &beliefs {
+                let (pid, sequence) = (belief.header.pid, belief.header.sequence);
                 let gaps = self.agent_gaps.entry(pid).or_default();
-                scene.lost.agent += gaps.before(Some(pid), sequence);
-                scene.album.add_belief(outlook, states.as_ref());
+                let lost = gaps.before(Some(pid), sequence);
+                scene.lost.agent = scene.lost.agent.saturating_add(lost);
+                match Outlook::try_from(belief) {
+                    Ok(outlook) => self.early.push((outlook, now)),
+                    Err(error) => tracing::warn!("{error}"),
+                }
             }
+            let states = scene.states();
+            self.early.retain(|(outlook, came)| {
+                let is_there = scene.album.add_belief(outlook, states.as_ref());
+                !is_there && now.duration_since(*came) < EARLY
+            });
         });
         Ok(true)
     }

@@ -159,6 +159,37 @@ fn what_was_seen_is_remembered_with_its_age() {
 }
 
 #[test]
+fn what_another_server_showed_before_is_not_remembered() {
+    let mut album = Album::default();
+    album.add_frame(&frame(5, [255, 255, 255, 0, 0, 0]), Instant::now());
+    for step in 1..=6 {
+        album.add_frame(&frame(step, [255, 1, 255, 255, 255, 255]), Instant::now());
+    }
+    let (header, array) = read(album, None);
+    assert_eq!(array("seen"), [255, 1, 255, 255, 255, 255]);
+    assert_eq!(header["shown"]["seen_since"], 0);
+}
+
+#[test]
+fn a_memory_says_how_far_it_reaches() {
+    let mut album = Album::default();
+    album.add_frame(&frame(7, [255, 1, 255, 255, 255, 255]), Instant::now());
+    album.add_frame(&frame(8, [255, 1, 255, 255, 255, 255]), Instant::now());
+    let (header, _) = read(album, None);
+    assert_eq!(header["shown"]["seen_since"], 7);
+    let shape = (&header["shown"]["height"], &header["shown"]["width"]);
+    assert_eq!(shape, (&Value::from(2), &Value::from(3)));
+}
+
+#[test]
+fn a_belief_without_its_frame_is_not_taken() {
+    let mut album = Album::default();
+    assert!(!album.add_belief(&outlook(1), None));
+    album.add_frame(&frame(1, [255; 6]), Instant::now());
+    assert!(album.add_belief(&outlook(1), None));
+}
+
+#[test]
 fn an_episode_that_begins_anew_remembers_nothing() {
     let mut album = Album::default();
     album.add_frame(&frame(5, [255, 0, 1, 255, 255, 255]), Instant::now());

@@ -6,12 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tensorboard.backend.event_processing import event_accumulator
 
 from emberwatch.programs import find
-
-event_accumulator = pytest.importorskip(
-    "tensorboard.backend.event_processing.event_accumulator", reason="group tensorboard"
-)
 
 WORLDS = "--height 6 --width 9 --moves 5 --burn-in 60".split()
 SETTINGS = """[learning]
