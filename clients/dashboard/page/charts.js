@@ -4,6 +4,7 @@ import { drawLine, drawStrip } from "/plot.js";
 import { make, swatch, write } from "/elements.js";
 import { objectiveColor } from "/palette.js";
 import { across } from "/scale.js";
+import { cellsOf } from "/wire.js";
 import { chartSentence, short, stateNames, targetName, text, whole } from "/words.js";
 
 const LINES = [
@@ -117,10 +118,6 @@ function clamp(serial, { first, last }) {
 function absence({ id }, picture) {
   if (id !== "log-loss") return "nothing yet";
   return picture.arrays.truth ? "needs a belief" : "needs the truth and a belief";
-}
-
-function cellsOf({ info }) {
-  return info ? info.height * info.width : null;
 }
 
 function listen(canvas, axis, { hover, seek }) {

@@ -2,6 +2,7 @@
 
 import { make, swatch } from "/elements.js";
 import { NEVER, rampColor } from "/palette.js";
+import { cellsOf, shapeOf } from "/wire.js";
 import { beliefNames, observationNames, stateNames } from "/words.js";
 
 // Long enough that a screen reader is not flooded while keys are held.
@@ -46,13 +47,13 @@ function robotCell({ shown }) {
 }
 
 function rowsOf(picture, { row, col }) {
-  const { info, arrays } = picture;
-  const at = row * info.width + col;
+  const { arrays } = picture;
+  const at = row * shapeOf(picture).width + col;
   const rows = [];
   if (arrays.truth) rows.push(named("state", arrays.truth[at], stateNames(picture), "states"));
   if (arrays.seen) rows.push(named("seen", arrays.seen[at], observationNames(picture), "observations"));
   if (arrays.age && arrays.seen?.[at] !== NEVER) rows.push({ name: "age", value: ageText(arrays.age[at]) });
-  const cells = info.height * info.width;
+  const cells = cellsOf(picture);
   beliefNames(picture).forEach((name, state) => {
     const share = arrays.belief[state * cells + at] / 255;
     rows.push({ name: `p(${name})`, value: share.toFixed(2), share, ramp: "belief" });

@@ -59,6 +59,7 @@ function draw() {
   controls.draw(picture);
   if (!picture.info || !picture.shown) return;
   const isRebuilt = panels.build(picture);
+  if (isRebuilt) act.within(shapeOf(picture));
   if (legend.draw(picture, palette) || isRebuilt) layout.shape(shapeOf(picture));
   panels.draw(picture, view, palette);
   charts.draw(picture, view, palette);

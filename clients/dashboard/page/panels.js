@@ -3,7 +3,7 @@
 import { make } from "/elements.js";
 import { drawMarks } from "/overlay.js";
 import { beliefNames, panelSentence, stateNames } from "/words.js";
-import { shapeOf } from "/wire.js";
+import { cellsOf, shapeOf } from "/wire.js";
 
 const OBSERVED = [
   { id: "truth", kind: "truth", title: "truth", hint: "hidden" },
@@ -106,9 +106,10 @@ function tableOf(kind, palette) {
   return kind === "truth" ? palette.stateTable : palette.frameTable;
 }
 
-function valuesOf({ kind, state }, { arrays, info }) {
+function valuesOf({ kind, state }, picture) {
+  const { arrays } = picture;
   if (kind !== "belief") return arrays[kind];
-  const cells = info.height * info.width;
+  const cells = cellsOf(picture);
   return arrays.belief?.subarray(state * cells, (state + 1) * cells);
 }
 

@@ -23,6 +23,8 @@ export function createView({ asks, changed }) {
     world(world) { if (world !== view.world) { view.world = world; view.at = null; writeHash(view); asks(); } },
     theme(theme) { view.theme = theme; writeHash(view); applyTheme(view); changed(); },
     cell(cell) { view.cell = cell; changed(); },
+    /** Another grid may lack the cell pointed at. */
+    within({ height, width }) { if (view.cell?.row >= height || view.cell?.col >= width) view.cell = null; },
     hover(serial) { if (serial !== view.hover) { view.hover = serial; changed(); } },
     player(wish) { Object.assign(view.player, wish); asks(); },
   };
