@@ -21,7 +21,9 @@ let picture = null;
 let described = 0;
 let isRedrawDue = false;
 
-const { view, act } = createView({ asks: () => link?.hurry(), changed: redraw });
+const { view, act } = createView({
+  asks: () => link?.hurry(), changed: redraw, worlds: () => picture?.info?.n_worlds,
+});
 const inspector = createInspector(byId("announce-cell"));
 const panels = createPanels(byId("panels"), { point, inspector: inspector.root });
 const charts = createCharts(byId("charts"), { hover: act.hover, seek: act.seek });
