@@ -117,7 +117,13 @@ function clamp(serial, { first, last }) {
 
 function absence({ id }, picture) {
   if (id !== "log-loss") return "nothing yet";
-  return picture.arrays.truth ? "needs a belief" : "needs the truth and a belief";
+  const { arrays, info, agent } = picture;
+  if (arrays.belief && agent && info.states && agent.states.join() !== info.states.join()) {
+    return "no score: its states are not the model's";
+  }
+  if (!arrays.truth) return "needs the truth and a belief";
+  if (!arrays.belief) return "needs a belief";
+  return info.states ? "nothing yet" : "needs to know the model";
 }
 
 function listen(canvas, axis, { hover, seek }) {

@@ -3,7 +3,7 @@
 import { make, swatch } from "/elements.js";
 import { NEVER, rampColor } from "/palette.js";
 import { cellsOf, shapeOf } from "/wire.js";
-import { beliefNames, observationNames, stateNames } from "/words.js";
+import { beliefNames, observationNames, seenSince, stateNames } from "/words.js";
 
 // Long enough that a screen reader is not flooded while keys are held.
 const QUIET_MILLIS = 400;
@@ -51,7 +51,7 @@ function rowsOf(picture, { row, col }) {
   const at = row * shapeOf(picture).width + col;
   const rows = [];
   if (arrays.truth) rows.push(named("state", arrays.truth[at], stateNames(picture), "states"));
-  if (arrays.seen) rows.push(named("seen", arrays.seen[at], observationNames(picture), "observations"));
+  if (arrays.seen) rows.push(seenRow(picture, arrays.seen[at]));
   if (arrays.age && arrays.seen?.[at] !== NEVER) rows.push({ name: "age", value: ageText(arrays.age[at]) });
   const cells = cellsOf(picture);
   beliefNames(picture).forEach((name, state) => {
@@ -62,8 +62,13 @@ function rowsOf(picture, { row, col }) {
   return rows;
 }
 
+function seenRow(picture, value) {
+  if (value !== NEVER) return named("seen", value, observationNames(picture), "observations");
+  const since = seenSince(picture);
+  return { name: "seen", value: since ? `not ${since}` : "never" };
+}
+
 function named(name, value, names, of) {
-  if (value === NEVER) return { name, value: "never" };
   return { name, value: names[value] ?? `value ${value}`, color: [of, value] };
 }
 

@@ -20,6 +20,7 @@ const byId = (id) => document.getElementById(id);
 let picture = null;
 let described = 0;
 let isRedrawDue = false;
+let hasFailed = false;
 
 const { view, act } = createView({
   asks: () => link?.hurry(), changed: redraw, worlds: () => picture?.info?.n_worlds,
@@ -41,7 +42,7 @@ const link = connect({
   show,
   superseded: (next) => next.world !== view.world,
   up: (isUp) => { if (!isUp) facts.gone(); },
-  failed(error) { facts.failed(error); console.error(error); },
+  failed,
 });
 
 function show(next) {
@@ -53,6 +54,13 @@ function show(next) {
   draw();
   window.emberwatch.picture = picture;
   window.emberwatch.drawn += 1;
+}
+
+// Every picture may fail alike: the page tells it as long as it lasts, the console once.
+function failed(error) {
+  facts.failed(error);
+  if (!hasFailed) console.error(error);
+  hasFailed = true;
 }
 
 function draw() {

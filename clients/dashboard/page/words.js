@@ -48,6 +48,11 @@ export function targetName(picture) {
   return target == null ? "target" : stateNames(picture)[target] ?? "target";
 }
 
+/** From which step "seen so far" knows, such as "since k = 12"; empty if from the episode's first. */
+export function seenSince({ shown }) {
+  return shown?.seen_since > 0 ? `since k = ${whole(shown.seen_since)}` : "";
+}
+
 /** What a panel shows, in one sentence, for people who do not see it. */
 export function panelSentence(panel, picture) {
   const { shown, info } = picture;
@@ -58,7 +63,8 @@ export function panelSentence(panel, picture) {
     case "truth":
       return `truth: ${whole(shown.n_target_cells)} of ${cells} cells in state ${targetName(picture)} ${at}`;
     case "seen":
-      return `seen so far: ${whole(observed(picture.arrays.seen))} of ${cells} cells observed ${at}`;
+      return `seen so far: ${whole(observed(picture.arrays.seen))} of ${cells} cells observed` +
+        `${seenSince(picture) && ` ${seenSince(picture)}`} ${at}`;
     case "frame":
       return `this path: ${whole(shown.n_visited)} cells visited, ${whole(shown.n_hits)} of them ` +
         `${targetName(picture)}, robot at row ${shown.robot[0]}, column ${shown.robot[1]} ${at}`;
