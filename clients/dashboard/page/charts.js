@@ -4,6 +4,7 @@ import { drawLine, drawStrip } from "/plot.js";
 import { make, swatch, write } from "/elements.js";
 import { objectiveColor } from "/palette.js";
 import { across } from "/scale.js";
+import { cellsOf } from "/wire.js";
 import { chartSentence, short, stateNames, targetName, text, whole } from "/words.js";
 
 const LINES = [
@@ -116,11 +117,13 @@ function clamp(serial, { first, last }) {
 
 function absence({ id }, picture) {
   if (id !== "log-loss") return "nothing yet";
-  return picture.arrays.truth ? "needs a belief" : "needs the truth and a belief";
-}
-
-function cellsOf({ info }) {
-  return info ? info.height * info.width : null;
+  const { arrays, info, agent } = picture;
+  if (arrays.belief && agent && info.states && agent.states.join() !== info.states.join()) {
+    return "no score: its states are not the model's";
+  }
+  if (!arrays.truth) return "needs the truth and a belief";
+  if (!arrays.belief) return "needs a belief";
+  return info.states ? "nothing yet" : "needs to know the model";
 }
 
 function listen(canvas, axis, { hover, seek }) {

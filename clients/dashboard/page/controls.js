@@ -1,6 +1,7 @@
 // What can be pressed: pause, scrub, world, theme, and a recording's player; and the keys for them.
 
 import { write } from "/elements.js";
+import { MOST_WORLDS } from "/view.js";
 import { whole } from "/words.js";
 
 const byId = (id) => document.getElementById(id);
@@ -84,11 +85,13 @@ function drawScrub({ kept, shown }, { at }) {
     : at == null ? `newest of ${whole(kept.last - kept.first + 1)}` : `${whole(kept.last - serial)} behind`);
 }
 
-function drawWorlds({ info, world }, view) {
+function drawWorlds({ info }, view) {
   const select = byId("world");
-  const count = Math.max(info?.n_worlds ?? 1, view.world + 1, world + 1);
-  if (select.options.length !== count) {
-    select.replaceChildren(...Array.from({ length: count }, (_, i) => new Option(String(i), String(i))));
+  // Before a server tells how many there are, the one that is asked for.
+  const [first, count] = info ? [0, Math.min(info.n_worlds, MOST_WORLDS)] : [view.world, 1];
+  if (select.options.length !== count || select.options[0].value !== String(first)) {
+    const numbers = Array.from({ length: count }, (_, i) => String(first + i));
+    select.replaceChildren(...numbers.map((number) => new Option(number, number)));
   }
   select.value = String(view.world);
 }

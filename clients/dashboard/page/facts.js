@@ -19,12 +19,13 @@ export function createFacts() {
 
   return {
     draw(picture, view) {
-      drawState(picture.state, isToldLarge(picture) ? null : picture.note ?? picture.player?.error);
+      const state = stateOf(picture);
+      drawState(state, isToldLarge(picture) ? null : picture.note ?? picture.player?.error);
       drawServer(picture);
       drawWorld(picture);
       drawAgent(picture, view.at == null);
       drawEmpty(picture);
-      say(picture.note ?? picture.player?.error ?? `${picture.state}, world ${picture.world}`);
+      say(picture.note ?? picture.player?.error ?? `${state}, world ${picture.world}`);
     },
     /** The dashboard itself went away: what was drawn last stays. */
     gone() {
@@ -33,8 +34,16 @@ export function createFacts() {
     },
     failed(error) {
       drawState("unreadable", `The dashboard sent what this page cannot read: ${error.message}`);
+      say("the dashboard sent what this page cannot read");
     },
   };
+}
+
+// Nobody serves a recording: it plays or rests.
+function stateOf({ state, source, player }) {
+  if (source !== "recording" || state !== "serving") return state;
+  if (player?.ended) return "ended";
+  return player?.playing === false ? "paused" : "playing";
 }
 
 // Before the first server the whole page says that one is waited for.
@@ -57,8 +66,18 @@ function drawServer({ status, lost, instance, source }) {
   for (const fact of document.querySelectorAll(".of-server")) fact.hidden = !isLive;
   write(byId("rate"), short(status?.steps_per_second));
   write(byId("observers"), whole(status?.n_observers));
+  drawLost(lost);
+}
+
+// Frames always, as their absence is good news; the rest only if there is any.
+function drawLost(lost) {
+  const others = [["truth", lost?.truth], ["beliefs", lost?.agent]].filter(([, count]) => count > 0);
+  const words = others.map(([name, count]) => ` · ${name} ${whole(count)}`).join("");
   write(byId("lost"), whole(lost?.frames));
-  byId("lost-fact").classList.toggle("is-alarming", lost?.frames > 0);
+  write(byId("lost-others"), words);
+  const fact = byId("lost-fact");
+  fact.title = `lost since attached: frames ${whole(lost?.frames)}${words}`;
+  fact.classList.toggle("is-alarming", lost?.frames > 0 || others.length > 0);
 }
 
 function drawWorld(picture) {

@@ -2,7 +2,8 @@
 
 import { make, swatch } from "/elements.js";
 import { NEVER, rampColor } from "/palette.js";
-import { beliefNames, observationNames, stateNames } from "/words.js";
+import { cellsOf, shapeOf } from "/wire.js";
+import { beliefNames, observationNames, seenSince, stateNames } from "/words.js";
 
 // Long enough that a screen reader is not flooded while keys are held.
 const QUIET_MILLIS = 400;
@@ -46,13 +47,13 @@ function robotCell({ shown }) {
 }
 
 function rowsOf(picture, { row, col }) {
-  const { info, arrays } = picture;
-  const at = row * info.width + col;
+  const { arrays } = picture;
+  const at = row * shapeOf(picture).width + col;
   const rows = [];
   if (arrays.truth) rows.push(named("state", arrays.truth[at], stateNames(picture), "states"));
-  if (arrays.seen) rows.push(named("seen", arrays.seen[at], observationNames(picture), "observations"));
+  if (arrays.seen) rows.push(seenRow(picture, arrays.seen[at]));
   if (arrays.age && arrays.seen?.[at] !== NEVER) rows.push({ name: "age", value: ageText(arrays.age[at]) });
-  const cells = info.height * info.width;
+  const cells = cellsOf(picture);
   beliefNames(picture).forEach((name, state) => {
     const share = arrays.belief[state * cells + at] / 255;
     rows.push({ name: `p(${name})`, value: share.toFixed(2), share, ramp: "belief" });
@@ -61,8 +62,13 @@ function rowsOf(picture, { row, col }) {
   return rows;
 }
 
+function seenRow(picture, value) {
+  if (value !== NEVER) return named("seen", value, observationNames(picture), "observations");
+  const since = seenSince(picture);
+  return { name: "seen", value: since ? `not ${since}` : "never" };
+}
+
 function named(name, value, names, of) {
-  if (value === NEVER) return { name, value: "never" };
   return { name, value: names[value] ?? `value ${value}`, color: [of, value] };
 }
 

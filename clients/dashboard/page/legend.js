@@ -4,6 +4,9 @@ import { make, swatch } from "/elements.js";
 import { rampStops } from "/palette.js";
 import { beliefNames, observationNames, stateNames } from "/words.js";
 
+// More names than this would leave no room for what they explain.
+const MOST_NAMES = 16;
+
 /** The legends above and below the panels; drawn anew only when they change. */
 export function createLegend(list, ramps) {
   let drawn = "";
@@ -13,7 +16,8 @@ export function createLegend(list, ramps) {
       const observations = observationNames(picture);
       const believed = beliefNames(picture).length;
       const { theme } = palette;
-      const key = JSON.stringify([states, observations, believed, theme, palette.states]);
+      const { state_colours: ofStates, observation_colours: ofObservations } = picture.info;
+      const key = JSON.stringify([states, observations, believed, theme, ofStates, ofObservations]);
       if (key === drawn) return false;
       drawn = key;
       list.replaceChildren(...values(states, observations, palette), ...marks(palette));
@@ -27,10 +31,14 @@ export function createLegend(list, ramps) {
 }
 
 function values(states, observations, palette) {
-  const ofStates = states.map((name, i) => value(name, palette.states[i]));
+  const ofStates = named(states, palette.states);
   if (states.join() === observations.join() || observations.length === 0) return ofStates;
-  const ofObservations = observations.map((name, i) => value(name, palette.observations[i]));
-  return [word("state"), ...ofStates, word("observed"), ...ofObservations];
+  return [word("state"), ...ofStates, word("observed"), ...named(observations, palette.observations)];
+}
+
+function named(names, colors) {
+  const items = names.slice(0, MOST_NAMES).map((name, i) => value(name, colors[i]));
+  return names.length > MOST_NAMES ? [...items, word(`and ${names.length - MOST_NAMES} more`)] : items;
 }
 
 function value(name, color) {

@@ -20,8 +20,11 @@ const byId = (id) => document.getElementById(id);
 let picture = null;
 let described = 0;
 let isRedrawDue = false;
+let hasFailed = false;
 
-const { view, act } = createView({ asks: () => link?.hurry(), changed: redraw });
+const { view, act } = createView({
+  asks: () => link?.hurry(), changed: redraw, worlds: () => picture?.info?.n_worlds,
+});
 const inspector = createInspector(byId("announce-cell"));
 const panels = createPanels(byId("panels"), { point, inspector: inspector.root });
 const charts = createCharts(byId("charts"), { hover: act.hover, seek: act.seek });
@@ -39,7 +42,7 @@ const link = connect({
   show,
   superseded: (next) => next.world !== view.world,
   up: (isUp) => { if (!isUp) facts.gone(); },
-  failed(error) { facts.failed(error); console.error(error); },
+  failed,
 });
 
 function show(next) {
@@ -53,12 +56,20 @@ function show(next) {
   window.emberwatch.drawn += 1;
 }
 
+// Every picture may fail alike: the page tells it as long as it lasts, the console once.
+function failed(error) {
+  facts.failed(error);
+  if (!hasFailed) console.error(error);
+  hasFailed = true;
+}
+
 function draw() {
   const palette = colours.paletteOf(picture, themeOf(view));
   facts.draw(picture, view);
   controls.draw(picture);
   if (!picture.info || !picture.shown) return;
   const isRebuilt = panels.build(picture);
+  if (isRebuilt) act.within(shapeOf(picture));
   if (legend.draw(picture, palette) || isRebuilt) layout.shape(shapeOf(picture));
   panels.draw(picture, view, palette);
   charts.draw(picture, view, palette);

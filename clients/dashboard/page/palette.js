@@ -28,6 +28,12 @@ const RAMPS = {
 // Before an agent has planned its first path.
 const IDLE = { name: "nothing yet", color: "#8b93a0" };
 
+// Beyond those lists each next hue is this far on, in degrees (the golden angle), so that neighbours differ;
+// lightness takes turns.
+const HUE_STEP = 137.508;
+const LIGHTNESSES = [0.42, 0.66, 0.3];
+const SATURATION = 0.55;
+
 // For objectives that name no state; apart from the wildfire's colours.
 const OBJECTIVES = ["#8a63b8", "#009e73", "#cc79a7", "#56b4e9", "#8c510a"];
 
@@ -40,7 +46,7 @@ const OLDEST_SHARE = 0.4;
 const HALF_AGE = 24;
 
 /**
- * The colours of a picture's model under a theme: `states` and `observations` as "#rrggbb" by number,
+ * The colours of a picture's model under a theme: `states` and `observations` as "#rrggbb" by any byte,
  * `unseen`, and tables of pixels: `stateTable` and `frameTable` by value, `seenTable` by
  * `value * 256 + age`, `rampTable(name)` by value 0..255.
  */
@@ -53,7 +59,7 @@ function make(ownStates, ownObservations, theme) {
   const states = colorsOf(ownStates);
   const observations = colorsOf(ownObservations);
   const unseen = unlike([...(ownStates ?? COLORS), ...(ownObservations ?? [])], UNSEEN[theme]);
-  const value = (colors) => (at) => channels(at === NEVER ? unseen : colors[at % colors.length]);
+  const value = (colors) => (at) => channels(at === NEVER ? unseen : colors[at]);
   const seen = value(observations);
   return {
     theme,
@@ -67,13 +73,14 @@ function make(ownStates, ownObservations, theme) {
   };
 }
 
-/** The colour of an objective: that of the state it names, else one of its own. */
+/** The colour of an objective: that of the state whose name it is, else one of its own. */
 export function objectiveColor(name, { objectives, names, palette }) {
   if (name === IDLE.name) return IDLE.color;
-  const stateOf = (objective) => names.findIndex((state) => objective.includes(state));
-  if (stateOf(name) >= 0) return palette.states[stateOf(name)];
-  const others = objectives.filter((other) => stateOf(other) < 0 && other !== IDLE.name);
-  return OBJECTIVES[Math.max(0, others.indexOf(name)) % OBJECTIVES.length];
+  const state = names.indexOf(name);
+  if (state >= 0) return palette.states[state];
+  const others = objectives.filter((other) => !names.includes(other) && other !== IDLE.name);
+  const at = Math.max(0, others.indexOf(name));
+  return OBJECTIVES[at] ?? generated(at);
 }
 
 /** "#rrggbb" as [red, green, blue]. */
@@ -94,9 +101,19 @@ export function rampStops(name, theme) {
   return RAMPS[name][theme];
 }
 
-// The model's own colours first; what they lack comes from here.
+// One for each byte: the model's own colours first; what they lack comes from here.
 function colorsOf(own) {
-  return [...(own ?? []), ...COLORS.slice(own?.length ?? 0)];
+  return Array.from({ length: 256 }, (_, at) => own?.[at] ?? COLORS[at] ?? generated(at));
+}
+
+function generated(at) {
+  const lightness = LIGHTNESSES[at % LIGHTNESSES.length];
+  const reach = SATURATION * Math.min(lightness, 1 - lightness);
+  const channel = (shift) => {
+    const turn = (shift + (at * HUE_STEP) / 30) % 12;
+    return Math.round(255 * (lightness - reach * Math.max(-1, Math.min(turn - 3, 9 - turn, 1))));
+  };
+  return `#${[0, 8, 4].map((shift) => channel(shift).toString(16).padStart(2, "0")).join("")}`;
 }
 
 /** The first grey that is well apart from all colours, else the one furthest from them. */

@@ -1,9 +1,9 @@
 // The grids: one canvas with a pixel per cell for each, a second one above it for marks.
 
-import { make } from "/elements.js";
+import { make, write } from "/elements.js";
 import { drawMarks } from "/overlay.js";
-import { beliefNames, panelSentence, stateNames } from "/words.js";
-import { shapeOf } from "/wire.js";
+import { beliefNames, panelSentence, seenSince, stateNames } from "/words.js";
+import { cellsOf, shapeOf } from "/wire.js";
 
 const OBSERVED = [
   { id: "truth", kind: "truth", title: "truth", hint: "hidden" },
@@ -72,7 +72,7 @@ function element(panel, picture, point) {
   figure.append(caption, grid);
   listen(grid, { height, width }, point);
   const context = cells.getContext("2d");
-  return { ...panel, figure, cells, marks, absent, context, image: context.createImageData(width, height) };
+  return { ...panel, figure, caption, cells, marks, absent, context, image: context.createImageData(width, height) };
 }
 
 function paint(panel, picture, view, palette) {
@@ -83,6 +83,7 @@ function paint(panel, picture, view, palette) {
     panel.absent.replaceChildren(reason, ...(flag ? [make("code", "", {}, flag)] : []));
   }
   panel.figure.classList.toggle("is-absent", !values);
+  if (panel.kind === "seen") write(panel.caption.lastChild, seenSince(picture) || panel.hint);
   if (values) {
     const pixels = new Uint32Array(panel.image.data.buffer);
     fill(pixels, values, panel, picture, palette);
@@ -106,9 +107,10 @@ function tableOf(kind, palette) {
   return kind === "truth" ? palette.stateTable : palette.frameTable;
 }
 
-function valuesOf({ kind, state }, { arrays, info }) {
+function valuesOf({ kind, state }, picture) {
+  const { arrays } = picture;
   if (kind !== "belief") return arrays[kind];
-  const cells = info.height * info.width;
+  const cells = cellsOf(picture);
   return arrays.belief?.subarray(state * cells, (state + 1) * cells);
 }
 

@@ -2,12 +2,18 @@
 // and theme, so that a link or a reload brings them back.
 
 const THEMES = ["auto", "light", "dark"];
+// Worlds that an address may name while nobody knows how many there are, and that can be selected at all.
+export const MOST_WORLDS = 4096;
 const darkness = matchMedia("(prefers-color-scheme: dark)");
 
-/** The view, with `asks()` called when another picture is wanted and `changed()` when only looks change. */
-export function createView({ asks, changed }) {
+/**
+ * The view, with `asks()` called when another picture is wanted and `changed()` when only looks change.
+ * `worlds()` gives how many there are, if that is known.
+ */
+export function createView({ asks, changed, worlds }) {
+  const read = () => readHash(Math.min(worlds() ?? MOST_WORLDS, MOST_WORLDS));
   const view = {
-    ...readHash(),
+    ...read(),
     /** Serial of the entry to look at; null: the newest. */
     at: null,
     /** The cell pointed at, { row, col }; null: none. */
@@ -23,13 +29,15 @@ export function createView({ asks, changed }) {
     world(world) { if (world !== view.world) { view.world = world; view.at = null; writeHash(view); asks(); } },
     theme(theme) { view.theme = theme; writeHash(view); applyTheme(view); changed(); },
     cell(cell) { view.cell = cell; changed(); },
+    /** Another grid may lack the cell pointed at. */
+    within({ height, width }) { if (view.cell?.row >= height || view.cell?.col >= width) view.cell = null; },
     hover(serial) { if (serial !== view.hover) { view.hover = serial; changed(); } },
     player(wish) { Object.assign(view.player, wish); asks(); },
   };
 
   darkness.addEventListener("change", changed);
   addEventListener("hashchange", () => {
-    const { world, theme } = readHash();
+    const { world, theme } = read();
     act.world(world);
     act.theme(theme);
   });
@@ -50,12 +58,12 @@ export function askOf(view, bins) {
   return { world: view.world, at: view.at, bins, speed, playing };
 }
 
-function readHash() {
+function readHash(worlds) {
   const hash = new URLSearchParams(location.hash.slice(1));
-  const world = Number(hash.get("world"));
+  const world = /^\d+$/.test(hash.get("world")) ? Number(hash.get("world")) : 0;
   const theme = hash.get("theme");
   return {
-    world: Number.isInteger(world) && world >= 0 ? world : 0,
+    world: world < worlds ? world : 0,
     theme: THEMES.includes(theme) ? theme : "auto",
   };
 }

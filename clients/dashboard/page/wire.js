@@ -24,10 +24,19 @@ export function decode(buffer) {
   return { ...picture, arrays };
 }
 
-/** Height and width of the grids in a picture, or null before any is known. */
+/**
+ * Height and width of the grids in a picture, or null before any is known: those of the entry shown,
+ * as the server may be a new one with another grid.
+ */
 export function shapeOf(picture) {
-  const info = picture?.info;
-  return info ? { height: info.height, width: info.width } : null;
+  const of = picture?.shown?.height ? picture.shown : picture?.info;
+  return of ? { height: of.height, width: of.width } : null;
+}
+
+/** How many cells its grids have; null before any is known. */
+export function cellsOf(picture) {
+  const shape = shapeOf(picture);
+  return shape && shape.height * shape.width;
 }
 
 function header(buffer) {
@@ -42,9 +51,8 @@ function header(buffer) {
 
 // A grid of another size would be painted askew, so it is refused instead.
 function checkGrids(picture, arrays) {
-  const shape = shapeOf(picture);
-  if (!shape) return;
-  const cells = shape.height * shape.width;
+  const cells = cellsOf(picture);
+  if (!cells) return;
   for (const name of ["truth", "frame", "seen", "age", "entropy"]) {
     if (arrays[name] && arrays[name].length !== cells) {
       throw new Error(`array ${name}: expected ${cells} cells, got ${arrays[name].length}`);

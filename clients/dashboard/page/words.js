@@ -1,5 +1,7 @@
 // Numbers and names as people read them, and the sentences that stand in for pictures.
 
+import { cellsOf } from "/wire.js";
+
 const WHOLE = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 const UNKNOWN = "–";
 
@@ -35,7 +37,7 @@ export function observationNames(picture) {
 export function beliefNames(picture) {
   const { belief } = picture.arrays;
   if (!belief || !picture.info) return [];
-  const count = belief.length / (picture.info.height * picture.info.width);
+  const count = belief.length / cellsOf(picture);
   const names = picture.agent?.states ?? picture.info.states;
   return names?.length === count ? names : numbered("state", count);
 }
@@ -46,17 +48,23 @@ export function targetName(picture) {
   return target == null ? "target" : stateNames(picture)[target] ?? "target";
 }
 
+/** From which step "seen so far" knows, such as "since k = 12"; empty if from the episode's first. */
+export function seenSince({ shown }) {
+  return shown?.seen_since > 0 ? `since k = ${whole(shown.seen_since)}` : "";
+}
+
 /** What a panel shows, in one sentence, for people who do not see it. */
 export function panelSentence(panel, picture) {
   const { shown, info } = picture;
   if (!shown || !info) return `${panel.title}: nothing yet`;
   const at = `at step ${whole(shown.step)}`;
-  const cells = whole(info.height * info.width);
+  const cells = whole(cellsOf(picture));
   switch (panel.kind) {
     case "truth":
       return `truth: ${whole(shown.n_target_cells)} of ${cells} cells in state ${targetName(picture)} ${at}`;
     case "seen":
-      return `seen so far: ${whole(observed(picture.arrays.seen))} of ${cells} cells observed ${at}`;
+      return `seen so far: ${whole(observed(picture.arrays.seen))} of ${cells} cells observed` +
+        `${seenSince(picture) && ` ${seenSince(picture)}`} ${at}`;
     case "frame":
       return `this path: ${whole(shown.n_visited)} cells visited, ${whole(shown.n_hits)} of them ` +
         `${targetName(picture)}, robot at row ${shown.robot[0]}, column ${shown.robot[1]} ${at}`;
@@ -81,7 +89,7 @@ function observed(seen) {
 }
 
 function share(picture, { kind, state }) {
-  const cells = picture.info.height * picture.info.width;
+  const cells = cellsOf(picture);
   const values = kind === "belief"
     ? picture.arrays.belief?.subarray(state * cells, (state + 1) * cells)
     : picture.arrays.entropy;
