@@ -4,7 +4,8 @@ use crate::harness::{PATIENCE, Program, Server, eventually};
 use protocol::message::AgentHeader;
 use protocol::observer::Observer;
 use protocol::outlook::Outlook;
-use std::time::Instant;
+use std::collections::BTreeSet;
+use std::time::{Duration, Instant};
 
 fn run(server: &Server, flags: &[&str]) -> Program {
     let common = ["run", "--instance", server.instance.name()];
@@ -64,4 +65,33 @@ fn beliefs_that_nobody_looks_at_are_not_shown() {
     assert_eq!(shown[0].header.sequence, 0);
     assert!(shown[0].header.step > 100, "a belief of before");
     assert_eq!(shown[0].header.pid, agent.pid());
+}
+
+#[test]
+fn a_comparison_that_is_watched_shows_the_beliefs_of_all_its_worlds() {
+    let flags = "--worlds 8 --publish-truth --height 8 --width 9 --moves 6 --burn-in 50";
+    let server = Server::start(flags);
+    let observer = Observer::agents(&server.instance).expect("observe");
+    let what = "compare --policies beam_exploit --baseline beam_exploit --seeds 0..8 --steps 600";
+    let words = format!(
+        "{what} --watch 127.0.0.1:0 --instance {}",
+        server.instance.name()
+    );
+    let comparison = Program::start("emberwatch-agent", &words.split(' ').collect::<Vec<_>>());
+    let mut missing: BTreeSet<u32> = (0..8).collect();
+    let start = Instant::now();
+    while !missing.is_empty() {
+        let remaining = PATIENCE.saturating_sub(start.elapsed());
+        let sample = observer.receive(remaining).expect("receive");
+        let sample = sample.unwrap_or_else(|| panic!("no belief about worlds {missing:?}"));
+        missing.remove(&sample.header.world);
+        std::thread::sleep(Duration::from_millis(2)); // as a dashboard looks
+    }
+    let ended = comparison.wait(PATIENCE);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert!(
+        ended.stderr.contains("watch at http://127.0.0.1:"),
+        "{}",
+        ended.stderr
+    );
 }
