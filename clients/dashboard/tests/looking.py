@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from playwright.sync_api import Locator, Page
+from playwright.sync_api import Locator, Page, WebSocketRoute
 
 from running import eventually
 
@@ -43,6 +43,20 @@ class Look:
             for complaint in self._complaints
             if not any(re.search(pattern, complaint) for pattern in self.allowed)
         ]
+
+    def heard(self, pattern: str) -> int:
+        """How often something was said on the console."""
+        return sum(bool(re.search(pattern, complaint)) for complaint in self._complaints)
+
+    def alter(self, change: Callable[[bytes], bytes]) -> None:
+        """Loads the page anew; what the dashboard sends it is changed on the way."""
+
+        def route(socket: WebSocketRoute) -> None:
+            dashboard = socket.connect_to_server()
+            dashboard.on_message(lambda message: socket.send(change(message)))
+
+        self.page.route_web_socket(re.compile("/socket$"), route)
+        self.page.reload()
 
     def at(self, testid: str) -> Locator:
         """The element of a test hook."""

@@ -118,6 +118,7 @@ def test_panels_show_what_was_published(programs, open_page, model, shape):
         f"step {STEPS} with its belief",
     )
     check_arrays(look, witness)
+    check_marks(look, witness)
     unseen = UNSEEN | ({"light": "484848"} if "road-ice" in model else {})
     for theme in ("light", "dark"):
         look.page.get_by_label(theme).check(force=True)
@@ -140,6 +141,40 @@ def check_arrays(look, witness: Witness) -> None:
     check_levels(look.array("belief"), 255 * belief)
     logarithms = np.log(belief, where=belief > 0, out=np.zeros_like(belief))
     check_levels(look.array("entropy"), -255 * (belief * logarithms).sum(0) / np.log(len(belief)))
+
+
+def check_marks(look, witness: Witness) -> None:
+    """The path's line, its start and the robot are where they were, and no mark is elsewhere."""
+    pixels = look.pixels("overlay-frame").astype(int)
+    shape = look.pixels("panel-frame").shape[:2]
+    scale = np.array(pixels.shape[:2]) / shape
+    is_marked = pixels[..., 3] > 0
+    # A thin line between two rows of pixels covers half of each.
+    is_dark = (pixels[..., 3] > 64) & (np.abs(pixels[..., :3] - 0x14) <= 4).all(-1)
+    is_light = (pixels == 255).all(-1)
+    last, before = witness.frames[STEPS].result, witness.frames[STEPS - 1].result
+    start, robot = (before.row, before.col), (last.row, last.col)
+    path = np.array(look.picture(".shown.path"))
+    assert tuple(path[0]) == start
+    assert tuple(path[-1]) == robot
+
+    def around(cell: tuple[int, int], reach: float) -> tuple[slice, slice]:
+        low = np.floor((np.array(cell) + 0.5 - reach).clip(0) * scale).astype(int)
+        high = np.ceil((np.array(cell) + 0.5 + reach) * scale).astype(int)
+        return slice(low[0], high[0]), slice(low[1], high[1])
+
+    for cell in (start, robot):
+        assert is_light[around(cell, 1.5)].any(), f"a light mark at {cell}"
+    n_line = 0
+    for cell in np.ndindex(*shape):
+        from_marks = np.abs(np.array([start, robot]) - cell).max(-1).min()
+        from_path = np.abs(path - cell).max(-1).min()
+        if from_marks > 3 and from_path == 0:
+            n_line += 1
+            assert is_dark[around(cell, 0.3)].any(), f"the path's line at {cell}"
+        elif from_marks > 3 and from_path > 1:
+            assert not is_marked[around(cell, 0.4)].any(), f"no mark at {cell}"
+    assert n_line > 0
 
 
 def check_levels(levels: np.ndarray, exact: np.ndarray) -> None:

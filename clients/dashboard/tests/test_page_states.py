@@ -102,6 +102,24 @@ def test_a_server_that_is_killed_is_waited_for(watched, programs):
     look.wait_for_steps()
 
 
+def test_a_server_with_another_grid_takes_over(watched, programs):
+    server, look = watched.server, watched.look
+    box = look.at("panel-truth").bounding_box()
+    look.at("panel-truth").hover(position={"x": box["width"] - 2, "y": box["height"] - 2})
+    look.eventually(lambda: look.page.get_by_text("row 23, col 31").is_visible(), "the last cell")
+    server.kill()
+    look.eventually(lambda: look.text("state") == "waiting", "waiting")
+    programs.server(server.instance, height=20, width=36, publish_truth=True, seed=9)
+    look.eventually(lambda: look.text("state") == "serving", "serving")
+    programs.agent(server.instance)
+    look.eventually(
+        lambda: look.picture(".arrays.truth.length") == 20 * 36 and look.has("belief"),
+        "the new grid with a belief",
+    )
+    assert look.pixels("panel-truth").shape == (20, 36, 4)
+    look.wait_for_steps()
+
+
 def test_another_agent_takes_over(watched, programs):
     server, look = watched.server, watched.look
     assert look.text("policy") == "beam_exploit"

@@ -40,6 +40,68 @@ def test_a_world_that_is_not_there(programs, open_page):
     assert look.picture(".world") == 0
 
 
+@pytest.mark.parametrize("bad", ["#world=99999999999", "#world=-1", "#world=1e2", "#%&theme=pink"])
+def test_an_address_that_makes_no_sense(programs, open_page, bad):
+    server = programs.server(worlds=2, seed=20)
+    look = open_page(programs.dashboard(server.instance), hash=bad)
+    look.eventually(lambda: look.picture(".shown.seed") == "20", "the first world")
+    assert look.at("world-select").locator("option").all_text_contents() == ["0", "1"]
+    look.at("world-select").select_option("1")
+    look.eventually(lambda: look.picture(".shown.seed") == "21", "the second")
+    look.page.evaluate(f"location.hash = '{bad}'")
+    look.eventually(lambda: look.picture(".shown.seed") == "20", "the first again")
+    assert look.at("world-select").input_value() == "0"
+    assert look.at("world-select").locator("option").count() == 2
+
+
+def model_of_ten_observations() -> str:
+    """A model file: two states, each seen as one of ten things."""
+    shares = [0.19, 0.17, 0.15, 0.13, 0.11, 0.09, 0.07, 0.05, 0.03, 0.01]
+    weights = "[[0.1, 0.1, 0.1], [0.1, 1.0, 0.1], [0.1, 0.1, 0.1]]"
+    states = [("calm", 0.5, 0.0, shares), ("fire", 0.5, 1.0, shares[::-1])]
+    parts = ['name = "ten"\nkernel_size = [3, 3]\n']
+    for name, initial, reward, observed_as in states:
+        parts.append(f"""
+            [[states]]
+            name = "{name}"
+            color = "#808080"
+            initial = {initial}
+            reward = {reward}
+            observed_as = {observed_as}""")
+    parts += [f'[[observations]]\nname = "kind {i}"\ncolor = "#808080"' for i in range(10)]
+    for source, target, scale in [
+        ("calm", "calm", 0.9),
+        ("calm", "fire", 0.1),
+        ("fire", "fire", 0.9),
+        ("fire", "calm", 0.1),
+    ]:
+        parts.append(f"""
+            [[kernel]]
+            from = "{source}"
+            to = "{target}"
+            scale = {scale}
+            weights = {weights}""")
+    return "\n".join(parts)
+
+
+def test_ten_observations_of_a_hidden_model(programs, open_page, tmp_path):
+    model = tmp_path / "ten.toml"
+    model.write_text(model_of_ten_observations())
+    server = programs.server(model=model, reveal_model="false", publish_truth=True)
+    look = open_page(programs.dashboard(server.instance))
+    agent = programs.agent(server.instance, model=model, steps=40)
+    assert agent.wait() == 0
+    look.eventually(lambda: look.picture(".shown.step") == 40 and look.has("seen"), "step 40")
+    seen = look.array("seen")
+    assert {8, 9} <= set(seen), "the observations beyond the page's own table"
+    legend = look.page.locator("#legend").text_content()
+    assert all(f"kind {i}" in legend for i in range(10))
+    frame, pixels = look.array("frame"), look.pixels("panel-frame").reshape(-1, 4)
+    colors = {value: set(map(tuple, pixels[frame == value])) for value in set(frame)}
+    assert all(len(found) == 1 for found in colors.values()), "a colour for each observation"
+    assert len(set.union(*colors.values())) == len(colors), "no two of the same colour"
+
+
 def test_what_is_not_published_is_told(programs, open_page):
     server = programs.server()
     look = open_page(programs.dashboard(server.instance))
