@@ -316,6 +316,7 @@ fn every_service_is_documented() {
         Channel::Control,
         Channel::Frames,
         Channel::Truth,
+        Channel::Agent,
         Channel::WakeServer,
         Channel::WakeClient,
         Channel::Decisions(7),
