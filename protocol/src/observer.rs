@@ -13,8 +13,8 @@ use std::cell::Cell;
 use std::time::{Duration, Instant};
 
 /// How long an observer sleeps between two looks: publishing wakes nobody, so that observers cost the
-/// server no system call. Nor do they spin: sixteen that did would take two cores from it. At 128,000 frames a
-/// second this fills [`FRAME_BUFFER`].
+/// server no system call. Nor do they spin, which would take processor time from it. At 128,000 frames a second
+/// this fills [`FRAME_BUFFER`].
 const LOOK_INTERVAL: Duration = Duration::from_micros(500);
 
 /// A sample copied out of shared memory.
