@@ -13,9 +13,12 @@ fn run(server: &Server, flags: &[&str]) -> Program {
 }
 
 /// Reads until one is as wanted.
-fn until(observer: &Observer<AgentHeader>, wanted: impl Fn(&Outlook) -> bool) -> Vec<Outlook> {
+fn until(
+    observer: &Observer<AgentHeader>,
+    mut wanted: impl FnMut(&Outlook) -> bool,
+) -> Vec<Outlook> {
     let (mut all, start) = (Vec::<Outlook>::new(), Instant::now());
-    while !all.last().is_some_and(&wanted) {
+    while !all.last().is_some_and(&mut wanted) {
         let remaining = PATIENCE.saturating_sub(start.elapsed());
         let sample = observer.receive(remaining).expect("receive");
         let sample = sample.expect("an agent that shows its belief");
@@ -94,4 +97,38 @@ fn a_comparison_that_is_watched_shows_the_beliefs_of_all_its_worlds() {
         "{}",
         ended.stderr
     );
+}
+
+#[test]
+fn a_training_shows_what_it_believes_of_all_its_worlds() {
+    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 500 --worlds 3");
+    let observer = Observer::agents(&server.instance).expect("observe");
+    let folder = tempfile::TempDir::new().expect("a folder");
+    let out = folder.path().join("out");
+    let flags = [
+        "--out",
+        out.to_str().expect("a path"),
+        "--world",
+        "1",
+        "--worlds",
+        "2",
+    ];
+    let common = ["train", "--instance", server.instance.name()];
+    let training = Program::start("emberwatch-agent", &[&common[..], &flags].concat());
+    let mut worlds = BTreeSet::new();
+    let shown = until(&observer, |outlook| {
+        worlds.insert(outlook.header.world);
+        worlds.len() == 2 && outlook.header.step > 5
+    });
+    drop(training);
+    assert_eq!(worlds, BTreeSet::from([1, 2]));
+    for Outlook { belief, intent, .. } in &shown {
+        assert_eq!(belief.dim(), (3, 16, 24));
+        let sums = belief.sum_axis(ndarray::Axis(0));
+        assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-4));
+        assert_eq!(intent.policy, "train learned_filter");
+        assert_eq!(intent.belief_from, "learned_filter");
+        assert_eq!(intent.states, ["state 0", "state 1", "state 2"]);
+        assert_eq!(intent.objective, "random moves");
+    }
 }

@@ -12,9 +12,14 @@ use crate::planner::{CellValues, Objective, Plan, Planner, PlanningProblem, Targ
 use crate::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::student::decisions::Decisions;
 use protocol::model::ModelError;
+use protocol::outlook::Intent;
 use protocol::{Cell, Frame, Grid, Model, Probabilities, Shape, Transition};
 use std::sync::Arc;
+use std::time::Duration;
 use thiserror::Error;
+
+/// What a path that was not planned was for.
+pub const RANDOM_MOVES: &str = "random moves";
 
 /// A policy at work on one world.
 pub struct Agent {
@@ -312,21 +317,25 @@ impl Agent {
         }
     }
 
-    /// What the last path was for, in a word or two: a state, `entropy`, `coverage` or an action.
-    pub fn aim(&self) -> String {
+    /// What the last path was for, in a word or two.
+    fn aim(&self) -> String {
         match &self.aim {
-            _ if self.policy.planner == PlannerKind::RandomWalk => "random moves".into(),
+            _ if self.policy.planner == PlannerKind::RandomWalk => RANDOM_MOVES.into(),
             Aim::Nothing => "nothing yet".into(),
-            Aim::Objective(Target::State(state)) => self.state_names[*state].clone(),
-            Aim::Objective(Target::Entropy) => "entropy".into(),
-            Aim::Objective(Target::Coverage) => "coverage".into(),
+            Aim::Objective(target) => target.label(&self.state_names),
             Aim::Action(name) => name.clone(),
         }
     }
 
-    /// Names of the belief's states.
-    pub fn state_names(&self) -> &[String] {
-        &self.state_names
+    /// What it tells those who look on; `planning`: time that its last plan took.
+    pub fn intent(&self, planning: Duration) -> Intent {
+        Intent {
+            policy: self.policy.name.clone(),
+            belief_from: self.policy.estimator.label().into(),
+            objective: self.aim(),
+            states: self.state_names.clone(),
+            plan_millis: planning.as_secs_f64() * 1e3,
+        }
     }
 
     /// The policy.
@@ -360,14 +369,16 @@ impl Estimator {
 /// The model's names, or numbers where a learner called the states what it liked.
 fn state_names(kind: EstimatorKind, model: &Model, n_states: usize) -> Vec<String> {
     match kind {
-        EstimatorKind::Learned | EstimatorKind::Autoencoder => (0..n_states)
-            .map(|state| format!("state {state}"))
-            .collect(),
-        _ => {
-            let states = model.file().states.iter();
-            states.map(|state| state.name.clone()).collect()
-        }
+        EstimatorKind::Learned | EstimatorKind::Autoencoder => numbered_states(n_states),
+        _ => model.state_names(),
     }
+}
+
+/// Names of states that were learned.
+pub fn numbered_states(n_states: usize) -> Vec<String> {
+    (0..n_states)
+        .map(|state| format!("state {state}"))
+        .collect()
 }
 
 /// The kind of belief, with a checksum of the parameters that give it its meaning.

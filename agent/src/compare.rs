@@ -314,8 +314,7 @@ impl Run {
                 world,
                 result: &self.observation.result,
                 belief: &belief,
-                agent: &self.agent,
-                planning: self.planning,
+                intent: self.agent.intent(self.planning),
             });
         }
     }

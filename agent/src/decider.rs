@@ -199,8 +199,7 @@ impl Decider {
                 world: self.client.worlds().start,
                 result: &self.observation.result,
                 belief: self.agent.belief(),
-                agent: &self.agent,
-                planning: self.planning,
+                intent: self.agent.intent(self.planning),
             });
         }
         self.agent.predict();
@@ -263,7 +262,6 @@ fn decision(
 
 fn agent_info(task: &Assignment, model: &Model, choices: &[Policy], client: &Client) -> AgentInfo {
     let server = client.info();
-    let states = model.file().states.iter();
     AgentInfo {
         protocol: VERSION,
         build: env!("CARGO_PKG_VERSION").into(),
@@ -274,7 +272,7 @@ fn agent_info(task: &Assignment, model: &Model, choices: &[Policy], client: &Cli
         width: server.width,
         n_moves: server.n_moves,
         max_steps: server.max_steps,
-        states: states.map(|state| state.name.clone()).collect(),
+        states: model.state_names(),
         objectives: choices.iter().map(|choice| choice.name.clone()).collect(),
         planner: task.planner.label().into(),
         summary: summary_names(model),

@@ -1,6 +1,5 @@
 //! Shows beliefs to whoever looks on, at the pace of eyes: the agent's side of the channel `agent`.
 
-use crate::agent::Agent;
 use crate::belief::Belief;
 use protocol::channels::Instance;
 use protocol::message::{AgentHeader, StepResult};
@@ -29,10 +28,8 @@ pub struct View<'a> {
     pub result: &'a StepResult,
     /// What is believed of it.
     pub belief: &'a Belief,
-    /// Who believes it.
-    pub agent: &'a Agent,
-    /// Time that its last plan took.
-    pub planning: Duration,
+    /// Who believes it, and what the path was for.
+    pub intent: Intent,
 }
 
 impl Feed {
@@ -82,7 +79,6 @@ impl Feed {
         };
         self.shown = Some(Instant::now());
         self.n_shown += 1;
-        let policy = view.agent.policy();
         let about = AgentHeader {
             world: view.world,
             episode: view.result.episode,
@@ -90,14 +86,7 @@ impl Feed {
             seed: view.result.seed,
             ..AgentHeader::default()
         };
-        let intent = Intent {
-            policy: policy.name.clone(),
-            belief_from: policy.estimator.label().into(),
-            objective: view.agent.aim(),
-            states: view.agent.state_names().to_vec(),
-            plan_millis: view.planning.as_secs_f64() * 1e3,
-        };
-        if let Err(error) = showcase.show(about, view.belief.probabilities(), &intent) {
+        if let Err(error) = showcase.show(about, view.belief.probabilities(), &view.intent) {
             tracing::warn!("beliefs are no longer shown: {error}");
             self.showcase = None;
         }

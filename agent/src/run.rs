@@ -261,8 +261,7 @@ impl Attached {
                 world: self.client.worlds().start,
                 result: &self.observation.result,
                 belief: self.agent.belief(),
-                agent: &self.agent,
-                planning: self.planning,
+                intent: self.agent.intent(self.planning),
             });
         }
         self.agent.predict();

@@ -10,6 +10,7 @@ use crate::client::Observation;
 use crate::estimator::{ZeroEvidence, learned_filter};
 use crate::metrics::Tick;
 use crate::network as networks;
+use crate::policy::EstimatorKind;
 use protocol::{Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
@@ -26,6 +27,15 @@ pub struct Site {
     pub n_moves: usize,
     /// The worlds' numbers.
     pub worlds: Range<u32>,
+}
+
+/// What a student makes of a world.
+#[derive(Debug, Clone)]
+pub struct Impression {
+    /// What it believes after the last frame, the posterior.
+    pub belief: Belief,
+    /// What its path was for, in a word or two.
+    pub objective: String,
 }
 
 /// What one update did.
@@ -115,11 +125,16 @@ pub trait Student {
     /// The next path of each world.
     fn plan(&mut self) -> Vec<Vec<Move>>;
 
-    /// Takes in what the paths showed: scores the prediction, corrects, predicts, remembers.
+    /// Takes in what the paths showed: scores the prediction, corrects, predicts, remembers. `watched`: which
+    /// of the worlds somebody looks at.
     ///
     /// # Errors
     /// [`StudentError`].
-    fn take_in(&mut self, observations: Vec<Observation>) -> Result<Tick, StudentError>;
+    fn take_in(
+        &mut self,
+        observations: Vec<Observation>,
+        watched: Option<usize>,
+    ) -> Result<(Tick, Option<Impression>), StudentError>;
 
     /// Makes the updates that the steps since the last call have earned.
     ///
@@ -135,6 +150,12 @@ pub trait Student {
 
     /// Updates of the model so far.
     fn n_updates(&self) -> u64;
+
+    /// Where its beliefs come from.
+    fn estimator(&self) -> EstimatorKind;
+
+    /// Names of its beliefs' states.
+    fn state_names(&self) -> Vec<String>;
 
     /// What it predicts of its first world, and the state of that which it thinks pays most.
     fn belief(&self) -> Option<(&Belief, usize)>;

@@ -5,28 +5,31 @@
 //! What is learned, and how it acts meanwhile, is a [`Student`]'s.
 
 mod events;
+mod students;
 
 use self::events::Events;
-use crate::checkpoint::{self, CheckpointError, Contents, Problem};
+use self::students::student;
+use crate::checkpoint::{self, CheckpointError, Contents};
 use crate::client::{Claim, Client, Observation};
 use crate::config::{AgentConfig, ConfigError, LearnerKind};
-use crate::estimator::Filter;
-use crate::estimator::learned_filter::{Dimensions, DimensionsError};
+use crate::estimator::learned_filter::DimensionsError;
+use crate::feed::{Feed, View};
 use crate::learner;
 use crate::metrics::{FROZEN, METRICS, Metrics, MetricsError, Tick};
 use crate::scoring::Score;
-use crate::student::decisions::{self, Decisions, DecisionsStudent};
-use crate::student::filter::FilterStudent;
-use crate::student::network::{self, NetworkStudent};
-use crate::student::{Site, Student, StudentError};
+use crate::student::decisions;
+use crate::student::network;
+use crate::student::{Impression, Student, StudentError};
 use crate::tensorboard::EventsError;
+use protocol::Move;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
-use protocol::control::{CoverageRule, WorldSeed};
+use protocol::control::WorldSeed;
+use protocol::message::StepResult;
 use protocol::model::ModelError;
-use protocol::{Model, Move};
+use protocol::outlook::Intent;
 use std::ops::Range;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use thiserror::Error;
@@ -213,6 +216,9 @@ pub fn train(
         }
     }
     trainee.client.release()?;
+    if let Some(feed) = trainee.feed {
+        feed.end();
+    }
     Ok(trainee.summary)
 }
 
@@ -222,6 +228,9 @@ struct Trainee {
     student: Box<dyn Student>,
     metrics: Metrics,
     events: Events,
+    feed: Option<Feed>,
+    /// Time that the last paths' plans took.
+    planning: Duration,
     summary: TrainSummary,
     saved: Instant,
     told: Told,
@@ -270,12 +279,16 @@ impl Trainee {
                 "not where the checkpoint left them: beliefs begin anew"
             );
         }
+        let belief = student.belief();
+        let feed = belief.map(|(belief, _)| Feed::open(instance, belief));
         let now = Instant::now();
         Ok(Self {
             client,
             student,
             metrics,
             events,
+            feed,
+            planning: Duration::ZERO,
             summary: TrainSummary::default(),
             saved: now,
             told: Told::at(now, &TrainSummary::default()),
@@ -291,7 +304,9 @@ impl Trainee {
         let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
         let is_done = |steps: u64| training.steps > 0 && steps >= training.steps;
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
+            let start = Instant::now();
             let paths = self.student.plan();
+            self.planning = start.elapsed();
             let observations = self.fly(&paths)?;
             let taken = self.take_in(observations)?;
             let tick = taken.map_err(|problem| training.stopped(problem, &*self.student))?;
@@ -330,10 +345,20 @@ impl Trainee {
         let ended = self.client.worlds().zip(&observations);
         let ended = ended.filter(|(_, seen)| is_over(seen));
         let ended: Vec<u32> = ended.map(|(world, _)| world).collect();
-        let tick = match self.student.take_in(observations) {
-            Ok(tick) => tick,
+        let feed = self.feed.as_ref();
+        let watched = feed.and_then(|feed| feed.turn(observations.len()));
+        let shown = watched.map(|index| (index, observations[index].result));
+        let (tick, impression) = match self.student.take_in(observations, watched) {
+            Ok(taken) => taken,
             Err(problem) => return Ok(Err(problem)),
         };
+        if let (Some((index, result)), Some(impression)) = (shown, impression) {
+            self.show(
+                self.client.worlds().start + index as u32,
+                &result,
+                impression,
+            );
+        }
         for world in ended {
             let observation = reset(&mut self.client, world)?;
             if let Err(problem) = self.student.begin(world, observation) {
@@ -343,6 +368,26 @@ impl Trainee {
         self.summary.steps += tick.n_worlds;
         self.summary.reward += tick.reward;
         Ok(Ok(tick))
+    }
+
+    /// Shows what the student makes of a world.
+    fn show(&mut self, world: u32, result: &StepResult, seen: Impression) {
+        let estimator = self.student.estimator().label();
+        let intent = Intent {
+            policy: format!("train {}", self.student.kind()),
+            belief_from: estimator.into(),
+            objective: seen.objective,
+            states: self.student.state_names(),
+            plan_millis: self.planning.as_secs_f64() * 1e3,
+        };
+        if let Some(feed) = &mut self.feed {
+            feed.show(&View {
+                world,
+                result,
+                belief: &seen.belief,
+                intent,
+            });
+        }
     }
 
     /// Writes the checkpoint, unless nothing is learned, and the metrics.
@@ -415,72 +460,4 @@ fn events(training: &Training, student: &dyn Student) -> Result<Events, EventsEr
         (false, true) => Events::begin(&training.out, student.world_steps()),
         (false, false) => Events::begin(&training.out, 0),
     }
-}
-
-/// What the settings say that learns, going on from a checkpoint's contents if there are any.
-fn student(
-    training: &Training,
-    client: &Client,
-    contents: Option<&Contents>,
-    place: &Path,
-) -> Result<Box<dyn Student>, TrainError> {
-    let (info, config) = (client.info(), &training.config);
-    let site = Site {
-        shape: client.shape(),
-        n_observations: info.n_observations,
-        n_moves: info.n_moves,
-        worlds: training.worlds.clone(),
-    };
-    let wrong = |problem: Problem| problem.of(place);
-    Ok(match config.learner {
-        LearnerKind::Filter => {
-            let dimensions = dimensions(config, site.n_observations)?;
-            Box::new(match contents {
-                Some(contents) => {
-                    FilterStudent::resume(contents, dimensions, site, config).map_err(wrong)?
-                }
-                None => FilterStudent::new(dimensions, site, config),
-            })
-        }
-        LearnerKind::Autoencoder => {
-            let mut progress = network::Progress::first(&site, config);
-            if let Some(contents) = contents {
-                progress.load(contents).map_err(wrong)?;
-            }
-            let full_frames = config.autoencoder.full_frames;
-            let wants = progress.iterations < full_frames && !training.freeze;
-            if wants && info.coverage == CoverageRule::Path {
-                return Err(TrainError::NoFullFrames(full_frames));
-            }
-            Box::new(NetworkStudent::new(progress, site, config))
-        }
-        LearnerKind::Decisions => {
-            let model = info.model.as_deref().ok_or(TrainError::NoModel)?;
-            let model = Model::from_toml(model)?;
-            let mut decisions = Decisions::first(&model, &config.decisions, config.seed);
-            if let Some(contents) = contents {
-                decisions.load(contents).map_err(wrong)?;
-            }
-            let prior = config.prior(info.burn_in);
-            let filter = Filter::new(&model, prior.belief(&model, site.shape, config.seed)?)?;
-            Box::new(DecisionsStudent::new(
-                decisions, filter, &model, site, config,
-            ))
-        }
-    })
-}
-
-fn dimensions(config: &AgentConfig, n_observations: usize) -> Result<Dimensions, DimensionsError> {
-    let learning = config.learning;
-    let n_states = match learning.states {
-        0 => n_observations,
-        states => states,
-    };
-    let kernel = (learning.kernel[0], learning.kernel[1]);
-    let dimensions = Dimensions {
-        n_states,
-        n_observations,
-        kernel,
-    };
-    dimensions.check()
 }

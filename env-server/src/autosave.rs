@@ -1,10 +1,14 @@
 //! Snapshots that a server writes of its own accord, and begins with.
 
 use crate::config::Checked;
-use crate::files::{Files, Job, Place};
-use crate::snapshot::folder::{FileError, Folder, refused};
+use crate::files::{Done, Files, Job, Place};
+use crate::snapshot::folder::{FileError, Folder, Outlives, refused};
 use crate::snapshot::{RestoredWorld, SnapshotError};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// How much of a run a loss of power may cost: to wait for the disk each time would slow the steps down.
+const SYNC_INTERVAL: Duration = Duration::from_secs(5);
 
 /// When to write the next one, and where.
 pub struct Autosave {
@@ -14,8 +18,10 @@ pub struct Autosave {
     every: u64,
     /// World steps at which the next is due.
     due: u64,
-    /// The job that writes one.
-    writing: Option<u64>,
+    /// The job that writes one, and what that outlives.
+    writing: Option<(u64, Outlives)>,
+    /// The last that outlives a loss of power, and when it was written.
+    safe: Option<(Instant, PathBuf)>,
 }
 
 impl Autosave {
@@ -41,6 +47,7 @@ impl Autosave {
             every,
             due: every,
             writing: None,
+            safe: None,
         }))
     }
 
@@ -55,24 +62,37 @@ impl Autosave {
         self.due = n_steps.saturating_add(self.every);
     }
 
-    /// Orders one.
-    pub fn order(&mut self, n_steps: u64, bytes: Vec<u8>, files: &mut Files) {
+    /// Orders one; the last of a run outlives a loss of power in any case.
+    pub fn order(&mut self, n_steps: u64, bytes: Vec<u8>, is_last: bool, files: &mut Files) {
         self.skip(n_steps);
-        let (folder, keep) = (self.folder.clone(), self.keep);
-        self.writing = Some(files.order(Job::Autosave {
-            folder,
-            keep,
+        let safe = self.safe.as_ref();
+        let outlives = match safe {
+            Some((at, _)) if !is_last && at.elapsed() < SYNC_INTERVAL => Outlives::Kills,
+            _ => Outlives::PowerLoss,
+        };
+        let job = files.order(Job::Autosave {
+            folder: self.folder.clone(),
+            outlives,
+            keep: self.keep,
+            spared: safe.map(|(_, path)| path.clone()),
             bytes,
-        }));
+        });
+        self.writing = Some((job, outlives));
     }
 
-    /// Takes note that a job is done; returns whether it was one of these.
-    pub fn is_done(&mut self, job: u64) -> bool {
-        let is_own = self.writing == Some(job);
-        if is_own {
-            self.writing = None;
+    /// Takes note of what came of a job; returns whether it was one of these.
+    pub fn is_done(&mut self, job: u64, outcome: &Result<Done, FileError>) -> bool {
+        let Some((_, outlives)) = self.writing.take_if(|(own, _)| *own == job) else {
+            return false;
+        };
+        match outcome {
+            Ok(Done::Saved { path, .. }) if outlives == Outlives::PowerLoss => {
+                self.safe = Some((Instant::now(), path.clone()));
+            }
+            Ok(_) => {}
+            Err(error) => tracing::warn!("not saved: {error}"),
         }
-        is_own
+        true
     }
 }
 

@@ -58,7 +58,7 @@ pub struct ServerConfig {
     pub snapshot_every: u64,
     /// The folder for these snapshots.
     pub snapshot_dir: String,
-    /// How many of them to keep, at least 1.
+    /// How many of them to keep, at least 1; the last that outlives a loss of power is kept besides.
     pub snapshot_keep: u32,
 }
 
@@ -125,7 +125,7 @@ pub struct ServerFlags {
     /// The folder for these snapshots
     #[arg(long, value_name = "FOLDER")]
     pub snapshot_dir: Option<String>,
-    /// How many of these snapshots to keep [default: 3]
+    /// How many of these snapshots to keep, and the last that the disk has for sure [default: 3]
     #[arg(long)]
     pub snapshot_keep: Option<u32>,
 }

@@ -1,7 +1,7 @@
 //! Snapshot files are written and read here, on a thread of its own, so that no disk delays a step.
 
 use crate::episode::Rules;
-use crate::snapshot::folder::{FileError, Folder, read, refused, write};
+use crate::snapshot::folder::{FileError, Folder, Outlives, read, refused, write};
 use crate::snapshot::{RestoredWorld, Settings, SnapshotError};
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::io::Errno;
@@ -29,8 +29,12 @@ pub enum Job {
     Autosave {
         /// Where.
         folder: Folder,
+        /// What it must outlive.
+        outlives: Outlives,
         /// How many to keep.
         keep: usize,
+        /// Another one to keep.
+        spared: Option<PathBuf>,
         /// What.
         bytes: Vec<u8>,
     },
@@ -159,16 +163,18 @@ impl Job {
     fn carry_out(self, place: &Place) -> Result<Done, FileError> {
         match self {
             Self::Save { path, bytes } => {
-                write(&path, &bytes)?;
+                write(&path, &bytes, Outlives::PowerLoss)?;
                 let n_bytes = bytes.len();
                 Ok(Done::Saved { path, n_bytes })
             }
             Self::Autosave {
                 folder,
+                outlives,
                 keep,
+                spared,
                 bytes,
             } => {
-                let path = folder.save(&bytes, keep)?;
+                let path = folder.save(&bytes, outlives, keep, spared.as_deref())?;
                 let n_bytes = bytes.len();
                 Ok(Done::Saved { path, n_bytes })
             }

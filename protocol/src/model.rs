@@ -194,6 +194,12 @@ impl Model {
         &self.reward
     }
 
+    /// Names of the states.
+    pub fn state_names(&self) -> Vec<String> {
+        let states = self.file.states.iter();
+        states.map(|state| state.name.clone()).collect()
+    }
+
     /// The state that pays most (the first of them): fire in the wildfire model.
     pub fn target_state(&self) -> usize {
         let better = |best, state| {

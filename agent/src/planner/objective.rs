@@ -19,6 +19,20 @@ pub enum Target {
     Coverage,
 }
 
+impl Target {
+    /// In a word, for those who look on; `states`: names of the belief's states.
+    ///
+    /// # Panics
+    /// If a state has no name.
+    pub fn label(self, states: &[String]) -> String {
+        match self {
+            Self::State(state) => states[state].clone(),
+            Self::Entropy => "entropy".into(),
+            Self::Coverage => "coverage".into(),
+        }
+    }
+}
+
 /// What a planner maximises: the sum over a path's cells of the target, plus a bonus per cell.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -1,7 +1,7 @@
 //! Learns which action of [`ActionSet::beam`] to take (paper section III.E): beam search plans on the
 //! known-model filter's belief, and a DQN that sees a summary of it chooses what each path is for.
 
-use super::{Lesson, NotFinite, Site, Student, StudentError};
+use super::{Impression, Lesson, NotFinite, Site, Student, StudentError};
 use crate::action::{Action, ActionSet};
 use crate::belief::Belief;
 use crate::checkpoint::{Contents, Problem};
@@ -13,6 +13,7 @@ use crate::metrics::Tick;
 use crate::network::dqn::Track;
 use crate::network::{Dqn, Transition};
 use crate::planner::BeamSearch;
+use crate::policy::EstimatorKind;
 use crate::scoring::score;
 use crate::summary::{summarise, summary_length};
 use ndarray::Array2;
@@ -47,6 +48,7 @@ pub struct DecisionsStudent {
     likelihood: Array2<f64>,
     /// The state that pays most.
     target: usize,
+    state_names: Vec<String>,
     pilots: Vec<Pilot>,
     owed: f64,
     is_frozen: bool,
@@ -145,6 +147,7 @@ impl DecisionsStudent {
             filter,
             likelihood: model.likelihood().clone(),
             target: model.target_state(),
+            state_names: model.state_names(),
             pilots: Vec::new(),
             owed: 0.0,
             is_frozen: false,
@@ -224,7 +227,11 @@ impl Student for DecisionsStudent {
         paths
     }
 
-    fn take_in(&mut self, observations: Vec<Observation>) -> Result<Tick, StudentError> {
+    fn take_in(
+        &mut self,
+        observations: Vec<Observation>,
+        watched: Option<usize>,
+    ) -> Result<(Tick, Option<Impression>), StudentError> {
         let mut tick = Tick::default();
         for (pilot, observation) in self.pilots.iter_mut().zip(observations) {
             tick.reward += observation.result.reward;
@@ -232,6 +239,13 @@ impl Student for DecisionsStudent {
             pilot.filter.correct(&observation.frame)?;
             pilot.observation = observation;
         }
+        let impression = watched.map(|index| {
+            let pilot = &self.pilots[index];
+            Impression {
+                belief: pilot.filter.belief().clone(),
+                objective: self.decisions.actions.actions()[pilot.action].name.clone(),
+            }
+        });
         let n_moves = self.site.n_moves;
         let config = &self.config.decisions;
         let bring = |pilot: &mut Pilot| {
@@ -247,7 +261,7 @@ impl Student for DecisionsStudent {
         self.decisions.world_steps += tick.n_worlds;
         tick.world_steps = self.decisions.world_steps;
         self.owed += tick.n_worlds as f64 * config.updates_per_step;
-        Ok(tick)
+        Ok((tick, impression))
     }
 
     fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {
@@ -285,6 +299,14 @@ impl Student for DecisionsStudent {
 
     fn n_updates(&self) -> u64 {
         self.decisions.dqn.n_updates()
+    }
+
+    fn estimator(&self) -> EstimatorKind {
+        EstimatorKind::KnownModel
+    }
+
+    fn state_names(&self) -> Vec<String> {
+        self.state_names.clone()
     }
 
     fn belief(&self) -> Option<(&Belief, usize)> {

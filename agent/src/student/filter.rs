@@ -1,7 +1,8 @@
 //! Learns the filter's parameters on several worlds at once: robots walk at random first, then plan on
 //! the belief of the filter as it is.
 
-use super::{Lesson, NotFinite, Site, Student, StudentError};
+use super::{Impression, Lesson, NotFinite, Site, Student, StudentError};
+use crate::agent::{RANDOM_MOVES, numbered_states};
 use crate::belief::Belief;
 use crate::checkpoint::{Contents, Problem};
 use crate::client::Observation;
@@ -10,7 +11,8 @@ use crate::estimator::learned_filter::Dimensions;
 use crate::learner::{KIND, LearnedModel, Learner, Progress};
 use crate::metrics::Tick;
 use crate::pilot::{Pilot, Stand};
-use crate::policy::PlannerKind;
+use crate::planner::Target;
+use crate::policy::{EstimatorKind, PlannerKind};
 use protocol::Move;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -136,19 +138,31 @@ impl Student for FilterStudent {
         paths
     }
 
-    fn take_in(&mut self, observations: Vec<Observation>) -> Result<Tick, StudentError> {
+    fn take_in(
+        &mut self,
+        observations: Vec<Observation>,
+        watched: Option<usize>,
+    ) -> Result<(Tick, Option<Impression>), StudentError> {
         let mut tick = Tick::default();
+        let n_walking = self.n_walking();
         let worlds = self.site.worlds.clone().zip(observations);
         for ((world, observation), pilot) in worlds.zip(&mut self.pilots) {
             tick.reward += observation.result.reward;
             tick.score += pilot.take_in(world, observation, &mut self.learner)?;
         }
+        let impression = watched.map(|index| Impression {
+            belief: self.pilots[index].filter.belief().clone(),
+            objective: match index < n_walking {
+                true => RANDOM_MOVES.into(),
+                false => Target::State(self.learned.target).label(&self.state_names()),
+            },
+        });
         self.pilots
             .par_iter_mut()
             .for_each(|pilot| pilot.filter.predict());
         tick.n_worlds = self.pilots.len() as u64;
         tick.world_steps = self.learner.world_steps();
-        Ok(tick)
+        Ok((tick, impression))
     }
 
     fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {
@@ -174,6 +188,14 @@ impl Student for FilterStudent {
 
     fn n_updates(&self) -> u64 {
         self.learner.n_updates()
+    }
+
+    fn estimator(&self) -> EstimatorKind {
+        EstimatorKind::Learned
+    }
+
+    fn state_names(&self) -> Vec<String> {
+        numbered_states(self.learned.tables.dimensions.n_states)
     }
 
     fn belief(&self) -> Option<(&Belief, usize)> {

@@ -2,7 +2,7 @@
 
 import { make, write } from "/elements.js";
 import { drawMarks } from "/overlay.js";
-import { beliefNames, panelSentence, seenSince, stateNames } from "/words.js";
+import { beliefAge, beliefNames, panelSentence, seenSince, stateNames } from "/words.js";
 import { cellsOf, shapeOf } from "/wire.js";
 
 const OBSERVED = [
@@ -84,6 +84,8 @@ function paint(panel, picture, view, palette) {
   }
   panel.figure.classList.toggle("is-absent", !values);
   if (panel.kind === "seen") write(panel.caption.lastChild, seenSince(picture) || panel.hint);
+  if (panel.kind === "belief") write(panel.caption.lastChild, beliefAge(picture));
+  if (panel.kind === "entropy") write(panel.caption.lastChild, beliefAge(picture) || panel.hint);
   if (values) {
     const pixels = new Uint32Array(panel.image.data.buffer);
     fill(pixels, values, panel, picture, palette);
@@ -117,7 +119,7 @@ function valuesOf({ kind, state }, picture) {
 function absence({ kind }, picture) {
   if (kind === "truth" && picture.source === "recording") return ["This recording holds no hidden states."];
   if (kind === "truth" && !picture.info.publish_truth) return ["The server keeps it to itself. To see it, start the server with ", "--publish-truth"];
-  if (kind === "belief" || kind === "entropy") return ["No belief was shown at this step."];
+  if (kind === "belief" || kind === "entropy") return ["No belief was shown at this step or shortly before."];
   return ["Not known for this step."];
 }
 

@@ -53,11 +53,18 @@ export function seenSince({ shown }) {
   return shown?.seen_since > 0 ? `since k = ${whole(shown.seen_since)}` : "";
 }
 
+/** How old the belief is, such as "of 3 steps before"; empty if it is about the step that is shown. */
+export function beliefAge({ agent, shown }) {
+  const age = agent && shown ? shown.step - agent.step : 0;
+  return age > 0 ? `of ${age === 1 ? "a step" : `${whole(age)} steps`} before` : "";
+}
+
 /** What a panel shows, in one sentence, for people who do not see it. */
 export function panelSentence(panel, picture) {
   const { shown, info } = picture;
   if (!shown || !info) return `${panel.title}: nothing yet`;
   const at = `at step ${whole(shown.step)}`;
+  const believed = `at step ${whole(picture.agent?.step ?? shown.step)}`;
   const cells = whole(cellsOf(picture));
   switch (panel.kind) {
     case "truth":
@@ -69,9 +76,9 @@ export function panelSentence(panel, picture) {
       return `this path: ${whole(shown.n_visited)} cells visited, ${whole(shown.n_hits)} of them ` +
         `${targetName(picture)}, robot at row ${shown.robot[0]}, column ${shown.robot[1]} ${at}`;
     case "belief":
-      return `belief ${panel.name}: mean probability ${share(picture, panel)} ${at}`;
+      return `belief ${panel.name}: mean probability ${share(picture, panel)} ${believed}`;
     default:
-      return `entropy: mean ${share(picture, panel)} of the most that is possible ${at}`;
+      return `entropy: mean ${share(picture, panel)} of the most that is possible ${believed}`;
   }
 }
 

@@ -19,6 +19,9 @@ const MAX_BYTES: usize = 256 << 20;
 /// How many of the last steps late hidden states and beliefs are looked for in.
 const MAX_DELAY: usize = 512;
 
+/// How many steps back a belief may be that is shown beside a step.
+const MAX_BELIEF_AGE: usize = 100;
+
 /// How many hidden states are held for frames that have not come yet: channels are read one after the
 /// other, and a recording may have them in either order.
 const MAX_EARLY: usize = 64;
@@ -256,6 +259,18 @@ impl Strip {
         self.entries.iter().take(n).rev()
     }
 
+    /// The latest step with a belief up to that of a serial number, of the same episode; none that is too far back
+    /// to tell much.
+    pub fn believed(&self, serial: u64) -> Option<&Entry> {
+        let (_, now) = self.nearest(serial)?;
+        let is_same = |entry: &&Entry| entry.is_of_episode(now);
+        let mut earlier = self
+            .back_from(serial)
+            .take(MAX_BELIEF_AGE)
+            .take_while(is_same);
+        earlier.find(|entry| entry.belief.is_some())
+    }
+
     /// All steps, the oldest first.
     pub fn entries(&self) -> impl ExactSizeIterator<Item = &Entry> {
         self.entries.iter()
@@ -310,6 +325,12 @@ impl Entry {
             episode: self.result.episode,
             step: self.result.step,
         }
+    }
+
+    /// Whether it is a step of the same episode on the same grid, or an earlier one.
+    pub fn is_of_episode(&self, other: &Self) -> bool {
+        let of = |entry: &Self| (entry.result.seed, entry.result.episode, entry.shape);
+        of(self) == of(other) && self.result.step <= other.result.step
     }
 
     /// Whether it is the same again, as a server shows it to an observer who has just come.

@@ -111,6 +111,8 @@ struct AgentFacts<'a> {
     objective: &'a str,
     plan_millis: f64,
     states: &'a [String],
+    /// The step that the belief is about, not after the one shown.
+    step: u64,
     is_live: bool,
 }
 
@@ -151,6 +153,7 @@ pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
         since = arrays.add_grids(strip, serial, entry);
         (objectives, series) = arrays.add_series(strip, ask.bins.clamp(BINS.0, BINS.1));
     }
+    let believed = chosen.and_then(|(serial, _)| strip?.believed(serial));
     let is_live = |entry: &Entry| now.duration_since(entry.at) < 4 * BELIEF_LAG;
     let header = Header {
         instance: &scene.instance,
@@ -171,7 +174,7 @@ pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
             .and_then(Strip::kept)
             .map(|(first, last)| Range { first, last }),
         shown: chosen.map(|(serial, entry)| Shown::of(serial, entry, since)),
-        agent: chosen.and_then(|(_, entry)| AgentFacts::of(entry, is_live(entry))),
+        agent: believed.and_then(|entry| AgentFacts::of(entry, is_live(entry))),
         lost: scene.lost,
         player: scene.player.as_ref(),
         objectives,
@@ -231,7 +234,8 @@ impl Arrays {
         let memory = Memory::of(strip, serial, entry);
         self.add_bytes("seen", &memory.seen);
         self.add_bytes("age", &memory.age);
-        if let Some(belief) = &entry.belief {
+        let believed = strip.believed(serial);
+        if let Some(belief) = believed.and_then(|entry| entry.belief.as_ref()) {
             self.add_bytes("belief", &belief.levels);
             self.add_bytes("entropy", &belief.entropy);
         }
@@ -306,9 +310,7 @@ impl Memory {
         let (mut n_unseen, mut since) = (n_cells, last.result.step + 1);
         for entry in strip.back_from(serial) {
             let (then, now) = (&entry.result, &last.result);
-            let is_same =
-                (then.seed, then.episode, entry.shape) == (now.seed, now.episode, last.shape);
-            if !is_same || then.step >= since || n_unseen == 0 {
+            if !entry.is_of_episode(last) || then.step >= since || n_unseen == 0 {
                 break;
             }
             since = then.step;
@@ -387,6 +389,7 @@ impl<'a> AgentFacts<'a> {
             objective: &intent.objective,
             plan_millis: intent.plan_millis,
             states: &intent.states,
+            step: entry.result.step,
             is_live,
         })
     }

@@ -264,3 +264,27 @@ fn what_makes_no_sense_is_left_out() {
         "{names}"
     );
 }
+
+#[test]
+fn a_step_without_a_belief_has_the_one_before_of_its_episode() {
+    let facts = |serial: u64| {
+        let mut album = Album::default();
+        for step in 1..=4 {
+            album.add_frame(&frame(step, [255; 6]), Instant::now());
+            if step == 2 {
+                album.add_belief(&outlook(step), Some(&states()));
+            }
+        }
+        let mut next_episode = frame(1, [255; 6]);
+        next_episode.header.result.episode = 1;
+        album.add_frame(&next_episode, Instant::now());
+        let (header, _) = read(album, Some(serial));
+        let about = header["agent"]["step"].as_u64();
+        (header["shown"]["step"].as_u64(), about)
+    };
+    let expected = [None, Some(2), Some(2), Some(2)];
+    for (serial, about) in (0..).zip(expected) {
+        assert_eq!(facts(serial), (Some(serial + 1), about));
+    }
+    assert_eq!(facts(4), (Some(1), None), "of another episode");
+}

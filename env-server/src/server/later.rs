@@ -59,17 +59,17 @@ impl Server {
             .as_ref()
             .is_some_and(|autosave| autosave.is_due(n_steps))
         {
-            self.save();
+            self.save(false);
         }
     }
 
-    fn save(&mut self) {
+    fn save(&mut self, is_last: bool) {
         let Some(autosave) = &mut self.autosave else {
             return;
         };
         let n_steps = self.simulator.n_steps();
         match self.simulator.snapshot(self.simulator.worlds()) {
-            Ok(bytes) => autosave.order(n_steps, bytes, &mut self.files),
+            Ok(bytes) => autosave.order(n_steps, bytes, is_last, &mut self.files),
             Err(error) => {
                 autosave.skip(n_steps);
                 tracing::warn!("not saved: {error}");
@@ -79,7 +79,7 @@ impl Server {
 
     /// Leaves a last snapshot, and everything in order, before others may take the instance.
     pub(super) fn end(mut self) -> Result<(), ServeError> {
-        self.save();
+        self.save(true);
         let (finished, is_late) = match self.files.finish(LAST_FILES) {
             Ok(finished) => (finished, false),
             Err(finished) => (finished, true),
@@ -99,11 +99,8 @@ impl Server {
     pub(super) fn take_files(&mut self, now: Instant) {
         for (number, outcome) in self.files.finished() {
             if let Some(autosave) = &mut self.autosave
-                && autosave.is_done(number)
+                && autosave.is_done(number, &outcome)
             {
-                if let Err(error) = outcome {
-                    tracing::warn!("not saved: {error}");
-                }
                 self.save_if_due(); // Steps may have gone on meanwhile, and stopped.
                 continue;
             }

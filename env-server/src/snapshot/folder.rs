@@ -33,6 +33,15 @@ pub struct FileError {
     pub is_damaged: bool,
 }
 
+/// What a file that was just written stays whole after.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Outlives {
+    /// The death of any process.
+    Kills,
+    /// A loss of power, too: the disk has it. Takes some milliseconds.
+    PowerLoss,
+}
+
 /// A folder with the last snapshots of an instance, numbered.
 #[derive(Debug, Clone)]
 pub struct Folder {
@@ -109,18 +118,25 @@ impl Folder {
         Ok(files)
     }
 
-    /// Writes the next file and removes all but the last few.
+    /// Writes the next file and removes all but the last few and `spared`.
     ///
     /// # Errors
     /// [`FileError`].
-    pub fn save(&self, bytes: &[u8], keep: usize) -> Result<PathBuf, FileError> {
+    pub fn save(
+        &self,
+        bytes: &[u8],
+        outlives: Outlives,
+        keep: usize,
+        spared: Option<&Path>,
+    ) -> Result<PathBuf, FileError> {
         let files = self.files()?;
         let number = files.last().map_or(1, |(number, _)| number + 1);
         let name = format!("{}-{number:0DIGITS$}.{EXTENSION}", self.instance);
         let path = self.path.join(name);
-        write(&path, bytes)?;
+        write(&path, bytes, outlives)?;
         let n_surplus = (files.len() + 1).saturating_sub(keep);
-        for (_, old) in &files[..n_surplus] {
+        let surplus = files[..n_surplus].iter().map(|(_, old)| old);
+        for old in surplus.filter(|old| Some(old.as_path()) != spared) {
             let _ = std::fs::remove_file(old); // Somebody else may have tidied up.
         }
         Ok(path)
@@ -131,16 +147,19 @@ impl Folder {
 ///
 /// # Errors
 /// [`FileError`].
-pub fn write(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
+pub fn write(path: &Path, bytes: &[u8], outlives: Outlives) -> Result<(), FileError> {
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(format!(".{}{PART}", std::process::id()));
     let part = path.with_file_name(name);
     may_be_replaced(path).map_err(|error| failed(path, error))?;
     let written = create(&part).and_then(|mut file| {
         file.write_all(bytes)?;
+        if outlives == Outlives::Kills {
+            return std::fs::rename(&part, path);
+        }
         file.sync_data()?;
         std::fs::rename(&part, path)?;
-        // So that the new name outlives a loss of power, too.
+        // So that the new name outlives it, too.
         let folder = path
             .parent()
             .filter(|folder| !folder.as_os_str().is_empty());

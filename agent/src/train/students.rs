@@ -1,0 +1,83 @@
+//! Which student the settings ask for.
+
+use super::{TrainError, Training};
+use crate::checkpoint::{Contents, Problem};
+use crate::client::Client;
+use crate::config::{AgentConfig, LearnerKind};
+use crate::estimator::Filter;
+use crate::estimator::learned_filter::{Dimensions, DimensionsError};
+use crate::student::decisions::{Decisions, DecisionsStudent};
+use crate::student::filter::FilterStudent;
+use crate::student::network::{self, NetworkStudent};
+use crate::student::{Site, Student};
+use protocol::Model;
+use protocol::control::CoverageRule;
+use std::path::Path;
+
+/// What the settings say that learns, going on from a checkpoint's contents if there are any.
+pub fn student(
+    training: &Training,
+    client: &Client,
+    contents: Option<&Contents>,
+    place: &Path,
+) -> Result<Box<dyn Student>, TrainError> {
+    let (info, config) = (client.info(), &training.config);
+    let site = Site {
+        shape: client.shape(),
+        n_observations: info.n_observations,
+        n_moves: info.n_moves,
+        worlds: training.worlds.clone(),
+    };
+    let wrong = |problem: Problem| problem.of(place);
+    Ok(match config.learner {
+        LearnerKind::Filter => {
+            let dimensions = dimensions(config, site.n_observations)?;
+            Box::new(match contents {
+                Some(contents) => {
+                    FilterStudent::resume(contents, dimensions, site, config).map_err(wrong)?
+                }
+                None => FilterStudent::new(dimensions, site, config),
+            })
+        }
+        LearnerKind::Autoencoder => {
+            let mut progress = network::Progress::first(&site, config);
+            if let Some(contents) = contents {
+                progress.load(contents).map_err(wrong)?;
+            }
+            let full_frames = config.autoencoder.full_frames;
+            let wants = progress.iterations < full_frames && !training.freeze;
+            if wants && info.coverage == CoverageRule::Path {
+                return Err(TrainError::NoFullFrames(full_frames));
+            }
+            Box::new(NetworkStudent::new(progress, site, config))
+        }
+        LearnerKind::Decisions => {
+            let model = info.model.as_deref().ok_or(TrainError::NoModel)?;
+            let model = Model::from_toml(model)?;
+            let mut decisions = Decisions::first(&model, &config.decisions, config.seed);
+            if let Some(contents) = contents {
+                decisions.load(contents).map_err(wrong)?;
+            }
+            let prior = config.prior(info.burn_in);
+            let filter = Filter::new(&model, prior.belief(&model, site.shape, config.seed)?)?;
+            Box::new(DecisionsStudent::new(
+                decisions, filter, &model, site, config,
+            ))
+        }
+    })
+}
+
+fn dimensions(config: &AgentConfig, n_observations: usize) -> Result<Dimensions, DimensionsError> {
+    let learning = config.learning;
+    let n_states = match learning.states {
+        0 => n_observations,
+        states => states,
+    };
+    let kernel = (learning.kernel[0], learning.kernel[1]);
+    let dimensions = Dimensions {
+        n_states,
+        n_observations,
+        kernel,
+    };
+    dimensions.check()
+}
