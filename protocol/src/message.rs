@@ -5,6 +5,10 @@
 //! valid values than bit patterns is converted with `TryFrom` and checked. Variable parts travel
 //! as the `[u8]` payload behind the header.
 
+mod status;
+
+pub use self::status::Status;
+
 use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 use thiserror::Error;
@@ -31,51 +35,6 @@ pub enum Operation {
     Observe = 2,
     /// Return the results and frames of an earlier step k; needs no lease.
     Recall = 3,
-}
-
-/// Answer to a request; every rejection has its own code and changes nothing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "snake_case")]
-#[repr(u32)]
-pub enum Status {
-    /// Done.
-    Ok = 0,
-    /// The request's version is not the server's; detail: the server's version.
-    VersionMismatch = 1,
-    /// No such operation; detail: the operation received.
-    UnknownOperation = 2,
-    /// Not a well-formed control message.
-    Malformed = 3,
-    /// A world outside the server's; detail: number of worlds.
-    NoSuchWorld = 4,
-    /// The payload is not `n_worlds * n_moves` bytes; detail: bytes expected.
-    WrongLength = 5,
-    /// Not the server's number of moves in a path; detail: moves expected.
-    WrongPathLength = 6,
-    /// A byte that is no move; detail: its position in the payload.
-    BadMove = 7,
-    /// The lease does not cover these worlds, or was never given; detail: the first such world.
-    NoLease = 8,
-    /// The lease was taken over, expired or released; detail: pid of the holder, 0 if none.
-    LeaseLost = 9,
-    /// Another client holds a world; detail: its pid.
-    Busy = 10,
-    /// A world is being reset; detail: the world.
-    Resetting = 11,
-    /// A world was truncated and must be reset first; detail: the world.
-    EpisodeOver = 12,
-    /// Full frames were asked of a server that gives none, or acting of a replay; detail: 0.
-    NotPermitted = 13,
-    /// A flag that the server does not know; detail: the flags received.
-    UnknownFlags = 14,
-    /// Not an objective of the agent's; detail: number of objectives.
-    BadObjective = 15,
-    /// The agent that was asked ends: it was told to, or cannot go on; detail: 0.
-    AgentEnds = 16,
-    /// A file that cannot be read or written, or is refused; detail: 0.
-    BadFile = 17,
-    /// A frame or a belief that the server does not keep; detail: the oldest step kept, or the present one.
-    NotKept = 18,
 }
 
 /// A number that is no [`Status`] or no [`Operation`].
@@ -306,96 +265,6 @@ impl TryFrom<u32> for Operation {
     }
 }
 
-impl Status {
-    /// Every status, in the order of its code.
-    pub const ALL: [Self; 19] = [
-        Self::Ok,
-        Self::VersionMismatch,
-        Self::UnknownOperation,
-        Self::Malformed,
-        Self::NoSuchWorld,
-        Self::WrongLength,
-        Self::WrongPathLength,
-        Self::BadMove,
-        Self::NoLease,
-        Self::LeaseLost,
-        Self::Busy,
-        Self::Resetting,
-        Self::EpisodeOver,
-        Self::NotPermitted,
-        Self::UnknownFlags,
-        Self::BadObjective,
-        Self::AgentEnds,
-        Self::BadFile,
-        Self::NotKept,
-    ];
-
-    /// What to tell a client of another version.
-    pub fn version_mismatch(client: u32, server: u64) -> String {
-        format!(
-            "protocol version mismatch: the client speaks {client}, the server {server}; \
-             use a client and a server of one release"
-        )
-    }
-
-    /// One sentence for people: what the status with this detail says and what to do.
-    pub fn explain(self, detail: u64) -> String {
-        match self {
-            Self::Ok => "ok".into(),
-            Self::VersionMismatch => Self::version_mismatch(VERSION, detail),
-            Self::UnknownOperation => {
-                format!("operation: expected 1 (step), 2 (observe) or 3 (recall), got {detail}")
-            }
-            Self::Malformed => "malformed control message".into(),
-            Self::NoSuchWorld => format!(
-                "no such world: the server has worlds 0 to {}",
-                detail.saturating_sub(1)
-            ),
-            Self::WrongLength => format!("wrong payload length: expected {detail} bytes"),
-            Self::WrongPathLength => {
-                format!("wrong path length: the server flies {detail} moves a step")
-            }
-            Self::BadMove => format!("byte {detail} of the paths: expected a move in 0..=3"),
-            Self::NoLease => format!("no lease on world {detail}: acquire it first"),
-            Self::LeaseLost if detail == 0 => {
-                "lease lost: it expired or was released; acquire the worlds again".into()
-            }
-            Self::LeaseLost => format!("lease lost to pid {detail}"),
-            Self::Busy => {
-                format!("busy: held by pid {detail}; wait for its release or take the worlds over")
-            }
-            Self::Resetting => {
-                format!("world {detail} is being reset; wait for the answer to the reset")
-            }
-            Self::EpisodeOver => format!("world {detail} was truncated: reset it first"),
-            Self::NotPermitted => {
-                "not permitted: full frames need a server with coverage \"client\" or \"full\", and a \
-                 replay takes no steps"
-                    .into()
-            }
-            Self::UnknownFlags => {
-                format!("flags: expected 0 or {FLAG_FULL_COVERAGE} (full coverage), got {detail}")
-            }
-            Self::BadObjective => format!("objective: expected 0 to {}", detail.saturating_sub(1)),
-            Self::AgentEnds => "the agent ends".into(),
-            Self::BadFile => "the file cannot be used".into(),
-            Self::NotKept => format!("not kept: the oldest step kept is {detail}"),
-        }
-    }
-}
-
-impl TryFrom<u32> for Status {
-    type Error = UnknownCode;
-
-    fn try_from(value: u32) -> Result<Self, UnknownCode> {
-        let known = Self::ALL.get(value as usize).copied();
-        known.ok_or(UnknownCode {
-            what: "status",
-            value,
-        })
-    }
-}
-
 /// The results and frames in the payload of a successful step answer.
 ///
 /// # Errors
@@ -423,21 +292,6 @@ pub fn split_step_payload<'a>(
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn status_codes_survive_the_wire() {
-        for (code, status) in Status::ALL.into_iter().enumerate() {
-            assert_eq!(status as usize, code);
-            assert_eq!(Status::try_from(code as u32), Ok(status));
-        }
-        assert_eq!(
-            Status::try_from(19),
-            Err(UnknownCode {
-                what: "status",
-                value: 19
-            })
-        );
-    }
 
     #[test]
     fn a_step_payload_of_the_wrong_length_is_refused() {

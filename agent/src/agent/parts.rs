@@ -1,0 +1,111 @@
+//! What an agent is made of, as its policy wants it.
+
+use super::{AgentError, Decider, Estimator, Task};
+use crate::config::AgentConfig;
+use crate::estimator::LearnedFilter;
+use crate::learner::LearnedModel;
+use crate::policy::{EstimatorKind, Policy};
+use crate::student::decisions::Decisions;
+use protocol::Model;
+use std::sync::Arc;
+
+/// The model's names, or numbers where a learner called the states what it liked.
+pub(super) fn state_names(kind: EstimatorKind, model: &Model, n_states: usize) -> Vec<String> {
+    match kind {
+        EstimatorKind::Learned | EstimatorKind::Autoencoder => numbered_states(n_states),
+        _ => model.state_names(),
+    }
+}
+
+/// Names of states that were learned.
+pub fn numbered_states(n_states: usize) -> Vec<String> {
+    (0..n_states)
+        .map(|state| format!("state {state}"))
+        .collect()
+}
+
+/// The kind of belief, with a checksum of the parameters that give it its meaning.
+pub(super) fn belief_kind(estimator: &Estimator, task: &Task<'_>) -> Option<String> {
+    let (kind, checksum) = match estimator {
+        Estimator::KnownModel(_) => {
+            let text = format!("{:?}", task.model.file());
+            ("known_model", crc32fast::hash(text.as_bytes()))
+        }
+        Estimator::Learned(filter) => {
+            let tables = filter.tables();
+            let numbers = [&tables.kernel, &tables.likelihood, &tables.initial];
+            let numbers = numbers.into_iter().flatten();
+            let bytes: Vec<u8> = numbers.flat_map(|number| number.to_le_bytes()).collect();
+            ("learned_filter", crc32fast::hash(&bytes))
+        }
+        _ => return None,
+    };
+    Some(format!(
+        "{kind} {checksum:08x}, probabilities [S, H, W] as f32"
+    ))
+}
+
+/// What decides for a policy: the DQN learned beside its belief, or that of a known model's.
+pub(super) fn decider(
+    policy: &Policy,
+    task: &Task<'_>,
+    config: &AgentConfig,
+) -> Result<Decider, AgentError> {
+    if policy.estimator != EstimatorKind::Autoencoder {
+        let contents = present(policy, &task.learned.decisions, "decisions")?;
+        let mut decisions = Decisions::first(task.model, &config.decisions, config.seed);
+        decisions.load(contents)?;
+        return Ok(Decider::Action(Arc::new(decisions)));
+    }
+    let network = present(policy, &task.learned.network, "an autoencoder")?.clone();
+    let choices = Policy::network_choices(network.autoencoder.shape().n_states);
+    let objectives = choices.iter().map(|choice| config.objective(choice));
+    Ok(Decider::Objective {
+        objectives: objectives.collect(),
+        network,
+    })
+}
+
+pub(super) fn learned_filter(
+    policy: &Policy,
+    task: &Task<'_>,
+) -> Result<LearnedFilter, AgentError> {
+    let learned: &LearnedModel = present(policy, &task.learned.filter, "a filter")?;
+    same_observations(task, learned.tables.dimensions.n_observations)?;
+    Ok(LearnedFilter::new(&learned.tables, task.shape))
+}
+
+pub(super) fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<Estimator, AgentError> {
+    let learned = present(policy, &task.learned.network, "an autoencoder")?;
+    let shape = learned.autoencoder.shape();
+    same_observations(task, shape.n_observations)?;
+    if shape.grid != task.shape {
+        let cells = |(height, width): (usize, usize)| format!("{height} x {width}");
+        return Err(AgentError::OtherGrid {
+            expected: cells(task.shape.dim()),
+            got: cells(shape.grid.dim()),
+        });
+    }
+    let follower = learned.autoencoder.follower();
+    let belief = follower.prediction().clone();
+    Ok(Estimator::Autoencoder(Box::new(follower), belief))
+}
+
+fn present<'a, T>(
+    policy: &Policy,
+    learned: &'a Option<T>,
+    kind: &'static str,
+) -> Result<&'a T, AgentError> {
+    learned.as_ref().ok_or_else(|| AgentError::NeedsCheckpoint {
+        policy: policy.name.clone(),
+        kind,
+    })
+}
+
+fn same_observations(task: &Task<'_>, got: usize) -> Result<(), AgentError> {
+    let expected = task.model.n_observations();
+    match got == expected {
+        true => Ok(()),
+        false => Err(AgentError::OtherObservations { expected, got }),
+    }
+}
