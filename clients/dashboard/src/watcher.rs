@@ -3,7 +3,7 @@
 //! One thread reads what is published, which needs no server; another asks the server now and then how it is.
 
 use crate::scene::{Info, Stage};
-use protocol::channels::{ChannelError, Instance};
+use protocol::channels::{AGENT_BUFFER, ChannelError, FRAME_BUFFER, Instance};
 use protocol::connection::{Connection, ConnectionError, unexpected};
 use protocol::control::{Reply, Request, ServerStatus};
 use protocol::message::{AgentHeader, FrameHeader, Header, TruthHeader};
@@ -16,14 +16,17 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
-/// Time between two looks at the channels: a buffer of 64 frames lasts that long at 32,000 steps a second.
-const LOOK_INTERVAL: Duration = Duration::from_millis(2);
+/// Least time between two looks at the channels: a buffer of 64 frames lasts that long at 32,000 steps a second.
+const LEAST_INTERVAL: Duration = Duration::from_millis(2);
 
-/// The same while nothing comes.
-const IDLE_INTERVAL: Duration = Duration::from_millis(10);
+/// Most: each look takes processor time, perhaps the simulator's.
+const MOST_INTERVAL: Duration = Duration::from_millis(10);
 
-/// Nothing comes if nothing came for so long.
-const IDLE_AFTER: Duration = Duration::from_secs(1);
+/// More frames or beliefs than that at a look, and the next is due soon: buffers may run over.
+const MANY: (usize, usize) = (FRAME_BUFFER / 3, AGENT_BUFFER / 3);
+
+/// Time after which channels that failed are opened again.
+const REOPEN_INTERVAL: Duration = Duration::from_secs(1);
 
 /// How long a belief waits for the frame that it is about: agents may be quicker than their server.
 const EARLY: Duration = Duration::from_millis(200);
@@ -103,7 +106,7 @@ fn read(reader: Reader, instance: &Instance, stage: &Stage, stop: &AtomicBool) {
         let Some(error) = failed else { return };
         tracing::error!("{error}");
         stage.change(|scene| scene.trouble = Some(error.to_string()));
-        std::thread::sleep(IDLE_AFTER);
+        std::thread::sleep(REOPEN_INTERVAL);
         reader = Reader::open(instance, stage);
     }
 }
@@ -188,20 +191,18 @@ impl Reader {
     }
 
     fn read(mut self, stage: &Stage, stop: &AtomicBool) -> Result<(), ChannelError> {
-        let mut last = Instant::now();
+        let mut interval = LEAST_INTERVAL;
         while !stop.load(Ordering::Relaxed) {
-            if self.look(stage)? {
-                last = Instant::now();
-            }
-            std::thread::sleep(match last.elapsed() < IDLE_AFTER {
-                true => LOOK_INTERVAL,
-                false => IDLE_INTERVAL,
-            });
+            interval = match self.look(stage)? {
+                true => LEAST_INTERVAL,
+                false => MOST_INTERVAL.min(2 * interval),
+            };
+            std::thread::sleep(interval);
         }
         Ok(())
     }
 
-    /// Takes in what is there; whether anything was.
+    /// Takes in what is there; returns whether it was much.
     fn look(&mut self, stage: &Stage) -> Result<bool, ChannelError> {
         // Beliefs first: what they are about is published at about the same time, so it mostly is there then.
         let beliefs = self.agents.as_ref().map_or(Ok(Vec::new()), all)?;
@@ -239,7 +240,7 @@ impl Reader {
                 !is_there && now.duration_since(*came) < EARLY
             });
         });
-        Ok(true)
+        Ok(frames.len() > MANY.0 || beliefs.len() > MANY.1)
     }
 }
 
@@ -251,4 +252,17 @@ fn all<H: Header>(observer: &Observer<H>) -> Result<Vec<Sample<H>>, ChannelError
         samples.push(sample);
     }
     Ok(samples)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_missing_in_a_row_is_counted_and_another_publisher_begins_a_new_one() {
+        let mut gaps = Gaps::default();
+        let row = [(1, 7), (1, 8), (1, 11), (1, 11), (2, 90), (2, 92), (1, 12)];
+        let missing = row.map(|(publisher, sequence)| gaps.before(Some(publisher), sequence));
+        assert_eq!(missing, [0, 0, 2, 0, 0, 1, 0]);
+    }
 }

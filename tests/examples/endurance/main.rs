@@ -2,7 +2,7 @@
 //! stopped, hours of coming and going.
 //!
 //! `cargo run --release -p tests --example endurance -- agents 1000 | servers 200 | observers 5 |
-//! dashboard 5 64 | soak 3600 FOLDER`
+//! dashboard 5 64 | snapshots 9 | soak 3600 FOLDER`
 
 #[expect(dead_code, reason = "the tests use all of it")]
 #[path = "../../harness.rs"]
@@ -13,6 +13,7 @@ mod dashboard;
 mod meter;
 mod observers;
 mod servers;
+mod snapshots;
 mod soak;
 
 use std::io::Write;
@@ -29,12 +30,21 @@ fn main() {
         ["servers", n] => servers::kill(number(n)),
         ["observers", n] => observers::compare(number(n)),
         ["dashboard", rounds, side] => dashboard::compare(number(rounds), number(side)),
+        ["snapshots", n] => snapshots::compare(number(n)),
         ["observe", instance] => observers::observe(instance),
         ["soak", seconds, folder] => soak::soak(number(seconds), folder.as_ref()),
         _ => panic!(
-            "expected agents N, servers N, observers ROUNDS, dashboard ROUNDS SIDE or soak SECONDS FOLDER, got {words:?}"
+            "expected agents N, servers N, observers ROUNDS, dashboard ROUNDS SIDE, snapshots ROUNDS or soak SECONDS FOLDER, got {words:?}"
         ),
     }
+}
+
+/// Median, least and greatest.
+fn range(mut numbers: Vec<f64>, digits: usize) -> String {
+    numbers.sort_by(f64::total_cmp);
+    let (least, most) = (numbers[0], numbers[numbers.len() - 1]);
+    let median = numbers[numbers.len() / 2];
+    format!("{median:.digits$} ({least:.digits$}-{most:.digits$})")
 }
 
 /// Writes a line.

@@ -1,21 +1,21 @@
 //! What observers cost: a step's time with 0, 1, 4 and 16 of them, one of them stopped.
 
 use crate::harness::{Paths, Server};
-use crate::say;
-use protocol::Probabilities;
+use crate::{range, say};
 use protocol::channels::Instance;
 use protocol::control::{Reply, Request};
 use protocol::message::{AgentHeader, Operation, StepRequest};
 use protocol::observer::Observer;
 use protocol::outlook::{Intent, Showcase};
 use protocol::path::path_to_bytes;
+use protocol::{Connection, Probabilities};
 use rustix::process::{Pid, Signal, kill_process};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 const N_STEPS: usize = 20_000;
 
-const TIMEOUT: Duration = Duration::from_secs(20);
+pub const TIMEOUT: Duration = Duration::from_secs(20);
 
 /// A process; killed on drop.
 pub struct Process(pub Child);
@@ -55,12 +55,7 @@ where
         }
     }
     for ((name, _), times) in audiences.iter().zip(&rounds) {
-        let column = |index: usize| {
-            let mut column: Vec<f64> = times.iter().map(|times| times[index]).collect();
-            column.sort_by(f64::total_cmp);
-            let (least, most) = (column[0], column[column.len() - 1]);
-            format!("{:.1} ({least:.1}-{most:.1})", column[column.len() / 2])
-        };
+        let column = |index: usize| range(times.iter().map(|times| times[index]).collect(), 1);
         let [a, b, c, d] = [0, 1, 2, 3].map(column);
         say(&format!("{name:<28}{a:>20}{b:>20}{c:>24}{d:>24}"));
     }
@@ -71,24 +66,8 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
     let server = Server::start(flags);
     let _audience = attend(&server);
     std::thread::sleep(Duration::from_millis(500));
-    let mut connection = server.connect();
+    let (mut connection, request) = acquire(&server);
     let info = connection.info().clone();
-    let acquire = Request::Acquire {
-        first_world: 0,
-        n_worlds: 1,
-        takeover: false,
-        ttl_millis: None,
-    };
-    let Ok(Reply::Lease(lease)) = connection.control(&acquire, TIMEOUT) else {
-        panic!("expected a lease");
-    };
-    let request = StepRequest {
-        operation: Operation::Step as u32,
-        lease: lease.lease,
-        n_worlds: 1,
-        n_moves: info.n_moves as u32,
-        ..StepRequest::default()
-    };
     let belief = Probabilities::from_elem((3, info.height, info.width), 1.0 / 3.0);
     let mut showcase =
         Showcase::open(&server.instance, 4 * belief.len() + 1024).expect("the agent channel");
@@ -130,6 +109,28 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
         at(&mut trips, 0.5),
         at(&mut trips, 0.99),
     ]
+}
+
+/// A connection that holds the first world, and the request of its step.
+pub fn acquire(server: &Server) -> (Connection, StepRequest) {
+    let mut connection = server.connect();
+    let acquire = Request::Acquire {
+        first_world: 0,
+        n_worlds: 1,
+        takeover: false,
+        ttl_millis: None,
+    };
+    let Ok(Reply::Lease(lease)) = connection.control(&acquire, TIMEOUT) else {
+        panic!("expected a lease");
+    };
+    let request = StepRequest {
+        operation: Operation::Step as u32,
+        lease: lease.lease,
+        n_worlds: 1,
+        n_moves: connection.info().n_moves as u32,
+        ..StepRequest::default()
+    };
+    (connection, request)
 }
 
 fn start(server: &Server, is_stopped: bool) -> Process {

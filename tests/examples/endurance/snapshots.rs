@@ -1,0 +1,46 @@
+//! What `--snapshot-every 1000` costs a client that steps as fast as it can.
+
+use crate::harness::{Paths, Server};
+use crate::observers::{TIMEOUT, acquire};
+use crate::{range, say};
+use protocol::path::path_to_bytes;
+use std::time::Instant;
+use tempfile::TempDir;
+
+const N_STEPS: usize = 100_000;
+
+/// Prints the time of a step without and with snapshots, run in turns, and their ratio.
+pub fn compare(n_rounds: usize) {
+    let (mut without, mut with, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
+    for _ in 0..n_rounds {
+        let folder = TempDir::new().expect("a folder");
+        let flags = format!(
+            "--snapshot-every 1000 --snapshot-dir {}",
+            folder.path().display()
+        );
+        without.push(measure(""));
+        with.push(measure(&flags));
+        ratios.push(with[with.len() - 1] / without[without.len() - 1]);
+    }
+    say(&format!(
+        "{N_STEPS} steps, us each: median (least-most) of {n_rounds} pairs"
+    ));
+    say(&format!(
+        "without {}   with {}   ratio {}",
+        range(without, 2),
+        range(with, 2),
+        range(ratios, 3)
+    ));
+}
+
+/// Microseconds of a step.
+fn measure(flags: &str) -> f64 {
+    let server = Server::start(&format!("--burn-in 1000 {flags}"));
+    let (mut connection, request) = acquire(&server);
+    let path = path_to_bytes(&Paths::new(0).next(request.n_moves as usize));
+    let mut step = || _ = connection.step(request, &path, TIMEOUT).expect("a step");
+    (0..N_STEPS / 20).for_each(|_| step());
+    let start = Instant::now();
+    (0..N_STEPS).for_each(|_| step());
+    start.elapsed().as_secs_f64() * 1e6 / N_STEPS as f64
+}
