@@ -185,7 +185,7 @@ impl Match<'_> {
         let mut runs = self.start(arena)?;
         for step in 0..self.comparison.steps {
             let shown = feed.turn(runs.len());
-            self.step(arena, &mut runs, step, shown)?;
+            self.step(arena, &mut runs, step, &shown)?;
             for (world, run) in arena.worlds().zip(&mut runs) {
                 run.show(feed, world);
             }
@@ -222,7 +222,7 @@ impl Match<'_> {
         arena: &mut Arena,
         runs: &mut [Run],
         step: u64,
-        shown: Option<usize>,
+        shown: &[usize],
     ) -> Result<(), CompareError> {
         if self.policy.estimator == EstimatorKind::NextTruth {
             let next = arena.foresee(self.seeds, step + 1)?;
@@ -242,7 +242,7 @@ impl Match<'_> {
             .enumerate()
             .map(|(index, (((run, plan), observation), truth))| {
                 let taken = run.take_in(&plan, observation, truth, target, is_last);
-                run.posterior = (shown == Some(index)).then(|| run.agent.belief().clone());
+                run.posterior = shown.contains(&index).then(|| run.agent.belief().clone());
                 run.agent.predict();
                 taken
             });

@@ -1,7 +1,7 @@
 //! Shows beliefs to whoever looks on, at the pace of eyes: the agent's side of the channel `agent`.
 
 use crate::belief::Belief;
-use protocol::channels::Instance;
+use protocol::channels::{AGENT_BUFFER, Instance};
 use protocol::message::{AgentHeader, StepResult};
 use protocol::outlook::{Intent, Showcase};
 use std::time::{Duration, Instant};
@@ -50,14 +50,21 @@ impl Feed {
 
     /// Whether it is time to show beliefs, and anybody looks.
     pub fn is_due(&self) -> bool {
-        self.turn(1).is_some()
+        !self.turn(1).is_empty()
     }
 
-    /// Which of several worlds is to be shown now, if any: one after the other, as a reader keeps few beliefs.
-    pub fn turn(&self, n_worlds: usize) -> Option<usize> {
-        let interval = INTERVAL / n_worlds.max(1) as u32;
-        let is_due = self.shown.is_none_or(|shown| shown.elapsed() >= interval);
-        (is_due && n_worlds > 0 && self.is_watched()).then(|| self.n_shown % n_worlds)
+    /// Which of several worlds are to be shown now: one after the other, and no more at once than a reader keeps
+    /// beside one that is still to be read.
+    pub fn turn(&self, n_worlds: usize) -> Vec<usize> {
+        if !self.is_watched() {
+            return Vec::new();
+        }
+        let share = |shown: Instant| shown.elapsed().as_secs_f64() / INTERVAL.as_secs_f64();
+        let n_due = self
+            .shown
+            .map_or(1, |shown| (share(shown) * n_worlds as f64) as usize);
+        let turn = (self.n_shown..).take(n_due.min(n_worlds).min(AGENT_BUFFER - 1));
+        turn.map(|number| number % n_worlds).collect()
     }
 
     /// Whether anybody looks.

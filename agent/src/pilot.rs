@@ -14,6 +14,7 @@ use crate::policy::{PlannerKind, Policy};
 use crate::scoring::{Score, score};
 use protocol::path::fly;
 use protocol::{Move, Shape};
+use std::time::{Duration, Instant};
 
 /// Acts on one world on a learned belief.
 pub struct Pilot {
@@ -26,6 +27,8 @@ pub struct Pilot {
     seed: u64,
     /// The cells that the last path visits.
     visited: Vec<usize>,
+    /// Time that its plan took.
+    pub planning: Duration,
 }
 
 impl Pilot {
@@ -42,6 +45,7 @@ impl Pilot {
             beam: config.planner(&Policy::learned(PlannerKind::Beam)),
             seed: planner_seed(config, observation.result.seed),
             visited: Vec::new(),
+            planning: Duration::ZERO,
             observation,
         }
     }
@@ -88,6 +92,7 @@ impl Pilot {
         config: &AgentConfig,
         n_moves: usize,
     ) -> Vec<Move> {
+        let start = Instant::now();
         let policy = Policy::learned(kind);
         let mut objective = config.objective(&policy);
         let planner = match kind {
@@ -108,6 +113,7 @@ impl Pilot {
         let moves = planner.plan(&problem).moves;
         let shape = self.filter.belief().shape();
         self.visited = fly(shape, problem.start, &moves).visited;
+        self.planning = start.elapsed();
         moves
     }
 

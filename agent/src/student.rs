@@ -36,6 +36,8 @@ pub struct Impression {
     pub belief: Belief,
     /// What its path was for, in a word or two.
     pub objective: String,
+    /// Time that the path's plan took.
+    pub planning: Duration,
 }
 
 /// What one update did.
@@ -125,16 +127,16 @@ pub trait Student {
     /// The next path of each world.
     fn plan(&mut self) -> Vec<Vec<Move>>;
 
-    /// Takes in what the paths showed: scores the prediction, corrects, predicts, remembers. `watched`: which
-    /// of the worlds somebody looks at.
+    /// Takes in what the paths showed: scores the prediction, corrects, predicts, remembers. Gives what it makes
+    /// of the worlds that are `watched`, by their index.
     ///
     /// # Errors
     /// [`StudentError`].
     fn take_in(
         &mut self,
         observations: Vec<Observation>,
-        watched: Option<usize>,
-    ) -> Result<(Tick, Option<Impression>), StudentError>;
+        watched: &[usize],
+    ) -> Result<(Tick, Vec<Impression>), StudentError>;
 
     /// Makes the updates that the steps since the last call have earned.
     ///

@@ -94,8 +94,6 @@ struct Trainee {
     metrics: Metrics,
     events: Events,
     feed: Option<Feed>,
-    /// Time that the last paths' plans took.
-    planning: Duration,
     summary: TrainSummary,
     saved: Instant,
     told: Told,
@@ -153,7 +151,6 @@ impl Trainee {
             metrics,
             events,
             feed,
-            planning: Duration::ZERO,
             summary: TrainSummary::default(),
             saved: now,
             told: Told::at(now, &TrainSummary::default()),
@@ -169,9 +166,7 @@ impl Trainee {
         let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
         let is_done = |steps: u64| training.steps > 0 && steps >= training.steps;
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
-            let start = Instant::now();
             let paths = self.student.plan();
-            self.planning = start.elapsed();
             let observations = self.fly(&paths)?;
             let taken = self.take_in(observations)?;
             let tick = taken.map_err(|problem| training.stopped(problem, &*self.student))?;
@@ -211,18 +206,17 @@ impl Trainee {
         let ended = ended.filter(|(_, seen)| is_over(seen));
         let ended: Vec<u32> = ended.map(|(world, _)| world).collect();
         let feed = self.feed.as_ref();
-        let watched = feed.and_then(|feed| feed.turn(observations.len()));
-        let shown = watched.map(|index| (index, observations[index].result));
-        let (tick, impression) = match self.student.take_in(observations, watched) {
+        let watched = feed.map_or_else(Vec::new, |feed| feed.turn(observations.len()));
+        let results: Vec<_> = watched
+            .iter()
+            .map(|&index| observations[index].result)
+            .collect();
+        let (tick, impressions) = match self.student.take_in(observations, &watched) {
             Ok(taken) => taken,
             Err(problem) => return Ok(Err(problem)),
         };
-        if let (Some((index, result)), Some(impression)) = (shown, impression) {
-            self.show(
-                self.client.worlds().start + index as u32,
-                &result,
-                impression,
-            );
+        for ((index, result), seen) in watched.into_iter().zip(&results).zip(impressions) {
+            self.show(self.client.worlds().start + index as u32, result, seen);
         }
         for world in ended {
             let observation = reset(&mut self.client, world)?;
@@ -243,7 +237,7 @@ impl Trainee {
             belief_from: estimator.into(),
             objective: seen.objective,
             states: self.student.state_names(),
-            plan_millis: self.planning.as_secs_f64() * 1e3,
+            plan_millis: seen.planning.as_secs_f64() * 1e3,
         };
         if let Some(feed) = &mut self.feed {
             feed.show(&View {

@@ -7,7 +7,8 @@ use crate::snapshot::{RestoredWorld, SnapshotError};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// How much of a run a loss of power may cost: to wait for the disk each time would slow the steps down.
+/// Least time between two snapshots that outlive a loss of power: to wait for the disk each time would slow the steps
+/// down.
 const SYNC_INTERVAL: Duration = Duration::from_secs(5);
 
 /// When to write the next one, and where.
@@ -66,10 +67,7 @@ impl Autosave {
     pub fn order(&mut self, n_steps: u64, bytes: Vec<u8>, is_last: bool, files: &mut Files) {
         self.skip(n_steps);
         let safe = self.safe.as_ref();
-        let outlives = match safe {
-            Some((at, _)) if !is_last && at.elapsed() < SYNC_INTERVAL => Outlives::Kills,
-            _ => Outlives::PowerLoss,
-        };
+        let outlives = outlives(safe.map(|(at, _)| at.elapsed()), is_last);
         let job = files.order(Job::Autosave {
             folder: self.folder.clone(),
             outlives,
@@ -93,6 +91,14 @@ impl Autosave {
             Err(error) => tracing::warn!("not saved: {error}"),
         }
         true
+    }
+}
+
+/// What the next snapshot must outlive; `age`: time since the last that outlives a loss of power, if there is one.
+fn outlives(age: Option<Duration>, is_last: bool) -> Outlives {
+    match age {
+        Some(age) if age < SYNC_INTERVAL && !is_last => Outlives::Kills,
+        _ => Outlives::PowerLoss,
     }
 }
 
@@ -140,4 +146,18 @@ pub fn first_worlds(checked: &Checked, place: &Place) -> Result<Option<FirstWorl
         tracing::info!(folder = %path.display(), "nothing to restore: the worlds begin anew");
     }
     damaged.map_or(Ok(None), Err)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_the_last_and_one_in_a_while_outlive_a_loss_of_power() {
+        let (soon, late) = (SYNC_INTERVAL / 2, SYNC_INTERVAL);
+        assert_eq!(outlives(None, false), Outlives::PowerLoss);
+        assert_eq!(outlives(Some(soon), false), Outlives::Kills);
+        assert_eq!(outlives(Some(late), false), Outlives::PowerLoss);
+        assert_eq!(outlives(Some(soon), true), Outlives::PowerLoss);
+    }
 }

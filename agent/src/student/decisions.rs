@@ -62,6 +62,8 @@ struct Pilot {
     observation: Observation,
     input: Vec<f32>,
     action: usize,
+    /// Time that its last plan took.
+    planning: Duration,
     track: Track,
 }
 
@@ -168,6 +170,7 @@ impl Pilot {
             planner: BeamSearch::new(student.config.beam_width),
             observation,
             action: 0,
+            planning: Duration::ZERO,
             track: student.decisions.dqn.track(),
         })
     }
@@ -210,6 +213,7 @@ impl Student for DecisionsStudent {
         let (decisions, config, n_moves) = (&self.decisions, &self.config, self.site.n_moves);
         let is_frozen = self.is_frozen;
         let plan = |(index, pilot): (usize, &mut Pilot)| {
+            let start = Instant::now();
             let step = decisions.world_steps + index as u64;
             pilot.action = match is_frozen {
                 true => decisions.dqn.best(&pilot.input),
@@ -220,6 +224,7 @@ impl Student for DecisionsStudent {
             let random = (planner_seed(config, result.seed), result.step);
             let (robot, belief) = (pilot.observation.robot(), pilot.filter.belief());
             let plan = action.plan(&mut pilot.planner, belief, robot, n_moves, random);
+            pilot.planning = start.elapsed();
             plan.moves
         };
         let paths = self.pilots.par_iter_mut().enumerate().map(plan).collect();
@@ -230,8 +235,8 @@ impl Student for DecisionsStudent {
     fn take_in(
         &mut self,
         observations: Vec<Observation>,
-        watched: Option<usize>,
-    ) -> Result<(Tick, Option<Impression>), StudentError> {
+        watched: &[usize],
+    ) -> Result<(Tick, Vec<Impression>), StudentError> {
         let mut tick = Tick::default();
         for (pilot, observation) in self.pilots.iter_mut().zip(observations) {
             tick.reward += observation.result.reward;
@@ -239,13 +244,15 @@ impl Student for DecisionsStudent {
             pilot.filter.correct(&observation.frame)?;
             pilot.observation = observation;
         }
-        let impression = watched.map(|index| {
+        let impression = |&index: &usize| {
             let pilot = &self.pilots[index];
             Impression {
                 belief: pilot.filter.belief().clone(),
                 objective: self.decisions.actions.actions()[pilot.action].name.clone(),
+                planning: pilot.planning,
             }
-        });
+        };
+        let impressions = watched.iter().map(impression).collect();
         let n_moves = self.site.n_moves;
         let config = &self.config.decisions;
         let bring = |pilot: &mut Pilot| {
@@ -261,7 +268,7 @@ impl Student for DecisionsStudent {
         self.decisions.world_steps += tick.n_worlds;
         tick.world_steps = self.decisions.world_steps;
         self.owed += tick.n_worlds as f64 * config.updates_per_step;
-        Ok((tick, impression))
+        Ok((tick, impressions))
     }
 
     fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {

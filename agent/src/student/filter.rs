@@ -141,8 +141,8 @@ impl Student for FilterStudent {
     fn take_in(
         &mut self,
         observations: Vec<Observation>,
-        watched: Option<usize>,
-    ) -> Result<(Tick, Option<Impression>), StudentError> {
+        watched: &[usize],
+    ) -> Result<(Tick, Vec<Impression>), StudentError> {
         let mut tick = Tick::default();
         let n_walking = self.n_walking();
         let worlds = self.site.worlds.clone().zip(observations);
@@ -150,19 +150,21 @@ impl Student for FilterStudent {
             tick.reward += observation.result.reward;
             tick.score += pilot.take_in(world, observation, &mut self.learner)?;
         }
-        let impression = watched.map(|index| Impression {
+        let impression = |&index: &usize| Impression {
             belief: self.pilots[index].filter.belief().clone(),
             objective: match index < n_walking {
                 true => RANDOM_MOVES.into(),
                 false => Target::State(self.learned.target).label(&self.state_names()),
             },
-        });
+            planning: self.pilots[index].planning,
+        };
+        let impressions = watched.iter().map(impression).collect();
         self.pilots
             .par_iter_mut()
             .for_each(|pilot| pilot.filter.predict());
         tick.n_worlds = self.pilots.len() as u64;
         tick.world_steps = self.learner.world_steps();
-        Ok((tick, impression))
+        Ok((tick, impressions))
     }
 
     fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {

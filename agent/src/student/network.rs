@@ -44,6 +44,8 @@ pub struct NetworkStudent {
     decision: Option<Decision>,
     track: Track,
     is_frozen: bool,
+    /// Time that the last plan took.
+    planning: Duration,
     times: [(&'static str, Duration); 4],
 }
 
@@ -72,6 +74,7 @@ impl NetworkStudent {
             observation: None,
             decision: None,
             is_frozen: false,
+            planning: Duration::ZERO,
             times: ["planning", "inference", "dqn", "autoencoder"]
                 .map(|part| (part, Duration::ZERO)),
         }
@@ -198,15 +201,16 @@ impl Student for NetworkStudent {
             action,
             value,
         });
-        self.times[0].1 += start.elapsed();
+        self.planning = start.elapsed();
+        self.times[0].1 += self.planning;
         vec![plan.moves]
     }
 
     fn take_in(
         &mut self,
         mut observations: Vec<Observation>,
-        watched: Option<usize>,
-    ) -> Result<(Tick, Option<Impression>), StudentError> {
+        watched: &[usize],
+    ) -> Result<(Tick, Vec<Impression>), StudentError> {
         let observation = observations.remove(0);
         let frame = observation.frame.clone();
         let prediction = self.progress.autoencoder.prediction();
@@ -226,11 +230,12 @@ impl Student for NetworkStudent {
         };
         let action = self.decision.as_ref().map(|decision| decision.action);
         let target = action.map(|action| self.objectives[action].target);
-        let impression = watched.map(|_| Impression {
-            belief: estimate,
+        let impression = |_: &usize| Impression {
+            belief: estimate.clone(),
             objective: target.map_or_else(String::new, |target| target.label(&self.state_names())),
-        });
-        Ok((tick, impression))
+            planning: self.planning,
+        };
+        Ok((tick, watched.iter().map(impression).collect()))
     }
 
     fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {

@@ -1,7 +1,7 @@
 // What the page says in words: state, note, facts, and what is missing.
 
 import { write } from "/elements.js";
-import { short, stateNames, targetName, text, whole } from "/words.js";
+import { beliefAge, short, stateNames, targetName, text, whole } from "/words.js";
 
 const byId = (id) => document.getElementById(id);
 
@@ -100,13 +100,16 @@ function holder(world) {
   return world.resetting ? "burning in" : text(world.holder_pid ?? "nobody");
 }
 
-function drawAgent({ agent, source }, isNewest) {
+function drawAgent(picture, isNewest) {
+  const { agent, source } = picture;
+  // Of an earlier step: what this path was for, and its plan, are not known.
+  const plan = beliefAge(picture) ? null : agent;
   const isSilent = isNewest && source === "live" && agent?.is_live === false;
   write(byId("policy"), text(agent?.policy));
   write(byId("silent"), isSilent ? "silent" : "");
-  write(byId("objective"), text(agent?.objective));
+  write(byId("objective"), text(plan?.objective));
   write(byId("belief-from"), text(agent?.belief_from));
-  write(byId("plan"), agent?.plan_millis == null ? text(null) : `${Number(agent.plan_millis.toPrecision(2))} ms`);
+  write(byId("plan"), plan?.plan_millis == null ? text(null) : `${Number(plan.plan_millis.toPrecision(2))} ms`);
 }
 
 // Before anything is known there is nothing to lay out: a word on how to begin.

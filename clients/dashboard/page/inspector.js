@@ -3,7 +3,7 @@
 import { make, swatch } from "/elements.js";
 import { NEVER, rampColor } from "/palette.js";
 import { cellsOf, shapeOf } from "/wire.js";
-import { beliefNames, observationNames, seenSince, stateNames } from "/words.js";
+import { beliefAge, beliefNames, observationNames, seenSince, stateNames } from "/words.js";
 
 // Long enough that a screen reader is not flooded while keys are held.
 const QUIET_MILLIS = 400;
@@ -54,6 +54,7 @@ function rowsOf(picture, { row, col }) {
   if (arrays.seen) rows.push(seenRow(picture, arrays.seen[at]));
   if (arrays.age && arrays.seen?.[at] !== NEVER) rows.push({ name: "age", value: ageText(arrays.age[at]) });
   const cells = cellsOf(picture);
+  if (beliefAge(picture)) rows.push({ name: "belief", value: beliefAge(picture) });
   beliefNames(picture).forEach((name, state) => {
     const share = arrays.belief[state * cells + at] / 255;
     rows.push({ name: `p(${name})`, value: share.toFixed(2), share, ramp: "belief" });

@@ -4,8 +4,6 @@
 import { decode } from "/wire.js";
 
 const RETRY_MILLIS = 1000;
-// From one ask to the next: 30 pictures a second are smooth, and more would take the simulator's processor time.
-const PICTURE_MILLIS = 1000 / 30;
 // The dashboard answers within half a second; a connection that is silent for longer is dead.
 const SILENCE_MILLIS = 6000;
 // Beside the ask that waits for news, one more may be under way: so that scrubbing need not wait.
@@ -22,7 +20,6 @@ export function connect({ ask, show, superseded, up, failed }) {
   let socket = null;
   let asked = 0;
   let isStale = false;
-  let askedAt = 0;
   let watchdog = 0;
 
   function open() {
@@ -35,7 +32,6 @@ export function connect({ ask, show, superseded, up, failed }) {
 
   function send() {
     asked += 1;
-    askedAt = performance.now();
     isStale = false;
     socket.send(JSON.stringify(ask()));
     watch(socket);
@@ -55,9 +51,7 @@ export function connect({ ask, show, superseded, up, failed }) {
     requestAnimationFrame(() => {
       const isOvertaken = asked > 0;
       if (picture && !(isOvertaken && superseded(picture))) attempt(() => show(picture));
-      setTimeout(() => {
-        if (from.readyState === WebSocket.OPEN && asked === 0) send();
-      }, askedAt + PICTURE_MILLIS - performance.now());
+      if (from.readyState === WebSocket.OPEN && asked === 0) send();
     });
   }
 

@@ -7,7 +7,7 @@ use protocol::outlook::{Intent, Outlook};
 use protocol::path::path_from_bytes;
 use protocol::{Cell, Move, Shape};
 use std::collections::{BTreeMap, VecDeque};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Most steps that are kept of a world.
 pub const MAX_ENTRIES: usize = 4096;
@@ -19,8 +19,8 @@ const MAX_BYTES: usize = 256 << 20;
 /// How many of the last steps late hidden states and beliefs are looked for in.
 const MAX_DELAY: usize = 512;
 
-/// How many steps back a belief may be that is shown beside a step.
-const MAX_BELIEF_AGE: usize = 100;
+/// How long before a step a belief may have come that is shown beside it.
+const MAX_BELIEF_AGE: Duration = Duration::from_secs(5);
 
 /// How many hidden states are held for frames that have not come yet: channels are read one after the
 /// other, and a recording may have them in either order.
@@ -259,16 +259,20 @@ impl Strip {
         self.entries.iter().take(n).rev()
     }
 
-    /// The latest step with a belief up to that of a serial number, of the same episode; none that is too far back
-    /// to tell much.
+    /// The steps of one run before a serial number and that one, the latest first: what is older may be of another
+    /// server, or from before a restore.
+    pub fn run_up_to(&self, serial: u64) -> impl Iterator<Item = &Entry> {
+        let mut next: Option<&Entry> = None;
+        self.back_from(serial)
+            .take_while(move |entry| next.replace(entry).is_none_or(|next| entry.precedes(next)))
+    }
+
+    /// The latest step with a belief of those, if that came not long before.
     pub fn believed(&self, serial: u64) -> Option<&Entry> {
         let (_, now) = self.nearest(serial)?;
-        let is_same = |entry: &&Entry| entry.is_of_episode(now);
-        let mut earlier = self
-            .back_from(serial)
-            .take(MAX_BELIEF_AGE)
-            .take_while(is_same);
-        earlier.find(|entry| entry.belief.is_some())
+        let is_recent = |entry: &&Entry| now.at.duration_since(entry.at) < MAX_BELIEF_AGE;
+        let mut recent = self.run_up_to(serial).take_while(is_recent);
+        recent.find(|entry| entry.belief.is_some())
     }
 
     /// All steps, the oldest first.
@@ -327,10 +331,10 @@ impl Entry {
         }
     }
 
-    /// Whether it is a step of the same episode on the same grid, or an earlier one.
-    pub fn is_of_episode(&self, other: &Self) -> bool {
+    /// Whether it is an earlier step of the same episode, on the same grid.
+    fn precedes(&self, other: &Self) -> bool {
         let of = |entry: &Self| (entry.result.seed, entry.result.episode, entry.shape);
-        of(self) == of(other) && self.result.step <= other.result.step
+        of(self) == of(other) && self.result.step < other.result.step
     }
 
     /// Whether it is the same again, as a server shows it to an observer who has just come.

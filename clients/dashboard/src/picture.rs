@@ -21,8 +21,11 @@ const NO_OBJECTIVE: u8 = 255;
 /// Most objectives with a colour of their own.
 const MAX_OBJECTIVES: usize = 255;
 
-/// A step with a belief is shown rather than a newer one without for so long.
-const BELIEF_LAG: Duration = Duration::from_millis(500);
+/// A step with a belief of its own is shown rather than a newer one without for so long.
+const BELIEF_LAG: Duration = Duration::from_millis(200);
+
+/// An agent that has shown no belief for so long is said to be silent.
+const SILENCE: Duration = Duration::from_secs(2);
 
 /// What a browser wants to see.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -147,14 +150,15 @@ pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
         Some(serial) => strip.nearest(serial),
         None => newest(strip),
     });
+    let believed = chosen.and_then(|(serial, _)| strip?.believed(serial));
     let mut arrays = Arrays::default();
     let (mut objectives, mut series, mut since) = (Vec::new(), None, 0);
     if let (Some(strip), Some((serial, entry))) = (strip, chosen) {
         since = arrays.add_grids(strip, serial, entry);
+        arrays.add_belief(believed);
         (objectives, series) = arrays.add_series(strip, ask.bins.clamp(BINS.0, BINS.1));
     }
-    let believed = chosen.and_then(|(serial, _)| strip?.believed(serial));
-    let is_live = |entry: &Entry| now.duration_since(entry.at) < 4 * BELIEF_LAG;
+    let is_live = |entry: &Entry| now.duration_since(entry.at) < SILENCE;
     let header = Header {
         instance: &scene.instance,
         source: match scene.player {
@@ -234,12 +238,14 @@ impl Arrays {
         let memory = Memory::of(strip, serial, entry);
         self.add_bytes("seen", &memory.seen);
         self.add_bytes("age", &memory.age);
-        let believed = strip.believed(serial);
+        memory.since
+    }
+
+    fn add_belief(&mut self, believed: Option<&Entry>) {
         if let Some(belief) = believed.and_then(|entry| entry.belief.as_ref()) {
             self.add_bytes("belief", &belief.levels);
             self.add_bytes("entropy", &belief.entropy);
         }
-        memory.since
     }
 
     /// Means of so many stretches of all that is kept; the objective is each stretch's last.
@@ -303,14 +309,14 @@ struct Memory {
 }
 
 impl Memory {
-    /// Of the steps of one run up to one of them: what is older in the album may be of another server.
+    /// Of the steps of one run up to one of them.
     fn of(strip: &Strip, serial: u64, last: &Entry) -> Self {
         let n_cells = last.shape.n_cells();
         let (mut seen, mut age) = (vec![UNOBSERVED; n_cells], vec![u8::MAX; n_cells]);
         let (mut n_unseen, mut since) = (n_cells, last.result.step + 1);
-        for entry in strip.back_from(serial) {
+        for entry in strip.run_up_to(serial) {
             let (then, now) = (&entry.result, &last.result);
-            if !entry.is_of_episode(last) || then.step >= since || n_unseen == 0 {
+            if n_unseen == 0 {
                 break;
             }
             since = then.step;

@@ -22,8 +22,11 @@ const LEAST_INTERVAL: Duration = Duration::from_millis(2);
 /// Most: each look takes processor time, perhaps the simulator's.
 const MOST_INTERVAL: Duration = Duration::from_millis(10);
 
-/// More frames or beliefs than that at a look, and the next is due soon: buffers may run over.
+/// More frames or beliefs than that at a look, and the next ones are due soon: buffers may run over.
 const MANY: (usize, usize) = (FRAME_BUFFER / 3, AGENT_BUFFER / 3);
+
+/// For how long they are.
+const BUSY: Duration = Duration::from_secs(1);
 
 /// Time after which channels that failed are opened again.
 const REOPEN_INTERVAL: Duration = Duration::from_secs(1);
@@ -191,13 +194,15 @@ impl Reader {
     }
 
     fn read(mut self, stage: &Stage, stop: &AtomicBool) -> Result<(), ChannelError> {
-        let mut interval = LEAST_INTERVAL;
+        let mut busy = Instant::now();
         while !stop.load(Ordering::Relaxed) {
-            interval = match self.look(stage)? {
+            if self.look(stage)? {
+                busy = Instant::now();
+            }
+            std::thread::sleep(match busy.elapsed() < BUSY {
                 true => LEAST_INTERVAL,
-                false => MOST_INTERVAL.min(2 * interval),
-            };
-            std::thread::sleep(interval);
+                false => MOST_INTERVAL,
+            });
         }
         Ok(())
     }

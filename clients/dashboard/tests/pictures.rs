@@ -278,8 +278,11 @@ fn a_step_without_a_belief_has_the_one_before_of_its_episode() {
         let mut next_episode = frame(1, [255; 6]);
         next_episode.header.result.episode = 1;
         album.add_frame(&next_episode, Instant::now());
-        let (header, _) = read(album, Some(serial));
+        let (header, array) = read(album, Some(serial));
         let about = header["agent"]["step"].as_u64();
+        if about.is_some() {
+            assert_eq!(array("belief")[..3], [0, 128, 128]);
+        }
         (header["shown"]["step"].as_u64(), about)
     };
     let expected = [None, Some(2), Some(2), Some(2)];

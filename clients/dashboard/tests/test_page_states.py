@@ -90,6 +90,27 @@ def test_an_entry_that_is_no_longer_kept_is_told(programs, open_page):
     assert look.page.evaluate(oldest) == 0, "the oldest is shown"
 
 
+def test_an_entry_without_a_belief_has_one_of_some_steps_before(programs, open_page):
+    # Thousands of steps a second, and fifty beliefs.
+    server = programs.server(height=4, width=4, moves=2, burn_in=0)
+    look = open_page(programs.dashboard(server.instance))
+    agent = programs.agent(server.instance)
+    look.eventually(lambda: look.has("belief"), "a belief")
+    look.wait_for_steps()
+    agent.kill()
+    look.page.keyboard.press("Space")
+    settled_serial(look)
+
+    def is_older() -> bool:
+        look.page.keyboard.press("ArrowLeft")
+        return look.picture(".agent.step") < look.picture(".shown.step")
+
+    look.eventually(is_older, "an entry between two beliefs")
+    age = look.page.locator("[data-panel=belief-0] .hint")
+    look.eventually(lambda: age.text_content().endswith("before"), "its age")
+    assert look.text("objective") == "–"
+
+
 def test_a_server_that_is_killed_is_waited_for(watched, programs):
     server, look = watched.server, watched.look
     server.kill()
