@@ -51,6 +51,7 @@ def test_what_is_lost_or_not_known_is_told(watched):
 
     look.alter(lambda message: told_anew(message, change))
     look.eventually(lambda: look.has("belief", "seen"), "a belief is shown")
+    look.eventually(lambda: look.picture(".agent.is_live") is False, "the last picture")
     assert look.text("lost") == "0"
     assert look.text("lost-others") == "· truth 2 · beliefs 1"
     assert look.page.get_by_text("its states are not the model's").is_visible()
