@@ -19,6 +19,9 @@ use tokio::net::TcpListener;
 /// How often the program looks whether to end.
 const TICK: Duration = Duration::from_millis(50);
 
+/// How much it gives way to others, of 19: on a busy machine a simulator that wakes up goes first.
+const NICENESS: i32 = 10;
+
 /// Shows an Emberwatch instance, or a recording, in a browser. Reads, never acts.
 #[derive(Parser)]
 #[command(name = "emberwatch-dashboard", version)]
@@ -55,6 +58,9 @@ fn main() -> ExitCode {
 }
 
 fn run(cli: &Cli) -> Result<()> {
+    if let Err(error) = rustix::process::nice(NICENESS) {
+        tracing::warn!("priority not lowered: {error}");
+    }
     let keeper = cli.exit_with.map(Keeper::watch).transpose()?;
     let stop = stop_on_signals().context("handle signals")?;
     let runtime = tokio::runtime::Builder::new_current_thread()
