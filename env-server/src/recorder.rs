@@ -94,7 +94,7 @@ pub enum RecordError {
 pub fn record(order: &Order, stop: &AtomicBool) -> Result<Summary, RecordError> {
     // Asked first: the answer takes longer than a quick agent takes to fill an observer's buffer.
     let greeted = Connection::open(&order.instance, NAME, HELLO_TIMEOUT);
-    let frames = Observer::frames(&order.instance)?;
+    let frames = Observer::frames(&order.instance)?.eager();
     let truths = order.truth.then(|| Observer::truth(&order.instance));
     let truths = truths.transpose()?;
     let failed = |problem| RecordError::File {

@@ -12,10 +12,16 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use std::cell::Cell;
 use std::time::{Duration, Instant};
 
-/// How long an observer sleeps between two looks: publishing wakes nobody, so that observers cost the
-/// server no system call. Nor do they spin, which would take processor time from it. At 128,000 frames a second
+/// How long an observer sleeps between two looks while much comes: publishing wakes nobody, so that observers cost
+/// the server no system call. Nor do they spin, which would take processor time from it. At 128,000 frames a second
 /// this fills [`FRAME_BUFFER`].
-const LOOK_INTERVAL: Duration = Duration::from_micros(500);
+const BUSY_INTERVAL: Duration = Duration::from_micros(500);
+
+/// The same while little comes: sixteen observers that look each 500 us would take a fifth of a core.
+const CALM_INTERVAL: Duration = Duration::from_millis(4);
+
+/// How long an observer stays busy after it began, and after it found a quarter of its buffer full.
+const BUSY: Duration = Duration::from_secs(1);
 
 /// A sample copied out of shared memory.
 #[derive(Debug, Clone, PartialEq)]
@@ -30,7 +36,19 @@ pub struct Sample<H> {
 pub struct Observer<H: Header> {
     subscriber: Subscriber<Ipc, [u8], H>,
     publisher: Cell<Option<u32>>,
+    pace: Pace,
     node: Node<Ipc>,
+}
+
+/// How often to look.
+#[derive(Debug)]
+struct Pace {
+    buffer: usize,
+    is_eager: bool,
+    /// Samples since the last sleep.
+    n_found: Cell<usize>,
+    /// When much came last.
+    busy: Cell<Instant>,
 }
 
 impl Observer<FrameHeader> {
@@ -91,8 +109,22 @@ impl<H: Header> Observer<H> {
         Ok(Self {
             subscriber: subscriber.map_err(ipc_error(refusal))?,
             publisher: Cell::new(None),
+            pace: Pace {
+                buffer,
+                is_eager: false,
+                n_found: Cell::new(0),
+                busy: Cell::new(Instant::now()),
+            },
             node,
         })
+    }
+
+    /// Looks each 500 us, whatever comes: for those who must not miss the first samples after a pause, when the
+    /// server may publish more than a buffer holds within the 4 ms that others sleep then.
+    #[must_use]
+    pub fn eager(mut self) -> Self {
+        self.pace.is_eager = true;
+        self
     }
 
     /// The next sample; `None` if none came in time. Gaps in the headers' sequence numbers are
@@ -108,7 +140,7 @@ impl<H: Header> Observer<H> {
             if sample.is_some() || remaining.is_zero() {
                 return Ok(sample);
             }
-            std::thread::sleep(remaining.min(LOOK_INTERVAL));
+            std::thread::sleep(remaining.min(self.pace.interval(Instant::now())));
         }
     }
 
@@ -121,7 +153,9 @@ impl<H: Header> Observer<H> {
             .subscriber
             .receive()
             .map_err(ipc_error("receive a sample"))?;
+        let n_found = &self.pace.n_found;
         Ok(sample.map(|sample| {
+            n_found.set(n_found.get() + 1);
             let pid = sample.header().node_id().pid::<Ipc>();
             self.publisher.set(pid.ok().map(|id| id.value() as u32));
             Sample {
@@ -137,6 +171,19 @@ impl<H: Header> Observer<H> {
     }
 }
 
+impl Pace {
+    /// How long to sleep, now that the buffer is empty.
+    fn interval(&self, now: Instant) -> Duration {
+        if self.n_found.replace(0) > self.buffer / 4 {
+            self.busy.set(now);
+        }
+        match self.is_eager || now.duration_since(self.busy.get()) < BUSY {
+            true => BUSY_INTERVAL,
+            false => CALM_INTERVAL,
+        }
+    }
+}
+
 /// Lets a sleeping server notice the new observer now rather than at its next tick.
 fn wake_server(node: &Node<Ipc>, instance: &Instance) -> Result<(), ChannelError> {
     let services = Services { node, instance };
@@ -149,4 +196,34 @@ fn wake_server(node: &Node<Ipc>, instance: &Instance) -> Result<(), ChannelError
         .notify()
         .map_err(ipc_error("wake the server"))?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_observer_looks_often_while_much_comes_and_for_a_second_after() {
+        let began = Instant::now();
+        let mut pace = Pace {
+            buffer: 64,
+            is_eager: false,
+            n_found: Cell::new(0),
+            busy: Cell::new(began),
+        };
+        let later = |seconds: f64| began + Duration::from_secs_f64(seconds);
+        assert_eq!(
+            pace.interval(later(0.9)),
+            BUSY_INTERVAL,
+            "it has just begun"
+        );
+        pace.n_found.set(16);
+        assert_eq!(pace.interval(later(1.1)), CALM_INTERVAL);
+        pace.n_found.set(17);
+        assert_eq!(pace.interval(later(2.0)), BUSY_INTERVAL);
+        assert_eq!(pace.interval(later(2.9)), BUSY_INTERVAL);
+        assert_eq!(pace.interval(later(3.1)), CALM_INTERVAL);
+        pace.is_eager = true;
+        assert_eq!(pace.interval(later(9.0)), BUSY_INTERVAL);
+    }
 }

@@ -20,9 +20,13 @@ from emberwatch.channels import Closing, Node, guard
 from emberwatch.errors import GarbledAnswerError, SettingError
 from emberwatch.wire import StepResult
 
-#: How long to sleep between two looks, seconds: publishing wakes nobody, and spinning would take
-#: a core from the server.
-_LOOK: Final = 500e-6
+#: How long to sleep between two looks, seconds, while much comes and while little does: publishing
+#: wakes nobody, and spinning would take a core from the server.
+_BUSY_LOOK: Final = 500e-6
+_CALM_LOOK: Final = 4e-3
+
+#: How long much is expected after it came, seconds.
+_BUSY: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,6 +118,9 @@ class _Reader(Closing):
     ) -> None:
         self._header = header
         self._next: dict[int, int] = {}
+        self._much = limits[1] // 4
+        self._n_found = 0
+        self._busy = time.perf_counter()
         self._node = Node(instance)
         try:
             self._node.clean_up()
@@ -149,11 +156,12 @@ class _Reader(Closing):
             with guard("receive a sample"):
                 sample = self._subscriber.receive()
             if sample is not None:
+                self._n_found += 1
                 break
             waited = time.perf_counter() - start
             if not waited < timeout:
                 return None
-            time.sleep(min(_LOOK, timeout - waited))
+            time.sleep(min(self._interval(), timeout - waited))
         size = ctypes.sizeof(self._header)
         header: Any = self._header.from_buffer_copy(ctypes.string_at(sample.user_header_ptr, size))
         if header.version != wire.VERSION:
@@ -166,6 +174,14 @@ class _Reader(Closing):
         lost = max(0, header.sequence - self._next.get(publisher, header.sequence))
         self._next[publisher] = header.sequence + 1
         return header, payload, lost
+
+    def _interval(self) -> float:
+        """How long to sleep, now that the buffer is empty."""
+        now = time.perf_counter()
+        if self._n_found > self._much:
+            self._busy = now
+        self._n_found = 0
+        return _BUSY_LOOK if now - self._busy < _BUSY else _CALM_LOOK
 
 
 class Observer(_Reader):
