@@ -6,9 +6,8 @@
 //! wake-up would cost more than it saves, then leave the processor to others.
 //!
 //! Yielding to a process that never sleeps costs its whole time slice, milliseconds, while a sleeper is
-//! woken ahead of it. A [`Waiter`] that lost the processor that way twice in a row stops yielding for a while: with
-//! three busy processes on two cores that makes 17 times as many steps a second (11,600 for 670). Once may have
-//! been a short piece of work, such as a snapshot's way to its file.
+//! woken ahead of it. A [`Waiter`] that lost the processor that way stops yielding for a while: with
+//! three busy processes on two cores that makes 17 times as many steps a second (11,600 for 670).
 
 use crate::channels::{ChannelError, Ipc, ipc_error};
 use iceoryx2::port::listener::Listener;
@@ -25,7 +24,7 @@ pub const SPIN: Duration = Duration::from_micros(5);
 /// How long to poll, from the start, before blocking.
 pub const YIELD: Duration = Duration::from_micros(50);
 
-/// Yields that take longer than this go to a process that never sleeps, if there are two in a row.
+/// A yield that takes longer than this went to a process that never sleeps.
 const LONG_YIELD: Duration = Duration::from_micros(200);
 
 /// How long not to yield after that.
@@ -35,8 +34,6 @@ const CONTENDED: Duration = Duration::from_millis(100);
 #[derive(Debug, Default)]
 pub struct Waiter {
     contended_until: Cell<Option<Instant>>,
-    /// Whether the last yield took long.
-    was_long: Cell<bool>,
 }
 
 impl Waiter {
@@ -74,13 +71,8 @@ impl Waiter {
 
     fn give_way(&self, now: Instant) {
         rustix::thread::sched_yield();
-        self.learn(now, Instant::now());
-    }
-
-    /// Takes note of a yield.
-    fn learn(&self, gone: Instant, back: Instant) {
-        let is_long = back - gone > LONG_YIELD;
-        if self.was_long.replace(is_long) && is_long {
+        let back = Instant::now();
+        if back - now > LONG_YIELD {
             self.contended_until.set(Some(back + CONTENDED));
         }
     }
@@ -166,29 +158,6 @@ mod tests {
             Ok(None)
         );
         assert!(longest <= timeout);
-    }
-
-    #[test]
-    fn two_long_yields_in_a_row_end_yielding_for_a_while() {
-        let waiter = Waiter::default();
-        let began = Instant::now();
-        let mut now = began;
-        let mut give_way = |micros: u64| {
-            let gone = now;
-            now += Duration::from_micros(micros);
-            waiter.learn(gone, now);
-            waiter.contended_until.get().is_some_and(|end| end > now)
-        };
-        assert_eq!(
-            [900, 2, 900, 2].map(&mut give_way),
-            [false; 4],
-            "each alone"
-        );
-        assert_eq!([900, 900].map(&mut give_way), [false, true]);
-        // Later on, one is enough: the process is still there.
-        now += CONTENDED;
-        waiter.learn(now, now + Duration::from_millis(3));
-        assert!(waiter.contended_until.get() > Some(now + CONTENDED));
     }
 
     #[test]

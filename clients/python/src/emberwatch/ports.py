@@ -37,7 +37,7 @@ STEP_TIMEOUT: Final = 5.0
 #: Default timeout of what may wait for a burn-in, seconds.
 RESET_TIMEOUT: Final = 120.0
 
-#: Yields that take longer go to a process that never sleeps, if there are two in a row; seconds.
+#: A yield that takes longer went to a process that never sleeps, seconds.
 _LONG_YIELD: Final = 200e-6
 
 #: How long not to yield after that, seconds.
@@ -76,7 +76,6 @@ class Bell:
         self._forget: weakref.finalize[[int], Any] | None = None
         self._poll = select.poll()
         self._contended_until = 0.0
-        self._was_long = False
         self._next_clean_up = 0.0
 
     def watch(self, pid: int) -> None:
@@ -127,8 +126,7 @@ class Bell:
             if response is not None:
                 return response
             before, now = now, time.perf_counter()
-            was_long, self._was_long = self._was_long, now - before > _LONG_YIELD
-            if was_long and self._was_long:
+            if now - before > _LONG_YIELD:
                 self._contended_until = now + _CONTENDED
         return self._sleep(pending, what, timeout, start)
 
