@@ -38,7 +38,7 @@ STEP_TIMEOUT: Final = 5.0
 RESET_TIMEOUT: Final = 120.0
 
 #: A yield that takes longer went to a process that never sleeps, seconds.
-_LONG_YIELD: Final = 200e-6
+_LONG_YIELD: Final = 1e-3
 
 #: How long not to yield after that, seconds.
 _CONTENDED: Final = 0.1
