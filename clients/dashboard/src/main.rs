@@ -20,7 +20,7 @@ use tokio::net::TcpListener;
 const TICK: Duration = Duration::from_millis(50);
 
 /// How much it gives way to others, of 19: on a busy machine a simulator that wakes up goes first.
-const NICENESS: i32 = 10;
+const NICENESS: i32 = 5;
 
 /// Shows an Emberwatch instance, or a recording, in a browser. Reads, never acts.
 #[derive(Parser)]
