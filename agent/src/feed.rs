@@ -56,13 +56,13 @@ impl Feed {
     /// Which of several worlds are to be shown now: one after the other, and no more at once than a reader keeps
     /// beside one that is still to be read.
     pub fn turn(&self, n_worlds: usize) -> Vec<usize> {
-        if !self.is_watched() {
-            return Vec::new();
-        }
         let share = |shown: Instant| shown.elapsed().as_secs_f64() / INTERVAL.as_secs_f64();
         let n_due = self
             .shown
             .map_or(1, |shown| (share(shown) * n_worlds as f64) as usize);
+        if n_due == 0 || !self.is_watched() {
+            return Vec::new();
+        }
         let turn = (self.n_shown..).take(n_due.min(n_worlds).min(AGENT_BUFFER - 1));
         turn.map(|number| number % n_worlds).collect()
     }

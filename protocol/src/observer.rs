@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 /// this fills [`FRAME_BUFFER`].
 const BUSY_INTERVAL: Duration = Duration::from_micros(500);
 
-/// The same while little comes: sixteen observers that look each 500 us would take a fifth of a core.
+/// The same while little comes: each look wakes a process, on a core that the server may need.
 const CALM_INTERVAL: Duration = Duration::from_millis(4);
 
 /// How long an observer stays busy after it began, and after it found a quarter of its buffer full.

@@ -25,7 +25,7 @@ const MOST_INTERVAL: Duration = Duration::from_millis(10);
 /// More frames or beliefs than that at a look, and the next ones are due soon: buffers may run over.
 const MANY: (usize, usize) = (FRAME_BUFFER / 3, AGENT_BUFFER / 3);
 
-/// For how long they are.
+/// How long to look as often as that after much came.
 const BUSY: Duration = Duration::from_secs(1);
 
 /// Time after which channels that failed are opened again.
