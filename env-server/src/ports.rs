@@ -15,7 +15,7 @@ use protocol::channels::{
     MAX_OBSERVERS, MAX_TRUTH_READERS, RequestResponse, SHARED_MEMORY, Services, StepService,
     TRUTH_BUFFER, TruthService, create_node, ipc_error,
 };
-use protocol::dead_nodes::Undertaker;
+use protocol::dead_nodes::{BURIAL, Undertaker};
 use protocol::message::{FrameHeader, Header, RESULT_BYTES, StepReply, StepRequest, TruthHeader};
 use protocol::responder::{
     Active, ActiveControl, Answers, ControlServer, control_server, holder, received,
@@ -116,7 +116,7 @@ impl Ports {
         check_shared_memory(place)?;
         Undertaker::prepare()?; // before iceoryx2 meets the first dead node
         let node = create_node()?;
-        node.try_cleanup_dead_nodes();
+        node.blocking_cleanup_dead_nodes(BURIAL);
         let services = Services {
             node: &node,
             instance: &place.instance,

@@ -16,6 +16,10 @@ use std::time::Duration;
 /// A node is created in milliseconds: what has no monitor for so long died before it got one.
 const BIRTH: Duration = Duration::from_secs(60);
 
+/// How long whoever takes a dead process's place waits for another that is clearing it away, which takes
+/// milliseconds: without that its ports are still taken.
+pub const BURIAL: Duration = Duration::from_secs(5);
+
 /// Clears away dead nodes of this user.
 pub struct Undertaker {
     node: Node<Ipc>,

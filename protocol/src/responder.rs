@@ -8,6 +8,7 @@ use crate::channels::{
     ipc_error,
 };
 use crate::connection::server_pid;
+use crate::dead_nodes::BURIAL;
 use crate::message::{ControlReply, ControlRequest, Header, Status, VERSION};
 use crate::wait::{descriptor, drain};
 use iceoryx2::active_request::ActiveRequest;
@@ -164,7 +165,7 @@ impl Responder {
     /// [`ResponderError`].
     pub fn open(instance: &Instance, world: u32) -> Result<Self, ResponderError> {
         let node = create_node()?;
-        node.try_cleanup_dead_nodes();
+        node.blocking_cleanup_dead_nodes(BURIAL);
         let services = Services {
             node: &node,
             instance,
