@@ -28,8 +28,11 @@ const TICK: Duration = Duration::from_millis(50);
 /// comes right before the next flush.
 const FLUSH_INTERVAL: Duration = Duration::from_millis(500);
 
-/// How long a server may take to say who it is, and how long to leave it alone if it does not.
-const HELLO_TIMEOUT: Duration = Duration::from_secs(1);
+/// How long a server may take to say who it is: one that does not publishes nothing meanwhile either.
+const HELLO_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// How long to leave a server alone that did not say who it is.
+const SILENCE: Duration = Duration::from_secs(1);
 
 /// Most bytes that wait to be written: 16,000 frames of 64 x 64 cells.
 const MAX_QUEUED_BYTES: usize = 64 << 20;
@@ -94,9 +97,10 @@ pub enum RecordError {
 pub fn record(order: &Order, stop: &AtomicBool) -> Result<Summary, RecordError> {
     // Asked first: the answer takes longer than a quick agent takes to fill an observer's buffer.
     let greeted = Connection::open(&order.instance, NAME, HELLO_TIMEOUT);
-    let frames = Observer::frames(&order.instance)?.eager();
+    // In this order: every frame that is recorded has its hidden states.
     let truths = order.truth.then(|| Observer::truth(&order.instance));
     let truths = truths.transpose()?;
+    let frames = Observer::frames(&order.instance)?.eager();
     let failed = |problem| RecordError::File {
         path: order.out.clone(),
         problem,
@@ -219,7 +223,7 @@ impl Recorder<'_> {
     fn ask(&mut self, publisher: u32) -> Option<ServerInfo> {
         if let Some((pid, when)) = self.silent
             && pid == publisher
-            && when.elapsed() < HELLO_TIMEOUT
+            && when.elapsed() < SILENCE
         {
             return None;
         }
