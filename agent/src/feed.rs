@@ -9,8 +9,9 @@ use std::time::{Duration, Instant};
 /// Time between two beliefs of a world that are shown: no screen is faster, and each costs a copy.
 const INTERVAL: Duration = Duration::from_millis(20);
 
-/// How long readers may take to fetch what was shown last: it goes with the process.
-const FAREWELL: Duration = Duration::from_millis(100);
+/// How long readers may take to fetch what was shown last, unless they leave before: it goes with the process
+/// where a reader has not met it yet.
+const FAREWELL: Duration = Duration::from_millis(500);
 
 /// What agents of one process show.
 pub struct Feed {
@@ -74,8 +75,9 @@ impl Feed {
 
     /// Ends, when readers have had time to fetch what was shown last.
     pub fn end(self) {
-        if self.shown.is_some() && self.is_watched() {
-            std::thread::sleep(FAREWELL);
+        let began = Instant::now();
+        while self.shown.is_some() && self.is_watched() && began.elapsed() < FAREWELL {
+            std::thread::sleep(INTERVAL);
         }
     }
 

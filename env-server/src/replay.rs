@@ -29,8 +29,8 @@ const BURST_TIME: Duration = Duration::from_millis(1);
 /// How often a replay that waits looks for observers and for the end.
 const TICK: Duration = Duration::from_millis(50);
 
-/// How long observers may take to read the last samples.
-const FAREWELL: Duration = Duration::from_millis(500);
+/// How long observers may take to read the last samples, unless they leave before.
+const FAREWELL: Duration = Duration::from_secs(3);
 
 /// What to replay, and how.
 #[derive(Debug)]
@@ -112,7 +112,10 @@ pub fn replay(order: &Order, stop: &AtomicBool) -> Result<(), ReplayError> {
     while order.repeat && !replay.ends() {
         replay.publish_all()?;
     }
-    replay.attend(Instant::now() + FAREWELL)?;
+    let farewell = Instant::now() + FAREWELL;
+    while !replay.ends() && replay.ports.observers() != (0, 0) && Instant::now() < farewell {
+        replay.attend(Instant::now() + TICK)?;
+    }
     tracing::info!(steps = replay.stage.n_steps(), "replayed");
     Ok(())
 }

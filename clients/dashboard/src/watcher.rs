@@ -32,7 +32,7 @@ const BUSY: Duration = Duration::from_secs(1);
 const REOPEN_INTERVAL: Duration = Duration::from_secs(1);
 
 /// How long a belief waits for the frame that it is about: agents may be quicker than their server.
-const EARLY: Duration = Duration::from_millis(200);
+const EARLY: Duration = Duration::from_secs(1);
 
 /// Most samples of a channel taken in at a look, so that browsers get their turn.
 const MOST_AT_ONCE: usize = 128;
