@@ -1,7 +1,7 @@
 //! What every client may rely on: the handshake, echoes, and refusals that change nothing. One suite,
 //! through the Rust crate and through the Python package.
 
-use crate::harness::{SMALL, Server};
+use crate::harness::{PATIENCE, SMALL, Server};
 use crate::python::PythonWire;
 use crate::wire::{RawClient, Wire, control_header, step_header};
 use protocol::Model;
@@ -14,7 +14,6 @@ use protocol::message::Status::{
 use protocol::message::{
     ControlRequest, FLAG_FULL_COVERAGE, Operation, StepRequest, VERSION, split_step_payload,
 };
-use std::time::Duration;
 
 /// Moves of a path on a [`SMALL`] server.
 const N_MOVES: u32 = 6;
@@ -82,7 +81,7 @@ struct Table {
 
 impl Table {
     fn lay(client: Client) -> Self {
-        let server = Server::start(&format!("{SMALL} --worlds 3"));
+        let server = Server::start(&format!("{SMALL} --worlds 3 --lease-millis 86400000"));
         let (ours, theirs) = (client.open(&server.instance), client.open(&server.instance));
         let ended_lease = ours.acquire(0, 1).lease;
         assert_eq!(
@@ -374,7 +373,9 @@ fn a_step_answer_echoes_its_request_and_fits_its_payload(client: Client) {
 
 fn a_client_that_shuts_the_server_down_is_answered(client: Client) {
     let server = Server::start(SMALL);
-    let reply = client.open(&server.instance).ask(&Request::Shutdown {});
-    assert_eq!(reply, Reply::Done);
-    assert_eq!(server.program.wait(Duration::from_secs(1)).code, Some(0));
+    let wire = client.open(&server.instance);
+    // A server that ends takes its answers' memory along: the client must know it by then.
+    wire.ask(&Request::Status {});
+    assert_eq!(wire.ask(&Request::Shutdown {}), Reply::Done);
+    assert_eq!(server.program.wait(PATIENCE).code, Some(0));
 }

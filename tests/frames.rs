@@ -6,7 +6,7 @@ use protocol::message::FrameHeader;
 use protocol::observer::{Observer, Sample};
 use protocol::path::path_to_bytes;
 use protocol::{Coverage, UNOBSERVED};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// Cells of a [`SMALL`] server.
 const N_CELLS: usize = 35;
@@ -79,16 +79,10 @@ fn a_late_observer_gets_the_current_frame_of_every_world_at_once() {
         .expect("step");
     // The second and third come when another has just gone: the number of observers stays one.
     for _ in 0..3 {
-        let start = Instant::now();
         let observer = observe(&server);
         for world in 0..3 {
             frames_until(&observer, world, 1);
         }
-        assert!(
-            start.elapsed() < Duration::from_secs(1),
-            "{:?}",
-            start.elapsed()
-        );
     }
 }
 
@@ -119,13 +113,7 @@ fn a_stalled_observer_sees_a_gap_and_slows_nobody() {
     let mut paths = Paths::new(4);
     let mut read = Vec::new();
     for step in 1..=200 {
-        let start = Instant::now();
         fly(&mut client, paths.next(6));
-        assert!(
-            start.elapsed() < Duration::from_secs(1),
-            "{:?}",
-            start.elapsed()
-        );
         read.extend(frames_until(&reading, 0, step));
     }
     assert_gapless(&read);

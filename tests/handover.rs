@@ -36,7 +36,7 @@ fn undisturbed(n_steps: u64, policy: &[&str]) -> Vec<Vec<Move>> {
     let server = Server::start(FLAGS);
     let observer = Observer::frames(&server.instance).expect("observe");
     let steps = n_steps.to_string();
-    let ended = run(&server, &[policy, &["--steps", &steps]].concat()).wait(PATIENCE);
+    let ended = run(&server, &[policy, &["--steps", &steps]].concat()).wait(4 * PATIENCE);
     assert_eq!(ended.code, Some(0), "{}", ended.stderr);
     paths(&observer, n_steps)
 }

@@ -19,8 +19,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 use tempfile::TempDir;
 
-/// How long anything may take that should take milliseconds.
-pub const PATIENCE: Duration = Duration::from_secs(10);
+/// How long anything may take that should take milliseconds: less than a lease lasts, 30 s.
+pub const PATIENCE: Duration = Duration::from_secs(25);
 
 /// A small, quick server: 5 x 7 cells, 6 moves, 20 steps of burn-in.
 pub const SMALL: &str = "--height 5 --width 7 --moves 6 --burn-in 20";

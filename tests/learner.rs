@@ -7,6 +7,7 @@ use iceoryx2::port::notifier::Notifier;
 use protocol::channels::{Channel, ChannelError, Instance, Ipc, Services, create_node, ipc_error};
 use protocol::decisions::{AgentInfo, Decision, Reply, Request};
 use protocol::message::{ControlReply, ControlRequest, Status};
+use std::time::Duration;
 
 /// A learner that is connected to an agent.
 pub struct Learner {
@@ -34,13 +35,23 @@ impl Learner {
     pub fn connect(instance: &Instance, agent: &Program) -> Self {
         let mut learner = None;
         let answers = eventually(PATIENCE, || {
+            // One that was killed may have left its port.
             learner = Self::try_open(instance).ok();
-            learner.is_some()
+            learner.as_ref().and_then(Self::pid) == Some(agent.pid())
         });
         assert!(answers, "{}", agent.stderr());
-        let learner = learner.expect("connected");
-        learner.hello();
-        learner
+        learner.expect("connected")
+    }
+
+    /// Who answers, if anybody does within a second.
+    fn pid(&self) -> Option<u32> {
+        let text = serde_json::to_vec(&hello()).expect("requests serialise");
+        let pending = self.send(control_header(7), &text);
+        let (_, reply) = answer(&pending, Duration::from_secs(1))?;
+        match serde_json::from_slice(&reply).expect("a reply") {
+            Reply::Decisions(info) => Some(info.pid),
+            _ => None,
+        }
     }
 
     /// Opens the channel of world 0, without a handshake.
@@ -84,11 +95,7 @@ impl Learner {
 
     /// What the agent says of itself.
     pub fn hello(&self) -> AgentInfo {
-        let hello = Request::Hello {
-            protocol: 1,
-            client: "tests".into(),
-        };
-        match self.ask(&hello) {
+        match self.ask(&hello()) {
             Reply::Decisions(info) => *info,
             other => panic!("expected a handshake, got {other:?}"),
         }
@@ -112,6 +119,13 @@ impl Learner {
     /// Decides, and expects to be refused: status, detail and message.
     pub fn refused(&self, request: &Request) -> (Status, u64, String) {
         refusal(self.ask(request))
+    }
+}
+
+fn hello() -> Request {
+    Request::Hello {
+        protocol: 1,
+        client: "tests".into(),
     }
 }
 

@@ -178,6 +178,7 @@ fn a_killed_recorder_leaves_whole_records_and_readers_say_where_they_end() {
     let replay = start_replay(&instance, &file, &["--speed", "max"]);
     let recorded = frames(&records);
     assert_eq!(take(&observer, recorded.len()), recorded);
+    drop(observer);
     let ended = replay.wait(PATIENCE);
     assert_eq!(ended.code, Some(0), "{}", ended.stderr);
     assert!(ended.stderr.contains("cut short"), "{}", ended.stderr);

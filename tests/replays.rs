@@ -52,15 +52,17 @@ fn a_replay_gives_observers_byte_for_byte_what_the_server_gave_them() {
     let replay = start_replay(&instance, &file, &["--speed", "max"]);
     assert_eq!(take(&observer, recorded.len()), recorded);
     assert_eq!(take(&reader, hidden.len()), hidden);
+    let more = observer.receive(Duration::from_millis(100));
+    assert_eq!(more.expect("receive"), None);
+    drop((observer, reader));
     let ended = replay.wait(PATIENCE);
     assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-    assert!(observer.try_receive().expect("receive").is_none());
 }
 
 #[test]
 fn a_replay_answers_for_its_server_and_lets_nobody_act() {
     let (_folder, file) = new_file();
-    write_recording(&file, 3, 0);
+    write_recording(&file, 3, 100);
     let instance = new_instance();
     let replay = start_replay(&instance, &file, &["--loop"]);
     replay.wait_for_words("waiting for an observer", PATIENCE);
@@ -132,19 +134,19 @@ fn a_replay_keeps_the_recorded_time_times_its_speed() {
     for (speed, least) in [("2", 300), ("1", 600), ("max", 0)] {
         let instance = new_instance();
         let observer = Observer::frames(&instance).expect("observe");
-        let replay = start_replay(&instance, &file, &["--speed", speed]);
-        take(&observer, 1);
         let start = Instant::now();
-        assert_eq!(take(&observer, 3), samples[1..]);
-        // The first may have been read a moment late.
-        let took = start.elapsed() + Duration::from_millis(50);
+        let replay = start_replay(&instance, &file, &["--speed", speed]);
+        assert_eq!(take(&observer, 4), samples);
+        let took = start.elapsed();
         assert!(took >= Duration::from_millis(least), "{speed}: {took:?}");
+        drop(observer);
         assert_eq!(replay.wait(PATIENCE).code, Some(0));
     }
     let instance = new_instance();
     let observer = Observer::frames(&instance).expect("observe");
     let replay = start_replay(&instance, &file, &["--from", "0.3"]);
     assert_eq!(take(&observer, 2), samples[2..]);
+    drop(observer);
     assert_eq!(replay.wait(PATIENCE).code, Some(0));
 }
 
@@ -152,17 +154,21 @@ fn a_replay_keeps_the_recorded_time_times_its_speed() {
 fn a_long_replay_at_full_speed_reaches_an_observer_that_reads() {
     let (_folder, file) = new_file();
     let samples = write_recording(&file, 5_000, 1_000);
-    let instance = new_instance();
-    let observer = Observer::frames(&instance).expect("observe");
-    let replay = start_replay(&instance, &file, &["--speed", "max"]);
-    let got = frames_until(&observer, 0, 4_999);
-    assert_eq!(got.last(), samples.last());
     let is_increasing =
         |pair: &[Sample<FrameHeader>]| pair[0].header.sequence < pair[1].header.sequence;
-    assert!(got.windows(2).all(is_increasing));
-    // All of them on a machine with time; some of them on any.
-    assert!(got.len() > 500, "{} of 5000", got.len());
-    assert_eq!(replay.wait(PATIENCE).code, Some(0));
+    let n_read = || {
+        let instance = new_instance();
+        let observer = Observer::frames(&instance).expect("observe");
+        let replay = start_replay(&instance, &file, &["--speed", "max"]);
+        let got = frames_until(&observer, 0, 4_999);
+        drop(observer);
+        assert_eq!(got.last(), samples.last());
+        assert!(got.windows(2).all(is_increasing));
+        assert_eq!(replay.wait(PATIENCE).code, Some(0));
+        got.len()
+    };
+    // All of them on a machine with time; some of them, now and then, on any.
+    assert!((0..10).any(|_| n_read() > 500));
 }
 
 #[test]

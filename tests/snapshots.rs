@@ -1,9 +1,10 @@
 //! Worlds that are written down and go on, bit for bit: snapshots, forks, servers that come back.
 
 use crate::harness::{
-    Ended, PATIENCE, Paths, SMALL, Server, eventually, fly, new_instance, reset, run, takeover,
+    Ended, PATIENCE, Paths, SMALL, Server, eventually, fly, frames_until, new_instance, reset, run,
+    takeover,
 };
-use crate::wire::{RawClient, Wire};
+use crate::wire::{RawClient, Wire, answer, control_header};
 use agent::client::{Client, Observation};
 use env_server::snapshot::folder::{Folder, Outlives};
 use protocol::channels::Instance;
@@ -11,6 +12,7 @@ use protocol::control::{Reply, Request};
 use protocol::message::Status;
 use protocol::observer::Observer;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 use tempfile::TempDir;
 
 const N_MOVES: usize = 6;
@@ -101,11 +103,7 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     let part = ["snapshot", text(&file), "--first-world", "1"];
     assert_eq!(server_command(&server, &part).code, Some(0));
     let observer = Observer::frames(&server.instance).expect("observe");
-    while observer
-        .receive(std::time::Duration::from_millis(300))
-        .expect("receive")
-        .is_some()
-    {}
+    frames_until(&observer, 2, 0);
     let into_first = ["restore", text(&file), "--from", "0", "--worlds", "1"];
     let ended = server_command(&server, &into_first);
     assert_eq!(ended.code, Some(0), "{}", ended.stderr);
@@ -390,6 +388,12 @@ fn nothing_but_snapshots_is_replaced_and_no_other_run_s() {
 
 #[test]
 fn a_world_in_its_burn_in_begins_anew_after_a_restart() {
+    // Of several tries: who is paused misses the burn-in.
+    assert!((0..10).any(|_| restart_in_burn_in()));
+}
+
+/// Whether the world was in its burn-in while snapshots were taken.
+fn restart_in_burn_in() -> bool {
     let folder = TempDir::new().expect("a folder");
     let flags = format!(
         "--height 32 --width 32 --moves 6 --burn-in 100000 --worlds 2 --snapshot-every 10 \
@@ -406,16 +410,16 @@ fn a_world_in_its_burn_in_begins_anew_after_a_restart() {
         seed: Some(77),
     }];
     let text = serde_json::to_vec(&Request::Reset { lease, worlds }).expect("a request");
-    let pending = wire
-        .send_control(crate::wire::control_header(1), &text)
-        .expect("send");
+    let pending = wire.send_control(control_header(1), &text).expect("send");
+    let is_resetting = || server.status().worlds[1].resetting;
+    let is_over = || answer(&pending, Duration::ZERO).is_some();
+    assert!(eventually(PATIENCE, || is_resetting() || is_over()));
     for k in 0..20 {
         fly(&mut stepping, Paths::new(k).next(N_MOVES));
     }
-    assert!(
-        server.status().worlds[1].resetting,
-        "too quick to prove anything"
-    );
+    if !is_resetting() {
+        return false;
+    }
     let entries = || {
         std::fs::read_dir(folder.path())
             .expect("the folder")
@@ -430,4 +434,5 @@ fn a_world_in_its_burn_in_begins_anew_after_a_restart() {
     assert!((10..=20).contains(&worlds[0].info.step), "{worlds:?}");
     let begun = &worlds[1].info;
     assert_eq!((begun.seed, begun.episode, begun.step), (77, 1, 0));
+    true
 }
