@@ -6,41 +6,24 @@
 //! `W (s a + t) = (W s) a + W t`; there, channels lost to dropout are zero and skipped.
 
 use super::batch_norm::Norm;
-use super::lanes::{Arithmetic, LANES, Lanes};
+use super::correlation::{balanced, with_constant};
+use super::lanes::{Arithmetic, Buffer, LANES, Lanes};
 use super::shape::ConvShape;
 use super::window::Visit;
+use std::ops::Range;
 
 /// Outputs computed at once by [`Dense::forward`]: as many sums as registers hold with ease.
 const BLOCK: usize = 6;
 
-/// Output channels of a backward pass that are taken at once.
+/// Output channels of a backward pass that are taken at once, at most.
 const OUTS: usize = 8;
-
-/// Outputs of the first convolution that one visit reaches: `(position, tap)`.
-#[inline(always)]
-fn reached(shape: &ConvShape, visit: Visit, mut each: impl FnMut(usize, usize)) {
-    let along = |axis: usize, at: usize| {
-        let first = (at + 1)
-            .saturating_sub(shape.kernel[axis])
-            .div_ceil(shape.stride);
-        first..(at / shape.stride + 1).min(shape.output[axis])
-    };
-    let (row, col) = (usize::from(visit.row), usize::from(visit.col));
-    for out_row in along(0, row) {
-        for out_col in along(1, col) {
-            let tap = (row - out_row * shape.stride) * shape.kernel[1];
-            let tap = tap + col - out_col * shape.stride;
-            each(out_row * shape.output[1] + out_col, tap);
-        }
-    }
-}
 
 /// The first convolution.
 #[derive(Debug)]
 pub(crate) struct Sparse {
     shape: ConvShape,
     /// `[observation][tap][channel]`.
-    columns: Vec<f32>,
+    columns: Buffer,
     bias: Vec<f32>,
 }
 
@@ -51,17 +34,39 @@ impl Sparse {
         let channels = shape.channels_out;
         let columns = (0..weight.len())
             .map(|index| weight[index % channels * n_columns + index / channels])
-            .collect();
+            .collect::<Vec<f32>>();
         Self {
             shape,
-            columns,
+            columns: Buffer::from(&*columns),
             bias: bias.to_vec(),
         }
     }
 
+    /// Rows and columns of the outputs that one visit reaches.
     #[inline(always)]
-    fn column(&self, value: u8, tap: usize) -> usize {
-        (usize::from(value) * self.shape.taps() + tap) * self.shape.channels_out
+    fn reached(&self, visit: Visit) -> [Range<usize>; 2] {
+        let shape = &self.shape;
+        let along = |axis: usize, at: usize| {
+            let first = (at + 1)
+                .saturating_sub(shape.kernel[axis])
+                .div_ceil(shape.stride);
+            first..(at / shape.stride + 1).min(shape.output[axis])
+        };
+        [
+            along(0, usize::from(visit.row)),
+            along(1, usize::from(visit.col)),
+        ]
+    }
+
+    /// Where an output that a visit reaches begins, and the column of weights that it reaches it with.
+    #[inline(always)]
+    fn place(&self, visit: Visit, row: usize, col: usize) -> (usize, usize) {
+        let shape = &self.shape;
+        let down = usize::from(visit.row) - row * shape.stride;
+        let right = usize::from(visit.col) - col * shape.stride;
+        let column = usize::from(visit.value) * shape.taps() + down * shape.kernel[1] + right;
+        let position = row * shape.output[1] + col;
+        (position * shape.channels_out, column * shape.channels_out)
     }
 
     /// `relu(mask (W y + b))` of one frame; the mask has one number per channel.
@@ -72,10 +77,14 @@ impl Sparse {
             position.copy_from_slice(&self.bias);
         }
         for &visit in visits {
-            reached(&self.shape, visit, |position, tap| {
-                let column = &self.columns[self.column(visit.value, tap)..][..channels];
-                add_lanes::<A>(&mut out[position * channels..][..channels], column);
-            });
+            let [rows, cols] = self.reached(visit);
+            for row in rows {
+                for col in cols.clone() {
+                    let (position, column) = self.place(visit, row, col);
+                    let column = &self.columns[column..][..channels];
+                    add_lanes::<A>(&mut out[position..][..channels], column);
+                }
+            }
         }
         for position in out.chunks_exact_mut(channels) {
             for (value, factor) in position.iter_mut().zip(mask) {
@@ -98,10 +107,14 @@ impl Sparse {
             add_lanes::<A>(d_bias, position);
         }
         for &visit in visits {
-            reached(&self.shape, visit, |position, tap| {
-                let column = &mut d_columns[self.column(visit.value, tap)..][..channels];
-                add_lanes::<A>(column, &dz[position * channels..][..channels]);
-            });
+            let [rows, cols] = self.reached(visit);
+            for row in rows {
+                for col in cols.clone() {
+                    let (position, column) = self.place(visit, row, col);
+                    let column = &mut d_columns[column..][..channels];
+                    add_lanes::<A>(column, &dz[position..][..channels]);
+                }
+            }
         }
     }
 
@@ -130,7 +143,7 @@ pub(crate) struct Dense {
     folded: Vec<Lanes>,
     bias: Lanes,
     /// As it is: `[out][tap][in]`.
-    weight: Vec<f32>,
+    weight: Buffer,
     input: Norm,
 }
 
@@ -138,15 +151,15 @@ pub(crate) struct Dense {
 #[derive(Debug, Clone)]
 pub(crate) struct DenseGradient {
     /// Of the folded weights, `[out][tap][in]`.
-    pub(crate) weight: Vec<f32>,
-    pub(crate) bias: Vec<f32>,
+    pub(crate) weight: Buffer,
+    pub(crate) bias: Buffer,
 }
 
 impl DenseGradient {
     pub(crate) fn zeros(shape: &ConvShape) -> Self {
         Self {
-            weight: vec![0.0; shape.channels_out * shape.taps() * shape.channels_in],
-            bias: vec![0.0; shape.lanes_out()],
+            weight: Buffer::zeros(shape.channels_out * shape.taps() * shape.channels_in),
+            bias: Buffer::zeros(shape.lanes_out()),
         }
     }
 
@@ -156,10 +169,10 @@ impl DenseGradient {
     }
 
     pub(crate) fn add(&mut self, other: &Self) {
-        for (sum, x) in self.weight.iter_mut().zip(&other.weight) {
+        for (sum, x) in self.weight.iter_mut().zip(&*other.weight) {
             *sum += x;
         }
-        for (sum, x) in self.bias.iter_mut().zip(&other.bias) {
+        for (sum, x) in self.bias.iter_mut().zip(&*other.bias) {
             *sum += x;
         }
     }
@@ -168,13 +181,13 @@ impl DenseGradient {
 impl Dense {
     /// From PyTorch's `[out][in][tap]` and the normalisation of the input.
     pub(crate) fn new(shape: ConvShape, weight: &[f32], bias: &[f32], input: &Norm) -> Self {
-        assert!(shape.channels_out <= LANES && shape.channels_in.is_multiple_of(LANES));
+        assert!(shape.channels_out <= LANES && [1, 2].contains(&(shape.channels_in / LANES)));
         let (taps, channels_in) = (shape.taps(), shape.channels_in);
         let mut conv = Self {
             shape,
             folded: vec![Lanes::ZERO; taps * channels_in],
             bias: Lanes::ZERO,
-            weight: vec![0.0; weight.len()],
+            weight: Buffer::zeros(weight.len()),
             input: input.clone(),
         };
         for out in 0..shape.channels_out {
@@ -213,11 +226,26 @@ impl Dense {
         mask: &[f32],
         out: &mut [f32],
     ) {
+        match self.shape.channels_in {
+            LANES => self.write_rows::<A, LANES>(input, kept, mask, out),
+            _ => self.write_rows::<A, { 2 * LANES }>(input, kept, mask, out),
+        }
+    }
+
+    /// Of `INPUTS` input channels.
+    #[inline(always)]
+    fn write_rows<A: Arithmetic, const INPUTS: usize>(
+        &self,
+        input: &[f32],
+        kept: &[u16],
+        mask: &[f32],
+        out: &mut [f32],
+    ) {
         let [rows, cols] = self.shape.output;
         let mut out = out.as_chunks_mut::<LANES>().0.iter_mut();
         for row in 0..rows {
             for first in (0..cols).step_by(BLOCK) {
-                let sums = self.block::<A>(input, kept, row, first);
+                let sums = self.block::<A, INPUTS>(input, kept, row, first);
                 for (sum, out) in sums[..BLOCK.min(cols - first)].iter().zip(&mut out) {
                     for lane in 0..LANES {
                         out[lane] = (sum.0[lane] * mask[lane]).max(0.0);
@@ -229,7 +257,7 @@ impl Dense {
 
     /// Up to [`BLOCK`] outputs of a row; those beyond the row's end are worthless.
     #[inline(always)]
-    fn block<A: Arithmetic>(
+    fn block<A: Arithmetic, const INPUTS: usize>(
         &self,
         input: &[f32],
         kept: &[u16],
@@ -237,16 +265,16 @@ impl Dense {
         first: usize,
     ) -> [Lanes; BLOCK] {
         let last = self.shape.output[1] - 1;
-        let channels = self.shape.channels_in;
+        let positions = input.as_chunks::<INPUTS>().0;
         let mut sums = [self.bias; BLOCK];
-        for tap in 0..self.shape.taps() {
-            let weights = &self.folded[tap * channels..][..channels];
-            let mut inputs = [input; BLOCK];
+        for (tap, weights) in self.folded.as_chunks::<INPUTS>().0.iter().enumerate() {
+            let mut inputs = [&positions[0]; BLOCK];
             for (at, inputs) in inputs.iter_mut().enumerate() {
-                *inputs = &input[self.input_at(row, (first + at).min(last), tap)..][..channels];
+                let position = self.input_at(row, (first + at).min(last), tap) / INPUTS;
+                *inputs = &positions[position];
             }
             for &channel in kept {
-                let channel = usize::from(channel);
+                let channel = usize::from(channel) % INPUTS;
                 for at in 0..BLOCK {
                     sums[at] = sums[at].add_scaled::<A>(inputs[at][channel], weights[channel]);
                 }
@@ -271,21 +299,35 @@ impl Dense {
             add_lanes::<A>(&mut gradient.bias, position);
         }
         for tap in 0..self.shape.taps() {
-            for outs in kept.chunks(OUTS) {
-                let mut first = 0;
-                while first + 2 * LANES <= self.shape.channels_in {
-                    let place = Place { tap, outs, first };
-                    self.input_gradient::<A, 2>(place, dz, dx);
-                    self.weight_gradient::<A, 2>(place, input, dz, &mut gradient.weight);
-                    first += 2 * LANES;
-                }
-                if first < self.shape.channels_in {
-                    let place = Place { tap, outs, first };
-                    self.input_gradient::<A, 1>(place, dz, dx);
-                    self.weight_gradient::<A, 1>(place, input, dz, &mut gradient.weight);
+            for outs in balanced(kept, OUTS) {
+                let place = Place { tap, outs };
+                let to = (&mut *dx, &mut *gradient.weight);
+                if self.shape.channels_in == LANES {
+                    with_constant!(
+                        outs.len(), both, [1 2 3 4 5 6 7 8], 1,
+                        (self, place, input, dz, to)
+                    );
+                } else {
+                    with_constant!(
+                        outs.len(), both, [1 2 3 4 5 6 7 8], 2,
+                        (self, place, input, dz, to)
+                    );
                 }
             }
         }
+    }
+
+    /// Both gradients of a part: to `dx`, and to the weights'.
+    #[inline(always)]
+    fn both<A: Arithmetic, const OUTS: usize, const VECTORS: usize>(
+        &self,
+        place: Place<'_>,
+        input: &[f32],
+        dz: &[f32],
+        (dx, d_weight): (&mut [f32], &mut [f32]),
+    ) {
+        self.input_gradient::<A, OUTS, VECTORS>(place, dz, dx);
+        self.weight_gradient::<A, OUTS, VECTORS>(place, input, dz, d_weight);
     }
 
     /// Calls `each` with every output's `dz` and with where the inputs of a place begin.
@@ -299,25 +341,24 @@ impl Dense {
         let cols = self.shape.output[1];
         let step = self.shape.stride * self.shape.channels_in;
         for (row, dz) in dz.as_chunks().0.chunks_exact(cols).enumerate() {
-            let first = self.input_at(row, 0, place.tap) + place.first;
+            let first = self.input_at(row, 0, place.tap);
             for (col, dz) in dz.iter().enumerate() {
                 each(dz, first + col * step);
             }
         }
     }
 
-    /// Of `VECTORS` times sixteen input channels, through [`OUTS`] outputs.
+    /// Of `VECTORS` times sixteen input channels, through `OUTS` outputs.
     #[inline(always)]
-    fn input_gradient<A: Arithmetic, const VECTORS: usize>(
+    fn input_gradient<A: Arithmetic, const OUTS: usize, const VECTORS: usize>(
         &self,
         place: Place<'_>,
         dz: &[f32],
         dx: &mut [f32],
     ) {
-        let (at, mut weights) = (places(place.outs), [[Lanes::ZERO; VECTORS]; OUTS]);
+        let (at, mut weights) = (places::<OUTS>(place.outs), [[Lanes::ZERO; VECTORS]; OUTS]);
         for (weights, &out) in weights.iter_mut().zip(place.outs) {
-            *weights =
-                Lanes::load_all(&self.weight[self.weight_at(out, place.tap) + place.first..]);
+            *weights = Lanes::load_all(&self.weight[self.weight_at(out, place.tap)..]);
         }
         self.each_output(place, dz, |dz, input| {
             let dx = &mut dx[input..][..VECTORS * LANES];
@@ -333,16 +374,16 @@ impl Dense {
         });
     }
 
-    /// From `VECTORS` times sixteen input channels to [`OUTS`] outputs.
+    /// From `VECTORS` times sixteen input channels to `OUTS` outputs.
     #[inline(always)]
-    fn weight_gradient<A: Arithmetic, const VECTORS: usize>(
+    fn weight_gradient<A: Arithmetic, const OUTS: usize, const VECTORS: usize>(
         &self,
         place: Place<'_>,
         input: &[f32],
         dz: &[f32],
         gradient: &mut [f32],
     ) {
-        let (at, mut sums) = (places(place.outs), [[Lanes::ZERO; VECTORS]; OUTS]);
+        let (at, mut sums) = (places::<OUTS>(place.outs), [[Lanes::ZERO; VECTORS]; OUTS]);
         self.each_output(place, dz, |dz, first| {
             let x = Lanes::load_all::<VECTORS>(&input[first..]);
             for out in 0..OUTS {
@@ -352,7 +393,7 @@ impl Dense {
             }
         });
         for (sums, &out) in sums.iter().zip(place.outs) {
-            let gradient = &mut gradient[self.weight_at(out, place.tap) + place.first..];
+            let gradient = &mut gradient[self.weight_at(out, place.tap)..];
             for (gradient, sum) in gradient.as_chunks_mut().0.iter_mut().zip(sums) {
                 *gradient = sum.add::<A>(Lanes(*gradient)).0;
             }
@@ -387,12 +428,14 @@ struct Place<'a> {
     tap: usize,
     /// Up to [`OUTS`] output channels.
     outs: &'a [u16],
-    /// The first input channel.
-    first: usize,
 }
 
-/// The lanes of up to [`OUTS`] channels; the last one's where there are fewer.
+/// The lanes of as many channels.
 #[inline(always)]
-fn places(outs: &[u16]) -> [usize; OUTS] {
-    std::array::from_fn(|out| usize::from(outs[out.min(outs.len() - 1)]) % LANES)
+fn places<const OUTS: usize>(outs: &[u16]) -> [usize; OUTS] {
+    let mut places = [0; OUTS];
+    for (place, &out) in places.iter_mut().zip(outs) {
+        *place = usize::from(out) % LANES;
+    }
+    places
 }

@@ -1,13 +1,12 @@
-//! The decoder's inner loop: outputs are sums of shifted planes, pixels in lanes.
+//! The inner loop of a doubling's backward pass: outputs are sums of shifted planes, pixels in lanes.
 //!
-//! `out[m][p] += sum over inputs k and taps t of weight[k, m][t] * plane[k][offset_t + p]`. Both the
-//! forward pass of a doubling (4 taps per phase) and the gradient of its input (16 taps) have this
-//! form. A block of outputs stays in registers while all inputs and taps pass.
+//! `out[m][p] += sum over inputs k and taps t of weight[k, m][t] * plane[k][offset_t + p]`. A block of outputs
+//! stays in registers while all inputs and taps pass.
 
 use super::lanes::{Arithmetic, LANES, Lanes};
 
 /// The 4 x 4 kernel of a pair of channels.
-pub(crate) type Kernel4x4 = [f32; LANES];
+pub(crate) type Kernel4x4 = Lanes;
 
 /// Vectors of pixels per block, where a plane has as many. 4 x 4 sums fit the 32 registers of AVX-512.
 const WIDE: usize = 4;
@@ -133,7 +132,7 @@ impl Correlation<'_> {
             for tap in taps {
                 let pixels = Lanes::load_all::<VECTORS>(&planes[tap.offset + first..]);
                 for output in 0..OUTPUTS {
-                    let weight = kernels[output][tap.entry % LANES];
+                    let weight = kernels[output].0[tap.entry % LANES];
                     for vector in 0..VECTORS {
                         sums[output][vector] =
                             sums[output][vector].add_scaled::<A>(weight, pixels[vector]);

@@ -10,15 +10,15 @@ mod loss;
 
 use super::batch_norm::{Norm, Sums};
 use super::correlation::Kernel4x4;
-use super::deconv::{Doubling, Scratch};
+use super::deconv::{Doubling, Map, Scratch};
 use super::dropout::{ChannelMask, Dropout};
-use super::lanes::{LANES, Lanes};
+use super::lanes::{Buffer, Lanes};
 use super::loss::CellLoss;
 use super::parallel::chunks_of;
 use super::parameters::{DECODER, Tensors};
 use super::seed::Seed;
 use super::shape::{DECODER_CHANNELS, NetworkShape};
-use super::visited::LastLayer;
+use super::visited::{LastLayer, Touched};
 use protocol::frame::UNOBSERVED;
 use std::ops::Range;
 
@@ -28,12 +28,16 @@ const LEVELS: usize = DECODER_CHANNELS.len();
 #[derive(Debug)]
 pub(crate) struct Chunk {
     frames: Range<usize>,
-    u: [Vec<f32>; LEVELS],
-    /// Gradients of the normalised maps, before ReLU.
-    dy: [Vec<f32>; LEVELS],
+    u: [Buffer; LEVELS],
+    /// Gradients of the normalised maps, before ReLU; of the last, `touched` has those of most frames.
+    dy: [Buffer; LEVELS],
+    /// Per frame what the last doubling touched, where it was evaluated at visited cells only.
+    touched: Vec<Option<Vec<Touched>>>,
+    /// One frame's `dy` of the last map.
+    spread: Buffer,
     sums: Sums,
     scratch: [Scratch; LEVELS],
-    d_seed: Vec<f32>,
+    d_seed: Buffer,
     d_weights: [Vec<Kernel4x4>; LEVELS],
     /// Per output channel of each doubling, over all frames.
     patch_sums: [Vec<Lanes>; LEVELS],
@@ -42,10 +46,10 @@ pub(crate) struct Chunk {
     d_hidden: Vec<f32>,
     loss: CellLoss,
     /// One frame's logits, then their gradients, and its observations; all cells.
-    logits: Vec<f32>,
+    logits: Buffer,
     values: Vec<u8>,
-    /// One plane.
-    dz: Vec<f32>,
+    /// One channel of the seed.
+    dz: Buffer,
 }
 
 /// Room for a window.
@@ -72,7 +76,12 @@ impl DecoderLayers {
             seed: Seed::new(shape.hidden, DECODER_CHANNELS[0], cells, weight(0)),
             doublings: std::array::from_fn(|level| {
                 let channels = shape.doubling_channels(level);
-                Doubling::new(shape.doubled(level), channels, weight(level + 1))
+                let size = shape.doubled(level);
+                let input = match level {
+                    0 => Map::rows(size),
+                    _ => Map::phases(size),
+                };
+                Doubling::new(input, channels, weight(level + 1))
             }),
             norms: Vec::with_capacity(LEVELS),
         }
@@ -93,7 +102,7 @@ struct Level<'a> {
     layers: &'a DecoderLayers,
     dropout: &'a Dropout,
     floors: Vec<f32>,
-    constants: Vec<f32>,
+    constants: Buffer,
 }
 
 impl<'a> Level<'a> {
@@ -122,41 +131,45 @@ impl<'a> Level<'a> {
 
     /// Numbers per frame of the maps before.
     fn length_in(&self) -> usize {
-        self.doubling().channels_in * self.doubling().plane_in()
+        self.doubling().channels_in * self.doubling().input.length()
     }
 
     /// Numbers per frame of the maps after.
     fn length_out(&self) -> usize {
-        self.doubling().channels_out * self.doubling().plane_out()
+        self.doubling().channels_out * self.doubling().output().length()
     }
 }
 
 impl Decoder {
     /// Room for windows of `n_frames` inputs.
     pub(crate) fn new(shape: &NetworkShape, n_frames: usize, layers: &DecoderLayers) -> Self {
+        let maps = |frames: &Range<usize>| {
+            std::array::from_fn(|level| {
+                let length = layers.doublings[level].input.length();
+                Buffer::zeros(frames.len() * DECODER_CHANNELS[level] * length)
+            })
+        };
         let chunk = |frames: Range<usize>| {
-            let maps: [Vec<f32>; LEVELS] = std::array::from_fn(|level| {
-                let plane = layers.doublings[level].plane_in();
-                vec![0.0; frames.len() * DECODER_CHANNELS[level] * plane]
-            });
             let last = &layers.doublings[LEVELS - 1];
             let channels_out = |level: usize| layers.doublings[level].channels_out;
             Chunk {
-                dy: maps.clone(),
-                u: maps,
+                dy: maps(&frames),
+                u: maps(&frames),
+                touched: frames.clone().map(|_| None).collect(),
+                spread: Buffer::zeros(DECODER_CHANNELS[LEVELS - 1] * last.input.length()),
                 sums: Sums::default(),
                 scratch: std::array::from_fn(|level| layers.doublings[level].scratch()),
                 d_seed: layers.seed.gradient(),
                 d_weights: std::array::from_fn(|level| {
-                    vec![[0.0; LANES]; DECODER_CHANNELS[level] * channels_out(level)]
+                    vec![Lanes::ZERO; DECODER_CHANNELS[level] * channels_out(level)]
                 }),
                 patch_sums: std::array::from_fn(|level| vec![Lanes::ZERO; channels_out(level)]),
                 d_last: LastLayer::gradient(shape.n_states),
                 d_hidden: vec![0.0; frames.len() * shape.hidden],
                 loss: CellLoss::new(&[], shape.n_states, 0),
-                logits: vec![0.0; shape.n_states * last.plane_out()],
-                values: vec![UNOBSERVED; last.plane_out()],
-                dz: vec![0.0; last.plane_out()],
+                logits: Buffer::zeros(shape.n_states * last.output().length()),
+                values: vec![UNOBSERVED; last.output().length()],
+                dz: Buffer::zeros(layers.seed.plane()),
                 frames,
             }
         };
@@ -171,7 +184,7 @@ impl Chunk {
     /// Forgets a doubling's gradients, and sums, before a backward pass.
     fn clear(&mut self, level: usize) {
         self.sums = Sums::zeros(DECODER_CHANNELS[level]);
-        self.d_weights[level].fill([0.0; LANES]);
+        self.d_weights[level].fill(Lanes::ZERO);
         self.patch_sums[level].fill(Lanes::ZERO);
     }
 }

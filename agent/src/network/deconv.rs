@@ -7,9 +7,12 @@
 
 mod backward;
 mod forward;
+mod map;
+
+pub(crate) use map::Map;
 
 use super::correlation::Kernel4x4;
-use super::lanes::{LANES, Lanes, whole_lanes};
+use super::lanes::{Buffer, LANES, Lanes, whole_lanes};
 
 /// Columns to the left, none, to the right.
 const COLUMN_SHIFTS: usize = 3;
@@ -17,14 +20,18 @@ const PHASES: usize = 4;
 const TAPS: usize = 16;
 /// Planes of an output gradient: of two row parities and four columns of the kernel.
 const GRADIENT_PLANES: usize = 8;
+/// Rows and columns of inputs around a pixel that its four outputs depend on.
+const SIDE: usize = 3;
+/// Sixteen pixels' neighbours and themselves.
+type Around = [Lanes; SIDE * SIDE];
 /// Pixels whose patches are made at once, to stay in the fastest cache.
 const BAND: usize = 64;
 
 /// Sizes and weights of one doubling.
 #[derive(Debug)]
 pub(crate) struct Doubling {
-    /// Rows and columns before doubling.
-    pub(crate) input: [usize; 2],
+    /// Before doubling.
+    pub(crate) input: Map,
     pub(crate) channels_in: usize,
     pub(crate) channels_out: usize,
     /// `[in][out]`.
@@ -35,71 +42,78 @@ pub(crate) struct Doubling {
 #[derive(Debug, Clone)]
 pub(crate) struct Scratch {
     /// Per kept input its values, shifted by a column to the right, not, and to the left.
-    shifted: Vec<f32>,
-    /// Per kept output its four phases.
-    phases: Vec<f32>,
-    /// Per kept output its gradient, with a border of zeros.
-    bordered: Vec<f32>,
+    shifted: Buffer,
+    /// Per kept input sixteen pixels' neighbours.
+    around: Vec<Around>,
     /// All outputs' gradients, as each tap meets them.
-    gradients: Vec<f32>,
+    gradients: Buffer,
     /// Per output and pixel of a band the 4 x 4 gradients that the pixel reached.
-    patches: Vec<f32>,
+    patches: Buffer,
     /// Per kept output the sum of its patches.
     pub(crate) patch_sums: Vec<Lanes>,
-    /// Per kept input `x'`.
-    pub(crate) values: Vec<f32>,
-    /// Per kept input its gradient.
-    pub(crate) dx: Vec<f32>,
+    /// One input, in the order of its map.
+    map: Buffer,
+    /// Per kept input `x'`, row by row.
+    values: Buffer,
+    /// Per kept input its gradient, row by row.
+    pub(crate) dx: Buffer,
 }
 
 impl Doubling {
     /// From PyTorch's `[in][out][4][4]`.
-    pub(crate) fn new(input: [usize; 2], channels: [usize; 2], weight: &[f32]) -> Self {
+    pub(crate) fn new(input: Map, channels: [usize; 2], weight: &[f32]) -> Self {
         let [channels_in, channels_out] = channels;
         Self {
             input,
             channels_in,
             channels_out,
-            weights: weight.as_chunks().0.to_vec(),
+            weights: weight
+                .as_chunks()
+                .0
+                .iter()
+                .map(|&kernel| Lanes(kernel))
+                .collect(),
         }
     }
 
-    /// Numbers per input plane: its pixels, padded to whole lanes.
+    /// Numbers per input plane: its rows, padded to whole lanes.
     pub(crate) fn plane_in(&self) -> usize {
-        whole_lanes(self.input[0] * self.input[1])
+        whole_lanes(self.input.pixels())
     }
 
-    /// Numbers per output plane.
-    pub(crate) fn plane_out(&self) -> usize {
-        whole_lanes(4 * self.input[0] * self.input[1])
+    /// After doubling.
+    pub(crate) fn output(&self) -> Map {
+        Map::phases(self.input.size().map(|side| 2 * side))
     }
 
     /// Of one column shift: a row of zeros above and below, and what the last lanes read beyond.
     fn shifted_plane(&self) -> usize {
-        whole_lanes((self.input[0] + 2) * self.input[1] + LANES)
+        let [rows, cols] = self.input.size();
+        whole_lanes((rows + 2) * cols + LANES)
     }
 
     fn gradient_plane(&self) -> usize {
-        whole_lanes((self.input[0] + 1) * self.input[1] + LANES)
+        let [rows, cols] = self.input.size();
+        whole_lanes((rows + 1) * cols + LANES)
     }
 
     pub(crate) fn scratch(&self) -> Scratch {
-        let [rows, cols] = self.input;
         let plane = self.plane_in();
-        let band = self.band_rows() * cols;
+        let band = self.band_rows() * self.input.size()[1];
         Scratch {
-            shifted: vec![0.0; self.channels_in * COLUMN_SHIFTS * self.shifted_plane()],
-            phases: vec![0.0; self.channels_out * PHASES * plane],
-            bordered: vec![0.0; self.channels_out * (2 * rows + 2) * (2 * cols + 2)],
-            gradients: vec![0.0; self.channels_out * GRADIENT_PLANES * self.gradient_plane()],
-            patches: vec![0.0; self.channels_out * band * TAPS],
+            shifted: Buffer::zeros(self.channels_in * COLUMN_SHIFTS * self.shifted_plane()),
+            around: vec![[Lanes::ZERO; SIDE * SIDE]; self.channels_in],
+            gradients: Buffer::zeros(self.channels_out * GRADIENT_PLANES * self.gradient_plane()),
+            patches: Buffer::zeros(self.channels_out * band * TAPS),
             patch_sums: vec![Lanes::ZERO; self.channels_out],
-            values: vec![0.0; self.channels_in * plane],
-            dx: vec![0.0; self.channels_in * plane],
+            map: Buffer::zeros(self.input.length()),
+            values: Buffer::zeros(self.channels_in * plane),
+            dx: Buffer::zeros(self.channels_in * plane),
         }
     }
 
     fn band_rows(&self) -> usize {
-        (BAND / self.input[1]).clamp(1, self.input[0])
+        let [rows, cols] = self.input.size();
+        (BAND / cols).clamp(1, rows)
     }
 }

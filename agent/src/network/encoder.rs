@@ -13,28 +13,35 @@ use linear::LinearGradient;
 use super::batch_norm::{Norm, Statistics, Sums};
 use super::conv::{Dense, DenseGradient, Sparse};
 use super::dropout::ChannelMask;
-use super::lanes::{Arithmetic, LANES, Lanes};
+use super::dropout::Dropout;
+use super::lanes::{Arithmetic, Buffer, LANES, Lanes};
 use super::parallel::chunks_of;
 use super::parameters::{ENCODER, Tensors};
 use super::shape::{ConvShape, NetworkShape};
+use super::window::Window;
 use std::ops::Range;
+
+/// Visits of a frame up to which its first map is computed anew.
+const MOST_VISITS: usize = 256;
 
 /// One chunk's frames: their maps, and gradients of everything.
 #[derive(Debug)]
 pub(crate) struct Chunk {
     frames: Range<usize>,
-    /// After ReLU, before normalisation; channels last.
-    maps: [Vec<f32>; 3],
+    /// After ReLU, before normalisation; channels last. Of the first, see [`First`].
+    maps: [Buffer; 3],
+    /// One frame's first map.
+    first: Buffer,
     /// Gradients of the normalised maps.
-    d_maps: [Vec<f32>; 3],
+    d_maps: [Buffer; 3],
     encodings: Vec<f32>,
     sums: Sums,
-    d_columns: Vec<f32>,
-    d_bias: Vec<f32>,
+    d_columns: Buffer,
+    d_bias: Buffer,
     dense: [DenseGradient; 2],
     linear: LinearGradient,
     /// One frame's gradient before ReLU.
-    dz: Vec<f32>,
+    dz: Buffer,
 }
 
 /// The encoder's weights, ready for a window.
@@ -43,6 +50,43 @@ pub(crate) struct Encoder {
     shapes: [ConvShape; 3],
     encoding: usize,
     chunks: Vec<Chunk>,
+}
+
+/// The first convolution over a window. Where few cells were visited, its map is quicker computed anew than
+/// fetched from memory, and only kept of other frames.
+#[derive(Clone, Copy)]
+struct First<'a> {
+    sparse: &'a Sparse,
+    window: &'a Window,
+    dropout: &'a Dropout,
+}
+
+impl First<'_> {
+    fn is_kept(&self, frame: usize) -> bool {
+        self.window.visits(frame).len() > MOST_VISITS
+    }
+
+    #[inline(always)]
+    fn compute<A: Arithmetic>(&self, frame: usize, map: &mut [f32]) {
+        let mask = multipliers(&self.dropout.encoder[0], frame, self.dropout.scale);
+        let visits = self.window.visits(frame);
+        self.sparse.forward::<A>(visits, &mask, map);
+    }
+
+    /// A frame's map, in its place or in the room for one.
+    #[inline(always)]
+    fn recall<'m, A: Arithmetic>(
+        &self,
+        frame: usize,
+        place: &'m [f32],
+        room: &'m mut [f32],
+    ) -> &'m [f32] {
+        if self.is_kept(frame) {
+            return place;
+        }
+        self.compute::<A>(frame, room);
+        room
+    }
 }
 
 /// What the backward pass needs beside the chunks.
@@ -58,24 +102,26 @@ impl Encoder {
     /// Room for windows of `n_frames` inputs.
     pub(crate) fn new(shape: &NetworkShape, n_frames: usize) -> Self {
         let shapes = shape.convolutions();
+        let largest = shapes.map(|conv| conv.outputs()).into_iter().max();
+        let largest = largest.unwrap_or(0);
         let chunk = |frames: Range<usize>| {
-            let maps = shapes.map(|conv| vec![0.0; frames.len() * conv.outputs()]);
+            let maps = shapes.map(|conv| Buffer::zeros(frames.len() * conv.outputs()));
             Chunk {
-                d_maps: maps.clone(),
+                d_maps: shapes.map(|conv| Buffer::zeros(frames.len() * conv.outputs())),
                 maps,
+                first: Buffer::zeros(shapes[0].outputs()),
                 encodings: vec![0.0; frames.len() * shape.encoding],
                 sums: Sums::default(),
-                d_columns: vec![
-                    0.0;
-                    shapes[0].channels_out * shapes[0].channels_in * shapes[0].taps()
-                ],
-                d_bias: vec![0.0; shapes[0].channels_out],
+                d_columns: Buffer::zeros(
+                    shapes[0].channels_out * shapes[0].channels_in * shapes[0].taps(),
+                ),
+                d_bias: Buffer::zeros(shapes[0].channels_out),
                 dense: [
                     DenseGradient::zeros(&shapes[1]),
                     DenseGradient::zeros(&shapes[2]),
                 ],
                 linear: LinearGradient::zeros(shape.encoding, shapes[2].outputs()),
-                dz: Vec::new(),
+                dz: Buffer::zeros(largest),
                 frames,
             }
         };

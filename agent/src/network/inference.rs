@@ -7,7 +7,7 @@ use super::deconv::Scratch;
 use super::dropout::Dropout;
 use super::encoder::{Linear, encoder_norm};
 use super::gru::{Gru, Trace};
-use super::lanes::{Arithmetic, Kernel, LANES, Lanes};
+use super::lanes::{Arithmetic, Buffer, Kernel, LANES, Lanes};
 use super::loss::softmax;
 use super::parameters::{DECODER_NORMS, ENCODER, Tensors};
 use super::shape::{DECODER_CHANNELS, ENCODER_CHANNELS, NetworkShape};
@@ -23,12 +23,14 @@ pub(crate) struct Inference {
     gru: Gru,
     decoder: DecoderLayers,
     everything: Dropout,
-    encoder_maps: [Vec<f32>; 3],
-    linear_input: Vec<f32>,
-    decoder_maps: Vec<Vec<f32>>,
+    encoder_maps: [Buffer; 3],
+    linear_input: Buffer,
+    decoder_maps: Vec<Buffer>,
+    /// One state of the padded grid, row by row.
+    rows: Vec<f32>,
     scratch: [Scratch; DECODER_CHANNELS.len()],
     /// What lost channels add to each doubling: nothing, as none are lost.
-    no_constants: Vec<f32>,
+    no_constants: Buffer,
     /// No channel's constant is taken out.
     no_floors: Vec<f32>,
     states: Vec<u16>,
@@ -59,12 +61,13 @@ impl Inference {
         let constants = decoder
             .doublings
             .iter()
-            .map(|doubling| doubling.channels_out * doubling.plane_in() * 4);
-        let planes = decoder.doublings.iter().map(|doubling| doubling.plane_in());
-        let maps = planes
+            .map(|doubling| doubling.channels_out * doubling.output().length());
+        let inputs = decoder.doublings.iter().map(|doubling| doubling.input);
+        let maps = inputs
             .zip(DECODER_CHANNELS)
-            .map(|(plane, channels)| vec![0.0; plane * channels]);
-        let logits = decoder.doublings[3].plane_out() * shape.n_states;
+            .map(|(input, channels)| Buffer::zeros(input.length() * channels));
+        let output = decoder.doublings[3].output();
+        let logits = output.length() * shape.n_states;
         Self {
             sparse: Sparse::new(convolutions[0], weight, bias),
             dense: [1, 2].map(|stage| {
@@ -74,11 +77,12 @@ impl Inference {
             linear: Linear::new(convolutions[2], shape.encoding, parameters, &norms[2]),
             gru: Gru::new(parameters, shape.encoding, shape.hidden),
             everything: Dropout::off(1),
-            encoder_maps: convolutions.map(|conv| vec![0.0; conv.outputs()]),
-            linear_input: vec![0.0; convolutions[2].outputs()],
-            decoder_maps: maps.chain([vec![0.0; logits]]).collect(),
+            encoder_maps: convolutions.map(|conv| Buffer::zeros(conv.outputs())),
+            linear_input: Buffer::zeros(convolutions[2].outputs()),
+            decoder_maps: maps.chain([Buffer::zeros(logits)]).collect(),
+            rows: vec![0.0; output.pixels()],
             scratch,
-            no_constants: vec![0.0; constants.max().unwrap_or(0)],
+            no_constants: Buffer::zeros(constants.max().unwrap_or(0)),
             no_floors: vec![0.0; DECODER_CHANNELS[0]],
             states: (0..shape.n_states as u16).collect(),
             decoder,
@@ -114,13 +118,7 @@ impl Inference {
             let scratch = &mut self.scratch[level];
             let (before, after) = self.decoder_maps.split_at_mut(level + 1);
             let floors = &self.no_floors[..doubling.channels_in];
-            doubling.values::<A>(
-                &before[level],
-                kept(level),
-                norm,
-                floors,
-                &mut scratch.values,
-            );
+            doubling.values::<A>(&before[level], kept(level), norm, floors, scratch);
             let channels = [kept(level), kept(level + 1)];
             doubling.forward::<A>(channels, &self.no_constants, 1.0, scratch, &mut after[0]);
         }
@@ -130,30 +128,34 @@ impl Inference {
     /// Softmax over the states, in place of the logits.
     #[inline(always)]
     fn normalise<A: Arithmetic>(&mut self) {
-        let plane = self.decoder.doublings[3].plane_out();
+        let length = self.decoder.doublings[3].output().length();
         let logits = self.decoder_maps.last_mut().expect("invariant: five maps");
         let mut lanes = vec![Lanes::ZERO; self.states.len()];
         let mut probabilities = lanes.clone();
-        for first in (0..plane).step_by(LANES) {
+        for first in (0..length).step_by(LANES) {
             for (state, lanes) in lanes.iter_mut().enumerate() {
-                *lanes = Lanes::load(&logits[state * plane + first..]);
+                *lanes = Lanes::load(&logits[state * length + first..]);
             }
             softmax::<A>(&lanes, &mut probabilities);
             for (state, lanes) in probabilities.iter().enumerate() {
-                lanes.store(&mut logits[state * plane + first..]);
+                lanes.store(&mut logits[state * length + first..]);
             }
         }
     }
 
     /// Copies the probabilities of the grid's cells, `[S, H, W]`.
-    fn cut_to_grid(&self, prediction: &mut [f32]) {
+    #[inline(always)]
+    fn cut_to_grid<A: Arithmetic>(&mut self, prediction: &mut [f32]) {
         let (height, width) = self.shape.grid.dim();
-        let padded = self.shape.doubled(DECODER_CHANNELS.len())[1];
-        let plane = self.decoder.doublings[3].plane_out();
+        let output = self.decoder.doublings[3].output();
         let probabilities = self.decoder_maps.last().expect("invariant: five maps");
-        for (row, to) in prediction.chunks_exact_mut(width).enumerate() {
-            let from = row / height * plane + row % height * padded;
-            to.copy_from_slice(&probabilities[from..][..width]);
+        let states = probabilities.chunks_exact(output.length());
+        for (from, to) in states.zip(prediction.chunks_exact_mut(height * width)) {
+            output.to_rows::<A>(from, &mut self.rows);
+            let rows = self.rows.chunks_exact(output.size()[1]);
+            for (from, to) in rows.zip(to.chunks_exact_mut(width)) {
+                to.copy_from_slice(&from[..width]);
+            }
         }
     }
 }
@@ -176,7 +178,7 @@ impl Kernel for Advance<'_> {
         let Trace { hidden, .. } = self.inference.gru.forward::<A>(self.hidden, &encoding);
         self.hidden.copy_from_slice(&hidden[n_hidden..]);
         self.inference.decode::<A>(self.hidden);
-        self.inference.cut_to_grid(self.prediction);
+        self.inference.cut_to_grid::<A>(self.prediction);
     }
 }
 
@@ -192,6 +194,6 @@ impl Kernel for Decode<'_> {
     #[inline(always)]
     fn run<A: Arithmetic>(self) {
         self.inference.decode::<A>(self.hidden);
-        self.inference.cut_to_grid(self.prediction);
+        self.inference.cut_to_grid::<A>(self.prediction);
     }
 }

@@ -2,16 +2,20 @@
 //!
 //! [`dispatch`] compiles a kernel once for AVX-512, once for AVX2 and once for any CPU. Everything
 //! between [`Kernel::run`] and [`Lanes`] is `#[inline(always)]`, to be compiled for those vectors.
-//! Sums and products of [`Lanes`] are named instructions (`x86.rs`): LLVM finds vectors in plain loops
+//! Sums, products and shuffles of [`Lanes`] are named instructions (`x86.rs`): LLVM finds vectors in plain loops
 //! over slices, but not reliably in blocks of many sums.
 
 use std::array::from_fn;
+use std::ops::{Deref, DerefMut};
 
 /// Numbers in [`Lanes`]: those of one AVX-512 register.
 pub(crate) const LANES: usize = 16;
 
 /// How sums and products are computed.
 pub(crate) trait Arithmetic: Copy {
+    /// How many [`Lanes`] of sums the registers hold, with room for what is added.
+    const SUMS: usize;
+
     /// `a * b + c`.
     fn mul_add(a: f32, b: f32, c: f32) -> f32;
 
@@ -26,6 +30,12 @@ pub(crate) trait Arithmetic: Copy {
 
     /// `a + b`.
     fn add(a: Lanes, b: Lanes) -> Lanes;
+
+    /// `a[0], b[0], a[1], b[1] ..`, all 32.
+    fn interleave(a: Lanes, b: Lanes) -> [Lanes; 2];
+
+    /// Of 32 numbers those at even and those at odd places.
+    fn deinterleave(a: Lanes, b: Lanes) -> [Lanes; 2];
 }
 
 /// On any CPU. Rounds products and sums: without hardware for it, `f32::mul_add` is a slow call.
@@ -33,6 +43,8 @@ pub(crate) trait Arithmetic: Copy {
 pub(crate) struct Portable;
 
 impl Arithmetic for Portable {
+    const SUMS: usize = 4;
+
     #[inline(always)]
     fn mul_add(a: f32, b: f32, c: f32) -> f32 {
         a * b + c
@@ -46,6 +58,19 @@ impl Arithmetic for Portable {
     #[inline(always)]
     fn add(a: Lanes, b: Lanes) -> Lanes {
         Lanes(from_fn(|lane| a.0[lane] + b.0[lane]))
+    }
+
+    #[inline(always)]
+    fn interleave(a: Lanes, b: Lanes) -> [Lanes; 2] {
+        let half = |first: usize| from_fn(|lane| [a, b][lane % 2].0[first + lane / 2]);
+        [Lanes(half(0)), Lanes(half(LANES / 2))]
+    }
+
+    #[inline(always)]
+    fn deinterleave(a: Lanes, b: Lanes) -> [Lanes; 2] {
+        let half =
+            |first: usize| from_fn(|lane| [a, b][2 * lane / LANES].0[(2 * lane + first) % LANES]);
+        [Lanes(half(0)), Lanes(half(1))]
     }
 }
 
@@ -149,12 +174,75 @@ impl Lanes {
         A::add(self, other)
     }
 
+    /// Rows to columns: lane `j` of number `i` to lane `i` of number `j`.
+    #[inline(always)]
+    pub(crate) fn transpose<A: Arithmetic>(mut square: [Self; LANES]) -> [Self; LANES] {
+        // Each time, the bits of a number's place `16 i + j` rotate by one; four times, `i` and `j` change places.
+        for _ in 0..LANES.ilog2() {
+            let mut shuffled = square;
+            for at in 0..LANES / 2 {
+                let pair = A::interleave(square[at], square[at + LANES / 2]);
+                [shuffled[2 * at], shuffled[2 * at + 1]] = pair;
+            }
+            square = shuffled;
+        }
+        square
+    }
+
     /// The sum over the lanes, pairwise.
     #[inline(always)]
     pub(crate) fn sum(self) -> f32 {
         let eight: [f32; 8] = from_fn(|lane| self.0[lane] + self.0[lane + 8]);
         let four: [f32; 4] = from_fn(|lane| eight[lane] + eight[lane + 4]);
         (four[0] + four[2]) + (four[1] + four[3])
+    }
+}
+
+/// Numbers that begin where a cache line does: loads and stores of [`Lanes`] meet one line, not two.
+#[derive(Debug)]
+pub(crate) struct Buffer {
+    room: Vec<f32>,
+    first: usize,
+    length: usize,
+}
+
+impl Buffer {
+    pub(crate) fn zeros(length: usize) -> Self {
+        let room = vec![0.0; length + LANES];
+        let first = room.as_ptr().align_offset(align_of::<Lanes>()).min(LANES);
+        Self {
+            room,
+            first,
+            length,
+        }
+    }
+}
+
+impl From<&[f32]> for Buffer {
+    fn from(numbers: &[f32]) -> Self {
+        let mut buffer = Self::zeros(numbers.len());
+        buffer.copy_from_slice(numbers);
+        buffer
+    }
+}
+
+impl Clone for Buffer {
+    fn clone(&self) -> Self {
+        Self::from(&**self)
+    }
+}
+
+impl Deref for Buffer {
+    type Target = [f32];
+
+    fn deref(&self) -> &[f32] {
+        &self.room[self.first..][..self.length]
+    }
+}
+
+impl DerefMut for Buffer {
+    fn deref_mut(&mut self) -> &mut [f32] {
+        &mut self.room[self.first..][..self.length]
     }
 }
 
@@ -212,6 +300,15 @@ pub(crate) mod tests {
                 assert_eq!(c.add_product::<A>(a, b).0[lane], a_lane * b_lane + c_lane);
                 assert_eq!(c.add_scaled::<A>(3.0, b).0[lane], 3.0 * b_lane + c_lane);
                 assert_eq!(a.add::<A>(b).0[lane], a_lane + b_lane);
+                let woven = A::interleave(a, b).map(|lanes| lanes.0);
+                assert_eq!(woven.as_flattened()[2 * lane..][..2], [a_lane, b_lane]);
+                let [even, odd] = A::deinterleave(Lanes(woven[0]), Lanes(woven[1]));
+                assert_eq!([even.0[lane], odd.0[lane]], [a_lane, b_lane]);
+            }
+            let square = from_fn(|row| Lanes(from_fn(|lane| (row * LANES + lane) as f32)));
+            let columns = Lanes::transpose::<A>(square);
+            for (lane, column) in columns.iter().enumerate() {
+                assert_eq!(column.0, square.map(|row| row.0[lane]));
             }
         }
     }

@@ -15,8 +15,10 @@
 //! 2. Dropout takes half of the channels, so a layer needs a quarter of its products. What lost channels
 //!    leave behind is a constant, see [`deconv`].
 //! 3. Stride-2 transposed convolutions are four small correlations with pixels in vector lanes.
-//! 4. The recurrence runs over the whole window at once.
-//! 5. [`lanes`] compiles everything for the CPU at hand; [`parallel`] uses all cores, and the number of
+//! 4. A window's maps do not fit the caches: what is cheap is computed anew instead of fetched, what is
+//!    mostly zero is kept as a list, and numbers begin where a cache line does.
+//! 5. The recurrence runs over the whole window at once.
+//! 6. [`lanes`] compiles everything for the CPU at hand; [`parallel`] uses all cores, and the number of
 //!    threads changes no bit.
 
 pub mod adam;

@@ -2,7 +2,7 @@
 //!
 //! Its input is one cell, so it is a matrix: `z[channel][cell] = sum over i of h_i W[i][channel][cell]`.
 
-use super::lanes::{Arithmetic, LANES, Lanes, whole_lanes};
+use super::lanes::{Arithmetic, Buffer, LANES, Lanes, whole_lanes};
 
 /// The matrix, each channel's cells padded to whole lanes.
 #[derive(Debug)]
@@ -10,14 +10,14 @@ pub(crate) struct Seed {
     channels: usize,
     cells: usize,
     /// `[hidden][channel][cell]`.
-    weight: Vec<f32>,
+    weight: Buffer,
 }
 
 impl Seed {
     /// From PyTorch's `[hidden][channel][cell]`.
     pub(crate) fn new(hidden: usize, channels: usize, cells: usize, weight: &[f32]) -> Self {
         let plane = whole_lanes(cells);
-        let mut padded = vec![0.0; hidden * channels * plane];
+        let mut padded = Buffer::zeros(hidden * channels * plane);
         for (to, from) in padded
             .chunks_exact_mut(plane)
             .zip(weight.chunks_exact(cells))
@@ -36,8 +36,8 @@ impl Seed {
     }
 
     /// Room for gradients.
-    pub(crate) fn gradient(&self) -> Vec<f32> {
-        vec![0.0; self.weight.len()]
+    pub(crate) fn gradient(&self) -> Buffer {
+        Buffer::zeros(self.weight.len())
     }
 
     /// Gradients in PyTorch's layout.

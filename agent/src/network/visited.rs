@@ -4,6 +4,7 @@
 //! are in lanes.
 
 use super::batch_norm::{Norm, Sums};
+use super::deconv::Map;
 use super::lanes::{Arithmetic, LANES, Lanes};
 use super::loss::CellLoss;
 use super::window::Visit;
@@ -12,8 +13,8 @@ use protocol::frame::UNOBSERVED;
 /// The last doubling's weights, channels in lanes.
 #[derive(Debug)]
 pub(crate) struct LastLayer {
-    /// Rows and columns before doubling.
-    input: [usize; 2],
+    /// Before doubling.
+    input: Map,
     n_states: usize,
     /// `[entry of the kernel][state]`.
     weights: Vec<Lanes>,
@@ -31,19 +32,39 @@ struct Neighbour {
     u: Lanes,
 }
 
+/// The gradient of one pixel before the last doubling, all channels.
+#[derive(Debug)]
+pub(crate) struct Touched {
+    pixel: usize,
+    d: Lanes,
+}
+
+impl Touched {
+    /// Gradients of one frame's kept channels, zero but for what was touched; `length` numbers each.
+    #[inline(always)]
+    pub(crate) fn spread(touched: &[Self], kept: &[u16], length: usize, dy: &mut [f32]) {
+        let dy = &mut dy[..kept.len() * length];
+        dy.fill(0.0);
+        for Self { pixel, d } in touched {
+            for (dy, &channel) in dy.chunks_exact_mut(length).zip(kept) {
+                dy[*pixel] += d.0[usize::from(channel) % LANES];
+            }
+        }
+    }
+}
+
 /// One frame: its maps before the last doubling, and where gradients go.
 pub(crate) struct LastMaps<'a> {
     pub(crate) kept: &'a [u16],
-    pub(crate) plane: usize,
     pub(crate) u: &'a [f32],
-    pub(crate) dy: &'a mut [f32],
+    pub(crate) touched: &'a mut Vec<Touched>,
     pub(crate) sums: &'a mut Sums,
     pub(crate) d_weights: &'a mut [Lanes],
 }
 
 impl LastLayer {
     /// From PyTorch's `[in][state][4][4]`.
-    pub(crate) fn new(input: [usize; 2], n_states: usize, weight: &[f32], norm: &Norm) -> Self {
+    pub(crate) fn new(input: Map, n_states: usize, weight: &[f32], norm: &Norm) -> Self {
         let mut weights = vec![Lanes::ZERO; 16 * n_states];
         for (index, &entry) in weight.iter().enumerate() {
             let (channel, state, tap) = (index / 16 / n_states, index / 16 % n_states, index % 16);
@@ -79,7 +100,6 @@ impl LastLayer {
         maps: &mut LastMaps<'_>,
         loss: &mut CellLoss,
     ) {
-        maps.dy[..maps.kept.len() * maps.plane].fill(0.0);
         let mut sums = [Lanes::ZERO; 2];
         let mut logits = vec![Lanes::ZERO; self.n_states];
         for visits in visits.chunks(LANES) {
@@ -110,7 +130,7 @@ impl LastLayer {
         for logits in logits.iter_mut() {
             logits.0[lane] = 0.0;
         }
-        self.each_neighbour::<A>(visit, maps.kept, maps.u, maps.plane, |neighbour| {
+        self.each_neighbour::<A>(visit, maps.kept, maps.u, |neighbour| {
             let x = Lanes(neighbour.y.0.map(|y| y.max(0.0)));
             for (state, logits) in logits.iter_mut().enumerate() {
                 let weights = self.weights[neighbour.entry * self.n_states + state];
@@ -130,13 +150,12 @@ impl LastLayer {
     ) {
         let LastMaps {
             kept,
-            plane,
             u,
-            dy,
+            touched,
             d_weights,
             ..
         } = maps;
-        self.each_neighbour::<A>(visit, kept, u, *plane, |neighbour| {
+        self.each_neighbour::<A>(visit, kept, u, |neighbour| {
             let first = neighbour.entry * self.n_states;
             let x = Lanes(neighbour.y.0.map(|y| y.max(0.0)));
             let mut d = Lanes::ZERO;
@@ -154,9 +173,10 @@ impl LastLayer {
             }
             sums[0] = sums[0].add::<A>(d);
             sums[1] = sums[1].add_product::<A>(d, neighbour.u);
-            for (index, &channel) in kept.iter().enumerate() {
-                dy[index * *plane + neighbour.pixel] += d.0[usize::from(channel) % LANES];
-            }
+            touched.push(Touched {
+                pixel: neighbour.pixel,
+                d,
+            });
         });
     }
 
@@ -167,10 +187,10 @@ impl LastLayer {
         visit: Visit,
         kept: &[u16],
         u: &[f32],
-        plane: usize,
         mut each: impl FnMut(Neighbour),
     ) {
-        let [rows, cols] = self.input;
+        let [rows, cols] = self.input.size();
+        let length = self.input.length();
         let (row, col) = (usize::from(visit.row), usize::from(visit.col));
         for term in 0..4 {
             // Cell 2 y + p depends on y + p - 1 and y + p, through entries 3 - p and 1 - p.
@@ -178,10 +198,10 @@ impl LastLayer {
             if !(1..=rows).contains(&down) || !(1..=cols).contains(&right) {
                 continue;
             }
-            let pixel = (down - 1) * cols + right - 1;
+            let pixel = self.input.at(down - 1, right - 1);
             let mut values = Lanes::ZERO;
             for (index, &channel) in kept.iter().enumerate() {
-                values.0[usize::from(channel) % LANES] = u[index * plane + pixel];
+                values.0[usize::from(channel) % LANES] = u[index * length + pixel];
             }
             each(Neighbour {
                 pixel,

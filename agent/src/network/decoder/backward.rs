@@ -10,6 +10,7 @@ use crate::network::parallel::{Pass, for_each_chunk};
 use crate::network::parameters::{DECODER, DECODER_NORMS, Tensors};
 use crate::network::seed::Seed;
 use crate::network::shape::DECODER_CHANNELS;
+use crate::network::visited::Touched;
 
 impl Decoder {
     /// Gradients of all other parameters, and of the states `h_1 .. h_K` (returned).
@@ -67,9 +68,9 @@ impl Decoder {
         let d_weight = gradient.get_mut(&format!("{}.weight", DECODER[index + 1]));
         d_weight.fill(0.0);
         for chunk in &self.chunks {
-            let chunk_weights = chunk.d_weights[index].as_flattened();
-            for (sum, d) in d_weight.iter_mut().zip(chunk_weights) {
-                *sum += d;
+            let kernels = d_weight.as_chunks_mut().0.iter_mut();
+            for (sum, d) in kernels.zip(&chunk.d_weights[index]) {
+                *sum = Lanes(*sum).add::<Portable>(*d).0;
             }
             for (sum, patches) in patch_sums.iter_mut().zip(&chunk.patch_sums[index]) {
                 *sum = sum.add::<Portable>(*patches);
@@ -93,20 +94,24 @@ impl Pass<Chunk> for DoublingBackward<'_> {
     fn run<A: Arithmetic>(&self, chunk: &mut Chunk) {
         let level = &self.level;
         let (index, doubling) = (level.level, level.doubling());
-        let plane = doubling.plane_out();
+        let length = doubling.output().length();
         chunk.clear(index);
         for (number, frame) in chunk.frames.clone().enumerate() {
             let outputs = level.dropout.decoder[index + 1].kept(frame);
-            let first = number * level.length_out();
-            for (at, &channel) in outputs.iter().enumerate() {
-                let range = first + at * plane..first + (at + 1) * plane;
-                let (u, dy) = (
-                    &chunk.u[index + 1][range.clone()],
-                    &chunk.dy[index + 1][range],
-                );
+            let place = number * level.length_out()..(number + 1) * level.length_out();
+            let dy = match &chunk.touched[number] {
+                Some(touched) if index + 2 == LEVELS => {
+                    Touched::spread(touched, outputs, length, &mut chunk.spread);
+                    &chunk.spread
+                }
+                _ => &chunk.dy[index + 1][place.clone()],
+            };
+            let maps = chunk.u[index + 1][place].chunks_exact(length);
+            let maps = maps.zip(dy.chunks_exact(length)).zip(outputs);
+            for (at, ((u, dy), &channel)) in maps.enumerate() {
                 let undo = BeforeDropout::new(self.norm, channel, level.dropout.scale);
-                doubling.place_gradient(at, &mut chunk.scratch[index], |row, dz| {
-                    let range = row * dz.len()..(row + 1) * dz.len();
+                doubling.place_gradient(at, &mut chunk.scratch[index], |first, dz| {
+                    let range = first..first + dz.len();
                     undo.write::<A>(&u[range.clone()], &dy[range], dz);
                 });
             }
@@ -161,7 +166,7 @@ impl Chunk {
         let at = number * level.length_in()..(number + 1) * level.length_in();
         let (u, dy) = (&self.u[index][at.clone()], &mut self.dy[index][at]);
         let scratch = &mut self.scratch[index];
-        doubling.values::<A>(u, kept, norm, &level.floors, &mut scratch.values);
+        doubling.values::<A>(u, kept, norm, &level.floors, scratch);
         doubling.backward::<A>([kept, outputs], scratch, &mut self.d_weights[index]);
         for (&output, sum) in outputs.iter().zip(&scratch.patch_sums) {
             let total = &mut self.patch_sums[index][usize::from(output)];
@@ -188,14 +193,15 @@ fn before_relu<A: Arithmetic>(
     dy: &mut [f32],
     sums: &mut Sums,
 ) {
-    let (plane, pixels) = (doubling.plane_in(), doubling.input[0] * doubling.input[1]);
-    let planes = u.chunks_exact(plane).zip(dx.chunks_exact(plane));
-    for (((u, dx), dy), &channel) in planes.zip(dy.chunks_exact_mut(plane)).zip(kept) {
+    let (map, plane) = (doubling.input, doubling.plane_in());
+    let planes = u.chunks_exact(map.length()).zip(dx.chunks_exact(plane));
+    for (((u, dx), dy), &channel) in planes.zip(dy.chunks_exact_mut(map.length())).zip(kept) {
         let channel = usize::from(channel);
         let (scale, shift) = (norm.scale[channel], norm.shift[channel]);
-        for ((dy, u), dx) in dy[..pixels].iter_mut().zip(u).zip(dx) {
+        map.take_rows::<A>(dx, dy);
+        for (dy, u) in dy.iter_mut().zip(u) {
             *dy = if A::mul_add(*u, scale, shift) > 0.0 {
-                *dx
+                *dy
             } else {
                 0.0
             };

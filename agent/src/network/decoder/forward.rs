@@ -73,8 +73,8 @@ impl Pass<Chunk> for SeedForward<'_> {
 
 /// Adds the sums of `u` and its square of the kept channels of one frame.
 #[inline(always)]
-fn add_moments<A: Arithmetic>(u: &[f32], plane: usize, kept: &[u16], sums: &mut Sums) {
-    for (u, &channel) in u.chunks_exact(plane).zip(kept) {
+fn add_moments<A: Arithmetic>(u: &[f32], length: usize, kept: &[u16], sums: &mut Sums) {
+    for (u, &channel) in u.chunks_exact(length).zip(kept) {
         sums.add(usize::from(channel), sum_and_product::<A>(u, u));
     }
 }
@@ -85,7 +85,7 @@ impl Pass<Chunk> for DoublingForward<'_> {
     #[inline(always)]
     fn run<A: Arithmetic>(&self, chunk: &mut Chunk) {
         let (level, doubling) = (&self.0, self.0.doubling());
-        let plane = doubling.plane_out();
+        let length = doubling.output().length();
         chunk.sums = Sums::zeros(doubling.channels_out);
         let scratch = &mut chunk.scratch[level.level];
         let (before, after) = chunk.u.split_at_mut(level.level + 1);
@@ -94,13 +94,7 @@ impl Pass<Chunk> for DoublingForward<'_> {
         for ((frame, input), output) in chunk.frames.clone().zip(inputs).zip(outputs) {
             let kept = level.mask().kept(frame);
             let kept_after = level.dropout.decoder[level.level + 1].kept(frame);
-            doubling.values::<A>(
-                input,
-                kept,
-                level.norm(),
-                &level.floors,
-                &mut scratch.values,
-            );
+            doubling.values::<A>(input, kept, level.norm(), &level.floors, scratch);
             let factor = level.dropout.scale;
             doubling.forward::<A>(
                 [kept, kept_after],
@@ -109,7 +103,7 @@ impl Pass<Chunk> for DoublingForward<'_> {
                 scratch,
                 output,
             );
-            add_moments::<A>(output, plane, kept_after, &mut chunk.sums);
+            add_moments::<A>(output, length, kept_after, &mut chunk.sums);
         }
     }
 }

@@ -64,7 +64,7 @@ impl Pass<Chunk> for Loss<'_> {
     #[inline(always)]
     fn run<A: Arithmetic>(&self, chunk: &mut Chunk) {
         let doubling = self.level.doubling();
-        let n_cells = 4 * doubling.input[0] * doubling.input[1];
+        let n_cells = doubling.output().pixels();
         chunk.clear(self.level.level);
         chunk.d_last.fill(Lanes::ZERO);
         chunk.loss = self.loss.clone();
@@ -85,9 +85,8 @@ impl Loss<'_> {
         let at = number * self.level.length_in()..(number + 1) * self.level.length_in();
         let mut maps = LastMaps {
             kept: self.level.mask().kept(frame),
-            plane: self.level.doubling().plane_in(),
-            u: &chunk.u[index][at.clone()],
-            dy: &mut chunk.dy[index][at],
+            u: &chunk.u[index][at],
+            touched: chunk.touched[number].insert(Vec::new()),
             sums: &mut chunk.sums,
             d_weights: &mut chunk.d_last,
         };
@@ -99,21 +98,23 @@ impl Loss<'_> {
     fn everywhere<A: Arithmetic>(&self, chunk: &mut Chunk, number: usize, frame: usize) {
         let (level, doubling) = (&self.level, self.level.doubling());
         let kept = level.mask().kept(frame);
+        chunk.touched[number] = None;
         let scratch = &mut chunk.scratch[level.level];
         let u = &chunk.u[level.level][number * level.length_in()..];
-        doubling.values::<A>(u, kept, level.norm(), &level.floors, &mut scratch.values);
+        doubling.values::<A>(u, kept, level.norm(), &level.floors, scratch);
         let channels = [kept, &self.states[..]];
         doubling.forward::<A>(channels, &level.constants, 1.0, scratch, &mut chunk.logits);
+        let output = doubling.output();
         chunk.values.fill(UNOBSERVED);
         for visit in self.window.targets(frame) {
-            let cell = usize::from(visit.row) * 2 * doubling.input[1] + usize::from(visit.col);
+            let cell = output.at(usize::from(visit.row), usize::from(visit.col));
             chunk.values[cell] = visit.value;
         }
         self.add_cells::<A>(chunk);
-        for (state, dz) in chunk.logits.chunks_exact(doubling.plane_out()).enumerate() {
+        for (state, dz) in chunk.logits.chunks_exact(output.length()).enumerate() {
             let scratch = &mut chunk.scratch[level.level];
-            doubling.place_gradient(state, scratch, |row, to| {
-                to.copy_from_slice(&dz[row * to.len()..][..to.len()]);
+            doubling.place_gradient(state, scratch, |first, to| {
+                to.copy_from_slice(&dz[first..][..to.len()]);
             });
         }
         chunk.through_doubling::<A>(level, number, frame, &self.states);
@@ -122,15 +123,15 @@ impl Loss<'_> {
     /// Adds all cells' losses and turns their logits into gradients.
     #[inline(always)]
     fn add_cells<A: Arithmetic>(&self, chunk: &mut Chunk) {
-        let plane = self.level.doubling().plane_out();
+        let length = self.level.doubling().output().length();
         let mut lanes = vec![Lanes::ZERO; self.states.len()];
         for (index, values) in chunk.values.as_chunks().0.iter().enumerate() {
             for (state, lanes) in lanes.iter_mut().enumerate() {
-                *lanes = Lanes::load(&chunk.logits[state * plane + index * LANES..]);
+                *lanes = Lanes::load(&chunk.logits[state * length + index * LANES..]);
             }
             chunk.loss.add::<A>(&mut lanes, values);
             for (state, lanes) in lanes.iter().enumerate() {
-                lanes.store(&mut chunk.logits[state * plane + index * LANES..]);
+                lanes.store(&mut chunk.logits[state * length + index * LANES..]);
             }
         }
     }

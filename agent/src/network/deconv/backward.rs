@@ -2,11 +2,12 @@
 
 use super::{Doubling, GRADIENT_PLANES, Scratch, TAPS};
 use crate::network::correlation::{Correlation, Kernel4x4, Tap, balanced, with_constant};
-use crate::network::lanes::{Arithmetic, Lanes};
+use crate::network::lanes::{Arithmetic, LANES, Lanes};
+use std::ops::Range;
 
 impl Doubling {
-    /// Puts the gradient of kept output number `index` where [`Self::backward`] expects it: `write`
-    /// is given each row's number and place.
+    /// Puts the gradient of kept output number `index` where [`Self::backward`] expects it: `write` is given
+    /// where each phase's pixels begin in the output's map, and their place.
     #[inline(always)]
     pub(crate) fn place_gradient(
         &self,
@@ -14,29 +15,39 @@ impl Doubling {
         scratch: &mut Scratch,
         mut write: impl FnMut(usize, &mut [f32]),
     ) {
-        let [rows, cols] = self.input;
-        let border = 2 * cols + 2;
-        let bordered = &mut scratch.bordered[index * (2 * rows + 2) * border..];
-        for (row, bordered) in bordered[border..]
-            .chunks_exact_mut(border)
-            .enumerate()
-            .take(2 * rows)
-        {
-            write(row, &mut bordered[1..=2 * cols]);
-        }
+        let ([_, cols], pixels) = (self.input.size(), self.input.pixels());
         let length = self.gradient_plane();
-        let group = &mut scratch.gradients[index * GRADIENT_PLANES * length..];
-        for row in 0..2 * rows + 2 {
-            let from = &bordered[row * border..][..border];
-            let at = row % 2 * 4 * length + row / 2 * cols;
-            for col in [0, 2] {
-                let (even, odd) = group[at + col * length..].split_at_mut(length);
-                let to = even[..cols].iter_mut().zip(&mut odd[..cols]);
-                // Both of a pair at once: LLVM makes shuffles of this, and slow gathers of each alone.
-                for ((even, odd), pair) in to.zip(from[col..].as_chunks::<2>().0) {
-                    [*even, *odd] = *pair;
-                }
+        let planes = &mut scratch.gradients[index * GRADIENT_PLANES * length..];
+        let mut rows = planes[..GRADIENT_PLANES * length].chunks_exact_mut(4 * length);
+        // Planes of the kernel's even rows begin with a row off the grid, those of its odd rows end so.
+        for (parity, first) in [(1, cols), (0, 0)] {
+            let planes = rows.next().expect("invariant: two halves");
+            let mut columns = planes.chunks_exact_mut(length);
+            let mut column =
+                || &mut columns.next().expect("invariant: four columns")[first..][..pixels];
+            // A phase meets two columns of the kernel: one as it is, one with its neighbour's pixels.
+            let [right, even, odd, left] = [column(), column(), column(), column()];
+            write(2 * parity * self.plane_in(), even);
+            write((2 * parity + 1) * self.plane_in(), odd);
+            right[1..].copy_from_slice(&odd[..pixels - 1]);
+            left[..pixels - 1].copy_from_slice(&even[1..]);
+            for (right, left) in right
+                .chunks_exact_mut(cols)
+                .zip(left.chunks_exact_mut(cols))
+            {
+                (right[0], left[cols - 1]) = (0.0, 0.0);
             }
+        }
+    }
+
+    /// Where a kernel's entry meets the gradients, for the first pixel.
+    #[inline(always)]
+    fn tap(&self, entry: usize) -> Tap {
+        let (row, col) = (entry / 4, entry % 4);
+        let plane = (row % 2 * 4 + col) * self.gradient_plane();
+        Tap {
+            offset: plane + row / 2 * self.input.size()[1],
+            entry,
         }
     }
 
@@ -53,13 +64,7 @@ impl Doubling {
     ) {
         let [inputs, outputs] = kept;
         let stride = GRADIENT_PLANES * self.gradient_plane();
-        let taps: [Tap; TAPS] = std::array::from_fn(|entry| {
-            let (row, col) = (entry / 4, entry % 4);
-            Tap {
-                offset: (row % 2 * 4 + col) * self.gradient_plane() + row / 2 * self.input[1],
-                entry,
-            }
-        });
+        let taps: [Tap; TAPS] = std::array::from_fn(|entry| self.tap(entry));
         scratch.dx[..inputs.len() * self.plane_in()].fill(0.0);
         let correlation = Correlation {
             planes: &scratch.gradients[..outputs.len() * stride],
@@ -84,14 +89,15 @@ impl Doubling {
     ) {
         let [inputs, outputs] = kept;
         scratch.patch_sums[..outputs.len()].fill(Lanes::ZERO);
-        for first_row in (0..self.input[0]).step_by(self.band_rows()) {
-            let n_rows = self.band_rows().min(self.input[0] - first_row);
-            self.gather_patches::<A>(outputs.len(), first_row, n_rows, scratch);
+        let [rows, cols] = self.input.size();
+        for first_row in (0..rows).step_by(self.band_rows()) {
+            let pixels = first_row * cols..rows.min(first_row + self.band_rows()) * cols;
+            self.gather_patches::<A>(outputs.len(), pixels.clone(), scratch);
             let band = Band {
                 doubling: self,
                 patches: &scratch.patches,
-                length: n_rows * self.input[1],
-                values: &scratch.values[first_row * self.input[1]..],
+                length: pixels.len(),
+                values: &scratch.values[pixels.start..],
             };
             let mut input = 0;
             for inputs in balanced(inputs, 4) {
@@ -105,36 +111,30 @@ impl Doubling {
         }
     }
 
-    /// The 4 x 4 gradients that each pixel of some rows reached, and their sum per output.
+    /// The 4 x 4 gradients that each of some pixels reached, and their sum per output.
     #[inline(always)]
     fn gather_patches<A: Arithmetic>(
         &self,
         n_outputs: usize,
-        first_row: usize,
-        n_rows: usize,
+        pixels: Range<usize>,
         to: &mut Scratch,
     ) {
-        let [rows, cols] = self.input;
-        let border = 2 * cols + 2;
-        for output in 0..n_outputs {
-            let bordered = &to.bordered[output * (2 * rows + 2) * border..];
-            let patches = &mut to.patches[output * n_rows * cols * TAPS..][..n_rows * cols * TAPS];
-            let mut sum = to.patch_sums[output];
-            for (row, patches) in patches.chunks_exact_mut(cols * TAPS).enumerate() {
-                let reached = &bordered[(first_row + row) * 2 * border..][..4 * border];
-                let reached: [&[f32]; 4] =
-                    std::array::from_fn(|row| &reached[row * border..][..border]);
-                for (col, patch) in patches.as_chunks_mut::<TAPS>().0.iter_mut().enumerate() {
-                    for (entries, row) in patch.as_chunks_mut::<4>().0.iter_mut().zip(reached) {
-                        entries.copy_from_slice(&row[2 * col..][..4]);
-                    }
-                }
+        let planes = to
+            .gradients
+            .chunks_exact(GRADIENT_PLANES * self.gradient_plane());
+        let patches = to.patches.chunks_exact_mut(pixels.len() * TAPS);
+        let outputs = planes.zip(patches).zip(&mut to.patch_sums);
+        for ((planes, patches), sum) in outputs.take(n_outputs) {
+            let patches = patches.as_chunks_mut::<TAPS>().0;
+            let mut columns = [planes; TAPS];
+            for (entry, column) in columns.iter_mut().enumerate() {
+                let first = self.tap(entry).offset + pixels.start;
+                *column = &planes[first..][..pixels.len()];
             }
-            // Not in the loop above: a patch just written in parts is slow to read as a whole.
-            for patch in patches.as_chunks().0 {
-                sum = sum.add::<A>(Lanes(*patch));
+            transpose::<A>(columns, patches);
+            for patch in patches {
+                *sum = sum.add::<A>(Lanes(*patch));
             }
-            to.patch_sums[output] = sum;
         }
     }
 
@@ -144,7 +144,7 @@ impl Doubling {
         &self,
         k: &[f32],
         patch_sums: &[Lanes],
-        d_weights: &mut [Kernel4x4],
+        d_weights: &mut [[f32; TAPS]],
     ) {
         for (k, d_weights) in k.iter().zip(d_weights.chunks_exact_mut(self.channels_out)) {
             for (d_kernel, sum) in d_weights.iter_mut().zip(patch_sums) {
@@ -167,9 +167,29 @@ impl Doubling {
             &self.weights[usize::from(channel) * self.channels_out..][..self.channels_out];
         let mut sum = Lanes::ZERO;
         for (&output, patch_sum) in outputs.iter().zip(patch_sums) {
-            sum = sum.add_product::<A>(Lanes(weights[usize::from(output)]), *patch_sum);
+            sum = sum.add_product::<A>(weights[usize::from(output)], *patch_sum);
         }
         sum.sum()
+    }
+}
+
+/// Writes columns side by side.
+#[inline(always)]
+fn transpose<A: Arithmetic>(columns: [&[f32]; TAPS], patches: &mut [[f32; TAPS]]) {
+    let (squares, rest) = patches.as_chunks_mut::<LANES>();
+    for (index, square) in squares.iter_mut().enumerate() {
+        let mut lanes = [Lanes::ZERO; TAPS];
+        for (lanes, column) in lanes.iter_mut().zip(columns) {
+            *lanes = Lanes::load(&column[index * LANES..]);
+        }
+        for (patch, lanes) in square.iter_mut().zip(Lanes::transpose::<A>(lanes)) {
+            *patch = lanes.0;
+        }
+    }
+    for (pixel, patch) in (squares.len() * LANES..).zip(rest) {
+        for (entry, column) in patch.iter_mut().zip(columns) {
+            *entry = column[pixel];
+        }
     }
 }
 
@@ -216,7 +236,7 @@ impl Band<'_> {
         let plane = self.doubling.plane_in();
         let values: [&[f32]; INPUTS] =
             std::array::from_fn(|index| &self.values[(input + index) * plane..][..self.length]);
-        let patches: [&[Kernel4x4]; OUTPUTS] = std::array::from_fn(|index| {
+        let patches: [&[[f32; TAPS]]; OUTPUTS] = std::array::from_fn(|index| {
             let first = (output + index) * self.length * TAPS;
             self.patches[first..][..self.length * TAPS].as_chunks().0
         });
@@ -233,7 +253,7 @@ impl Band<'_> {
         for (sums, &input) in sums.iter().zip(inputs) {
             for (sum, &output) in sums.iter().zip(outputs) {
                 let at = usize::from(input) * self.doubling.channels_out + usize::from(output);
-                d_weights[at] = sum.add::<A>(Lanes(d_weights[at])).0;
+                d_weights[at] = sum.add::<A>(d_weights[at]);
             }
         }
     }

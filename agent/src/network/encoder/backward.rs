@@ -1,8 +1,8 @@
 //! The encoder backward: from the gradients of the encodings to those of all its parameters.
 
-use super::{Chunk, Encoder, EncoderLayers, Linear, add_sums, multipliers, total};
+use super::{Chunk, Encoder, EncoderLayers, First, Linear, add_sums, multipliers, total};
 use crate::network::batch_norm::{NormGradient, Sums};
-use crate::network::conv::{Dense, DenseGradient, Sparse};
+use crate::network::conv::{Dense, DenseGradient};
 use crate::network::dropout::Dropout;
 use crate::network::lanes::{Arithmetic, LANES, Lanes};
 use crate::network::parallel::{Pass, for_each_chunk};
@@ -27,6 +27,11 @@ impl Encoder {
             },
         );
         self.write_linear(&layers.linear, gradient);
+        let first = First {
+            sparse: &layers.sparse,
+            window,
+            dropout,
+        };
         for stage in [2, 1] {
             let norm = self.norm_gradient(stage, layers, gradient);
             let conv = &layers.dense[stage - 1];
@@ -36,7 +41,7 @@ impl Encoder {
                     stage,
                     conv,
                     norm: &norm,
-                    dropout,
+                    first,
                 },
             );
             let mut total = DenseGradient::zeros(&self.shapes[stage]);
@@ -47,13 +52,7 @@ impl Encoder {
             gradient.set_layer(ENCODER[stage][0], &weight, &bias);
         }
         let norm = self.norm_gradient(0, layers, gradient);
-        let pass = SparseBackward {
-            sparse: &layers.sparse,
-            window,
-            norm: &norm,
-            dropout,
-        };
-        for_each_chunk(&mut self.chunks, &pass);
+        for_each_chunk(&mut self.chunks, &SparseBackward { first, norm: &norm });
         let d_columns = total(self.chunks.iter().map(|chunk| &chunk.d_columns[..]));
         let d_bias = total(self.chunks.iter().map(|chunk| &chunk.d_bias[..]));
         let weight = layers.sparse.weight_gradient(&d_columns);
@@ -118,7 +117,7 @@ struct DenseBackward<'a> {
     stage: usize,
     conv: &'a Dense,
     norm: &'a NormGradient,
-    dropout: &'a Dropout,
+    first: First<'a>,
 }
 
 impl Pass<Chunk> for DenseBackward<'_> {
@@ -131,21 +130,25 @@ impl Pass<Chunk> for DenseBackward<'_> {
         let length_in = chunk.maps[self.stage - 1].len() / n_frames;
         chunk.sums = Sums::zeros(self.conv.inputs());
         let origin = [0.0; 2 * LANES];
-        chunk.dz.resize(length, 0.0);
         for (index, frame) in chunk.frames.clone().enumerate() {
-            let mask = &self.dropout.encoder[self.stage];
-            let factors = multipliers(mask, frame, self.dropout.scale);
+            let mask = &self.first.dropout.encoder[self.stage];
+            let factors = multipliers(mask, frame, self.first.dropout.scale);
             let at = index * length..(index + 1) * length;
             let (map, d_map) = (
                 &chunk.maps[self.stage][at.clone()],
                 &chunk.d_maps[self.stage][at],
             );
-            before_relu::<A>(d_map, map, self.norm, &factors, &mut chunk.dz);
+            let dz = &mut chunk.dz[..length];
+            before_relu::<A>(d_map, map, self.norm, &factors, dz);
             let at = index * length_in..(index + 1) * length_in;
             let input = &chunk.maps[self.stage - 1][at.clone()];
+            let input = match self.stage {
+                1 => self.first.recall::<A>(frame, input, &mut chunk.first),
+                _ => input,
+            };
             let dx = &mut chunk.d_maps[self.stage - 1][at];
             self.conv
-                .backward::<A>(input, mask.kept(frame), &chunk.dz, dx, gradient);
+                .backward::<A>(input, mask.kept(frame), dz, dx, gradient);
             add_sums::<A>(
                 dx,
                 Some(input),
@@ -157,10 +160,8 @@ impl Pass<Chunk> for DenseBackward<'_> {
 }
 
 struct SparseBackward<'a> {
-    sparse: &'a Sparse,
-    window: &'a Window,
+    first: First<'a>,
     norm: &'a NormGradient,
-    dropout: &'a Dropout,
 }
 
 impl Pass<Chunk> for SparseBackward<'_> {
@@ -169,16 +170,22 @@ impl Pass<Chunk> for SparseBackward<'_> {
         chunk.d_columns.fill(0.0);
         chunk.d_bias.fill(0.0);
         let length = chunk.maps[0].len() / chunk.frames.len().max(1);
-        chunk.dz.resize(length, 0.0);
         for (index, frame) in chunk.frames.clone().enumerate() {
-            let mask = multipliers(&self.dropout.encoder[0], frame, self.dropout.scale);
+            let First {
+                sparse,
+                window,
+                dropout,
+            } = self.first;
+            let mask = multipliers(&dropout.encoder[0], frame, dropout.scale);
             let at = index * length..(index + 1) * length;
-            let (map, d_map) = (&chunk.maps[0][at.clone()], &chunk.d_maps[0][at]);
-            before_relu::<A>(d_map, map, self.norm, &mask, &mut chunk.dz[..length]);
+            let place = &chunk.maps[0][at.clone()];
+            let map = self.first.recall::<A>(frame, place, &mut chunk.first);
+            let d_map = &chunk.d_maps[0][at];
+            let dz = &mut chunk.dz[..length];
+            before_relu::<A>(d_map, map, self.norm, &mask, dz);
             let (d_columns, d_bias) = (&mut chunk.d_columns, &mut chunk.d_bias);
-            let visits = self.window.visits(frame);
-            self.sparse
-                .backward::<A>(visits, &chunk.dz[..length], d_columns, d_bias);
+            let visits = window.visits(frame);
+            sparse.backward::<A>(visits, dz, d_columns, d_bias);
         }
     }
 }

@@ -1,6 +1,6 @@
 //! The encoder forward: a window's maps, stage by stage, and the encodings.
 
-use super::{Chunk, Encoder, EncoderLayers, Linear, add_sums, encoder_norm, multipliers};
+use super::{Chunk, Encoder, EncoderLayers, First, Linear, add_sums, encoder_norm, multipliers};
 use crate::network::batch_norm::{Norm, Statistics, Sums};
 use crate::network::conv::{Dense, Sparse};
 use crate::network::dropout::Dropout;
@@ -22,17 +22,20 @@ impl Encoder {
         let sparse = Sparse::new(shapes[0], weight, bias);
         // Most cells of a kept channel see nothing and hold this number.
         let origin: Vec<f32> = bias.iter().map(|b| (b * dropout.scale).max(0.0)).collect();
-        let pass = SparseForward {
+        let first = First {
             sparse: &sparse,
             window,
             dropout,
+        };
+        let pass = SparseForward {
+            first,
             origin: &origin,
         };
         for_each_chunk(&mut self.chunks, &pass);
-        let first = self.norm(0, parameters, &origin);
-        let conv = self.convolve(1, parameters, &first, dropout);
+        let norm = self.norm(0, parameters, &origin);
+        let conv = self.convolve(1, parameters, &norm, first);
         let second = self.norm(1, parameters, &[0.0; LANES]);
-        let last = self.convolve(2, parameters, &second, dropout);
+        let last = self.convolve(2, parameters, &second, first);
         let third = self.norm(2, parameters, &[0.0; LANES]);
         let linear = Linear::new(shapes[2], self.encoding, parameters, &third);
         for_each_chunk(&mut self.chunks, &LinearForward { linear: &linear });
@@ -41,7 +44,7 @@ impl Encoder {
             sparse,
             dense: [conv, last],
             linear,
-            norms: [first, second, third],
+            norms: [norm, second, third],
         };
         (encodings.copied().collect(), layers)
     }
@@ -51,7 +54,7 @@ impl Encoder {
         stage: usize,
         parameters: &Tensors,
         input: &Norm,
-        dropout: &Dropout,
+        first: First<'_>,
     ) -> Dense {
         let (weight, bias) = parameters.layer(ENCODER[stage][0]);
         let conv = Dense::new(self.shapes[stage], weight, bias, input);
@@ -60,7 +63,7 @@ impl Encoder {
             &DenseForward {
                 stage,
                 conv: &conv,
-                dropout,
+                first,
             },
         );
         conv
@@ -75,9 +78,7 @@ impl Encoder {
 }
 
 struct SparseForward<'a> {
-    sparse: &'a Sparse,
-    window: &'a Window,
-    dropout: &'a Dropout,
+    first: First<'a>,
     origin: &'a [f32],
 }
 
@@ -92,9 +93,11 @@ impl Pass<Chunk> for SparseForward<'_> {
             .clone()
             .zip(chunk.maps[0].chunks_exact_mut(length.max(1)))
         {
-            let mask = multipliers(&self.dropout.encoder[0], frame, self.dropout.scale);
-            self.sparse
-                .forward::<A>(self.window.visits(frame), &mask, map);
+            let map = match self.first.is_kept(frame) {
+                true => map,
+                false => &mut *chunk.first,
+            };
+            self.first.compute::<A>(frame, map);
             add_sums::<A>(map, None, self.origin, &mut chunk.sums);
         }
     }
@@ -103,7 +106,7 @@ impl Pass<Chunk> for SparseForward<'_> {
 struct DenseForward<'a> {
     stage: usize,
     conv: &'a Dense,
-    dropout: &'a Dropout,
+    first: First<'a>,
 }
 
 impl Pass<Chunk> for DenseForward<'_> {
@@ -121,8 +124,13 @@ impl Pass<Chunk> for DenseForward<'_> {
             .zip(inputs)
             .zip(output.chunks_exact_mut(outputs.max(1)))
         {
-            let mask = multipliers(&self.dropout.encoder[self.stage], frame, self.dropout.scale);
-            let kept = self.dropout.encoder[self.stage - 1].kept(frame);
+            let dropout = self.first.dropout;
+            let mask = multipliers(&dropout.encoder[self.stage], frame, dropout.scale);
+            let kept = dropout.encoder[self.stage - 1].kept(frame);
+            let input = match self.stage {
+                1 => self.first.recall::<A>(frame, input, &mut chunk.first),
+                _ => input,
+            };
             self.conv.forward::<A>(input, kept, &mask, output);
             add_sums::<A>(output, None, &[0.0; LANES], &mut chunk.sums);
         }

@@ -1,7 +1,7 @@
 //! The linear layer from the normalised, flattened last map to the encoding.
 
 use crate::network::batch_norm::Norm;
-use crate::network::lanes::{Arithmetic, Lanes, sum_and_product};
+use crate::network::lanes::{Arithmetic, Buffer, Lanes, sum_and_product};
 use crate::network::parameters::{LINEAR, Tensors};
 use crate::network::shape::ConvShape;
 
@@ -10,25 +10,25 @@ use crate::network::shape::ConvShape;
 pub(crate) struct Linear {
     pub(super) shape: ConvShape,
     /// `[encoding][position][channel]`, channels padded to whole lanes.
-    pub(super) weight: Vec<f32>,
+    pub(super) weight: Buffer,
     pub(super) bias: Vec<f32>,
     pub(super) input: Norm,
 }
 
 #[derive(Debug)]
 pub(super) struct LinearGradient {
-    pub(super) weight: Vec<f32>,
+    pub(super) weight: Buffer,
     pub(super) bias: Vec<f32>,
     /// One frame's input.
-    pub(super) x: Vec<f32>,
+    pub(super) x: Buffer,
 }
 
 impl LinearGradient {
     pub(super) fn zeros(encoding: usize, length: usize) -> Self {
         Self {
-            weight: vec![0.0; encoding * length],
+            weight: Buffer::zeros(encoding * length),
             bias: vec![0.0; encoding],
-            x: vec![0.0; length],
+            x: Buffer::zeros(length),
         }
     }
 }
@@ -43,7 +43,7 @@ impl Linear {
         let (weight, bias) = parameters.layer(LINEAR);
         let mut linear = Self {
             shape,
-            weight: vec![0.0; encoding * shape.outputs()],
+            weight: Buffer::zeros(encoding * shape.outputs()),
             bias: bias.to_vec(),
             input: input.clone(),
         };
