@@ -31,7 +31,7 @@ EXAMPLES = [
 def test_an_example_runs(name: str, arguments: str, line: str, tmp_path: Path) -> None:
     command = [sys.executable, str(FOLDER / name)]
     command += arguments.replace("OUT", str(tmp_path)).split()
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=tmp_path)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
     assert re.search(line, done.stdout), done.stdout
     if "OUT" in arguments:

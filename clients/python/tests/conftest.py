@@ -20,7 +20,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 #: A whole test, seconds.
-DEADLINE = 90
+DEADLINE = 300
 
 
 @pytest.fixture(autouse=True)

@@ -1,6 +1,7 @@
 """What the tests of the environments share: small worlds, servers, comparisons."""
 
 import contextlib
+import dataclasses
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -52,6 +53,16 @@ def make(name: str = WILDFIRE, **keywords: Any) -> gymnasium.Env[Any, Any]:
 def make_vec(n_worlds: int, **keywords: Any) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
     """`gymnasium.make_vec` of small worlds, or with `instance` of a running server's."""
     return gymnasium.make_vec(WILDFIRE, num_envs=n_worlds, **_small(keywords))
+
+
+@contextlib.contextmanager
+def impatient(env: Any, seconds: float = 0.2) -> Iterator[None]:
+    """Calls of an environment wait no longer than that."""
+    session = env.unwrapped._session
+    kept = session.settings
+    session.settings = dataclasses.replace(kept, timeout=seconds)
+    yield
+    session.settings = kept
 
 
 def _small(keywords: dict[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from processes import PATIENCE, Script, Server, eventually
+from processes import PATIENCE, Script, Server, eventually, quick_once
 
 from emberwatch import errors
 from emberwatch.client import connect
@@ -38,7 +38,7 @@ def test_every_call_has_a_timeout(server: Start) -> None:
         with pytest.raises(errors.RequestTimeoutError, match=r"within 0\.05 s") as raised:
             call()
         assert started.instance in str(raised.value)
-        assert 0.05 <= time.monotonic() - start < 2.0
+        assert time.monotonic() - start >= 0.05
     started.wake_up()
     assert client.observe().result().step == 0
 
@@ -183,21 +183,23 @@ def test_ctrl_c_ends_a_blocked_step_and_the_client_goes_on(server: Start) -> Non
     started = server()
     client = started.connect()
     lease = client.acquire()
-    waited = []
-    for k in range(3):
+
+    def interrupted() -> float:
         started.stop()
         thread, sent = interrupt()
         with pytest.raises(KeyboardInterrupt) as raised:
             thread.start()
             lease.step([3] * 6, timeout=PATIENCE)
-        waited.append(time.monotonic() - sent[0])
+        waited = time.monotonic() - sent[0]
         thread.join()
         started.wake_up()
         # `raised` still holds the traceback, as an `except` block does.
         before = client.observe().result().step
         assert raised is not None
-        assert lease.step([3] * 6).result().step == before + 1, k
-    assert min(waited) < 0.25, waited
+        assert lease.step([3] * 6).result().step == before + 1
+        return waited
+
+    assert quick_once(0.25, interrupted)
 
 
 def test_a_client_may_be_used_while_its_error_is_handled(server: Start) -> None:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from processes import Server, eventually, is_running
@@ -83,10 +84,12 @@ def test_a_program_that_never_answers_is_given_up(
     monkeypatch.setattr(programs.sysconfig, "get_path", lambda _: str(tmp_path))
     monkeypatch.setattr(programs, "_START_TIMEOUT", 0.2)
     path = tmp_path / "emberwatch-server"
-    path.write_text("#!/bin/sh\necho $$ > $0.pid\nexec sleep 60\n")
+    path.write_text("#!/bin/sh\nexec sleep 60\n")
     path.chmod(0o700)
+    started: list[Program] = []
+    monkeypatch.setattr(programs, "_programs", SimpleNamespace(add=started.append, discard=id))
     assert "did not answer within 0.2 s" in launch_error()
-    assert not is_running(int((tmp_path / "emberwatch-server.pid").read_text()))
+    assert [program._process.returncode is None for program in started] == [False]
 
 
 def test_a_program_that_does_not_stop_is_killed(

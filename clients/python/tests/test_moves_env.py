@@ -13,6 +13,7 @@ from environments import (
     SMALL,
     actions,
     assert_same,
+    impatient,
     make,
     no_warnings,
     rollout,
@@ -349,14 +350,14 @@ def test_a_killed_private_server_is_replaced_by_the_next_reset() -> None:
 
 
 def test_after_a_timeout_no_move_is_flown_before_a_reset() -> None:
-    env = make(MOVES, timeout=0.2)
+    env = make(MOVES)
     env.reset(seed=1)
     for _ in range(3):
         env.step(1)
     pid = _server(env)
     os.kill(pid, signal.SIGSTOP)
     try:
-        with pytest.raises(RequestTimeoutError):
+        with impatient(env), pytest.raises(RequestTimeoutError):
             env.step(1)
     finally:
         os.kill(pid, signal.SIGCONT)

@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from environments import impatient
 from gymnasium.utils.env_checker import check_env
 from processes import Server, eventually
 
@@ -89,10 +90,13 @@ def test_two_agents_of_their_own_do_not_share_a_world(env: Any) -> None:
 
 
 def test_a_stopped_agent_is_a_timeout_and_the_next_step_asks_for_a_reset() -> None:
-    env = make(timeout=0.5)
+    env = make()
     env.reset(seed=1000)
     os.kill(env._agent.pid, signal.SIGSTOP)
-    with pytest.raises(errors.RequestTimeoutError, match=r"within 0\.5 s"):
+    with (
+        impatient(env, 0.5),
+        pytest.raises(errors.RequestTimeoutError, match=r"within 0\.5 s"),
+    ):
         env.step(0)
     os.kill(env._agent.pid, signal.SIGCONT)
     with pytest.raises(errors.ClosedError, match="an earlier decision timed out"):
@@ -103,12 +107,12 @@ def test_a_stopped_agent_is_a_timeout_and_the_next_step_asks_for_a_reset() -> No
 
 
 def test_a_lease_lost_between_steps_is_told_as_that(server: Callable[..., Server]) -> None:
-    started = server(lease_millis=300)
+    started = server(lease_millis=3000)
     env = gymnasium.make(
         "emberwatch/WildfireObjective-v0", instance=started.instance, prior="initial"
     ).unwrapped
     env.reset(seed=1000)
-    started.connect().acquire(takeover=True)
+    started.connect().acquire(takeover=True, ttl=3600)
     # The agent finds out when it renews its lease, and ends.
     assert eventually(lambda: env._agent.ended()[0] is not None)
     with pytest.raises(errors.LeaseLostError, match="lease lost to pid"):

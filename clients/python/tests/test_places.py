@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from processes import Server, eventually
+from processes import Server, connects, eventually
 
 from emberwatch import channels, errors
 from emberwatch.client import connect
@@ -22,15 +22,7 @@ def test_a_seventeenth_client_is_told_the_limit_and_others_go_on(server: Start) 
         started.connect()
     assert clients[-1].acquire().step([3] * 6).result().step == 1
     clients[0].close()
-    assert eventually(lambda: _connects(started))
-
-
-def _connects(started: Server) -> bool:
-    try:
-        started.connect()
-    except errors.ChannelError:
-        return False
-    return True
+    assert eventually(lambda: connects(started))
 
 
 def test_without_a_server_the_instance_and_the_remedy_are_named() -> None:

@@ -183,7 +183,7 @@ def test_what_a_recorder_wrote_is_what_the_server_answered(
         answers = [lease.step(moves) for moves in paths]
         assert recorder.wait(PATIENCE) == 0
     samples = [record.sample for record in recording.read(path, world=1)]
-    # By step: an observer that is greeted late gets a frame twice, and may miss the first.
+    # By step: an observer that is greeted late gets a frame twice.
     frames = {it.result.step: it for it in samples if isinstance(it, Frame)}
     truths = {it.step: it for it in samples if isinstance(it, Truth)}
     assert set(range(1, 21)) <= set(frames)

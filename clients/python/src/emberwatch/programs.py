@@ -35,7 +35,7 @@ _START_TIMEOUT: Final = 20.0
 _STOP_TIMEOUT: Final = 3.0
 
 #: How long a program that says farewell may take to end, seconds.
-_FAREWELL: Final = 0.5
+_FAREWELL: Final = 3.0
 
 _numbers = itertools.count()
 
