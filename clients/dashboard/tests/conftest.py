@@ -12,10 +12,10 @@ import pytest
 from playwright.sync_api import Browser, BrowserContext, sync_playwright
 
 from looking import Look
-from running import Dashboard, Program, Programs
+from running import PATIENCE, Dashboard, Program, Programs
 
 #: A whole test, seconds; a busy machine is no bug.
-DEADLINE = 120
+DEADLINE = 400
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -50,7 +50,7 @@ def chromium(request: pytest.FixtureRequest) -> Iterator[Browser]:
     # A root user's browser, as in containers, has no sandbox.
     flags = ["--no-sandbox"] if os.geteuid() == 0 else []
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=flags)
+        browser = playwright.chromium.launch(executable_path=path, args=flags, timeout=120_000)
         yield browser
         browser.close()
 
@@ -73,6 +73,7 @@ def open_page(chromium: Browser) -> Iterator[Callable[..., Look]]:
 
     def open_one(dashboard: Dashboard, *, hash: str = "", **settings: object) -> Look:
         context = chromium.new_context(**{"viewport": {"width": 1280, "height": 720}} | settings)
+        context.set_default_timeout(1000 * PATIENCE)
         contexts.append(context)
         look = Look(context.new_page())
         looks.append(look)

@@ -268,16 +268,16 @@ fn what_makes_no_sense_is_left_out() {
 #[test]
 fn a_step_without_a_belief_has_the_one_before_of_its_episode() {
     let facts = |serial: u64| {
-        let mut album = Album::default();
+        let (mut album, now) = (Album::default(), Instant::now());
         for step in 1..=4 {
-            album.add_frame(&frame(step, [255; 6]), Instant::now());
+            album.add_frame(&frame(step, [255; 6]), now);
             if step == 2 {
                 album.add_belief(&outlook(step), Some(&states()));
             }
         }
         let mut next_episode = frame(1, [255; 6]);
         next_episode.header.result.episode = 1;
-        album.add_frame(&next_episode, Instant::now());
+        album.add_frame(&next_episode, now);
         let (header, array) = read(album, Some(serial));
         let about = header["agent"]["step"].as_u64();
         if about.is_some() {

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 #: How long anything may take that should take much less, seconds.
-PATIENCE = 30.0
+PATIENCE = 90.0
 
 _numbers = itertools.count()
 
@@ -100,7 +100,8 @@ class Programs:
         return subprocess.run(command, capture_output=True, timeout=PATIENCE).returncode == 0
 
     def agent(self, instance: str, **settings: object) -> Program:
-        """An agent that acts on a world until it is stopped."""
+        """An agent that acts on a world, once it is there, until it is stopped."""
+        eventually(lambda: self.is_serving(instance), "a server")
         return self._keep(
             Program(self._path("agent"), ["run", *flags({"instance": instance} | settings)])
         )

@@ -68,12 +68,16 @@ class Witness:
     def watch(self, last: int) -> None:
         """Reads until that step."""
         self.frames = {}
+        outlook = None
         while last not in self.frames:
             frame = self._frames.receive(PATIENCE)
             assert frame is not None and frame.n_lost == 0
             self.frames[frame.result.step] = frame
+            # Meets the agent before it is gone.
+            outlook = self._outlook.receive(0) or outlook
         self.truth = self._last(self._truth, last)
-        self.outlook = self._last(self._outlook, last)
+        is_last = outlook is not None and outlook.step == last
+        self.outlook = outlook if is_last else self._last(self._outlook, last)
 
     @staticmethod
     def _last(reader, step: int):

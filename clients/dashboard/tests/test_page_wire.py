@@ -17,10 +17,10 @@ def told_anew(message: bytes, change: Callable[[dict], None]) -> bytes:
 def test_damaged_pictures_are_told_and_do_not_flood_the_console(watched):
     look = watched.look
     look.allowed.append("expected 4 bytes")
-    damaged = []
+    damaged, told = [], []
 
     def damage(message: bytes) -> bytes:
-        if len(damaged) >= 10:
+        if told and len(damaged) >= 10:
             return message
         damaged.append(message)
         return message[:3]
@@ -28,9 +28,10 @@ def test_damaged_pictures_are_told_and_do_not_flood_the_console(watched):
     look.alter(damage)
     look.eventually(lambda: look.text("state") == "unreadable", "told")
     assert "cannot read" in look.text("note")
+    told.append(True)
     look.eventually(lambda: look.text("state") == "serving", "pictures again")
     assert not look.at("note").is_visible()
-    assert len(damaged) == 10
+    assert len(damaged) >= 10
     assert look.heard("expected 4 bytes") == 1
 
 

@@ -45,13 +45,14 @@ def test_an_address_that_makes_no_sense(programs, open_page, bad):
     server = programs.server(worlds=2, seed=20)
     look = open_page(programs.dashboard(server.instance), hash=bad)
     look.eventually(lambda: look.picture(".shown.seed") == "20", "the first world")
-    assert look.at("world-select").locator("option").all_text_contents() == ["0", "1"]
+    options = look.at("world-select").locator("option")
+    look.eventually(lambda: options.all_text_contents() == ["0", "1"], "two worlds")
     look.at("world-select").select_option("1")
     look.eventually(lambda: look.picture(".shown.seed") == "21", "the second")
     look.page.evaluate(f"location.hash = '{bad}'")
     look.eventually(lambda: look.picture(".shown.seed") == "20", "the first again")
-    assert look.at("world-select").input_value() == "0"
-    assert look.at("world-select").locator("option").count() == 2
+    look.eventually(lambda: look.at("world-select").input_value() == "0", "the first chosen")
+    assert options.count() == 2
 
 
 def model_of_ten_observations() -> str:
@@ -107,7 +108,7 @@ def test_what_is_not_published_is_told(programs, open_page):
     look = open_page(programs.dashboard(server.instance))
     programs.agent(server.instance)
     look.eventually(lambda: look.has("belief"), "a belief is shown")
-    assert look.page.get_by_text("--publish-truth").is_visible()
+    look.eventually(lambda: look.page.get_by_text("--publish-truth").is_visible(), "no truth")
     assert look.page.get_by_text("needs the truth and a belief").is_visible()
     assert not look.at("panel-truth").is_visible()
 
