@@ -51,13 +51,18 @@ fn keeps_its_lease() -> bool {
     let (agent, learner) = start_with_learner(&server.instance, "");
     let start = Instant::now();
     while start.elapsed() < Duration::from_millis(1200) {
-        if holder(&server) != Some(agent.pid()) {
+        let is_held = holder(&server) == Some(agent.pid());
+        if !is_held || !matches!(learner.ask(&Request::Last {}), Reply::Decision(_)) {
             return false;
         }
-        learner.last();
     }
     std::thread::sleep(Duration::from_millis(1200));
-    holder(&server) == Some(agent.pid()) && learner.decide(2).step == 1
+    let is_held = holder(&server) == Some(agent.pid());
+    is_held
+        && matches!(
+            learner.ask(&Request::Decide { objective: 2 }),
+            Reply::Decision(_)
+        )
 }
 
 #[test]

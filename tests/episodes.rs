@@ -1,6 +1,6 @@
 //! Resets, episode ends and coverage, as every client sees them.
 
-use crate::harness::{SMALL, Server, fly, new_instance, reset};
+use crate::harness::{PATIENCE, SMALL, Server, eventually, fly, new_instance, reset};
 use crate::wire::{RawClient, Wire, answer, control_header, step_header};
 use protocol::control::{Reply, Request, WorldInfo, WorldSeed};
 use protocol::message::{FLAG_FULL_COVERAGE, Operation, Status, StepRequest, split_step_payload};
@@ -179,32 +179,35 @@ fn a_world_in_burn_in_takes_no_step_and_requests_for_it_wait() {
     let lease = wire.acquire(0, 1).lease;
     let is_ready = !server.status().worlds[0].resetting;
     assert!(is_ready, "acquiring waits for burn-in");
-    let reset = format!(r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":0,"seed":5}}]}}"#);
+    let reset = |seed| {
+        format!(r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":0,"seed":{seed}}}]}}"#)
+    };
     // Of several tries: who is paused misses a burn-in.
     let n_resets = (1..=20).find(|&n_resets| {
-        let pending = wire.send_control(control_header(1), reset.as_bytes());
+        let pending = wire.send_control(control_header(1), reset(n_resets).as_bytes());
         let pending = pending.expect("send");
-        let mut is_refused = false;
-        let reply = loop {
-            if let Some((_, text)) = answer(&pending, Duration::ZERO) {
-                break serde_json::from_slice(&text).expect("a reply");
-            }
-            let (reply, _) = wire.step(step_header(lease, N_MOVES), &[0; 6]);
-            is_refused |= reply.status == Status::Resetting as u32;
+        let (mut is_refused, mut reply) = (false, None);
+        let is_answered = || {
+            reply = answer(&pending, Duration::ZERO);
+            let (step, _) = wire.step(step_header(lease, N_MOVES), &[0; 6]);
+            is_refused |= step.status == Status::Resetting as u32;
+            reply.is_some()
         };
-        let Reply::Reset { worlds } = reply else {
-            panic!("expected a reset, got {reply:?}");
+        assert!(eventually(PATIENCE, is_answered));
+        let (_, text) = reply.expect("an answer");
+        let Ok(Reply::Reset { worlds }) = serde_json::from_slice(&text) else {
+            panic!("expected a reset, got {}", text.escape_ascii());
         };
         let begun = (worlds[0].seed, worlds[0].step, worlds[0].episode);
         assert_eq!(
             begun,
-            (5, 0, n_resets),
+            (n_resets, 0, n_resets),
             "the answer comes after the burn-in"
         );
         is_refused
     });
     assert!(n_resets.is_some(), "no step was refused");
-    let twice = Wire::open(&server.instance).control(control_header(2), reset.as_bytes());
+    let twice = Wire::open(&server.instance).control(control_header(2), reset(7).as_bytes());
     assert_eq!(
         twice.0.status,
         Status::NoLease as u32,
