@@ -1,6 +1,6 @@
 //! The inner loop of a doubling's backward pass: outputs are sums of shifted planes, pixels in lanes.
 //!
-//! `out[m][p] += sum over inputs k and taps t of weight[k, m][t] * plane[k][offset_t + p]`. A block of outputs
+//! `out[m][p] = sum over inputs k and taps t of weight[k, m][t] * plane[k][offset_t + p]`. A block of outputs
 //! stays in registers while all inputs and taps pass.
 
 use super::lanes::{Arithmetic, LANES, Lanes};
@@ -53,10 +53,9 @@ macro_rules! with_constant {
 pub(crate) use with_constant;
 
 impl Correlation<'_> {
-    /// Adds every term to `out`: one plane per output, `out_stride` apart, of `length` pixels in whole
-    /// lanes.
+    /// Writes `out`: one plane per output, `out_stride` apart, of `length` pixels in whole lanes.
     #[inline(always)]
-    pub(crate) fn add_to<A: Arithmetic, const TAPS: usize>(
+    pub(crate) fn write<A: Arithmetic, const TAPS: usize>(
         &self,
         taps: &[Tap; TAPS],
         length: usize,
@@ -74,7 +73,7 @@ impl Correlation<'_> {
             let mut done = 0;
             for outputs in balanced(self.outputs, most) {
                 let out = &mut out[done * out_stride + first..];
-                self.add_block::<A, TAPS>(n_vectors, outputs, taps, first, out, out_stride);
+                self.write_block::<A, TAPS>(n_vectors, outputs, taps, first, out, out_stride);
                 done += outputs.len();
             }
             first += n_vectors * LANES;
@@ -82,7 +81,7 @@ impl Correlation<'_> {
     }
 
     #[inline(always)]
-    fn add_block<A: Arithmetic, const TAPS: usize>(
+    fn write_block<A: Arithmetic, const TAPS: usize>(
         &self,
         n_vectors: usize,
         outputs: &[u16],
@@ -118,11 +117,6 @@ impl Correlation<'_> {
         let at: [usize; OUTPUTS] =
             std::array::from_fn(|output| usize::from(outputs[output]) * self.output_step);
         let mut sums = [[Lanes::ZERO; VECTORS]; OUTPUTS];
-        for (output, sums) in sums.iter_mut().enumerate() {
-            for (vector, sum) in sums.iter_mut().enumerate() {
-                *sum = Lanes::load(&out[output * stride + vector * LANES..]);
-            }
-        }
         for (planes, &input) in self.planes.chunks_exact(self.stride).zip(self.inputs) {
             let weights = &self.weights[usize::from(input) * self.input_step..];
             let mut kernels = [&weights[0]; OUTPUTS];

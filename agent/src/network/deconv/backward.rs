@@ -65,7 +65,6 @@ impl Doubling {
         let [inputs, outputs] = kept;
         let stride = GRADIENT_PLANES * self.gradient_plane();
         let taps: [Tap; TAPS] = std::array::from_fn(|entry| self.tap(entry));
-        scratch.dx[..inputs.len() * self.plane_in()].fill(0.0);
         let correlation = Correlation {
             planes: &scratch.gradients[..outputs.len() * stride],
             stride,
@@ -76,7 +75,7 @@ impl Doubling {
             output_step: self.channels_out,
         };
         let plane = self.plane_in();
-        correlation.add_to::<A, TAPS>(&taps, plane, &mut scratch.dx, plane);
+        correlation.write::<A, TAPS>(&taps, plane, &mut scratch.dx, plane);
         self.weight_gradient::<A>(kept, scratch, d_weights);
     }
 
