@@ -3,10 +3,10 @@
 
 use super::adam::{Adam, AdamSettings};
 use super::dropout::Dropout;
-use super::gradient::Workspace;
+use super::gradient::{Trajectory, Workspace};
 use super::inference::{Advance, Decode, Inference};
 use super::lanes::dispatch;
-use super::loss::softmax_of_columns;
+use super::loss::{LossSettings, softmax_of_columns};
 use super::parameters::{OBSERVATION, Tensors, normal};
 use super::shape::NetworkShape;
 use super::window::Window;
@@ -15,6 +15,7 @@ use crate::estimator::ZeroEvidence;
 use protocol::frame::Frame;
 use protocol::grid::{Probabilities, Shape};
 use protocol::randomness::{Purpose, stream};
+use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -30,6 +31,8 @@ pub struct AutoencoderSettings {
     pub window: usize,
     /// Frames remembered.
     pub replay: usize,
+    /// The loss.
+    pub loss: LossSettings,
     /// The optimiser.
     pub adam: AdamSettings,
 }
@@ -42,6 +45,7 @@ impl AutoencoderSettings {
             hidden: 4,
             window: 1000,
             replay: 5000,
+            loss: LossSettings::paper(),
             adam: AdamSettings::paper(1e-4),
         }
     }
@@ -200,7 +204,7 @@ impl Autoencoder {
 
     /// Forgets all frames: `h ~ N(0, I)`, the same for a seed.
     pub fn forget(&mut self) {
-        let hidden = self.draw_hidden(u64::MAX);
+        let hidden = self.draw_hidden(&mut stream(self.seed, Purpose::Hidden, u64::MAX));
         self.restart(hidden);
     }
 
@@ -290,7 +294,7 @@ impl Autoencoder {
         Ok(accepted(estimate))
     }
 
-    /// One step of Adam on a window, with dropout and `h_0` of this update; the loss before it.
+    /// [`Self::update_on`] one window.
     ///
     /// # Errors
     /// [`NotFinite`] for a number that is not; nothing has changed then.
@@ -298,30 +302,55 @@ impl Autoencoder {
     /// # Panics
     /// If the window has fewer than two frames or is of another grid.
     pub fn update(&mut self, window: &Window) -> Result<f64, NotFinite> {
-        let dropout = Dropout::draw(window.len(), self.seed, self.n_updates);
-        let hidden = self.draw_hidden(self.n_updates);
-        self.update_with(window, &dropout, &hidden)
+        self.update_on(std::slice::from_ref(window))
     }
 
-    /// [`Self::update`] with given masks and `h_0`.
+    /// One step of Adam on the mean over some windows, each with dropout and `h_0` of its own, drawn from
+    /// this update's streams one after the other; the loss before it.
     ///
     /// # Errors
     /// [`NotFinite`] for a number that is not; nothing has changed then.
     ///
     /// # Panics
-    /// If the window has fewer than two frames or is of another grid.
-    pub fn update_with(
-        &mut self,
-        window: &Window,
-        dropout: &Dropout,
-        hidden: &[f32],
-    ) -> Result<f64, NotFinite> {
-        assert!(window.len() > 1, "window: expected two frames or more");
-        assert!(window.fits(&self.shape), "window: grid or observations");
-        let mut workspace = self.take_workspace(window.len());
+    /// If there is no window, or one has fewer than two frames, another length or another grid.
+    pub fn update_on(&mut self, windows: &[Window]) -> Result<f64, NotFinite> {
+        let mut coins = stream(self.seed, Purpose::Dropout, self.n_updates);
+        let mut hidden = stream(self.seed, Purpose::Hidden, self.n_updates);
+        let drawn: Vec<_> = windows
+            .iter()
+            .map(|window| {
+                let dropout = Dropout::draw_from(window.len(), &mut coins);
+                (window, dropout, self.draw_hidden(&mut hidden))
+            })
+            .collect();
+        let trajectories = drawn.iter().map(|(window, dropout, first)| Trajectory {
+            window,
+            dropout,
+            first,
+        });
+        self.update_with(&trajectories.collect::<Vec<_>>())
+    }
+
+    /// [`Self::update_on`] with given masks and `h_0`.
+    ///
+    /// # Errors
+    /// [`NotFinite`] for a number that is not; nothing has changed then.
+    ///
+    /// # Panics
+    /// If there is no window, or one has fewer than two frames, another length or another grid.
+    pub fn update_with(&mut self, trajectories: &[Trajectory<'_>]) -> Result<f64, NotFinite> {
+        for Trajectory { window, .. } in trajectories {
+            assert!(window.len() > 1, "window: expected two frames or more");
+            assert!(window.fits(&self.shape), "window: grid or observations");
+        }
+        let mut workspace = self.take_workspace(trajectories[0].window.len());
         let mut statistics = self.statistics.clone();
-        let loss =
-            workspace.loss_and_gradient(&self.parameters, &mut statistics, window, dropout, hidden);
+        let loss = workspace.mean_loss_and_gradient(
+            &self.parameters,
+            &mut statistics,
+            trajectories,
+            &self.settings.loss,
+        );
         let broken = self.not_finite(loss, &workspace.gradient);
         let broken = broken.or_else(|| self.move_by(&workspace.gradient, statistics));
         self.workspace = Some(workspace);
@@ -370,10 +399,9 @@ impl Autoencoder {
         tensor.map(str::to_owned).or_else(gradient).or_else(loss)
     }
 
-    /// `h_0 ~ N(0, I)` of an update.
-    fn draw_hidden(&self, update: u64) -> Vec<f32> {
-        let mut rng = stream(self.seed, Purpose::Hidden, update);
-        (0..self.shape.hidden).map(|_| normal(&mut rng)).collect()
+    /// `h_0 ~ N(0, I)`.
+    fn draw_hidden(&self, rng: &mut ChaCha8Rng) -> Vec<f32> {
+        (0..self.shape.hidden).map(|_| normal(rng)).collect()
     }
 
     fn take_inference(&mut self) -> Inference {

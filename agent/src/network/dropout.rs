@@ -5,6 +5,7 @@
 
 use super::shape::{DECODER_CHANNELS, ENCODER_CHANNELS};
 use protocol::randomness::{Purpose, stream};
+use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::Rng;
 
 /// The channels kept and lost in each frame behind one layer.
@@ -73,9 +74,13 @@ impl Dropout {
         }
     }
 
-    /// Fair coins: those of update `update` under a seed.
+    /// Fair coins: the first of update `update` under a seed.
     pub fn draw(n_frames: usize, seed: u64, update: u64) -> Self {
-        let mut rng = stream(seed, Purpose::Dropout, update);
+        Self::draw_from(n_frames, &mut stream(seed, Purpose::Dropout, update))
+    }
+
+    /// Fair coins: the next of a stream.
+    pub(crate) fn draw_from(n_frames: usize, rng: &mut ChaCha8Rng) -> Self {
         let mut toss = |channels: usize| {
             let words_each = channels.div_ceil(64);
             let words: Vec<u64> = (0..n_frames * words_each).map(|_| rng.next_u64()).collect();

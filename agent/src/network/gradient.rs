@@ -1,4 +1,4 @@
-//! One window's loss and gradient: encoder, recurrence, decoder, and back (paper eqs. 7 to 11).
+//! Loss and gradient of trajectories: encoder, recurrence, decoder, and back (paper eqs. 7 to 11).
 
 use super::batch_norm::Norm;
 use super::decoder::{Decoder, DecoderLayers};
@@ -6,9 +6,21 @@ use super::dropout::Dropout;
 use super::encoder::Encoder;
 use super::gru::{self, Gru, Trace};
 use super::lanes::dispatch;
+use super::loss::LossSettings;
 use super::parameters::{DECODER_NORMS, ENCODER, Tensors};
 use super::shape::NetworkShape;
 use super::window::Window;
+
+/// A sampled trajectory, and what is drawn at random for it.
+#[derive(Debug, Clone, Copy)]
+pub struct Trajectory<'a> {
+    /// Its frames.
+    pub window: &'a Window,
+    /// The channels that it loses.
+    pub dropout: &'a Dropout,
+    /// `h_0`.
+    pub first: &'a [f32],
+}
 
 /// Room for windows of one length.
 #[derive(Debug)]
@@ -37,16 +49,41 @@ impl Workspace {
         self.n_frames
     }
 
-    /// The mean loss over the window's targets, from the state `h_0`; leaves the gradient in
-    /// `self.gradient` and moves the running statistics.
-    pub(crate) fn loss_and_gradient(
+    /// The mean loss of trajectories (`1 / L` of eqs. 8 and 11), of which each counts alike; leaves its
+    /// gradient in `self.gradient` and moves the running statistics by one after the other.
+    pub(crate) fn mean_loss_and_gradient(
         &mut self,
         parameters: &Tensors,
         statistics: &mut Tensors,
-        window: &Window,
-        dropout: &Dropout,
-        first: &[f32],
+        trajectories: &[Trajectory<'_>],
+        settings: &LossSettings,
     ) -> f64 {
+        let mut loss = self.loss_and_gradient(parameters, statistics, trajectories[0], settings);
+        for &trajectory in &trajectories[1..] {
+            let before = self.gradient.numbers.clone();
+            loss += self.loss_and_gradient(parameters, statistics, trajectory, settings);
+            let sums = self.gradient.numbers.iter_mut().zip(before);
+            sums.for_each(|(sum, d)| *sum += d);
+        }
+        let share = 1.0 / trajectories.len() as f32;
+        let gradient = self.gradient.numbers.iter_mut();
+        gradient.for_each(|d| *d *= share);
+        loss / trajectories.len() as f64
+    }
+
+    /// The loss of a trajectory; leaves the gradient in `self.gradient` and moves the running statistics.
+    fn loss_and_gradient(
+        &mut self,
+        parameters: &Tensors,
+        statistics: &mut Tensors,
+        trajectory: Trajectory<'_>,
+        settings: &LossSettings,
+    ) -> f64 {
+        let Trajectory {
+            window,
+            dropout,
+            first,
+        } = trajectory;
         assert_eq!(window.len(), self.n_frames, "frames of a window");
         let gradient = &mut self.gradient;
         let (encodings, encoder) = self.encoder.forward(parameters, window, dropout);
@@ -62,9 +99,10 @@ impl Workspace {
         let mut decoder = DecoderLayers::new(&self.shape, parameters);
         self.decoder
             .forward(parameters, &mut decoder, hidden, dropout);
+        let targets = (window, settings);
         let loss = self
             .decoder
-            .loss(parameters, &decoder, window, dropout, gradient);
+            .loss(parameters, &decoder, targets, dropout, gradient);
         let d_hidden = self.decoder.backward(&decoder, hidden, dropout, gradient);
         let mut d_encodings = Vec::new();
         dispatch(gru::Backward {

@@ -5,10 +5,48 @@
 //! `-log q_y - sum over a != y of log(1 - q_a)`.
 
 use super::lanes::{Arithmetic, LANES, Lanes};
+use super::window::Window;
 use protocol::frame::UNOBSERVED;
+use serde::{Deserialize, Serialize};
 
-/// Added inside logarithms, as in the authors' code.
-const EPSILON: f32 = 1e-10;
+/// What the sum over a window's visited cells is divided by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LossKind {
+    /// Their number, as in the authors' code.
+    MeanOfCells,
+    /// The number K of predicted frames (eqs. 8 and 11).
+    SumOfCells,
+}
+
+/// Settings of the loss.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LossSettings {
+    /// What the sum over cells is divided by.
+    pub kind: LossKind,
+    /// Added inside logarithms. With 0 they are exact, and the loss infinite where a probability is
+    /// rounded to 0 or 1.
+    pub log_floor: f32,
+}
+
+impl LossSettings {
+    /// What the authors ran.
+    pub fn paper() -> Self {
+        Self {
+            kind: LossKind::MeanOfCells,
+            log_floor: 1e-10,
+        }
+    }
+
+    /// What the sum over a window's visited cells is divided by.
+    pub(crate) fn divisor(&self, window: &Window) -> usize {
+        match self.kind {
+            LossKind::MeanOfCells => window.n_targets(),
+            LossKind::SumOfCells => window.len() - 1,
+        }
+    }
+}
 
 /// The observation matrix, and its gradient so far.
 #[derive(Debug, Clone)]
@@ -16,8 +54,9 @@ pub(crate) struct CellLoss {
     n_states: usize,
     /// `[observation][state]`; columns sum to one.
     observation: Vec<f32>,
-    /// `1 / number of targets`.
+    /// One divided by [`LossSettings::divisor`].
     weight: f32,
+    log_floor: f32,
     d_observation: Vec<f64>,
     loss: f64,
     /// Room for `u` and its gradient.
@@ -26,21 +65,28 @@ pub(crate) struct CellLoss {
 }
 
 impl CellLoss {
-    /// From the matrix before its softmax, `[O, S]`, and the number of cells in the mean.
-    pub(crate) fn new(parameters: &[f32], n_states: usize, n_targets: usize) -> Self {
+    /// From the matrix before its softmax, `[O, S]`, and what the sum over cells is divided by; with the
+    /// authors' floor under logarithms.
+    pub(crate) fn new(parameters: &[f32], n_states: usize, divisor: usize) -> Self {
         let observation = softmax_of_columns(parameters, n_states);
         Self {
             n_states,
             d_observation: vec![0.0; observation.len()],
             observation,
-            weight: 1.0 / n_targets.max(1) as f32,
+            weight: 1.0 / divisor.max(1) as f32,
+            log_floor: LossSettings::paper().log_floor,
             loss: 0.0,
             u: vec![Lanes::ZERO; n_states],
             d_u: vec![Lanes::ZERO; n_states],
         }
     }
 
-    /// The sum of the losses so far, before division by the number of cells.
+    /// Adds another number inside logarithms.
+    pub(crate) fn with_log_floor(self, log_floor: f32) -> Self {
+        Self { log_floor, ..self }
+    }
+
+    /// The sum of the losses so far, before division.
     pub(crate) fn sum(&self) -> f64 {
         self.loss
     }
@@ -49,7 +95,7 @@ impl CellLoss {
     /// gradients. Cells that are not observed add nothing.
     #[inline(always)]
     pub(crate) fn add<A: Arithmetic>(&mut self, logits: &mut [Lanes], values: &[u8; LANES]) {
-        let seen = values.map(|value| if value == UNOBSERVED { 0.0 } else { 1.0 });
+        let seen = values.map(|value| value != UNOBSERVED);
         softmax::<A>(logits, &mut self.u);
         self.d_u.fill(Lanes::ZERO);
         let mut likelihood = [1.0; LANES];
@@ -62,10 +108,10 @@ impl CellLoss {
             let mut d_q = Lanes::ZERO;
             for lane in 0..LANES {
                 let hit = usize::from(values[lane]) == observed;
-                let term = EPSILON + if hit { q.0[lane] } else { 1.0 - q.0[lane] };
+                let term = self.log_floor + if hit { q.0[lane] } else { 1.0 - q.0[lane] };
                 likelihood[lane] *= term;
                 let slope = if hit { -self.weight } else { self.weight };
-                d_q.0[lane] = seen[lane] * slope / term;
+                d_q.0[lane] = if seen[lane] { slope / term } else { 0.0 };
             }
             for (state, index) in row.enumerate() {
                 let d_u = &mut self.d_u[state];
@@ -75,9 +121,10 @@ impl CellLoss {
             }
         }
         for lane in 0..LANES {
-            if values[lane] != UNOBSERVED {
+            if seen[lane] {
                 // One logarithm a cell. At most one factor other than q_y is near zero, as the q sum to
-                // one, so the product cannot underflow.
+                // one, and 6e-8 or more unless it is zero, so the product underflows only where q_y all
+                // but does.
                 self.loss -= f64::from(likelihood[lane].ln());
             }
         }
@@ -192,8 +239,8 @@ mod tests {
         }
     }
 
-    /// The loss in 64 bits, written as in the paper.
-    fn exact(parameters: &[f64], logits: &[f64], value: usize) -> f64 {
+    /// The loss in 64 bits, written as in the paper, with a number added inside logarithms.
+    fn exact(parameters: &[f64], logits: &[f64], value: usize, floor: f64) -> f64 {
         let n_states = logits.len();
         let total: f64 = logits.iter().map(|x| x.exp()).sum();
         let column = |state: usize| parameters.iter().skip(state).step_by(n_states);
@@ -208,21 +255,48 @@ mod tests {
         };
         (0..parameters.len() / n_states)
             .map(|observed| match observed == value {
-                true => -q(observed).ln(),
-                false => -(1.0 - q(observed)).ln(),
+                true => -(floor + q(observed)).ln(),
+                false => -(floor + 1.0 - q(observed)).ln(),
             })
             .sum()
     }
 
     #[test]
+    fn exact_logarithms_are_infinite_at_certainty_and_unseen_cells_add_nothing() {
+        // All three states look like observation 0, to the last bit.
+        let parameters = [200.0, 200.0, 200.0, 0.0, 0.0, 0.0];
+        let sum = |floor: f32, value: u8| {
+            let loss = CellLoss::new(&parameters, 3, 1).with_log_floor(floor);
+            let (mut loss, mut lanes) = (loss, [Lanes::ZERO; 3]);
+            let mut values = [UNOBSERVED; LANES];
+            values[2] = value;
+            loss.add::<Portable>(&mut lanes, &values);
+            assert!(lanes.iter().all(|d| d.0[1] == 0.0), "{lanes:?}");
+            loss.sum()
+        };
+        assert_eq!([sum(0.0, UNOBSERVED), sum(0.0, 0)], [0.0, 0.0]);
+        assert_eq!(sum(0.0, 1), f64::INFINITY);
+        // Twice the logarithm of 1e-10.
+        assert!((sum(1e-10, 1) - 46.05).abs() < 0.01);
+    }
+
+    #[test]
     fn gradients_are_finite_differences() {
-        for (n_states, n_observations) in [(3, 3), (2, 4), (4, 2)] {
+        // Of the divisors and floors, 5 and 0.25 show in every number.
+        for (n_states, n_observations, divisor, floor) in [
+            (3, 3, 1, 1e-10),
+            (2, 4, 5, 0.0),
+            (4, 2, 1, 0.25),
+            (1, 3, 5, 0.25),
+        ] {
+            let share = 1.0 / divisor as f64;
             let wave = |index: usize| (index as f64 * 1.7).sin();
             let parameters: Vec<f64> = (0..n_states * n_observations).map(wave).collect();
             let logits: Vec<f64> = (0..n_states).map(|state| 2.0 * wave(state + 50)).collect();
             let value = n_observations - 1;
             let single = |values: &[f64]| values.iter().map(|&x| x as f32).collect::<Vec<_>>();
-            let mut loss = CellLoss::new(&single(&parameters), n_states, 1);
+            let loss = CellLoss::new(&single(&parameters), n_states, divisor);
+            let mut loss = loss.with_log_floor(floor as f32);
             let mut lanes: Vec<Lanes> = logits.iter().map(|&x| Lanes([x as f32; LANES])).collect();
             let mut values = [UNOBSERVED; LANES];
             values[5] = value as u8;
@@ -233,7 +307,7 @@ mod tests {
             };
             close(
                 loss.sum() as f32,
-                exact(&parameters, &logits, value),
+                exact(&parameters, &logits, value, floor),
                 "loss",
             );
             let slope = |f: &dyn Fn(f64) -> f64| (f(1e-5) - f(-1e-5)) / 2e-5;
@@ -241,7 +315,7 @@ mod tests {
                 let moved = |by: f64| {
                     let mut logits = logits.clone();
                     logits[state] += by;
-                    exact(&parameters, &logits, value)
+                    share * exact(&parameters, &logits, value, floor)
                 };
                 close(lanes[state].0[5], slope(&moved), "logit");
                 close(lanes[state].0[4], 0.0, "unseen");
@@ -251,7 +325,7 @@ mod tests {
                 let moved = |by: f64| {
                     let mut parameters = parameters.clone();
                     parameters[index] += by;
-                    exact(&parameters, &logits, value)
+                    share * exact(&parameters, &logits, value, floor)
                 };
                 close(got, slope(&moved), "observation matrix");
             }

@@ -54,6 +54,8 @@ pub use autoencoder::{Autoencoder, AutoencoderSettings, NotFinite, StepError};
 pub use checkpoint::CheckpointError;
 pub use dqn::{Dqn, DqnSettings, Track, Transition};
 pub use dropout::{ChannelMask, Dropout};
+pub use gradient::Trajectory;
+pub use loss::{LossKind, LossSettings};
 pub use parameters::Tensors;
 pub use replay::Replay;
 pub use shape::NetworkShape;

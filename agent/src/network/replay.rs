@@ -83,18 +83,16 @@ impl Replay {
         self.frames.is_empty()
     }
 
-    /// Consecutive frames of one track from a random one on, those of an update under a seed; `None` while
-    /// no track has `length` frames.
-    pub fn window(&self, length: usize, seed: u64, update: u64) -> Option<Window> {
-        let starts = self.starts(length);
-        let n_starts: usize = starts.iter().map(Range::len).sum();
-        if n_starts == 0 {
-            return None;
-        }
+    /// Consecutive frames of one track from a random one on, again and again without end: those of an
+    /// update under a seed. None while no track has `length` frames.
+    pub fn windows(&self, length: usize, seed: u64, update: u64) -> impl Iterator<Item = Window> {
+        let starts: Vec<usize> = self.starts(length).into_iter().flatten().collect();
         let mut rng = stream(seed, Purpose::Replay, update);
-        let choice = (rng.next_u64() % n_starts as u64) as usize;
-        let first = starts.into_iter().flatten().nth(choice)?;
-        Some(Window::new(self.frames.range(first..first + length)))
+        std::iter::from_fn(move || {
+            let choice = rng.next_u64().checked_rem(starts.len() as u64)?;
+            let first = starts[choice as usize];
+            Some(Window::new(self.frames.range(first..first + length)))
+        })
     }
 }
 
@@ -107,14 +105,14 @@ mod tests {
     fn windows_are_consecutive_and_reach_every_frame() {
         let mut replay = Replay::new(8);
         for cell in 0..20 {
-            assert!(cell > 2 || replay.window(4, 0, 0).is_none());
+            assert!(cell > 2 || replay.windows(4, 0, 0).next().is_none());
             let mut frame = Frame::empty(Shape::new(4, 5).expect("valid shape"));
             frame.observe(cell, 1);
             replay.push(frame);
         }
         let mut seen = [false; 20];
         for update in 0..100 {
-            let window = replay.window(4, 0, update).expect("eight frames");
+            let window = replay.windows(4, 0, update).next().expect("eight frames");
             let cell = |frame| {
                 let visit = window.visits(frame)[0];
                 usize::from(visit.row) * 5 + usize::from(visit.col)
@@ -123,6 +121,25 @@ mod tests {
             seen[cell(0)..=cell(3)].fill(true);
         }
         assert!((0..20).all(|cell| seen[cell] == (cell >= 12)), "{seen:?}");
+    }
+
+    #[test]
+    fn windows_of_an_update_are_drawn_one_after_the_other() {
+        let mut replay = Replay::new(100);
+        for cell in 0..20 {
+            let mut frame = Frame::empty(Shape::new(4, 5).expect("valid shape"));
+            frame.observe(cell, 1);
+            replay.push(frame);
+        }
+        let starts = |n: usize, update: u64| -> Vec<u16> {
+            let windows = replay.windows(3, 7, update).take(n);
+            let cell = |window: Window| window.visits(0)[0].row * 5 + window.visits(0)[0].col;
+            windows.map(cell).collect()
+        };
+        assert_eq!(starts(9, 0)[..1], starts(1, 0));
+        assert_ne!(starts(9, 0), starts(9, 1));
+        let distinct: std::collections::BTreeSet<u16> = starts(9, 0).into_iter().collect();
+        assert!(distinct.len() > 3, "{distinct:?}");
     }
 
     #[test]
@@ -139,6 +156,6 @@ mod tests {
         // Places 0 to 9 hold frames 20 to 29.
         assert_eq!(replay.starts(1), [0..1, 1..5, 5..6, 6..10]);
         assert_eq!(replay.starts(4), [1..2, 6..7]);
-        assert!(replay.window(5, 0, 0).is_none());
+        assert!(replay.windows(5, 0, 0).next().is_none());
     }
 }

@@ -18,8 +18,8 @@ use crate::compare::planner_seed;
 use crate::config::AgentConfig;
 use crate::learned::likelihood;
 use crate::metrics::Tick;
-use crate::network::Transition;
 use crate::network::dqn::Track;
+use crate::network::{Transition, Window};
 use crate::planner::{Objective, Planner, PlanningProblem};
 use crate::policy::{EstimatorKind, Policy};
 use crate::reward::met;
@@ -123,17 +123,17 @@ impl NetworkStudent {
         let start = Instant::now();
         let number = self.progress.autoencoder.n_updates();
         let config = &self.config.autoencoder;
-        let window = self
-            .progress
-            .replay
-            .window(config.window, self.config.seed, number);
-        let Some(window) = window.filter(|window| window.has_targets()) else {
+        let replay = &self.progress.replay;
+        let windows = replay.windows(config.window, self.config.seed, number);
+        let mut windows: Vec<Window> = windows.take(config.trajectories).collect();
+        windows.retain(Window::has_targets);
+        if windows.is_empty() {
             return Ok([None; 2]);
-        };
+        }
         // Both step sizes go by the iteration, as eq. 20 compares them.
         let rate = config.step_size.at(self.progress.iterations);
         self.progress.autoencoder.set_learning_rate(rate as f32);
-        let loss = self.progress.autoencoder.update(&window);
+        let loss = self.progress.autoencoder.update_on(&windows);
         self.times[3].1 += start.elapsed();
         Ok([Some(loss?), Some(rate)])
     }

@@ -13,7 +13,7 @@
 
 use agent::belief::Belief;
 use agent::network::adam::AdamSettings;
-use agent::network::{Autoencoder, AutoencoderSettings, Dropout, Window};
+use agent::network::{Autoencoder, AutoencoderSettings, Dropout, Trajectory, Window};
 use candle_core::{Device, Tensor};
 use ndarray::{Array, Array1, Array3, Array4, ArrayD, ArrayView2, ArrayView3, Dimension, IxDyn};
 use ndarray_npy::{NpzReader, ReadableElement};
@@ -136,9 +136,12 @@ fn an_update_without_dropout_reproduces_loss_gradients_and_parameters() {
     let window = Window::new(&frames);
     let hidden: Array1<f32> = golden.get("h0");
     let dropout = Dropout::off(window.len());
-    let loss = network
-        .update_with(&window, &dropout, &hidden.to_vec())
-        .expect("finite");
+    let trajectory = Trajectory {
+        window: &window,
+        dropout: &dropout,
+        first: &hidden.to_vec(),
+    };
+    let loss = network.update_with(&[trajectory]).expect("finite");
     let expected: f64 = golden.get::<f64, ndarray::Ix0>("loss").into_scalar();
     assert!(
         (loss / expected - 1.0).abs() < 1e-4,

@@ -1,7 +1,9 @@
 //! What holds of every network: seeds, threads, checkpoints, numbers that are not finite, learning.
 
 use crate::synthetic::{coin, dropout, frames};
-use agent::network::{Autoencoder, AutoencoderSettings, CheckpointError, Window};
+use agent::network::{
+    Autoencoder, AutoencoderSettings, CheckpointError, LossSettings, Trajectory, Window,
+};
 use protocol::grid::Shape;
 
 fn network(grid: [usize; 2], seed: u64) -> Autoencoder {
@@ -65,6 +67,101 @@ fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
 }
 
 #[test]
+fn an_infinite_loss_is_named_and_changes_nothing() {
+    let settings = |log_floor| AutoencoderSettings {
+        loss: LossSettings {
+            log_floor,
+            ..LossSettings::paper()
+        },
+        ..AutoencoderSettings::paper()
+    };
+    let update = |log_floor| {
+        let grid = Shape::new(32, 32).expect("shape");
+        let mut network = Autoencoder::new(settings(log_floor), grid, 3, 3, 1);
+        // Every state looks like observation 0, to the last bit.
+        network.parameters_mut().get_mut("W_obs_param")[..3].fill(200.0);
+        let before = network.to_safetensors().expect("bytes");
+        let result = network.update(&window(&network, 8, 20));
+        (result, before == network.to_safetensors().expect("bytes"))
+    };
+    let (result, is_unchanged) = update(0.0);
+    let error = result.expect_err("not finite");
+    assert!(
+        error.tensor.starts_with("gradient of") || error.tensor == "loss",
+        "{error}"
+    );
+    assert!(is_unchanged);
+    let (result, is_unchanged) = update(1e-10);
+    assert!(result.expect("finite").is_finite() && !is_unchanged);
+}
+
+#[test]
+fn an_update_on_two_trajectories_follows_the_mean_of_their_gradients() {
+    let network = || network([32, 32], 3);
+    // Of other numbers of cells: each trajectory counts alike all the same.
+    let windows = [(9, 10), (9, 3)].map(|(n_frames, one_in)| {
+        Window::new(&frames(network().shape().grid, 3, n_frames, one_in)[1..])
+    });
+    let dropout = dropout(8, 2.0, coin);
+    let hidden = [[0.5; 16], [-1.0; 16]];
+    let trajectory = |index: usize| Trajectory {
+        window: &windows[index],
+        dropout: &dropout,
+        first: &hidden[index],
+    };
+    let update = |trajectories: &[Trajectory<'_>]| {
+        let mut network = network();
+        let loss = network.update_with(trajectories).expect("finite");
+        (loss, network)
+    };
+    let first = network();
+    let (both, one, other) = (
+        update(&[trajectory(0), trajectory(1)]),
+        update(&[trajectory(0)]),
+        update(&[trajectory(1)]),
+    );
+    assert_ne!(one.0, other.0);
+    assert_eq!(both.0, (one.0 + other.0) / 2.0);
+    let gradient = |network: &Autoencoder, name: &str| {
+        network.gradient().expect("an update").get(name).to_vec()
+    };
+    for (name, ..) in first.parameters().iter() {
+        let [both, one, other] = [&both, &one, &other].map(|of| gradient(&of.1, name));
+        let mean = one.iter().zip(&other).map(|(a, b)| (a + b) / 2.0);
+        assert_eq!(both, mean.collect::<Vec<f32>>(), "{name}");
+    }
+    // Each moves the running statistics by its own, the second after the first.
+    for (name, _, first) in first.statistics().iter() {
+        let [both, one, other] = [&both, &one, &other].map(|of| of.1.statistics().get(name));
+        for index in 0..first.len() {
+            let expected =
+                one[index] + other[index] - first[index] - 0.1 * (one[index] - first[index]);
+            let error = (both[index] - expected).abs();
+            assert!(
+                error < 1e-5 * (1.0 + expected.abs()),
+                "{name}: off by {error}"
+            );
+        }
+    }
+    // One step of Adam, not two.
+    assert_eq!(both.1.counters(), [1, 1]);
+    assert_eq!(both.1.n_updates(), 1);
+}
+
+#[test]
+fn trajectories_of_an_update_have_masks_and_hidden_vectors_of_their_own() {
+    let update = |n_windows: usize| {
+        let mut network = network([32, 32], 3);
+        let window = window(&network, 8, 10);
+        let loss = network.update_on(&vec![window; n_windows]).expect("finite");
+        (loss, network.parameters().get("decoder.8.weight").to_vec())
+    };
+    assert_eq!(update(2), update(2));
+    // The mean over two that are alike would be that of one.
+    assert!((update(2).0 - update(1).0).abs() > 1e-4);
+}
+
+#[test]
 fn a_saved_network_resumes_bit_for_bit() {
     let mut network = network([32, 32], 2);
     let window = window(&network, 10, 10);
@@ -113,13 +210,14 @@ fn updates_lower_the_loss_of_what_repeats() {
     }
     let window = Window::new(&frames);
     let dropout = dropout(24, 2.0, coin);
+    let trajectory = Trajectory {
+        window: &window,
+        dropout: &dropout,
+        first: &[0.0; 16],
+    };
     let mut losses = Vec::new();
     for _ in 0..60 {
-        losses.push(
-            network
-                .update_with(&window, &dropout, &[0.0; 16])
-                .expect("finite"),
-        );
+        losses.push(network.update_with(&[trajectory]).expect("finite"));
     }
     assert!(
         losses[59] < 0.8 * losses[0],

@@ -6,7 +6,8 @@
 
 use crate::synthetic::{coin, dropout, frames};
 use agent::network::{
-    Autoencoder, AutoencoderSettings, ChannelMask, Dropout, NetworkShape, Tensors, Window,
+    Autoencoder, AutoencoderSettings, ChannelMask, Dropout, LossKind, LossSettings, NetworkShape,
+    Tensors, Trajectory, Window,
 };
 use candle_core::{D, DType, Device, Result, Tensor, Var};
 use candle_nn::ops::{sigmoid, softmax};
@@ -131,7 +132,13 @@ impl Stock {
             .reshape((n_frames, channels, height, width))
     }
 
-    fn loss(&self, frames: &[Frame], dropout: &Dropout, first: &[f32]) -> Result<Tensor> {
+    fn loss(
+        &self,
+        frames: &[Frame],
+        dropout: &Dropout,
+        first: &[f32],
+        settings: LossSettings,
+    ) -> Result<Tensor> {
         let hidden = self.recur(&self.encode(frames, dropout)?, first)?;
         let logits = self.decode(&hidden, dropout)?;
         let n_targets = frames.len() - 1;
@@ -149,10 +156,15 @@ impl Stock {
             .flatten_from(2)?
             .transpose(1, 2)?;
         let seen = y.sum_keepdim(D::Minus1)?;
-        let hit = (&y * (&q + 1e-10)?.log()?)?;
-        let miss = ((1.0 - &y)? * ((1.0 - &q)? + 1e-10)?.log()?)?;
+        let floor = f64::from(settings.log_floor);
+        let hit = (&y * (&q + floor)?.log()?)?;
+        let miss = ((1.0 - &y)? * ((1.0 - &q)? + floor)?.log()?)?;
         let entropy = (hit + miss)?.broadcast_mul(&seen)?.sum_all()?;
-        entropy.neg()? / seen.sum_all()?.to_scalar::<f64>()?
+        let divisor = match settings.kind {
+            LossKind::MeanOfCells => seen.sum_all()?.to_scalar::<f64>()?,
+            LossKind::SumOfCells => n_targets as f64,
+        };
+        entropy.neg()? / divisor
     }
 }
 
@@ -199,6 +211,7 @@ struct Case {
     /// One cell in so many is seen.
     one_in: u64,
     drops: bool,
+    loss: LossSettings,
 }
 
 const CASE: Case = Case {
@@ -208,6 +221,10 @@ const CASE: Case = Case {
     n_frames: 40,
     one_in: 100,
     drops: true,
+    loss: LossSettings {
+        kind: LossKind::MeanOfCells,
+        log_floor: 1e-10,
+    },
 };
 
 fn check(case: Case) {
@@ -215,6 +232,7 @@ fn check(case: Case) {
     let settings = AutoencoderSettings {
         encoding: 6,
         hidden: 5,
+        loss: case.loss,
         ..AutoencoderSettings::paper()
     };
     let mut network = Autoencoder::new(settings, grid, case.n_states, case.n_observations, 3);
@@ -230,11 +248,16 @@ fn check(case: Case) {
         false => dropout(frames.len(), 1.0, |_, _, _| true),
     };
     let first = [0.3, -1.2, 0.7, 0.1, 2.0];
-    let loss = stock.loss(&frames, &dropout, &first).expect("stock loss");
+    let loss = stock.loss(&frames, &dropout, &first, case.loss);
+    let loss = loss.expect("stock loss");
     let exact: f64 = loss.to_scalar().expect("a number");
     let window = Window::new(&frames);
     let got = network
-        .update_with(&window, &dropout, &first)
+        .update_with(&[Trajectory {
+            window: &window,
+            dropout: &dropout,
+            first: &first,
+        }])
         .expect("finite");
     assert!(
         (got / exact - 1.0).abs() < 1e-5,
@@ -271,6 +294,35 @@ fn on_full_frames() {
         n_frames: 12,
         ..CASE
     });
+}
+
+#[test]
+fn with_the_sum_of_cells() {
+    let kind = LossKind::SumOfCells;
+    for one_in in [1, 100] {
+        check(Case {
+            n_frames: 12,
+            one_in,
+            loss: LossSettings { kind, ..CASE.loss },
+            ..CASE
+        });
+    }
+}
+
+#[test]
+fn with_exact_and_with_coarse_logarithms() {
+    for log_floor in [0.0, 0.1] {
+        check(Case {
+            grid: [32, 32],
+            n_frames: 20,
+            one_in: 5,
+            loss: LossSettings {
+                log_floor,
+                ..CASE.loss
+            },
+            ..CASE
+        });
+    }
 }
 
 #[test]

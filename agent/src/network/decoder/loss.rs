@@ -3,7 +3,7 @@
 use super::{Chunk, Decoder, DecoderLayers, LEVELS, Level};
 use crate::network::dropout::Dropout;
 use crate::network::lanes::{Arithmetic, LANES, Lanes};
-use crate::network::loss::CellLoss;
+use crate::network::loss::{CellLoss, LossSettings};
 use crate::network::parallel::{Pass, for_each_chunk};
 use crate::network::parameters::{DECODER, OBSERVATION, Tensors};
 use crate::network::visited::{LastLayer, LastMaps};
@@ -19,7 +19,7 @@ impl Decoder {
         &mut self,
         parameters: &Tensors,
         layers: &DecoderLayers,
-        window: &Window,
+        (window, settings): (&Window, &LossSettings),
         dropout: &Dropout,
         gradient: &mut Tensors,
     ) -> f64 {
@@ -27,7 +27,9 @@ impl Decoder {
         let n_states = self.shape.n_states;
         let weight = parameters.get(&format!("{}.weight", DECODER[LEVELS]));
         let input = level.doubling().input;
-        let loss = CellLoss::new(parameters.get(OBSERVATION), n_states, window.n_targets());
+        let divisor = settings.divisor(window);
+        let loss = CellLoss::new(parameters.get(OBSERVATION), n_states, divisor);
+        let loss = loss.with_log_floor(settings.log_floor);
         let last = LastLayer::new(input, n_states, weight, level.norm());
         let states = (0..n_states as u16).collect();
         let pass = Loss {
@@ -47,7 +49,7 @@ impl Decoder {
         for chunk in &self.chunks {
             LastLayer::add_gradient(&chunk.d_last, n_states, d_weight);
         }
-        losses().map(CellLoss::sum).sum::<f64>() / window.n_targets() as f64
+        losses().map(CellLoss::sum).sum::<f64>() / divisor as f64
     }
 }
 
