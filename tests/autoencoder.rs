@@ -25,6 +25,18 @@ batch = 4
 replay = 20
 ";
 
+/// The same as the paper prints it.
+fn printed() -> String {
+    let objective = "[objective]\nbelief = \"estimate\"\n";
+    let loss = "trajectories = 3\nloss = \"sum_of_cells\"\nlog_floor = 0.0\n";
+    SETTINGS
+        .replace(
+            "[autoencoder]\n",
+            &format!("{objective}[autoencoder]\n{loss}"),
+        )
+        .replace("[dqn]\n", "[dqn]\ninput = \"before_frame\"\n")
+}
+
 /// Columns of the metrics.
 const LOSS: usize = 2;
 const DQN_LOSS: usize = 6;
@@ -102,7 +114,12 @@ fn the_same_seed_gives_the_same_losses_bit_for_bit() {
 
 #[test]
 fn a_training_that_stopped_goes_on_as_if_it_had_not() {
-    let place = Place::new(SETTINGS);
+    goes_on_as_if_it_had_not_stopped(SETTINGS);
+    goes_on_as_if_it_had_not_stopped(&printed());
+}
+
+fn goes_on_as_if_it_had_not_stopped(settings: &str) {
+    let place = Place::new(settings);
     let flags = format!("{WORLD} --coverage client");
     let whole = Server::start(&flags);
     let name = whole.instance.name();
@@ -116,6 +133,84 @@ fn a_training_that_stopped_goes_on_as_if_it_had_not() {
     assert_eq!(whole, parts);
     let checkpoint = |out| contents(&place.checkpoint(out));
     assert_eq!(checkpoint("whole"), checkpoint("parts"));
+}
+
+#[test]
+fn settings_of_the_loss_and_of_plans_reach_the_training() {
+    let settings = [
+        ("", ""),
+        ("[autoencoder]\n", "[autoencoder]\ntrajectories = 2\n"),
+        (
+            "[autoencoder]\n",
+            "[autoencoder]\nloss = \"sum_of_cells\"\n",
+        ),
+        ("[autoencoder]\n", "[autoencoder]\nlog_floor = 0.001\n"),
+        (
+            "[autoencoder]\n",
+            "[objective]\nbelief = \"estimate\"\n[autoencoder]\n",
+        ),
+    ];
+    let runs = settings.map(|(from, to)| {
+        let place = Place::new(&SETTINGS.replacen(from, to, 1));
+        let rows = place.train("out", &format!("{WORLD} --steps 8"));
+        let loss = rows.into_iter().find(|row| !row[LOSS].is_empty());
+        (loss.expect("an update"), contents(&place.checkpoint("out")))
+    });
+    let [(default, stored), others @ .., (_, planned)] = runs;
+    for (index, (other, _)) in others.iter().enumerate() {
+        assert_eq!(default[1], other[1], "the same step");
+        assert_ne!(default[LOSS], other[LOSS], "{index}");
+    }
+    // Only shown in part, as paths are flown.
+    assert_ne!(
+        stored.bytes["replay.frames"],
+        planned.bytes["replay.frames"]
+    );
+    let has_estimate =
+        |stored: &agent::checkpoint::Contents| stored.tensors.contains_key("state.estimate");
+    assert!(!has_estimate(&stored) && has_estimate(&planned));
+}
+
+#[test]
+fn actions_go_by_what_the_settings_say_and_a_checkpoint_by_its_own() {
+    let inputs = [
+        ("after_frame", 4, Some("state.hidden")),
+        ("before_frame", 4, Some("state.before")),
+        ("summary", 74, None),
+    ];
+    for (input, length, last) in inputs {
+        let place = Place::new(&SETTINGS.replace("[dqn]", &format!("[dqn]\ninput = \"{input}\"")));
+        place.train("out", &format!("{WORLD} --steps 15"));
+        let stored = contents(&place.checkpoint("out"));
+        let rows = |name: &str| -> Vec<Vec<f32>> {
+            let numbers = stored.tensors[name].numbers.chunks(length);
+            numbers.map(<[f32]>::to_vec).collect()
+        };
+        let (before, after) = (rows("dqn.replay.input"), rows("dqn.replay.next"));
+        assert_eq!(before.len(), 15, "{input}");
+        assert_eq!(before[1..], after[..14], "{input}");
+        if let Some(last) = last {
+            assert_eq!(after[14], stored.tensors[last].numbers, "{input}");
+        }
+        let checkpoint = place.checkpoint("out");
+        let checkpoint = checkpoint.display();
+        let worlds = format!("--seeds 3..4 --steps 5 {WORLD} --shooting-samples 16");
+        let policies = "--policies autoencoder_policy,coverage --baseline coverage";
+        let compared = agent(&format!(
+            "compare {policies} --checkpoint {checkpoint} {worlds}"
+        ));
+        assert!(compared.stdout.contains("autoencoder_policy"), "{input}");
+        let other = if input == "summary" {
+            "after_frame"
+        } else {
+            "summary"
+        };
+        let settings = SETTINGS.replace("[dqn]", &format!("[dqn]\ninput = \"{other}\""));
+        std::fs::write(place.path("agent.toml"), settings).expect("settings");
+        let resume = place.words("out", &format!("{WORLD} --steps 8 --resume"));
+        let words = format!("dqn.input: expected {other}, got {input}");
+        check(AGENT, &resume, &[&words]);
+    }
 }
 
 #[test]

@@ -105,8 +105,14 @@ fn the_same_seed_gives_the_same_losses_bit_for_bit() {
 #[test]
 fn training_goes_on_bit_for_bit_where_it_stopped() {
     // 60 steps end in mid-block, mid-window and in the walk; 120 after the first updates.
-    for stops in [&[60_u64][..], &[120], &[22, 61, 100]] {
+    for (stops, belief) in [
+        (&[60_u64][..], "predictor"),
+        (&[120], "estimate"),
+        (&[22, 61, 100], "estimate"),
+    ] {
         let place = Place::new();
+        let settings = format!("{SETTINGS}[objective]\nbelief = \"{belief}\"\n");
+        std::fs::write(place.path("agent.toml"), settings).expect("settings");
         let [whole, parts] = ["whole", "parts"].map(|out| {
             let server = Server::start(&format!("{SMALL} --worlds 2 --seed 4"));
             let train = |flags: String| {

@@ -54,7 +54,7 @@ impl Action {
         }
     }
 
-    /// What the cells are worth under a belief about the time at which the path is observed.
+    /// What the cells are worth under a belief.
     pub fn values(&self, belief: &Belief) -> CellValues {
         let mut values = self.objective.values(belief);
         if self.exploration > 0.0 {

@@ -1,10 +1,12 @@
 //! One agent on one world: plan, then correct and predict. Pure; the wire is elsewhere.
 
 mod parts;
+#[cfg(test)]
+mod tests;
 
 pub use self::parts::numbered_states;
 
-use self::parts::{autoencoder, belief_kind, decider, learned_filter, state_names};
+use self::parts::{autoencoder, basis, belief_kind, decider, learned_filter, state_names};
 use crate::action::Action;
 use crate::belief::{Belief, BeliefError};
 use crate::checkpoint::Problem;
@@ -12,7 +14,7 @@ use crate::config::AgentConfig;
 use crate::estimator::{Filter, LearnedFilter, ZeroEvidence};
 use crate::learned::{Learned, LearnedNetwork};
 use crate::network::{self as networks, Autoencoder};
-use crate::planner::{CellValues, Objective, Plan, Planner, PlanningProblem, Target};
+use crate::planner::{CellValues, Objective, Plan, PlanBasis, Planner, PlanningProblem, Target};
 use crate::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::student::decisions::Decisions;
 use protocol::model::ModelError;
@@ -30,6 +32,7 @@ pub struct Agent {
     policy: Policy,
     objective: Objective,
     estimator: Estimator,
+    basis: PlanBasis,
     /// Says to other agents what the belief is, where it is all that the estimator knows.
     belief_kind: Option<String>,
     planner: Box<dyn Planner + Send>,
@@ -183,6 +186,7 @@ impl Agent {
         Ok(Self {
             policy: policy.clone(),
             objective,
+            basis: basis(policy, &task, config)?,
             estimator,
             belief_kind,
             planner: config.planner(policy),
@@ -209,7 +213,10 @@ impl Agent {
                     objectives,
                 }),
                 Estimator::Autoencoder(follower, _),
-            ) => objectives[network.dqn.best(follower.hidden())],
+            ) => {
+                let input = network.input.of(follower, robot, self.n_moves);
+                objectives[network.dqn.best(&input)]
+            }
             (Some(Decider::Action(decisions)), estimator) => {
                 let decisions = decisions.clone();
                 let action = decisions.decide(estimator.belief(), robot, self.n_moves);
@@ -226,14 +233,15 @@ impl Agent {
     /// As [`Self::plan`], for an action other than the policy's.
     pub fn plan_action(&mut self, action: &Action, robot: Cell, step: u64) -> Plan {
         self.aim = Aim::Action(action.name.clone());
-        let (belief, random) = (self.estimator.belief(), (self.seed, step));
+        let belief = self.basis.belief(self.estimator.belief());
+        let random = (self.seed, step);
         action.plan(&mut *self.planner, belief, robot, self.n_moves, random)
     }
 
     /// As [`Self::plan`], for an objective other than the policy's.
     pub fn plan_for(&mut self, objective: Objective, robot: Cell, step: u64) -> Plan {
         self.aim = Aim::Objective(objective.target);
-        let values: CellValues = objective.values(self.estimator.belief());
+        let values: CellValues = objective.values(self.basis.belief(self.estimator.belief()));
         let problem = PlanningProblem {
             start: robot,
             n_moves: self.n_moves,
@@ -269,6 +277,7 @@ impl Agent {
 
     /// Moves the belief from X_k to X_{k+1} (paper eq. 6).
     pub fn predict(&mut self) {
+        self.basis.see(self.estimator.belief());
         match &mut self.estimator {
             Estimator::None(_) | Estimator::NextTruth(_) => {}
             Estimator::KnownModel(filter) => filter.predict(),

@@ -11,7 +11,9 @@ pub use networks::{AutoencoderConfig, DqnConfig, StepSize};
 use crate::belief::EntropyKind;
 use crate::estimator::Prior;
 use crate::planner::beam::DEFAULT_WIDTH;
-use crate::planner::{BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target};
+use crate::planner::{
+    BasisKind, BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target,
+};
 use crate::policy::{BEAM_BONUS, PlannerKind, Policy};
 use clap::{Args, ValueEnum};
 use serde::{Deserialize, Serialize};
@@ -72,6 +74,9 @@ pub struct ObjectiveConfig {
     pub entropy: EntropyKind,
     /// Whether a cell's value counts at every visit (the paper as printed).
     pub revisits: bool,
+    /// Paths are planned on the `predictor` `u_{k+1}` (the authors' code) or the `estimate` `p_k` (the
+    /// paper).
+    pub belief: BasisKind,
 }
 
 /// The known-model filter's first belief.
@@ -188,6 +193,7 @@ impl Default for ObjectiveConfig {
             beam_bonus: BEAM_BONUS,
             entropy: EntropyKind::Mean,
             revisits: false,
+            belief: BasisKind::Predictor,
         }
     }
 }
@@ -384,5 +390,18 @@ mod tests {
         };
         let error = config.check().expect_err("no beam").to_string();
         assert_eq!(error, "beam_width: expected 1 to 10000, got 0");
+        for (text, words) in [
+            (
+                "[objective]\nbelief = \"prior\"",
+                "unknown variant `prior`, expected `predictor` or `estimate`",
+            ),
+            (
+                "[dqn]\ninput = \"h\"",
+                "unknown variant `h`, expected one of `after_frame`, `before_frame`, `summary`",
+            ),
+        ] {
+            let error = toml::from_str::<AgentConfig>(text).expect_err("no such name");
+            assert!(error.to_string().contains(words), "{error}");
+        }
     }
 }

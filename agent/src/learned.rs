@@ -1,8 +1,10 @@
 //! What checkpoints hold, by kind: all that policies on a learned belief need.
 
 use crate::checkpoint::{self, CheckpointError, Contents, Problem};
+use crate::config::AgentConfig;
 use crate::learner::{self, LearnedModel};
-use crate::network::{Autoencoder, Dqn};
+use crate::network::{Autoencoder, Dqn, DqnInput};
+use crate::planner::BasisKind;
 use crate::policy::EstimatorKind;
 use crate::student::{decisions, network};
 use ndarray::Array2;
@@ -30,6 +32,10 @@ pub struct LearnedNetwork {
     pub autoencoder: Autoencoder,
     /// The choice of objectives.
     pub dqn: Dqn,
+    /// What that sees.
+    pub input: DqnInput,
+    /// What the paths were planned on that it values.
+    pub basis: BasisKind,
     /// The state that pays most.
     pub target: usize,
 }
@@ -103,6 +109,23 @@ impl Learned {
             .as_ref()
             .map(|network| likelihood(&network.autoencoder))
     }
+}
+
+/// The settings that a checkpoint was trained with.
+///
+/// # Errors
+/// [`Problem`] for none, or others than an agent's.
+pub fn settings(contents: &Contents) -> Result<AgentConfig, Problem> {
+    const SETTINGS: &str = "settings";
+    let text = contents.texts.get(SETTINGS);
+    let text = text.ok_or_else(|| Problem::Missing(SETTINGS.into()))?;
+    let wrong = |got: String| Problem::Value {
+        name: SETTINGS.into(),
+        expected: "those of an agent".into(),
+        got,
+    };
+    let config: AgentConfig = toml::from_str(text).map_err(|error| wrong(error.to_string()))?;
+    config.check().map_err(|error| wrong(error.to_string()))
 }
 
 /// `P(y | x)` of a network, shape `[S, O]`.

@@ -9,7 +9,7 @@ use crate::compare::planner_seed;
 use crate::config::AgentConfig;
 use crate::estimator::{LearnedFilter, ZeroEvidence};
 use crate::learner::{LearnedModel, Learner};
-use crate::planner::{Planner, PlanningProblem, Target};
+use crate::planner::{PlanBasis, Planner, PlanningProblem, Target};
 use crate::policy::{PlannerKind, Policy};
 use crate::scoring::{Score, score};
 use protocol::path::fly;
@@ -20,6 +20,8 @@ use std::time::{Duration, Instant};
 pub struct Pilot {
     /// The belief.
     pub filter: LearnedFilter,
+    /// What paths are planned on.
+    basis: PlanBasis,
     /// What the world shows.
     pub observation: Observation,
     walk: Box<dyn Planner + Send>,
@@ -41,6 +43,7 @@ impl Pilot {
     ) -> Self {
         Self {
             filter: LearnedFilter::new(&learned.tables, shape),
+            basis: PlanBasis::new(config.objective.belief),
             walk: config.planner(&Policy::learned(PlannerKind::RandomWalk)),
             beam: config.planner(&Policy::learned(PlannerKind::Beam)),
             seed: planner_seed(config, observation.result.seed),
@@ -59,8 +62,14 @@ impl Pilot {
         let frame = &self.observation.frame;
         learner.see(world, self.filter.belief(), frame);
         self.filter.correct(frame)?;
-        self.filter.predict();
+        self.predict();
         Ok(())
+    }
+
+    /// Moves the belief to the next step.
+    pub fn predict(&mut self) {
+        self.basis.see(self.filter.belief());
+        self.filter.predict();
     }
 
     /// Goes on where a checkpoint left it, if the world still shows what it showed then; else begins
@@ -78,6 +87,9 @@ impl Pilot {
             Some(stand) if stand.is_of(&self.observation) && learner.has_track(world) => {
                 let belief = stand.belief.clone();
                 self.filter = LearnedFilter::with_prior(self.filter.tables(), belief);
+                if let Some(estimate) = &stand.estimate {
+                    self.basis.see(estimate);
+                }
                 Ok(true)
             }
             _ => self.begin(world, learner).map(|()| false),
@@ -102,7 +114,7 @@ impl Pilot {
                 &mut self.beam
             }
         };
-        let values = objective.values(self.filter.belief());
+        let values = objective.values(self.basis.belief(self.filter.belief()));
         let problem = PlanningProblem {
             start: self.observation.robot(),
             n_moves,

@@ -3,6 +3,8 @@
 pub mod decisions;
 pub mod filter;
 pub mod network;
+#[cfg(test)]
+mod tests;
 
 use crate::belief::Belief;
 use crate::checkpoint::Contents;

@@ -1,4 +1,4 @@
-//! A belief in a few numbers: what a learner outside sees in place of the paper's `h_k`.
+//! A belief in a few numbers: what a learner outside, or a DQN, sees in place of the paper's `h_k`.
 //!
 //! The numbers are as many for every grid, from 0 to 1. With S states there are S + 1 layers: the
 //! probability of each state, and the entropy of each cell as a share of the greatest, `log S`. Each
@@ -62,6 +62,12 @@ pub fn summarise(belief: &Belief, robot: Cell, n_moves: usize) -> Vec<f32> {
     });
     let robot = [scaled(robot.row, height), scaled(robot.col, width)];
     means.chain(around).chain(blocks).chain(robot).collect()
+}
+
+/// What a DQN sees of a belief: the summary's square roots, which spread small probabilities.
+pub fn spread_summary(belief: &Belief, robot: Cell, n_moves: usize) -> Vec<f32> {
+    let summary = summarise(belief, robot, n_moves);
+    summary.into_iter().map(f32::sqrt).collect()
 }
 
 /// Entropy of each cell as a share of `log S`, shape `[H, W]`; 0 for a model of one state.

@@ -3,7 +3,9 @@
 use super::{AgentError, Decider, Estimator, Task};
 use crate::config::AgentConfig;
 use crate::estimator::LearnedFilter;
+use crate::learned::settings;
 use crate::learner::LearnedModel;
+use crate::planner::{BasisKind, PlanBasis};
 use crate::policy::{EstimatorKind, Policy};
 use crate::student::decisions::Decisions;
 use protocol::Model;
@@ -43,6 +45,28 @@ pub(super) fn belief_kind(estimator: &Estimator, task: &Task<'_>) -> Option<Stri
     Some(format!(
         "{kind} {checksum:08x}, probabilities [S, H, W] as f32"
     ))
+}
+
+/// What a policy plans on: what the settings say, but where a DQN decides what it was trained with, as
+/// its values are of such paths. Who is told the state that a path will meet plans on that.
+pub(super) fn basis(
+    policy: &Policy,
+    task: &Task<'_>,
+    config: &AgentConfig,
+) -> Result<PlanBasis, AgentError> {
+    let learned = task.learned;
+    let kind = match policy.estimator {
+        EstimatorKind::NextTruth => BasisKind::Predictor,
+        EstimatorKind::Autoencoder if policy.is_decided => {
+            present(policy, &learned.network, "an autoencoder")?.basis
+        }
+        _ if policy.is_decided => {
+            let contents = present(policy, &learned.decisions, "decisions")?;
+            settings(contents)?.objective.belief
+        }
+        _ => config.objective.belief,
+    };
+    Ok(PlanBasis::new(kind))
 }
 
 /// What decides for a policy: the DQN learned beside its belief, or that of a known model's.

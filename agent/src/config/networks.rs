@@ -1,7 +1,9 @@
 //! Settings of the paper's networks: the sections `[autoencoder]` and `[dqn]` of `config/agent.toml`.
 
 use super::ConfigError;
-use crate::network::{AdamSettings, AutoencoderSettings, DqnSettings, LossKind, LossSettings};
+use crate::network::{
+    AdamSettings, AutoencoderSettings, DqnInput, DqnSettings, LossKind, LossSettings,
+};
 use serde::{Deserialize, Serialize};
 
 /// The authors' step sizes.
@@ -159,6 +161,8 @@ impl AutoencoderConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DqnConfig {
+    /// What it sees: `after_frame`, `before_frame` (paper eq. 17) or `summary`.
+    pub input: DqnInput,
     /// Transitions that the replay keeps, at least a batch, at most 1,000,000.
     pub replay: usize,
     /// Transitions of an update, 1 to 65,536.
@@ -199,6 +203,7 @@ impl DqnConfig {
     pub fn paper() -> Self {
         let settings = DqnSettings::paper();
         Self {
+            input: DqnInput::AfterFrame,
             replay: settings.replay,
             batch: settings.batch,
             gamma: settings.gamma,

@@ -93,6 +93,8 @@ pub struct Autoencoder {
     pub(crate) adam: Adam,
     pub(crate) n_updates: u64,
     pub(crate) hidden: Vec<f32>,
+    /// The hidden vector before the last frame.
+    before: Vec<f32>,
     /// The predictor `u_k` of the next frame.
     prediction: Belief,
     /// Of the present parameters, if any frame was read since they changed.
@@ -127,6 +129,7 @@ impl Autoencoder {
             parameters,
             n_updates: 0,
             hidden: Vec::new(),
+            before: Vec::new(),
             prediction: Belief::uniform(n_states, grid),
             inference: None,
             workspace: None,
@@ -153,6 +156,16 @@ impl Autoencoder {
     /// The hidden vector `h_k`.
     pub fn hidden(&self) -> &[f32] {
         &self.hidden
+    }
+
+    /// The hidden vector before the last frame was read.
+    pub fn hidden_before(&self) -> &[f32] {
+        &self.before
+    }
+
+    /// Puts another in place of [`Self::hidden_before`].
+    pub fn set_hidden_before(&mut self, before: Vec<f32>) {
+        self.before = before;
     }
 
     /// The predictor `u_k` of the next frame.
@@ -214,6 +227,7 @@ impl Autoencoder {
     /// If `hidden` has another length.
     pub fn restart(&mut self, hidden: Vec<f32>) {
         assert_eq!(hidden.len(), self.shape.hidden, "numbers of h");
+        self.before.clone_from(&hidden);
         self.hidden = hidden;
         let mut inference = self.take_inference();
         let mut prediction = self.no_prediction();
@@ -259,7 +273,7 @@ impl Autoencoder {
             let (update, tensor) = (self.n_updates, "the hidden vector".into());
             return Err(NotFinite { update, tensor }.into());
         }
-        self.hidden = hidden;
+        self.before = std::mem::replace(&mut self.hidden, hidden);
         self.prediction = accepted(prediction);
         Ok(estimate)
     }

@@ -3,11 +3,13 @@
 //! Its input is the autoencoder's hidden vector, or any other summary of the belief. A transition is
 //! never terminal: episodes are cut off, the world goes on.
 
+mod input;
 mod learning;
 mod memory;
 mod state;
 mod track;
 
+pub use input::DqnInput;
 pub use track::Track;
 
 use super::adam::{Adam, AdamSettings};

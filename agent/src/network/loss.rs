@@ -108,7 +108,9 @@ impl CellLoss {
             let mut d_q = Lanes::ZERO;
             for lane in 0..LANES {
                 let hit = usize::from(values[lane]) == observed;
-                let term = self.log_floor + if hit { q.0[lane] } else { 1.0 - q.0[lane] };
+                // Rounding may take q above one.
+                let miss = (1.0 - q.0[lane]).max(0.0);
+                let term = self.log_floor + if hit { q.0[lane] } else { miss };
                 likelihood[lane] *= term;
                 let slope = if hit { -self.weight } else { self.weight };
                 d_q.0[lane] = if seen[lane] { slope / term } else { 0.0 };

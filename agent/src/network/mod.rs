@@ -52,7 +52,7 @@ mod x86;
 pub use adam::{Adam, AdamSettings};
 pub use autoencoder::{Autoencoder, AutoencoderSettings, NotFinite, StepError};
 pub use checkpoint::CheckpointError;
-pub use dqn::{Dqn, DqnSettings, Track, Transition};
+pub use dqn::{Dqn, DqnInput, DqnSettings, Track, Transition};
 pub use dropout::{ChannelMask, Dropout};
 pub use gradient::Trajectory;
 pub use loss::{LossKind, LossSettings};

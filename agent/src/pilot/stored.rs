@@ -13,16 +13,19 @@ use std::ops::Range;
 const PLACES: &str = "worlds.places";
 const FRAMES: &str = "worlds.frames";
 const BELIEFS: &str = "worlds.beliefs";
+const ESTIMATES: &str = "worlds.estimates";
 
 /// Numbers of a place.
 const N_PLACE: usize = size_of::<Place>() / size_of::<u64>();
 
-/// Where a checkpoint left a world: what it showed, and the belief about what comes next.
+/// Where a checkpoint left a world: what it showed, the belief about what comes next, and the estimate
+/// behind it, where paths are planned on that.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Stand {
     place: Place,
     frame: Vec<u8>,
     pub(super) belief: Belief,
+    pub(super) estimate: Option<Belief>,
 }
 
 impl Stand {
@@ -51,20 +54,26 @@ impl Stand {
         contents: &mut Contents,
     ) {
         let (height, width) = shape.dim();
-        let (mut places, mut frames, mut beliefs) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut places, mut frames) = (Vec::new(), Vec::new());
+        let (mut beliefs, mut estimates) = (Vec::new(), Vec::new());
         let (mut n_pilots, mut n_states) = (0, 0);
         for (world, pilot) in pilots {
             places.push(u64::from(world));
             places.extend(pilot.observation.place());
             frames.extend_from_slice(pilot.observation.frame.as_bytes());
             beliefs.extend_from_slice(pilot.filter.belief().as_slice());
+            estimates.extend(pilot.basis.estimate().map(Belief::as_slice));
             n_states = pilot.filter.belief().n_states();
             n_pilots += 1;
         }
-        let beliefs = Tensor {
+        let tensor = |numbers| Tensor {
             shape: vec![n_pilots, n_states, height, width],
-            numbers: beliefs,
+            numbers,
         };
+        if estimates.len() == n_pilots {
+            let estimates = tensor(estimates.concat());
+            contents.tensors.insert(ESTIMATES.into(), estimates);
+        }
         let frames = Bytes {
             shape: vec![n_pilots, height, width],
             bytes: frames,
@@ -72,7 +81,7 @@ impl Stand {
         let places = Bytes::of_counts(places);
         contents.bytes.insert(PLACES.into(), places);
         contents.bytes.insert(FRAMES.into(), frames);
-        contents.tensors.insert(BELIEFS.into(), beliefs);
+        contents.tensors.insert(BELIEFS.into(), tensor(beliefs));
     }
 
     /// What [`Self::store`] put there, by world; none of another grid.
@@ -94,25 +103,33 @@ impl Stand {
         let frames = contents.bytes(FRAMES, &[places.len(), height, width])?;
         let dim = [places.len(), n_states, height, width];
         let beliefs = contents.tensor(BELIEFS, &dim)?;
+        let estimates = match contents.tensors.contains_key(ESTIMATES) {
+            true => Some(contents.tensor(ESTIMATES, &dim)?),
+            false => None,
+        };
         let n_cells = height * width;
+        let belief = |name: &str, numbers: &[f32], index: usize| {
+            let numbers = numbers[index * n_states * n_cells..][..n_states * n_cells].to_vec();
+            let numbers = Array3::from_shape_vec((n_states, height, width), numbers);
+            let numbers = numbers.expect("invariant: S x H x W numbers");
+            let belief = Belief::from_probabilities(numbers);
+            belief.map_err(|error| wrong(name, "beliefs", error))
+        };
         let each = places.iter().zip(frames.chunks_exact(n_cells));
-        let each = each.zip(beliefs.chunks_exact(n_states * n_cells));
-        let stand = |((numbers, frame), belief): ((&[u64; N_PLACE + 1], &[u8]), &[f32])| {
+        let stand = |(index, (numbers, frame)): (usize, (&[u64; N_PLACE + 1], &[u8]))| {
             // Before the place, the world.
             let &[world, ref place @ ..] = numbers;
             let world = u32::try_from(world).map_err(|_| wrong(PLACES, "worlds", world))?;
-            let belief = Array3::from_shape_vec((n_states, height, width), belief.to_vec());
-            let belief = belief.expect("invariant: S x H x W numbers");
-            let belief = Belief::from_probabilities(belief);
-            let belief = belief.map_err(|error| wrong(BELIEFS, "beliefs", error))?;
+            let estimate = estimates.map(|estimates| belief(ESTIMATES, estimates, index));
             let stand = Self {
                 place: *place,
                 frame: frame.to_vec(),
-                belief,
+                belief: belief(BELIEFS, beliefs, index)?,
+                estimate: estimate.transpose()?,
             };
             Ok((world, stand))
         };
-        each.map(stand).collect()
+        each.enumerate().map(stand).collect()
     }
 }
 

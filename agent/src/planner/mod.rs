@@ -3,12 +3,14 @@
 //! An [`Objective`] turns a belief into [`CellValues`] once; a [`Planner`] then looks for the path
 //! with the best score, which is eq. 15 with the sign turned and without its constant factor.
 
+pub mod basis;
 pub mod beam;
 pub mod objective;
 pub mod random_walk;
 pub mod shooting;
 mod window;
 
+pub use basis::{BasisKind, PlanBasis};
 pub use beam::BeamSearch;
 pub use objective::{CellValues, Objective, Target};
 pub use random_walk::RandomWalk;

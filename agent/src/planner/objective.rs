@@ -79,8 +79,7 @@ impl Objective {
         }
     }
 
-    /// What the cells are worth under a belief about the time at which the path is observed: the
-    /// predictor `u_{k+1}`, as the world moves before it is seen.
+    /// What the cells are worth under a belief, which [`super::PlanBasis`] chooses.
     pub fn values(&self, belief: &Belief) -> CellValues {
         let value = match self.target {
             Target::State(state) => belief.probability(state).to_owned(),

@@ -12,10 +12,10 @@ use crate::estimator::{Filter, ZeroEvidence};
 use crate::metrics::Tick;
 use crate::network::dqn::Track;
 use crate::network::{Dqn, Transition};
-use crate::planner::BeamSearch;
+use crate::planner::{BeamSearch, PlanBasis};
 use crate::policy::EstimatorKind;
 use crate::scoring::score;
-use crate::summary::{summarise, summary_length};
+use crate::summary::{spread_summary, summary_length};
 use ndarray::Array2;
 use protocol::{Cell, Model, Move};
 use rayon::prelude::*;
@@ -58,6 +58,7 @@ pub struct DecisionsStudent {
 /// One world's robot.
 struct Pilot {
     filter: Filter,
+    basis: PlanBasis,
     planner: BeamSearch,
     observation: Observation,
     input: Vec<f32>,
@@ -65,14 +66,6 @@ struct Pilot {
     /// Time that its last plan took.
     planning: Duration,
     track: Track,
-}
-
-/// What the DQN sees of a belief: its summary, of which the square root spreads small probabilities;
-/// from 0 to 1, `summary_length` of them.
-pub fn input(belief: &Belief, robot: Cell, n_moves: usize) -> Vec<f32> {
-    let summary = summarise(belief, robot, n_moves);
-    let spread = summary.iter().map(|share| share.sqrt());
-    spread.collect()
 }
 
 impl Decisions {
@@ -90,7 +83,7 @@ impl Decisions {
 
     /// The action that is worth most on a belief.
     pub fn decide(&self, belief: &Belief, robot: Cell, n_moves: usize) -> &Action {
-        &self.actions.actions()[self.dqn.best(&input(belief, robot, n_moves))]
+        &self.actions.actions()[self.dqn.best(&spread_summary(belief, robot, n_moves))]
     }
 
     /// As a checkpoint, without settings.
@@ -163,9 +156,12 @@ impl Pilot {
     fn new(student: &DecisionsStudent, observation: Observation) -> Result<Self, ZeroEvidence> {
         let mut filter = student.filter.clone();
         filter.correct(&observation.frame)?;
+        let mut basis = PlanBasis::new(student.config.objective.belief);
+        basis.see(filter.belief());
         filter.predict();
         Ok(Self {
-            input: input(filter.belief(), observation.robot(), student.site.n_moves),
+            basis,
+            input: spread_summary(filter.belief(), observation.robot(), student.site.n_moves),
             filter,
             planner: BeamSearch::new(student.config.beam_width),
             observation,
@@ -222,7 +218,8 @@ impl Student for DecisionsStudent {
             let action = &decisions.actions.actions()[pilot.action];
             let result = &pilot.observation.result;
             let random = (planner_seed(config, result.seed), result.step);
-            let (robot, belief) = (pilot.observation.robot(), pilot.filter.belief());
+            let robot = pilot.observation.robot();
+            let belief = pilot.basis.belief(pilot.filter.belief());
             let plan = action.plan(&mut pilot.planner, belief, robot, n_moves, random);
             pilot.planning = start.elapsed();
             plan.moves
@@ -256,8 +253,10 @@ impl Student for DecisionsStudent {
         let n_moves = self.site.n_moves;
         let config = &self.config.decisions;
         let bring = |pilot: &mut Pilot| {
+            pilot.basis.see(pilot.filter.belief());
             pilot.filter.predict();
-            let next = input(pilot.filter.belief(), pilot.observation.robot(), n_moves);
+            let robot = pilot.observation.robot();
+            let next = spread_summary(pilot.filter.belief(), robot, n_moves);
             pilot.bring(config, next)
         };
         let transitions: Vec<_> = self.pilots.par_iter_mut().map(bring).collect();

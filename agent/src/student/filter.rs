@@ -159,9 +159,7 @@ impl Student for FilterStudent {
             planning: self.pilots[index].planning,
         };
         let impressions = watched.iter().map(impression).collect();
-        self.pilots
-            .par_iter_mut()
-            .for_each(|pilot| pilot.filter.predict());
+        self.pilots.par_iter_mut().for_each(Pilot::predict);
         tick.n_worlds = self.pilots.len() as u64;
         tick.world_steps = self.learner.world_steps();
         Ok((tick, impressions))

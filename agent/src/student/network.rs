@@ -52,7 +52,7 @@ pub struct NetworkStudent {
 /// The action of a step, what it was chosen on, and the cells that its path visits.
 struct Decision {
     visited: Vec<usize>,
-    hidden: Vec<f32>,
+    input: Vec<f32>,
     action: usize,
     value: f32,
 }
@@ -90,19 +90,30 @@ impl NetworkStudent {
         let start = Instant::now();
         let estimate = self.progress.autoencoder.step(frame);
         self.times[1].1 += start.elapsed();
-        Ok(estimate?)
+        let estimate = estimate?;
+        self.progress.basis.see(&estimate);
+        Ok(estimate)
+    }
+
+    /// What the next action goes by.
+    fn input(&self) -> Vec<f32> {
+        let Progress {
+            input, autoencoder, ..
+        } = &self.progress;
+        input.of(autoencoder, self.observation().robot(), self.site.n_moves)
     }
 
     /// Adds the transition to the DQN's replay, and what the path met to the estimate of rewards.
     fn remember(&mut self, estimate: &Belief, reward: f64) {
+        let next = self.input();
         if let Some(decision) = &self.decision {
             let met = met(estimate, decision.visited.iter().copied());
             self.progress.reward.add(&met, reward);
             let step = Transition {
-                input: decision.hidden.clone(),
+                input: decision.input.clone(),
                 action: decision.action,
                 reward: reward as f32,
-                next: self.progress.autoencoder.hidden().to_vec(),
+                next,
             };
             if let Some(transition) = self.track.add(step) {
                 self.progress.dqn.remember(transition);
@@ -178,14 +189,15 @@ impl Student for NetworkStudent {
 
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let start = Instant::now();
-        let hidden = self.progress.autoencoder.hidden().to_vec();
-        let dqn = &self.progress.dqn;
+        let input = self.input();
+        let Progress { dqn, basis, .. } = &self.progress;
         let action = match self.is_frozen {
-            true => dqn.best(&hidden),
-            false => dqn.act(&hidden, self.progress.iterations),
+            true => dqn.best(&input),
+            false => dqn.act(&input, self.progress.iterations),
         };
-        let value = dqn.values(&hidden)[action];
-        let values = self.objectives[action].values(self.progress.autoencoder.prediction());
+        let value = dqn.values(&input)[action];
+        let belief = basis.belief(self.progress.autoencoder.prediction());
+        let values = self.objectives[action].values(belief);
         let observation = self.observation();
         let problem = PlanningProblem {
             start: observation.robot(),
@@ -197,7 +209,7 @@ impl Student for NetworkStudent {
         let plan = self.planner.plan(&problem);
         self.decision = Some(Decision {
             visited: fly(self.site.shape, problem.start, &plan.moves).visited,
-            hidden,
+            input,
             action,
             value,
         });

@@ -1,15 +1,21 @@
 //! What Algorithm 1 has learned, and where it stands: as a checkpoint, and from one.
 
+use crate::belief::Belief;
 use crate::checkpoint::{Bytes, Contents, Problem, Tensor};
 use crate::client::Place;
 use crate::config::AgentConfig;
-use crate::learned::LearnedNetwork;
-use crate::network::{Autoencoder, Dqn, NetworkShape, Replay, Tensors};
+use crate::learned::{LearnedNetwork, settings};
+use crate::network::{Autoencoder, Dqn, DqnInput, NetworkShape, Replay, Tensors};
+use crate::planner::PlanBasis;
 use crate::policy::Policy;
 use crate::reward::RewardEstimate;
 use crate::student::Site;
 use protocol::model::MAX_VALUES;
-use protocol::{Frame, Shape};
+use protocol::{Frame, Probabilities, Shape};
+
+/// Names in checkpoints of what paths are planned on and actions go by, where these are wanted.
+const ESTIMATE: &str = "state.estimate";
+const BEFORE: &str = "state.before";
 
 /// What is learned, and where learning stands.
 pub struct Progress {
@@ -17,6 +23,10 @@ pub struct Progress {
     pub autoencoder: Autoencoder,
     /// The choice of objectives.
     pub dqn: Dqn,
+    /// What that sees.
+    pub input: DqnInput,
+    /// What paths are planned on.
+    pub basis: PlanBasis,
     /// The frames that are learned from.
     pub replay: Replay,
     /// Which state pays.
@@ -35,8 +45,12 @@ impl Progress {
         let (seed, grid) = (config.seed, site.shape);
         let autoencoder = Autoencoder::new(settings, grid, n_states, site.n_observations, seed);
         let n_actions = Policy::network_choices(n_states).len();
+        let input = config.dqn.input;
+        let n_inputs = input.length(settings.hidden, n_states);
         Self {
-            dqn: Dqn::new(config.dqn.settings(), settings.hidden, n_actions, seed),
+            dqn: Dqn::new(config.dqn.settings(), n_inputs, n_actions, seed),
+            input,
+            basis: PlanBasis::new(config.objective.belief),
             autoencoder,
             replay: Replay::new(settings.replay),
             reward: RewardEstimate::new(n_states),
@@ -57,6 +71,8 @@ impl Progress {
             target: self.target(),
             autoencoder: self.autoencoder,
             dqn: self.dqn,
+            input: self.input,
+            basis: self.basis.kind(),
         }
     }
 
@@ -66,6 +82,7 @@ impl Progress {
         for (name, shape, numbers) in self.autoencoder.named_numbers() {
             contents.tensors.insert(name, Tensor { shape, numbers });
         }
+        self.save_stand(&mut contents);
         self.dqn.save(&mut contents);
         let frames = self
             .replay
@@ -109,23 +126,34 @@ impl Progress {
         contents
     }
 
+    /// What is behind the state: the estimate and the hidden vector before it.
+    fn save_stand(&self, contents: &mut Contents) {
+        let mut add = |name: &str, shape: &[usize], numbers: &[f32]| {
+            let (shape, numbers) = (shape.to_vec(), numbers.to_vec());
+            contents
+                .tensors
+                .insert(name.into(), Tensor { shape, numbers });
+        };
+        if let Some(estimate) = self.basis.estimate() {
+            add(ESTIMATE, estimate.view().shape(), estimate.as_slice());
+        }
+        if self.input == DqnInput::BeforeFrame {
+            let before = self.autoencoder.hidden_before();
+            add(BEFORE, &[before.len()], before);
+        }
+    }
+
     /// From a checkpoint, with its own settings.
     ///
     /// # Errors
     /// [`Problem`] names what is missing or of another form.
     pub fn read(contents: &Contents) -> Result<Self, Problem> {
-        let settings = contents.texts.get("settings");
-        let settings = settings.ok_or_else(|| Problem::Missing("settings".into()))?;
+        let config = settings(contents)?;
         let wrong = |name: &str, expected: &str, got: String| Problem::Value {
             name: name.into(),
             expected: expected.into(),
             got,
         };
-        let config: AgentConfig = toml::from_str(settings)
-            .map_err(|error| wrong("settings", "those of an agent", error.to_string()))?;
-        let config = config
-            .check()
-            .map_err(|error| wrong("settings", "those of an agent", error.to_string()))?;
         let count = |name: &str| contents.count(name).map(|count| count as usize);
         let shape = Shape::new(count("height")?, count("width")?);
         let observations = count("observations")?;
@@ -151,11 +179,20 @@ impl Progress {
     /// # Errors
     /// [`Problem`] names what is missing or of another form; some of it may have been taken over then.
     pub fn load(&mut self, contents: &Contents) -> Result<(), Problem> {
+        let input = settings(contents)?.dqn.input;
+        if input != self.input {
+            return Err(Problem::Value {
+                name: "dqn.input".into(),
+                expected: self.input.label().into(),
+                got: input.label().into(),
+            });
+        }
         let numbers = |name: &str, dims: &[usize]| contents.tensor(name, dims).map(<[f32]>::to_vec);
         squares_are_not_negative(contents)?;
         let counters = [contents.count("adam_steps")?, contents.count("updates")?];
         self.autoencoder.load(numbers, counters)?;
         self.dqn.load(contents)?;
+        self.load_stand(contents)?;
         let n_states = self.reward.rewards.len();
         self.reward.products = contents.floats("reward.products", n_states * n_states)?;
         self.reward.rewards = contents.floats("reward.rewards", n_states)?;
@@ -170,6 +207,28 @@ impl Progress {
                 got: got.len().to_string(),
             })?),
         };
+        Ok(())
+    }
+
+    /// What [`Self::save_stand`] put there. Without an estimate, as where others were not wanted, the next
+    /// path is planned on the predictor.
+    fn load_stand(&mut self, contents: &Contents) -> Result<(), Problem> {
+        if contents.tensors.contains_key(ESTIMATE) {
+            let dim = self.autoencoder.prediction().view().dim();
+            let numbers = contents.tensor(ESTIMATE, &[dim.0, dim.1, dim.2])?.to_vec();
+            let estimate = Probabilities::from_shape_vec(dim, numbers);
+            let estimate = estimate.expect("invariant: the tensor has this shape");
+            let estimate = Belief::from_probabilities(estimate);
+            self.basis.see(&estimate.map_err(|error| Problem::Value {
+                name: ESTIMATE.into(),
+                expected: "a belief".into(),
+                got: error.to_string(),
+            })?);
+        }
+        if self.input == DqnInput::BeforeFrame {
+            let before = contents.tensor(BEFORE, &[self.autoencoder.hidden().len()])?;
+            self.autoencoder.set_hidden_before(before.to_vec());
+        }
         Ok(())
     }
 

@@ -1,0 +1,146 @@
+//! Which belief students plan on.
+
+use super::decisions::{Decisions, DecisionsStudent};
+use super::filter::FilterStudent;
+use super::network::{NetworkStudent, Progress};
+use super::{Site, Student};
+use crate::action::ActionSet;
+use crate::belief::Belief;
+use crate::client::Observation;
+use crate::compare::planner_seed;
+use crate::config::AgentConfig;
+use crate::estimator::Filter;
+use crate::estimator::learned_filter::Dimensions;
+use crate::planner::{BasisKind, Objective, PlanningProblem, Target};
+use crate::policy::{PlannerKind, Policy};
+use protocol::message::StepResult;
+use protocol::randomness::split_mix;
+use protocol::{Cell, Frame, Model, Move, Shape};
+
+const ROBOT: Cell = Cell { row: 4, col: 4 };
+
+fn site() -> Site {
+    Site {
+        shape: Shape::new(8, 9).expect("test shape"),
+        n_observations: 3,
+        n_moves: 6,
+        worlds: 0..1,
+    }
+}
+
+fn config(belief: BasisKind) -> AgentConfig {
+    let mut config = AgentConfig {
+        beam_width: 8,
+        shooting_samples: 64,
+        ..AgentConfig::default()
+    };
+    config.objective.belief = belief;
+    config
+}
+
+fn observation(step: u64) -> Observation {
+    let mut frame = Frame::empty(site().shape);
+    for cell in 0..site().shape.n_cells() {
+        let bits = split_mix(step, cell as u64);
+        if bits.is_multiple_of(4) {
+            frame.observe(cell, (bits >> 32) as u8 % 3);
+        }
+    }
+    let (row, col) = (ROBOT.row as u32, ROBOT.col as u32);
+    let result = StepResult {
+        step,
+        row,
+        col,
+        ..StepResult::default()
+    };
+    Observation { result, frame }
+}
+
+/// The path that a policy's planner finds for an objective.
+fn path(
+    config: &AgentConfig,
+    policy: &Policy,
+    objective: Objective,
+    belief: &Belief,
+    step: u64,
+) -> Vec<Move> {
+    let problem = PlanningProblem {
+        start: ROBOT,
+        n_moves: site().n_moves,
+        values: &objective.values(belief),
+        seed: planner_seed(config, 0),
+        step,
+    };
+    config.planner(policy).plan(&problem).moves
+}
+
+/// A frozen student must plan on one of the beliefs. `paths`: what it may choose among on a belief, where
+/// a state pays most, at a step.
+fn check(
+    mut student: impl Student,
+    basis: BasisKind,
+    paths: impl Fn(&Belief, usize, u64) -> Vec<Vec<Move>>,
+) {
+    student.freeze();
+    student.attach(vec![observation(0)]).expect("possible");
+    let mut all = [true; 2];
+    for step in 1..9 {
+        student.plan();
+        let seen = vec![observation(step)];
+        let (_, impressions) = student.take_in(seen, &[0]).expect("possible");
+        let (predictor, target) = student.belief().expect("a belief");
+        let beliefs = [&impressions[0].belief, predictor];
+        let paths = beliefs.map(|belief| paths(belief, target, step));
+        let path = student.plan().remove(0);
+        for (all, paths) in all.iter_mut().zip(&paths) {
+            *all &= paths.contains(&path);
+        }
+    }
+    let expected = match basis {
+        BasisKind::Estimate => [true, false],
+        BasisKind::Predictor => [false, true],
+    };
+    assert_eq!(all, expected, "{}, {basis:?}", student.kind());
+}
+
+#[test]
+fn students_plan_on_the_belief_that_settings_say() {
+    for basis in [BasisKind::Predictor, BasisKind::Estimate] {
+        let config = &config(basis);
+        let dimensions = Dimensions {
+            n_states: 3,
+            n_observations: 3,
+            kernel: (3, 3),
+        };
+        let student = FilterStudent::new(dimensions, site(), config);
+        check(student, basis, |belief, target, step| {
+            let policy = Policy::learned(PlannerKind::Beam);
+            let objective = Objective {
+                target: Target::State(target),
+                ..config.objective(&policy)
+            };
+            vec![path(config, &policy, objective, belief, step)]
+        });
+        let student = NetworkStudent::new(Progress::first(&site(), config), site(), config);
+        check(student, basis, |belief, _, step| {
+            let choices = Policy::network_choices(3);
+            let path = |choice| path(config, choice, config.objective(choice), belief, step);
+            choices.iter().map(path).collect()
+        });
+        let model = Model::wildfire();
+        let filter = Filter::new(&model, Belief::uniform(3, site().shape)).expect("valid");
+        let decisions = Decisions::first(&model, &config.decisions, 0);
+        let student = DecisionsStudent::new(decisions, filter, &model, site(), config);
+        let actions = ActionSet::beam(&model);
+        let beam = Policy::learned(PlannerKind::Beam);
+        check(student, basis, |belief, _, step| {
+            let path = |action: &crate::action::Action| {
+                let random = (planner_seed(config, 0), step);
+                let mut planner = config.planner(&beam);
+                let plan = action.plan(&mut *planner, belief, ROBOT, site().n_moves, random);
+                plan.moves
+            };
+            actions.actions().iter().map(path).collect()
+        });
+    }
+}
