@@ -10,6 +10,9 @@ use serde::{Deserialize, Serialize};
 const PAPER_RATE: f64 = 1e-4;
 const PAPER_DQN_RATE: f64 = 0.01;
 
+/// What the authors add inside the loss' logarithms.
+const PAPER_LOG_FLOOR: f64 = 1e-10;
+
 /// A step size that vanishes: `rate (1 + n / steady)^-power` at iteration n.
 ///
 /// With powers of more than one half and at most one, sums of step sizes diverge and those of their
@@ -69,7 +72,7 @@ pub struct AutoencoderConfig {
     /// authors' code), or `sum_of_cells`, the number of predicted frames K (paper eqs. 8 and 11).
     pub loss: LossKind,
     /// Added inside the loss' logarithms, 0 to 0.001; 0: they are exact.
-    pub log_floor: f32,
+    pub log_floor: f64,
     /// Adam's decay of the mean of gradients, and of the mean of their squares.
     pub betas: [f32; 2],
     /// Adam's step size.
@@ -102,7 +105,7 @@ impl AutoencoderConfig {
             replay_frames: settings.replay,
             full_frames: 1_000,
             loss: settings.loss.kind,
-            log_floor: settings.loss.log_floor,
+            log_floor: PAPER_LOG_FLOOR,
             betas: settings.adam.betas,
             step_size: StepSize::constant(PAPER_RATE),
         }
@@ -130,7 +133,7 @@ impl AutoencoderConfig {
         for (setting, got, least, most) in sizes {
             between(setting, got, least, most)?;
         }
-        within("autoencoder.log_floor", f64::from(self.log_floor), 0.001)?;
+        within("autoencoder.log_floor", self.log_floor, 0.001)?;
         for beta in self.betas {
             within("autoencoder.betas", f64::from(beta), 0.999_999)?;
         }
@@ -147,7 +150,7 @@ impl AutoencoderConfig {
             replay: self.replay_frames,
             loss: LossSettings {
                 kind: self.loss,
-                log_floor: self.log_floor,
+                log_floor: self.log_floor as f32,
             },
             adam: AdamSettings {
                 betas: self.betas,
