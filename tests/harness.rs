@@ -22,6 +22,9 @@ use tempfile::TempDir;
 /// How long anything may take that should take milliseconds: less than a lease lasts, 30 s.
 pub const PATIENCE: Duration = Duration::from_secs(25);
 
+/// How long a server that has just begun may take to answer, before it is asked again.
+const START: Duration = Duration::from_secs(3);
+
 /// A small, quick server: 5 x 7 cells, 6 moves, 20 steps of burn-in.
 pub const SMALL: &str = "--height 5 --width 7 --moves 6 --burn-in 20";
 
@@ -133,7 +136,7 @@ impl Server {
     pub fn start_with(instance: &Instance, flags: &[&str]) -> Self {
         let server = Self::start_without_waiting(instance, flags);
         let mut problem = String::new();
-        let answers = eventually(PATIENCE, || match status(instance) {
+        let answers = eventually(2 * PATIENCE, || match status_within(instance, START) {
             Ok(status) => !status.worlds.iter().any(|world| world.resetting),
             Err(error) => {
                 problem = error.to_string();
@@ -157,7 +160,7 @@ impl Server {
     pub fn start_in_burn_in(instance: &Instance, flags: &str) -> Self {
         let flags: Vec<&str> = flags.split_whitespace().collect();
         let server = Self::start_without_waiting(instance, &flags);
-        let answers = eventually(PATIENCE, || status(instance).is_ok());
+        let answers = eventually(PATIENCE, || status_within(instance, START).is_ok());
         assert!(answers, "{}", server.program.stderr());
         server
     }
@@ -248,8 +251,12 @@ pub fn eventually(limit: Duration, mut holds: impl FnMut() -> bool) -> bool {
 
 /// The server's status, over a connection of its own.
 pub fn status(instance: &Instance) -> Result<ServerStatus, ConnectionError> {
-    let mut connection = Connection::open(instance, "tests", PATIENCE)?;
-    match connection.control(&Request::Status {}, PATIENCE)? {
+    status_within(instance, PATIENCE)
+}
+
+fn status_within(instance: &Instance, limit: Duration) -> Result<ServerStatus, ConnectionError> {
+    let mut connection = Connection::open(instance, "tests", limit)?;
+    match connection.control(&Request::Status {}, limit)? {
         Reply::Status(status) => Ok(status),
         other => panic!("expected a status, got {other:?}"),
     }
