@@ -31,7 +31,6 @@ def test_damaged_pictures_are_told_and_do_not_flood_the_console(watched):
     told.append(True)
     look.eventually(lambda: look.text("state") == "serving", "pictures again")
     assert not look.at("note").is_visible()
-    assert len(damaged) >= 10
     assert look.heard("expected 4 bytes") == 1
 
 
