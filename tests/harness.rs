@@ -102,6 +102,12 @@ impl Program {
         }
     }
 
+    /// Kills it as no handler can prevent, unless it has ended; returns when it is gone.
+    pub fn kill(mut self) {
+        self.child.kill().expect("kill the program");
+        self.child.wait().expect("wait for the program");
+    }
+
     /// Waits until its standard error says something.
     pub fn wait_for_words(&self, words: &str, limit: Duration) {
         let said = eventually(limit, || self.stderr().contains(words));
@@ -201,9 +207,8 @@ impl Server {
     }
 
     /// Kills it as no handler can prevent; returns when it is gone.
-    pub fn kill(mut self) {
-        self.program.child.kill().expect("kill the server");
-        self.program.child.wait().expect("wait for the server");
+    pub fn kill(self) {
+        self.program.kill();
     }
 }
 

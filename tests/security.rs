@@ -50,7 +50,7 @@ fn places() -> (Vec<PathBuf>, Vec<PathBuf>) {
         files.extend(below.map(|entry| entry.path()));
         next += 1;
     }
-    let prefix = format!("emberwatch_{}_", getuid().as_raw());
+    let prefix = format!("emberwatch-{}_", getuid().as_raw());
     let segments = std::fs::read_dir(SHARED_MEMORY)
         .expect("shared memory")
         .flatten();
@@ -90,7 +90,7 @@ fn another_user_cannot_connect_observe_read_or_remove() {
     let (files, segments) = places();
     let ours = (
         channel_directory(),
-        format!("emberwatch_{}_", getuid().as_raw()),
+        format!("emberwatch-{}_", getuid().as_raw()),
     );
     clean_up(USERS[0]);
     as_user(USERS[0], || {
@@ -146,8 +146,8 @@ fn another_user_cannot_connect_observe_read_or_remove() {
 #[test]
 fn who_takes_our_place_first_gets_in_the_way_and_is_told_of() {
     let [user, other, _] = USERS.map(|user| user + 10);
-    let directory = PathBuf::from(format!("/tmp/emberwatch-{user}"));
-    let segment = Path::new(SHARED_MEMORY).join(format!("emberwatch_{user}_squatter"));
+    let directory = PathBuf::from(format!("{SHARED_MEMORY}/emberwatch-{user}"));
+    let segment = Path::new(SHARED_MEMORY).join(format!("emberwatch-{user}_squatter"));
     let refused = |place: &Path| {
         let refusal = create_node()
             .map(drop)
@@ -220,8 +220,8 @@ fn threads_that_listen_leave_the_umask_as_it_was() {
 
 /// Removes what a user who is nobody left.
 fn clean_up(user: u32) {
-    let _ = std::fs::remove_dir_all(format!("/tmp/emberwatch-{user}"));
-    let prefix = format!("emberwatch_{user}_");
+    let _ = std::fs::remove_dir_all(format!("{SHARED_MEMORY}/emberwatch-{user}"));
+    let prefix = format!("emberwatch-{user}_");
     for entry in std::fs::read_dir(SHARED_MEMORY)
         .expect("shared memory")
         .flatten()

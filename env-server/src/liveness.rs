@@ -1,11 +1,11 @@
-//! Who the clients are and whether they live: pidfds for their death, and a janitor that clears
-//! away what dead processes left in shared memory.
+//! Who the clients are and whether they live: pidfds for their death, and a thread that removes what
+//! dead processes left in shared memory.
 
 use crate::lease::ClientId;
 use iceoryx2::prelude::PayloadHeader;
 use iceoryx2::service::header::request_response::RequestHeader;
 use protocol::channels::Ipc;
-use protocol::dead_nodes::Undertaker;
+use protocol::cleanup::remove_leftovers;
 use protocol::wait::sleep_until_readable;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use std::collections::HashMap;
@@ -18,8 +18,8 @@ use std::time::Duration;
 /// ever can make the server hold.
 const MAX_KNOWN_NODES: usize = 1024;
 
-/// How often the janitor looks without being asked: for observers, whose death nobody reports.
-const JANITOR_INTERVAL: Duration = Duration::from_secs(2);
+/// How often to look without being asked: for observers, whose death nobody reports.
+const CLEANUP_INTERVAL: Duration = Duration::from_secs(2);
 
 /// The processes behind requests.
 #[derive(Default)]
@@ -28,9 +28,9 @@ pub struct Clients {
     processes: HashMap<u32, OwnedFd>,
 }
 
-/// Clears away what dead processes left. It is a thread because one dead process costs
+/// Removes what dead processes left. It is a thread because one dead process costs
 /// milliseconds, and steps must not wait for that.
-pub struct Janitor {
+pub struct Cleaner {
     requests: Option<Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
@@ -87,12 +87,12 @@ impl Clients {
     }
 }
 
-impl Janitor {
-    /// Starts the janitor.
+impl Cleaner {
+    /// Starts the thread.
     pub fn start() -> Self {
         let (requests, receiver) = channel();
         let thread = std::thread::Builder::new()
-            .name("janitor".into())
+            .name("cleaner".into())
             .spawn(move || clean(&receiver));
         Self {
             requests: Some(requests),
@@ -108,7 +108,7 @@ impl Janitor {
     }
 }
 
-impl Drop for Janitor {
+impl Drop for Cleaner {
     fn drop(&mut self) {
         self.requests = None;
         if let Some(thread) = self.thread.take() {
@@ -118,16 +118,14 @@ impl Drop for Janitor {
 }
 
 fn clean(requests: &Receiver<()>) {
-    let Ok(undertaker) = Undertaker::new() else {
-        return;
-    };
     while !matches!(
-        requests.recv_timeout(JANITOR_INTERVAL),
+        requests.recv_timeout(CLEANUP_INTERVAL),
         Err(RecvTimeoutError::Disconnected)
     ) {
-        let n_nodes = undertaker.clear();
-        if n_nodes > 0 {
-            tracing::debug!(n_nodes, "cleared away what dead processes left");
+        match remove_leftovers() {
+            Ok(0) => {}
+            Ok(n_files) => tracing::debug!(n_files, "removed what dead processes left"),
+            Err(error) => tracing::debug!("not removed what dead processes left: {error}"),
         }
     }
 }

@@ -13,16 +13,17 @@ use iceoryx2::service::port_factory::server::ServerCreateError;
 use protocol::channels::{
     Channel, ChannelError, ControlService, FRAME_BUFFER, FrameService, Instance, Ipc, MAX_CLIENTS,
     MAX_OBSERVERS, MAX_TRUTH_READERS, RequestResponse, SHARED_MEMORY, Services, StepService,
-    TRUTH_BUFFER, TruthService, create_node, ipc_error,
+    TRUTH_BUFFER, TruthService, create_node, entries_of, ipc_error,
 };
-use protocol::dead_nodes::{BURIAL, Undertaker};
 use protocol::message::{FrameHeader, Header, RESULT_BYTES, StepReply, StepRequest, TruthHeader};
 use protocol::responder::{
     Active, ActiveControl, Answers, ControlServer, control_server, holder, received,
 };
+use protocol::turn::Turn;
 use protocol::wait::{descriptor, drain};
 use std::collections::HashSet;
 use std::os::fd::BorrowedFd;
+use std::path::PathBuf;
 use thiserror::Error;
 
 /// A request on `step` that waits for its answer.
@@ -57,6 +58,14 @@ pub enum PortError {
         /// MiB there.
         free: u64,
     },
+    /// Somebody removed the server's files: clients do not find it any more.
+    #[error(
+        "{path} was removed while the server was running: keep cleaners of old files away from {SHARED_MEMORY}"
+    )]
+    Removed {
+        /// What is missing.
+        path: String,
+    },
     /// A channel could not be made.
     #[error(transparent)]
     Channel(#[from] ChannelError),
@@ -89,11 +98,20 @@ pub struct Ports {
     step_service: StepService,
     frame_service: FrameService,
     truth_service: Option<TruthService>,
+    entries: Vec<PathBuf>,
     _node: Node<Ipc>,
+    /// Last, so that all else is dropped within it.
+    end: Option<Turn>,
+}
+
+impl Drop for Ports {
+    fn drop(&mut self) {
+        self.end = Turn::take().ok();
+    }
 }
 
 impl Ports {
-    /// Takes an instance's place, after clearing away what a dead server left.
+    /// Takes an instance's place.
     ///
     /// # Errors
     /// [`PortError`].
@@ -114,9 +132,8 @@ impl Ports {
     /// [`PortError`].
     pub fn open_at(place: &Place) -> Result<Self, PortError> {
         check_shared_memory(place)?;
-        Undertaker::prepare()?; // before iceoryx2 meets the first dead node
+        let _turn = Turn::take()?;
         let node = create_node()?;
-        node.blocking_cleanup_dead_nodes(BURIAL);
         let services = Services {
             node: &node,
             instance: &place.instance,
@@ -149,6 +166,8 @@ impl Ports {
                 .create()
                 .map_err(ipc_error("publish the truth"))
         });
+        let services_made = [control_service.service_hash(), step_service.service_hash()];
+        let entries = entries_of(&node, &services_made);
         Ok(Self {
             step,
             control,
@@ -160,8 +179,30 @@ impl Ports {
             step_service,
             frame_service,
             truth_service,
+            entries,
             _node: node,
+            end: None,
         })
+    }
+
+    /// Checks that clients can still find the server.
+    ///
+    /// # Errors
+    /// [`PortError::Removed`].
+    pub fn check_entries(&self) -> Result<(), PortError> {
+        match self.entries.iter().find(|path| !path.exists()) {
+            None => Ok(()),
+            Some(path) => Err(PortError::Removed {
+                path: path.display().to_string(),
+            }),
+        }
+    }
+
+    /// Leaves. Once its files were removed, those of the same names are another server's: nothing is touched then.
+    pub fn leave(self) {
+        if self.check_entries().is_err() {
+            std::mem::forget(self);
+        }
     }
 
     /// The next step request.

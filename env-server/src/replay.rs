@@ -4,7 +4,7 @@
 
 mod stage;
 
-use crate::liveness::Janitor;
+use crate::liveness::Cleaner;
 use crate::ports::{Place, PortError, Ports};
 use protocol::channels::{ChannelError, FRAME_BUFFER, Instance, ipc_error};
 use protocol::control::{Reply, ServerInfo};
@@ -100,24 +100,12 @@ pub fn replay(order: &Order, stop: &AtomicBool) -> Result<(), ReplayError> {
         n_in_burst: 0,
         burst_began: Instant::now(),
         is_over: false,
-        _janitor: Janitor::start(),
+        _cleaner: Cleaner::start(),
     };
-    if !order.at_once {
-        tracing::info!("waiting for an observer");
-        while !replay.ends() && replay.ports.observers() == (0, 0) {
-            replay.attend(Instant::now() + TICK)?;
-        }
-    }
-    replay.publish_all()?;
-    while order.repeat && !replay.ends() {
-        replay.publish_all()?;
-    }
-    let farewell = Instant::now() + FAREWELL;
-    while !replay.ends() && replay.ports.observers() != (0, 0) && Instant::now() < farewell {
-        replay.attend(Instant::now() + TICK)?;
-    }
+    let outcome = replay.run();
     tracing::info!(steps = replay.stage.n_steps(), "replayed");
-    Ok(())
+    replay.ports.leave();
+    outcome
 }
 
 /// What a look through the whole file tells.
@@ -136,7 +124,7 @@ struct Replay<'a> {
     n_in_burst: usize,
     burst_began: Instant,
     is_over: bool,
-    _janitor: Janitor,
+    _cleaner: Cleaner,
 }
 
 impl Survey {
@@ -185,6 +173,24 @@ impl Survey {
 }
 
 impl Replay<'_> {
+    fn run(&mut self) -> Result<(), ReplayError> {
+        if !self.order.at_once {
+            tracing::info!("waiting for an observer");
+            while !self.ends() && self.ports.observers() == (0, 0) {
+                self.attend(Instant::now() + TICK)?;
+            }
+        }
+        self.publish_all()?;
+        while self.order.repeat && !self.ends() {
+            self.publish_all()?;
+        }
+        let farewell = Instant::now() + FAREWELL;
+        while !self.ends() && self.ports.observers() != (0, 0) && Instant::now() < farewell {
+            self.attend(Instant::now() + TICK)?;
+        }
+        Ok(())
+    }
+
     /// Publishes the recording once.
     fn publish_all(&mut self) -> Result<(), ReplayError> {
         let began = Instant::now();
@@ -263,6 +269,7 @@ impl Replay<'_> {
             while let Some(request) = self.ports.receive_control() {
                 self.answer(request);
             }
+            self.ports.check_entries()?;
             let left = until.saturating_duration_since(Instant::now());
             if left.is_zero() || self.ends() {
                 return Ok(());

@@ -5,7 +5,7 @@ mod later;
 use crate::autosave::{Autosave, FirstWorlds, first_worlds};
 use crate::config::Checked;
 use crate::files::Files;
-use crate::liveness::{Clients, Janitor};
+use crate::liveness::{Cleaner, Clients};
 use crate::ports::{ActiveStep, PortError, Ports};
 use crate::publications::Publications;
 use crate::resets::Resets;
@@ -86,11 +86,13 @@ pub fn serve(
     exit_with: Option<i32>,
 ) -> Result<(), ServeError> {
     let mut server = Server::start(checked, exit_with)?;
-    while !stop.load(Ordering::Relaxed) && !server.is_over {
-        server.turn()?;
+    let mut outcome = Ok(());
+    while outcome.is_ok() && !stop.load(Ordering::Relaxed) && !server.is_over {
+        outcome = server.turn();
     }
     let n_steps = server.simulator.n_steps();
     server.end()?;
+    outcome?;
     tracing::info!(n_steps, "stopped");
     Ok(())
 }
@@ -101,7 +103,7 @@ struct Server {
     waiter: Waiter,
     clients: Clients,
     keeper: Option<Keeper>,
-    janitor: Janitor,
+    cleaner: Cleaner,
     resets: Resets,
     awaiting: Vec<(ActiveControl, Awaited)>,
     files: Files,
@@ -170,7 +172,7 @@ impl Server {
             waiter: Waiter::default(),
             clients: Clients::default(),
             keeper,
-            janitor: Janitor::start(),
+            cleaner: Cleaner::start(),
             resets,
             awaiting: Vec::new(),
             files,
@@ -218,10 +220,10 @@ impl Server {
         match found {
             Some(Found::Step(request)) => self.answer_step(now, &request),
             Some(Found::Control(request)) => self.answer_control(now, request),
-            Some(Found::Event) | None => self.look_around(now),
+            Some(Found::Event) | None => self.look_around(now)?,
         }
         if now - self.last_tick > BUSY_TICK {
-            self.look_around(now);
+            self.look_around(now)?;
         }
         Ok(())
     }
@@ -272,7 +274,7 @@ impl Server {
 
     fn answer_control(&mut self, now: Instant, request: ActiveControl) {
         // A holder that died a moment ago must not keep its worlds from the next.
-        self.bury_the_dead();
+        self.forget_ended_clients();
         let client = self.clients.identify(request.header());
         let surroundings = Surroundings {
             uptime: self.started.elapsed(),
@@ -320,10 +322,10 @@ impl Server {
     }
 
     /// Everything that no request asks for.
-    fn look_around(&mut self, now: Instant) {
+    fn look_around(&mut self, now: Instant) -> Result<(), ServeError> {
         self.last_tick = now;
         self.forget_abandoned(now);
-        self.bury_the_dead();
+        self.forget_ended_clients();
         self.take_resets(now);
         self.take_files(now);
         self.is_over |= self.keeper.as_ref().is_some_and(Keeper::has_ended);
@@ -332,13 +334,14 @@ impl Server {
         }
         self.publications.greet(&self.ports, &self.simulator);
         self.rate.update(now, self.simulator.n_steps());
+        Ok(self.ports.check_entries()?)
     }
 
-    fn bury_the_dead(&mut self) {
+    fn forget_ended_clients(&mut self) {
         for pid in self.clients.take_dead() {
             let n_leases = self.simulator.end_of_process(pid);
             tracing::info!(pid, n_leases, "a client ended");
-            self.janitor.request();
+            self.cleaner.request();
         }
         let n_leases = self
             .simulator

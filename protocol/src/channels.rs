@@ -18,7 +18,7 @@ use std::fmt::Debug;
 use std::sync::{Mutex, PoisonError};
 use thiserror::Error;
 
-pub use crate::node::{SHARED_MEMORY, channel_directory, create_node, node_config};
+pub use crate::node::{SHARED_MEMORY, channel_directory, create_node, entries_of, node_config};
 
 /// Most clients at a time on each of `step` and `control`.
 pub const MAX_CLIENTS: usize = 16;

@@ -6,11 +6,13 @@
 use crate::channels::{
     Channel, ChannelError, Instance, Ipc, RequestResponse, Services, create_node, ipc_error,
 };
+use crate::cleanup::remove_leftovers;
 use crate::control::{Reply, Request, ServerInfo};
 use crate::message::split_step_payload;
 use crate::message::{
     ControlReply, ControlRequest, Header, Status, StepReply, StepRequest, StepResult, VERSION,
 };
+use crate::turn::Turn;
 use crate::wait::{Waiter, descriptor, drain, is_readable, sleep_until_readable};
 use iceoryx2::node::Node;
 use iceoryx2::pending_response::PendingResponse;
@@ -90,6 +92,14 @@ pub struct Connection {
     wake: Wake,
     info: ServerInfo,
     sequence: u64,
+    /// Last, so that the ports are dropped within it.
+    end: Option<Turn>,
+}
+
+impl Drop for Connection {
+    fn drop(&mut self) {
+        self.end = Turn::take().ok();
+    }
 }
 
 /// Both ends of waking, and the server's life.
@@ -99,7 +109,7 @@ struct Wake {
     listener: Listener<Ipc>,
     server_process: OwnedFd,
     waiter: Waiter,
-    node: Node<Ipc>,
+    _node: Node<Ipc>,
 }
 
 impl Connection {
@@ -113,6 +123,7 @@ impl Connection {
         client: &str,
         timeout: Duration,
     ) -> Result<Self, ConnectionError> {
+        let mut turn = Some(Turn::take()?); // declared first: what fails below is dropped within it
         let node = create_node()?;
         let services = Services {
             node: &node,
@@ -120,13 +131,8 @@ impl Connection {
         };
         let control_service = services.open_control()?;
         let step_service = services.open_step()?;
-        let server_process = match server_process(&control_service) {
-            Some(process) => process,
-            None => {
-                node.try_cleanup_dead_nodes();
-                return Err(instance.no_server().into());
-            }
-        };
+        let server_process =
+            server_process(&control_service).ok_or_else(|| instance.no_server())?;
         let server = services
             .wake(Channel::WakeServer)?
             .notifier_builder()
@@ -148,9 +154,12 @@ impl Connection {
             listener,
             server_process,
             waiter: Waiter::default(),
-            node,
+            _node: node,
         };
-        let info = shake_hands(&control, &mut wake, client, timeout)?;
+        drop(turn.take());
+        let info = shake_hands(&control, &mut wake, client, timeout);
+        turn = Some(Turn::take()?);
+        let info = info?;
         let longest = info.n_worlds as usize * info.n_moves;
         let step = step_service
             .client_builder()
@@ -159,12 +168,14 @@ impl Connection {
         let step = step.map_err(ipc_error(
             "create a step client (are there more than 16 clients?)",
         ))?;
+        drop(turn);
         Ok(Self {
             step,
             control,
             wake,
             info,
             sequence: 1,
+            end: None,
         })
     }
 
@@ -323,7 +334,7 @@ impl Wake {
 
     /// The error of a server that has ended; clears away what it left.
     fn gone(&self) -> ConnectionError {
-        self.node.try_cleanup_dead_nodes();
+        let _ = remove_leftovers(); // What stays is removed by the next program.
         ConnectionError::ServerGone {
             instance: self.instance.name().into(),
         }

@@ -9,9 +9,9 @@
 //! one path and moves the world once; a *frame* is what was seen; a *lease* is the right to act.
 
 pub mod channels;
+pub mod cleanup;
 pub mod connection;
 pub mod control;
-pub mod dead_nodes;
 pub mod decisions;
 pub mod dynamics;
 pub mod frame;
@@ -29,6 +29,7 @@ pub mod randomness;
 pub mod recording;
 pub mod responder;
 pub mod transition;
+pub mod turn;
 pub mod wait;
 
 pub use connection::Connection;

@@ -1,8 +1,11 @@
 //! A process's place in iceoryx2: the node, its configuration, and the user's own directory.
 
 use crate::channels::{ChannelError, Ipc, ipc_error};
+use crate::cleanup::{remove_leftovers, unfinished_segment};
+use crate::turn::Turn;
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::prelude::{Config, FileName, Path, SemanticString, SignalHandlingMode};
+use iceoryx2::service::service_hash::ServiceHash;
 use std::fs::{DirBuilder, Permissions};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::PathBuf;
@@ -10,7 +13,8 @@ use std::path::PathBuf;
 /// Where iceoryx2 keeps shared memory: a folder that every user may write to.
 pub const SHARED_MEMORY: &str = "/dev/shm";
 
-/// Makes this process known to iceoryx2, under the user's own directory and prefix.
+/// Makes this process known to iceoryx2, under the user's own directory and prefix, after removing what dead processes
+/// left there.
 ///
 /// # Errors
 /// [`ChannelError`] if the directory, or shared memory of this prefix, is somebody else's, or the node
@@ -19,6 +23,15 @@ pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
     iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
     let shared_memory = std::path::Path::new(SHARED_MEMORY);
     let config = node_config()?;
+    let turn = Turn::take()?;
+    remove_leftovers()?;
+    if !turn.is_alone()
+        && let Some(segment) = unfinished_segment()
+    {
+        // iceoryx2 might wait for it for ever.
+        let problem = "a stopped process is in the middle of making it: continue that, or kill it";
+        return Err(wrong(&segment, problem.into()));
+    }
     own_segments(shared_memory, &prefix())?;
     let node = NodeBuilder::new()
         .config(&config)
@@ -29,12 +42,33 @@ pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
     Ok(node)
 }
 
-/// The directory of this user's channel files: `/tmp/emberwatch-<uid>/`.
+/// The directory of this user's channel files: `/dev/shm/emberwatch-<uid>/`.
+///
+/// Beside the shared memory, so that both are there or neither: no cleaner of old files comes here, and it is the
+/// same for every process of the user, of a session or not.
 pub fn channel_directory() -> PathBuf {
     PathBuf::from(format!(
-        "/tmp/emberwatch-{}/",
+        "{SHARED_MEMORY}/emberwatch-{}/",
         rustix::process::getuid().as_raw()
     ))
+}
+
+/// The files by which others find a node and services: without them it is cut off.
+pub fn entries_of(node: &Node<Ipc>, services: &[&ServiceHash]) -> Vec<PathBuf> {
+    let (directory, prefix) = (channel_directory(), prefix());
+    let monitor = format!("nodes/{prefix}{}.node_monitor", node.id().value());
+    let services = services
+        .iter()
+        .map(|hash| format!("services/{prefix}{hash}.service"));
+    let names = services.chain([monitor]);
+    names.map(|name| directory.join(name)).collect()
+}
+
+/// The same, made if need be, and checked.
+pub(crate) fn own_channel_directory() -> Result<PathBuf, ChannelError> {
+    let directory = channel_directory();
+    own_directory(&directory)?;
+    Ok(directory)
 }
 
 /// iceoryx2's configuration: its defaults, the user's own directory and prefix.
@@ -42,20 +76,37 @@ pub fn channel_directory() -> PathBuf {
 /// # Errors
 /// [`ChannelError::Directory`] if the directory cannot be made or is somebody else's.
 pub fn node_config() -> Result<Config, ChannelError> {
-    let directory = channel_directory();
-    own_directory(&directory)?;
+    let directory = own_channel_directory()?;
     let path = Path::new(directory.as_os_str().as_encoded_bytes())
         .map_err(ipc_error("set the root path"))?;
     let prefix = FileName::new(prefix().as_bytes()).map_err(ipc_error("set the prefix"))?;
     let mut config = Config::default();
     config.global.set_root_path(&path);
     config.global.prefix = prefix;
+    // Not whenever it likes, but in turn.
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
     Ok(config)
 }
 
 /// What names of this user's shared memory begin with.
 pub(crate) fn prefix() -> String {
-    format!("emberwatch_{}_", rustix::process::getuid().as_raw())
+    format!("emberwatch-{}_", rustix::process::getuid().as_raw())
+}
+
+/// The error of a file or folder that the system does not let be used.
+pub(crate) fn not_usable(path: &std::path::Path, error: std::io::Error) -> ChannelError {
+    wrong(
+        path,
+        match error.kind() {
+            std::io::ErrorKind::ReadOnlyFilesystem => format!(
+                "{error}: channels need a {SHARED_MEMORY} that can be written to; as root, \
+                 `mount -o remount,rw {SHARED_MEMORY}`, or mount a tmpfs there"
+            ),
+            _ => error.to_string(),
+        },
+    )
 }
 
 fn wrong(path: &std::path::Path, problem: String) -> ChannelError {
@@ -97,7 +148,7 @@ fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
     let wrong = |problem: String| wrong(path, problem);
     match DirBuilder::new().mode(0o700).create(path) {
         Err(error) if error.kind() != std::io::ErrorKind::AlreadyExists => {
-            return Err(wrong(error.to_string()));
+            return Err(not_usable(path, error));
         }
         _ => {}
     }

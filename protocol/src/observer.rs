@@ -5,6 +5,7 @@ use crate::channels::{
     create_node, ipc_error,
 };
 use crate::message::{AgentHeader, FrameHeader, Header, TruthHeader};
+use crate::turn::Turn;
 use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::PayloadHeader;
@@ -38,6 +39,14 @@ pub struct Observer<H: Header> {
     publisher: Cell<Option<u32>>,
     pace: Pace,
     node: Node<Ipc>,
+    /// Last, so that all else is dropped within it.
+    end: Option<Turn>,
+}
+
+impl<H: Header> Drop for Observer<H> {
+    fn drop(&mut self) {
+        self.end = Turn::take().ok();
+    }
 }
 
 /// How often to look.
@@ -100,6 +109,7 @@ impl<H: Header> Observer<H> {
         buffer: usize,
         refusal: &'static str,
     ) -> Result<Self, ChannelError> {
+        let _turn = Turn::take()?;
         let node = create_node()?;
         let service = service(&Services {
             node: &node,
@@ -116,6 +126,7 @@ impl<H: Header> Observer<H> {
                 busy: Cell::new(Instant::now()),
             },
             node,
+            end: None,
         })
     }
 
@@ -186,6 +197,7 @@ impl Pace {
 
 /// Lets a sleeping server notice the new observer now rather than at its next tick.
 fn wake_server(node: &Node<Ipc>, instance: &Instance) -> Result<(), ChannelError> {
+    let _turn = Turn::take()?;
     let services = Services { node, instance };
     let notifier = services
         .wake(Channel::WakeServer)?

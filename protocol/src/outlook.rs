@@ -9,6 +9,7 @@ use crate::channels::{
 use crate::grid::{Probabilities, Shape};
 use crate::message::{AgentHeader, VERSION};
 use crate::observer::Sample;
+use crate::turn::Turn;
 use iceoryx2::node::Node;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::prelude::{AllocationStrategy, PortFactory};
@@ -62,6 +63,14 @@ pub struct Showcase {
     publisher: Publisher<Ipc, [u8], AgentHeader>,
     sequence: u64,
     _node: Node<Ipc>,
+    /// Last, so that all else is dropped within it.
+    end: Option<Turn>,
+}
+
+impl Drop for Showcase {
+    fn drop(&mut self) {
+        self.end = Turn::take().ok();
+    }
 }
 
 impl Showcase {
@@ -70,6 +79,7 @@ impl Showcase {
     /// # Errors
     /// [`ChannelError`], also when there are too many agents.
     pub fn open(instance: &Instance, n_bytes: usize) -> Result<Self, ChannelError> {
+        let _turn = Turn::take()?;
         let node = create_node()?;
         let service = Services {
             node: &node,
@@ -90,6 +100,7 @@ impl Showcase {
             publisher,
             sequence: 0,
             _node: node,
+            end: None,
         })
     }
 

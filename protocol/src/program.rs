@@ -50,6 +50,13 @@ impl Keeper {
     }
 }
 
+/// A process's state, such as `R` or `Z`, as `/proc` says; `None` if there is none of that id.
+pub(crate) fn process_state(pid: i32) -> Option<char> {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    // After its name, which may hold anything, in brackets.
+    stat.rsplit_once(") ")?.1.chars().next()
+}
+
 /// Logs to standard error, at `info` unless `RUST_LOG` says otherwise.
 pub fn start_logging() {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));

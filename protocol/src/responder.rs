@@ -8,8 +8,8 @@ use crate::channels::{
     ipc_error,
 };
 use crate::connection::server_pid;
-use crate::dead_nodes::BURIAL;
 use crate::message::{ControlReply, ControlRequest, Header, Status, VERSION};
+use crate::turn::Turn;
 use crate::wait::{descriptor, drain};
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::node::Node;
@@ -57,6 +57,14 @@ pub struct Responder {
     answers: Answers,
     listener: Listener<Ipc>,
     _node: Node<Ipc>,
+    /// Last, so that all else is dropped within it.
+    end: Option<Turn>,
+}
+
+impl Drop for Responder {
+    fn drop(&mut self) {
+        self.end = Turn::take().ok();
+    }
 }
 
 /// Why decisions cannot be answered.
@@ -158,14 +166,13 @@ impl Answers {
 }
 
 impl Responder {
-    /// Takes the place of the one that answers a world's decisions, after clearing away what a dead one
-    /// left.
+    /// Takes the place of the one that answers a world's decisions.
     ///
     /// # Errors
     /// [`ResponderError`].
     pub fn open(instance: &Instance, world: u32) -> Result<Self, ResponderError> {
+        let _turn = Turn::take()?;
         let node = create_node()?;
-        node.blocking_cleanup_dead_nodes(BURIAL);
         let services = Services {
             node: &node,
             instance,
@@ -185,6 +192,7 @@ impl Responder {
             answers: Answers::new(&services)?,
             listener,
             _node: node,
+            end: None,
         })
     }
 

@@ -1,6 +1,9 @@
 """Where a client connects: limits, instance names, and the directory of the channels."""
 
 import os
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -97,6 +100,54 @@ def test_shared_memory_of_our_prefix_is_ours_and_closed_to_others(
     monkeypatch.setattr(os, "getuid", lambda: owner + 1)
     with pytest.raises(errors.ChannelError, match=f"something of user {owner}"):
         channels._own_segments(tmp_path, "emberwatch_1_")
+
+
+def _segment(name: str) -> Path:
+    uid = os.getuid()
+    return Path(f"/dev/shm/emberwatch-{uid}_{'0123456789abcdef' * 2}{US:08x}_{name}")
+
+
+def _identity(pid: int, seconds: float) -> int:
+    return pid << 64 | int(seconds)
+
+
+def test_what_dead_processes_left_half_made_is_removed_and_the_young_of_others_stays() -> None:
+    nobody = 1 << 30
+    dead = [_segment(f"{_identity(nobody, time.time())}.dynamic")]
+    dead += [_segment(f"{_identity(US, time.time() - 60)}.data")]
+    dead += [_segment(f"{_identity(nobody, 0)}_{_identity(nobody, 1)}.connection")]
+    young = _segment(f"{_identity(US, time.time() + 60)}.dynamic")
+    for path in (*dead, young):
+        path.touch(0o200)
+    node = channels.directory() / "nodes" / str(_identity(nobody, time.time()))
+    node.mkdir()
+    (node / "emberwatch-0_node.details").touch(0o600)
+    try:
+        with pytest.raises(errors.NoServerError):
+            connect("nobody-here")
+        assert [path for path in (*dead, node) if path.exists()] == []
+        assert young.exists()
+    finally:
+        young.unlink()
+
+
+def test_a_stopped_process_in_its_turn_keeps_nobody_waiting() -> None:
+    with channels.in_turn():
+        pass
+    code = (
+        "import fcntl, os, signal, sys; lock = open(sys.argv[1], 'r+'); "
+        "fcntl.flock(lock, fcntl.LOCK_EX); print(flush=True); os.kill(os.getpid(), signal.SIGSTOP)"
+    )
+    command = [sys.executable, "-c", code, str(channels.directory() / "lock")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as holder:
+        try:
+            assert holder.stdout is not None
+            holder.stdout.readline()
+            with pytest.raises(errors.NoServerError):
+                connect("nobody-here")
+            assert holder.poll() is None
+        finally:
+            holder.kill()
 
 
 def _refuses(place: Path, words: str, monkeypatch: pytest.MonkeyPatch) -> None:

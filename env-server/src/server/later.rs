@@ -87,6 +87,7 @@ impl Server {
         if is_late {
             tracing::warn!("files were not written within {LAST_FILES:?}");
         }
+        self.ports.leave();
         let failed = finished
             .into_iter()
             .filter_map(|(_, outcome)| outcome.err());

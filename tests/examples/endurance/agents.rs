@@ -36,7 +36,7 @@ pub fn kill(n_kills: usize) {
             }
             waits.push(one(&server, &mut rng));
         }
-        std::thread::sleep(Duration::from_secs(5)); // The janitor looks each two.
+        std::thread::sleep(Duration::from_secs(5)); // The cleaner looks each two.
         stop.store(true, Ordering::Relaxed);
         frames.join().expect("the observer")
     });

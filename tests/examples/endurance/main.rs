@@ -1,12 +1,14 @@
 //! What long and rough use does to a server: agents and servers that are killed, observers that are
 //! stopped, hours of coming and going.
 //!
-//! `cargo run --release -p tests --example endurance -- agents 1000 | servers 200 | observers 5 |
+//! `cargo run --release -p tests --example endurance -- agents 1000 | servers 200 | starts 2000 | observers 5 |
 //! dashboard 5 64 | snapshots 9 | soak 3600 FOLDER`
 
 #[expect(dead_code, reason = "the tests use all of it")]
 #[path = "../../harness.rs"]
 mod harness;
+#[path = "../../kills.rs"]
+mod kills;
 
 mod agents;
 mod dashboard;
@@ -15,6 +17,7 @@ mod observers;
 mod servers;
 mod snapshots;
 mod soak;
+mod starts;
 
 use std::io::Write;
 
@@ -28,13 +31,14 @@ fn main() {
     match words[..] {
         ["agents", n] => agents::kill(number(n)),
         ["servers", n] => servers::kill(number(n)),
+        ["starts", n] => starts::kill(number(n)),
         ["observers", n] => observers::compare(number(n)),
         ["dashboard", rounds, side] => dashboard::compare(number(rounds), number(side)),
         ["snapshots", n] => snapshots::compare(number(n)),
         ["observe", instance] => observers::observe(instance),
         ["soak", seconds, folder] => soak::soak(number(seconds), folder.as_ref()),
         _ => panic!(
-            "expected agents N, servers N, observers ROUNDS, dashboard ROUNDS SIDE, snapshots ROUNDS or soak SECONDS FOLDER, got {words:?}"
+            "expected agents N, servers N, starts N, observers ROUNDS, dashboard ROUNDS SIDE, snapshots ROUNDS or soak SECONDS FOLDER, got {words:?}"
         ),
     }
 }

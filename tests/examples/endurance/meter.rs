@@ -9,9 +9,9 @@ pub struct Use {
     pub resident: u64,
     /// Its open descriptors.
     pub descriptors: usize,
-    /// Files in shared memory and in the channels' folder that are this user's, of all instances.
+    /// Files of this user's channels, of all instances.
     pub files: usize,
-    /// KiB of those in shared memory that are in use.
+    /// KiB of those that are in use.
     pub shared: u64,
 }
 
@@ -21,18 +21,21 @@ impl Use {
         let status = std::fs::read_to_string(format!("/proc/{pid}/status")).expect("its status");
         let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
         let number = line.and_then(|line| line.split_whitespace().next()?.parse().ok());
-        let own = format!("emberwatch_{}_", rustix::process::getuid().as_raw());
-        let is_own = |path: &PathBuf| path.to_string_lossy().contains(&own);
-        let mut shared = files_under(Path::new("/dev/shm"));
-        shared.retain(is_own);
-        let others = files_under(&protocol::channels::channel_directory());
+        let own = format!("/dev/shm/emberwatch-{}", rustix::process::getuid().as_raw());
+        let is_own = |path: &PathBuf| {
+            let path = path.to_string_lossy();
+            let rest = path.strip_prefix(&own);
+            rest.is_some_and(|rest| rest.starts_with(['_', '/']))
+        };
+        let mut files = files_under(Path::new("/dev/shm"));
+        files.retain(is_own);
         Self {
             resident: number.expect("a number of KiB"),
             descriptors: std::fs::read_dir(format!("/proc/{pid}/fd"))
                 .expect("its descriptors")
                 .count(),
-            files: shared.len() + others.len(),
-            shared: shared.iter().map(|path| kibibytes(path)).sum(),
+            files: files.len(),
+            shared: files.iter().map(|path| kibibytes(path)).sum(),
         }
     }
 }

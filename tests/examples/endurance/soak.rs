@@ -52,7 +52,7 @@ pub fn soak(seconds: u64, folder: &Path) {
     let tenth = &rows[rows.len() / 10];
     say(&format!("after a tenth: {}", tenth.1));
     drop(guests);
-    std::thread::sleep(Duration::from_secs(5)); // The janitor looks each two.
+    std::thread::sleep(Duration::from_secs(5)); // The cleaner looks each two.
     rows.push((
         started.elapsed().as_secs_f64(),
         Use::of(server.program.pid()),

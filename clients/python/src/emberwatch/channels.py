@@ -1,10 +1,11 @@
 """Where channels live and how they are opened (PROTOCOL.md section 1).
 
-The only module, with `ports` and `observer`, that knows iceoryx2.
+The only module, with `cleanup`, `ports` and `observer`, that knows iceoryx2.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import importlib
 import os
@@ -16,7 +17,9 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from emberwatch import wire
+from emberwatch.cleanup import Places
 from emberwatch.errors import ChannelError, ClosedError, ForkedError, SettingError
+from emberwatch.turn import turn, unusable
 
 _INSTANCE: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -54,9 +57,10 @@ class Node:
         self._usable = True
         self._forked = False
         builder = iox2.NodeBuilder.new().signal_handling_mode(iox2.SignalHandlingMode.Disabled)
-        with guard("create a node"):
-            config = _config()
+        config = _config()
+        with in_turn() as is_alone, guard("create a node"):
             _own_segments(_SHARED_MEMORY, _prefix())
+            _remove_leftovers(is_alone)
             self.node: Any = builder.config(config).create(iox2.ServiceType.Ipc)
             # Of the first node of all, iceoryx2 lets everybody write to the counter of nodes.
             _own_segments(_SHARED_MEMORY, _prefix())
@@ -85,10 +89,13 @@ class Node:
             return
         self._usable = False
         _nodes.discard(self)
-        # The youngest first: ports before the node that they were made from.
-        while self._held:
-            self._held.pop()
-        self.node = None
+        with contextlib.ExitStack() as stack:
+            with contextlib.suppress(ChannelError):
+                stack.enter_context(in_turn())
+            # The youngest first: ports before the node that they were made from.
+            while self._held:
+                self._held.pop()
+            self.node = None
 
     def open_request_response(
         self, service: str, request: type[wire.Header], reply: type[wire.Header]
@@ -109,11 +116,10 @@ class Node:
 
     def other_version(self, service: str) -> int | None:
         """The protocol version of a server on the instance that speaks another one, if any."""
-        with guard("list the services"):
-            services = iox2.Service.list(_config(), iox2.ServiceType.Ipc)
-        pattern = re.compile(rf"emberwatch/v(\d+)/{self.instance}/{service}")
-        found = (pattern.fullmatch(details.name().to_string()) for details in services)
-        versions = {int(match[1]) for match in found if match}
+        # Of the files themselves: iceoryx2 opens each service, and may wait for one without end.
+        pattern = re.compile(rf'service_name = "emberwatch/v(\d+)/{self.instance}/{service}"')
+        texts = map(_text, (directory() / "services").glob(f"{_prefix()}*.service"))
+        versions = {int(match[1]) for text in texts for match in pattern.finditer(text)}
         return max(versions - {wire.VERSION}, default=None)
 
     def open_publications(
@@ -134,7 +140,7 @@ class Node:
         builder = builder.user_header(header).max_publishers(publishers)
         builder = builder.max_subscribers(readers).max_nodes(wire.MAX_NODES).history_size(1)
         builder = builder.subscriber_max_buffer_size(buffer).subscriber_max_borrowed_samples(1)
-        with guard(f"open {service} on instance {self.instance!r}"):
+        with in_turn(), guard(f"open {service} on instance {self.instance!r}"):
             return self.keep(builder.enable_safe_overflow(True).open_or_create())
 
     def open_wake(self, service: str) -> Any:
@@ -145,12 +151,14 @@ class Node:
         """
         builder = self.node.service_builder(self._name(service)).event()
         builder = builder.max_listeners(wire.MAX_NODES).max_notifiers(wire.MAX_NODES)
-        with guard(f"open {service} on instance {self.instance!r}"):
+        with in_turn(), guard(f"open {service} on instance {self.instance!r}"):
             return self.keep(builder.max_nodes(wire.MAX_NODES).open_or_create())
 
     def clean_up(self) -> None:
-        """Removes what dead processes left behind."""
-        self.node.try_cleanup_dead_nodes()
+        """Removes what dead processes left behind, if others let us."""
+        with contextlib.suppress(ChannelError), in_turn() as is_alone, guard("clean up"):
+            if is_alone:
+                _remove_leftovers(is_alone)
 
     def abandon(self) -> None:
         """In a forked child: nothing of the parent's may be dropped here, so all of it leaks."""
@@ -202,19 +210,46 @@ class guard:
 
 
 def directory() -> Path:
-    """The directory of this user's channels."""
-    return Path(f"/tmp/emberwatch-{os.getuid()}")
+    """The directory of this user's channels, beside the shared memory: both are there, or none."""
+    return _SHARED_MEMORY / f"emberwatch-{os.getuid()}"
+
+
+def in_turn() -> contextlib.AbstractContextManager[bool]:
+    """A turn of making and removing; yields whether nobody else has it."""
+    return turn(_own_directory(directory()))
+
+
+def _remove_leftovers(is_alone: bool) -> None:
+    places = Places(directory(), _SHARED_MEMORY, _prefix())
+    if is_alone:
+        places.remove_leftovers(_config())
+        return
+    for segment in places.unfinished():
+        raise ChannelError(
+            f"{segment}: a stopped process is in the middle of making it: continue that, or kill it"
+        )
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace")
+    except OSError:
+        return ""
 
 
 def _config() -> Any:
     config = iox2.config.default()
+    # Not whenever it likes, but in turn.
+    config.global_cfg.node.cleanup_dead_nodes_on_creation = False
+    config.global_cfg.node.cleanup_dead_nodes_on_destruction = False
+    config.global_cfg.service.cleanup_dead_nodes_on_open = False
     config.global_cfg.root_path = iox2.Path.new(f"{_own_directory(directory())}/")
     config.global_cfg.prefix = iox2.FileName.new(_prefix())
     return config
 
 
 def _prefix() -> str:
-    return f"emberwatch_{os.getuid()}_"
+    return f"emberwatch-{os.getuid()}_"
 
 
 def _own_segments(folder: Path, prefix: str) -> None:
@@ -240,7 +275,7 @@ def _own_directory(path: Path) -> Path:
     except FileExistsError:
         pass
     except OSError as error:
-        raise ChannelError(f"create {path}: {error.strerror}") from None
+        raise unusable(path, error) from None
     found = path.lstat()
     if (
         not stat.S_ISDIR(found.st_mode)

@@ -50,7 +50,6 @@ class Client(Closing):
         self._sequence = 0
         self._turn = threading.Lock()
         try:
-            self._node.clean_up()
             self._bell = Bell(self._node)
             self._control = RequestPort(
                 self._bell,

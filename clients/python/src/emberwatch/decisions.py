@@ -32,7 +32,6 @@ class Decisions(Closing):
         self._sequence = 0
         self._turn = threading.Lock()
         try:
-            self._node.clean_up()
             self._bell = Bell(self._node, f"wake-agent-{world}", "agent")
             self._port = RequestPort(
                 self._bell,

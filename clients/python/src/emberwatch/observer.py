@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch import wire
-from emberwatch.channels import Closing, Node, guard
+from emberwatch.channels import Closing, Node, guard, in_turn
 from emberwatch.errors import GarbledAnswerError, SettingError
 from emberwatch.wire import StepResult
 
@@ -123,12 +123,11 @@ class _Reader(Closing):
         self._busy = time.perf_counter()
         self._node = Node(instance)
         try:
-            self._node.clean_up()
             readers, buffer = limits
             factory = self._node.open_publications(
                 service, header, readers, buffer, publishers=publishers
             )
-            with guard(f"read {service} (are there more than {readers} readers?)"):
+            with in_turn(), guard(f"read {service} (are there more than {readers} readers?)"):
                 port = factory.subscriber_builder().buffer_size(buffer).create()
                 self._subscriber: Any = self._node.keep(port)
                 if publishers == 1:  # the server, which shows where its worlds are

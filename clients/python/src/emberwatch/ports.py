@@ -14,7 +14,7 @@ import weakref
 from typing import Any, Final, Generic, TypeVar
 
 from emberwatch import wire
-from emberwatch.channels import Node, guard, iox2
+from emberwatch.channels import Node, guard, in_turn, iox2
 from emberwatch.errors import (
     ChannelError,
     NoServerError,
@@ -64,7 +64,7 @@ class Bell:
         """
         self.node: Final = node
         self._who = who
-        with guard("open the wake services (are there more than 64 processes?)"):
+        with in_turn(), guard("open the wake services (are there more than 64 processes?)"):
             notifier = node.open_wake(wake).notifier_builder().create()
             listener = node.open_wake("wake-client").listener_builder().create()
         self.ring: Any = node.keep(notifier).notify
@@ -195,13 +195,14 @@ class RequestPort(Generic[Reply]):
         self._request_bytes = ctypes.sizeof(self._request)
         self._reply_bytes = ctypes.sizeof(self._reply)
         node = bell.node
-        factory = node.open_request_response(service, *headers)
-        if factory is None or factory.dynamic_config.number_of_servers == 0:
-            raise no_server(node, service)
-        builder = factory.client_builder().initial_max_slice_len(max(slice_len, 1))
         growth = iox2.AllocationStrategy.PowerOfTwo if grows else iox2.AllocationStrategy.Static
-        with guard(f"create a {service} client (are there more than 16 clients?)"):
-            self._client: Any = node.keep(builder.allocation_strategy(growth).create())
+        with in_turn():
+            factory = node.open_request_response(service, *headers)
+            if factory is None or factory.dynamic_config.number_of_servers == 0:
+                raise no_server(node, service)
+            builder = factory.client_builder().initial_max_slice_len(max(slice_len, 1))
+            with guard(f"create a {service} client (are there more than 16 clients?)"):
+                self._client: Any = node.keep(builder.allocation_strategy(growth).create())
 
     def close(self) -> None:
         """Lets go of the port; closing the node closes it."""

@@ -1,0 +1,146 @@
+"""Removes what processes leave that die at any instruction (PROTOCOL.md section 9).
+
+During a turn every file is one of three: part of a node whose process lives, of a service that such
+a node uses, or left over.
+"""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import stat
+import time
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from emberwatch.turn import process_state
+
+_iox2: Final[Any] = importlib.import_module("iceoryx2")
+
+#: What is younger, seconds, and of a living process may be in the making: not all take turns.
+_MAKING: Final = 1.0
+
+
+class Places:
+    """Where channels' files are, and what their names begin with."""
+
+    def __init__(self, root: Path, shared: Path, prefix: str) -> None:
+        """Names them."""
+        self._root, self._shared, self._prefix = root, shared, prefix
+
+    def unfinished(self) -> list[Path]:
+        """Segments that are not finished, which iceoryx2 might wait for without end."""
+        return [path for path in self._shared.glob(f"{self._prefix}*") if _is_unfinished(path)]
+
+    def remove_leftovers(self, config: Any) -> None:
+        """Removes what dead processes left; to be called in a turn that is ours alone."""
+        living: set[int] = set()
+        dead: list[Any] = []
+        for node in _iox2.Node.list(_iox2.ServiceType.Ipc, config):
+            if isinstance(node, _iox2.NodeState.Dead):
+                dead.append(node._0)
+            elif isinstance(node, _iox2.NodeState.Alive):
+                living.add(int(node._0.id.value))
+            elif isinstance(node, _iox2.NodeState.Inaccessible):
+                living.add(int(node._0.value))
+        ports, services = self._used(living)
+        for path in self.unfinished():
+            ids = self._ids(path)
+            # A port's memory grows without a turn.
+            grows = path.suffix == ".data" and ids & ports
+            if not grows and not any(map(_is_in_the_making, ids)):
+                _remove(path)
+        for node in dead:
+            identity = int(node.id.value)
+            # Unfinished tags were for nothing yet, but iceoryx2 could not remove the folder.
+            for path in filter(_is_writable, self._folder(identity).glob("*")):
+                _remove(path)
+            # Else nothing of it is in memory that others use; the details go last.
+            if node.details is not None and services & self._tags(identity, ".service_tag"):
+                try:
+                    node.try_remove_stale_resources()
+                except _iox2.NodeCleanupFailure:
+                    living.add(identity)
+        self._remove_nodes(living)
+        ports, services = self._used(living)
+        used = ports | set(self._remove_services(services))
+        sockets = self._root.glob(f"{self._prefix}*")
+        for path in (*self._shared.glob(f"{self._prefix}*"), *sockets):
+            ids = self._ids(path)
+            if ids and not ids & used and not any(map(_is_in_the_making, ids)):
+                _remove(path)
+
+    def _remove_nodes(self, living: set[int]) -> None:
+        for path in (self._root / "nodes").glob("*"):
+            identity = path.name.removeprefix(self._prefix).partition(".node_monitor")[0]
+            if identity.isdecimal() and int(identity) not in living:
+                if not _is_in_the_making(int(identity)):
+                    _remove(path)
+
+    def _remove_services(self, hashes: set[str]) -> Iterator[int]:
+        """Removes services that nobody uses; yields the ids of the others."""
+        for path in (self._root / "services").glob(f"{self._prefix}*.service"):
+            if path.stem.removeprefix(self._prefix) not in hashes:
+                _remove(path)
+                continue
+            try:
+                identity = tomllib.loads(path.read_text())["unique_service_id"]
+                yield identity["unique_value"] << 64 | identity["payload_value"]
+            except (OSError, ValueError, KeyError, TypeError):  # It is in the making.
+                continue
+
+    def _used(self, living: set[int]) -> tuple[set[int], set[str]]:
+        """Ids of the ports, and hashes of the services' names, that living nodes use."""
+        ports, services = set[int](), set[str]()
+        for node in living:
+            ports |= {int(port) for port in self._tags(node, ".port_tag")}
+            services |= self._tags(node, ".service_tag")
+        return ports, services
+
+    def _folder(self, node: int) -> Path:
+        return self._root / "nodes" / str(node)
+
+    def _tags(self, node: int, suffix: str) -> set[str]:
+        """What a node's folder has finished tags of one kind for."""
+        found = self._folder(node).glob(f"{self._prefix}*{suffix}")
+        found = (path for path in found if not _is_writable(path))
+        return {path.name.removeprefix(self._prefix).removesuffix(suffix) for path in found}
+
+    def _ids(self, path: Path) -> set[int]:
+        """The ids in `<prefix><hash>_<id>[_<id>].<kind>` or `<prefix><id>.event`."""
+        words = path.name.removeprefix(self._prefix).partition(".")[0].split("_")
+        # The segments of one port are numbered; a hash has letters, or more digits than an id.
+        return {int(word) for word in words if word.isdecimal() and 10 < len(word) < 40}
+
+
+def _is_in_the_making(identity: int) -> bool:
+    """Whether an id was begun just now, by a process that lives."""
+    seconds, nanos, pid = (identity >> shift & 0xFFFFFFFF for shift in (0, 32, 64))
+    is_young = time.time() - seconds - nanos * 1e-9 < _MAKING
+    return is_young and process_state(pid) not in (None, "Z", "X")
+
+
+def _is_writable(path: Path) -> bool:
+    """A tag, or a node's details, can be written to until it is finished."""
+    try:
+        return bool(path.lstat().st_mode & stat.S_IWUSR)
+    except FileNotFoundError:
+        return False
+
+
+def _is_unfinished(path: Path) -> bool:
+    """A segment can be read only when it is finished."""
+    try:
+        found = path.lstat()
+    except FileNotFoundError:
+        return False
+    return found.st_size == 0 or not found.st_mode & stat.S_IRUSR
+
+
+def _remove(path: Path) -> None:
+    try:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    except OSError:  # What stays is removed by the next program.
+        pass

@@ -1,0 +1,59 @@
+//! Programs that are killed while they start, end or connect, in five loops at once; then every name must start.
+
+use crate::harness::{PATIENCE, Server, status};
+use crate::kills::{FLAGS, Kills, files_of, kill_in_loops, look_up_nobody};
+use crate::meter::Use;
+use crate::{say, spread};
+use rustix::process::Signal;
+use std::time::{Duration, Instant};
+
+const N_LOOPS: usize = 5;
+
+/// Kills so many servers in their start, and a quarter as many each in their end and of those who connect.
+pub fn kill(n_starts: usize) {
+    let witness = Server::start("--burn-in 0");
+    let before = Use::of(witness.program.pid());
+    let each = Kills {
+        starts: n_starts / N_LOOPS,
+        ends: n_starts / N_LOOPS / 4,
+        connects: n_starts / N_LOOPS / 4,
+    };
+    let started = Instant::now();
+    let left = kill_in_loops(N_LOOPS as u64, each);
+    say(&format!(
+        "{} programs killed in {:.0} s: {} in their start, {} in their end, {} while they connected",
+        left.killed.len(),
+        started.elapsed().as_secs_f64(),
+        each.starts * N_LOOPS,
+        each.ends * N_LOOPS,
+        each.connects * N_LOOPS
+    ));
+    let look_ups = (0..100).map(|_| look_up_nobody().as_secs_f64());
+    say(&format!(
+        "looking for nobody: {}",
+        spread(look_ups.collect())
+    ));
+    let mut starts = Vec::new();
+    for instance in &left.instances {
+        let start = Instant::now();
+        let server = Server::start_with(instance, &FLAGS);
+        starts.push(start.elapsed().as_secs_f64());
+        server.program.signal(Signal::TERM);
+        assert_eq!(server.program.wait(PATIENCE).code, Some(0));
+    }
+    say(&format!("{} names start: {}", starts.len(), spread(starts)));
+    assert!(status(&witness.instance).is_ok(), "the witness serves");
+    std::thread::sleep(Duration::from_secs(3)); // The cleaner looks each two.
+    say(&format!("a server that watched, before: {before}"));
+    say(&format!(
+        "                      after:  {}",
+        Use::of(witness.program.pid())
+    ));
+    let files = files_of(&left.killed);
+    assert!(
+        files.is_empty(),
+        "{} files, such as {:?}",
+        files.len(),
+        files[0]
+    );
+}

@@ -1,0 +1,62 @@
+//! Where the channels are: what happens when it cannot be used, or is taken away.
+//!
+//! In a mount namespace of its own, as that is everybody's; where none may be made, those tests say so and pass.
+
+use crate::harness::{SMALL, program_path};
+use std::io::Write;
+use std::process::{Command, Output};
+
+/// Runs a shell script where `/dev/shm` is its own; `$S` is the server. `None` if there may be no such place.
+fn apart(script: &str) -> Option<Output> {
+    let run = |script: &str| {
+        let mut command = Command::new("unshare");
+        let script = format!("mount -t tmpfs tmpfs /dev/shm && {script}");
+        command
+            .args(["-rm", "timeout", "60", "sh", "-c", &script])
+            .env("S", program_path("emberwatch-server"))
+            .env("RUST_LOG", "info");
+        command.output().ok()
+    };
+    if !run("true").is_some_and(|output| output.status.success()) {
+        let note = "skipped: this process may not make a mount namespace\n";
+        let _ = std::io::stderr().write_all(note.as_bytes());
+        return None;
+    }
+    run(script)
+}
+
+#[test]
+fn a_server_whose_files_are_removed_says_so_and_ends_and_leaves_its_successor_alone() {
+    let script = format!(
+        "$S {SMALL} & first=$!
+         until $S status >/dev/null 2>&1; do sleep 0.01; done
+         rm -r /dev/shm/emberwatch-*
+         $S {SMALL} & second=$!
+         wait $first; echo first ended with $?
+         until $S status >/dev/null 2>&1; do sleep 0.01; done
+         sleep 0.5; $S status && kill $second; wait $second; echo second ended with $?"
+    );
+    let Some(output) = apart(&script) else { return };
+    let (said, warned) = (
+        String::from_utf8_lossy(&output.stdout),
+        String::from_utf8_lossy(&output.stderr),
+    );
+    assert!(said.contains("first ended with 1"), "{said} {warned}");
+    assert!(
+        warned.contains("was removed while the server was running"),
+        "{warned}"
+    );
+    assert!(said.contains("second ended with 0"), "{said} {warned}");
+}
+
+#[test]
+fn shared_memory_that_is_read_only_is_called_so() {
+    for before in ["true", "$S status --instance nobody"] {
+        let script = format!("{before} 2>/dev/null; mount -o remount,ro /dev/shm; $S {SMALL}");
+        let Some(output) = apart(&script) else { return };
+        let words = String::from_utf8_lossy(&output.stderr);
+        for expected in ["Read-only file system", "remount,rw /dev/shm"] {
+            assert!(words.contains(expected), "{words}");
+        }
+    }
+}
