@@ -84,8 +84,8 @@ fn a_takeover_ends_the_former_lease_and_leaves_the_world_where_it_was() {
     );
     assert_eq!(fly(&mut next, Paths::new(2).next(6)).result.step, 2);
     next.release().expect("release");
-    check(former.step(0..1, &paths(1)), Status::LeaseLost, 0);
-    check(former.release(), Status::LeaseLost, 0);
+    check(former.step(0..1, &paths(1)), Status::LeaseLost, us());
+    check(former.release(), Status::LeaseLost, us());
 }
 
 #[test]

@@ -146,7 +146,7 @@ impl Client {
     /// What the worlds showed at an earlier step k.
     ///
     /// # Errors
-    /// [`ConnectionError`]; a refusal as `NotKept` tells the oldest step that is kept.
+    /// [`ConnectionError`]; a refusal as `NotKept` tells the nearest step that is kept.
     pub fn recall(
         &mut self,
         worlds: Range<u32>,

@@ -178,11 +178,12 @@ impl Episode {
         &self.frame
     }
 
-    /// What step k showed, if it is kept; else the oldest step that is.
+    /// What step k showed, if it is kept; else the nearest step that is, the oldest or the present.
     pub fn recall(&self, step: u64) -> Result<&Seen, u64> {
-        let oldest = || self.history.all().next().map(|seen| seen.result.step);
-        let seen = self.history.step(step);
-        seen.ok_or_else(|| oldest().unwrap_or(self.result.step))
+        let oldest = self.history.all().next().map(|seen| seen.result.step);
+        let present = self.result.step;
+        let nearest = oldest.filter(|_| step < present).unwrap_or(present);
+        self.history.step(step).ok_or(nearest)
     }
 
     /// About how many bytes a snapshot of it takes.

@@ -33,6 +33,8 @@ pub struct Lease {
     /// It ends this long after its last use.
     pub time_to_live: Duration,
     expires: Instant,
+    /// The process that last took a world from it.
+    taker: Option<u32>,
     /// Requests that wait for worlds to be reset; it cannot expire meanwhile.
     n_waiting: u32,
 }
@@ -52,8 +54,16 @@ pub struct Leases {
     /// The token that holds each world.
     holders: Vec<Option<u64>>,
     live: HashMap<u64, Lease>,
-    /// Tokens that have ended, each with its first world.
-    ended: VecDeque<(u64, usize)>,
+    ended: VecDeque<Ended>,
+}
+
+/// A lease that has ended.
+#[derive(Debug)]
+struct Ended {
+    token: u64,
+    first_world: usize,
+    /// The process that took its last world, if that was its end.
+    taker: Option<u32>,
 }
 
 /// What a client asks for.
@@ -109,7 +119,10 @@ impl Leases {
             return Err(Refusal::new(Status::Busy, holder.client.pid.into()));
         }
         for world in claim.worlds.clone() {
-            self.holders[world] = Some(token);
+            let former = self.holders[world].replace(token);
+            if let Some(former) = former.and_then(|token| self.live.get_mut(&token)) {
+                former.taker = Some(claim.client.pid);
+            }
         }
         self.forget_empty_leases();
         let Claim {
@@ -124,6 +137,7 @@ impl Leases {
             worlds,
             time_to_live,
             expires: now + time_to_live,
+            taker: None,
             n_waiting: 0,
         };
         Ok(self.live.entry(token).or_insert(lease))
@@ -228,23 +242,23 @@ impl Leases {
 
     fn first_world(&self, token: u64) -> Option<usize> {
         let live = self.live.get(&token).map(|lease| lease.worlds.start);
-        let mut ended = self.ended.iter().filter(|(ended, _)| *ended == token);
-        live.or_else(|| ended.next().map(|(_, world)| *world))
+        live.or_else(|| self.ended(token).map(|ended| ended.first_world))
+    }
+
+    fn ended(&self, token: u64) -> Option<&Ended> {
+        self.ended.iter().find(|ended| ended.token == token)
     }
 
     fn not_held(&self, token: u64, client: ClientId, world: usize) -> Refusal {
-        let live = self
-            .live
-            .get(&token)
-            .is_some_and(|lease| lease.client == client && lease.worlds.contains(&world));
-        if live || self.ended.iter().any(|(ended, _)| *ended == token) {
-            let holder = self.holder(world).filter(|holder| holder.token != token);
-            return Refusal::new(
-                Status::LeaseLost,
-                holder.map_or(0, |lease| lease.client.pid.into()),
-            );
-        }
-        Refusal::new(Status::NoLease, world as u64)
+        let is_own = |lease: &&Lease| lease.client == client && lease.worlds.contains(&world);
+        let holder = self.holder(world).map(|holder| holder.client.pid);
+        let taker = match (self.live.get(&token).filter(is_own), self.ended(token)) {
+            (Some(_), _) if self.holders[world] == Some(token) => None, // It has expired.
+            (Some(lease), _) => holder.or(lease.taker),
+            (None, Some(ended)) => ended.taker.or(holder),
+            (None, None) => return Refusal::new(Status::NoLease, world as u64),
+        };
+        Refusal::new(Status::LeaseLost, taker.map_or(0, u64::from))
     }
 
     fn end_where(&mut self, is_over: impl Fn(&Lease) -> bool) -> Vec<Lease> {
@@ -261,17 +275,19 @@ impl Leases {
 
     fn end(&mut self, token: u64) -> Option<Lease> {
         let lease = self.live.remove(&token)?;
-        for holder in self
-            .holders
-            .iter_mut()
-            .filter(|holder| **holder == Some(token))
-        {
-            *holder = None;
+        let mut held = false;
+        for holder in &mut self.holders[lease.worlds.clone()] {
+            held |= *holder == Some(token);
+            holder.take_if(|holder| *holder == token);
         }
         if self.ended.len() == REMEMBERED {
             self.ended.pop_front();
         }
-        self.ended.push_back((token, lease.worlds.start));
+        self.ended.push_back(Ended {
+            token,
+            first_world: lease.worlds.start,
+            taker: lease.taker.filter(|_| !held),
+        });
         Some(lease)
     }
 

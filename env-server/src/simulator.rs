@@ -277,7 +277,9 @@ impl Simulator {
     fn check_kept(&self, worlds: &Range<usize>, step: u64) -> Result<(), Refusal> {
         let mut episodes = worlds.clone().filter_map(|world| self.episode(world));
         let missing = episodes.find_map(|episode| episode.recall(step).err());
-        missing.map_or(Ok(()), |oldest| Err(Refusal::new(Status::NotKept, oldest)))
+        missing.map_or(Ok(()), |nearest| {
+            Err(Refusal::new(Status::NotKept, nearest))
+        })
     }
 
     fn check_batch(

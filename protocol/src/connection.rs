@@ -428,7 +428,13 @@ fn refuse(
     match Status::try_from(code) {
         Ok(Status::Ok) => Ok(()),
         Ok(status) => {
-            let message = message.unwrap_or_else(|| status.explain(detail));
+            let message = match status {
+                // In the words of the commands that connect this way.
+                Status::Busy => format!(
+                    "busy: held by pid {detail}; wait for its release, or take over with --takeover"
+                ),
+                _ => message.unwrap_or_else(|| status.explain(detail)),
+            };
             Err(ConnectionError::Refused {
                 status,
                 detail,

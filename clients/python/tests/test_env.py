@@ -560,7 +560,9 @@ def test_a_second_environment_on_a_world_names_the_holder() -> None:
     with serving(worlds=2) as instance:
         first, second = make(instance=instance), make(instance=instance)
         first.reset(seed=1)
-        with pytest.raises(BusyError, match=f"held by pid {os.getpid()}") as caught:
+        with pytest.raises(
+            BusyError, match=f"held by pid {os.getpid()}; .* takeover=True"
+        ) as caught:
             second.reset()
         assert caught.value.detail == os.getpid()
         beside = make(instance=instance, world=1)

@@ -121,6 +121,33 @@ fn a_lost_lease_names_who_holds_its_own_worlds_now() {
 }
 
 #[test]
+fn a_lost_lease_names_its_taker_also_when_that_has_left() {
+    let (mut leases, now) = (Leases::new(3), Instant::now());
+    let lost = |leases: &mut Leases, worlds: Range<usize>| {
+        let refusal = leases.use_lease(now, 11, client(1), &worlds);
+        refusal.expect_err("lost").detail
+    };
+    leases
+        .acquire(now, claim(1, 0..3, false), 11)
+        .expect("free");
+    leases
+        .acquire(now, claim(2, 0..1, true), 12)
+        .expect("takeover");
+    leases.release(now, 12, client(2)).expect("held");
+    assert_eq!(lost(&mut leases, 0..1), 2);
+    assert_eq!(leases.use_lease(now, 11, client(1), &(1..3)), Ok(()));
+    leases
+        .acquire(now, claim(3, 1..3, true), 13)
+        .expect("takeover of the rest");
+    leases.release(now, 13, client(3)).expect("held");
+    assert_eq!(lost(&mut leases, 1..2), 3);
+    leases
+        .acquire(now, claim(4, 1..2, false), 14)
+        .expect("free");
+    assert_eq!(lost(&mut leases, 1..2), 3, "not who came later");
+}
+
+#[test]
 fn a_stolen_token_is_worth_nothing() {
     let (mut leases, now) = (Leases::new(1), Instant::now());
     leases

@@ -25,7 +25,8 @@ pub enum Status {
     BadMove = 7,
     /// The lease does not cover these worlds, or was never given; detail: the first such world.
     NoLease = 8,
-    /// The lease was taken over, expired or released; detail: pid of the holder, 0 if none.
+    /// The lease was taken over, expired or released; detail: pid of who took it over or holds the
+    /// world since, 0 if nobody.
     LeaseLost = 9,
     /// Another client holds a world; detail: its pid.
     Busy = 10,
@@ -43,7 +44,7 @@ pub enum Status {
     AgentEnds = 16,
     /// A file that cannot be read or written, or is refused; detail: 0.
     BadFile = 17,
-    /// A frame or a belief that the server does not keep; detail: the oldest step kept, or the present one.
+    /// A frame or a belief that the server does not keep; detail: the nearest step kept, or the present one.
     NotKept = 18,
 }
 
@@ -101,10 +102,12 @@ impl Status {
             Self::LeaseLost if detail == 0 => {
                 "lease lost: it expired or was released; acquire the worlds again".into()
             }
-            Self::LeaseLost => format!("lease lost to pid {detail}"),
-            Self::Busy => {
-                format!("busy: held by pid {detail}; wait for its release or take the worlds over")
-            }
+            Self::LeaseLost => format!(
+                "lease lost to pid {detail}, which took the world over or acquired it since"
+            ),
+            Self::Busy => format!(
+                "busy: held by pid {detail}; wait for its release, or acquire with \"takeover\": true"
+            ),
             Self::Resetting => {
                 format!("world {detail} is being reset; wait for the answer to the reset")
             }
@@ -120,7 +123,7 @@ impl Status {
             Self::BadObjective => format!("objective: expected 0 to {}", detail.saturating_sub(1)),
             Self::AgentEnds => "the agent ends".into(),
             Self::BadFile => "the file cannot be used".into(),
-            Self::NotKept => format!("not kept: the oldest step kept is {detail}"),
+            Self::NotKept => format!("not kept: the nearest step that is kept is {detail}"),
         }
     }
 }

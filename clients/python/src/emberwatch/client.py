@@ -129,7 +129,7 @@ class Client(Closing):
         """The results and frames of an earlier step k of the episode. Needs no lease.
 
         Raises:
-            NotKeptError: If the server does not keep it any more; `detail` is the oldest step kept.
+            NotKeptError: If the server does not keep it; `detail` is the nearest step kept.
         """
         if not 0 <= step < 2**64:
             raise SettingError(f"step: expected an integer within 0 to 2**64 - 1, got {step!r}")

@@ -118,7 +118,10 @@ class NoLeaseError(RefusedError):
 
 
 class LeaseLostError(RefusedError):
-    """The lease ended or the world was taken over. `detail`: pid of the holder, 0 if none."""
+    """The lease ended or the world was taken over.
+
+    `detail`: pid of who took it over, or holds it since; 0 if nobody.
+    """
 
     name = "lease_lost"
 
@@ -172,7 +175,7 @@ class BadFileError(RefusedError):
 
 
 class NotKeptError(RefusedError):
-    """A step's frame, or a belief, that is not kept; `detail` is the oldest step that is."""
+    """A step's frame, or a belief, that is not kept; `detail` is the nearest step that is."""
 
     name = "not_kept"
 
@@ -201,13 +204,15 @@ REFUSALS: tuple[type[RefusedError], ...] = (
 
 
 def refusal(code: int, detail: int, message: str | None = None) -> RefusedError:
-    """The error for a status code other than 0, in the server's words if it gave some."""
+    """The error for a status code other than 0, in the server's words if they fit Python."""
     if not 1 <= code <= len(REFUSALS):
         return RefusedError(
             message or f"the server refused: status {code}, detail {detail}", detail
         )
     kind = REFUSALS[code - 1]
-    return kind(message or _explain(kind, detail), detail)
+    if message is None or kind is BusyError:  # to take over is said in Python's terms
+        message = _explain(kind, detail)
+    return kind(message, detail)
 
 
 def _explain(kind: type[RefusedError], detail: int) -> str:
@@ -225,8 +230,8 @@ def _explain(kind: type[RefusedError], detail: int) -> str:
         "wrong_path_length": "wrong path length: the server flies {} moves a step",
         "bad_move": "byte {} of the paths: expected a move in 0..=3",
         "no_lease": "no lease on world {}: acquire it first",
-        "lease_lost": "lease lost to pid {}",
-        "busy": "busy: held by pid {}; wait for its release or take the worlds over",
+        "lease_lost": "lease lost to pid {}, which took the world over or acquired it since",
+        "busy": "busy: held by pid {}; wait for its release, or acquire with takeover=True",
         "resetting": "world {} is being reset; wait for the answer to the reset",
         "episode_over": "world {} was truncated: reset it first",
         "not_permitted": 'not permitted: full frames need a server with coverage "client" or '
@@ -234,7 +239,7 @@ def _explain(kind: type[RefusedError], detail: int) -> str:
         "unknown_flags": "flags: expected 0 or 1 (full coverage), got {}",
         "bad_objective": "objective: expected one below {}",
         "bad_file": "the file cannot be used",
-        "not_kept": "not kept: the oldest step kept is {}",
+        "not_kept": "not kept: the nearest step that is kept is {}",
         "agent_ends": "the agent ends",
     }
     return sentences[kind.name].format(detail)
