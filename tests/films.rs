@@ -119,15 +119,25 @@ fn what_is_not_recorded_is_shown_and_told() {
 }
 
 #[test]
-fn a_cut_recording_is_shown_as_far_as_it_goes() {
+fn a_cut_or_damaged_recording_is_shown_as_far_as_it_is_good() {
     let (folder, file, _) = record(6, "");
     let bytes = std::fs::read(&file).expect("read");
     let cut = folder.path().join("cut.recording");
     std::fs::write(&cut, &bytes[..bytes.len() - 60]).expect("write");
     let out = folder.path().join("cut.gif");
-    let ended = film(&cut, &format!("--gif {} --from 2", out.display()));
-    assert!(ended.stderr.contains("cut short"), "{}", ended.stderr);
-    assert!((4..=5).contains(&delays(&out).len()));
+    let mut damaged = bytes.clone();
+    damaged[bytes.len() - 300] ^= 1;
+    let wrong = folder.path().join("damaged.recording");
+    std::fs::write(&wrong, &damaged).expect("write");
+    for (file, words, shown) in [
+        (&cut, "cut short", 4..=5),
+        (&wrong, "damaged at byte", 1..=5),
+    ] {
+        let ended = film(file, &format!("--gif {} --from 2", out.display()));
+        assert!(ended.stderr.contains(words), "{}", ended.stderr);
+        assert!(ended.stderr.contains("good before it"), "{}", ended.stderr);
+        assert!(shown.contains(&delays(&out).len()));
+    }
 }
 
 #[test]

@@ -170,7 +170,7 @@ fn a_killed_recorder_leaves_whole_records_and_readers_say_where_they_end() {
     let (records, error) = read(&file);
     let length = file.metadata().expect("the file").len();
     match error {
-        Some(RecordingError::Cut { offset, got }) => assert_eq!(offset + got, length),
+        Some(RecordingError::Cut { offset, got, .. }) => assert_eq!(offset + got, length),
         other => panic!("expected a cut, got {other:?}"),
     }
     let instance = new_instance();
@@ -318,7 +318,7 @@ replay / => recording /: Is a directory
 replay FOREIGN => not a recording | got "a text t"
 replay NEWER => recording version: expected 1, got 2
 replay DAMAGED => damaged at byte 16: checksum: expected
-replay START => expected samples from 0ns on, got none
+replay START => cut short: expected a whole record at byte 16, got 0 bytes; good before it: 0 steps
 replay GOOD --from 9 => expected samples from 9s on, got none
 replay GOOD --from -1 => -1
 replay GOOD --from x => --from | expected seconds

@@ -183,7 +183,7 @@ pub enum FilmError {
 /// Makes a film or a still.
 ///
 /// # Errors
-/// [`FilmError`]. A recording that was cut short is shown as far as it goes, with a warning.
+/// [`FilmError`]. A recording that is damaged or cut short is shown as far as it is good, with a warning.
 pub fn film(order: &Order) -> Result<Summary, FilmError> {
     let survey = Survey::of(order)?;
     survey.warn(order);

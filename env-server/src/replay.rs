@@ -47,6 +47,8 @@ pub struct Order {
     pub repeat: bool,
     /// Whether to begin without an observer.
     pub at_once: bool,
+    /// Whether to refuse a file that is damaged or cut short.
+    pub strict: bool,
 }
 
 /// Why a replay failed.
@@ -80,7 +82,8 @@ pub enum ReplayError {
 /// Replays until the end, `stop`, or a client's `shutdown`.
 ///
 /// # Errors
-/// [`ReplayError`]. A recording that was cut short is replayed as far as it goes, with a warning.
+/// [`ReplayError`]. A recording that is damaged or cut short is replayed as far as it is good, with a
+/// warning.
 pub fn replay(order: &Order, stop: &AtomicBool) -> Result<(), ReplayError> {
     let survey = Survey::of(order)?;
     let ports = Ports::open_at(&survey.place)?;
@@ -136,13 +139,13 @@ impl Survey {
             answer_bytes: 0,
             publish_truth: false,
         };
-        let (mut first, mut is_empty) = (None, true);
+        let (mut first, mut is_empty, mut early) = (None, true, None);
         let mut reader = open(&order.file)?;
         for record in reader.by_ref() {
             let record = match record {
                 Ok(record) => record,
-                Err(cut @ RecordingError::Cut { .. }) => {
-                    tracing::warn!(file = %order.file.display(), "{cut}; replaying what is there");
+                Err(problem) if !order.strict && problem.leaves_good_records() => {
+                    early = Some(problem);
                     break;
                 }
                 Err(problem) => return Err(file_error(&order.file, problem)),
@@ -158,12 +161,18 @@ impl Survey {
         }
         let totals = reader.totals();
         place.publish_truth = totals.n_truths > 0;
-        match first {
-            Some(info) if !is_empty => Ok(Self {
-                place,
-                info,
-                totals,
-            }),
+        match (first, early) {
+            (Some(info), early) if !is_empty => {
+                if let Some(problem) = early {
+                    tracing::warn!(file = %order.file.display(), "{problem}; replaying these");
+                }
+                Ok(Self {
+                    place,
+                    info,
+                    totals,
+                })
+            }
+            (_, Some(problem)) => Err(file_error(&order.file, problem)),
             _ => Err(ReplayError::Empty {
                 path: order.file.clone(),
                 from: order.from,
@@ -197,7 +206,7 @@ impl Replay<'_> {
         for record in open(&self.order.file)? {
             let record = match record {
                 Ok(record) => record,
-                Err(RecordingError::Cut { .. }) => break,
+                Err(problem) if problem.leaves_good_records() => break,
                 Err(problem) => return Err(file_error(&self.order.file, problem)),
             };
             let time = Duration::from_nanos(record.nanos);

@@ -17,6 +17,7 @@ use crate::observer::Sample;
 use crate::path::MAX_MOVES;
 use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
 use thiserror::Error;
 
 /// The first bytes of every recording.
@@ -133,25 +134,39 @@ pub enum RecordingError {
     /// The file ends without an end: its recorder was killed, or bytes are missing. Everything before
     /// is whole.
     #[error(
-        "the recording was cut short: expected a whole record at byte {offset}, got {got} bytes"
+        "the recording was cut short: expected a whole record at byte {offset}, got {got} bytes; good before it: \
+         {n_steps} steps"
     )]
     Cut {
         /// Where the last whole record ends, bytes from the start of the file.
         offset: u64,
         /// Bytes behind it.
         got: u64,
+        /// World steps before it.
+        n_steps: u64,
     },
-    /// Bytes that no recorder wrote.
-    #[error("the recording is damaged at byte {offset}: {problem}")]
+    /// Bytes that no recorder wrote. Everything before is whole.
+    #[error(
+        "the recording is damaged at byte {offset}: {problem}; good before it: {n_steps} steps"
+    )]
     Damaged {
         /// Where the record begins.
         offset: u64,
         /// What was expected, and what is there.
         problem: String,
+        /// World steps before it.
+        n_steps: u64,
     },
     /// A record that does not belong here, so that it was not written.
     #[error("not recorded: {0}")]
     Refused(String),
+}
+
+impl RecordingError {
+    /// Whether everything before is whole, so that it can be used.
+    pub fn leaves_good_records(&self) -> bool {
+        matches!(self, Self::Cut { .. } | Self::Damaged { .. })
+    }
 }
 
 /// What has passed so far; writer and reader keep it alike, so that neither lets a record through that
@@ -161,6 +176,10 @@ struct Course {
     nanos: u64,
     server: Option<Limits>,
     totals: Totals,
+    /// Episode and step of each world's last frame: a frame may be published again.
+    last: HashMap<u32, (u64, u64)>,
+    /// World steps.
+    n_steps: u64,
 }
 
 /// What the samples of a server must fit.
@@ -183,6 +202,7 @@ impl Course {
         match &record.event {
             Event::Server(info) => {
                 self.server = Some(Limits::of(info)?);
+                self.last.clear();
                 totals.n_servers += 1;
             }
             Event::Frame(Sample { header, payload }) => {
@@ -196,6 +216,9 @@ impl Course {
                 limits.check(header.version, header.world, grid, payload.len(), path)?;
                 totals.n_frames += 1;
                 totals.n_lost_frames += n_lost;
+                let now = (header.result.episode, header.result.step);
+                let is_new = self.last.insert(header.world, now) != Some(now);
+                self.n_steps += u64::from(is_new && path > 0);
             }
             Event::Truth(Sample { header, payload }) => {
                 let grid = (header.height, header.width);

@@ -120,6 +120,12 @@ fn read(bytes: &[u8]) -> (Vec<Record>, Option<RecordingError>) {
     (records, None)
 }
 
+/// Frames of a path; none of the example's comes twice.
+fn count_steps(records: &[Record]) -> u64 {
+    let is_step = |record: &&Record| matches!(&record.event, Event::Frame(sample) if sample.header.n_moves > 0);
+    records.iter().filter(is_step).count() as u64
+}
+
 fn check_refused(bytes: &[u8], words: &str) {
     let (_, error) = read(bytes);
     let said = error.expect("refused").to_string();
@@ -175,8 +181,13 @@ fn a_recording_cut_anywhere_is_read_up_to_its_last_whole_record_and_says_so() {
         let offset = if n_whole == 0 { 0 } else { ends[n_whole - 1] };
         assert_eq!(records, example()[..n_whole.saturating_sub(1)], "{length}");
         match error {
-            Some(RecordingError::Cut { offset: said, got }) => {
+            Some(RecordingError::Cut {
+                offset: said,
+                got,
+                n_steps,
+            }) => {
                 assert_eq!((said, got), (offset as u64, (length - offset) as u64));
+                assert_eq!(n_steps, count_steps(&records));
             }
             other => panic!("cut after {length} bytes: {other:?}"),
         }
@@ -191,8 +202,11 @@ fn a_flipped_bit_anywhere_is_noticed() {
             let mut damaged = bytes.clone();
             damaged[position] ^= 1 << bit;
             let (records, error) = read(&damaged);
-            assert!(error.is_some(), "byte {position}, bit {bit}");
+            let error = error.unwrap_or_else(|| panic!("byte {position}, bit {bit}"));
             assert_eq!(records, example()[..records.len()]);
+            if let RecordingError::Damaged { n_steps, .. } = error {
+                assert_eq!(n_steps, count_steps(&records));
+            }
         }
     }
 }

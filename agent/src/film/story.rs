@@ -99,8 +99,8 @@ pub struct Story<R> {
 /// What ends a story that is not told to the recording's end.
 #[derive(Debug)]
 pub enum End {
-    /// The file lacks its end.
-    Cut(RecordingError),
+    /// The file lacks its end, or is damaged from here on.
+    Early(RecordingError),
     /// The next server's worlds are of another kind.
     OtherWorlds,
 }
@@ -133,8 +133,8 @@ impl<R: Iterator<Item = Result<Record, RecordingError>>> Story<R> {
         while self.end.is_none() {
             let record = match self.records.next() {
                 Some(Ok(record)) => record,
-                Some(Err(error @ RecordingError::Cut { .. })) => {
-                    self.end = Some(End::Cut(error));
+                Some(Err(error)) if error.leaves_good_records() => {
+                    self.end = Some(End::Early(error));
                     break;
                 }
                 Some(Err(error)) => return Err(error.into()),

@@ -1,6 +1,6 @@
 //! What there is to show of a recording, before any of it is drawn.
 
-use super::story::{Beat, End, Link, Story};
+use super::story::{Beat, End, Link, Story, StoryError};
 use super::{FilmError, Order, Product, open};
 use protocol::control::ServerInfo;
 use protocol::recording::Event;
@@ -46,7 +46,10 @@ impl Survey {
         let end = story.into_end();
         let Some(server) = server.filter(|_| !tally.runs.is_empty()) else {
             let got = order.world;
-            return Err(FilmError::World { known, got });
+            return Err(match end {
+                Some(End::Early(problem)) => StoryError::from(problem).of(&order.recording),
+                _ => FilmError::World { known, got },
+            });
         };
         if tally.n_beats == 0 {
             return Err(tally.nothing(&order.product));
@@ -65,7 +68,7 @@ impl Survey {
     /// Says what the pictures cannot.
     pub fn warn(&self, order: &Order) {
         match &self.end {
-            Some(End::Cut(problem)) => tracing::warn!("{problem}; showing it as far as it goes"),
+            Some(End::Early(problem)) => tracing::warn!("{problem}; showing these"),
             Some(End::OtherWorlds) => tracing::warn!(
                 "the recording goes on with another server's worlds, of another kind; showing the first's"
             ),

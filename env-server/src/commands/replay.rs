@@ -28,6 +28,9 @@ pub struct ReplayCommand {
     /// Begin at once, rather than when there is an observer
     #[arg(long)]
     no_wait: bool,
+    /// Refuse a recording that is damaged or cut short, rather than replay what of it is good
+    #[arg(long)]
+    strict: bool,
 }
 
 /// How fast to replay; `None`: no waiting for the recorded times.
@@ -45,6 +48,7 @@ impl ReplayCommand {
             from: self.from,
             repeat: self.repeat,
             at_once: self.no_wait,
+            strict: self.strict,
         };
         Ok(replay(&order, &stop)?)
     }

@@ -12,7 +12,8 @@ use std::io::{Read, Seek, SeekFrom};
 
 /// Reads a recording: an iterator of records that ends after the first error.
 ///
-/// A file without an end gives [`RecordingError::Cut`] after its last whole record.
+/// A file without an end gives [`RecordingError::Cut`] after its last whole record, a damaged one
+/// [`RecordingError::Damaged`] before the first that is not.
 #[derive(Debug)]
 pub struct Reader<R> {
     input: R,
@@ -42,8 +43,11 @@ impl<R: Read> Reader<R> {
             return Err(RecordingError::Foreign(header.magic[..n_magic].to_vec()));
         }
         if n_read < size_of::<FileHeader>() {
-            let got = n_read as u64;
-            return Err(RecordingError::Cut { offset: 0, got });
+            return Err(RecordingError::Cut {
+                offset: 0,
+                got: n_read as u64,
+                n_steps: 0,
+            });
         }
         if header.version != VERSION {
             return Err(RecordingError::Version(header.version));
@@ -75,17 +79,22 @@ impl<R: Read> Reader<R> {
 
     /// The next record; `None` at the end.
     fn read(&mut self) -> Result<Option<Record>, RecordingError> {
-        let offset = self.at.offset;
+        let (offset, n_steps) = (self.at.offset, self.at.course.n_steps);
         let mut header = RecordHeader::zeroed();
         let n_read = fill(&mut self.input, &mut header)?;
         let cut = |got: usize| RecordingError::Cut {
             offset,
             got: got as u64,
+            n_steps,
         };
         if n_read < size_of::<RecordHeader>() {
             return Err(cut(n_read));
         }
-        let damaged = |problem: String| RecordingError::Damaged { offset, problem };
+        let damaged = |problem: String| RecordingError::Damaged {
+            offset,
+            problem,
+            n_steps,
+        };
         let length = header.length as usize;
         if length > MAX_STORED_BYTES {
             let problem = format!("body: expected at most {MAX_STORED_BYTES} bytes, got {length}");

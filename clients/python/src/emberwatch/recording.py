@@ -50,6 +50,18 @@ class RecordingCutWarning(UserWarning):
     """A recording ends without an end. Every record before is whole."""
 
 
+class RecordingDamagedWarning(UserWarning):
+    """A recording has bytes that no recorder wrote. Every record before is whole."""
+
+
+class _EarlyEndError(RecordingError):
+    """What is wrong with a recording whose records up to here are whole."""
+
+    def __init__(self, message: str, warning: type[UserWarning]) -> None:
+        super().__init__(message)
+        self.warning = warning
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Record:
     """A record, checked.
@@ -66,7 +78,9 @@ class Record:
     sample: Frame | Truth
 
 
-def read(path: str | os.PathLike[str], *, world: int | None = None) -> Iterator[Record]:
+def read(
+    path: str | os.PathLike[str], *, world: int | None = None, strict: bool = False
+) -> Iterator[Record]:
     """Reads a recording: an iterator of its frames and hidden states, in order.
 
     Hidden states come before the frame of their step. They are for evaluation and pictures, never
@@ -75,22 +89,29 @@ def read(path: str | os.PathLike[str], *, world: int | None = None) -> Iterator[
     Args:
         path: The file.
         world: Only this world; None: all.
+        strict: Raise an error where there would be a warning.
 
     Yields:
         Each record, as copies of your own.
 
     Raises:
-        RecordingError: If the file is no recording, or damaged; after everything before the damage.
+        RecordingError: If the file is no recording.
         OSError: If it cannot be read.
 
     Warns:
         RecordingCutWarning: After the last whole record of a file that was cut short.
+        RecordingDamagedWarning: After the last whole record before damage.
     """
     with Path(path).open("rb") as file:
         reader = _Reader(file, os.fspath(path))
-        for record in reader.records():
-            if world is None or record.sample.world == world:
-                yield record
+        try:
+            for record in reader.records():
+                if world is None or record.sample.world == world:
+                    yield record
+        except _EarlyEndError as error:
+            if strict:
+                raise
+            warnings.warn(str(error), error.warning, stacklevel=2)
 
 
 class _Reader:
@@ -102,6 +123,9 @@ class _Reader:
         self._offset = 0
         self._nanos = 0
         self._server: ServerInfo | None = None
+        #: World steps, and episode and step of each world's last frame.
+        self._n_steps = 0
+        self._last: dict[int, tuple[int, int]] = {}
         self._totals: dict[str, int] = dict.fromkeys(
             ["n_servers", "n_frames", "n_truths", "n_lost_frames", "n_lost_truths"], 0
         )
@@ -115,7 +139,6 @@ class _Reader:
             )
         if len(head) < FILE_HEADER.size:
             self._cut(len(head))
-            return
         _, version, reserved = FILE_HEADER.unpack(head)
         if version != VERSION:
             raise RecordingError(
@@ -128,14 +151,12 @@ class _Reader:
             head = self._file.read(RECORD_HEADER.size)
             if len(head) < RECORD_HEADER.size:
                 self._cut(len(head))
-                return
             nanos, kind, length, n_lost, checksum = RECORD_HEADER.unpack(head)
             if length > MAX_STORED_BYTES:
                 self._damaged(f"body: expected at most {MAX_STORED_BYTES} bytes, got {length}")
             stored = self._file.read(length)
             if len(stored) < length:
                 self._cut(len(head) + len(stored))
-                return
             expected = zlib.crc32(stored, zlib.crc32(head[:-4]))
             if checksum != expected:
                 self._damaged(f"checksum: expected {expected:#010x}, got {checksum:#010x}")
@@ -156,6 +177,7 @@ class _Reader:
         try:
             if kind == SERVER:
                 self._totals["n_servers"] += 1
+                self._last.clear()
                 self._server = record_from_reply(ServerInfo, json.loads(body))
                 return None
             if kind == FRAME:
@@ -172,6 +194,11 @@ class _Reader:
         name = "frames" if kind == FRAME else "truths"
         self._totals[f"n_{name}"] += 1
         self._totals[f"n_lost_{name}"] += n_lost
+        if isinstance(sample, Frame):  # which may be published again
+            now = (sample.result.episode, sample.result.step)
+            is_new = self._last.get(sample.world) != now
+            self._n_steps += is_new and len(sample.path) > 0
+            self._last[sample.world] = now
         return sample
 
     def _check_sample(self, header: Any) -> None:
@@ -209,15 +236,16 @@ class _Reader:
         if self._file.read(1):
             self._damaged("expected nothing behind the end, got more bytes")
 
-    def _cut(self, got: int) -> None:
-        warnings.warn(
-            f"{self._name}: the recording was cut short: expected a whole record at byte "
-            f"{self._offset}, got {got} bytes",
+    def _cut(self, got: int) -> NoReturn:
+        self._end(
+            f"was cut short: expected a whole record at byte {self._offset}, got {got} bytes",
             RecordingCutWarning,
-            stacklevel=4,
         )
 
     def _damaged(self, problem: str) -> NoReturn:
-        raise RecordingError(
-            f"{self._name}: the recording is damaged at byte {self._offset}: {problem}"
+        self._end(f"is damaged at byte {self._offset}: {problem}", RecordingDamagedWarning)
+
+    def _end(self, problem: str, warning: type[UserWarning]) -> NoReturn:
+        raise _EarlyEndError(
+            f"{self._name}: the recording {problem}; good before it: {self._n_steps} steps", warning
         )
