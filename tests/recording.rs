@@ -11,6 +11,8 @@ use protocol::observer::{Observer, Sample};
 use protocol::recording::{Event, Reader, Record, RecordingError, Writer};
 use rustix::process::Signal;
 use std::fs::File;
+use std::io::Read;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
@@ -284,6 +286,53 @@ fn a_recorder_ends_after_its_steps_with_its_worlds_alone() {
             |truth: &Sample<TruthHeader>| (truth.header.world, truth.header.step) == (world, 2);
         assert!(truths(&records).iter().any(is_last), "world {world}");
     }
+}
+
+#[test]
+fn a_damaged_recording_is_replayed_up_to_the_damage_unless_that_is_checked() {
+    let (_folder, file) = new_file();
+    let samples = write_recording(&file, 5, 0);
+    let mut bytes = std::fs::read(&file).expect("read");
+    let at = bytes.len() - 160; // in the fourth frame's record
+    bytes[at] ^= 1;
+    std::fs::write(&file, &bytes).expect("write");
+    let (records, error) = read(&file);
+    let good = frames(&records);
+    assert!(matches!(error, Some(RecordingError::Damaged { .. })));
+    assert!((1..5).contains(&good.len()) && good[..] == samples[..good.len()]);
+    let words = format!("good before it: {} steps", good.len());
+    let instance = new_instance();
+    let observer = Observer::frames(&instance).expect("observe");
+    let replay = start_replay(&instance, &file, &[]);
+    assert_eq!(take(&observer, good.len()), good);
+    drop(observer);
+    let ended = replay.wait(PATIENCE);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert!(ended.stderr.contains(&words), "{}", ended.stderr);
+    let refused = start_replay(&instance, &file, &["--strict"]).wait(PATIENCE);
+    assert_eq!(refused.code, Some(1), "{}", refused.stderr);
+    assert!(refused.stderr.contains(&words), "{}", refused.stderr);
+}
+
+#[test]
+fn nobody_else_reads_a_recording() {
+    let server = Server::start(&format!("{SMALL} --publish-truth"));
+    let (folder, file) = new_file();
+    let link = folder.path().join("link");
+    std::os::unix::fs::symlink(&file, &link).expect("a link");
+    std::fs::write(&file, "open to everybody").expect("write");
+    let old = File::open(&file).expect("somebody has it open");
+    let everybody = std::fs::Permissions::from_mode(0o666);
+    std::fs::set_permissions(&file, everybody).expect("a mode");
+    let flags = ["--truth", "--force"];
+    for path in [&file, &link, &folder.path().join("new")] {
+        stop(start_recorder(&server.instance, path, &flags));
+        let mode = path.metadata().expect("the file").permissions().mode();
+        assert_eq!(mode & 0o777, 0o600, "{}", path.display());
+    }
+    let mut seen = String::new();
+    (&old).read_to_string(&mut seen).expect("read");
+    assert_eq!(seen, "open to everybody");
 }
 
 #[test]

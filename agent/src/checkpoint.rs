@@ -11,8 +11,9 @@ use crate::belief::BeliefError;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use std::collections::HashMap;
-use std::fs::File;
-use std::io::Write;
+use std::fs::{File, OpenOptions};
+use std::io::{Read, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 
@@ -38,6 +39,9 @@ pub enum Problem {
     /// The system refused.
     #[error("{0}")]
     Io(#[from] std::io::Error),
+    /// A folder, a pipe or a device, which may never end.
+    #[error("expected a regular file, got something else")]
+    NoFile,
     /// Too large to be one.
     #[error("expected at most {MAX_BYTES} bytes, got {0}")]
     Large(u64),
@@ -109,7 +113,11 @@ pub fn write(path: &Path, kind: &'static str, contents: &Contents) -> Result<(),
     let mut beside = path.as_os_str().to_owned();
     beside.push(format!(".{}", std::process::id()));
     let beside = PathBuf::from(beside);
-    let written = File::create(&beside).and_then(|mut file| {
+    // It holds beliefs about worlds, which are their owner's.
+    let _ = std::fs::remove_file(&beside);
+    let mut options = OpenOptions::new();
+    options.write(true).create_new(true).mode(0o600);
+    let written = options.open(&beside).and_then(|mut file| {
         file.write_all(&bytes)?;
         file.sync_all()?;
         std::fs::rename(&beside, path)
@@ -138,11 +146,16 @@ pub fn read_any(
     kinds: &[&'static str],
 ) -> Result<(&'static str, Contents), CheckpointError> {
     let bytes = || {
-        let size = std::fs::metadata(path)?.len();
-        if size > MAX_BYTES {
-            return Err(Problem::Large(size));
+        let found = std::fs::metadata(path)?;
+        if !found.is_file() {
+            return Err(Problem::NoFile);
         }
-        Ok(std::fs::read(path)?)
+        if found.len() > MAX_BYTES {
+            return Err(Problem::Large(found.len()));
+        }
+        let mut bytes = Vec::new();
+        File::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
+        Ok(bytes)
     };
     let contents = bytes().and_then(|bytes| decode(kinds, &bytes));
     contents.map_err(|problem| problem.of(path))
@@ -242,6 +255,7 @@ impl Contents {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::os::unix::fs::PermissionsExt;
 
     fn contents() -> Contents {
         let mut contents = Contents::default();
@@ -269,9 +283,12 @@ mod tests {
     #[test]
     fn what_is_written_is_read() {
         let (folder, path) = place();
+        std::fs::write(&path, "open to everybody").expect("written");
         write(&path, "tests", &contents()).expect("written");
         write(&path, "tests", &contents()).expect("written over");
         assert_eq!(read(&path, "tests").expect("read"), contents());
+        let mode = path.metadata().expect("the file").permissions().mode();
+        assert_eq!(mode & 0o777, 0o600);
         let files = std::fs::read_dir(folder.path()).expect("the folder");
         assert_eq!(files.count(), 1, "nothing left beside it");
     }
@@ -331,6 +348,8 @@ mod tests {
         assert_eq!(error(read.bytes("lap", &[16])), words);
         let error = read.counts("kernel").expect_err("floats").to_string();
         assert_eq!(error, "expected \"kernel\" in it, found none");
+        let endless = super::read(Path::new("/dev/zero"), "tests").expect_err("no file");
+        assert!(endless.to_string().contains("expected a regular file"));
         let missing = super::read(Path::new("no/such"), "tests").expect_err("none");
         assert!(
             missing

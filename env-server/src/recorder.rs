@@ -13,6 +13,7 @@ use protocol::recording::{Event, Record, RecordingError, Totals, Writer};
 use std::collections::HashMap;
 use std::fs::{File, OpenOptions};
 use std::io::BufWriter;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -389,11 +390,21 @@ fn bytes_of(record: &Record) -> usize {
         }
 }
 
+/// A file that nobody else reads: it may hold hidden states.
 fn create(path: &Path, overwrite: bool) -> Result<File, RecordError> {
     let mut options = OpenOptions::new();
-    options.write(true).truncate(true);
-    options.create(overwrite).create_new(!overwrite);
-    options.open(path).map_err(|error| match error.kind() {
+    options.write(true).mode(0o600);
+    let found = path.metadata().ok().filter(|_| overwrite);
+    let file = match found.map(|found| found.is_file()) {
+        // Not the old one: others may have it open, or may open it.
+        Some(true) => path.canonicalize().and_then(|path| {
+            std::fs::remove_file(&path)?;
+            options.create_new(true).open(path)
+        }),
+        Some(false) => options.open(path), // a pipe, perhaps
+        None => options.create_new(true).open(path),
+    };
+    file.map_err(|error| match error.kind() {
         std::io::ErrorKind::AlreadyExists => RecordError::Exists(path.into()),
         _ => RecordError::File {
             path: path.into(),
