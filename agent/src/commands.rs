@@ -26,7 +26,7 @@ use protocol::Model;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::message::Status;
-use protocol::program::stop_on_signals;
+use protocol::program::{read_text, stop_on_signals};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -114,8 +114,7 @@ fn model_named(name: &str) -> Result<Model> {
 }
 
 fn read_model(path: &Path) -> Result<Model> {
-    let text =
-        std::fs::read_to_string(path).with_context(|| format!("model file {}", path.display()))?;
+    let text = read_text(path).with_context(|| format!("model file {}", path.display()))?;
     Model::from_toml(&text).with_context(|| format!("model file {}", path.display()))
 }
 

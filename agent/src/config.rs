@@ -16,6 +16,7 @@ use crate::planner::{
 };
 use crate::policy::{BEAM_BONUS, PlannerKind, Policy};
 use clap::{Args, ValueEnum};
+use protocol::program::read_text;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use thiserror::Error;
@@ -315,7 +316,7 @@ fn read(path: &PathBuf) -> Result<AgentConfig, ConfigError> {
         path: path.display().to_string(),
         problem,
     };
-    let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+    let text = read_text(path).map_err(|error| wrong(error.to_string()))?;
     toml::from_str(&text).map_err(|error| wrong(error.to_string()))
 }
 

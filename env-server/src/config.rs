@@ -5,6 +5,7 @@ use clap::{Args, ValueEnum};
 use protocol::channels::Instance;
 use protocol::control::CoverageRule;
 use protocol::path::MAX_MOVES;
+use protocol::program::read_text;
 use protocol::{Cell, Model, Shape};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -310,7 +311,7 @@ impl ServerConfig {
 }
 
 fn read(what: &'static str, path: &Path) -> Result<String, ConfigError> {
-    std::fs::read_to_string(path).map_err(|error| file_error(what, path, error))
+    read_text(path).map_err(|error| file_error(what, path, error))
 }
 
 fn file_error(what: &'static str, path: &Path, problem: impl ToString) -> ConfigError {

@@ -1,16 +1,21 @@
-//! What every program does when it starts: log to standard error, stop on signals or with another
-//! process.
+//! What every program does when it starts: log to standard error, read settings and models, stop on signals or
+//! with another process.
 
 use crate::wait::is_readable;
 use rustix::io::Errno;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
-use std::io::IsTerminal;
+use std::fs::File;
+use std::io::{IsTerminal, Read};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use thiserror::Error;
 use tracing_subscriber::EnvFilter;
+
+/// Longest settings or model file, bytes: a model of 64 states with kernels of 15 x 15 cells has 5 MB.
+pub const MAX_TEXT_BYTES: u64 = 16 << 20;
 
 /// The process that a private program ends with.
 #[derive(Debug)]
@@ -66,6 +71,20 @@ pub fn start_logging() {
     log.with_target(false)
         .with_ansi(std::io::stderr().is_terminal())
         .init();
+}
+
+/// The text of a settings or model file, which may be a pipe but not endless.
+///
+/// # Errors
+/// The system's, or what is wrong with the text.
+pub fn read_text(path: &Path) -> std::io::Result<String> {
+    let mut text = String::new();
+    let mut file = File::open(path)?.take(MAX_TEXT_BYTES + 1);
+    if file.read_to_string(&mut text)? as u64 > MAX_TEXT_BYTES {
+        let problem = format!("expected at most {MAX_TEXT_BYTES} bytes, got more");
+        return Err(std::io::Error::other(problem));
+    }
+    Ok(text)
 }
 
 /// A flag that SIGINT, SIGTERM or SIGHUP sets; a second one ends the process at once.

@@ -137,6 +137,17 @@ def test_files_are_refused_with_their_path(tmp_path: Path) -> None:
         Model.read(tmp_path / "none.toml")
 
 
+def test_an_endless_file_is_refused() -> None:
+    with pytest.raises(ModelError, match="/dev/zero: expected at most 16777216 bytes"):
+        Model.read("/dev/zero")
+
+
+def test_the_documented_example_is_a_model() -> None:
+    page = (REPOSITORY / "docs/model-file.md").read_text()
+    example = page.split("```toml\n")[1].split("```")[0]
+    assert Model.from_toml(example).bias.tolist() == [0.01, 0.0]
+
+
 def test_weights_that_can_vanish_are_refused_on_the_grid_where_they_can() -> None:
     Model.wildfire().check_on(height=1, width=1)
     without_centre = Model.from_toml(WILDFIRE.replace("1.0, 0.1]", "0.0, 0.1]"))

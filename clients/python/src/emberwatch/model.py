@@ -30,6 +30,9 @@ MAX_VALUES = 64
 MAX_KERNEL_SIDE = 15
 """Largest side of a kernel, cells."""
 
+MAX_FILE_BYTES = 16 << 20
+"""Longest model file that is read, bytes."""
+
 _LEAST_SHARE = 1e-30  # of the largest weight, that a cell's weights may sum to: the server's
 _SMALLEST, _LARGEST = 1e-100, 1e100  # size of numbers that are not zero: the server's
 _SUM_TOLERANCE = 1e-6  # of a distribution in a model file: the server's
@@ -93,8 +96,12 @@ class Model:
             ModelError: Names the file and the entry, what it must be and what it is.
             OSError: The file cannot be read.
         """
+        with Path(path).open("rb") as file:  # which may be a pipe, but not endless
+            text = file.read(MAX_FILE_BYTES + 1)
+        if len(text) > MAX_FILE_BYTES:
+            raise ModelError(f"{path}: expected at most {MAX_FILE_BYTES} bytes, got more")
         try:
-            return cls.from_toml(Path(path).read_bytes().decode())
+            return cls.from_toml(text.decode())
         except (ModelError, UnicodeDecodeError) as error:
             raise ModelError(f"{path}: {error}") from error
 
