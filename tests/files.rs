@@ -1,7 +1,7 @@
 //! Settings and model files: wrong ones are refused by path and entry, right ones run.
 
 use crate::commands::{AGENT, LIMIT, SERVER, TINY, check};
-use crate::harness::{repository, run};
+use crate::harness::{SMALL, Server, repository, run};
 use std::path::PathBuf;
 use tempfile::TempDir;
 
@@ -126,6 +126,20 @@ fn the_checked_settings_are_accepted_again_as_a_file() {
             "{}",
             second.stderr
         );
+    }
+}
+
+#[test]
+fn a_model_in_which_no_state_pays_is_warned_of() {
+    let wildfire = repository().join("config/models/wildfire.toml");
+    let wildfire = std::fs::read_to_string(wildfire).expect("the model file");
+    assert!(wildfire.contains("reward = 1.0"));
+    let files = Files::new();
+    for (reward, is_warned_of) in [("reward = -1.0", false), ("", true)] {
+        let model = files.write("model.toml", &wildfire.replace("reward = 1.0", reward));
+        let server = Server::start(&format!("{SMALL} --model {model}"));
+        let log = server.program.stderr();
+        assert_eq!(log.contains("no state pays"), is_warned_of, "{log}");
     }
 }
 

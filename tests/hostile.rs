@@ -8,11 +8,13 @@ use crate::harness::{PATIENCE, Paths, Program, Server, claim, eventually, fly};
 use crate::siege::{FLAGS, besiege};
 use crate::wire::{RawClient, Wire, answer, client, control_header, step_header};
 use agent::client::Client;
+use protocol::Connection;
 use protocol::channels::{Channel, MAX_CLIENTS, MAX_OBSERVERS, Services, create_node};
+use protocol::connection::ConnectionError;
 use protocol::control::{MAX_CONTROL_BYTES, Reply, Request, WorldSeed};
 use protocol::message::{Status, StepRequest};
 use protocol::observer::Observer;
-use rustix::process::Signal;
+use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, prlimit};
 use std::time::Duration;
 
 fn attack(n_messages: u64) {
@@ -42,6 +44,26 @@ fn random_messages_change_nothing_for_others() {
 #[ignore = "takes minutes"]
 fn a_million_random_messages_change_nothing_for_others() {
     attack(1_000_000);
+}
+
+#[test]
+fn a_server_without_descriptors_says_so_and_hears_who_comes_when_there_are_some() {
+    let server = Server::start(FLAGS);
+    let limit = |current| {
+        let pid = Pid::from_raw(server.program.pid() as i32);
+        let limits = Rlimit {
+            current: Some(current),
+            ..getrlimit(Resource::Nofile)
+        };
+        prlimit(pid, Resource::Nofile, limits).expect("limit the server");
+    };
+    limit(12);
+    let unheard = Connection::open(&server.instance, "tests", Duration::from_secs(1));
+    assert!(matches!(unheard, Err(ConnectionError::Timeout { .. })));
+    let words = "no file descriptors for a client or an observer";
+    server.program.wait_for_words(words, PATIENCE);
+    limit(512);
+    server.connect();
 }
 
 #[test]

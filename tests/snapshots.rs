@@ -12,7 +12,7 @@ use protocol::control::{Reply, Request};
 use protocol::message::Status;
 use protocol::observer::Observer;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
 const N_MOVES: usize = 6;
@@ -384,6 +384,41 @@ fn nothing_but_snapshots_is_replaced_and_no_other_run_s() {
         &second.program.wait(PATIENCE),
         "or --restore, got 1 of another run",
     );
+}
+
+#[test]
+fn snapshots_of_other_instances_alone_are_told_of() {
+    let folder = TempDir::new().expect("a folder");
+    let flags = format!("{SMALL} --restore {}", text(folder.path()));
+    let first = Server::start(&flags);
+    first.program.wait_for_words("nothing to restore", PATIENCE);
+    let other = folder.path().join("other-000000000001.snapshot");
+    let written = server_command(&first, &["snapshot", text(&other)]);
+    assert_eq!(written.code, Some(0), "{}", written.stderr);
+    let second = Server::start(&flags);
+    let name = second.instance.name();
+    let words = format!("this instance, {name}-<12 digits>.snapshot, got others, such as other-0");
+    second.program.wait_for_words(&words, PATIENCE);
+    let log = second.program.stderr();
+    assert!(log.contains("WARN") && log.contains("begin anew"), "{log}");
+}
+
+#[test]
+fn snapshots_that_cannot_be_written_are_warned_of_now_and_then() {
+    let folder = TempDir::new().expect("a folder");
+    let place = folder.path().join("snaps");
+    let flags = format!("{SMALL} --snapshot-every 1 --snapshot-dir {}", text(&place));
+    let (began, server) = (Instant::now(), Server::start(&flags));
+    std::fs::remove_dir(&place).expect("remove");
+    std::fs::write(&place, "no folder").expect("write");
+    let mut client = server.acquire(0..1);
+    for k in 0..300 {
+        fly(&mut client, Paths::new(k).next(N_MOVES));
+    }
+    server.program.wait_for_words("not saved", PATIENCE);
+    let (log, seconds) = (server.program.stderr(), began.elapsed().as_secs() as usize);
+    let n_warnings = log.matches("not saved").count();
+    assert!(n_warnings <= 1 + seconds / 10, "{log}");
 }
 
 #[test]

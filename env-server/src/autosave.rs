@@ -4,6 +4,8 @@ use crate::config::Checked;
 use crate::files::{Done, Files, Job, Place};
 use crate::snapshot::folder::{FileError, Folder, Outlives, refused};
 use crate::snapshot::{RestoredWorld, SnapshotError};
+use crate::throttle::Throttle;
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -23,6 +25,7 @@ pub struct Autosave {
     writing: Option<(u64, Outlives)>,
     /// The last that outlives a loss of power, and when it was written.
     safe: Option<(Instant, PathBuf)>,
+    failures: Throttle,
 }
 
 impl Autosave {
@@ -49,6 +52,7 @@ impl Autosave {
             due: every,
             writing: None,
             safe: None,
+            failures: Throttle::default(),
         }))
     }
 
@@ -88,9 +92,16 @@ impl Autosave {
                 self.safe = Some((Instant::now(), path.clone()));
             }
             Ok(_) => {}
-            Err(error) => tracing::warn!("not saved: {error}"),
+            Err(error) => self.warn(error),
         }
         true
+    }
+
+    /// Says, now and then, that one was not written.
+    pub fn warn(&mut self, error: &dyn Display) {
+        if let Some(unsaid) = self.failures.pass(Instant::now()) {
+            tracing::warn!(unsaid, "not saved: {error}");
+        }
     }
 }
 
@@ -120,7 +131,11 @@ pub fn first_worlds(checked: &Checked, place: &Place) -> Result<Option<FirstWorl
     }
     let path = Path::new(&checked.config.restore);
     let files = if path.is_dir() {
-        let files = Folder::new(path, &checked.instance).files()?;
+        let folder = Folder::new(path, &checked.instance);
+        let files = folder.files()?;
+        if files.is_empty() {
+            say_what_is_there(&folder, path);
+        }
         files.into_iter().rev().map(|(_, path)| path).collect()
     } else {
         vec![path.to_owned()]
@@ -142,10 +157,20 @@ pub fn first_worlds(checked: &Checked, place: &Place) -> Result<Option<FirstWorl
             Err(error) => return Err(error),
         }
     }
-    if damaged.is_none() {
-        tracing::info!(folder = %path.display(), "nothing to restore: the worlds begin anew");
-    }
     damaged.map_or(Ok(None), Err)
+}
+
+/// Says why nothing of a folder is restored. An empty one is that of a first start, and so may be one with other
+/// instances' files; but these may also be those that were meant.
+fn say_what_is_there(folder: &Folder, path: &Path) {
+    let (path, expected) = (path.display(), folder.pattern());
+    match &folder.snapshots()[..] {
+        [] => tracing::info!(folder = %path, "nothing to restore: the worlds begin anew"),
+        [first, ..] => tracing::warn!(
+            "--restore {path}: expected snapshots of this instance, {expected}, got others, such as {first}: the \
+             worlds begin anew; to restore one of these, name its file, or its instance with --instance"
+        ),
+    }
 }
 
 #[cfg(test)]

@@ -9,6 +9,7 @@
 pub mod autosave;
 pub mod beliefs;
 pub mod config;
+pub mod descriptors;
 pub mod episode;
 pub mod files;
 pub mod history;
@@ -23,4 +24,5 @@ pub mod sensor;
 pub mod server;
 pub mod simulator;
 pub mod snapshot;
+pub mod throttle;
 pub mod world;

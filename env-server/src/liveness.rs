@@ -2,17 +2,19 @@
 //! dead processes left in shared memory.
 
 use crate::lease::ClientId;
+use crate::throttle::Throttle;
 use iceoryx2::prelude::PayloadHeader;
 use iceoryx2::service::header::request_response::RequestHeader;
 use protocol::channels::Ipc;
 use protocol::cleanup::remove_leftovers;
 use protocol::wait::sleep_until_readable;
+use rustix::io::Errno;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use std::collections::HashMap;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Nodes remembered before the table is started afresh: bounds what a client that reconnects for
 /// ever can make the server hold.
@@ -26,6 +28,7 @@ const CLEANUP_INTERVAL: Duration = Duration::from_secs(2);
 pub struct Clients {
     nodes: HashMap<u128, u32>,
     processes: HashMap<u32, OwnedFd>,
+    unwatched: Throttle,
 }
 
 /// Removes what dead processes left. It is a thread because one dead process costs
@@ -47,8 +50,9 @@ impl Clients {
         if self.nodes.len() == MAX_KNOWN_NODES {
             self.nodes.clear();
         }
-        self.nodes.insert(node, pid);
-        self.watch(pid);
+        if self.watch(pid) {
+            self.nodes.insert(node, pid);
+        }
         ClientId { node, pid }
     }
 
@@ -75,14 +79,26 @@ impl Clients {
         dead
     }
 
-    fn watch(&mut self, pid: u32) {
+    /// Watches a process; returns whether there is no need to try again.
+    fn watch(&mut self, pid: u32) -> bool {
         let process = i32::try_from(pid).ok().and_then(Pid::from_raw);
         let Some(process) = process.filter(|_| !self.processes.contains_key(&pid)) else {
-            return;
+            return true;
         };
-        // A process that has ended already leaves nothing to watch; its lease will expire.
-        if let Ok(descriptor) = pidfd_open(process, PidfdFlags::empty()) {
-            self.processes.insert(pid, descriptor);
+        match pidfd_open(process, PidfdFlags::empty()) {
+            Ok(descriptor) => self.processes.insert(pid, descriptor).is_none(),
+            // A process that has ended already leaves nothing to watch; its lease will expire.
+            Err(Errno::SRCH) => true,
+            Err(problem) => {
+                if let Some(unsaid) = self.unwatched.pass(Instant::now()) {
+                    tracing::warn!(
+                        pid,
+                        unsaid,
+                        "a client cannot be watched, so its leases may outlive it: {problem}"
+                    );
+                }
+                false
+            }
         }
     }
 }

@@ -1,6 +1,8 @@
 //! The server's ends of the channels.
 
 use crate::config::Checked;
+use crate::descriptors::{Shortage, TooFew, make_room};
+use crate::throttle::Throttle;
 use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::publisher::Publisher;
@@ -17,13 +19,15 @@ use protocol::channels::{
 };
 use protocol::message::{FrameHeader, Header, RESULT_BYTES, StepReply, StepRequest, TruthHeader};
 use protocol::responder::{
-    Active, ActiveControl, Answers, ControlServer, control_server, holder, received,
+    Active, ActiveControl, Answers, ControlServer, Unheard, control_server, holder, received,
 };
 use protocol::turn::Turn;
 use protocol::wait::{descriptor, drain};
+use std::cell::RefCell;
 use std::collections::HashSet;
 use std::os::fd::BorrowedFd;
 use std::path::PathBuf;
+use std::time::Instant;
 use thiserror::Error;
 
 /// A request on `step` that waits for its answer.
@@ -66,6 +70,9 @@ pub enum PortError {
         /// What is missing.
         path: String,
     },
+    /// Too few file descriptors: a client too many would not be heard.
+    #[error(transparent)]
+    Descriptors(#[from] TooFew),
     /// A channel could not be made.
     #[error(transparent)]
     Channel(#[from] ChannelError),
@@ -94,6 +101,9 @@ pub struct Ports {
     truth: Option<Publisher<Ipc, [u8], TruthHeader>>,
     listener: Listener<Ipc>,
     answers: Answers,
+    unheard: Unheard,
+    shortage: Shortage,
+    unpublished: RefCell<Throttle>,
     control_service: ControlService,
     step_service: StepService,
     frame_service: FrameService,
@@ -132,6 +142,7 @@ impl Ports {
     /// [`PortError`].
     pub fn open_at(place: &Place) -> Result<Self, PortError> {
         check_shared_memory(place)?;
+        make_room()?;
         let _turn = Turn::take()?;
         let node = create_node()?;
         let services = Services {
@@ -139,17 +150,21 @@ impl Ports {
             instance: &place.instance,
         };
         let (control_service, step_service) = (services.create_control()?, services.create_step()?);
-        let control = control_server(&control_service);
+        let unheard = Unheard::default();
+        let control = control_server(&control_service, &unheard);
         let control = control.map_err(|error| taken(place, &control_service, error))?;
         let step = step_service
             .server_builder()
-            .initial_max_slice_len(place.answer_bytes.max(1));
+            .initial_max_slice_len(place.answer_bytes.max(1))
+            .set_request_degradation_handler(unheard.counter())
+            .set_response_degradation_handler(unheard.counter());
         let step = step.max_loaned_responses_per_request(1).create();
         let step = step.map_err(|error| taken(place, &step_service, error))?;
         let frame_service = services.frames()?;
         let frames = frame_service
             .publisher_builder()
             .initial_max_slice_len(place.n_cells + place.n_moves)
+            .set_degradation_handler(unheard.counter())
             .max_loaned_samples(1);
         let frames = frames.create().map_err(ipc_error("publish frames"))?;
         let truth_service = if place.publish_truth {
@@ -160,6 +175,7 @@ impl Ports {
         let truth = truth_service.as_ref().map(|service| {
             let publisher = service
                 .publisher_builder()
+                .set_degradation_handler(unheard.counter())
                 .initial_max_slice_len(place.n_cells);
             publisher
                 .max_loaned_samples(1)
@@ -175,6 +191,9 @@ impl Ports {
             truth: truth.transpose()?,
             listener: services.listener(Channel::WakeServer)?,
             answers: Answers::new(&services)?,
+            unheard,
+            shortage: Shortage::default(),
+            unpublished: RefCell::default(),
             control_service,
             step_service,
             frame_service,
@@ -207,12 +226,12 @@ impl Ports {
 
     /// The next step request.
     pub fn receive_step(&self) -> Option<ActiveStep> {
-        received(self.step.receive())
+        received(self.step.receive(), &self.unheard)
     }
 
     /// The next control request.
     pub fn receive_control(&self) -> Option<ActiveControl> {
-        received(self.control.receive())
+        received(self.control.receive(), &self.unheard)
     }
 
     /// Sends answers to requests of both kinds.
@@ -234,9 +253,7 @@ impl Ports {
                     .send()
                     .map_err(|error| format!("{error:?}"))
             });
-        if let Err(problem) = sent {
-            tracing::warn!(problem, "a frame was not published");
-        }
+        self.warn_of(sent, "a frame was not published");
     }
 
     /// Publishes hidden states, if the server does so at all.
@@ -252,9 +269,21 @@ impl Ports {
                     .send()
                     .map_err(|error| format!("{error:?}"))
             });
-        if let Err(problem) = sent {
-            tracing::warn!(problem, "hidden states were not published");
+        self.warn_of(sent, "hidden states were not published");
+    }
+
+    /// Says, now and then, what was not published.
+    fn warn_of(&self, sent: Result<usize, String>, what: &str) {
+        if let Err(problem) = sent
+            && let Some(unsaid) = self.unpublished.borrow_mut().pass(Instant::now())
+        {
+            tracing::warn!(problem, unsaid, "{what}");
         }
+    }
+
+    /// Says, now and then, if clients or observers cannot be heard.
+    pub fn warn_of_shortage(&mut self, now: Instant) {
+        self.shortage.warn(now, self.unheard.take());
     }
 
     /// Lets new observers connect; returns the number of observers of frames and of the truth.

@@ -279,7 +279,9 @@ impl Replay<'_> {
                 self.answer(request);
             }
             self.ports.check_entries()?;
-            let left = until.saturating_duration_since(Instant::now());
+            let now = Instant::now();
+            self.ports.warn_of_shortage(now);
+            let left = until.saturating_duration_since(now);
             if left.is_zero() || self.ends() {
                 return Ok(());
             }

@@ -11,6 +11,7 @@ use crate::publications::Publications;
 use crate::resets::Resets;
 use crate::simulator::{Awaited, FileOrder, Outcome, Simulator, Surroundings};
 use crate::snapshot::folder::FileError;
+use crate::throttle::Throttle;
 use protocol::channels::{ChannelError, ipc_error};
 use protocol::control::Reply;
 use protocol::message::{Operation, Status};
@@ -113,6 +114,7 @@ struct Server {
     payload: Vec<u8>,
     /// Observers that were there at the last look.
     publications: Publications,
+    expiries: Throttle,
     rate: Rate,
     started: Instant,
     last_tick: Instant,
@@ -147,6 +149,13 @@ impl Server {
             seed = config.seed,
             "serving"
         );
+        if checked.model.reward().iter().all(|&reward| reward == 0.0) {
+            let model = checked.model.name();
+            tracing::warn!(
+                model,
+                "no state pays: every reward will be 0; give a state a `reward` in the model file"
+            );
+        }
         let n_threads = config.threads;
         let autosave = Autosave::new(&checked)?;
         let settings = checked.clone();
@@ -180,6 +189,7 @@ impl Server {
             autosave,
             payload: Vec::new(),
             publications: Publications::default(),
+            expiries: Throttle::default(),
             rate: Rate {
                 since: now,
                 n_steps: 0,
@@ -330,8 +340,11 @@ impl Server {
         self.take_files(now);
         self.is_over |= self.keeper.as_ref().is_some_and(Keeper::has_ended);
         for pid in self.simulator.expire(now) {
-            tracing::warn!(pid, "a lease expired");
+            if let Some(unsaid) = self.expiries.pass(now) {
+                tracing::warn!(pid, unsaid, "a lease expired");
+            }
         }
+        self.ports.warn_of_shortage(now);
         self.publications.greet(&self.ports, &self.simulator);
         self.rate.update(now, self.simulator.n_steps());
         Ok(self.ports.check_entries()?)

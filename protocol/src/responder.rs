@@ -13,15 +13,19 @@ use crate::turn::Turn;
 use crate::wait::{descriptor, drain};
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::node::Node;
-use iceoryx2::port::ReceiveError;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::{ListenerKey, Notifier};
 use iceoryx2::port::server::Server;
+use iceoryx2::port::{
+    DegradationAction, DegradationCause, DegradationFn, DegradationInfo, ReceiveError,
+};
 use iceoryx2::prelude::{AllocationStrategy, CallbackProgression};
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use serde::Serialize;
 use std::collections::HashMap;
 use std::os::fd::BorrowedFd;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
@@ -50,11 +54,16 @@ pub struct Answers {
     listeners: HashMap<u128, ListenerKey>,
 }
 
+/// Counts connections that could not be opened, as where no file descriptors are left: who is behind one is not heard.
+#[derive(Debug, Clone, Default)]
+pub struct Unheard(Arc<AtomicU64>);
+
 /// The one that answers the decisions of a world.
 #[derive(Debug)]
 pub struct Responder {
     server: ControlServer,
     answers: Answers,
+    unheard: Unheard,
     listener: Listener<Ipc>,
     _node: Node<Ipc>,
     /// Last, so that all else is dropped within it.
@@ -87,6 +96,22 @@ pub enum ResponderError {
     /// A channel could not be made.
     #[error(transparent)]
     Channel(#[from] ChannelError),
+}
+
+impl Unheard {
+    /// What a port calls for each such connection.
+    pub fn counter(&self) -> impl DegradationFn + 'static {
+        let count = self.0.clone();
+        move |_: DegradationCause, _: &DegradationInfo| {
+            count.fetch_add(1, Ordering::Relaxed);
+            DegradationAction::Ignore
+        }
+    }
+
+    /// How many there were since the last call.
+    pub fn take(&self) -> u64 {
+        self.0.swap(0, Ordering::Relaxed)
+    }
 }
 
 impl Answers {
@@ -178,18 +203,21 @@ impl Responder {
             instance,
         };
         let service = services.create_decisions(world)?;
-        let server = control_server(&service).map_err(|error| match holder(&service, &error) {
-            Some(pid) => ResponderError::Taken {
-                instance: instance.name().into(),
-                world,
-                pid,
-            },
-            None => ipc_error("create a server")(error).into(),
-        })?;
+        let unheard = Unheard::default();
+        let server =
+            control_server(&service, &unheard).map_err(|error| match holder(&service, &error) {
+                Some(pid) => ResponderError::Taken {
+                    instance: instance.name().into(),
+                    world,
+                    pid,
+                },
+                None => ipc_error("create a server")(error).into(),
+            })?;
         let listener = services.listener(Channel::WakeAgent(world))?;
         Ok(Self {
             server,
             answers: Answers::new(&services)?,
+            unheard,
             listener,
             _node: node,
             end: None,
@@ -198,7 +226,11 @@ impl Responder {
 
     /// The next request.
     pub fn receive(&self) -> Option<ActiveControl> {
-        received(self.server.receive())
+        let request = received(self.server.receive(), &self.unheard);
+        if self.unheard.take() > 0 {
+            tracing::warn!("a connection could not be opened: are no file descriptors left?");
+        }
+        request
     }
 
     /// Answers a request.
@@ -222,8 +254,11 @@ impl Responder {
 
 /// What was received. A failure is the affair of the client behind it, whose other requests wait for
 /// an answer still or whose memory is gone: it must not be the end of the server.
-pub fn received<T>(result: Result<Option<T>, ReceiveError>) -> Option<T> {
+pub fn received<T>(result: Result<Option<T>, ReceiveError>, unheard: &Unheard) -> Option<T> {
     result.unwrap_or_else(|error| {
+        if matches!(error, ReceiveError::ConnectionFailure(_)) {
+            unheard.0.fetch_add(1, Ordering::Relaxed);
+        }
         tracing::debug!(?error, "a request was not received");
         None
     })
@@ -233,9 +268,14 @@ pub fn received<T>(result: Result<Option<T>, ReceiveError>) -> Option<T> {
 ///
 /// # Errors
 /// iceoryx2's; [`holder`] tells whether another process has the port.
-pub fn control_server(service: &ControlService) -> Result<ControlServer, ServerCreateError> {
+pub fn control_server(
+    service: &ControlService,
+    unheard: &Unheard,
+) -> Result<ControlServer, ServerCreateError> {
     let builder = service.server_builder().initial_max_slice_len(JSON_SLICE);
     builder
+        .set_request_degradation_handler(unheard.counter())
+        .set_response_degradation_handler(unheard.counter())
         .allocation_strategy(AllocationStrategy::PowerOfTwo)
         .create()
 }

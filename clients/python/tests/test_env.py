@@ -556,6 +556,13 @@ def test_nobody_serving_is_told_by_make() -> None:
         make(instance="nobody")
 
 
+def test_a_model_in_which_no_state_pays_is_warned_of(tmp_path: Path) -> None:
+    model = tmp_path / "model.toml"
+    model.write_text(Path(LIVELY).read_text().replace("reward = 1.0", "reward = 0.0"))
+    with pytest.warns(UserWarning, match="no state pays: every reward will be 0"):
+        make(model=str(model))
+
+
 def test_a_second_environment_on_a_world_names_the_holder() -> None:
     with serving(worlds=2) as instance:
         first, second = make(instance=instance), make(instance=instance)

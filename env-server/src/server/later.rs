@@ -72,7 +72,7 @@ impl Server {
             Ok(bytes) => autosave.order(n_steps, bytes, is_last, &mut self.files),
             Err(error) => {
                 autosave.skip(n_steps);
-                tracing::warn!("not saved: {error}");
+                autosave.warn(&error);
             }
         }
     }

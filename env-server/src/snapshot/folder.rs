@@ -118,6 +118,26 @@ impl Folder {
         Ok(files)
     }
 
+    /// How the instance's files are named.
+    pub fn pattern(&self) -> String {
+        format!("{}-<{DIGITS} digits>.{EXTENSION}", self.instance)
+    }
+
+    /// The names of the folder's snapshots of all instances, by their ending.
+    pub fn snapshots(&self) -> Vec<String> {
+        let entries = std::fs::read_dir(&self.path)
+            .into_iter()
+            .flatten()
+            .flatten();
+        let paths = entries.map(|entry| entry.path());
+        let mut names: Vec<String> = paths
+            .filter(|path| path.extension().is_some_and(|end| end == EXTENSION))
+            .filter_map(|path| Some(path.file_name()?.to_string_lossy().into_owned()))
+            .collect();
+        names.sort_unstable();
+        names
+    }
+
     /// Writes the next file and removes all but the last few and `spared`.
     ///
     /// # Errors

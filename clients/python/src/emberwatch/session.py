@@ -6,6 +6,7 @@ process and used in a forked child, as Gymnasium's `AsyncVectorEnv` does.
 
 from __future__ import annotations
 
+import warnings
 import weakref
 from collections.abc import Sequence
 from typing import Final
@@ -70,6 +71,12 @@ class Session:
                 self.model, self.shape, self.burn_in = running_world(
                     settings, n_worlds, client.info
                 )
+        if self.model is not None and not self.model.reward.any():
+            warnings.warn(
+                f"model {self.model.name!r}: no state pays: every reward will be 0; give a state "
+                "a `reward` in the model file",
+                stacklevel=2,
+            )
 
     @property
     def instance(self) -> str:

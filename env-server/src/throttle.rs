@@ -1,0 +1,39 @@
+//! Says one of many like warnings, and then how many there were. Pure: time comes in as an argument.
+
+use std::time::{Duration, Instant};
+
+/// Least time between two warnings of one kind.
+const INTERVAL: Duration = Duration::from_secs(10);
+
+/// Decides which warnings of one kind are said.
+#[derive(Debug, Default)]
+pub struct Throttle {
+    last: Option<Instant>,
+    n_unsaid: u64,
+}
+
+impl Throttle {
+    /// Takes note of a warning; returns whether to say it, and how many were not said before it.
+    pub fn pass(&mut self, now: Instant) -> Option<u64> {
+        if self.last.is_some_and(|last| now < last + INTERVAL) {
+            self.n_unsaid += 1;
+            return None;
+        }
+        self.last = Some(now);
+        Some(std::mem::take(&mut self.n_unsaid))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_warning_is_said_and_then_their_number() {
+        let (mut throttle, start) = (Throttle::default(), Instant::now());
+        let moments = [0, 1, 2, 9_999, 10_000, 10_001, 30_000, 60_000];
+        let said = moments.map(|millis| throttle.pass(start + Duration::from_millis(millis)));
+        let expected = [Some(0), None, None, None, Some(3), None, Some(1), Some(0)];
+        assert_eq!(said, expected);
+    }
+}
