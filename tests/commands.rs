@@ -228,3 +228,24 @@ fn status_tells_people_and_programs_of_every_world() {
     assert_eq!(stop.code, Some(0), "{}", stop.stderr);
     assert_eq!(server.program.wait(LIMIT).code, Some(0));
 }
+
+#[test]
+fn the_documented_prior_is_written() {
+    let page = include_str!("../docs/commands.md");
+    let line = page
+        .lines()
+        .find(|line| line.contains("emberwatch-agent prior"));
+    let (command, _) = line
+        .expect("the command")
+        .split_once('#')
+        .expect("what it does");
+    let folder = tempfile::TempDir::new().expect("a folder");
+    let file = folder.path().join("prior.npy");
+    let command = command.replace("FILE", file.to_str().expect("a plain path"));
+    // Fewer and younger worlds than documented: it is the flags that are checked.
+    let command = command.replace("--burn-in 10000", "--burn-in 10 --worlds 1");
+    let words: Vec<&str> = command.split_whitespace().skip(1).collect();
+    let ended = run(AGENT, &words, LIMIT);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert!(file.is_file());
+}

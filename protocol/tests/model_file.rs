@@ -1,0 +1,77 @@
+//! docs/model-file.md: its example is a model, and it names every key with its limits.
+
+use protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
+use protocol::program::MAX_TEXT_BYTES;
+use protocol::{Model, Shape};
+use std::collections::BTreeSet;
+use toml::{Table, Value};
+
+const PAGE: &str = include_str!("../../docs/model-file.md");
+
+fn example() -> &'static str {
+    let (_, example) = PAGE.split_once("```toml\n").expect("an example");
+    let (example, _) = example.split_once("```").expect("its end");
+    example
+}
+
+/// The keys of a table and of the tables in it; those below are named with what they are of.
+fn keys(of: &str, table: &Table) -> BTreeSet<String> {
+    let mut found = BTreeSet::new();
+    for (key, value) in table {
+        found.insert(format!("{of}{key}"));
+        let entries = value.as_array().into_iter().flatten();
+        for entry in entries.filter_map(Value::as_table) {
+            found.extend(keys(&format!("{key} "), entry));
+        }
+    }
+    found
+}
+
+/// The keys that the page's tables have.
+fn documented() -> BTreeSet<String> {
+    let mut of = String::new();
+    let mut found = BTreeSet::new();
+    for line in PAGE.lines() {
+        if let Some(rest) = line.strip_prefix("Of each of the `") {
+            let (name, _) = rest.split_once('`').expect("a name");
+            of = format!("{name} ");
+        } else if let Some(rest) = line.strip_prefix("| `") {
+            let (key, _) = rest.split_once('`').expect("a key");
+            assert!(found.insert(format!("{of}{key}")), "{key} twice");
+        }
+    }
+    found
+}
+
+#[test]
+fn the_example_is_a_model_that_uses_every_key() {
+    let model = Model::from_toml(example()).expect("a model");
+    let shape = Shape::new(64, 64).expect("test shape");
+    assert_eq!(model.check_on(shape), Ok(()));
+    let written: Table = example().parse().expect("TOML");
+    assert_eq!(keys("", &written), documented());
+}
+
+#[test]
+fn every_key_of_the_parser_is_on_the_page() {
+    let file = Model::wildfire().file().clone();
+    let parsed = Table::try_from(file).expect("models serialise");
+    assert_eq!(documented(), keys("", &parsed));
+}
+
+#[test]
+fn the_limits_are_the_parser_s() {
+    let mebibytes = MAX_TEXT_BYTES >> 20;
+    for words in [
+        format!("2 to {MAX_VALUES},"),
+        format!("each odd, 1 to {MAX_KERNEL_SIDE} |"),
+        format!("at most {mebibytes} MiB"),
+    ] {
+        assert!(PAGE.contains(&words), "{words:?} is not on the page");
+    }
+    let readme = include_str!("../../README.md");
+    assert!(readme.contains(&format!("names 2 to {MAX_VALUES} states")));
+    assert!(readme.contains(&format!(
+        "up to {MAX_KERNEL_SIDE} x {MAX_KERNEL_SIDE} cells"
+    )));
+}
