@@ -234,6 +234,20 @@ def test_a_frame_is_your_own_to_write_to() -> None:
     assert answer.result().step == 1 and (answer.frames == 7).all()
 
 
+def test_an_answer_is_shown_in_short() -> None:
+    message, _ = document.worked_example("StepReply")
+    reply = wire.StepReply.from_buffer_copy(message[:64])
+    shape = (1, reply.height, reply.width)
+    answer = wire.StepAnswer(reply, bytearray(message[64:]), n_observations=3)
+    assert repr(answer) == (
+        f"StepAnswer(first_world={reply.first_world}, simulation_nanos={reply.simulation_nanos}, "
+        f"frames=<uint8 {shape}>, results=[{answer.result()}])"
+    )
+    several = wire.StepReply(n_worlds=3, height=64, width=64)
+    answer = wire.StepAnswer(several, bytearray(3 * (64 + 64 * 64)), n_observations=3)
+    assert repr(answer).endswith("truncated=0), and 2 more])") and len(repr(answer)) < 400
+
+
 def test_the_documented_requests_are_what_a_client_sends() -> None:
     def sent(call: Any, reply: object = replies("done")[0]) -> dict[str, Any]:
         wired.say(reply)

@@ -244,6 +244,15 @@ class StepAnswer:
         check_frame(frames, n_observations)
         self.frames = frames.reshape(n_worlds, height, width)
 
+    def __repr__(self) -> str:
+        """The first result, and the shape of the frames."""
+        others = len(self.frames) - 1
+        more = f", and {others} more" if others else ""
+        return (
+            f"StepAnswer(first_world={self.first_world}, simulation_nanos={self.simulation_nanos}, "
+            f"frames=<uint8 {self.frames.shape}>, results=[{self.result()}{more}])"
+        )
+
     @property
     def results(self) -> NDArray[np.void]:
         """One `StepResult` per world, as a structured array `(n_worlds,)` of `RESULT_DTYPE`."""
