@@ -2,6 +2,7 @@
 
 import gc
 import os
+import subprocess
 import threading
 import time
 from collections.abc import Callable
@@ -13,9 +14,11 @@ import pytest
 from numpy.typing import NDArray
 from processes import PATIENCE, Script, Server, eventually, is_running
 
+import emberwatch
 from emberwatch import errors, wire
 from emberwatch.client import Client, connect
 from emberwatch.errors import InvalidActionError
+from emberwatch.programs import find
 
 Start = Callable[..., Server]
 Run = Callable[..., Script]
@@ -235,6 +238,11 @@ def test_status_counts(server: Start) -> None:
         (0, None, False),
         (1, US, False),
     ]
+
+
+def test_the_version_is_that_of_the_programs() -> None:
+    said = subprocess.run([find("emberwatch-server"), "--version"], capture_output=True, text=True)
+    assert said.stdout.split() == ["emberwatch-server", emberwatch.__version__]
 
 
 def test_shutdown_ends_the_server(server: Start) -> None:

@@ -18,6 +18,7 @@ from emberwatch.lease import Lease
 from emberwatch.moves_env import WildfireMovesEnv
 from emberwatch.objective_env import WildfireObjectiveEnv
 from emberwatch.observer import Frame, Observer, Outlook, OutlookReader, Truth, TruthReader, observe
+from emberwatch.release import VERSION
 from emberwatch.replies import Decision, DecisionsInfo, ServerInfo, ServerStatus, WorldInfo
 from emberwatch.vector_env import WildfireVectorEnv
 from emberwatch.wire import StepAnswer, StepResult
@@ -47,6 +48,8 @@ __all__ = [
     "observe",
     "recording",
 ]
+
+__version__ = VERSION
 
 #: Steps after which an episode is truncated, unless `gymnasium.make` is told otherwise.
 MAX_EPISODE_STEPS = 1000
