@@ -110,7 +110,9 @@ fn model_named(name: &str) -> Result<Model> {
     if let Some(model) = Model::built_in(name) {
         return Ok(model);
     }
+    let names = Model::built_in_names().collect::<Vec<_>>().join(", ");
     read_model(Path::new(name))
+        .with_context(|| format!("--model: expected {names} or a model file"))
 }
 
 fn read_model(path: &Path) -> Result<Model> {

@@ -49,6 +49,7 @@ from emberwatch.errors import (
 from emberwatch.programs import find
 
 PARTS = ["frame", "robot", "age"]
+from emberwatch.model import Model
 
 
 @pytest.fixture(autouse=True)
@@ -471,7 +472,7 @@ def test_wrong_options_are_named(keywords: dict[str, Any], message: str) -> None
         ({"truth": "no"}, "truth: expected True or False, got 'no'"),
         ({"takeover": 1}, "takeover: expected True or False, got 1"),
         ({"instance": 5}, "instance: expected a name or None, got 5"),
-        ({"model": 5}, "model: expected a path or None, got 5"),
+        ({"model": 5}, "model: expected a name, a path or None, got 5"),
         ({"timeout": None}, "timeout: expected seconds above 0, got None"),
         ({"timeout": 0}, "timeout: expected seconds above 0, got 0"),
         ({"timeout": float("nan")}, "timeout: .* got nan"),
@@ -498,7 +499,10 @@ def test_an_unknown_keyword_is_named(keyword: str) -> None:
 
 
 def test_a_missing_model_is_named_by_make() -> None:
-    with pytest.raises(Exception, match=r"nowhere\.toml"):
+    words = (
+        r"model: expected wildfire, .* or the path of a model file, got 'nowhere\.toml': No such"
+    )
+    with pytest.raises(SettingError, match=words):
         make(model="nowhere.toml")
 
 
@@ -512,6 +516,16 @@ def lab() -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
+@pytest.mark.parametrize("name", ["wildfire-sparse", Path("wildfire-latent")])
+def test_a_model_may_be_named(name: str | Path) -> None:
+    env = make(model=name)
+    env.reset(seed=1)
+    with emberwatch.connect(env.unwrapped.instance) as client:
+        assert env.unwrapped.model == Model.from_toml(client.info.model)
+    assert env.unwrapped.model.name == str(name)
+    env.close()
+
+
     ("keywords", "message"),
     [
         ({"height": 8}, "height: expected 7, as the server has, or None, got 8"),

@@ -2,6 +2,8 @@
 
 import copy
 import pickle
+import re
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import emberwatch
+from emberwatch.errors import SettingError
 from emberwatch.model import Model, ModelError
+from emberwatch.programs import find
 
 REPOSITORY = Path(__file__).parents[3]
 CONFIG = REPOSITORY / "config/models"
@@ -29,9 +33,24 @@ def changed(old: str, new: str) -> str:
     return WILDFIRE.replace(old, new, 1)
 
 
-def test_the_packaged_wildfire_is_the_servers() -> None:
-    packaged = Path(emberwatch.__file__).parent / "models/wildfire.toml"
-    assert packaged.read_bytes() == (CONFIG / "wildfire.toml").read_bytes()
+def test_names_are_those_of_the_programs() -> None:
+    packaged = Path(emberwatch.__file__).parent / "models"
+    names = {file.stem: file.read_bytes() for file in packaged.iterdir()}
+    for name, file in names.items():
+        assert file == (CONFIG / f"{name}.toml").read_bytes()
+        assert Model.named(name).name == Model.named(Path(name)).name == name
+    command = [find("emberwatch-agent"), "run", "--model=no/such"]
+    words = subprocess.run(command, capture_output=True, text=True).stderr
+    known = re.search(r"--model: expected (.*) or a model file", words)
+    assert known is not None and set(known[1].split(", ")) == set(names)
+
+
+def test_what_is_neither_a_name_nor_a_file_is_named(tmp_path: Path) -> None:
+    words = "model: expected wildfire, .* or the path of a model file, got "
+    for name, problem in (("ash", "No such file"), (tmp_path, "Is a directory")):
+        with pytest.raises(SettingError, match=f"{words}'{name}': {problem}"):
+            Model.named(name)
+    assert Model.named(CONFIG / "road-ice.toml").name == "road-ice"
 
 
 def test_wildfire_has_the_published_parameters() -> None:

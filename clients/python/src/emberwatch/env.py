@@ -79,9 +79,10 @@ class WildfireEnv(WorldEnv):
     * `instance`: attach to this running server; None: a private one.
     * `world`: which of its worlds (0).
     * `takeover`: take the world from whoever holds it (False).
-    * `model`: path of a model file (`"wildfire"`); `height`, `width` (64), `n_moves` (64, T),
-      `burn_in` (10,000), `start` (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the
-      private server. With `instance` they may be left out, or must agree.
+    * `model`: `"wildfire"` (the default), `"wildfire-sparse"`, `"wildfire-latent"` or the path of
+      a model file; `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `start`
+      (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the private server. With `instance`
+      they may be left out, or must agree.
     * `truth`: reveal the hidden states in `info` and pictures (False).
     * `timeout`: how long to wait for a step, seconds (5).
     * `render_mode`: `"rgb_array"`, `"human"` (a window, or the terminal) or `"ansi"`.

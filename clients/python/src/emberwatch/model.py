@@ -14,12 +14,15 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
-from os import PathLike
+from importlib.resources.abc import Traversable
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, NoReturn, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
+
+from emberwatch.errors import SettingError
 
 Color = tuple[int, int, int]
 """Red, green and blue, 0 to 255 each."""
@@ -45,7 +48,7 @@ class ModelError(ValueError):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Model:
-    """A checked model; make one with `from_toml`, `read` or `wildfire`.
+    """A checked model; make one with `named`, `read` or `from_toml`.
 
     S is the number of states, O that of observations, (KH, KW) the kernel's size, both odd. Two
     models are equal if all they say is, whatever their files look like.
@@ -106,11 +109,28 @@ class Model:
             raise ModelError(f"{path}: {error}") from error
 
     @classmethod
+    def named(cls, name: str | PathLike[str]) -> Self:
+        """The built-in model of a name, or that of a file: what ``--model`` takes.
+
+        Raises:
+            SettingError: It is neither a name nor a file that can be read.
+            ModelError: Names the file and the entry, what it must be and what it is.
+        """
+        name, built_in = fspath(name), built_in_models()
+        if name in built_in:
+            return cls.from_toml(built_in[name].read_text("utf-8"))
+        try:
+            return cls.read(name)
+        except OSError as error:
+            raise SettingError(
+                f"model: expected {', '.join(built_in)} or the path of a model file, "
+                f"got {name!r}: {error.strerror}"
+            ) from None
+
+    @classmethod
     def wildfire(cls) -> Self:
         """The built-in wildfire of the paper's section II, as ``config/models/wildfire.toml``."""
-        return cls.from_toml(
-            (resources.files("emberwatch") / "models/wildfire.toml").read_text("utf-8")
-        )
+        return cls.named("wildfire")
 
     @property
     def n_states(self) -> int:
@@ -167,6 +187,13 @@ class Model:
         names = (self.name, self.state_names, self.state_colors)
         observations = (self.observation_names, self.observation_colors)
         return (*names, *observations, *((array.shape, array.tobytes()) for array in arrays))
+
+
+def built_in_models() -> dict[str, Traversable]:
+    """The files of the models that have names, by name: those that the programs know."""
+    folder = resources.files("emberwatch") / "models"
+    files = {file.name.removesuffix(".toml"): file for file in folder.iterdir()}
+    return dict(sorted(files.items()))
 
 
 def _distinct(side: int, kernel: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final, TypedDict
 
 import numpy as np
@@ -62,7 +61,8 @@ class Settings:
             SettingError: Naming a keyword, what it expects, and what it got.
         """
         self._check("instance", "a name or None", _is(self.instance, str, type(None)))
-        self._check("model", "a path or None", _is(self.model, str, os.PathLike, type(None)))
+        is_model = _is(self.model, str, os.PathLike, type(None))
+        self._check("model", "a name, a path or None", is_model)
         self._check("start", "a text or None", _is(self.start, str, type(None)))
         self._check("takeover", "True or False", _is(self.takeover, bool))
         self._check("truth", "True or False", _is(self.truth, bool))
@@ -110,7 +110,7 @@ def private_world(settings: Settings) -> tuple[Model, Shape, int]:
             "takeover, world: expected instance=..., a running server to attach to; a private "
             f"server has its own worlds, got world {settings.world}"
         )
-    model = _model(settings)
+    model = Model.named(settings.model_argument)
     shape = Shape(
         height=check_count("height", settings.height, 64, _MAX_SIDE),
         width=check_count("width", settings.width, 64, _MAX_SIDE),
@@ -163,13 +163,8 @@ def running_world(
         n_observations=info.n_observations,
     )
     if settings.model is not None:
-        return _model(settings), shape, info.burn_in
+        return Model.named(settings.model_argument), shape, info.burn_in
     return None if info.model is None else Model.from_toml(info.model), shape, info.burn_in
-
-
-def _model(settings: Settings) -> Model:
-    named = settings.model_argument
-    return Model.wildfire() if named == "wildfire" else Model.read(Path(named))
 
 
 def check_count(name: str, value: int | None, default: int, highest: int) -> int:

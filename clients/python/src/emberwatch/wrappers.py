@@ -85,7 +85,8 @@ class Belief(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArg
             keep: Whether the original observations stay beside the belief.
             dtype: Type and layout of the belief.
             prior: The belief about ``X_0``.
-            model: The world's model, or the path of its file, for servers that do not reveal it.
+            model: The world's model, its name, or the path of its file, for servers that do not
+                reveal it.
 
         Raises:
             ValueError: No model is known, or an argument or the environment is of another form.
@@ -230,12 +231,12 @@ def _model_of(env: gymnasium.Env[Any, Any], model: Model | str | PathLike[str] |
     if isinstance(model, Model):
         return model
     if model is not None:
-        return Model.read(model)
+        return Model.named(model)
     revealed = getattr(env.unwrapped, "model", None)
     if not isinstance(revealed, Model):
         raise ValueError(
             "Belief: expected the world's model, got none: the server does not reveal it "
-            "(--reveal-model false); pass model=, a Model or the path of its file"
+            "(--reveal-model false); pass model=, a Model, its name or the path of its file"
         )
     return revealed
 
