@@ -4,6 +4,7 @@ import copy
 import gc
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from environments import (
     LIVELY,
     MOVES,
     SMALL,
+    OBJECTIVE,
     WILDFIRE,
     actions,
     assert_same,
@@ -492,10 +494,17 @@ def test_an_unknown_render_mode_is_named() -> None:
         emberwatch.WildfireEnv(render_mode="film")
 
 
-@pytest.mark.parametrize("keyword", ["hight", "n_worlds", "num_envs"])
-def test_an_unknown_keyword_is_named(keyword: str) -> None:
-    with pytest.raises(TypeError, match=keyword):
-        make(**{keyword: 2})
+@pytest.mark.parametrize("name", [WILDFIRE, MOVES, OBJECTIVE])
+@pytest.mark.parametrize(
+    ("keyword", "hint"),
+    [("hight", r" \(did you mean 'height'\?\)"), ("num_envs", ""), ("renderMode", ".*_mode.*")],
+)
+def test_an_unknown_keyword_is_named(name: str, keyword: str, hint: str) -> None:
+    with pytest.raises(SettingError) as raised:
+        make(name, **{keyword: 2})
+    words = r"keywords: expected some of .*burn_in, .*render_mode, .*width, .*got "
+    assert re.fullmatch(f"{words}'{keyword}'{hint}", str(raised.value))
+    assert ("planner" in str(raised.value)) == (name == OBJECTIVE)
 
 
 def test_a_missing_model_is_named_by_make() -> None:

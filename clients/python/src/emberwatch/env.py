@@ -110,7 +110,7 @@ class WildfireEnv(WorldEnv):
             SettingError: If an argument is impossible or contradicts the running server.
             NoServerError: If nobody serves `instance`.
         """
-        settings = Settings(**world)
+        settings = Settings.of(WildfireEnv, world)
         super().__init__(settings, render_mode, reveals=settings.truth)
         self._observations = Observations(observation, self._shape)
         self.observation_space = self._observations.space

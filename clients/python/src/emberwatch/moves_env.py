@@ -101,7 +101,7 @@ class WildfireMovesEnv(WorldEnv):
         reveals = world.get("truth", False)
         self._pays_moves = reward == "move"
         world["truth"] = reveals or self._pays_moves
-        super().__init__(Settings(**world), render_mode, reveals=reveals)
+        super().__init__(Settings.of(WildfireMovesEnv, world), render_mode, reveals=reveals)
         if self._pays_moves and self.model is None:
             raise SettingError("reward='move': expected a server that reveals its model")
         self._names, self._is_plain = check_parts(observation, _PARTS)

@@ -104,7 +104,7 @@ class WildfireObjectiveEnv(WorldEnv):
         _check_choice("planner", planner, ("beam", "shooting"))
         _check_choice("prior", prior, ("simulated", "initial", "uniform"))
         _check_choice("agent", agent, ("own", "running"))
-        settings = Settings(**world)
+        settings = Settings.of(WildfireObjectiveEnv, world)
         if agent == "running" and settings.instance is None:
             raise SettingError("agent='running': expected instance=..., where it runs")
         super().__init__(settings, render_mode, reveals=settings.truth)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import re
 from dataclasses import dataclass
+from difflib import get_close_matches
+from inspect import signature
 from typing import Any, Final, TypedDict
 
 import numpy as np
@@ -72,6 +74,27 @@ class Settings:
         self._check("burn_in", "a number of steps, at least 0, or None", is_steps)
         is_time = _is_number(self.timeout) and self.timeout > 0
         self._check("timeout", "seconds above 0", is_time)
+
+    @classmethod
+    def of(cls, environment: type, world: WorldArguments) -> Settings:
+        """The settings of an environment, from what is left of its keywords.
+
+        Raises:
+            SettingError: Naming a keyword that is none, the one most alike, and all there are.
+        """
+        known = {
+            name
+            for name, parameter in signature(environment.__init__).parameters.items()
+            if parameter.kind is parameter.KEYWORD_ONLY
+        }
+        known |= set(WorldArguments.__annotations__)
+        for name in world:
+            if name not in known:
+                alike = get_close_matches(name, known, 1)
+                hint = f" (did you mean {alike[0]!r}?)" if alike else ""
+                expected = ", ".join(sorted(known))
+                raise SettingError(f"keywords: expected some of {expected}, got {name!r}{hint}")
+        return cls(**world)
 
     def _check(self, name: str, expected: str, is_right: bool) -> None:
         if not is_right:

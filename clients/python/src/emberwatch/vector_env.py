@@ -71,7 +71,7 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
             )
         check_count("num_envs", num_envs, 1, _MAX_WORLDS)
         self._mode = AutoresetMode(autoreset_mode)
-        self._session = Session(Settings(**world), num_envs)
+        self._session = Session(Settings.of(WildfireVectorEnv, world), num_envs)
         shape = self._session.shape
         self._observations = Observations(observation, shape, num_envs)
         self._views = [View(render_mode, shape, self._session.model) for _ in range(num_envs)]
