@@ -710,6 +710,21 @@ def test_a_killed_private_server_is_replaced_by_the_next_reset(call: str) -> Non
     env.close()
 
 
+@pytest.mark.parametrize("name", [WILDFIRE, MOVES, OBJECTIVE])
+def test_a_live_environment_is_not_copied_but_says_what_to_do(name: str) -> None:
+    env = make(name, **({"prior": "initial"} if name == OBJECTIVE else {}))
+    for _ in range(2):
+        again = pickle.loads(pickle.dumps(copy.deepcopy(env)))
+        again.reset(seed=1)
+        again.close()
+        env.reset(seed=1)
+        for copying in (copy.copy, copy.deepcopy, pickle.dumps):
+            with pytest.raises(TypeError, match=r"close it first, or .*\.make\(env\.spec"):
+                copying(env.unwrapped)
+        env.step(env.action_space.sample())
+        env.close()
+
+
 def test_a_stopped_server_times_out_and_resume_finds_the_step() -> None:
     env = make()
     env.reset(seed=1)

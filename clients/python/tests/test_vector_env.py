@@ -3,6 +3,7 @@
 import copy
 import gc
 import os
+import pickle
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -541,6 +542,22 @@ def test_a_killed_private_server_is_replaced_by_the_next_reset(flying: Vector) -
 
     assert quick_once(0.5, noticing)
     assert flying.step(np.zeros((2, 4), int))[4]["step"].tolist() == [1, 1]
+
+
+def test_live_worlds_are_not_copied(flying: Vector) -> None:
+    for copying in (copy.deepcopy, pickle.dumps):
+        with pytest.raises(TypeError, match="expected a closed environment, got a WildfireVector"):
+            copying(flying)
+    flying.close()
+    again = copy.deepcopy(flying)
+    again.reset(seed=1)
+    again.close()
+
+
+def test_an_unknown_keyword_is_named() -> None:
+    with pytest.raises(SettingError, match="got 'burnin' .did you mean 'burn_in'"):
+        make_vec(2, burnin=3)
+    gc.collect()
 
 
 def test_a_stopped_server_times_out_and_resume_goes_on(flying: Vector) -> None:

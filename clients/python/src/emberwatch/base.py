@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from emberwatch.errors import SettingError
 from emberwatch.model import Model
 from emberwatch.replies import Decision
-from emberwatch.session import Session
+from emberwatch.session import Session, state_to_copy
 from emberwatch.settings import Settings, draw_seed
 from emberwatch.view import RENDER_FPS, RENDER_MODES, View
 from emberwatch.wire import StepAnswer, StepResult
@@ -65,6 +65,10 @@ class WorldEnv(gymnasium.Env[Any, Any]):
         """Gives the world back; a private server stops. Again is fine."""
         self._session.close()
         self._view.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies, which only a closed environment has."""
+        return state_to_copy(self, self._is_open())
 
     def _is_open(self) -> bool:
         """Whether there has been a reset since it was made or closed."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 import weakref
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -264,6 +264,21 @@ class Session:
         # For environments that nobody closes. Does nothing where it has been stopped before.
         weakref.finalize(self, self._program.stop)
         return self._program.wait_for(lambda: Client(instance, timeout=settings.timeout))
+
+
+def state_to_copy(environment: object, is_open: bool) -> dict[str, Any]:
+    """What a copy of an environment gets, pickled or not.
+
+    Raises:
+        TypeError: If it is open: no two may act on the same worlds.
+    """
+    if is_open:
+        raise TypeError(
+            f"copy or pickle: expected a closed environment, got a {type(environment).__name__} "
+            "that acts on a server's worlds: close it first, or make another with "
+            "gymnasium.make(env.spec); Client.snapshot and Lease.fork copy worlds"
+        )
+    return vars(environment).copy()
 
 
 def _text(model: Model | None) -> str | None:

@@ -18,7 +18,7 @@ from emberwatch.base import NOTHING_TO_DRAW, wants_to_resume
 from emberwatch.errors import SettingError
 from emberwatch.model import Model
 from emberwatch.observations import Observations, Parts
-from emberwatch.session import Session
+from emberwatch.session import Session, state_to_copy
 from emberwatch.settings import Settings, WorldArguments, check_count, draw_seed
 from emberwatch.view import RENDER_FPS, RENDER_MODES, View, fly
 from emberwatch.wire import RESULT_DTYPE, StepAnswer
@@ -188,6 +188,10 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         self._session.close()
         for view in self._views:
             view.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies, which only a closed environment has."""
+        return state_to_copy(self, self._session.is_open)
 
     def _fly(self, moves: NDArray[np.uint8], run: range) -> None:
         """Steps consecutive worlds."""
