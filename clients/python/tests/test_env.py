@@ -19,8 +19,8 @@ import pytest
 from environments import (
     LIVELY,
     MOVES,
-    SMALL,
     OBJECTIVE,
+    SMALL,
     WILDFIRE,
     actions,
     assert_same,
@@ -48,10 +48,10 @@ from emberwatch.errors import (
     ServerGoneError,
     SettingError,
 )
+from emberwatch.model import Model
 from emberwatch.programs import find
 
 PARTS = ["frame", "robot", "age"]
-from emberwatch.model import Model
 
 
 @pytest.fixture(autouse=True)
@@ -515,16 +515,6 @@ def test_a_missing_model_is_named_by_make() -> None:
         make(model="nowhere.toml")
 
 
-# A running server
-
-
-@pytest.fixture(scope="module")
-def lab() -> Iterator[str]:
-    with serving(worlds=2) as instance:
-        yield instance
-
-
-@pytest.mark.parametrize(
 @pytest.mark.parametrize("name", ["wildfire-sparse", Path("wildfire-latent")])
 def test_a_model_may_be_named(name: str | Path) -> None:
     env = make(model=name)
@@ -535,6 +525,16 @@ def test_a_model_may_be_named(name: str | Path) -> None:
     env.close()
 
 
+# A running server
+
+
+@pytest.fixture(scope="module")
+def lab() -> Iterator[str]:
+    with serving(worlds=2) as instance:
+        yield instance
+
+
+@pytest.mark.parametrize(
     ("keywords", "message"),
     [
         ({"height": 8}, "height: expected 7, as the server has, or None, got 8"),
@@ -647,7 +647,7 @@ def test_another_server_of_other_size_is_refused() -> None:
     with serving(instance=instance):
         env.reset(seed=1)
         env.step([0, 0, 0, 0])
-    with pytest.raises(ServerGoneError):
+    with pytest.raises(NoServerError):
         env.reset()
     with serving(instance=instance, width=6), pytest.raises(SettingError, match="width=6"):
         env.reset()
@@ -692,8 +692,7 @@ def test_a_private_server_ends_with_its_forgotten_environment() -> None:
     assert has_ended(pid)
 
 
-@pytest.mark.parametrize("call", ["step", "reset"])
-def test_a_killed_private_server_is_replaced_by_the_next_reset(call: str) -> None:
+def test_a_killed_private_server_is_replaced_by_the_next_reset() -> None:
     env = make()
     expected = rollout(env, 5, seed=3)
 
@@ -701,12 +700,37 @@ def test_a_killed_private_server_is_replaced_by_the_next_reset(call: str) -> Non
         os.kill(private_pid(env), signal.SIGKILL)
         begin = time.monotonic()
         with pytest.raises(ServerGoneError):
-            env.step([0, 0, 0, 0]) if call == "step" else env.reset()
+            env.step([0, 0, 0, 0])
         waited = time.monotonic() - begin
         assert_same(rollout(env, 5, seed=3), expected)
         return waited
 
     assert quick_once(0.5, noticing)
+    env.close()
+
+
+@pytest.mark.parametrize("name", [WILDFIRE, MOVES])
+@pytest.mark.parametrize("times_out", [False, True])
+def test_a_reset_that_finds_the_server_dead_starts_another(name: str, times_out: bool) -> None:
+    env = make(name)
+    expected = rollout(env, 8, seed=3)
+    pid = private_pid(env)
+    os.kill(pid, signal.SIGSTOP)
+    if times_out:
+        with impatient(env), pytest.raises(RequestTimeoutError):
+            for _ in range(4):
+                env.step(env.action_space.sample())
+    os.kill(pid, signal.SIGKILL)
+    assert_same(rollout(env, 8, seed=3), expected)
+    env.close()
+
+
+def test_a_world_that_is_gone_is_not_gone_on_with() -> None:
+    env = make()
+    env.reset(seed=1)
+    os.kill(private_pid(env), signal.SIGKILL)
+    with pytest.raises(ServerGoneError):
+        env.reset(options={"resume": True})
     env.close()
 
 

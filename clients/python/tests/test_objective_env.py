@@ -178,12 +178,16 @@ def test_a_seed_that_does_not_fit_is_refused(env: Any) -> None:
         env.reset(seed=2**64)
 
 
-def test_a_reset_that_finds_the_agent_dead_is_the_last_to_fail(env: Any) -> None:
-    env.reset(seed=1000)
+def test_a_reset_that_finds_agent_or_server_dead_starts_others(env: Any) -> None:
+    expected = env.reset(seed=1000)
+    for _ in range(2):
+        os.kill(env._agent.pid, signal.SIGKILL)
+        assert np.array_equal(env.reset(seed=1000)[0], expected[0])
+        os.kill(env._session._program.pid, signal.SIGKILL)
+        assert np.array_equal(env.reset(seed=1000)[0], expected[0])
     os.kill(env._agent.pid, signal.SIGKILL)
     with pytest.raises(errors.ServerGoneError):
-        env.reset(seed=1000)
-    env.reset(seed=1000)
+        env.reset(options={"resume": True})
 
 
 def test_an_agent_that_is_killed_is_noticed_and_a_reset_starts_another(env: Any) -> None:

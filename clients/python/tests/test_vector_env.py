@@ -544,6 +544,25 @@ def test_a_killed_private_server_is_replaced_by_the_next_reset(flying: Vector) -
     assert flying.step(np.zeros((2, 4), int))[4]["step"].tolist() == [1, 1]
 
 
+def test_a_reset_that_finds_the_server_dead_starts_another(flying: Vector) -> None:
+    expected = flying.reset(seed=5)
+    for times_out in (False, True):
+        pid = private_pid(flying)
+        os.kill(pid, signal.SIGSTOP)
+        if times_out:
+            with impatient(flying), pytest.raises(RequestTimeoutError):
+                flying.step(np.zeros((2, 4), int))
+        os.kill(pid, signal.SIGKILL)
+        assert_same(flying.reset(seed=5), expected)
+
+
+def test_a_reset_of_some_worlds_needs_the_others(flying: Vector) -> None:
+    os.kill(private_pid(flying), signal.SIGKILL)
+    with pytest.raises(ServerGoneError):
+        flying.reset(options={"reset_mask": np.array([True, False])})
+    flying.reset(seed=1)
+
+
 def test_live_worlds_are_not_copied(flying: Vector) -> None:
     for copying in (copy.deepcopy, pickle.dumps):
         with pytest.raises(TypeError, match="expected a closed environment, got a WildfireVector"):

@@ -152,9 +152,13 @@ class WildfireObjectiveEnv(WorldEnv):
         resume = wants_to_resume(options, seed)
         world_seed = draw_seed(self.np_random) if seed is None and not resume else seed
         world_seed = None if world_seed is None else as_seed(world_seed)
-        decisions = self._open(world_seed)
-        with self._closing_when_lost():
-            decision = decisions.last() if resume else decisions.reset(world_seed)
+        may_move = self._is_open() and not resume
+        try:
+            decision = self._begin_with(world_seed, resume)
+        except (AgentEndsError, ServerGoneError):
+            if not may_move:
+                raise
+            decision = self._begin_with(world_seed, resume)
         self._is_lost = False
         self._path = None
         return self._seen(decision)
@@ -212,6 +216,12 @@ class WildfireObjectiveEnv(WorldEnv):
     def _is_open(self) -> bool:
         return self._decisions is not None
 
+    def _begin_with(self, seed: int | None, resume: bool) -> Decision:
+        """Where an episode begins, or goes on."""
+        decisions = self._open(seed)
+        with self._closing_when_lost():
+            return decisions.last() if resume else decisions.reset(seed)
+
     def _open(self, seed: int | None) -> Decisions:
         """Starts what is missing: server, agent, readers."""
         if self._decisions is not None:
@@ -248,7 +258,7 @@ class WildfireObjectiveEnv(WorldEnv):
 
         if not self._owns_agent:
             return connect()
-        flags = self._arguments | {"instance": instance, "world": str(settings.world)}
+        flags = {"instance": instance, "world": str(settings.world)} | self._arguments
         command = ["serve-decisions", *(f"--{flag}={value}" for flag, value in flags.items())]
         if settings.takeover:
             command.append("--takeover")

@@ -116,19 +116,20 @@ class Session:
     def reset(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
         """Begins new episodes in some of the worlds, counted from 0; returns how all stand.
 
+        If the server has ended, those in all worlds begin at another.
+
         Raises:
             SettingError: If a seed does not fit into 64 bits.
             LeaseLostError, ServerGoneError: The session is closed then; another try opens anew.
         """
         seeds = [as_seed(seed) for seed in seeds]
-        self.open(seeds[0] - indices[0])
-        lease = self._opened()
+        may_move = self.is_open and len(indices) == self.n_worlds
         try:
-            lease.reset(seeds, worlds=[lease.worlds[index] for index in indices])
-            return self._observe()
-        except (LeaseLostError, ServerGoneError):
-            self.close()
-            raise
+            return self._begin(indices, seeds)
+        except ServerGoneError:
+            if not may_move:
+                raise
+        return self._begin(indices, seeds)
 
     def step(self, moves: NDArray[np.uint8], indices: range | None = None) -> StepAnswer:
         """Flies checked paths in all worlds, or some consecutive ones.
@@ -217,6 +218,16 @@ class Session:
             client.close()
         if program is not None:
             program.stop()
+
+    def _begin(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
+        self.open(seeds[0] - indices[0])
+        lease = self._opened()
+        try:
+            lease.reset(seeds, worlds=[lease.worlds[index] for index in indices])
+            return self._observe()
+        except (LeaseLostError, ServerGoneError):
+            self.close()
+            raise
 
     def _opened(self) -> Lease:
         if self._lease is None:
