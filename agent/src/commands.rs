@@ -20,7 +20,7 @@ use agent::decisions::DecisionsError;
 use agent::learned::Learned;
 use agent::run::{Mission, RunError, run};
 use agent::train::TrainError;
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use clap::Args;
 use protocol::Model;
 use protocol::channels::Instance;
@@ -110,9 +110,13 @@ fn model_named(name: &str) -> Result<Model> {
     if let Some(model) = Model::built_in(name) {
         return Ok(model);
     }
-    let names = Model::built_in_names().collect::<Vec<_>>().join(", ");
-    read_model(Path::new(name))
-        .with_context(|| format!("--model: expected {names} or a model file"))
+    let path = Path::new(name);
+    ensure!(
+        path.exists(),
+        "model file {name}: No such file: expected one, or {}",
+        Model::built_in_names().collect::<Vec<_>>().join(", ")
+    );
+    read_model(path)
 }
 
 fn read_model(path: &Path) -> Result<Model> {

@@ -41,7 +41,7 @@ def test_names_are_those_of_the_programs() -> None:
         assert Model.named(name).name == Model.named(Path(name)).name == name
     command = [find("emberwatch-agent"), "run", "--model=no/such"]
     words = subprocess.run(command, capture_output=True, text=True).stderr
-    known = re.search(r"--model: expected (.*) or a model file", words)
+    known = re.search(r"no/such: No such file: expected one, or (.*)", words)
     assert known is not None and set(known[1].split(", ")) == set(names)
 
 
