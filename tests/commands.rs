@@ -1,6 +1,8 @@
 //! Wrong input to every command: an exit code, one line that says what was expected, no panic.
 
 use crate::harness::{Ended, SMALL, Server, run};
+use agent::policy;
+use protocol::Model;
 use std::time::Duration;
 
 /// How long a refusal may take.
@@ -248,4 +250,13 @@ fn the_documented_prior_is_written() {
     let ended = run(AGENT, &words, LIMIT);
     assert_eq!(ended.code, Some(0), "{}", ended.stderr);
     assert!(file.is_file());
+}
+
+#[test]
+fn help_lists_the_policies() {
+    for command in ["run", "compare"] {
+        let help = run(AGENT, &[command, "--help"], LIMIT).stdout;
+        let list = policy::list(&Model::wildfire());
+        assert!(help.contains(list.trim_end()), "{command}: {help}");
+    }
 }

@@ -18,6 +18,7 @@ pub use train::TrainCommand;
 use agent::config::AgentFlags;
 use agent::decisions::DecisionsError;
 use agent::learned::Learned;
+use agent::policy;
 use agent::run::{Mission, RunError, run};
 use agent::train::TrainError;
 use anyhow::{Context, Result, ensure};
@@ -81,6 +82,15 @@ impl RunCommand {
         tracing::info!(steps = summary.steps, mean_reward, "done");
         Ok(())
     }
+}
+
+/// What the policies of the built-in wildfire are, for `--help`.
+pub fn policies() -> String {
+    let list = policy::list(&Model::wildfire());
+    format!(
+        "Policies, for the states of the wildfire; where no belief is named they plan on the known \
+         model's filter's:\n{list}"
+    )
 }
 
 /// Where results go wrong for a reason that callers may want to tell apart, a code of its own.

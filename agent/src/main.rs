@@ -17,12 +17,14 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     /// Act on one world of a running server
+    #[command(after_long_help = commands::policies())]
     Run(commands::RunCommand),
     /// Take decisions for one world from a learner outside, and do the rest
     ServeDecisions(commands::ServeDecisionsCommand),
     /// Write a filter's first belief to a file
     Prior(commands::PriorCommand),
     /// Compare policies on the same worlds: table, CSV and figures
+    #[command(after_long_help = commands::policies())]
     Compare(commands::CompareCommand),
     /// Learn a model while acting: checkpoint and metrics
     Train(commands::TrainCommand),

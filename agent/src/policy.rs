@@ -1,7 +1,12 @@
 //! Policies by name: which belief, which planner, which objective (the ladder of the benchmark).
 
+mod names;
+
+pub use names::list;
+
 use crate::action::{Action, ActionSet};
 use crate::planner::{Objective, Target};
+use names::{known_names, ladder_names};
 use protocol::Model;
 use thiserror::Error;
 
@@ -290,52 +295,6 @@ fn planner_named(name: &str) -> Option<PlannerKind> {
         "beam" => Some(PlannerKind::Beam),
         _ => None,
     }
-}
-
-fn ladder_names(model: &Model) -> Vec<String> {
-    let others = model
-        .file()
-        .states
-        .iter()
-        .enumerate()
-        .filter(|(state, _)| *state != model.target_state());
-    let others = others.map(|(_, entry)| format!("shooting_{}", entry.name));
-    let mut names: Vec<String> = ["random_walk", "coverage", "shooting_explore"]
-        .map(String::from)
-        .to_vec();
-    names.extend(others);
-    let rest = [
-        "shooting_exploit",
-        "shooting_exploit_only",
-        "beam_exploit",
-        "oracle_shooting",
-        "oracle_beam",
-        "clairvoyant_beam",
-    ];
-    names.extend(rest.map(String::from));
-    names
-}
-
-fn known_names(model: &Model) -> Vec<String> {
-    let mut names = ladder_names(model);
-    names.extend(["beam_explore", "beam_exploit_only", "clairvoyant_shooting"].map(String::from));
-    names.extend(Policy::OF_FILTER.map(String::from));
-    names.extend(Policy::OF_DECISIONS.map(String::from));
-    names.extend(
-        ActionSet::beam(model)
-            .names()
-            .iter()
-            .map(|name| format!("act_{name}")),
-    );
-    names.extend(Policy::OF_AUTOENCODER.map(String::from));
-    names.extend(
-        model
-            .file()
-            .states
-            .iter()
-            .map(|state| format!("beam_{}", state.name)),
-    );
-    names
 }
 
 #[cfg(test)]
