@@ -2,6 +2,8 @@
 
 use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly};
 use crate::wire::{RawClient, Wire, step_header};
+use agent::agent::known_model_kind;
+use protocol::Model;
 use protocol::Move;
 use protocol::control::{LeftPart, Reply, Request, WorldSeed};
 use protocol::message::{FrameHeader, Operation, Status, StepRequest, split_step_payload};
@@ -14,6 +16,9 @@ const FLAGS: &str = "--height 16 --width 16 --moves 12 --burn-in 3000 --seed 3";
 
 /// Room for all frames of these tests.
 const ALL: &str = "--history 100000";
+
+/// What an agent says before it simulates one.
+const FIRST_BELIEF: &str = "simulating the first belief";
 
 fn run(server: &Server, flags: &[&str]) -> Program {
     let common = ["run", "--instance", server.instance.name()];
@@ -60,11 +65,9 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
         assert_eq!(ended.code, Some(3), "{}", ended.stderr);
         let ended = second.wait(PATIENCE);
         assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-        assert!(
-            ended.stderr.contains("the frames that were kept"),
-            "{}",
-            ended.stderr
-        );
+        for words in [FIRST_BELIEF, "the frames that were kept"] {
+            assert!(ended.stderr.contains(words), "{}", ended.stderr);
+        }
         // The third comes after a release, and finds the second's belief.
         let third = run(&server, &[&policy[..], &["--steps", "20"]].concat()).wait(PATIENCE);
         assert_eq!(third.code, Some(0), "{}", third.stderr);
@@ -73,6 +76,7 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
             "{}",
             third.stderr
         );
+        assert!(!third.stderr.contains(FIRST_BELIEF), "{}", third.stderr);
         let last = server.observe(0).0.step;
         assert_eq!(
             paths(&observer, last),
@@ -80,6 +84,24 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
             "{policy:?}"
         );
     }
+}
+
+#[test]
+fn an_agent_that_finds_a_damaged_belief_begins_with_its_own() {
+    let policy = ["--policy", "beam_exploit"];
+    let server = Server::start(FLAGS);
+    let observer = Observer::frames(&server.instance).expect("observe");
+    let mut client = server.acquire(0..1);
+    let at = client.observe(0..1).expect("observe")[0].result;
+    let kind = known_model_kind(&Model::wildfire());
+    client
+        .leave_belief(&at, &kind, b"not whole")
+        .expect("leave");
+    client.release().expect("release");
+    let ended = run(&server, &[&policy[..], &["--steps", "10"]].concat()).wait(PATIENCE);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert!(ended.stderr.contains(FIRST_BELIEF), "{}", ended.stderr);
+    assert_eq!(paths(&observer, 10), undisturbed(10, &policy));
 }
 
 #[test]

@@ -4,7 +4,7 @@ mod parts;
 #[cfg(test)]
 mod tests;
 
-pub use self::parts::numbered_states;
+pub use self::parts::{known_model_kind, numbered_states};
 
 use self::parts::{autoencoder, basis, belief_kind, decider, learned_filter, state_names};
 use crate::action::Action;

@@ -323,6 +323,25 @@ pub fn server_info(instance: &Instance) -> Result<ServerInfo, ConnectionError> {
     Ok(connection.info().clone())
 }
 
+/// Whether a belief of a kind was left about a world as it stands; needs no lease.
+///
+/// # Errors
+/// [`ConnectionError`].
+pub fn is_belief_left(
+    instance: &Instance,
+    world: u32,
+    kind: &str,
+) -> Result<bool, ConnectionError> {
+    let mut connection = Connection::open(instance, CLIENT_NAME, STEP_TIMEOUT)?;
+    let request = Request::Belief { world, offset: 0 };
+    match connection.control(&request, STEP_TIMEOUT) {
+        Ok(Reply::Belief { info, .. }) => Ok(info.kind == kind),
+        Ok(other) => Err(unexpected("belief", &other)),
+        Err(ConnectionError::Refused { .. }) => Ok(false),
+        Err(error) => Err(error),
+    }
+}
+
 /// A server's grid.
 ///
 /// # Errors

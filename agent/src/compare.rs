@@ -6,6 +6,7 @@ use crate::belief::Belief;
 use crate::client::Observation;
 use crate::config::AgentConfig;
 use crate::feed::{Feed, View};
+use crate::first_belief::first_belief;
 use crate::learned::Learned;
 use crate::planner::Plan;
 use crate::policy::{EstimatorKind, Policy};
@@ -117,7 +118,7 @@ pub fn compare(
     progress: &dyn Fn(&str, u64),
 ) -> Result<Results, CompareError> {
     let prior = comparison.config.prior(arena.info().burn_in);
-    let prior = prior.belief(arena.model(), arena.shape(), comparison.config.seed)?;
+    let prior = first_belief(prior, arena.model(), arena.shape(), comparison.config.seed)?;
     let seeds: Vec<u64> = comparison.seeds.clone().collect();
     let mut results = Results {
         runs: Vec::new(),

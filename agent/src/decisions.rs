@@ -3,9 +3,9 @@
 //! One request after the other, each answered before the next is taken; between them the lease is kept
 //! alive. Without the world there is nothing to serve, so a lost lease or a server that ends is the end.
 
-use crate::belief::Belief;
 use crate::client::shape_of;
 use crate::decider::{Assignment, Decider};
+use crate::first_belief::first_belief;
 use crate::run::{RunError, is_outage, prepare};
 use protocol::Model;
 use protocol::channels::{ChannelError, ipc_error};
@@ -103,11 +103,8 @@ impl Service {
         // What takes long is done before anybody can ask and before the lease begins to run.
         let (info, model) = prepare(&task.instance, task.world, model)?;
         let shape = shape_of(&info).map_err(RunError::from)?;
-        let prior: Result<Belief, _> =
-            task.config
-                .prior(info.burn_in)
-                .belief(&model, shape, task.config.seed);
-        let prior = prior.map_err(RunError::from)?;
+        let prior = task.config.prior(info.burn_in);
+        let prior = first_belief(prior, &model, shape, task.config.seed).map_err(RunError::from)?;
         let responder = Responder::open(&task.instance, task.world)?;
         let decider = Decider::attach(task, model, prior)?;
         let (instance, pid) = (task.instance.name(), std::process::id());

@@ -9,6 +9,7 @@ use crate::belief::Belief;
 use crate::client::Observation;
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
+use crate::first_belief::first_belief;
 use crate::learned::Learned;
 use crate::policy::{EstimatorKind, Policy, UnknownPolicy};
 use crate::scoring::{Score, score};
@@ -75,7 +76,7 @@ pub fn examine(
 ) -> Result<Vec<Marks>, ExaminationError> {
     let config = examination.config;
     let prior = config.prior(arena.info().burn_in);
-    let prior = prior.belief(arena.model(), arena.shape(), config.seed)?;
+    let prior = first_belief(prior, arena.model(), arena.shape(), config.seed)?;
     let seeds: Vec<u64> = examination.seeds.clone().collect();
     let mut marks = Vec::new();
     for batch in seeds.chunks(arena.batch_size()) {

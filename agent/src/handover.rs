@@ -23,11 +23,7 @@ pub fn resume(
     present: &Observation,
 ) -> Result<bool, RunError> {
     let step = present.result.step;
-    if let Some(kind) = agent.belief_kind().map(str::to_owned)
-        && let Some(belief) = belief_left(client, &kind, agent.belief())?
-    {
-        tracing::info!(step, "going on from the belief that was left");
-        agent.take_over(belief);
+    if take_over_left(client, agent, present)? {
         return Ok(true);
     }
     if !agent.sees_frames() {
@@ -50,6 +46,28 @@ pub fn resume(
         tracing::info!(first, step, "going on from the frames that were kept");
     }
     Ok(false)
+}
+
+/// Gives an agent the belief that was left for it, if there is one; whatever it believed before is
+/// forgotten.
+///
+/// # Errors
+/// [`ConnectionError`].
+pub fn take_over_left(
+    client: &mut Client,
+    agent: &mut Agent,
+    present: &Observation,
+) -> Result<bool, ConnectionError> {
+    let Some(kind) = agent.belief_kind().map(str::to_owned) else {
+        return Ok(false);
+    };
+    let Some(belief) = belief_left(client, &kind, agent.belief())? else {
+        return Ok(false);
+    };
+    let step = present.result.step;
+    tracing::info!(step, "going on from the belief that was left");
+    agent.take_over(belief);
+    Ok(true)
 }
 
 /// Leaves an agent's belief about X_{k+1}, after its last observation, to the next one.

@@ -17,6 +17,7 @@ pub mod estimator;
 pub mod evaluate;
 pub mod feed;
 pub mod film;
+pub mod first_belief;
 pub mod handover;
 pub mod launch;
 pub mod learned;

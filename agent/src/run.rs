@@ -1,13 +1,16 @@
 //! The agent's life on one world: attach, act, reconnect, leave.
 
-use crate::agent::{Agent, AgentError, Task};
+use crate::agent::{Agent, AgentError, Task, known_model_kind};
 use crate::belief::Belief;
-use crate::client::{Claim, Client, Observation, server_info, shape_of};
+use crate::client::{
+    Claim, Client, Observation, is_belief_left, server_info, shape_of,
+};
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
 use crate::estimator::Prior;
 use crate::feed::{Feed, View};
-use crate::handover::{leave, resume};
+use crate::first_belief::first_belief;
+use crate::handover::{leave, resume, take_over_left};
 use crate::learned::Learned;
 use crate::policy::{EstimatorKind, Policy, UnknownPolicy};
 use crate::truth::{TruthError, TruthFeed};
@@ -175,8 +178,6 @@ struct Report {
 impl Attached {
     /// Acquires the world where it stands and takes in its last frame.
     fn attach(mission: &Mission, takeover: bool) -> Result<Self, RunError> {
-        let worlds = mission.world..mission.world + 1;
-        // What takes long is done before the lease begins to run.
         let (info, model) = prepare(&mission.instance, mission.world, mission.model.as_ref())?;
         let policy = Policy::named(&mission.policy, &model)?;
         if policy.estimator == EstimatorKind::NextTruth {
@@ -184,7 +185,58 @@ impl Attached {
                 policy: policy.name,
             });
         }
-        let prior = prior(mission, &model, &policy, &info)?;
+        let shape = shape_of(&info)?;
+        // What takes long is done before the lease begins to run, and not at all where a belief was left.
+        let prior = match policy.estimator {
+            EstimatorKind::KnownModel => {
+                let any = Belief::from_initial(&model, shape);
+                if let Some(attached) = Self::go_on(mission, takeover, &model, &policy, &any)? {
+                    return Ok(attached);
+                }
+                mission.config.prior(info.burn_in)
+            }
+            _ => Prior::Initial,
+        };
+        let prior = first_belief(prior, &model, shape, mission.config.seed)?;
+        let mut attached = Self::acquire(mission, takeover, &model, &policy, &prior)?;
+        let present = &attached.observation;
+        if !resume(&mut attached.client, &mut attached.agent, present)? {
+            attached.take_in(false)?;
+        }
+        Ok(attached)
+    }
+
+    /// Acquires the world if a belief was left about it, in the place of `any`.
+    fn go_on(
+        mission: &Mission,
+        takeover: bool,
+        model: &Model,
+        policy: &Policy,
+        any: &Belief,
+    ) -> Result<Option<Self>, RunError> {
+        let kind = known_model_kind(model);
+        if !is_belief_left(&mission.instance, mission.world, &kind)? {
+            return Ok(None);
+        }
+        let mut attached = Self::acquire(mission, takeover, model, policy, any)?;
+        let present = &attached.observation;
+        if take_over_left(&mut attached.client, &mut attached.agent, present)? {
+            return Ok(Some(attached));
+        }
+        // Another agent acted since.
+        attached.client.release()?;
+        Ok(None)
+    }
+
+    /// Acquires the world for an agent before its first frame.
+    fn acquire(
+        mission: &Mission,
+        takeover: bool,
+        model: &Model,
+        policy: &Policy,
+        prior: &Belief,
+    ) -> Result<Self, RunError> {
+        let worlds = mission.world..mission.world + 1;
         let claim = Claim {
             worlds: worlds.clone(),
             takeover,
@@ -203,14 +255,14 @@ impl Attached {
         let n_moves = client.info().n_moves;
         let seed = planner_seed(&mission.config, seed);
         let task = Task {
-            model: &model,
+            model,
             shape: client.shape(),
             n_moves,
-            prior: &prior,
+            prior,
             seed,
             learned: &mission.learned,
         };
-        let agent = Agent::new(&policy, &mission.config, task)?;
+        let agent = Agent::new(policy, &mission.config, task)?;
         let truth = if policy.estimator == EstimatorKind::Truth {
             Some(open_truth(mission, &client)?)
         } else {
@@ -221,7 +273,7 @@ impl Attached {
             since: Instant::now(),
             last: Summary::default(),
         };
-        let mut attached = Self {
+        Ok(Self {
             client,
             truth,
             agent,
@@ -229,12 +281,7 @@ impl Attached {
             feed,
             planning: Duration::ZERO,
             report,
-        };
-        let present = &attached.observation;
-        if !resume(&mut attached.client, &mut attached.agent, present)? {
-            attached.take_in(false)?;
-        }
-        Ok(attached)
+        })
     }
 
     /// Plans, flies, corrects, predicts; returns the reward. The last belief is shown in any case.
@@ -298,20 +345,6 @@ impl Report {
             last: *summary,
         };
     }
-}
-
-/// The belief before the first frame: simulated only for those who filter.
-fn prior(
-    mission: &Mission,
-    model: &Model,
-    policy: &Policy,
-    info: &ServerInfo,
-) -> Result<Belief, RunError> {
-    let kind = match policy.estimator {
-        EstimatorKind::KnownModel => mission.config.prior(info.burn_in),
-        _ => Prior::Initial,
-    };
-    Ok(kind.belief(model, shape_of(info)?, mission.config.seed)?)
 }
 
 /// What a server says of itself, and its model, or the one given; checks that it has the world.

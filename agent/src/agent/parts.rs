@@ -29,10 +29,7 @@ pub fn numbered_states(n_states: usize) -> Vec<String> {
 /// The kind of belief, with a checksum of the parameters that give it its meaning.
 pub(super) fn belief_kind(estimator: &Estimator, task: &Task<'_>) -> Option<String> {
     let (kind, checksum) = match estimator {
-        Estimator::KnownModel(_) => {
-            let text = format!("{:?}", task.model.file());
-            ("known_model", crc32fast::hash(text.as_bytes()))
-        }
+        Estimator::KnownModel(_) => return Some(known_model_kind(task.model)),
         Estimator::Learned(filter) => {
             let tables = filter.tables();
             let numbers = [&tables.kernel, &tables.likelihood, &tables.initial];
@@ -42,9 +39,17 @@ pub(super) fn belief_kind(estimator: &Estimator, task: &Task<'_>) -> Option<Stri
         }
         _ => return None,
     };
-    Some(format!(
-        "{kind} {checksum:08x}, probabilities [S, H, W] as f32"
-    ))
+    Some(kind_of(kind, checksum))
+}
+
+/// The kind of the known-model filter's belief.
+pub fn known_model_kind(model: &Model) -> String {
+    let text = format!("{:?}", model.file());
+    kind_of("known_model", crc32fast::hash(text.as_bytes()))
+}
+
+fn kind_of(estimator: &str, checksum: u32) -> String {
+    format!("{estimator} {checksum:08x}, probabilities [S, H, W] as f32")
 }
 
 /// What a policy plans on: what the settings say, but where a DQN decides what it was trained with, as

@@ -3,6 +3,7 @@
 use super::model_named;
 use agent::Belief;
 use agent::estimator::Prior;
+use agent::first_belief::first_belief;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use ndarray_npy::WriteNpyExt;
@@ -48,7 +49,7 @@ impl PriorCommand {
             n_worlds: self.worlds as usize,
             burn_in: self.burn_in,
         };
-        let belief = prior.belief(&model, shape, self.seed)?;
+        let belief = first_belief(prior, &model, shape, self.seed)?;
         write_whole(&self.out, &belief)?;
         let shape = belief.probabilities().shape();
         tracing::info!(?shape, file = %self.out.display(), "written");

@@ -6,6 +6,7 @@ use crate::client::Client;
 use crate::config::{AgentConfig, LearnerKind};
 use crate::estimator::Filter;
 use crate::estimator::learned_filter::{Dimensions, DimensionsError};
+use crate::first_belief::first_belief;
 use crate::student::decisions::{Decisions, DecisionsStudent};
 use crate::student::filter::FilterStudent;
 use crate::student::network::{self, NetworkStudent};
@@ -59,7 +60,8 @@ pub fn student(
                 decisions.load(contents).map_err(wrong)?;
             }
             let prior = config.prior(info.burn_in);
-            let filter = Filter::new(&model, prior.belief(&model, site.shape, config.seed)?)?;
+            let prior = first_belief(prior, &model, site.shape, config.seed)?;
+            let filter = Filter::new(&model, prior)?;
             Box::new(DecisionsStudent::new(
                 decisions, filter, &model, site, config,
             ))
