@@ -1,8 +1,9 @@
 //! Wrong input to every command: an exit code, one line that says what was expected, no panic.
 
-use crate::harness::{Ended, SMALL, Server, run};
+use crate::harness::{Ended, PATIENCE, Program, SMALL, Server, new_instance, run};
 use agent::policy;
 use protocol::Model;
+use rustix::process::Signal;
 use std::time::Duration;
 
 /// How long a refusal may take.
@@ -57,7 +58,10 @@ stop --instance a/b => instance name | "a/b"
 
 /// The same for the agent.
 const WRONG_AGENT_FLAGS: &str = r#"
-run --instance nobody => no server on instance "nobody"
+run --instance nobody --wait 0 => no server on instance "nobody"
+run --instance nobody --wait 0.3 => no server on instance "nobody"
+run --wait soon => --wait | expected seconds
+run --wait=-1 => --wait | expected seconds
 run --instance a/b => instance name | "a/b"
 run --steps -1 => -1
 run --world x => --world | 'x'
@@ -69,7 +73,7 @@ run --preset lab => --preset | default, paper
 run --prior none => --prior | simulated, initial, uniform
 run --beam-width 0 => beam_width: expected 1 to 10000, got 0
 run --shooting-samples 0 => shooting_samples: expected 1 to 1000000, got 0
-serve-decisions --instance nobody => no server on instance "nobody"
+serve-decisions --instance nobody --wait 0 => no server on instance "nobody"
 serve-decisions --instance a/b => instance name | "a/b"
 serve-decisions --world x => --world | 'x'
 serve-decisions --planner random_walk => --planner | beam, shooting
@@ -101,7 +105,7 @@ compare --baseline ash => --baseline | expected one of | got "ash"
 compare --height 0 => height and width in 1..=4096, got 0 x 64
 compare --model no.toml => model file no.toml | No such file
 compare --server no/such => start no/such | No such file
-compare --instance nobody => no server on instance "nobody"
+compare --instance nobody --wait 0 => no server on instance "nobody"
 compare --instance x --height 9 => --instance | --height
 compare TINY --csv /proc/no/file.csv => create /proc/no
 compare TINY --csv / => --csv: expected a file, got the folder /
@@ -250,6 +254,50 @@ fn the_documented_prior_is_written() {
     let ended = run(AGENT, &words, LIMIT);
     assert_eq!(ended.code, Some(0), "{}", ended.stderr);
     assert!(file.is_file());
+}
+
+#[test]
+fn agents_wait_for_the_server_that_is_started_with_them() {
+    let folder = tempfile::TempDir::new().expect("a folder");
+    let out = folder.path().join("out").display().to_string();
+    let train = format!("train --out {out} --worlds 1 --steps 3");
+    for (command, done) in [
+        ("run --steps 3", "done"),
+        (&*train, "done"),
+        ("serve-decisions", "serving decisions"),
+        (
+            "compare --policies coverage --baseline coverage --seeds 0..1 --steps 1",
+            "",
+        ),
+    ] {
+        let instance = new_instance();
+        let flags = format!("{command} --wait 60 --instance {}", instance.name());
+        let flags: Vec<&str> = flags.split_whitespace().collect();
+        let agent = Program::start(AGENT, &flags);
+        agent.wait_for_words("waiting for it", PATIENCE);
+        let _server = Server::start_on(&instance, &format!("{SMALL} --worlds 2 --publish-truth"));
+        agent.wait_for_words(done, PATIENCE);
+        if command == "serve-decisions" {
+            agent.signal(Signal::TERM);
+        }
+        let ended = agent.wait(PATIENCE);
+        assert_eq!(ended.code, Some(0), "{command}: {}", ended.stderr);
+        let told = ended.stderr.matches("waiting for it").count();
+        assert_eq!(told, 1, "{command}: {}", ended.stderr);
+    }
+}
+
+#[test]
+fn an_agent_that_waits_can_be_stopped() {
+    for command in ["run", "serve-decisions"] {
+        let instance = new_instance();
+        let flags = [command, "--wait", "1e18", "--instance", instance.name()];
+        let agent = Program::start(AGENT, &flags);
+        agent.wait_for_words("waiting for it", PATIENCE);
+        agent.signal(Signal::TERM);
+        let ended = agent.wait(PATIENCE);
+        assert_eq!(ended.code, Some(0), "{command}: {}", ended.stderr);
+    }
 }
 
 #[test]

@@ -363,7 +363,7 @@ train => --out
 train --out /proc/no => create /proc/no
 train --out /tmp --freeze => --resume
 train --out OUT --worlds 0 => --worlds | 1..=1024
-train --out OUT --instance nobody => no server on instance \"nobody\"
+train --out OUT --instance nobody --wait 0 => no server on instance \"nobody\"
 train --out OUT --instance a/b => instance name | \"a/b\"
 train --out OUT --instance x --height 9 => --instance | --height
 train --out OUT --time-limit=-1 => --time-limit | expected seconds

@@ -2,7 +2,7 @@
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
-use protocol::channels::Instance;
+use protocol::channels::{ChannelError, Instance};
 use protocol::connection::{ConnectionError, StepAnswer, unexpected};
 use protocol::control::{
     LeaseInfo, LeftPart, MAX_BELIEF_PART, Reply, Request, ServerInfo, WorldInfo, WorldSeed,
@@ -12,13 +12,17 @@ use protocol::path::path_to_bytes;
 use protocol::{Cell, Connection, Frame, Move, Shape};
 use std::ops::Range;
 use std::os::fd::BorrowedFd;
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 /// How this program names itself to servers.
 const CLIENT_NAME: &str = concat!("emberwatch-agent ", env!("CARGO_PKG_VERSION"));
 
 /// How long a step may take.
 pub const STEP_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// How long to wait between attempts to reach a server that is away.
+pub const RETRY_INTERVAL: Duration = Duration::from_millis(200);
 
 /// How long anything else may take; resets simulate the burn-in of all their worlds.
 pub const CONTROL_TIMEOUT: Duration = Duration::from_secs(120);
@@ -321,6 +325,43 @@ fn garbled(problem: &dyn std::fmt::Display) -> ConnectionError {
 pub fn server_info(instance: &Instance) -> Result<ServerInfo, ConnectionError> {
     let connection = Connection::open(instance, CLIENT_NAME, STEP_TIMEOUT)?;
     Ok(connection.info().clone())
+}
+
+/// Waits until an instance has a server, and says so once if that is not at once; returns whether it has
+/// one: not if `stop` was set meanwhile.
+///
+/// # Errors
+/// [`ConnectionError`], that of the last try, if there is none within `limit`.
+pub fn wait_for_server(
+    instance: &Instance,
+    limit: Duration,
+    stop: &AtomicBool,
+) -> Result<bool, ConnectionError> {
+    let (start, mut is_told) = (Instant::now(), false);
+    while !stop.load(Ordering::Relaxed) {
+        match server_info(instance) {
+            Ok(_) => return Ok(true),
+            Err(error) if is_away(&error) && start.elapsed() < limit => {
+                if !is_told {
+                    tracing::info!("{error}; waiting for it, {limit:?} at most");
+                }
+                is_told = true;
+            }
+            Err(error) => return Err(error),
+        }
+        let left = limit.saturating_sub(start.elapsed());
+        std::thread::sleep(RETRY_INTERVAL.min(left));
+    }
+    Ok(false)
+}
+
+/// Whether a server is away and may come.
+pub fn is_away(error: &ConnectionError) -> bool {
+    match error {
+        ConnectionError::ServerGone { .. } | ConnectionError::Timeout { .. } => true,
+        ConnectionError::Channel(channel) => matches!(channel, ChannelError::NoServer { .. }),
+        _ => false,
+    }
 }
 
 /// Whether a belief of a kind was left about a world as it stands; needs no lease.

@@ -15,6 +15,7 @@ pub use film::FilmCommand;
 pub use prior::PriorCommand;
 pub use train::TrainCommand;
 
+use agent::client::wait_for_server;
 use agent::config::AgentFlags;
 use agent::decisions::DecisionsError;
 use agent::learned::Learned;
@@ -31,6 +32,8 @@ use protocol::program::{read_text, stop_on_signals};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 /// Exit code of a run whose lease was lost.
 const LEASE_LOST: u8 = 3;
@@ -41,6 +44,8 @@ pub struct RunCommand {
     /// The server's instance name
     #[arg(long, default_value = "default")]
     instance: String,
+    #[command(flatten)]
+    wait: WaitFlag,
     /// The world to act on
     #[arg(long, default_value_t = 0)]
     world: u32,
@@ -77,10 +82,29 @@ impl RunCommand {
             config: self.settings.effective()?,
             learned: Learned::read(self.checkpoint.as_deref())?,
         };
-        let summary = run(&mission, &*stop_on_signals().context("handle signals")?)?;
+        let stop = stop_on_signals().context("handle signals")?;
+        if !self.wait.for_server(&mission.instance, &stop)? {
+            return Ok(());
+        }
+        let summary = run(&mission, &stop)?;
         let mean_reward = summary.reward / summary.steps.max(1) as f64;
         tracing::info!(steps = summary.steps, mean_reward, "done");
         Ok(())
+    }
+}
+
+/// How long to wait for a server.
+#[derive(Debug, Args)]
+pub struct WaitFlag {
+    /// Seconds to wait until the instance has a server; 0: not at all
+    #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = parse_seconds)]
+    wait: Duration,
+}
+
+impl WaitFlag {
+    /// Waits for the instance's server; returns whether to go on: not if `stop` was set meanwhile.
+    fn for_server(&self, instance: &Instance, stop: &AtomicBool) -> Result<bool> {
+        Ok(wait_for_server(instance, self.wait, stop)?)
     }
 }
 
@@ -91,6 +115,12 @@ pub fn policies() -> String {
         "Policies, for the states of the wildfire; where no belief is named they plan on the known \
          model's filter's:\n{list}"
     )
+}
+
+fn parse_seconds(text: &str) -> Result<Duration, String> {
+    let seconds: f64 = text.parse().map_err(|_| "expected seconds, such as 60")?;
+    let limit = Duration::try_from_secs_f64(seconds);
+    limit.map_err(|error| format!("expected seconds, such as 60: {error}"))
 }
 
 /// Where results go wrong for a reason that callers may want to tell apart, a code of its own.

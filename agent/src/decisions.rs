@@ -13,7 +13,7 @@ use protocol::connection::ConnectionError;
 use protocol::control::parse;
 use protocol::decisions::{Reply, Request};
 use protocol::message::{Status, VERSION};
-use protocol::program::{Keeper, NoKeeper};
+use protocol::program::Keeper;
 use protocol::responder::{ActiveControl, Responder, ResponderError, wait_until_taken};
 use protocol::wait::{Waiter, sleep_until_event};
 use std::cell::Cell;
@@ -39,12 +39,9 @@ pub enum DecisionsError {
     /// A channel failed.
     #[error(transparent)]
     Channel(#[from] ChannelError),
-    /// The process to end with is not there.
-    #[error(transparent)]
-    Keeper(#[from] NoKeeper),
 }
 
-/// Serves until `stop` is set, a client asks to shut down, or the process `exit_with` ends; then
+/// Serves until `stop` is set, a client asks to shut down, or the keeper ends; then
 /// releases the world. `model` is for servers that do not reveal theirs.
 ///
 /// # Errors
@@ -52,10 +49,10 @@ pub enum DecisionsError {
 pub fn serve_decisions(
     task: &Assignment,
     model: Option<&Model>,
-    exit_with: Option<i32>,
+    keeper: Option<Keeper>,
     stop: &AtomicBool,
 ) -> Result<(), DecisionsError> {
-    let mut service = Service::start(task, model, exit_with)?;
+    let mut service = Service::start(task, model, keeper)?;
     match service.serve(stop) {
         Ok(asked) => service.stop(asked),
         Err(error) => {
@@ -97,9 +94,8 @@ impl Service {
     fn start(
         task: &Assignment,
         model: Option<&Model>,
-        exit_with: Option<i32>,
+        keeper: Option<Keeper>,
     ) -> Result<Self, DecisionsError> {
-        let keeper = exit_with.map(Keeper::watch).transpose()?;
         // What takes long is done before anybody can ask and before the lease begins to run.
         let (info, model) = prepare(&task.instance, task.world, model)?;
         let shape = shape_of(&info).map_err(RunError::from)?;

@@ -3,7 +3,7 @@
 use crate::agent::{Agent, AgentError, Task, known_model_kind};
 use crate::belief::Belief;
 use crate::client::{
-    Claim, Client, Observation, is_belief_left, server_info, shape_of,
+    Claim, Client, Observation, RETRY_INTERVAL, is_away, is_belief_left, server_info, shape_of,
 };
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
@@ -14,7 +14,7 @@ use crate::handover::{leave, resume, take_over_left};
 use crate::learned::Learned;
 use crate::policy::{EstimatorKind, Policy, UnknownPolicy};
 use crate::truth::{TruthError, TruthFeed};
-use protocol::channels::{ChannelError, Instance};
+use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::ServerInfo;
 use protocol::message::Status;
@@ -23,9 +23,6 @@ use protocol::{Grid, Model};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use thiserror::Error;
-
-/// How long to wait between attempts to reach a server that is gone.
-const RETRY_INTERVAL: Duration = Duration::from_millis(200);
 
 /// How often progress is told.
 const REPORT_INTERVAL: Duration = Duration::from_secs(2);
@@ -429,12 +426,5 @@ fn is_own_lease(error: &RunError) -> bool {
 
 /// Whether the server is away and may come back.
 pub fn is_outage(error: &RunError) -> bool {
-    let RunError::Connection(error) = error else {
-        return false;
-    };
-    match error {
-        ConnectionError::ServerGone { .. } | ConnectionError::Timeout { .. } => true,
-        ConnectionError::Channel(channel) => matches!(channel, ChannelError::NoServer { .. }),
-        _ => false,
-    }
+    matches!(error, RunError::Connection(error) if is_away(error))
 }

@@ -1,6 +1,6 @@
 //! `serve-decisions`: a learner outside decides, this program estimates, plans and steps.
 
-use super::model_named;
+use super::{WaitFlag, model_named};
 use agent::config::AgentFlags;
 use agent::decider::Assignment;
 use agent::decisions::serve_decisions;
@@ -8,7 +8,7 @@ use agent::policy::PlannerKind;
 use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
 use protocol::channels::Instance;
-use protocol::program::stop_on_signals;
+use protocol::program::{Keeper, stop_on_signals};
 
 /// Take decisions for one world from a learner outside.
 #[derive(Args)]
@@ -16,6 +16,8 @@ pub struct ServeDecisionsCommand {
     /// The server's instance name
     #[arg(long, default_value = "default")]
     instance: String,
+    #[command(flatten)]
+    wait: WaitFlag,
     /// The world to act on
     #[arg(long, default_value_t = 0)]
     world: u32,
@@ -58,8 +60,12 @@ impl ServeDecisionsCommand {
             },
             config: self.settings.effective()?,
         };
+        let keeper = self.exit_with.map(Keeper::watch).transpose()?;
         let stop = stop_on_signals().context("handle signals")?;
-        serve_decisions(&task, model.as_ref(), self.exit_with, &stop)?;
+        if !self.wait.for_server(&task.instance, &stop)? {
+            return Ok(());
+        }
+        serve_decisions(&task, model.as_ref(), keeper, &stop)?;
         tracing::info!("done");
         Ok(())
     }

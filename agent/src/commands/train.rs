@@ -1,7 +1,7 @@
 //! `train`: learns a model while acting.
 
-use super::make_folder;
 use super::worlds::GridFlags;
+use super::{WaitFlag, make_folder, parse_seconds};
 use agent::config::{AgentFlags, LearnerKind, Preset};
 use agent::launch::OwnServer;
 use agent::report::training::draw_training;
@@ -22,6 +22,8 @@ pub struct TrainCommand {
     /// Act on this running server; without it, one is started and stopped
     #[arg(long)]
     instance: Option<String>,
+    #[command(flatten)]
+    wait: WaitFlag,
     /// The first world to act on
     #[arg(long, default_value_t = 0)]
     world: u32,
@@ -90,7 +92,10 @@ impl TrainCommand {
             config,
         };
         let contents = training.check()?;
-        let (instance, _own) = self.server(n_worlds, learner)?;
+        let (instance, own) = self.server(n_worlds, learner)?;
+        if own.is_none() && !self.wait.for_server(&instance, &stop)? {
+            return Ok(());
+        }
         let summary = train(&instance, &training, contents, &stop)?;
         let mean_reward = summary.reward / summary.steps.max(1) as f64;
         tracing::info!(
@@ -131,10 +136,4 @@ impl TrainCommand {
         let server = OwnServer::start(self.server.clone(), &arguments)?;
         Ok((server.instance().clone(), Some(server)))
     }
-}
-
-fn parse_seconds(text: &str) -> Result<Duration, String> {
-    let seconds: f64 = text.parse().map_err(|_| "expected seconds, such as 60")?;
-    let limit = Duration::try_from_secs_f64(seconds);
-    limit.map_err(|error| format!("expected seconds, such as 60: {error}"))
 }

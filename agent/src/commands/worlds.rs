@@ -1,6 +1,6 @@
 //! The worlds that policies meet: a running server's, or a private one's.
 
-use super::model_named;
+use super::{WaitFlag, model_named};
 use agent::arena::{Arena, MAX_BATCH};
 use agent::launch::OwnServer;
 use anyhow::{Result, ensure};
@@ -9,6 +9,7 @@ use protocol::channels::Instance;
 use protocol::{Model, Shape};
 use std::ops::Range;
 use std::path::PathBuf;
+use std::sync::atomic::AtomicBool;
 
 /// Most worlds of a comparison.
 const MAX_SEEDS: u64 = 100_000;
@@ -22,6 +23,8 @@ pub struct WorldFlags {
     /// Use the worlds of this running server; without it, one is started and stopped
     #[arg(long)]
     instance: Option<String>,
+    #[command(flatten)]
+    wait: WaitFlag,
     /// World seeds, first..end
     #[arg(long, value_parser = parse_seeds, default_value = "0..8")]
     pub seeds: Range<u64>,
@@ -66,7 +69,11 @@ impl WorldFlags {
     /// Attaches to the server or starts one. `check` refuses what cannot be right before that.
     pub fn open(&self, needs_scouts: bool, check: impl Fn(&Model) -> Result<()>) -> Result<Worlds> {
         let (instance, own) = match &self.instance {
-            Some(name) => (Instance::new(name)?, None),
+            Some(name) => {
+                let instance = Instance::new(name)?;
+                self.wait.for_server(&instance, &AtomicBool::new(false))?;
+                (instance, None)
+            }
             None => {
                 check(&self.grid.check()?)?;
                 let arguments = self.server_arguments(needs_scouts);

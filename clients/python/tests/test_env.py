@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -576,7 +577,7 @@ def test_a_hidden_model_is_none() -> None:
 
 def test_nobody_serving_is_told_by_make() -> None:
     with pytest.raises(NoServerError, match="emberwatch-server --instance nobody"):
-        make(instance="nobody")
+        make(instance="nobody", timeout=0.1)
 
 
 def test_a_model_in_which_no_state_pays_is_warned_of(tmp_path: Path) -> None:
@@ -647,7 +648,7 @@ def test_another_server_of_other_size_is_refused() -> None:
     with serving(instance=instance):
         env.reset(seed=1)
         env.step([0, 0, 0, 0])
-    with pytest.raises(NoServerError):
+    with impatient(env), pytest.raises(NoServerError):
         env.reset()
     with serving(instance=instance, width=6), pytest.raises(SettingError, match="width=6"):
         env.reset()
@@ -723,6 +724,18 @@ def test_a_reset_that_finds_the_server_dead_starts_another(name: str, times_out:
     os.kill(pid, signal.SIGKILL)
     assert_same(rollout(env, 8, seed=3), expected)
     env.close()
+
+
+def test_a_reset_waits_for_the_next_server() -> None:
+    with serving() as instance:
+        env = make(instance=instance, timeout=20.0)
+        expected = rollout(env, 5, seed=3)
+        os.kill(private_pid(env), signal.SIGKILL)
+        with ThreadPoolExecutor() as threads:
+            again = threads.submit(rollout, env, 5, seed=3)
+            with serving(instance=instance):
+                assert_same(again.result(60), expected)
+                env.close()
 
 
 def test_a_world_that_is_gone_is_not_gone_on_with() -> None:

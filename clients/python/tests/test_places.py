@@ -5,13 +5,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from processes import Server, connects, eventually
+from processes import PATIENCE, Server, connects, eventually
 
 from emberwatch import channels, errors
 from emberwatch.client import connect
+from emberwatch.programs import unused_instance
 
 Start = Callable[..., Server]
 
@@ -30,9 +32,23 @@ def test_a_seventeenth_client_is_told_the_limit_and_others_go_on(server: Start) 
 
 def test_without_a_server_the_instance_and_the_remedy_are_named() -> None:
     with pytest.raises(errors.NoServerError) as raised:
-        connect("nobody-here")
+        connect("nobody-here", timeout=0.1)
     assert "'nobody-here'" in str(raised.value)
     assert "emberwatch-server --instance nobody-here" in str(raised.value)
+
+
+def test_a_server_that_is_started_later_is_waited_for(
+    server: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    instance = unused_instance()
+    with ThreadPoolExecutor() as threads:
+        waiting = threads.submit(connect, instance, timeout=PATIENCE)
+        assert eventually(lambda: "waiting up to 20 s" in caplog.text)
+        started = server(instance)
+        with waiting.result(2 * PATIENCE) as client:
+            assert client.info.pid == started.program.pid
+    assert len(caplog.records) == 1
+    assert f"no server on instance {instance!r}" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "a b", ".", "ä", "x" * 65, "a\n", "a\0"])

@@ -6,23 +6,26 @@ Every call has a timeout in seconds; everything returned is a copy.
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
+import time
 from base64 import b64decode
-from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
-from typing import Any, Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final, TypeVar
 
 from emberwatch import wire
 from emberwatch.channels import Closing, Node
 from emberwatch.errors import (
     GarbledAnswerError,
+    NoServerError,
     NotKeptError,
     SettingError,
     refusal,
 )
 from emberwatch.lease import Lease
 from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT, Bell, RequestPort
+from emberwatch.release import VERSION
 from emberwatch.replies import (
     Grant,
     LeftBelief,
@@ -36,6 +39,13 @@ from emberwatch.replies import (
     records,
 )
 from emberwatch.wire import StepAnswer
+
+_Connection = TypeVar("_Connection")
+
+_log: Final = logging.getLogger("emberwatch")
+
+#: How long to sleep between two looks for a server, seconds.
+_RETRY: Final = 0.2
 
 
 class Client(Closing):
@@ -271,30 +281,44 @@ class Client(Closing):
         hello = {
             "op": "hello",
             "protocol": wire.VERSION,
-            "client": f"emberwatch-python {_release()}",
+            "client": f"emberwatch-python {VERSION}",
         }
         reply = self.control(hello, timeout=timeout)
         return record(ServerInfo, reply)
 
 
 def connect(instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> Client:
-    """Connects to a running server.
+    """Connects to a running server, or to one that is just starting.
 
     Args:
         instance: The server's instance name.
-        timeout: How long the handshake may take, seconds.
+        timeout: How long to wait until there is a server, and then for its answer, seconds.
 
     Raises:
-        NoServerError: If nobody serves the instance.
+        NoServerError: If nobody serves the instance by then.
         VersionMismatchError: If the server speaks another protocol version.
         RequestTimeoutError: If it does not answer.
         ChannelError: If the channels cannot be opened, also when there are too many clients.
     """
-    return Client(instance, timeout=timeout)
+    return when_served(timeout, lambda: Client(instance, timeout=timeout))
 
 
-def _release() -> str:
-    try:
-        return version("emberwatch")
-    except PackageNotFoundError:
-        return "(not installed)"
+def when_served(timeout: float, connect: Callable[[], _Connection]) -> _Connection:
+    """Connects as soon as somebody answers there, and says so once if that is not at once.
+
+    Raises:
+        NoServerError: If nobody does within `timeout` seconds.
+    """
+    deadline, waits = time.monotonic() + timeout, False
+    while True:
+        try:
+            return connect()
+        except NoServerError as error:
+            left = deadline - time.monotonic()
+            # Not "<=": "not a number" would never end.
+            if not left > 0:
+                raise
+            if not waits:
+                _log.warning("%s; waiting up to %g s for it", error, timeout)
+            waits = True
+            time.sleep(min(_RETRY, left))

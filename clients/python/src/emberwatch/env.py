@@ -84,7 +84,7 @@ class WildfireEnv(WorldEnv):
       (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the private server. With `instance`
       they may be left out, or must agree.
     * `truth`: reveal the hidden states in `info` and pictures (False).
-    * `timeout`: how long to wait for a step, seconds (5).
+    * `timeout`: how long to wait for a step, or until the running server is there, seconds (5).
     * `render_mode`: `"rgb_array"`, `"human"` (a window, or the terminal) or `"ansi"`.
 
     ## Vectorized environment

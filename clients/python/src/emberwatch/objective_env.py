@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from emberwatch.arguments import as_choice, as_seed
 from emberwatch.base import WorldEnv, reported, wants_to_resume
+from emberwatch.client import connect, when_served
 from emberwatch.decisions import Decisions
 from emberwatch.errors import (
     AgentEndsError,
@@ -232,6 +233,8 @@ class WildfireObjectiveEnv(WorldEnv):
             if instance is None:
                 with self._session.launch(0 if seed is None else seed) as client:
                     instance = client.instance
+            else:
+                connect(instance, timeout=settings.timeout).close()
             if self.render_mode is not None:
                 self._frames = Observer(instance, world=settings.world)
             if self._reveals:
@@ -245,11 +248,11 @@ class WildfireObjectiveEnv(WorldEnv):
     def _start_agent(self, instance: str) -> Decisions:
         settings = self._session.settings
 
-        def connect() -> Decisions:
+        def connect_to_any() -> Decisions:
             return Decisions(instance, settings.world, timeout=settings.timeout)
 
         def connect_to_own() -> Decisions:
-            decisions = connect()
+            decisions = connect_to_any()
             if self._agent is not None and decisions.info.pid == self._agent.pid:
                 return decisions
             # Another agent serves the world: ours is about to end, and to say so.
@@ -257,8 +260,9 @@ class WildfireObjectiveEnv(WorldEnv):
             raise NoServerError(f"world {settings.world} has another agent")
 
         if not self._owns_agent:
-            return connect()
-        flags = {"instance": instance, "world": str(settings.world)} | self._arguments
+            return when_served(settings.timeout, connect_to_any)
+        flags = {"instance": instance, "world": str(settings.world), "wait": "0"}
+        flags |= self._arguments
         command = ["serve-decisions", *(f"--{flag}={value}" for flag, value in flags.items())]
         if settings.takeover:
             command.append("--takeover")

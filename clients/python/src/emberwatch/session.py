@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from emberwatch import wire
 from emberwatch.arguments import as_seed
-from emberwatch.client import Client
+from emberwatch.client import Client, connect
 from emberwatch.errors import (
     ClosedError,
     EmberwatchError,
@@ -67,7 +67,7 @@ class Session:
         if settings.instance is None:
             self.model, self.shape, self.burn_in = private_world(settings)
         else:
-            with Client(settings.instance, timeout=settings.timeout) as client:
+            with connect(settings.instance, timeout=settings.timeout) as client:
                 self.model, self.shape, self.burn_in = running_world(
                     settings, n_worlds, client.info
                 )
@@ -182,7 +182,7 @@ class Session:
             if settings.instance is None:
                 self._client = client = self.launch(0 if seed is None else seed % 2**64)
             else:
-                self._client = client = Client(settings.instance, timeout=settings.timeout)
+                self._client = client = connect(settings.instance, timeout=settings.timeout)
                 self._check_unchanged(client)
             self._lease = client.acquire(
                 settings.world,
