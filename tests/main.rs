@@ -17,7 +17,6 @@ mod decisions;
 mod determinism;
 mod episodes;
 mod files;
-mod films;
 mod frames;
 mod handover;
 mod harness;

@@ -3,7 +3,6 @@
 mod compare;
 mod decisions;
 mod evaluate;
-mod film;
 mod prior;
 mod train;
 mod worlds;
@@ -11,7 +10,6 @@ mod worlds;
 pub use compare::CompareCommand;
 pub use decisions::ServeDecisionsCommand;
 pub use evaluate::EvaluateCommand;
-pub use film::FilmCommand;
 pub use prior::PriorCommand;
 pub use train::TrainCommand;
 

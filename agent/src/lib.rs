@@ -16,7 +16,6 @@ pub mod decisions;
 pub mod estimator;
 pub mod evaluate;
 pub mod feed;
-pub mod film;
 pub mod first_belief;
 pub mod handover;
 pub mod launch;

@@ -28,8 +28,6 @@ enum Command {
     Compare(commands::CompareCommand),
     /// Learn a model while acting: checkpoint and metrics
     Train(commands::TrainCommand),
-    /// Make a film or a still of a recording
-    Film(commands::FilmCommand),
     /// Score a checkpoint beside the known model
     Evaluate(commands::EvaluateCommand),
 }
@@ -42,7 +40,6 @@ fn main() -> ExitCode {
         Command::Prior(command) => command.run(),
         Command::Compare(command) => command.run(),
         Command::Train(command) => command.run(),
-        Command::Film(command) => command.run(),
         Command::Evaluate(command) => command.run(),
     };
     match result {

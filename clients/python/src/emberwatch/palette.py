@@ -23,7 +23,7 @@ LIGHT: Final[Color] = (0xFF, 0xFF, 0xFF)
 
 # The wildfire model's three, then from Okabe and Ito (2008), with a brown for their orange.
 _COLORS = ("3B6EA5", "E3B23C", "C8371B", "009E73", "CC79A7", "56B4E9", "8C510A", "F0E442")
-_GREYS = (0x30, 0x60, 0x98, 0xE2)  # for what was not observed, the preferred one first
+_GREYS = (0x30, 0x60, 0x98, 0xE2)  # for what was not observed
 _APART = 3 * 60 * 60  # squared distance at which colours are told apart, as in the Rust figures
 
 
@@ -36,16 +36,17 @@ class Palette:
     observations: tuple[Color, ...]
     """By observed value."""
     unobserved: Color
-    """A grey unlike the others, dark if it can be."""
+    """A grey unlike the others."""
     path: Color
     """Of a path over observed cells: dark or light, whichever is further from all of them."""
 
     @classmethod
-    def of(cls, source: Model | int) -> Self:
+    def of(cls, source: Model | int, *, on_paper: bool = False) -> Self:
         """The model's colours, or eight others in turn for a hidden model.
 
         Args:
             source: The model, or its number of observations, 1 to 64.
+            on_paper: Whether what was not observed is light if it can be, as the page around it.
         """
         if isinstance(source, Model):
             states, observations = source.state_colors, source.observation_colors
@@ -55,7 +56,7 @@ class Palette:
         return cls(
             states=states,
             observations=observations,
-            unobserved=_grey_unlike((*states, *observations)),
+            unobserved=_grey_unlike((*states, *observations), _GREYS[:: -1 if on_paper else 1]),
             path=mark_on(*observations),
         )
 
@@ -106,11 +107,11 @@ def _color(index: int) -> Color:
     return red, green, blue
 
 
-def _grey_unlike(colors: tuple[Color, ...]) -> Color:
+def _grey_unlike(colors: tuple[Color, ...], greys: tuple[int, ...]) -> Color:
     """The first grey that is well apart from all colours, else the one furthest from them."""
 
     def nearest(grey: int) -> int:
         return min(sum((channel - grey) ** 2 for channel in color) for color in colors)
 
-    grey = next((g for g in _GREYS if nearest(g) >= _APART), max(_GREYS, key=nearest))
+    grey = next((g for g in greys if nearest(g) >= _APART), max(greys, key=nearest))
     return grey, grey, grey

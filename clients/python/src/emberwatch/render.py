@@ -28,7 +28,7 @@ from emberwatch.palette import Palette as Palette
 _EDGE = (0xB4, 0xB4, 0xB4)
 _LONG_SIDE = 512  # pixels of a panel, about, unless a scale is given
 _GAP = 8  # pixels between panels
-_LEAST_LINE_SCALE = 4  # pixels a cell needs to show its colour beside a line
+LEAST_LINE_SCALE = 3  # pixels a cell needs to show its colour beside a line
 _LEAST_RIM_SCALE = 12  # the same with a rim around the line
 _TINT = 0.45  # share of white in visited cells too small for a line
 _LEAST_RADIUS, _MOST_RADIUS = 6.0, 14.0  # pixels of the robot's mark
@@ -44,7 +44,7 @@ Cells = NDArray[np.integer] | Sequence[tuple[int, int]]
 def rgb_array(
     *,
     frame: NDArray[np.uint8],
-    robot: tuple[int, int],
+    robot: tuple[int, int] | None,
     palette: Palette,
     path: Cells | None = None,
     truth: NDArray[np.uint8] | None = None,
@@ -57,9 +57,9 @@ def rgb_array(
 
     Args:
         frame: Observed values, 255 where nothing was observed; shape (H, W).
-        robot: The robot's cell (row, column).
+        robot: The robot's cell (row, column); None leaves it out.
         palette: The colours.
-        path: Visited cells in order; a line, or a tint where cells are below 4 pixels.
+        path: Visited cells in order; a line, or a tint where cells are below 3 pixels.
         truth: Hidden states, shape (H, W).
         scale: Side of a cell in pixels, at least 1; the default makes panels about 512 long.
 
@@ -76,7 +76,7 @@ def rgb_array(
     if scale < 1:
         raise ValueError(f"scale: expected at least 1 pixel, got {scale}")
     colors = palette.paint_frame(frame)
-    if scale < _LEAST_LINE_SCALE:
+    if scale < LEAST_LINE_SCALE:
         panels = [_enlarge(_tinted(colors, cells), scale)]
     else:
         seen = (frame != UNOBSERVED)[:, :, None]
@@ -85,8 +85,9 @@ def rgb_array(
         _draw_path(panels[0], cells, line, scale)
     if truth is not None:
         panels.append(_enlarge(palette.paint_truth(truth), scale))
-    for panel in panels:
-        _draw_robot(panel, robot, scale)
+    if robot is not None:
+        for panel in panels:
+            _draw_robot(panel, robot, scale)
     return _join(panels, axis=0 if width >= 2 * height else 1)
 
 
@@ -210,7 +211,7 @@ class Screen:
 
 def _check(
     frame: NDArray[np.uint8],
-    robot: tuple[int, int],
+    robot: tuple[int, int] | None,
     path: Cells | None,
     truth: NDArray[np.uint8] | None,
 ) -> NDArray[np.intp]:
@@ -220,7 +221,7 @@ def _check(
     if truth is not None and truth.shape != frame.shape:
         raise ValueError(f"truth: expected shape {frame.shape}, got {truth.shape}")
     cells = np.asarray([] if path is None else path, dtype=np.intp).reshape(-1, 2)
-    for what, places in (("robot", np.asarray([robot])), ("path", cells)):
+    for what, places in (("robot", np.asarray([robot or (0, 0)])), ("path", cells)):
         off = ((places < 0) | (places >= frame.shape)).any(axis=1)
         if off.any():
             got = tuple(places[np.argmax(off)].tolist())
@@ -249,7 +250,7 @@ def _draw_path(
     """A line through the cells' middles in each cell's colour, and a square where it begins."""
     if not len(cells):
         return
-    line = min(6, scale // 4)
+    line = max(1, min(6, scale // 4))
     rim = 0 if scale < _LEAST_RIM_SCALE else max(1, line // 3)
     is_dark = colors[:, :, :1] == DARK[0]
     ink = _enlarge(colors, scale)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from emberwatch.errors import SettingError
 from emberwatch.model import Model
 from emberwatch.render import Palette, Screen, ansi, rgb_array
+from emberwatch.replies import ServerInfo
 from emberwatch.settings import Shape
 
 #: The render modes of every environment here.
@@ -72,7 +73,7 @@ class View:
             self._screen = None
 
 
-def fly(start: tuple[int, int], moves: ArrayLike, shape: Shape) -> NDArray[np.intp]:
+def fly(start: tuple[int, int], moves: ArrayLike, shape: Shape | ServerInfo) -> NDArray[np.intp]:
     """The cells of a path after each move, `(n_moves, 2)`: a move off the grid stays in place."""
     row, col = start
     cells: list[tuple[int, int]] = []

@@ -1,0 +1,126 @@
+"""Steps in, scenes out: the known model's filter runs along, also where steps are missing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.belief import Filter, ZeroEvidenceError
+from emberwatch.errors import EmberwatchError
+from emberwatch.film.steps import Step
+from emberwatch.view import fly
+
+# Behind a longer gap the belief begins again: a fire forgets itself within about 5,500 steps.
+_MOST_LOST = 10_000
+
+
+class FilmError(EmberwatchError):
+    """A film that cannot be made."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Selection:
+    """Which steps k to show: every so many of them, from the first to the last."""
+
+    first: int
+    last: float
+    every: int
+
+    def shows(self, step: Step) -> bool:
+        """Whether a step is shown."""
+        k = step.frame.result.step
+        return self.first <= k <= self.last and (k - self.first) % self.every == 0
+
+    def shows_gap(self, step: Step) -> bool:
+        """Whether the steps right before it that are not recorded are shown, in one scene."""
+        k, n_lost = step.frame.result.step, step.n_lost or 0
+        return 0 < n_lost <= _MOST_LOST and self.first < k and k - n_lost <= self.last
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scene:
+    """What one picture shows. Parts that are not recorded are None.
+
+    Attributes:
+        step: The step, or the one behind a gap.
+        k: Number of the step shown: of a gap the last.
+        is_gap: Whether it stands for the steps before `step` that are not recorded.
+        path: The robot's cells, the start first, `(n, 2)`.
+        belief: The posterior, of a gap the predictor, `(S, H, W)`; None where no model is known.
+        since: The step at which the belief began.
+        n_lost: Steps since then that are not recorded.
+        mean_reward: Of the recorded steps since then.
+    """
+
+    step: Step
+    k: int
+    is_gap: bool = False
+    path: NDArray[np.intp] | None = None
+    belief: NDArray[np.float64] | None
+    since: int
+    n_lost: int
+    mean_reward: float = 0.0
+
+
+def scenes(
+    steps: Iterable[Step], selection: Selection, begin: Callable[[int], Filter] | None
+) -> Iterator[Scene]:
+    """The scenes to show.
+
+    Args:
+        steps: Every step there is, also those that are not shown.
+        selection: Which to show.
+        begin: The filter before the frame of a step k; None where no model is known.
+
+    Raises:
+        FilmError: A frame cannot be, given the model and the first belief.
+    """
+    known: Filter | None = None
+    since = n_lost = n_rewards = 0
+    total = 0.0
+    for step in steps:
+        k = step.frame.result.step
+        if step.n_lost is None or step.n_lost > _MOST_LOST:
+            known = None if begin is None else begin(k)
+            since, n_lost, n_rewards, total = k, 0, 0, 0.0
+        else:
+            n_lost += step.n_lost
+            _predict(known, step.n_lost)
+            if selection.shows_gap(step):
+                belief = known and known.belief
+                yield Scene(
+                    step=step, k=k - 1, is_gap=True, belief=belief, since=since, n_lost=n_lost
+                )
+            _predict(known, 1)
+        try:
+            if known is not None:
+                known.correct(step.frame.frame)
+        except ZeroEvidenceError as error:
+            raise FilmError(f"step {k}: {error}") from error
+        if step.frame.path.size:
+            n_rewards, total = n_rewards + 1, total + step.frame.result.reward
+        if selection.shows(step):
+            yield Scene(
+                step=step,
+                k=k,
+                path=_path(step),
+                belief=known and known.belief,
+                since=since,
+                n_lost=n_lost,
+                mean_reward=total / max(n_rewards, 1),
+            )
+
+
+def _predict(known: Filter | None, n_steps: int) -> None:
+    if known is not None:
+        for _ in range(n_steps):
+            known.predict()
+
+
+def _path(step: Step) -> NDArray[np.intp]:
+    frame = step.frame
+    start = frame.start if frame.path.size else (frame.result.row, frame.result.col)
+    return np.concatenate([np.array([start], np.intp), fly(start, frame.path, step.server)])

@@ -1,0 +1,250 @@
+"""Films of recordings: what they show, and what they say is missing."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import document
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from test_recording import FILE_HEADER, deflated, packed
+
+from emberwatch import wire
+from emberwatch.belief import Filter, uniform_prior
+from emberwatch.film.__main__ import main
+from emberwatch.model import Model
+
+MODEL = Model.wildfire()
+HEIGHT, WIDTH, SCALE = 3, 5, 10
+#: Left and upper edges of the four panels, pixels: they are 150 wide, with 16 between.
+LEFTS, TOP = [14, 180, 346, 512], 68
+INFO = document.examples()[1] | {"height": HEIGHT, "width": WIDTH, "n_moves": 2, "n_worlds": 2}
+SEEN = np.full((HEIGHT, WIDTH), 255, np.uint8)
+SEEN[0, :2], SEEN[1, 1] = [0, 1], 2
+TRUTH = np.arange(HEIGHT * WIDTH, dtype=np.uint8).reshape(HEIGHT, WIDTH) % 3
+UNSEEN = (0xE2, 0xE2, 0xE2)
+
+
+def server(**changes: Any) -> bytes:
+    info = INFO | {"model": MODEL.toml, "observations": list(MODEL.observation_names)} | changes
+    return packed(1, deflated(json.dumps(info).encode()))
+
+
+def frame(step: int, *, episode: int = 0, world: int = 0, reward: float = 2.0) -> bytes:
+    """The robot flies right and down from the corner; sees `SEEN`."""
+    result = wire.StepResult(step, 7, episode, reward, 0, 3, 0, 1, 1, 1, 0, 0)
+    header = wire.FrameHeader(version=1, world=world, height=HEIGHT, width=WIDTH, n_moves=2)
+    header.result[:] = wire.RESULT.pack(*result)
+    return packed(2, deflated(bytes(header) + SEEN.tobytes() + b"\3\1"))
+
+
+def truth(step: int) -> bytes:
+    header = wire.TruthHeader(version=1, height=HEIGHT, width=WIDTH, step=step, seed=7)
+    return packed(3, deflated(bytes(header) + TRUTH.tobytes()))
+
+
+def both(*steps: int) -> list[bytes]:
+    return [record for step in steps for record in (truth(step), frame(step))]
+
+
+def end(records: list[bytes]) -> bytes:
+    kinds = [int.from_bytes(record[8:12], sys.byteorder) for record in records]
+    names = ("n_servers", "n_frames", "n_truths")
+    totals = {name: kinds.count(kind) for kind, name in enumerate(names, 1)}
+    return packed(
+        4, deflated(json.dumps(totals | {"n_lost_frames": 0, "n_lost_truths": 0}).encode())
+    )
+
+
+class Studio:
+    """Runs the command on a recording of these records."""
+
+    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self._file, self._capsys = folder / "lab.recording", capsys
+        self.gif, self.png = folder / "new/lab.gif", folder / "new/lab.png"
+
+    def film(self, records: list[bytes], *flags: object, cut: bool = False) -> str:
+        """What it says to the standard error."""
+        content = FILE_HEADER + b"".join(records) + end(records)
+        self._file.write_bytes(content[: -len(end(records)) - 5] if cut else content)
+        out = self.png if "--step" in flags else self.gif
+        words = [self._file, "--out", out, "--prior", "uniform", "--scale", SCALE, *flags]
+        main([str(word) for word in words])
+        return self._capsys.readouterr().err
+
+    def fails(self, records: list[bytes], *flags: object) -> str:
+        with pytest.raises(SystemExit):
+            self.film(records, *flags)
+        return self._capsys.readouterr().err
+
+    def still(self, records: list[bytes], step: int, *flags: object) -> NDArray[np.uint8]:
+        self.film(records, "--step", step, *flags)
+        return np.asarray(Image.open(self.png))
+
+    def pictures(self) -> list[tuple[NDArray[np.uint8], int]]:
+        """Pixels and milliseconds of each picture of the film."""
+        with Image.open(self.gif) as film:
+            found: list[tuple[NDArray[np.uint8], int]] = []
+            for at in range(getattr(film, "n_frames", 1)):
+                film.seek(at)
+                found.append((np.asarray(film.convert("RGB")), film.info["duration"]))
+        return found
+
+    def millis(self) -> list[int]:
+        return [millis for _, millis in self.pictures()]
+
+
+@pytest.fixture
+def studio(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Studio:
+    return Studio(tmp_path, capsys)
+
+
+def cells(image: NDArray[np.uint8], panel: int) -> NDArray[np.uint8]:
+    """The colour in the upper left corner of each cell of a panel, `(H, W, 3)`."""
+    rows = TOP + SCALE * np.arange(HEIGHT)
+    cols = LEFTS[panel] + SCALE * np.arange(WIDTH)
+    return image[np.ix_(rows, cols)]
+
+
+def test_panels_show_truth_frame_belief_and_entropy(studio: Studio) -> None:
+    image = studio.still([server(), *both(0, 1)], 1)
+    assert (cells(image, 0) == np.array(MODEL.state_colors, np.uint8)[TRUTH]).all()
+    seen = np.array([*MODEL.observation_colors, UNSEEN], np.uint8)[np.minimum(SEEN, 3)]
+    assert (cells(image, 1) == seen).all()
+    known = Filter(MODEL, prior=uniform_prior(MODEL, height=HEIGHT, width=WIDTH))
+    known.correct(SEEN)
+    known.predict()
+    known.correct(SEEN)
+    for panel, shares in ((2, known.belief[2]), (3, known.entropy() / np.log(3))):
+        lightness = cells(image, panel).astype(int).sum(axis=2).ravel()
+        order = np.argsort(shares.ravel())
+        assert (np.diff(lightness[order]) <= 0).all()
+        levels = np.rint(shares * 23).ravel()
+        assert len(set(levels)) == len(set(lightness)) > 1
+    robot = image[TOP + 15, LEFTS[0] + 15], image[TOP + 15, LEFTS[2] + 15]
+    assert (np.array(robot) == 0x14).all()
+
+
+def test_a_film_shows_each_step_and_a_still_one_of_them(studio: Studio) -> None:
+    records = [server(), *both(0, 1, 2, 3, 4)]
+    assert studio.film(records, "--fps", 20) == ""
+    assert studio.millis() == [50] * 4 + [1000]
+    studio.film(records, "--from", 1, "--to", 4, "--every", 2)
+    (first, _), _ = studio.pictures()
+    assert studio.millis() == [100, 1000]
+    still = studio.still(records, 1)
+    assert still.shape == first.shape
+    for panel in range(4):  # texts have fewer greys in a film
+        assert np.abs(cells(still, panel).astype(int) - cells(first, panel)).max() <= 4
+
+
+def test_the_belief_goes_through_gaps_which_are_shown_and_told(studio: Studio) -> None:
+    records = [server(), *both(0, 1, 4, 5)]
+    words = studio.film(records)
+    assert "2 steps are not recorded; the belief is predicted through them" in words
+    assert studio.millis() == [100, 100, 1000, 100, 1000]
+    gap = studio.pictures()[2][0]
+    assert (cells(gap, 0)[0] == 255).all() and (cells(gap, 1)[0] == 255).all()
+    known = Filter(MODEL, prior=uniform_prior(MODEL, height=HEIGHT, width=WIDTH))
+    known.correct(SEEN)
+    known.predict()
+    known.correct(SEEN)
+    for _ in range(2):
+        known.predict()
+    shades = cells(gap, 2).astype(int).sum(axis=2)
+    levels = np.rint(known.belief[2] * 23)
+    assert len(np.unique(levels)) == len(np.unique(shades)) > 1
+    assert (np.argsort(levels.ravel(), kind="stable")[-1:] == np.argmin(shades)).all()
+    studio.film(records, "--to", 4, "--every", 4)
+    assert studio.millis() == [100, 1000, 1000], "a gap is not left out"
+
+
+def test_the_belief_begins_again_with_an_episode(studio: Studio) -> None:
+    records = [server(), *both(0, 1), frame(0, episode=1)]
+    words = studio.film(records, "--step", 0)
+    assert "--step: recorded in 2 episodes; showing the first" in words
+    studio.film(records)
+    first, _, again = (cells(image, 2) for image, _ in studio.pictures())
+    assert (first == again).all()
+    lacking = cells(studio.pictures()[2][0], 0)
+    assert (lacking[0] == 255).all(), "no hidden states of that step"
+
+
+def test_what_is_not_recorded_is_left_out(studio: Studio) -> None:
+    whole = studio.still([server(), *both(1)], 1)
+    blind = studio.still([server(), frame(1)], 1)
+    assert whole.shape[1] - blind.shape[1] == 166, "no panel of hidden states"
+    words = studio.film([server(model=None), *both(1)])
+    assert "the belief is left out, as the server hid its model" in words
+    assert studio.pictures()[0][0].shape[1] == 2 * 150 + 16 + 28
+
+
+def test_a_hidden_model_is_given(studio: Studio, tmp_path: Path) -> None:
+    file = tmp_path / "model.toml"
+    file.write_text(MODEL.toml)
+    known = studio.still([server(), *both(1)], 1)
+    given = studio.still([server(model=None), *both(1)], 1, "--model", file)
+    assert (known == given).all()
+    error = studio.fails([server(model=None, n_observations=4), *both(1)], "--model", file)
+    assert "--model: expected one with 4 observations, as recorded, got 3" in error
+
+
+def test_a_cut_recording_is_shown_as_far_as_it_goes(studio: Studio) -> None:
+    words = studio.film([server(), frame(0), frame(1), frame(2)], cut=True)
+    assert "warning" in words and "cut short" in words
+    assert len(studio.millis()) == 2
+
+
+def test_worlds_of_another_kind_end_the_film(studio: Studio) -> None:
+    records = [server(), frame(0), server(pid=9), frame(0), server(pid=7, model=None), frame(1)]
+    assert "worlds of another kind follow" in studio.film(records)
+    assert len(studio.millis()) == 1, "two alike"
+
+
+def test_a_frame_that_is_published_again_counts_once(studio: Studio) -> None:
+    studio.film([server(), frame(0), frame(1), frame(1), frame(1, world=1), frame(2)])
+    assert len(studio.millis()) == 3
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--world", 7], "--world: expected one of those recorded, [0, 1], got 7"),
+        (["--step", 9], "expected some of the recorded steps 0 to 1, 4 to 4, got 9 to 9"),
+        (["--from", 5], "expected some of the recorded steps 0 to 1, 4 to 4, got 5 to inf"),
+        (["--from", 5, "--to", 4], "--to: expected 5 to inf, got 4"),
+        (["--every", 0], "--every: expected 1 to inf, got 0"),
+        (["--fps", 0], "--fps: expected 0.1 to 50, got 0.0"),
+        (["--fps", "fast"], "invalid float value: 'fast'"),
+        (["--scale", 101], "--scale: expected 1 to 100, got 101"),
+        (["--step", 1, "--every", 2], "--step: expected none of --from, --to and --every"),
+        (["--out", "lab.mp4"], "--out: expected a .gif, or with --step a .png, got lab.mp4"),
+        (["--step", 1, "--out", "a.gif"], "--out: expected a .gif, or with --step a .png"),
+        (["--prior", "none"], "invalid choice: 'none'"),
+        (["--out", "/dev/null/a.gif"], "/dev/null"),
+    ],
+)
+def test_wrong_flags_are_named(studio: Studio, flags: list[object], words: str) -> None:
+    records = [server(), frame(0), frame(1), frame(1, world=1), frame(4)]
+    assert words in studio.fails(records, *flags)
+    assert not studio.gif.exists() and not studio.png.exists()
+
+
+def test_recordings_that_make_no_sense_are_named(studio: Studio) -> None:
+    assert "at byte 16" in studio.fails([b"\0" * 40])
+    always = [("[0.98, 0.01, 0.01]", "[1, 0, 0]"), ("[0.80, 0.15, 0.05]", "[1, 0, 0]")]
+    toml = MODEL.toml.replace("[0.01, 0.01, 0.98]", "[0, 1, 0]")
+    for before, after in always:
+        toml = toml.replace(before, after)
+    assert "step 0: frame: cell (1, 1): expected" in studio.fails([server(model=toml), frame(0)])
+
+
+def test_without_pillow_it_says_what_to_install(
+    studio: Studio, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "emberwatch.film.page", raising=False)
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    assert "pip install emberwatch[film]" in studio.fails([server(), frame(0)])
