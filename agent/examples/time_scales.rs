@@ -4,7 +4,8 @@
 //! `cargo run -p agent --example time_scales -- docs/time-scales.png`
 
 use agent::config::{AgentConfig, StepSize};
-use agent::report::figures::curves::{Curve, Page, Panel, Scale, draw_curves};
+use agent::report::save;
+use figures::{Curve, Lines, Panel, Scale};
 use std::path::Path;
 
 const ITERATIONS: u64 = 25_000;
@@ -19,13 +20,16 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             AgentConfig::paper(),
         ),
     ];
-    let page = Page {
+    let page = Lines {
         title: "Two time scales".into(),
         note: "rate (1 + n / steady)^-power at iteration n; paper eq. 20".into(),
         axis: "iteration n".into(),
         panels: panels.map(|(title, config)| panel(title, &config)).into(),
     };
-    Ok(draw_curves(Path::new(&path), &page)?)
+    Ok(save(
+        Path::new(&path),
+        &page.svg().ok_or("expected curves")?,
+    )?)
 }
 
 fn panel(title: &str, config: &AgentConfig) -> Panel {
@@ -43,5 +47,6 @@ fn panel(title: &str, config: &AgentConfig) -> Panel {
             curve("DQN", &at(dqn)),
             curve("quotient", &|n| model.at(n) / dqn.at(n)),
         ],
+        shade: None,
     }
 }

@@ -10,6 +10,7 @@ const SOURCES: [&str; 7] = [
     "protocol/src",
     "env-server/src",
     "agent/src",
+    "agent/figures/src",
     "clients/dashboard/src",
     "clients/dashboard/page",
     "tests/src",

@@ -7,14 +7,14 @@ pub mod csv;
 pub mod events;
 pub mod figures;
 mod number;
-pub mod picture;
+mod rewards;
 pub mod statistics;
 pub mod table;
 pub mod training;
 
 pub use self::csv::write_csv;
 pub use self::events::write_events;
-pub use self::figures::{Snapshot, draw_ladder, draw_rewards, draw_snapshot};
+pub use self::figures::{Snapshot, draw_ladder, draw_rewards, draw_snapshot, save};
 pub use self::table::render_table;
 
 use std::collections::BTreeMap;
@@ -74,15 +74,8 @@ pub enum ReportError {
         got: f64,
     },
     /// Parts of a snapshot that do not belong together.
-    #[error("snapshot: {what}: expected {expected}, got {got}")]
-    Snapshot {
-        /// Which part.
-        what: &'static str,
-        /// What it must be.
-        expected: String,
-        /// What it is.
-        got: String,
-    },
+    #[error(transparent)]
+    Snapshot(#[from] ::figures::Misfit),
     /// A file that could not be written.
     #[error("cannot write {}: {reason}", path.display())]
     Write {

@@ -1,9 +1,10 @@
 //! A training's metrics as curves: the paper's figure of improvement over iterations, and step sizes.
 
 use super::ReportError;
-use super::figures::curves::{Curve, Page, Panel, Scale, draw_curves};
+use super::figures::save;
 use super::statistics::Estimate;
 use crate::metrics::{MetricsError, Rows};
+use figures::{Curve, Lines, Panel, Scale};
 use std::path::Path;
 use thiserror::Error;
 
@@ -36,6 +37,7 @@ pub fn draw_training(folder: &Path) -> Result<(), TrainingFigureError> {
         title: title.into(),
         scale,
         curves,
+        shade: None,
     };
     let (linear, logarithmic) = (Scale::Linear, Scale::Logarithmic);
     let rates = [curve("rate", "model"), curve("dqn_rate", "DQN")];
@@ -65,7 +67,7 @@ pub fn draw_training(folder: &Path) -> Result<(), TrainingFigureError> {
         panel("step sizes", logarithmic, vec![model, dqn, quotient]),
     ];
     let per_point = rows.len().div_ceil(POINTS).max(1);
-    let page = Page {
+    let page = Lines {
         title: "Learning while acting".into(),
         note: match per_point {
             1 => "each row of metrics.csv".into(),
@@ -77,8 +79,9 @@ pub fn draw_training(folder: &Path) -> Result<(), TrainingFigureError> {
         axis: "world steps, of all worlds together".into(),
         panels,
     };
+    let svg = page.svg().ok_or(ReportError::Empty { what: "curves" })?;
     for name in FIGURES {
-        draw_curves(&folder.join(name), &page)?;
+        save(&folder.join(name), &svg)?;
     }
     Ok(())
 }

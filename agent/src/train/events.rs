@@ -2,9 +2,9 @@
 
 use crate::belief::Belief;
 use crate::metrics::{Tick, averages};
-use crate::report::picture::{Picture, belief_picture};
 use crate::student::{Lesson, Student};
 use crate::tensorboard::{EventFile, EventsError, Value};
+use figures::{Heat, heat};
 use std::path::Path;
 
 /// Steps of all worlds from one picture to the next.
@@ -58,7 +58,8 @@ impl Events {
     }
 
     fn show(&mut self, step: u64, belief: &Belief, state: usize) -> Result<(), EventsError> {
-        let (Picture { height, width, .. }, png) = belief_picture(belief, state);
+        let picture = heat(belief.probability(state).view());
+        let Heat { height, width, png } = picture.expect("invariant: a grid has cells, and fits");
         let png = &png;
         let image = Value::Image { height, width, png };
         self.file.add(step, [("belief_of_first_world", image)])

@@ -55,6 +55,11 @@ def test_the_path_is_a_line_and_ends_in_the_robot() -> None:
     assert pixel(without, 40, 20) == FIRE and pixel(without, 20, 20) == NORMAL
 
 
+def test_without_robot_and_path_there_are_only_cells() -> None:
+    cells = WILDFIRE.paint_frame(FRAME).repeat(40, axis=0).repeat(40, axis=1)
+    assert (draw(robot=None, path=None) == cells).all()
+
+
 def test_a_path_over_unseen_cells_is_light() -> None:
     unseen = np.full((2, 3), 255, np.uint8)
     assert pixel(draw(frame=unseen), 40, 20) == WHITE

@@ -1,8 +1,11 @@
 //! How panels of one grid each share a page, and how a grid's cells become crisp pixels.
 
-use super::canvas::{Canvas, SCALE};
-use plotters::style::RGBColor;
-use protocol::{Cell, Shape};
+use crate::palette::Color;
+use crate::svg::{Run, Svg};
+use std::collections::BTreeMap;
+
+/// Pixels per point of a PNG.
+const SCALE: f64 = 2.0;
 
 /// Distance between panels in points.
 const GAP: f64 = 26.0;
@@ -28,7 +31,7 @@ struct Zoom {
 /// Panels of equal size in rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Layout {
-    shape: Shape,
+    shape: (usize, usize),
     columns: usize,
     n_panels: usize,
     zoom: Zoom,
@@ -39,7 +42,7 @@ pub struct Layout {
 impl Layout {
     /// The layout with the largest cells within `width` points; of equals, the one with three
     /// columns, then with fewer rows.
-    pub fn new(shape: Shape, n_panels: usize, (left, width): (f64, f64)) -> Self {
+    pub fn new(shape: (usize, usize), n_panels: usize, (left, width): (f64, f64)) -> Self {
         let most = ((width + GAP) / (LEAST_ROOM + GAP)) as usize;
         let candidates = (1..=most.clamp(1, n_panels)).map(|columns| {
             let zoom = Zoom::fitting(shape, n_panels, columns, width);
@@ -93,7 +96,7 @@ impl Layout {
     /// Width and height of a panel in points.
     pub fn panel_size(&self) -> (f64, f64) {
         let points = |cells: usize| (self.zoom.n_pixels(cells)) as f64 / SCALE;
-        (points(self.shape.width()), points(self.shape.height()))
+        (points(self.shape.1), points(self.shape.0))
     }
 
     /// Side of a cell in points.
@@ -102,43 +105,48 @@ impl Layout {
     }
 
     /// Middle of a cell in a panel at `corner`.
-    pub fn center(&self, corner: (f64, f64), cell: Cell) -> (f64, f64) {
+    pub fn center(&self, corner: (f64, f64), (row, col): (usize, usize)) -> (f64, f64) {
         let middle = |at: usize| (at as f64 + 0.5) * self.cell_size();
-        (corner.0 + middle(cell.col), corner.1 + middle(cell.row))
+        (corner.0 + middle(col), corner.1 + middle(row))
     }
 
-    /// Fills each cell of a panel at `corner` with its colour; nearest neighbour, so that no colour
-    /// appears that is not in the legend.
-    pub fn fill(
-        &self,
-        canvas: &mut Canvas<'_>,
-        corner: (f64, f64),
-        color: impl Fn(Cell) -> RGBColor,
-    ) {
+    /// Fills each cell (row, column) of a panel at `corner` with its colour; nearest neighbour, so that no
+    /// colour appears that is not in the legend.
+    pub fn fill(&self, page: &mut Svg, corner: (f64, f64), color: impl Fn(usize, usize) -> Color) {
         let Zoom { pixels, stride } = self.zoom;
-        let origin = ((corner.0 * SCALE) as i32, (corner.1 * SCALE) as i32);
-        for (down, row) in (0..self.shape.height()).step_by(stride).enumerate() {
-            for (right, col) in (0..self.shape.width()).step_by(stride).enumerate() {
+        let side = pixels as f64 / SCALE;
+        let mut runs: BTreeMap<[u8; 3], Vec<Run>> = BTreeMap::new();
+        for (down, row) in (0..self.shape.0).step_by(stride).enumerate() {
+            let colors = (0..self.shape.1).step_by(stride).map(|col| color(row, col));
+            let colors: Vec<Color> = colors.collect();
+            let mut right = 0;
+            for run in colors.chunk_by(|a, b| a == b) {
+                let Color(red, green, blue) = run[0];
                 let at = (
-                    origin.0 + (right * pixels) as i32,
-                    origin.1 + (down * pixels) as i32,
+                    corner.0 + right as f64 * side,
+                    corner.1 + down as f64 * side,
                 );
-                let side = pixels as i32;
-                canvas.pixel_rectangle(at, (side, side), color(Cell { row, col }));
+                runs.entry([red, green, blue])
+                    .or_default()
+                    .push((at, run.len()));
+                right += run.len();
             }
+        }
+        for ([red, green, blue], runs) in runs {
+            page.squares(&runs, side, Color(red, green, blue));
         }
     }
 }
 
 impl Zoom {
-    fn fitting(shape: Shape, n_panels: usize, columns: usize, width: f64) -> Self {
+    fn fitting(shape: (usize, usize), n_panels: usize, columns: usize, width: f64) -> Self {
         let rows = n_panels.div_ceil(columns) as f64;
         let columns = columns as f64;
         let room = (width - GAP * (columns - 1.0)) / columns * SCALE;
         let height = (PAGE_HEIGHT / rows - TITLE_ROOM - GAP).max(LEAST_HEIGHT) * SCALE;
-        let longer = shape.width().max(shape.height()) as f64;
-        let cell = (room / shape.width() as f64)
-            .min(height / shape.height() as f64)
+        let longer = shape.1.max(shape.0) as f64;
+        let cell = (room / shape.1 as f64)
+            .min(height / shape.0 as f64)
             .min(MOST_SIDE * SCALE / longer);
         if cell >= 1.0 {
             Self {
@@ -163,7 +171,6 @@ mod tests {
     use super::*;
 
     fn check(shape: (usize, usize), n_panels: usize, columns: usize) {
-        let shape = Shape::new(shape.0, shape.1).expect("test shape");
         let layout = Layout::new(shape, n_panels, (30.0, 1140.0));
         assert_eq!(layout.columns, columns, "{layout:?}");
         let (width, height) = layout.panel_size();

@@ -1,47 +1,57 @@
 //! Colours of the figures: few, apart under every common colour blindness, on white.
 
-use plotters::style::RGBColor;
+use std::fmt::{self, Display, Formatter};
+
+/// Red, green and blue.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Color(pub u8, pub u8, pub u8);
+
+impl Display for Color {
+    fn fmt(&self, out: &mut Formatter<'_>) -> fmt::Result {
+        write!(out, "#{:02x}{:02x}{:02x}", self.0, self.1, self.2)
+    }
+}
 
 /// Text, error bars and the zero line.
-pub const INK: RGBColor = RGBColor(0x33, 0x33, 0x33);
+pub const INK: Color = Color(0x33, 0x33, 0x33);
 
 /// Secondary text.
-pub const MUTED: RGBColor = RGBColor(0x66, 0x66, 0x66);
+pub const MUTED: Color = Color(0x66, 0x66, 0x66);
 
 /// Grid lines.
-pub const GRID: RGBColor = RGBColor(0xe4, 0xe4, 0xe4);
+pub const GRID: Color = Color(0xe4, 0xe4, 0xe4);
 
 /// The figure's background.
-pub const PAPER: RGBColor = RGBColor(0xff, 0xff, 0xff);
+pub const PAPER: Color = Color(0xff, 0xff, 0xff);
 
 /// Light area behind a line plot.
-pub const SHADE: RGBColor = RGBColor(0xf7, 0xe6, 0xd8);
+pub const SHADE: Color = Color(0xf7, 0xe6, 0xd8);
 
 /// Lines in the order of use: Okabe and Ito (2008), with brown for their yellow, which is too
 /// light for a line on white.
-pub const LINES: [RGBColor; 8] = [
-    RGBColor(0x00, 0x72, 0xb2),
-    RGBColor(0xd5, 0x5e, 0x00),
-    RGBColor(0x00, 0x9e, 0x73),
-    RGBColor(0xcc, 0x79, 0xa7),
-    RGBColor(0xe6, 0x9f, 0x00),
-    RGBColor(0x56, 0xb4, 0xe9),
-    RGBColor(0x33, 0x33, 0x33),
-    RGBColor(0x8c, 0x51, 0x0a),
+pub const LINES: [Color; 8] = [
+    Color(0x00, 0x72, 0xb2),
+    Color(0xd5, 0x5e, 0x00),
+    Color(0x00, 0x9e, 0x73),
+    Color(0xcc, 0x79, 0xa7),
+    Color(0xe6, 0x9f, 0x00),
+    Color(0x56, 0xb4, 0xe9),
+    Color(0x33, 0x33, 0x33),
+    Color(0x8c, 0x51, 0x0a),
 ];
 
 /// ColorBrewer's YlGnBu (Apache-2.0), light to dark: its lightness falls evenly, so that it also
 /// reads in grey.
-const SEQUENTIAL: [RGBColor; 9] = [
-    RGBColor(0xff, 0xff, 0xd9),
-    RGBColor(0xed, 0xf8, 0xb1),
-    RGBColor(0xc7, 0xe9, 0xb4),
-    RGBColor(0x7f, 0xcd, 0xbb),
-    RGBColor(0x41, 0xb6, 0xc4),
-    RGBColor(0x1d, 0x91, 0xc0),
-    RGBColor(0x22, 0x5e, 0xa8),
-    RGBColor(0x25, 0x34, 0x94),
-    RGBColor(0x08, 0x1d, 0x58),
+const SEQUENTIAL: [Color; 9] = [
+    Color(0xff, 0xff, 0xd9),
+    Color(0xed, 0xf8, 0xb1),
+    Color(0xc7, 0xe9, 0xb4),
+    Color(0x7f, 0xcd, 0xbb),
+    Color(0x41, 0xb6, 0xc4),
+    Color(0x1d, 0x91, 0xc0),
+    Color(0x22, 0x5e, 0xa8),
+    Color(0x25, 0x34, 0x94),
+    Color(0x08, 0x1d, 0x58),
 ];
 
 /// Greys that may stand for "not observed", the preferred one first.
@@ -50,17 +60,22 @@ const NEUTRALS: [u8; 4] = [0xe2, 0xb8, 0x80, 0x48];
 /// Squared distance at which two colours are told apart at a glance: 60 of 255 in each channel.
 const APART: i32 = 3 * 60 * 60;
 
-/// Colour of a probability, light for 0; values outside `0..=1` are clamped.
-pub fn sequential(probability: f32) -> RGBColor {
+/// Colour of a probability, light for 0 and for none; values outside `0..=1` are clamped.
+pub fn sequential(probability: f32) -> Color {
     let last = SEQUENTIAL.len() - 1;
-    let at = f64::from(probability.clamp(0.0, 1.0)) * last as f64;
+    let known = if probability.is_nan() {
+        0.0
+    } else {
+        probability
+    };
+    let at = f64::from(known.clamp(0.0, 1.0)) * last as f64;
     let below = (at.floor() as usize).min(last - 1);
     blend(SEQUENTIAL[below], SEQUENTIAL[below + 1], at - below as f64)
 }
 
 /// A grey unlike all the given colours: the first that is well apart from them, else the furthest.
-pub fn unlike(colors: &[RGBColor]) -> RGBColor {
-    let grey = |level: u8| RGBColor(level, level, level);
+pub fn unlike(colors: &[Color]) -> Color {
+    let grey = |level: u8| Color(level, level, level);
     let nearest = |level: u8| {
         let distances = colors.iter().map(|&color| distance(color, grey(level)));
         distances.min().unwrap_or(i32::MAX)
@@ -71,19 +86,19 @@ pub fn unlike(colors: &[RGBColor]) -> RGBColor {
 }
 
 /// `from` at `fraction` 0, `to` at 1.
-pub fn blend(from: RGBColor, to: RGBColor, fraction: f64) -> RGBColor {
+pub fn blend(from: Color, to: Color, fraction: f64) -> Color {
     let channel = |from: u8, to: u8| {
         let (from, to) = (f64::from(from), f64::from(to));
         (from + (to - from) * fraction).round() as u8
     };
-    RGBColor(
+    Color(
         channel(from.0, to.0),
         channel(from.1, to.1),
         channel(from.2, to.2),
     )
 }
 
-fn distance(a: RGBColor, b: RGBColor) -> i32 {
+fn distance(a: Color, b: Color) -> i32 {
     let channel = |a: u8, b: u8| (i32::from(a) - i32::from(b)).pow(2);
     channel(a.0, b.0) + channel(a.1, b.1) + channel(a.2, b.2)
 }
@@ -95,20 +110,21 @@ mod tests {
     #[test]
     fn higher_probabilities_are_darker() {
         let light = |p: f32| {
-            let RGBColor(red, green, blue) = sequential(p);
+            let Color(red, green, blue) = sequential(p);
             u32::from(red) * 2 + u32::from(green) * 7 + u32::from(blue)
         };
         for step in 0..20_u8 {
             let p = f32::from(step) / 20.0;
             assert!(light(p) > light(p + 0.05), "at {p}");
         }
-        assert_eq!(sequential(f32::NAN.max(7.0)), SEQUENTIAL[8]);
+        assert_eq!(sequential(7.0), SEQUENTIAL[8]);
+        assert_eq!(sequential(f32::NAN), SEQUENTIAL[0]);
     }
 
     #[test]
     fn the_unobserved_grey_avoids_the_states() {
-        assert_eq!(unlike(&[RGBColor(0, 0, 0)]), RGBColor(0xe2, 0xe2, 0xe2));
-        let greys = [RGBColor(0xff, 0xff, 0xff), RGBColor(0xb0, 0xb0, 0xb0)];
-        assert_eq!(unlike(&greys), RGBColor(0x48, 0x48, 0x48));
+        assert_eq!(unlike(&[Color(0, 0, 0)]), Color(0xe2, 0xe2, 0xe2));
+        let greys = [Color(0xff, 0xff, 0xff), Color(0xb0, 0xb0, 0xb0)];
+        assert_eq!(unlike(&greys), Color(0x48, 0x48, 0x48));
     }
 }

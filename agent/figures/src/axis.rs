@@ -1,5 +1,14 @@
 //! Linear axes with round ticks, and labels that keep their distance.
 
+/// Sizes of numbers between which axes are exact enough.
+const LEAST: f64 = 1e-200;
+const MOST: f64 = 1e200;
+
+/// Whether a number has a place on an axis.
+pub fn is_drawable(value: f64) -> bool {
+    value.abs() <= MOST
+}
+
 /// Range and ticks of an axis.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Axis {
@@ -10,13 +19,18 @@ pub struct Axis {
 }
 
 impl Axis {
-    /// An axis over zero and all the given (finite) values, with about `n_ticks` ticks,
-    /// the first and last of them at its ends.
+    /// An axis over zero and all the given values that can be drawn, with about `n_ticks` ticks, the first
+    /// and last of them at its ends.
     pub fn covering(values: impl Iterator<Item = f64>, n_ticks: usize) -> Self {
+        let values = values.filter(|&value| is_drawable(value));
         let (least, most) = values.fold((0.0_f64, 0.0_f64), |(least, most), value| {
             (least.min(value), most.max(value))
         });
-        let most = if most > least { most } else { least + 1.0 };
+        let most = if most - least > LEAST {
+            most
+        } else {
+            least + 1.0
+        };
         let step = round_step((most - least) / n_ticks as f64);
         let (first, last) = ((least / step).floor() as i64, (most / step).ceil() as i64);
         let ticks = (first..=last).map(|tick| tick as f64 * step).collect();
@@ -72,7 +86,12 @@ impl Axis {
 
     /// Label of a tick.
     pub fn label(&self, tick: f64) -> String {
-        format!("{tick:.*}", self.decimals)
+        let most = self.range.0.abs().max(self.range.1.abs());
+        match self.decimals > 6 || most >= 1e7 {
+            true if tick != 0.0 => format!("{:e}", format!("{tick:.2e}").parse().unwrap_or(tick)),
+            true => "0".into(),
+            false => format!("{tick:.*}", self.decimals),
+        }
     }
 }
 
@@ -134,6 +153,22 @@ mod tests {
         );
         check(&[], &[0.0, 0.2, 0.4, 0.6, 0.8, 1.0], "0.2");
         check(&[0.0, 0.0], &[0.0, 0.2, 0.4, 0.6, 0.8, 1.0], "0.2");
+        check(
+            &[f64::NAN, 1e300, 1e-300],
+            &[0.0, 0.2, 0.4, 0.6, 0.8, 1.0],
+            "0.2",
+        );
+    }
+
+    #[test]
+    fn labels_of_extreme_numbers_stay_short() {
+        let label = |value: f64| {
+            let axis = Axis::covering(std::iter::once(value), 5);
+            (axis.label(0.0), axis.label(axis.ticks[1]))
+        };
+        assert_eq!(label(1e9), ("0".into(), "2e8".into()));
+        assert_eq!(label(1.2e-9), ("0".into(), "2.5e-10".into()));
+        assert_eq!(label(4e199), ("0".into(), "1e199".into()));
     }
 
     #[test]

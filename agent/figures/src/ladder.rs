@@ -1,0 +1,188 @@
+//! The ladder: one value per row as a bar, with its standard error and every single world.
+
+use crate::axis::{Axis, is_drawable};
+use crate::palette::{Color, GRID, INK, PAPER, blend};
+use crate::svg::{Align, Svg};
+use crate::text::TextStyle;
+use crate::{MARGIN, WIDTH};
+use std::collections::BTreeSet;
+
+const ROW: f64 = 44.0;
+const BAR: f64 = 26.0;
+/// Upper edge of the bars, below title, note and legend.
+const TOP: f64 = 132.0;
+/// Room for tick labels and the axis label.
+const BOTTOM: f64 = 72.0;
+/// Widest label of a row, and of a value; longer ones are shortened.
+const LABEL_ROOM: f64 = 360.0;
+const VALUE_ROOM: f64 = 200.0;
+
+/// A page of bars.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Ladder {
+    /// Its title.
+    pub title: String,
+    /// A line of small print under it.
+    pub note: String,
+    /// What the values count.
+    pub axis: String,
+    /// What colours mean; all of them fit on a line.
+    pub legend: Vec<(&'static str, Color)>,
+    /// From top to bottom.
+    pub bars: Vec<Bar>,
+}
+
+/// A row. What is not finite is not drawn.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Bar {
+    /// Its name.
+    pub name: String,
+    /// What is said behind it, smaller; may be empty.
+    pub remark: String,
+    /// The value as text.
+    pub label: String,
+    /// Colour of the bar.
+    pub color: Color,
+    /// The value.
+    pub value: f64,
+    /// Its standard error; none where there is none.
+    pub error: Option<f64>,
+    /// Each world's seed and value.
+    pub worlds: Vec<(u64, f64)>,
+}
+
+/// Where rows and values lie on the page.
+struct Plot {
+    left: f64,
+    right: f64,
+    bottom: f64,
+    axis: Axis,
+    seeds: Vec<u64>,
+}
+
+impl Ladder {
+    /// The page as SVG.
+    pub fn svg(&self) -> String {
+        let plot = Plot::of(&self.bars);
+        let mut page = Svg::titled(plot.bottom + BOTTOM, &self.title, &self.note);
+        self.draw_legend(&mut page);
+        self.draw_axis(&mut page, &plot);
+        for (rank, bar) in self.bars.iter().enumerate() {
+            bar.draw(&mut page, &plot, TOP + ROW * (rank as f64 + 0.5));
+        }
+        let zero = plot.x(0.0);
+        page.rule((zero, TOP), (zero, plot.bottom), 1.0, INK);
+        page.finish()
+    }
+
+    fn draw_legend(&self, page: &mut Svg) {
+        let mut left = MARGIN;
+        for &(name, color) in &self.legend {
+            page.rectangle((left, 89.0), (left + 14.0, 103.0), color);
+            page.text((left + 21.0, 96.0), Align::Left, TextStyle::LABEL, name);
+            left += 21.0 + TextStyle::LABEL.width(name) + 26.0;
+        }
+    }
+
+    fn draw_axis(&self, page: &mut Svg, plot: &Plot) {
+        for &tick in &plot.axis.ticks {
+            let x = plot.x(tick);
+            page.rule((x, TOP), (x, plot.bottom), 1.0, GRID);
+            let at = (x, plot.bottom + 16.0);
+            page.text(at, Align::Center, TextStyle::NOTE, &plot.axis.label(tick));
+        }
+        let label = TextStyle::LABEL.fit(&self.axis, WIDTH - 2.0 * MARGIN);
+        // Centred below the bars, unless a long label has to move left to stay on the page.
+        let half = TextStyle::LABEL.width(&label) / 2.0;
+        let center = ((plot.left + plot.right) / 2.0).min(WIDTH - MARGIN - half);
+        let at = (center, plot.bottom + 44.0);
+        page.text(at, Align::Center, TextStyle::LABEL, &label);
+    }
+}
+
+impl Plot {
+    fn of(bars: &[Bar]) -> Self {
+        let widest = |width: &dyn Fn(&Bar) -> f64| bars.iter().map(width).fold(0.0, f64::max);
+        let label =
+            |bar: &Bar| TextStyle::LABEL.width(&bar.name) + TextStyle::NOTE.width(&bar.remark);
+        let values = widest(&|bar| TextStyle::LABEL.width(&bar.label)).min(VALUE_ROOM);
+        let seeds = bars.iter().flat_map(|bar| &bar.worlds).map(|world| world.0);
+        Self {
+            left: MARGIN + widest(&label).min(LABEL_ROOM) + 14.0,
+            right: WIDTH - MARGIN - values - 24.0,
+            bottom: TOP + ROW * bars.len() as f64,
+            axis: Axis::covering(bars.iter().flat_map(Bar::extent), 8),
+            seeds: seeds.collect::<BTreeSet<u64>>().into_iter().collect(),
+        }
+    }
+
+    fn x(&self, value: f64) -> f64 {
+        self.left + self.axis.fraction(value) * (self.right - self.left)
+    }
+}
+
+impl Bar {
+    fn extent(&self) -> impl Iterator<Item = f64> + '_ {
+        let error = self.error.unwrap_or(0.0);
+        let worlds = self.worlds.iter().map(|world| world.1);
+        worlds.chain([self.value, self.value - error, self.value + error])
+    }
+
+    fn draw(&self, page: &mut Svg, plot: &Plot, middle: f64) {
+        self.draw_label(page, plot, middle);
+        let label = TextStyle::LABEL.fit(&self.label, VALUE_ROOM);
+        page.text(
+            (WIDTH - MARGIN, middle),
+            Align::Right,
+            TextStyle::LABEL,
+            &label,
+        );
+        if !is_drawable(self.value) {
+            return;
+        }
+        let (zero, end) = (plot.x(0.0), plot.x(self.value));
+        let (upper, lower) = (middle - BAR / 2.0, middle + BAR / 2.0);
+        page.rectangle((zero.min(end), upper), (zero.max(end), lower), self.color);
+        self.draw_worlds(page, plot, upper);
+        let ends = self
+            .error
+            .map(|error| [self.value - error, self.value + error]);
+        if let Some(ends) = ends.filter(|ends| ends.iter().all(|&end| is_drawable(end))) {
+            let [from, to] = ends.map(|value| plot.x(value));
+            page.rule((from, middle), (to, middle), 2.0, INK);
+            for x in [from, to] {
+                page.rule((x, middle - 6.0), (x, middle + 6.0), 2.0, INK);
+            }
+        }
+    }
+
+    fn draw_worlds(&self, page: &mut Svg, plot: &Plot, upper: f64) {
+        let dot = blend(self.color, INK, 0.55);
+        let worlds = if self.worlds.len() > 1 {
+            &self.worlds[..]
+        } else {
+            &[]
+        };
+        for &(seed, value) in worlds.iter().filter(|world| is_drawable(world.1)) {
+            // One height per world, so that a world can be followed from bar to bar.
+            let rank = plot.seeds.binary_search(&seed).unwrap_or(0) as f64 + 0.5;
+            let at = (plot.x(value), upper + BAR * rank / plot.seeds.len() as f64);
+            page.disc(at, 3.5, PAPER);
+            page.disc(at, 2.5, dot);
+        }
+    }
+
+    fn draw_label(&self, page: &mut Svg, plot: &Plot, middle: f64) {
+        let right = plot.left - 14.0;
+        let remark = TextStyle::NOTE.fit(&self.remark, LABEL_ROOM / 2.0);
+        let width = TextStyle::NOTE.width(&remark);
+        page.text((right, middle), Align::Right, TextStyle::NOTE, &remark);
+        let name = TextStyle::LABEL.fit(&self.name, right - MARGIN - width + 1.0);
+        page.text(
+            (right - width, middle),
+            Align::Right,
+            TextStyle::LABEL,
+            &name,
+        );
+    }
+}

@@ -1,0 +1,159 @@
+//! What the colours and marks of a snapshot mean, and how the marks look.
+
+use crate::palette::{Color, INK, MUTED, PAPER};
+use crate::snapshot::Named;
+use crate::svg::{Align, Point, Svg};
+use crate::text::TextStyle;
+use crate::{MARGIN, WIDTH};
+
+/// Height of a line of the legend.
+const LINE: f64 = 26.0;
+const SWATCH: f64 = 14.0;
+
+/// A mark of the legend.
+#[derive(Debug, Clone, Copy)]
+enum Mark {
+    /// No mark: the heading of a group.
+    Heading,
+    Color(Color),
+    Path,
+    Start,
+    Robot,
+}
+
+/// A mark with its name, and where it stands.
+struct Entry {
+    mark: Mark,
+    name: String,
+    at: Point,
+}
+
+/// Marks with their names, broken into lines.
+pub struct Legend {
+    entries: Vec<Entry>,
+    height: f64,
+}
+
+impl Legend {
+    /// The legend from `corner` on; what states and observations share is said once.
+    pub fn new(states: &[Named], observations: &[Named], unobserved: Color, corner: Point) -> Self {
+        let group = |heading: &str, named: &[Named]| {
+            let marks = named
+                .iter()
+                .map(|it| (Mark::Color(it.color), it.name.clone()));
+            std::iter::once((Mark::Heading, heading.into()))
+                .chain(marks)
+                .collect::<Vec<_>>()
+        };
+        let mut groups = match states == observations {
+            true => vec![group("state, observed value:", states)],
+            false => vec![
+                group("state:", states),
+                group("observed value:", observations),
+            ],
+        };
+        if let Some(last) = groups.last_mut() {
+            last.push((Mark::Color(unobserved), "not observed".into()));
+            last.extend([(Mark::Path, "path".into()), (Mark::Start, "start".into())]);
+            last.push((Mark::Robot, "robot".into()));
+        }
+        Self::placed(groups, corner)
+    }
+
+    /// Places each group of marks on lines of its own.
+    fn placed(groups: Vec<Vec<(Mark, String)>>, (left, top): Point) -> Self {
+        let mut entries = Vec::new();
+        let mut middle = top;
+        for group in groups {
+            let mut x = left;
+            for (mark, name) in group {
+                let name = TextStyle::LABEL.fit(&name, WIDTH - left - MARGIN - 30.0);
+                let width = mark.width() + TextStyle::LABEL.width(&name);
+                if x > left && x + width > WIDTH - MARGIN {
+                    (x, middle) = (left, middle + LINE);
+                }
+                entries.push(Entry {
+                    mark,
+                    name,
+                    at: (x, middle),
+                });
+                x += width + if mark.width() > 0.0 { 24.0 } else { 12.0 };
+            }
+            middle += LINE;
+        }
+        Self {
+            entries,
+            height: middle - top,
+        }
+    }
+
+    /// Height of its lines in points.
+    pub fn height(&self) -> f64 {
+        self.height
+    }
+
+    /// Draws all marks with their names.
+    pub fn draw(&self, page: &mut Svg) {
+        for Entry { mark, name, at } in &self.entries {
+            mark.draw(page, *at);
+            let style = match mark {
+                Mark::Heading => TextStyle::LABEL.colored(MUTED),
+                _ => TextStyle::LABEL,
+            };
+            page.text((at.0 + mark.width(), at.1), Align::Left, style, name);
+        }
+    }
+}
+
+impl Mark {
+    /// Width of the mark and the space behind it.
+    fn width(self) -> f64 {
+        match self {
+            Self::Heading => 0.0,
+            Self::Path => SWATCH + 16.0,
+            Self::Color(_) | Self::Start | Self::Robot => SWATCH + 7.0,
+        }
+    }
+
+    fn draw(self, page: &mut Svg, (x, y): Point) {
+        let middle = (x + SWATCH / 2.0, y);
+        match self {
+            Self::Heading => {}
+            Self::Color(color) => {
+                let (from, to) = ((x, y - SWATCH / 2.0), (x + SWATCH, y + SWATCH / 2.0));
+                page.rectangle(from, to, color);
+                page.outline(from, to, 0.5, MUTED);
+            }
+            Self::Path => draw_path(page, &[(x + 2.0, y), (x + SWATCH + 7.0, y)], 2.0, 0.0),
+            Self::Start => draw_start(page, middle, 4.5),
+            Self::Robot => draw_robot(page, middle, 6.5),
+        }
+    }
+}
+
+/// Draws a path of straight legs, with a white rim where cells are wide enough to show beside it.
+pub fn draw_path(page: &mut Svg, points: &[Point], width: f64, rim: f64) {
+    for (half, color) in [(width / 2.0 + rim, PAPER), (width / 2.0, INK)] {
+        for ends in points.windows(2) {
+            let ((x0, y0), (x1, y1)) = (ends[0], ends[1]);
+            // A leg runs along a row or a column, so it is a rectangle, without blurred edges.
+            let from = (x0.min(x1) - half, y0.min(y1) - half);
+            page.rectangle(from, (x0.max(x1) + half, y0.max(y1) + half), color);
+        }
+    }
+}
+
+/// Draws the mark of the path's first cell.
+pub fn draw_start(page: &mut Svg, (x, y): Point, half: f64) {
+    page.rectangle((x - half, y - half), (x + half, y + half), INK);
+    let inner = half - 1.5;
+    page.rectangle((x - inner, y - inner), (x + inner, y + inner), PAPER);
+}
+
+/// Draws the mark of the robot's cell.
+pub fn draw_robot(page: &mut Svg, center: Point, radius: f64) {
+    page.disc(center, radius, PAPER);
+    page.disc(center, radius - 1.0, INK);
+    page.disc(center, radius - 2.5, PAPER);
+    page.disc(center, (radius - 4.5).max(1.0), INK);
+}

@@ -1,0 +1,27 @@
+//! Charts: data in, SVG out, and PNG from that SVG, the same on every machine.
+//!
+//! [`Ladder`] has bars, [`Lines`] curves over one axis, [`Snapshot`] the cells of one step. Each makes a
+//! text; [`png`] turns it into pixels. [`svg`](crate::svg) draws, [`axis`](crate::axis) scales.
+
+mod axis;
+mod ladder;
+mod legend;
+mod lines;
+mod palette;
+mod panels;
+mod raster;
+mod snapshot;
+mod svg;
+mod text;
+
+pub use ladder::{Bar, Ladder};
+pub use lines::{Curve, Lines, MOST_CURVES, Panel, Scale, Shade};
+pub use palette::Color;
+pub use raster::{Heat, PngError, heat, png};
+pub use snapshot::{Misfit, Named, Snapshot};
+
+/// Width of every page in points.
+const WIDTH: f64 = 1200.0;
+
+/// Empty rim of every page in points.
+const MARGIN: f64 = 32.0;

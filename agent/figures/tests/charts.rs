@@ -1,0 +1,315 @@
+//! Charts of data that nobody wished for: still XML, still a picture, nothing off the page.
+
+use figures::{
+    Bar, Color, Curve, Ladder, Lines, MOST_CURVES, Named, Panel, Scale, Shade, Snapshot, png,
+};
+use ndarray::{Array2, Array3};
+use resvg::tiny_skia::Pixmap;
+use resvg::usvg::roxmltree::Document;
+
+const BLUE: Color = Color(0x00, 0x72, 0xb2);
+const EXTREME: [f64; 8] = [
+    f64::NAN,
+    f64::INFINITY,
+    f64::NEG_INFINITY,
+    f64::MAX,
+    f64::MIN_POSITIVE,
+    -1e150,
+    1e-150,
+    0.0,
+];
+
+/// Expects XML, finite numbers, texts that stay on the page, and a white rim; gives the texts.
+fn check(svg: &str) -> Vec<String> {
+    assert!(!svg.contains("NaN") && !svg.contains("inf\""), "{svg}");
+    let document = Document::parse(svg).expect("XML");
+    let number = |node: resvg::usvg::roxmltree::Node<'_, '_>, name: &str| -> f64 {
+        node.attribute(name)
+            .and_then(|text| text.parse().ok())
+            .expect("a number")
+    };
+    let texts = document
+        .descendants()
+        .filter(|node| node.has_tag_name("text"));
+    let texts: Vec<_> = texts.collect();
+    for &text in &texts {
+        let (x, width) = (number(text, "x"), number(text, "textLength"));
+        assert!(
+            x >= 20.0 && x + width <= 1181.0,
+            "{x} {width} {:?}",
+            text.text()
+        );
+    }
+    let pixels = Pixmap::decode_png(&png(svg).expect("a PNG")).expect("a PNG");
+    let (width, height) = (pixels.width(), pixels.height());
+    assert_eq!(width, 2400);
+    let is_rim = |at: u32| {
+        let (x, y) = (at % width, at / width);
+        x < 40 || x + 40 >= width || y < 16 || y + 16 >= height
+    };
+    let mut rim = pixels.pixels().iter().zip(0..).filter(|it| is_rim(it.1));
+    assert!(rim.all(|(pixel, _)| pixel.red() == 255 && pixel.green() == 255));
+    texts
+        .iter()
+        .filter_map(|text| text.text().map(str::to_owned))
+        .collect()
+}
+
+fn bar(name: &str, value: f64) -> Bar {
+    Bar {
+        name: name.into(),
+        remark: " (known model)".into(),
+        label: "a value".into(),
+        color: BLUE,
+        value,
+        error: Some(value.abs() / 10.0),
+        worlds: vec![(3, value), (4, value * 1.2)],
+    }
+}
+
+fn ladder(bars: Vec<Bar>) -> Ladder {
+    Ladder {
+        title: "Reward of each policy".into(),
+        note: "bars are means".into(),
+        axis: "cells".into(),
+        legend: vec![("no belief", BLUE)],
+        bars,
+    }
+}
+
+#[test]
+fn ladders_of_none_one_and_many() {
+    check(&ladder(Vec::new()).svg());
+    let texts = check(&ladder(vec![bar("beam", 40.0)]).svg());
+    assert!(texts.contains(&"beam".into()) && texts.contains(&"a value".into()));
+    let many = (0..100).map(|at| bar(&format!("policy {at}"), f64::from(at) - 50.0));
+    let texts = check(&ladder(many.collect()).svg());
+    assert!(texts.contains(&"policy 99".into()));
+}
+
+#[test]
+fn names_are_escaped_and_shortened() {
+    let long = "a very long name ".repeat(40);
+    let hostile = "</text><script>&amp;\u{1}\"'";
+    let mut page = ladder(vec![bar(&long, 1.0), bar(hostile, 2.0)]);
+    (page.title, page.axis, page.note) = (long.clone(), long.clone(), long.clone());
+    page.bars[0].remark = long.clone();
+    page.bars[1].label = long.clone();
+    let texts = check(&page.svg());
+    assert!(texts.contains(&hostile.replace('\u{1}', " ")));
+    assert!(texts.iter().filter(|text| text.ends_with('…')).count() >= 5);
+    let curves = vec![Curve::new(&long, vec![(0.0, 1.0), (9.0, 2.0)])];
+    let page = lines(vec![panel(&long, Scale::Linear, curves)]);
+    check(
+        &Lines {
+            title: long.clone(),
+            note: long.clone(),
+            axis: long,
+            ..page
+        }
+        .svg()
+        .expect("a point"),
+    );
+}
+
+#[test]
+fn extreme_values_are_drawn_or_left_out() {
+    for value in EXTREME {
+        let mut other = bar("error", 2.0);
+        (other.error, other.worlds) = (Some(value), vec![(1, value), (2, 1.0)]);
+        check(&ladder(vec![bar("value", value), other, bar("usual", 3.0)]).svg());
+        for scale in [Scale::Linear, Scale::Logarithmic] {
+            let mut curve = Curve::new("extreme", vec![(0.0, value), (value, 1.0), (5.0, 2.0)]);
+            curve.errors = vec![value, 1.0, value];
+            let mut panel = panel("extreme", scale, vec![curve]);
+            panel.shade = Some(Shade {
+                name: "shaded".into(),
+                points: vec![(0.0, value), (value, 1.0), (5.0, 2.0)],
+            });
+            check(&lines(vec![panel]).svg().expect("a point"));
+        }
+    }
+}
+
+fn panel(title: &str, scale: Scale, curves: Vec<Curve>) -> Panel {
+    Panel {
+        title: title.into(),
+        scale,
+        curves,
+        shade: None,
+    }
+}
+
+fn lines(panels: Vec<Panel>) -> Lines {
+    Lines {
+        title: "Curves".into(),
+        note: "small print".into(),
+        axis: "step k".into(),
+        panels,
+    }
+}
+
+#[test]
+fn panels_without_a_point_are_left_out() {
+    let curve = |name: &str, y: f64| Curve::new(name, vec![(0.0, y), (1.0, y)]);
+    assert_eq!(lines(Vec::new()).svg(), None);
+    let none = panel("none", Scale::Logarithmic, vec![curve("negative", -1.0)]);
+    assert_eq!(lines(vec![none.clone()]).svg(), None);
+    let some = panel(
+        "some",
+        Scale::Linear,
+        vec![curve("here", -1.0), Curve::new("empty", vec![])],
+    );
+    let texts = check(&lines(vec![none, some]).svg().expect("a point"));
+    assert!(texts.contains(&"here".into()));
+    assert!(!texts.contains(&"none".into()) && !texts.contains(&"empty".into()));
+}
+
+#[test]
+fn there_are_as_many_curves_as_colours_and_one_point_is_seen() {
+    let curve = |at: usize| Curve::new(&format!("curve {at}"), vec![(1.0, 7.0)]);
+    let all = panel("all", Scale::Linear, (0..20).map(curve).collect());
+    let several = lines(vec![
+        all.clone(),
+        panel("one", Scale::Linear, vec![curve(20)]),
+    ]);
+    for page in [lines(vec![all]), several] {
+        let svg = page.svg().expect("a point");
+        let texts = check(&svg);
+        assert!(texts.contains(&format!("curve {}", MOST_CURVES - 1)));
+        assert!(!texts.contains(&format!("curve {MOST_CURVES}")));
+        assert!(svg.matches("<circle").count() >= MOST_CURVES);
+    }
+}
+
+struct Step {
+    truth: Array2<u8>,
+    frame: Array2<u8>,
+    belief: Array3<f32>,
+}
+
+fn step(height: usize, width: usize) -> Step {
+    let value = |(row, col): (usize, usize)| ((row * 7 + col * 3) % 5 % 3) as u8;
+    let truth = Array2::from_shape_fn((height, width), value);
+    let belief = Array3::from_shape_fn((3, height, width), |(_, row, col)| {
+        (row + col) as f32 / (height + width) as f32
+    });
+    let frame = truth.mapv(|value| if value == 0 { 255 } else { value });
+    Step {
+        truth,
+        frame,
+        belief,
+    }
+}
+
+fn snapshot(step: &Step) -> Snapshot<'_> {
+    let named = |(name, color): (&str, Color)| Named {
+        name: name.into(),
+        color,
+    };
+    let named = [
+        ("normal", BLUE),
+        ("latent", Color(230, 180, 60)),
+        ("fire", Color(200, 50, 30)),
+    ]
+    .map(named);
+    Snapshot {
+        title: "wildfire, step k = 4".into(),
+        note: "world seed 7".into(),
+        states: named.to_vec(),
+        observations: named.to_vec(),
+        truth: step.truth.view(),
+        observation: step.truth.view(),
+        frame: step.frame.view(),
+        path: vec![(0, 0), (step.truth.nrows() - 1, 0)],
+        belief: step.belief.view(),
+    }
+}
+
+#[test]
+fn snapshots_show_each_cell_in_its_colour() {
+    for (height, width) in [(2, 3), (1, 1), (5, 40), (40, 5), (300, 500)] {
+        let step = step(height, width);
+        let mut page = snapshot(&step);
+        let texts = check(&page.svg().expect("fits"));
+        assert!(texts.contains(&"belief: fire".into()));
+        page.path.clear();
+        check(&page.svg().expect("fits"));
+    }
+    let step = step(2, 3);
+    let svg = snapshot(&step).svg().expect("fits");
+    let document = Document::parse(&svg).expect("XML");
+    let squares = document
+        .descendants()
+        .filter(|node| node.has_tag_name("path"));
+    let of = |color: &str| {
+        let found = squares
+            .clone()
+            .find(|node| node.attribute("fill") == Some(color));
+        found
+            .and_then(|node| node.attribute("d"))
+            .map(|path| path.matches('M').count())
+    };
+    // The first panel, the truth: neighbours in a row are one rectangle.
+    assert_eq!(step.truth, ndarray::arr2(&[[0, 0, 1], [2, 0, 0]]));
+    assert_eq!(
+        (of("#0072b2"), of("#e6b43c"), of("#c8321e")),
+        (Some(2), Some(1), Some(1))
+    );
+}
+
+#[test]
+fn parts_that_do_not_fit_are_named() {
+    let (good, other) = (step(4, 6), step(6, 4));
+    let mut nan = step(4, 6);
+    nan.belief[[0, 0, 0]] = f32::NAN;
+    let refused = |change: &dyn Fn(&mut Snapshot<'_>), words: &str| {
+        let mut snapshot = snapshot(&good);
+        change(&mut snapshot);
+        let error = snapshot.svg().expect_err("a misfit").to_string();
+        assert!(error.starts_with(&format!("snapshot: {words}")), "{error}");
+    };
+    refused(
+        &|it| it.states.truncate(2),
+        "belief: expected shape [2, 4, 6], got [3, 4, 6]",
+    );
+    refused(
+        &|it| it.observations.truncate(2),
+        "observation: expected values below 2, got 2",
+    );
+    refused(
+        &|it| it.path.push((4, 0)),
+        "path: expected cells of a 4 x 6 grid",
+    );
+    let mixed = Snapshot {
+        frame: other.frame.view(),
+        ..snapshot(&good)
+    };
+    let error = mixed.svg().expect_err("a misfit").to_string();
+    assert_eq!(error, "snapshot: frame: expected shape [4, 6], got [6, 4]");
+    let error = snapshot(&nan).svg().expect_err("a NaN").to_string();
+    assert!(
+        error.starts_with("snapshot: belief: expected finite numbers"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_band_ends_where_its_scale_does() {
+    let points = (0..10).map(|x| (f64::from(x), 1.0)).collect();
+    let mut curve = Curve::new("rate", points);
+    curve.errors = (0..10).map(|x| f64::from(x) / 4.0).collect();
+    for (scale, n_edges) in [(Scale::Linear, 20), (Scale::Logarithmic, 8)] {
+        let svg = lines(vec![panel("rate", scale, vec![curve.clone()])]).svg();
+        let svg = svg.expect("a point");
+        check(&svg);
+        let document = Document::parse(&svg).expect("XML");
+        let band = document
+            .descendants()
+            .find(|node| node.has_tag_name("polygon"));
+        let edges = band
+            .and_then(|band| band.attribute("points"))
+            .map(|it| it.matches(',').count());
+        assert_eq!(edges, Some(n_edges), "{scale:?}");
+    }
+}
