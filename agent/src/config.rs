@@ -18,7 +18,7 @@ use crate::policy::{BEAM_BONUS, PlannerKind, Policy};
 use clap::{Args, ValueEnum};
 use protocol::program::read_text;
 use serde::{Deserialize, Serialize};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 /// Settings of planners and estimators; `config/agent.toml` lists them with their defaults.
@@ -311,7 +311,7 @@ impl AgentFlags {
     }
 }
 
-fn read(path: &PathBuf) -> Result<AgentConfig, ConfigError> {
+fn read(path: &Path) -> Result<AgentConfig, ConfigError> {
     let wrong = |problem: String| ConfigError::File {
         path: path.display().to_string(),
         problem,
