@@ -1,6 +1,6 @@
 // The time series: three lines and the strip of objectives above one common axis.
 
-import { drawLine, drawStrip } from "/plot.js";
+import { drawLine, drawStrip, frameOf, roomFor } from "/plot.js";
 import { make, swatch, write } from "/elements.js";
 import { objectiveColor } from "/palette.js";
 import { across } from "/scale.js";
@@ -9,23 +9,42 @@ import { chartSentence, short, stateNames, targetName, text, whole } from "/word
 
 const LINES = [
   { id: "reward", array: "series_reward", now: "reward", title: () => "reward", unit: (target) => `${target} cells found in a step` },
-  { id: "target", array: "series_target", now: "n_target_cells", title: (target) => `${target} cells`, unit: (_, cells) => `of ${cells}` },
+  { id: "target", array: "series_target", now: "n_target_cells", apart: 1, title: (target) => `${target} cells`, unit: (_, cells) => `of ${cells}` },
   { id: "log-loss", array: "series_log_loss", now: "log_loss", title: () => "log-loss", unit: () => "nats per cell" },
 ];
 
-/** The charts in `parent`; `hover(serial)` and `seek(serial)` hear of pointers on them. */
-export function createCharts(parent, { hover, seek }) {
+/** The charts in `parent`; `seek(serial)` hears of clicks on them. */
+export function createCharts(parent, { pointer, seek }) {
   const charts = [...LINES.map(lineChart), stripChart()];
   parent.append(...charts.map((chart) => chart.figure));
+  const canvases = charts.map((chart) => chart.canvas);
+  // Common to all charts: what is below, and how many CSS pixels are left of it.
   let axis = null;
-  for (const { canvas } of charts) listen(canvas, () => axis, { hover, seek });
+  let left = 0;
+
+  function serialAt({ element, clientX }) {
+    const box = element.getBoundingClientRect();
+    return axis?.at((clientX - box.left - left) / (box.width - left)) ?? null;
+  }
+
+  for (const canvas of canvases) {
+    canvas.addEventListener("click", ({ clientX }) => {
+      const serial = serialAt({ element: canvas, clientX });
+      if (serial != null) seek(serial);
+    });
+  }
 
   return {
     /** Bins worth asking for: as many as there are pixels to draw them on. */
     bins: () => Math.min(Math.max(Math.round(charts[0].canvas.clientWidth || 300), 16), 2000),
     draw(picture, view, palette) {
       axis = picture.series && across(picture.series);
-      charts.forEach((chart) => chart.draw(chart, picture, axis, view, palette));
+      for (const chart of charts) chart.begin(chart, picture, axis);
+      left = roomFor(charts.map((chart) => chart.frame), axis?.word ?? "");
+      const pointed = pointer.on(canvases);
+      const hover = pointed && serialAt(pointed);
+      const looked = view.at == null ? null : picture.shown?.serial;
+      for (const chart of charts) chart.draw(chart, picture, { axis, left, hover, looked }, palette);
     },
     describe: (picture) => charts.forEach((chart) => chart.describe(chart, picture)),
   };
@@ -48,19 +67,21 @@ function frame(id, rest) {
 
 function lineChart(line) {
   return frame(line.id, {
-    line,
-    draw(chart, picture, axis, view) {
+    begin(chart, picture, axis) {
+      const values = picture.arrays[line.array];
+      chart.values = axis && values && !values.every(Number.isNaN) ? values : null;
+      chart.frame = frameOf(chart.canvas, chart.values, line.apart);
+    },
+    draw(chart, picture, common) {
       const target = targetName(picture);
       write(chart.parts.title, line.title(target));
       write(chart.parts.unit, line.unit(target, whole(cellsOf(picture))));
-      const values = picture.arrays[line.array];
-      const cursor = cursorOf(picture, view);
-      const hovered = view.hover != null && axis && values ? values[axis.bin(clamp(view.hover, axis))] : null;
-      write(chart.parts.now, short(hovered ?? picture.shown?.[line.now]));
-      writeHover(chart, axis, view);
-      const isEmpty = !values || !axis || values.every(Number.isNaN);
-      write(chart.absent, isEmpty ? absence(line, picture) : "");
-      drawLine(chart.canvas, isEmpty ? null : { values, axis, cursor });
+      const { values } = chart;
+      const { axis, hover } = common;
+      write(chart.parts.now, short(hover == null || !values ? picture.shown?.[line.now] : values[axis.bin(hover)]));
+      writeHover(chart, common);
+      write(chart.absent, values ? "" : absence(line, picture));
+      if (values) drawLine(chart.frame, values, common);
     },
     describe(chart, picture) {
       const values = picture.arrays[line.array] ?? [];
@@ -73,17 +94,22 @@ function lineChart(line) {
 
 function stripChart() {
   return frame("objective", {
-    draw(chart, picture, axis, view, palette) {
-      const values = picture.arrays.series_objective;
-      const names = picture.objectives ?? [];
+    begin(chart, picture, axis) {
+      const isKnown = axis && picture.arrays.series_objective && picture.objectives.length > 0;
+      chart.values = isKnown ? picture.arrays.series_objective : null;
+      chart.frame = frameOf(chart.canvas, null);
+    },
+    draw(chart, picture, common, palette) {
+      const names = picture.objectives;
       write(chart.parts.title, "objective");
       const colors = names.map((name) => objectiveColor(name, { objectives: names, names: stateNames(picture), palette }));
       writeNames(chart, names, colors);
-      const isEmpty = !values || !axis || names.length === 0;
-      write(chart.absent, isEmpty ? "no agent tells its objective" : "");
-      const hovered = !isEmpty && view.hover != null ? names[values[axis.bin(clamp(view.hover, axis))]] : null;
-      write(chart.parts.now, text(hovered ?? picture.agent?.objective));
-      drawStrip(chart.canvas, axis && { values: isEmpty ? [] : values, axis, colors, cursor: cursorOf(picture, view) });
+      const { values } = chart;
+      write(chart.absent, values ? "" : "no agent tells its objective");
+      const { axis, hover } = common;
+      write(chart.parts.now, text(hover == null || !values ? picture.agent?.objective : names[values[axis.bin(hover)]]));
+      writeHover(chart, common);
+      if (axis) drawStrip(chart.frame, values ?? [], common, colors);
     },
     describe(chart, picture) {
       chart.canvas.setAttribute("aria-label", `objective: now ${picture.agent?.objective ?? "not known"}`);
@@ -102,17 +128,8 @@ function writeNames(chart, names, colors) {
   }));
 }
 
-function writeHover({ parts }, axis, { hover }) {
-  write(parts.at, hover != null && axis ? `at ${axis.word} ${whole(axis.number(clamp(hover, axis)))}` : "");
-}
-
-// The entry pointed at, else the one that is looked at; the newest needs no mark.
-function cursorOf(picture, { hover, at }) {
-  return hover ?? (at != null ? picture.shown?.serial : null);
-}
-
-function clamp(serial, { first, last }) {
-  return Math.min(Math.max(serial, first), last);
+function writeHover({ parts }, { axis, hover }) {
+  write(parts.at, hover == null ? "" : `at ${axis.word} ${whole(axis.number(hover))}`);
 }
 
 function absence({ id }, picture) {
@@ -124,18 +141,4 @@ function absence({ id }, picture) {
   if (!arrays.truth) return "needs the truth and a belief";
   if (!arrays.belief) return "needs a belief";
   return info.states ? "nothing yet" : "needs to know the model";
-}
-
-function listen(canvas, axis, { hover, seek }) {
-  const serial = (event) => {
-    const box = canvas.getBoundingClientRect();
-    const left = parseFloat(canvas.dataset.left ?? 0);
-    return axis()?.at((event.clientX - box.left - left) / (box.width - left));
-  };
-  canvas.addEventListener("pointermove", (event) => hover(serial(event) ?? null));
-  canvas.addEventListener("pointerleave", () => hover(null));
-  canvas.addEventListener("click", (event) => {
-    const at = serial(event);
-    if (at != null) seek(at);
-  });
 }

@@ -9,6 +9,8 @@ const byId = (id) => document.getElementById(id);
 export function createFacts() {
   const announce = byId("announce");
   let said = "";
+  // Whether no picture can be had: that is told until one comes.
+  let isTroubled = false;
 
   // A change of state is said aloud, once.
   function say(sentence) {
@@ -17,24 +19,35 @@ export function createFacts() {
     announce.textContent = sentence;
   }
 
+  function drawWell(picture) {
+    const state = stateOf(picture);
+    const problem = picture.note ?? picture.player?.error;
+    drawState(state, isToldLarge(picture) ? null : problem);
+    say(problem ?? `${state}, world ${picture.world}`);
+  }
+
+  function drawTrouble(state, note, sentence) {
+    isTroubled = true;
+    drawState(state, note);
+    say(sentence);
+  }
+
   return {
     draw(picture, view) {
-      const state = stateOf(picture);
-      drawState(state, isToldLarge(picture) ? null : picture.note ?? picture.player?.error);
+      if (!isTroubled) drawWell(picture);
       drawServer(picture);
       drawWorld(picture);
       drawAgent(picture, view.at == null);
       drawEmpty(picture);
-      say(picture.note ?? picture.player?.error ?? `${state}, world ${picture.world}`);
     },
+    recovered() { isTroubled = false; },
     /** The dashboard itself went away: what was drawn last stays. */
     gone() {
-      drawState("gone", "The dashboard is gone; reconnecting every second.");
-      say("dashboard gone, reconnecting");
+      drawTrouble("gone", "The dashboard is gone; reconnecting every second.", "dashboard gone, reconnecting");
     },
     failed(error) {
-      drawState("unreadable", `The dashboard sent what this page cannot read: ${error.message}`);
-      say("the dashboard sent what this page cannot read");
+      const problem = `The dashboard sent what this page cannot read: ${error.message}`;
+      drawTrouble("unreadable", problem, "the dashboard sent what this page cannot read");
     },
   };
 }
@@ -66,6 +79,7 @@ function drawServer({ status, lost, instance, source }) {
   for (const fact of document.querySelectorAll(".of-server")) fact.hidden = !isLive;
   write(byId("rate"), short(status?.steps_per_second));
   write(byId("observers"), whole(status?.n_observers));
+  write(byId("observers-word"), status?.n_observers === 1 ? "observer" : "observers");
   drawLost(lost);
 }
 

@@ -18,15 +18,16 @@ export function createInspector(announcer) {
   let timer = 0;
   let shownKey = "";
 
-  function draw(picture, view, palette) {
-    const at = view.cell ?? robotCell(picture);
+  /** `cell` is the one pointed at, or null. */
+  function draw(picture, cell, palette) {
+    const at = cell ?? robotCell(picture);
     if (!at) return;
     const rows = rowsOf(picture, at);
     const heading = `row ${at.row}, col ${at.col}`;
-    const key = JSON.stringify([heading, rows, Boolean(view.cell), palette.theme]);
+    const key = JSON.stringify([heading, rows, Boolean(cell), palette.theme]);
     if (key === shownKey) return;
     shownKey = key;
-    title.replaceChildren(make("b", "", {}, heading), make("span", "hint", {}, view.cell ? "" : "robot"));
+    title.replaceChildren(make("b", "", {}, heading), make("span", "hint", {}, cell ? "" : "robot"));
     list.replaceChildren(...rows.map((row) => rowElement(row, palette)));
   }
 

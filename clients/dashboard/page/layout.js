@@ -8,19 +8,23 @@ const WORTHWHILE = 0.8;
 // A regular layout reads best: another must be larger by this to be preferred.
 const REGULAR_MERIT = 1.15;
 // Sizes in rem, as in the style sheet: the inspector's title, a line of it, its columns of lines with the gap
-// between them, and the least width of a panel's column, which its caption needs.
+// between them, the least width of a panel's column, which its caption needs, and the note that stands for beliefs.
 const TITLE = 1.7;
 const LINE = 1.72;
 const LANE = 9;
 const LANE_GAP = 1.2;
 const CAPTION_WIDTH = 8;
+const NOTE = 5;
+// Smaller panels show nothing: they scroll instead.
+const LEAST = 4;
 // Panels before the inspector in a regular layout.
 const OBSERVED = 3;
 
 /**
  * The best layout of panels within `area`: columns, the panels' size in CSS pixels, the inspector's span.
  *
- * `places` counts panels, the inspector's lines, and the columns of a regular layout. In an area of
+ * `places` counts panels, the inspector's lines, and the columns of a regular layout, and tells whether a note stands for
+ * the beliefs (`isBare`). In an area of
  * height Infinity the page scrolls and `forced` columns are taken.
  */
 export function fit({ area, shape, places, forced, gap, caption, ratio, rem }) {
@@ -37,26 +41,25 @@ export function fit({ area, shape, places, forced, gap, caption, ratio, rem }) {
   return best;
 }
 
-function place(columns, { panels, regular }) {
+function place(columns, { panels, regular, isBare }) {
   const isRegular = columns === regular;
-  if (isRegular) return { columns, isRegular, span: columns - OBSERVED, rows: 1 + Math.ceil((panels - OBSERVED || 1) / columns) };
+  if (isRegular) return { columns, isRegular, hasNote: false, span: columns - OBSERVED, rows: 1 + Math.ceil((panels - OBSERVED || 1) / columns) };
   const over = panels % columns;
-  return { columns, isRegular, span: columns - over, rows: Math.floor(panels / columns) + 1 };
+  return { columns, isRegular, hasNote: isBare, span: columns - over, rows: Math.floor(panels / columns) + 1 };
 }
 
-// The row that the inspector is in may have to be higher than the panels: then they give way.
+// The row that the inspector is in may have to be higher than the panels: then they give way. In a regular layout the
+// note fills the beliefs' row, else it has one of its own.
 function sizeFor({ area, shape, placed, gap, caption, ratio, rem, lines }) {
-  const free = {
-    x: (area.width - (placed.columns - 1) * gap) / placed.columns,
-    y: (area.height - (placed.rows - 1) * gap) / placed.rows - caption,
-  };
+  const height = area.height - (placed.rows - 1) * gap - (placed.hasNote ? NOTE * rem + gap : 0);
+  const free = { x: (area.width - (placed.columns - 1) * gap) / placed.columns, y: height / placed.rows - caption };
   const size = sized(free, shape, ratio);
   const width = placed.span * (size.width + gap) - gap;
   const lanes = Math.max(1, Math.floor((width / rem + LANE_GAP) / (LANE + LANE_GAP)));
   const inspector = (TITLE + LINE * Math.ceil(lines / lanes)) * rem;
   const excess = inspector - (size.height + caption);
   if (excess <= 0 || area.height === Infinity || placed.rows === 1) return size;
-  const left = (area.height - inspector - (placed.rows - 1) * gap) / (placed.rows - 1) - caption;
+  const left = (height - inspector) / (placed.rows - 1) - caption;
   return sized({ x: free.x, y: Math.min(free.y, left) }, shape, ratio);
 }
 
@@ -71,29 +74,45 @@ function range(from, to) {
   return Array.from({ length: to - from + 1 }, (_, i) => from + i);
 }
 
-/** Keeps `panels` fitted within `stage`: call `layOut()` after anything that changes how much fits. */
+/** Keeps `panels` fitted within `stage`. */
 export function createLayout({ stage, field, panels }, places) {
-  let shape = null;
+  let sizes = "";
 
-  function layOut() {
-    if (!shape || stage.clientWidth === 0) return;
-    const style = getComputedStyle(stage);
-    const number = (name) => parseFloat(style.getPropertyValue(name));
-    const rem = parseFloat(getComputedStyle(document.documentElement).fontSize);
-    const gap = parseFloat(getComputedStyle(panels).columnGap);
-    const fitted = fit({
-      area: number("--stacked") ? { width: stage.clientWidth, height: Infinity } : beside(style, number("--charts") * rem),
-      shape, places: places(), forced: number("--columns"), gap, caption: number("--caption") * rem, ratio: devicePixelRatio, rem,
-    });
-    apply(fitted, gap, Math.max(fitted.width, number("--stacked") ? 0 : CAPTION_WIDTH * rem));
+  function layOut(shape) {
+    // Legends take more lines beside fewer columns: they are counted at their highest.
+    stage.style.removeProperty("--field-width");
+    let others = -1;
+    for (let used = usedByOthers(); used > others; used = usedByOthers()) {
+      others = used;
+      fitBeside(others, shape);
+    }
   }
 
-  // What legends and charts leave.
-  function beside(style, chartsWidth) {
+  function fitBeside(others, shape) {
+    const style = getComputedStyle(stage);
+    const number = (name) => parseFloat(style.getPropertyValue(name));
+    const isStacked = number("--stacked") === 1;
+    const rem = parseFloat(getComputedStyle(document.documentElement).fontSize);
+    const gap = parseFloat(getComputedStyle(panels).columnGap);
+    const width = stage.clientWidth - (isStacked ? 0 : number("--charts") * rem + parseFloat(style.columnGap));
+    const height = isStacked ? Infinity : stage.clientHeight - others;
+    const caption = number("--caption") * rem;
+    const fitted = (height, forced) => fit({
+      area: { width, height }, shape, places: places(), forced, gap, caption, ratio: devicePixelRatio, rem,
+    });
+    let best = fitted(height, number("--columns"));
+    const isCramped = best.width < LEAST * rem;
+    if (isCramped) best = fitted(Infinity, number("--columns"));
+    field.classList.toggle("is-cramped", isCramped);
+    const share = (width + gap) / best.columns - gap;
+    apply(best, gap, isStacked ? share : Math.max(best.width, CAPTION_WIDTH * rem));
+  }
+
+  // What legends leave is for panels.
+  function usedByOthers() {
     const rowGap = parseFloat(getComputedStyle(field).rowGap);
     const others = [...field.children].filter((child) => child !== panels && child.offsetHeight > 1);
-    const used = others.reduce((sum, child) => sum + child.offsetHeight + rowGap, 0);
-    return { width: stage.clientWidth - chartsWidth - parseFloat(style.columnGap), height: stage.clientHeight - used };
+    return others.reduce((sum, child) => sum + child.offsetHeight + rowGap, 0);
   }
 
   function apply({ width, height, columns, span, isCrisp, isRegular }, gap, column) {
@@ -107,9 +126,14 @@ export function createLayout({ stage, field, panels }, places) {
     panels.classList.toggle("is-regular", isRegular);
   }
 
-  new ResizeObserver(layOut).observe(stage);
+  const sizeOf = () => [stage.clientWidth, stage.clientHeight, devicePixelRatio].join();
+
   return {
-    layOut,
-    shape(next) { shape = next; layOut(); },
+    /** Fits panels of this shape, if they, legends (`isChanged`) or what there is room for have changed. */
+    draw(shape, isChanged) {
+      if (stage.clientWidth === 0 || (!isChanged && sizeOf() === sizes)) return;
+      layOut(shape);
+      sizes = sizeOf();
+    },
   };
 }

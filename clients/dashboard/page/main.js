@@ -9,6 +9,7 @@ import { createLayout } from "/layout.js";
 import { createLegend } from "/legend.js";
 import * as colours from "/palette.js";
 import { createPanels } from "/panels.js";
+import { createPointer } from "/pointer.js";
 import { connect } from "/socket.js";
 import { askOf, createView, themeOf } from "/view.js";
 import { shapeOf } from "/wire.js";
@@ -26,8 +27,9 @@ const { view, act } = createView({
   asks: () => link?.hurry(), changed: redraw, worlds: () => picture?.info?.n_worlds,
 });
 const inspector = createInspector(byId("announce-cell"));
-const panels = createPanels(byId("panels"), { point, inspector: inspector.root });
-const charts = createCharts(byId("charts"), { hover: act.hover, seek: act.seek });
+const pointer = createPointer(redraw);
+const panels = createPanels(byId("panels"), { pointer, byKey, inspector: inspector.root });
+const charts = createCharts(byId("charts"), { pointer, seek: act.seek });
 const legend = createLegend(byId("legend"), byId("ramps"));
 const facts = createFacts();
 const controls = createControls({ view, act }, () => picture);
@@ -47,6 +49,7 @@ const link = connect({
 
 function show(next) {
   picture = next;
+  facts.recovered();
   // A server that began anew counts from the start again: nothing is left of the entry looked at.
   if (view.at != null && next.kept && view.at > next.kept.last) view.at = null;
   // So does a link to a world that this server has not.
@@ -69,11 +72,12 @@ function draw() {
   controls.draw(picture);
   if (!picture.info || !picture.shown) return;
   const isRebuilt = panels.build(picture);
-  if (isRebuilt) act.within(shapeOf(picture));
-  if (legend.draw(picture, palette) || isRebuilt) layout.shape(shapeOf(picture));
-  panels.draw(picture, view, palette);
+  const isRelabelled = legend.draw(picture, palette);
+  layout.draw(shapeOf(picture), isRebuilt || isRelabelled);
+  const cell = panels.cell(picture);
+  panels.draw(picture, cell, palette);
   charts.draw(picture, view, palette);
-  inspector.draw(picture, view, palette);
+  inspector.draw(picture, cell, palette);
   describe(isRebuilt);
 }
 
@@ -86,16 +90,20 @@ function describe(isDue) {
   document.title = titleOf(picture);
 }
 
-// What the visitor points at is drawn at once, at most once a frame, without a new picture.
+// What lies under the pointer and what has changed its size are drawn at once, at most once a frame, without a
+// new picture.
 function redraw() {
   if (isRedrawDue || !picture) return;
   isRedrawDue = true;
   requestAnimationFrame(() => { isRedrawDue = false; draw(); });
 }
 
-function point(cell, isByKey = false) {
-  act.cell(cell);
-  if (isByKey && picture?.shown) inspector.say(picture, cell);
+function byKey(cell) {
+  redraw();
+  if (cell && picture?.shown) inspector.say(picture, cell);
 }
 
 addEventListener("resize", redraw);
+// Whatever grows or shrinks moves others: either of these two tells.
+const sizes = new ResizeObserver(redraw);
+for (const element of [document.body, byId("stage")]) sizes.observe(element);

@@ -12,21 +12,27 @@ const OBSERVED = [
 ];
 const ENTROPY = { id: "entropy", kind: "entropy", title: "entropy", hint: "of the belief" };
 
-/** The panels in `parent`; `point(cell)` is called with the cell that is pointed at, or null. */
-export function createPanels(parent, { point, inspector }) {
+/** The panels in `parent`, and the inspector among them; `byKey(cell)` hears of cells that keys go to, or null. */
+export function createPanels(parent, { pointer, byKey, inspector }) {
   let built = { key: "", world: null, beliefs: [], panels: [] };
+  // The cell that keys went to; once the pointer moves over a panel, it counts again.
+  let keyed = null;
+  const hold = (cell) => { keyed = cell; byKey(cell); };
+  const release = () => { keyed = null; };
 
   /** Builds panels anew when their number, names or shape change. Tells whether it did. */
   function build(picture) {
     const beliefs = namesOf(picture);
     const key = JSON.stringify([shapeOf(picture), beliefs, stateNames(picture).length]);
     if (key === built.key) return false;
-    const panels = OBSERVED.map((panel) => element(panel, picture, point));
-    const believed = beliefs.map((name, state) => element(
-      { id: `belief-${state}`, kind: "belief", title: "belief", name, state, hint: `p(${name})` }, picture, point));
-    if (beliefs.length > 0) believed.push(element(ENTROPY, picture, point));
+    const add = (panel) => element(panel, picture, { hold, release });
+    const panels = OBSERVED.map(add);
+    const believed = beliefs.map((name, state) => add(
+      { id: `belief-${state}`, kind: "belief", title: "belief", name, state, hint: `p(${name})` }));
+    if (beliefs.length > 0) believed.push(add(ENTROPY));
     const row = believed.map((panel) => panel.figure);
-    parent.replaceChildren(...panels.map((panel) => panel.figure), inspector, ...(row.length ? row : [noBelief()]));
+    parent.replaceChildren(...panels.map((panel) => panel.figure), inspector, ...(row.length ? row : [noBelief(picture)]));
+    release();
     built = { key, world: picture.world, beliefs, panels: [...panels, ...believed] };
     return true;
   }
@@ -40,18 +46,24 @@ export function createPanels(parent, { point, inspector }) {
 
   return {
     build,
-    /** For the layout: panels, lines of the inspector, columns that hold all beliefs in one row. */
+    /** For the layout: panels, lines of the inspector, whether a note stands for beliefs, columns that hold those in one row. */
     places: () => ({
       panels: built.panels.length,
       lines: OBSERVED.length + (built.beliefs.length && built.beliefs.length + 1),
+      isBare: built.beliefs.length === 0,
       regular: Math.max(built.beliefs.length + 1, OBSERVED.length + 1),
     }),
-    draw: (picture, view, palette) => built.panels.forEach((panel) => paint(panel, picture, view, palette)),
+    /** The cell that keys or the pointer are on, { row, col }; null: none. */
+    cell(picture) {
+      const pointed = keyed ? null : pointer.on(built.panels.map((panel) => panel.grid));
+      return pointed ? cellAt(pointed, shapeOf(picture)) : keyed;
+    },
+    draw: (picture, cell, palette) => built.panels.forEach((panel) => paint(panel, picture, cell, palette)),
     describe: (picture) => built.panels.forEach((panel) => describe(panel, picture)),
   };
 }
 
-function element(panel, picture, point) {
+function element(panel, picture, { hold, release }) {
   const { height, width } = shapeOf(picture);
   const figure = make("figure", "panel", { panel: panel.id });
   const caption = make("figcaption");
@@ -70,12 +82,13 @@ function element(panel, picture, point) {
   const absent = make("p", "absent");
   grid.append(cells, marks, absent);
   figure.append(caption, grid);
-  listen(grid, { height, width }, point);
+  listen(grid, { height, width }, hold);
+  for (const type of ["pointermove", "pointerdown"]) grid.addEventListener(type, release);
   const context = cells.getContext("2d");
-  return { ...panel, figure, caption, cells, marks, absent, context, image: context.createImageData(width, height) };
+  return { ...panel, figure, caption, grid, cells, marks, absent, context, image: context.createImageData(width, height) };
 }
 
-function paint(panel, picture, view, palette) {
+function paint(panel, picture, cell, palette) {
   const values = valuesOf(panel, picture);
   const [reason, flag] = values ? [""] : absence(panel, picture);
   if (panel.absent.dataset.reason !== reason) {
@@ -91,7 +104,7 @@ function paint(panel, picture, view, palette) {
     fill(pixels, values, panel, picture, palette);
     panel.context.putImageData(panel.image, 0, 0);
   }
-  drawMarks(panel.marks, picture, { cell: view.cell, hasPath: panel.kind === "frame" && Boolean(values) });
+  drawMarks(panel.marks, picture, { cell, hasPath: panel.kind === "frame" && Boolean(values) });
 }
 
 function fill(pixels, values, { kind }, { arrays }, palette) {
@@ -123,8 +136,10 @@ function absence({ kind }, picture) {
   return ["Not known for this step."];
 }
 
-function noBelief() {
-  return make("p", "absent no-belief", {}, "No agent publishes its belief on this world.");
+function noBelief({ source }) {
+  const isRecording = source === "recording";
+  const reason = isRecording ? "A recording holds no beliefs." : "No agent publishes its belief on this world.";
+  return make("p", "absent no-belief", {}, reason);
 }
 
 function describe(panel, picture) {
@@ -132,21 +147,19 @@ function describe(panel, picture) {
   panel.cells.setAttribute("aria-label", sentence);
 }
 
-function listen(grid, shape, point) {
-  const at = (event) => {
-    const box = grid.getBoundingClientRect();
-    point(inside(shape, {
-      row: Math.floor(((event.clientY - box.top) / box.height) * shape.height),
-      col: Math.floor(((event.clientX - box.left) / box.width) * shape.width),
-    }));
-  };
+function cellAt({ element: grid, clientX, clientY }, shape) {
+  const box = grid.getBoundingClientRect();
+  return inside(shape, {
+    row: Math.floor(((clientY - box.top) / box.height) * shape.height),
+    col: Math.floor(((clientX - box.left) / box.width) * shape.width),
+  });
+}
+
+function listen(grid, shape, hold) {
   let held = { row: shape.height >> 1, col: shape.width >> 1 };
   const steps = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
-  grid.addEventListener("pointermove", at);
-  grid.addEventListener("pointerdown", at);
-  grid.addEventListener("pointerleave", () => point(null));
-  grid.addEventListener("focus", () => grid.matches(":focus-visible") && point(held, true));
-  grid.addEventListener("blur", () => point(null));
+  grid.addEventListener("focus", () => grid.matches(":focus-visible") && hold(held));
+  grid.addEventListener("blur", () => hold(null));
   grid.addEventListener("keydown", (event) => {
     const step = steps[event.key];
     if (!step) return;
@@ -154,7 +167,7 @@ function listen(grid, shape, point) {
     event.stopPropagation();
     const size = event.shiftKey ? 10 : 1;
     held = inside(shape, { row: held.row + step[0] * size, col: held.col + step[1] * size });
-    point(held, true);
+    hold(held);
   });
 }
 

@@ -4,66 +4,84 @@ import { prepare } from "/elements.js";
 import { NEVER } from "/palette.js";
 import { extent, tickText, ticks } from "/scale.js";
 
-// Room left of the plots for the ticks' text, in the canvas's font size.
+// Sizes in the canvas's font size. Room left of the plots for the ticks' text, and what is kept free beside a text.
 const LEFT = 3.1;
+const SPACE = 0.5;
 // Agents are sampled now and then: what lies between two samples is drawn unless it is so many times as
 // long as is usual between them.
 const LONG = 4;
 // Half of a tick's text stands out above and below its line.
 const MARGIN = 0.6;
-// Pixels between two ticks, so that their texts stay apart.
-const TICK_PIXELS = 34;
-const STEP_TICK_PIXELS = 74;
+// Least distance of two ticks, upwards and across, so that their texts stay apart.
+const TICK = 2.7;
+const STEP_TICK = 5.8;
+// Height of the text below the strip.
+const STEPS = 1.7;
 
-/** A line chart; `plot` null draws nothing. */
-export function drawLine(canvas, plot) {
-  const frame = begin(canvas);
-  if (!frame || !plot) return;
-  const { values, axis } = plot;
-  const { low, high } = extent(values);
-  const base = low > 0.6 * high ? low : Math.min(0, low);
-  const count = Math.max(2, Math.floor(frame.height / TICK_PIXELS));
-  const { at, step } = ticks(base, high > base ? high : base + 1, count);
-  const y = vertical(frame, at[0], at.at(-1));
-  drawRows(frame, at, y, (value) => tickText(value, step));
-  drawColumns(frame, axis);
-  const runs = runsOf(values, (value) => !Number.isNaN(value), axis.bridge).map((run) =>
-    run.map((bin) => [x(frame, axis.binShare(bin)), y(values[bin])]));
-  // An area stands for an amount, so only where the axis begins at zero.
-  if (at[0] === 0) drawArea(frame, runs);
-  drawRuns(frame, runs);
-  drawCursor(frame, axis, plot.cursor, values, y);
-}
-
-/** The strip of objectives with the axis of steps below; `plot` null draws nothing. */
-export function drawStrip(canvas, plot) {
-  const frame = begin(canvas);
-  if (!frame || !plot) return;
-  const { values, axis, colors } = plot;
-  const height = frame.height - frame.em * 1.7;
-  drawColumns(frame, axis, height);
-  for (const { from, to, value } of blocksOf(values, axis.bridge)) {
-    if (value >= colors.length) continue;
-    const left = x(frame, from / values.length);
-    frame.context.fillStyle = colors[value];
-    frame.context.fillRect(left, 0, Math.max(1, x(frame, to / values.length) - left), height);
-  }
-  drawSteps(frame, axis);
-  drawCursor({ ...frame, height }, axis, plot.cursor);
-}
-
-function begin(canvas) {
+/** A chart's canvas, cleared, with ticks upwards for `values`, if there are any, at least so much apart; null while hidden. */
+export function frameOf(canvas, values, apart = 0) {
   const drawn = prepare(canvas);
   if (!drawn) return null;
   const style = getComputedStyle(canvas);
   const em = parseFloat(style.fontSize);
   const color = (name) => style.getPropertyValue(name);
   const { context, ratio } = drawn;
-  const frame = { context, width: drawn.width / ratio, height: drawn.height / ratio, em, left: LEFT * em, color };
-  canvas.dataset.left = frame.left;
+  const frame = { context, width: drawn.width / ratio, height: drawn.height / ratio, em, color };
   context.scale(ratio, ratio);
   context.font = `${style.fontWeight} ${style.fontSize} ${style.fontFamily}`;
-  return frame;
+  return values ? { ...frame, rows: rowsOf(frame, values, apart) } : frame;
+}
+
+/** Room left of the plots of charts with a common axis below, in CSS pixels; `word` is what that axis counts. */
+export function roomFor(frames, word) {
+  return Math.max(0, ...frames.filter(Boolean).map(({ context, em, rows }) => {
+    const width = (text) => context.measureText(text).width;
+    const widest = Math.max(...(rows?.map(({ label }) => width(label)) ?? [0]));
+    // The first step's text may begin before the plot.
+    return Math.max(LEFT * em, widest + 1.2 * SPACE * em, width(word) + (SPACE + 1) * em);
+  }));
+}
+
+/** A line chart of values of each bin. */
+export function drawLine(frame, values, { axis, left, hover, looked }) {
+  if (!frame) return;
+  const plot = { ...frame, left };
+  const { rows } = frame;
+  const y = vertical(plot, rows[0].value, rows.at(-1).value);
+  drawRows(plot, y);
+  drawColumns(plot, axis);
+  const runs = runsOf(values, (value) => !Number.isNaN(value), axis.bridge).map((run) =>
+    run.map((bin) => [x(plot, axis.binShare(bin)), y(values[bin])]));
+  // An area stands for an amount, so only where the axis begins at zero.
+  if (rows[0].value === 0) drawArea(plot, runs);
+  drawRuns(plot, runs);
+  for (const serial of [looked, hover]) drawCursor(plot, axis, serial, values, y);
+}
+
+/** The strip of objectives with the axis of steps below. */
+export function drawStrip(frame, values, { axis, left, hover, looked }, colors) {
+  if (!frame) return;
+  const plot = { ...frame, left };
+  const height = frame.height - frame.em * STEPS;
+  if (values.length > 0) drawColumns(plot, axis, height);
+  for (const { from, to, value } of blocksOf(values, axis.bridge)) {
+    if (value >= colors.length) continue;
+    const start = x(plot, from / values.length);
+    frame.context.fillStyle = colors[value];
+    frame.context.fillRect(start, 0, Math.max(1, x(plot, to / values.length) - start), height);
+  }
+  drawSteps(plot, axis);
+  for (const serial of [looked, hover]) drawCursor({ ...plot, height }, axis, serial);
+}
+
+// Ticks upwards that cover the values.
+function rowsOf({ height, em }, values, apart) {
+  const { low, high } = extent(values);
+  const base = low > 0.6 * high ? low : Math.min(0, low);
+  const top = high > base ? high : base + 1;
+  const count = Math.max(1, Math.min(Math.floor(height / (TICK * em)), (top - base) / apart));
+  const { at, step } = ticks(base, top, count);
+  return at.map((value) => ({ value, label: tickText(value, step) }));
 }
 
 function x({ left, width }, share) {
@@ -75,19 +93,19 @@ function vertical({ height, em }, low, high) {
   return (value) => height - margin - ((value - low) / (high - low)) * (height - 2 * margin);
 }
 
-function drawRows({ context, width, left, em, color }, at, y, label) {
+function drawRows({ context, width, left, em, color, rows }, y) {
   context.textAlign = "right";
   context.textBaseline = "middle";
-  for (const value of at) {
+  for (const { value, label } of rows) {
     context.fillStyle = color("--grid");
     context.fillRect(left, Math.round(y(value)), width - left, 1);
     context.fillStyle = color("--muted");
-    context.fillText(label(value), left - 0.5 * em, y(value));
+    context.fillText(label, left - SPACE * em, y(value));
   }
 }
 
-function stepsOf({ width, left }, axis) {
-  const count = Math.max(2, Math.floor((width - left) / STEP_TICK_PIXELS));
+function stepsOf({ width, left, em }, axis) {
+  const count = Math.max(2, Math.floor((width - left) / (STEP_TICK * em)));
   const [low, high] = [axis.number(axis.first), axis.number(axis.last)];
   const { at, step } = ticks(low, Math.max(high, low + 1), count);
   const whole = step < 1 ? at.filter(Number.isInteger) : at;
@@ -108,12 +126,15 @@ function drawSteps(frame, axis) {
   context.textBaseline = "bottom";
   context.textAlign = "left";
   context.fillText(axis.word, 0, height);
-  context.textAlign = "center";
+  let free = 0;
   for (const value of at) {
     const label = tickText(value, Math.max(step, 1));
-    const half = context.measureText(label).width / 2;
+    const wide = context.measureText(label).width;
     const middle = x(frame, axis.share(axis.serial(value)));
-    context.fillText(label, Math.min(Math.max(middle, frame.left + half - em), width - half), height);
+    const from = Math.min(Math.max(middle - wide / 2, frame.left - em), width - wide);
+    if (from < free) continue;
+    context.fillText(label, from, height);
+    free = from + wide + SPACE * em;
   }
 }
 
@@ -129,11 +150,10 @@ function runsOf(values, isKnown, bridge) {
   return runs;
 }
 
-// The median: 1 where all bins are known, so that there a few missing ones are seen as a gap.
+// The median.
 function usualGap(known) {
   const gaps = known.slice(1).map((bin, i) => bin - known[i]).sort((a, b) => a - b);
-  const usual = gaps[gaps.length >> 1] ?? 1;
-  return usual > 1 ? usual : 1 / LONG;
+  return gaps[gaps.length >> 1] ?? 1;
 }
 
 /** Blocks of one objective: each lasts until the run's next sample of another. */

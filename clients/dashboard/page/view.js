@@ -1,5 +1,5 @@
-// What the visitor wants to see: world, entry, theme, pointed-at cell. The address's hash keeps world
-// and theme, so that a link or a reload brings them back.
+// What the visitor wants to see: world, entry, theme. The address's hash keeps world and theme, so that a
+// link or a reload brings them back.
 
 const THEMES = ["auto", "light", "dark"];
 // Worlds that an address may name while nobody knows how many there are, and that can be selected at all.
@@ -16,22 +16,14 @@ export function createView({ asks, changed, worlds }) {
     ...read(),
     /** Serial of the entry to look at; null: the newest. */
     at: null,
-    /** The cell pointed at, { row, col }; null: none. */
-    cell: null,
-    /** Serial pointed at in a chart; null: none. */
-    hover: null,
     /** For the next ask only: a recording's speed, and whether it plays. */
     player: { speed: null, playing: null },
   };
 
   const act = {
-    seek(serial) { view.at = serial; view.hover = null; asks(); changed(); },
+    seek(serial) { view.at = serial; asks(); changed(); },
     world(world) { if (world !== view.world) { view.world = world; view.at = null; writeHash(view); asks(); } },
     theme(theme) { view.theme = theme; writeHash(view); applyTheme(view); changed(); },
-    cell(cell) { view.cell = cell; changed(); },
-    /** Another grid may lack the cell pointed at. */
-    within({ height, width }) { if (view.cell?.row >= height || view.cell?.col >= width) view.cell = null; },
-    hover(serial) { if (serial !== view.hover) { view.hover = serial; changed(); } },
     player(wish) { Object.assign(view.player, wish); asks(); },
   };
 

@@ -15,7 +15,7 @@ from looking import Look
 from running import PATIENCE, Dashboard, Program, Programs
 
 #: A whole test, seconds; a busy machine is no bug.
-DEADLINE = 400
+DEADLINE = 900
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -25,6 +25,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--programs", type=Path, default=ROOT / "target/debug")
     parser.addoption("--chromium", default=shutil.which("chromium"))
     parser.addoption("--screenshots", type=Path, default=ROOT / "target/screenshots")
+    parser.addoption("--throttle", type=float, default=1.0, help="how many times slower pages run")
 
 
 @pytest.fixture(autouse=True)
@@ -63,11 +64,12 @@ def programs(request: pytest.FixtureRequest) -> Iterator[Programs]:
 
 
 @pytest.fixture
-def open_page(chromium: Browser) -> Iterator[Callable[..., Look]]:
+def open_page(request: pytest.FixtureRequest, chromium: Browser) -> Iterator[Callable[..., Look]]:
     """Opens a dashboard's page: `open_page(dashboard, hash="#world=2", color_scheme="dark")`.
 
     At the end of the test the page must not have complained, but about what the test allowed.
     """
+    throttle = request.config.getoption("--throttle")
     looks: list[Look] = []
     contexts: list[BrowserContext] = []
 
@@ -77,6 +79,7 @@ def open_page(chromium: Browser) -> Iterator[Callable[..., Look]]:
         contexts.append(context)
         look = Look(context.new_page())
         looks.append(look)
+        look.slow_down(throttle)
         look.page.goto(dashboard.url + hash)
         return look
 

@@ -58,6 +58,11 @@ class Look:
         self.page.route_web_socket(re.compile("/socket$"), route)
         self.page.reload()
 
+    def slow_down(self, rate: float) -> None:
+        """Makes the page's scripts so many times slower."""
+        client = self.page.context.new_cdp_session(self.page)
+        client.send("Emulation.setCPUThrottlingRate", {"rate": rate})
+
     def at(self, testid: str) -> Locator:
         """The element of a test hook."""
         return self.page.get_by_test_id(testid)
@@ -110,9 +115,19 @@ class Look:
         return self.page.evaluate("""JSON.stringify(window.emberwatch?.picture, (name, value) =>
             name === "path" || ArrayBuffer.isView(value) ? value.length : value)""")
 
+    def wait_for_pictures(self, count: int = 2) -> None:
+        """Waits until so many further pictures were drawn."""
+        first = self.drawn()
+        self.eventually(lambda: self.drawn() >= first + count, f"{count} more pictures")
+
     def wait_for_steps(self, count: int = 3) -> None:
-        """Waits until so many further steps were shown."""
-        first = self.picture(".shown.step") or 0
-        self.eventually(
-            lambda: (self.picture(".shown.step") or 0) >= first + count, f"{count} more steps"
-        )
+        """Waits until so many further steps were shown. Agents may begin at the first again."""
+        first = float("inf")
+
+        def are_shown() -> bool:
+            nonlocal first
+            step = self.picture(".shown.step") or 0
+            first = min(first, step)
+            return step >= first + count
+
+        self.eventually(are_shown, f"{count} more steps")

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 #: How long anything may take that should take much less, seconds.
-PATIENCE = 90.0
+PATIENCE = 180.0
 
 _numbers = itertools.count()
 

@@ -1,0 +1,162 @@
+"""A pointer that rests is told what lies under it now, whatever changes there."""
+
+import re
+
+import pytest
+
+PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True}
+
+
+def is_at(look, cell: str) -> bool:
+    """Whether the inspector is about this cell, such as "row 1, col 2"."""
+    return look.page.get_by_label("one cell in numbers").locator("h3 b").text_content() == cell
+
+
+def is_at_robot(look) -> bool:
+    """Whether it is about the robot's cell, as nothing is pointed at."""
+    hint = look.page.get_by_label("one cell in numbers").locator("h3 .hint")
+    return hint.text_content() == "robot"
+
+
+def middle(look, panel: str, row: int, col: int) -> tuple[float, float]:
+    """Where the middle of a cell is in the window."""
+    box = look.at(panel).bounding_box()
+    height, width = look.page.evaluate(
+        "[emberwatch.picture.shown.height, emberwatch.picture.shown.width]"
+    )
+    return (
+        box["x"] + (col + 0.5) * box["width"] / width,
+        box["y"] + (row + 0.5) * box["height"] / height,
+    )
+
+
+def told(look, chart: str) -> str:
+    """Which step a chart tells the value of, such as "at k 12"."""
+    return look.page.locator(f".chart-{chart} .at").text_content()
+
+
+@pytest.fixture
+def resting(programs, open_page):
+    """A page of 24 x 32 cells before an agent acts: nothing changes."""
+    server = programs.server(publish_truth=True)
+    look = open_page(programs.dashboard(server.instance))
+    look.eventually(lambda: look.has("truth"), "the world before its first step")
+    look.eventually(lambda: look.text("holder") == "nobody", "the server's facts")
+    look.wait_for_pictures()
+    return server, look
+
+
+@pytest.mark.parametrize("chart", ["reward", "target", "log-loss", "objective"])
+def test_values_come_under_the_pointer(resting, programs, chart):
+    server, look = resting
+    canvas = look.at(f"chart-{chart}")
+    canvas.hover(position={"x": canvas.bounding_box()["width"] - 1, "y": 20})
+    look.eventually(lambda: told(look, chart) == "at k 0", "all that there is")
+    assert programs.agent(server.instance, steps=40).wait() == 0
+    # No step is lost: 40 are fewer than a reader's buffer holds.
+    look.eventually(lambda: told(look, chart) == "at k 40", "the step that came there")
+    value = look.page.locator(".chart-target output")
+    look.eventually(
+        lambda: value.text_content() == str(look.picture(".shown.n_target_cells")), "its value"
+    )
+
+
+def test_a_cell_that_moves_under_the_pointer_is_told(resting):
+    _, look = resting
+    look.page.mouse.move(*middle(look, "panel-truth", 3, 4))
+    look.eventually(lambda: is_at(look, "row 3, col 4"), "the cell pointed at")
+    look.page.mouse.move(*middle(look, "panel-truth", 23, 31))
+    look.eventually(lambda: is_at(look, "row 23, col 31"), "the last cell")
+    look.page.set_viewport_size({"width": 1600, "height": 1100})
+    look.eventually(lambda: not is_at(look, "row 23, col 31"), "panels grew: another cell")
+    assert not is_at_robot(look)
+    look.page.set_viewport_size({"width": 1280, "height": 720})
+    look.eventually(lambda: is_at(look, "row 23, col 31"), "the last cell again")
+
+
+def test_a_page_that_scrolls_moves_under_the_pointer(resting):
+    _, look = resting
+    look.page.set_viewport_size({"width": 800, "height": 600})
+    look.wait_for_pictures()
+    x, y = middle(look, "panel-truth", 3, 4)
+    look.page.mouse.move(x, y)
+    look.eventually(lambda: is_at(look, "row 3, col 4"), "the cell pointed at")
+    by = middle(look, "panel-truth", 5, 4)[1] - y
+    look.page.evaluate(f"scrollBy(0, {by})")
+    look.eventually(lambda: is_at(look, "row 5, col 4"), "two rows further down")
+    look.page.evaluate("scrollTo(0, document.documentElement.scrollHeight)")
+    look.eventually(lambda: is_at_robot(look), "no cell is there")
+
+
+def test_a_pointer_that_leaves_points_at_nothing(resting):
+    _, look = resting
+    look.page.mouse.move(*middle(look, "panel-seen", 3, 4))
+    look.eventually(lambda: is_at(look, "row 3, col 4"), "the cell pointed at")
+    look.page.mouse.move(2, 2)
+    look.eventually(lambda: is_at_robot(look), "it left the panel")
+    look.at("chart-target").hover()
+    look.eventually(lambda: told(look, "target") == "at k 0", "a value")
+    look.page.evaluate(
+        "document.documentElement.dispatchEvent("
+        "new PointerEvent('pointerleave', { isPrimary: true }))"
+    )
+    look.eventually(lambda: told(look, "target") == "", "it left the window")
+
+
+def test_a_panel_that_goes_is_pointed_at_no_more(programs, open_page):
+    server = programs.server(worlds=2, seed=20)
+    look = open_page(programs.dashboard(server.instance))
+    assert programs.agent(server.instance, steps=5).wait() == 0
+    look.eventually(lambda: look.picture(".agent.is_live") is False, "its last belief")
+    look.page.mouse.move(*middle(look, "panel-belief-1", 3, 4))
+    look.eventually(lambda: is_at(look, "row 3, col 4"), "the cell pointed at")
+    look.page.evaluate("location.hash = '#world=1'")
+    look.eventually(lambda: look.picture(".shown.seed") == "21", "a world without beliefs")
+    look.eventually(lambda: is_at_robot(look), "no panel is there")
+
+
+def test_keys_and_the_pointer_take_turns(resting):
+    _, look = resting
+    look.page.mouse.move(*middle(look, "panel-truth", 3, 4))
+    look.page.get_by_label("cells of seen so far").focus()
+    look.page.keyboard.press("ArrowDown")
+    look.eventually(lambda: is_at(look, "row 13, col 16"), "where the key went")
+    look.page.mouse.move(*middle(look, "panel-truth", 6, 7))
+    look.eventually(lambda: is_at(look, "row 6, col 7"), "where the pointer went then")
+
+
+def test_a_finger_points_while_it_touches(programs, open_page):
+    server = programs.server(publish_truth=True)
+    look = open_page(programs.dashboard(server.instance), **PHONE)
+    assert programs.agent(server.instance, steps=40).wait() == 0
+    look.eventually(lambda: look.picture(".agent.is_live") is False, "the last picture")
+    client = look.page.context.new_cdp_session(look.page)
+
+    def touch(kind: str, *points: tuple[float, float]) -> None:
+        places = [{"x": x, "y": y} for x, y in points]
+        client.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": places})
+
+    look.at("panel-truth").scroll_into_view_if_needed()
+    touch("touchStart", middle(look, "panel-truth", 3, 4))
+    look.eventually(lambda: is_at(look, "row 3, col 4"), "the cell touched")
+    touch("touchEnd")
+    look.eventually(lambda: is_at_robot(look), "the finger was lifted")
+    look.at("chart-reward").scroll_into_view_if_needed()
+    box = look.at("chart-reward").bounding_box()
+    touch("touchStart", (box["x"] + box["width"] / 2, box["y"] + 20))
+    look.eventually(lambda: re.fullmatch(r"at k \d+", told(look, "reward")), "the step touched")
+    step = told(look, "reward").removeprefix("at k ")
+    touch("touchEnd")
+    look.eventually(lambda: told(look, "reward") == "", "the finger was lifted")
+    look.eventually(lambda: look.text("step") == step, "the tap went to that step")
+
+
+def test_a_pointer_does_not_hide_that_the_dashboard_is_gone(watched):
+    look = watched.look
+    look.allowed.append("WebSocket connection to .* failed")
+    watched.dashboard.kill()
+    look.eventually(lambda: "dashboard gone" in look.text("state"), "gone")
+    look.page.mouse.move(*middle(look, "panel-truth", 3, 4))
+    look.eventually(lambda: is_at(look, "row 3, col 4"), "the cell pointed at")
+    assert "dashboard gone" in look.text("state")
+    assert look.at("note").is_visible()
