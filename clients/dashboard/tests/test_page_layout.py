@@ -1,0 +1,222 @@
+"""Nothing is clipped, nothing covers anything else, at all usual sizes of a window."""
+
+import pytest
+
+from running import eventually
+
+SIZES = [
+    (360, 740),
+    (390, 844),
+    (768, 1024),
+    (1024, 768),
+    (1056, 640),
+    (1200, 800),
+    (1280, 720),
+    (1600, 1000),
+    (1920, 1080),
+    (2560, 1440),
+]
+
+# Keeps where each canvas's texts are, in its own pixels, since it was last cleared.
+RECORD_TEXTS = """(() => {
+  const { prototype } = CanvasRenderingContext2D;
+  const { clearRect, fillText } = prototype;
+  prototype.clearRect = function (...box) {
+    this.canvas.texts = [];
+    clearRect.apply(this, box);
+  };
+  prototype.fillText = function (text, x, y) {
+    const size = this.measureText(text);
+    const { a, d, e, f } = this.getTransform();
+    this.canvas.texts.push({
+      name: text,
+      left: a * (x - size.actualBoundingBoxLeft) + e,
+      right: a * (x + size.actualBoundingBoxRight) + e,
+      top: d * (y - size.actualBoundingBoxAscent) + f,
+      bottom: d * (y + size.actualBoundingBoxDescent) + f,
+    });
+    fillText.call(this, text, x, y);
+  };
+})()"""
+
+# What is wrong with the page as it is, in sentences.
+PROBLEMS = """() => {
+  const problems = [];
+  const all = (selector) => [...document.querySelectorAll(selector)]
+    .filter((element) => element.getClientRects().length > 0);
+  const nameOf = (element) => element.dataset.testid ?? (element.id || element.className)
+    + (element.dataset.panel ?? "");
+  const within = (inner, outer, by) => inner.left >= outer.left - by && inner.top >= outer.top - by
+    && inner.right <= outer.right + by && inner.bottom <= outer.bottom + by;
+  const meet = (one, other, by) => one.left < other.right - by && other.left < one.right - by
+    && one.top < other.bottom - by && other.top < one.bottom - by;
+  const pairs = (boxes, by, where) => boxes.forEach((one, i) => boxes.slice(i + 1)
+    .filter((other) => meet(one, other, by))
+    .forEach((other) => problems.push(`${where}: ${one.name} and ${other.name} overlap`)));
+
+  for (const canvas of all(".plot canvas")) {
+    const frame = { left: 0, top: 0, right: canvas.width, bottom: canvas.height };
+    for (const text of canvas.texts) {
+      if (!within(text, frame, 0.5)) problems.push(`${nameOf(canvas)}: ${text.name} is clipped`);
+    }
+    pairs(canvas.texts, 0, nameOf(canvas));
+  }
+
+  const parts = all(".panel, .inspector, .no-belief, .chart, .legend, .ramps").map((element) => {
+    const { left, top, right, bottom } = element.getBoundingClientRect();
+    const filled = Math.max(bottom, top + element.scrollHeight);
+    return { name: nameOf(element), left, top, right, bottom: filled };
+  });
+  pairs(parts, 1, "stage");
+  const isFixed = getComputedStyle(document.querySelector(".transport")).position === "static";
+  if (isFixed) {
+    const stage = document.querySelector(".stage").getBoundingClientRect();
+    const scrolls = getComputedStyle(document.querySelector(".field")).overflowY === "auto";
+    const out = scrolls ? [] : parts.filter((part) => !within(part, stage, 1));
+    out.forEach(({ name }) => problems.push(`${name} is outside the stage`));
+    if (document.documentElement.scrollHeight > innerHeight) problems.push("the page scrolls");
+  }
+  if (document.documentElement.scrollWidth > innerWidth) problems.push("the page is too wide");
+
+  // Texts within all that clips them; where one ends in an ellipsis its start is seen.
+  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  for (let node = walker.nextNode(); node; node = walker.nextNode()) {
+    const parent = node.parentElement;
+    if (!node.data.trim() || parent.closest(".unseen, option, noscript, script")) continue;
+    const range = document.createRange();
+    range.selectNodeContents(node);
+    for (const box of range.getClientRects()) {
+      for (let outer = parent; outer; outer = outer.parentElement) {
+        const style = getComputedStyle(outer);
+        if (style.textOverflow === "ellipsis") break;
+        const frame = outer.getBoundingClientRect();
+        const clips = outer === document.body || style.overflowX !== "visible";
+        if (clips && (box.left < frame.left - 1 || box.right > frame.right + 1)) {
+          problems.push(`${nameOf(outer)} clips ${node.data}`);
+        }
+      }
+    }
+  }
+  return problems;
+}"""
+
+# Controls within the window, and those of them that something else lies on.
+CONTROLS = """() => {
+  const seen = [], covered = [];
+  const all = document.querySelectorAll("button, select, input[type=range], .theme label");
+  for (const control of all) {
+    const box = control.getBoundingClientRect();
+    const isInside = box.width > 0 && box.top >= 0 && box.left >= 0
+      && box.bottom <= innerHeight && box.right <= innerWidth;
+    if (!isInside) continue;
+    const name = control.id || control.textContent;
+    seen.push(name);
+    // Corners are round.
+    const [x, y] = [[box.left + 4, box.right - 4], [box.top + 4, box.bottom - 4]];
+    const points = [[(x[0] + x[1]) / 2, (y[0] + y[1]) / 2]];
+    for (const across of x) for (const down of y) points.push([across, down]);
+    for (const [across, down] of points) {
+      const top = document.elementFromPoint(across, down);
+      if (!control.contains(top)) covered.push(`${name} by ${top?.outerHTML.slice(0, 80)}`);
+    }
+  }
+  return { seen, covered };
+}"""
+
+
+def check(look, controls: set[str]) -> None:
+    """Looks for what is wrong at each size. Nothing else may happen meanwhile."""
+    for width, height in SIZES:
+        look.page.set_viewport_size({"width": width, "height": height})
+        # The texts of a canvas are kept since it was drawn.
+        look.eventually(lambda w=width: look.page.evaluate("innerWidth") == w, "the window's size")
+        look.wait_for_pictures()
+        assert look.page.evaluate(PROBLEMS) == [], f"at {width} x {height}"
+        found = set()
+        for end in (0, "document.documentElement.scrollHeight"):
+            look.page.evaluate(f"scrollTo(0, {end})")
+            seen = look.page.evaluate(CONTROLS)
+            assert seen["covered"] == [], f"at {width} x {height}, scrolled to {end}"
+            found.update(seen["seen"])
+        assert found == controls, f"all are seen at {width} x {height}"
+
+
+LIVE = {"world", "auto", "light", "dark", "pause", "scrub"}
+
+
+def begin(look) -> None:
+    """Loads the page again, with its texts recorded."""
+    look.page.add_init_script(RECORD_TEXTS)
+    look.page.reload()
+    look.eventually(lambda: look.has("frame"), "a world")
+
+
+def test_before_an_agent_acts(programs, open_page):
+    # About two thousand cells burn, which five digits and a point tell of.
+    server = programs.server(height=64, width=64, moves=64, burn_in=12000, publish_truth=True)
+    look = open_page(programs.dashboard(server.instance))
+    begin(look)
+    look.eventually(lambda: look.text("holder") == "nobody", "the server's facts")
+    check(look, LIVE)
+
+
+def test_with_an_agent(programs, open_page):
+    server = programs.server(height=64, width=64, moves=64, burn_in=12000, publish_truth=True)
+    look = open_page(programs.dashboard(server.instance))
+    assert programs.agent(server.instance, steps=1500).wait() == 0
+    begin(look)
+    look.eventually(lambda: look.picture(".agent.is_live") is False, "the last belief")
+    look.eventually(lambda: look.text("holder") == "nobody", "the agent is gone")
+    check(look, LIVE)
+
+
+def test_with_a_recording(programs, open_page, tmp_path):
+    server = programs.server(publish_truth=True)
+    eventually(lambda: programs.is_serving(server.instance), "a server")
+    file = tmp_path / "with-a-rather-long-name.recording"
+    recorder = programs.record(server.instance, file, steps=300)
+    programs.agent(server.instance)
+    assert recorder.wait() == 0
+    look = open_page(programs.dashboard(recording=file))
+    begin(look)
+    look.at("speed").select_option("0")
+    look.eventually(lambda: look.text("clock") == "ended", "its end")
+    check(look, LIVE | {"play", "speed"})
+
+
+@pytest.mark.parametrize("n_states", [2, 9])
+def test_with_few_and_many_states(programs, open_page, tmp_path, n_states):
+    model = tmp_path / "model.toml"
+    model.write_text(model_of(n_states))
+    server = programs.server(model=model, publish_truth=True)
+    look = open_page(programs.dashboard(server.instance))
+    begin(look)
+    look.eventually(lambda: look.text("holder") == "nobody", "the server's facts")
+    check(look, LIVE)
+    assert programs.agent(server.instance, model=model, steps=40).wait() == 0
+    look.eventually(lambda: look.picture(".agent.is_live") is False, "the last belief")
+    look.eventually(lambda: look.text("holder") == "nobody", "the agent is gone")
+    check(look, LIVE)
+
+
+def model_of(n_states: int) -> str:
+    """A model file: states that stay what they are, each seen as it is."""
+    parts = ['name = "many"\nkernel_size = [1, 1]\n']
+    for state in range(n_states):
+        seen = [float(other == state) for other in range(n_states)]
+        parts.append(f"""
+            [[states]]
+            name = "state-{state}"
+            color = "#8080{16 * state:02x}"
+            initial = {1 / n_states}
+            reward = {float(state == 0)}
+            observed_as = {seen}
+            [[observations]]
+            name = "state-{state}"
+            color = "#8080{16 * state:02x}"
+            [[kernel]]
+            from = "state-{state}"
+            to = "state-{state}"
+            scale = 1.0
+            weights = [[1.0]]""")
+    return "\n".join(parts)
