@@ -8,13 +8,15 @@ from contextlib import closing
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
+from running import PATIENCE
+
 PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 3, "has_touch": True}
 DESK = {"viewport": {"width": 1280, "height": 720}}
 
 
 def answer(port: int, path: str, **headers: str) -> http.client.HTTPResponse:
     """The answer to a request with exactly these headers."""
-    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)) as connection:
         connection.putrequest("GET", path, skip_host=True)
         for name, value in headers.items():
             connection.putheader(name.replace("_", "-"), value)
@@ -99,12 +101,14 @@ def test_every_control_is_reached_by_tab(watched):
 
 def test_canvases_tell_what_they_show(watched):
     look = watched.look
-    label = look.at("panel-truth").get_attribute("aria-label")
-    assert "cells in state fire at step" in label
+    truth, chart = look.at("panel-truth"), look.at("chart-reward")
+    # Descriptions follow what is drawn, now and then.
     look.eventually(
-        lambda: look.at("panel-truth").get_attribute("aria-label") != label, "it is kept true"
+        lambda: "cells in state fire at step" in truth.get_attribute("aria-label"), "the truth"
     )
-    assert "mean" in look.at("chart-reward").get_attribute("aria-label")
+    label = truth.get_attribute("aria-label")
+    look.eventually(lambda: truth.get_attribute("aria-label") != label, "it is kept true")
+    look.eventually(lambda: "mean" in chart.get_attribute("aria-label"), "the rewards")
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])

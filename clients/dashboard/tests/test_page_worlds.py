@@ -1,8 +1,8 @@
 """Large, oblong and many worlds; slow browsers; what is not published."""
 
-import pytest
+import re
 
-from running import eventually
+import pytest
 
 
 def test_a_large_world(programs, open_page):
@@ -116,23 +116,37 @@ def test_what_is_not_published_is_told(programs, open_page):
 def test_a_slow_browser_gets_fewer_pictures_and_the_newest(programs, open_page):
     server = programs.server(publish_truth=True)
     look = open_page(programs.dashboard(server.instance))
-    client = look.page.context.new_cdp_session(look.page)
-    client.send("Emulation.setCPUThrottlingRate", {"rate": 30})
+    # Asks that were not answered yet, after each message of each connection.
+    waiting: list[int] = []
+
+    def watch(socket) -> None:
+        n_waiting = 0
+
+        def count(by: int) -> None:
+            nonlocal n_waiting
+            n_waiting += by
+            waiting.append(n_waiting)
+
+        socket.on("framesent", lambda _: count(1))
+        socket.on("framereceived", lambda _: count(-1))
+
+    look.page.on("websocket", watch)
+    look.slow_down(30)
+    look.page.reload()
     look.eventually(lambda: look.picture(".shown"), "the world before its first step")
     agent = programs.agent(server.instance, steps=4000)
-    agent.wait()
-    drawn = look.drawn()
+    assert agent.wait() == 0
     look.eventually(lambda: look.picture(".shown.step") == 4000, "the newest step")
-    assert look.drawn() - drawn < 20, "no pictures were queued"
+    assert look.drawn() < 4000
+    assert set(waiting) <= {0, 1, 2}, "no pictures were queued"
 
 
 def test_one_cell_is_the_same_in_all_panels(watched):
-    server, look = watched.server, watched.look
-    look.page.keyboard.press("Space")
-    look.eventually(lambda: look.at("pause").text_content() != "Pause", "paused")
-    server.kill()
-    look.eventually(lambda: look.text("state") == "waiting", "nothing moves")
-    look.at("panel-belief-1").hover(position={"x": 5, "y": 5})
+    look = watched.look
+    watched.agent.interrupt()
+    look.eventually(lambda: look.picture(".agent.is_live") is False, "nothing moves")
+    look.eventually(lambda: look.has("belief", "truth"), "a belief of the last step")
+    look.at("panel-belief-1").hover(position={"x": 2, "y": 2})
     inspector = look.page.get_by_label("one cell in numbers")
     look.eventually(lambda: "row 0, col 0" in inspector.text_content(), "the cell pointed at")
     for panel in ("truth", "seen", "frame", "belief-0", "belief-2", "entropy"):
@@ -155,7 +169,12 @@ def test_charts_tell_values_and_seek(watched, chart):
     look.eventually(lambda: look.picture(".kept.last") > 20, "some steps")
     canvas = look.at(f"chart-{chart}")
     canvas.hover(position={"x": 120, "y": 20})
-    look.eventually(lambda: look.page.get_by_text("at k").first.is_visible(), "the step there")
+    # Entries and steps part where a busy machine lost frames.
+    told = look.page.locator(f".chart-{chart} .at").get_by_text(
+        re.compile(r"^at (k|entry) [\d,]+$")
+    )
+    look.eventually(told.is_visible, "the step there")
     canvas.click(position={"x": 120, "y": 20})
     look.eventually(lambda: look.at("pause").text_content() == "Go live", "paused there")
-    eventually(lambda: look.picture(".shown.serial") < look.picture(".kept.last"), "an older entry")
+    is_older = "emberwatch.picture.shown.serial < emberwatch.picture.kept.last"
+    look.eventually(lambda: look.page.evaluate(is_older), "an older entry")
