@@ -4,7 +4,7 @@
 use crate::harness::{Program, Server, run};
 use crate::meter::Use;
 use crate::say;
-use agent::report::figures::curves::{Curve, Page, Panel, Scale, draw_curves};
+use figures::{Curve, Lines, Panel, Scale};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -149,8 +149,9 @@ fn write(folder: &Path, rows: &[(f64, Use)]) {
                 .map(|(seconds, used)| (*seconds, value(used)))
                 .collect(),
         )],
+        shade: None,
     };
-    let page = Page {
+    let page = Lines {
         title: "A server while agents come and go".into(),
         note: "agents start, are killed, stopped, woken, told to stop and taken over; snapshots are written".into(),
         axis: "seconds".into(),
@@ -161,5 +162,6 @@ fn write(folder: &Path, rows: &[(f64, Use)]) {
             panel("shared memory, MiB in use", |used| used.shared as f64 / 1024.0),
         ],
     };
-    draw_curves(&folder.join("soak.png"), &page).expect("draw");
+    let picture = figures::png(&page.svg().expect("points")).expect("a picture");
+    std::fs::write(folder.join("soak.png"), picture).expect("write the figure");
 }
