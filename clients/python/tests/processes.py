@@ -7,8 +7,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 
 from emberwatch.client import Client
 from emberwatch.errors import ChannelError, EmberwatchError
@@ -17,6 +17,9 @@ from emberwatch.replies import ServerStatus
 
 #: How long anything may take that should take milliseconds, seconds.
 PATIENCE = 20.0
+
+#: The timeout of a wait that ends for another reason, seconds.
+LONG = 5 * PATIENCE
 
 #: A small, quick server: 5 x 7 cells, 6 moves, 20 steps of burn-in.
 SMALL = {"height": 5, "width": 7, "moves": 6, "burn_in": 20}
@@ -137,9 +140,23 @@ def eventually(holds: Callable[[], bool], limit: float = PATIENCE) -> bool:
     return True
 
 
-def quick_once(limit: float, measure: Callable[[], float]) -> bool:
-    """Whether something takes less than `limit` seconds, in one of ten tries."""
-    return any(measure() < limit for _ in range(10))
+@contextmanager
+def stopped(pid: int) -> Iterator[None]:
+    """A process that does not run meanwhile."""
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        assert eventually(lambda: _state(pid) == "T")
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+@contextmanager
+def in_time() -> Iterator[None]:
+    """What ends sooner than a wait of `LONG` does."""
+    start = time.monotonic()
+    yield
+    assert time.monotonic() - start < PATIENCE
 
 
 def connects(server: Server) -> bool:

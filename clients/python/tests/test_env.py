@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -18,7 +17,6 @@ import gymnasium
 import numpy as np
 import pytest
 from environments import (
-    LIVELY,
     MOVES,
     OBJECTIVE,
     SMALL,
@@ -34,7 +32,7 @@ from environments import (
 )
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv
-from processes import eventually, is_running, quick_once
+from processes import eventually, is_running, stopped
 
 import emberwatch
 from emberwatch.errors import (
@@ -696,17 +694,12 @@ def test_a_private_server_ends_with_its_forgotten_environment() -> None:
 def test_a_killed_private_server_is_replaced_by_the_next_reset() -> None:
     env = make()
     expected = rollout(env, 5, seed=3)
-
-    def noticing() -> float:
-        os.kill(private_pid(env), signal.SIGKILL)
-        begin = time.monotonic()
-        with pytest.raises(ServerGoneError):
-            env.step([0, 0, 0, 0])
-        waited = time.monotonic() - begin
-        assert_same(rollout(env, 5, seed=3), expected)
-        return waited
-
-    assert quick_once(0.5, noticing)
+    pid = private_pid(env)
+    os.kill(pid, signal.SIGKILL)
+    assert has_ended(pid)
+    with pytest.raises(ServerGoneError):
+        env.step([0, 0, 0, 0])
+    assert_same(rollout(env, 5, seed=3), expected)
     env.close()
 
 
@@ -766,12 +759,8 @@ def test_a_stopped_server_times_out_and_resume_finds_the_step() -> None:
     env = make()
     env.reset(seed=1)
     pid = private_pid(env)
-    os.kill(pid, signal.SIGSTOP)
-    try:
-        with impatient(env), pytest.raises(RequestTimeoutError):
-            env.step([1, 1, 3, 3])
-    finally:
-        os.kill(pid, signal.SIGCONT)
+    with stopped(pid), impatient(env), pytest.raises(RequestTimeoutError):
+        env.step([1, 1, 3, 3])
     with pytest.raises(ClosedError, match="timed out"):
         env.step([1, 1, 3, 3])
     for _ in range(100):  # the server takes a moment to let go of the request given up
@@ -929,14 +918,3 @@ def test_without_a_render_mode_nothing_is_drawn_with_a_word() -> None:
     with pytest.warns(UserWarning, match="nothing to draw; give a render_mode"):
         assert env.render() is None
     env.close()
-
-
-def test_the_time_from_make_to_the_first_step_is_short(capsys: pytest.CaptureFixture[str]) -> None:
-    begin = time.perf_counter()
-    env = gymnasium.make(WILDFIRE, model=LIVELY)
-    env.reset(seed=1)
-    env.step(env.action_space.sample())
-    elapsed = time.perf_counter() - begin
-    env.close()
-    with capsys.disabled():
-        print(f" [make to first step: {elapsed:.3f} s]", end="")

@@ -21,6 +21,7 @@ from environments import (
 )
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv
+from processes import stopped
 
 from emberwatch.errors import (
     BusyError,
@@ -355,12 +356,8 @@ def test_after_a_timeout_no_move_is_flown_before_a_reset() -> None:
     for _ in range(3):
         env.step(1)
     pid = _server(env)
-    os.kill(pid, signal.SIGSTOP)
-    try:
-        with impatient(env), pytest.raises(RequestTimeoutError):
-            env.step(1)
-    finally:
-        os.kill(pid, signal.SIGCONT)
+    with stopped(pid), impatient(env), pytest.raises(RequestTimeoutError):
+        env.step(1)
     with pytest.raises(ClosedError, match="timed out"):
         env.step(1)
     observation, info = env.reset(options={"resume": True})

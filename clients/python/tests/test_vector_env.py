@@ -5,7 +5,6 @@ import gc
 import os
 import pickle
 import signal
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from environments import (
     serving,
 )
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
-from processes import is_running, quick_once
+from processes import eventually, is_running, stopped
 
 import emberwatch
 from emberwatch.errors import (
@@ -530,17 +529,12 @@ def test_a_private_server_ends_with_its_forgotten_environment() -> None:
 
 def test_a_killed_private_server_is_replaced_by_the_next_reset(flying: Vector) -> None:
     expected = flying.reset(seed=5)
-
-    def noticing() -> float:
-        os.kill(private_pid(flying), signal.SIGKILL)
-        begin = time.monotonic()
-        with pytest.raises(ServerGoneError):
-            flying.step(np.zeros((2, 4), int))
-        waited = time.monotonic() - begin
-        assert_same(flying.reset(seed=5), expected)
-        return waited
-
-    assert quick_once(0.5, noticing)
+    pid = private_pid(flying)
+    os.kill(pid, signal.SIGKILL)
+    assert eventually(lambda: not is_running(pid))
+    with pytest.raises(ServerGoneError):
+        flying.step(np.zeros((2, 4), int))
+    assert_same(flying.reset(seed=5), expected)
     assert flying.step(np.zeros((2, 4), int))[4]["step"].tolist() == [1, 1]
 
 
@@ -581,12 +575,8 @@ def test_an_unknown_keyword_is_named() -> None:
 
 def test_a_stopped_server_times_out_and_resume_goes_on(flying: Vector) -> None:
     pid = private_pid(flying)
-    os.kill(pid, signal.SIGSTOP)
-    try:
-        with impatient(flying), pytest.raises(RequestTimeoutError):
-            flying.step(np.zeros((2, 4), int))
-    finally:
-        os.kill(pid, signal.SIGCONT)
+    with stopped(pid), impatient(flying), pytest.raises(RequestTimeoutError):
+        flying.step(np.zeros((2, 4), int))
     with pytest.raises(emberwatch.errors.ClosedError, match="timed out"):
         flying.step(np.zeros((2, 4), int))
     infos = flying.reset(options={"resume": True})[1]
