@@ -3,8 +3,13 @@
 use crate::harness::{PATIENCE, Program, SMALL, Server, eventually, takeover};
 use crate::learner::{Learner, refusal, reply_to, start_agent, start_with_learner};
 use crate::wire::control_header;
-use agent::client::{Claim, Client};
+use agent::client::{Claim, Client, shape_of};
+use agent::config::AgentConfig;
+use agent::decider::{Assignment, Decider};
+use agent::policy::PlannerKind;
+use agent::run::{RunError, prepare};
 use protocol::channels::{ChannelError, Instance};
+use protocol::connection::ConnectionError;
 use protocol::decisions::{Reply, Request};
 use protocol::message::Status;
 use rustix::process::Signal;
@@ -41,28 +46,43 @@ fn a_second_agent_is_refused_whatever_it_asks_for() {
 }
 
 #[test]
-fn a_lease_does_not_expire_while_nobody_decides() {
-    // Of several tries: an agent that is paused for so long loses its lease all the same.
-    assert!((0..8).any(|_| keeps_its_lease()));
+fn an_agent_renews_its_lease_when_a_third_of_it_has_passed_without_use() {
+    let lease = Duration::from_secs(3600);
+    let server = Server::start(&format!("{SMALL} --lease-millis {}", lease.as_millis()));
+    let (mut decider, begun) = (attach(&server), Instant::now());
+    decider.keep_alive(begun + lease / 3).expect("renewed");
+    let due = begun + 2 * (lease / 3);
+    let almost = due - Duration::from_millis(1);
+    assert!(!decider.until_renewal(almost).is_zero());
+    assert!(decider.until_renewal(due).is_zero());
+    let _thief = Client::acquire(&server.instance, &takeover(0..1)).expect("take over");
+    decider.keep_alive(almost).expect("nothing is asked");
+    let lost = decider.keep_alive(due);
+    assert!(
+        matches!(
+            &lost,
+            Err(RunError::Connection(ConnectionError::Refused {
+                status: Status::LeaseLost,
+                ..
+            }))
+        ),
+        "{lost:?}"
+    );
 }
 
-fn keeps_its_lease() -> bool {
-    let server = Server::start(&format!("{SMALL} --lease-millis 600"));
-    let (agent, learner) = start_with_learner(&server.instance, "");
-    let start = Instant::now();
-    while start.elapsed() < Duration::from_millis(1200) {
-        let is_held = holder(&server) == Some(agent.pid());
-        if !is_held || !matches!(learner.ask(&Request::Last {}), Reply::Decision(_)) {
-            return false;
-        }
-    }
-    std::thread::sleep(Duration::from_millis(1200));
-    let is_held = holder(&server) == Some(agent.pid());
-    is_held
-        && matches!(
-            learner.ask(&Request::Decide { objective: 2 }),
-            Reply::Decision(_)
-        )
+/// What decides for world 0 in an agent, without what serves it.
+fn attach(server: &Server) -> Decider {
+    let task = Assignment {
+        instance: server.instance.clone(),
+        world: 0,
+        takeover: false,
+        planner: PlannerKind::Beam,
+        config: AgentConfig::default(),
+    };
+    let (info, model) = prepare(&task.instance, 0, None).expect("a server");
+    let shape = shape_of(&info).expect("a grid");
+    let prior = task.config.prior(info.burn_in).belief(&model, shape, 0);
+    Decider::attach(&task, model, prior.expect("a belief")).expect("attach")
 }
 
 #[test]
@@ -130,14 +150,14 @@ fn an_agent_whose_server_is_killed_says_so_and_ends() {
 
 #[test]
 fn an_agent_whose_world_is_taken_says_so_and_ends_with_code_3() {
-    let server = Server::start(&format!("{SMALL} --lease-millis 3000"));
     let theft = Claim {
         time_to_live: Some(Duration::from_secs(3600)),
         ..takeover(0..1)
     };
-    for decides in [true, false] {
+    // One that is not asked notices when it renews its lease.
+    for (decides, lease) in [(true, 86_400_000), (false, 3_000)] {
+        let server = Server::start(&format!("{SMALL} --lease-millis {lease}"));
         let (agent, learner) = start_with_learner(&server.instance, "--takeover");
-        learner.decide(2);
         let before = server.observe(0).0;
         let _thief = Client::acquire(&server.instance, &theft).expect("take over");
         if decides {
@@ -148,11 +168,7 @@ fn an_agent_whose_world_is_taken_says_so_and_ends_with_code_3() {
         drop(learner);
         let ended = agent.wait(PATIENCE);
         assert_eq!(ended.code, Some(3), "{}", ended.stderr);
-        assert!(
-            ended.stderr.contains("lease lost to pid"),
-            "{}",
-            ended.stderr
-        );
+        assert!(ended.stderr.contains("lease lost"), "{}", ended.stderr);
         assert_eq!(server.observe(0).0, before, "it stepped nothing");
     }
 }

@@ -163,55 +163,55 @@ fn coverage_is_what_the_server_says() {
 
 #[test]
 fn a_world_in_burn_in_takes_no_step_and_requests_for_it_wait() {
-    let flags = "--height 32 --width 32 --moves 6";
-    let endless = format!("{flags} --burn-in {}", 1u64 << 40);
-    let server = Server::start_in_burn_in(&new_instance(), &endless);
+    let server = Server::start_with_endless_resets("");
     let wire = Wire::open(&server.instance);
+    let lease = wire.acquire(0, 2).lease;
+    let reset = |wire: &Wire| {
+        let text = format!(r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":1}}]}}"#);
+        let pending = wire.send_control(control_header(1), text.as_bytes());
+        pending.expect("send")
+    };
+    let pending = reset(&wire);
+    let is_resetting = || server.status().worlds[1].resetting;
+    assert!(eventually(PATIENCE, is_resetting));
+    let second = StepRequest {
+        first_world: 1,
+        ..step_header(lease, N_MOVES)
+    };
+    assert_eq!(
+        wire.step(second, &[0; 6]).0.status,
+        Status::Resetting as u32
+    );
     let observe = StepRequest {
         operation: Operation::Observe as u32,
+        first_world: 1,
         ..step_header(0, 0)
     };
     assert_eq!(wire.step(observe, &[]).0.status, Status::Resetting as u32);
-    assert!(server.status().worlds[0].resetting);
-    let flags = format!("{flags} --burn-in 100000");
-    let server = Server::start_in_burn_in(&new_instance(), &flags);
+    let first = wire.step(step_header(lease, N_MOVES), &[0; 6]);
+    assert_eq!(first.0.status, Status::Ok as u32, "its neighbour goes on");
+    let other = Wire::open(&server.instance);
+    let (refused, _) = answer(&reset(&other), PATIENCE).expect("an answer");
+    assert_eq!(refused.status, Status::NoLease as u32);
+    assert!(answer(&pending, Duration::ZERO).is_none());
+}
+
+#[test]
+fn what_waits_for_a_burn_in_is_answered_after_it() {
+    let flags = "--height 32 --width 32 --moves 6 --burn-in 100000";
+    let server = Server::start_in_burn_in(&new_instance(), flags);
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(0, 1).lease;
-    let is_ready = !server.status().worlds[0].resetting;
-    assert!(is_ready, "acquiring waits for burn-in");
-    let reset = |seed| {
-        format!(r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":0,"seed":{seed}}}]}}"#)
+    assert!(!server.status().worlds[0].resetting);
+    let worlds = vec![WorldSeed {
+        world: 0,
+        seed: Some(7),
+    }];
+    let Reply::Reset { worlds } = wire.ask(&Request::Reset { lease, worlds }) else {
+        panic!("expected a reset");
     };
-    // Of several tries: who is paused misses a burn-in.
-    let n_resets = (1..=20).find(|&n_resets| {
-        let pending = wire.send_control(control_header(1), reset(n_resets).as_bytes());
-        let pending = pending.expect("send");
-        let (mut is_refused, mut reply) = (false, None);
-        let is_answered = || {
-            reply = answer(&pending, Duration::ZERO);
-            let (step, _) = wire.step(step_header(lease, N_MOVES), &[0; 6]);
-            is_refused |= step.status == Status::Resetting as u32;
-            reply.is_some()
-        };
-        assert!(eventually(PATIENCE, is_answered));
-        let (_, text) = reply.expect("an answer");
-        let Ok(Reply::Reset { worlds }) = serde_json::from_slice(&text) else {
-            panic!("expected a reset, got {}", text.escape_ascii());
-        };
-        let begun = (worlds[0].seed, worlds[0].step, worlds[0].episode);
-        assert_eq!(
-            begun,
-            (n_resets, 0, n_resets),
-            "the answer comes after the burn-in"
-        );
-        is_refused
-    });
-    assert!(n_resets.is_some(), "no step was refused");
-    let twice = Wire::open(&server.instance).control(control_header(2), reset(7).as_bytes());
-    assert_eq!(
-        twice.0.status,
-        Status::NoLease as u32,
-        "and not by another client"
-    );
-    assert_eq!(Some(server.status().worlds[0].info.episode), n_resets);
+    let begun = (worlds[0].seed, worlds[0].step, worlds[0].episode);
+    assert_eq!(begun, (7, 0, 1));
+    let (step, _) = wire.step(step_header(lease, N_MOVES), &[0; 6]);
+    assert_eq!(step.status, Status::Ok as u32);
 }

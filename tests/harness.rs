@@ -1,6 +1,9 @@
 //! Programs as children: started on names of their own, waited for with deadlines, killed on drop.
 
 use agent::client::{Claim, Client, Observation};
+use env_server::config::ServerConfig;
+use env_server::episode::{Episode, Rules};
+use env_server::snapshot::{Settings, WorldToWrite, encode};
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::{Reply, Request, ServerInfo, ServerStatus, WorldSeed};
@@ -27,6 +30,9 @@ const START: Duration = Duration::from_secs(3);
 
 /// A small, quick server: 5 x 7 cells, 6 moves, 20 steps of burn-in.
 pub const SMALL: &str = "--height 5 --width 7 --moves 6 --burn-in 20";
+
+/// A burn-in that never ends, steps.
+pub const ENDLESS: u64 = 1 << 40;
 
 /// A child process and what it wrote to its standard error so far.
 pub struct Program {
@@ -85,6 +91,25 @@ impl Program {
     pub fn signal(&self, signal: Signal) {
         let pid = Pid::from_raw(self.child.id() as i32).expect("a process id");
         kill_process(pid, signal).expect("signal the program");
+    }
+
+    /// Pauses it; returns when it no longer runs.
+    pub fn stop(&self) {
+        self.signal(Signal::STOP);
+        let stat = format!("/proc/{}/stat", self.pid());
+        let is_stopped = || {
+            let stat = std::fs::read_to_string(&stat).expect("its state");
+            stat.rsplit(") ")
+                .next()
+                .is_some_and(|rest| rest.starts_with('T'))
+        };
+        assert!(eventually(PATIENCE, is_stopped), "{}", self.stderr());
+    }
+
+    /// Whether it has ended.
+    pub fn has_ended(&mut self) -> bool {
+        let status = self.child.try_wait();
+        status.expect("look at the program").is_some()
     }
 
     /// Waits until it ends.
@@ -171,6 +196,22 @@ impl Server {
         server
     }
 
+    /// Starts a server of two worlds as [`SMALL`] ones at k = 0, whose every reset goes on for ever.
+    pub fn start_with_endless_resets(flags: &str) -> Self {
+        let (settings, mut rules) = small_settings(ENDLESS);
+        rules.burn_in = 0;
+        let episodes = [0, 1].map(|seed| Episode::new(&rules, seed));
+        let worlds = episodes.each_ref().map(WorldToWrite::Ready);
+        let folder = TempDir::new().expect("a folder for the worlds");
+        let file = folder.path().join("worlds.snapshot");
+        std::fs::write(&file, encode(&settings, &worlds).expect("small")).expect("write");
+        let shape = "--height 5 --width 7 --moves 6 --worlds 2";
+        let file = file.display();
+        Self::start(&format!(
+            "{shape} --burn-in {ENDLESS} --restore {file} {flags}"
+        ))
+    }
+
     /// A new connection to it.
     pub fn connect(&self) -> Connection {
         Connection::open(&self.instance, "tests", PATIENCE).expect("connect")
@@ -252,6 +293,28 @@ pub fn eventually(limit: Duration, mut holds: impl FnMut() -> bool) -> bool {
         std::thread::sleep(Duration::from_millis(1));
     }
     true
+}
+
+/// What snapshots of a server as a [`SMALL`] one say of it, and the rules of its worlds.
+pub fn small_settings(burn_in: u64) -> (Settings, Rules) {
+    let config = ServerConfig {
+        height: 5,
+        width: 7,
+        moves: 6,
+        burn_in,
+        ..ServerConfig::default()
+    };
+    let checked = config.check().expect("valid settings");
+    let rules = Rules::new(
+        &checked.model,
+        checked.shape,
+        burn_in,
+        0,
+        checked.config.start,
+    );
+    let mut rules = rules.expect("a valid model");
+    (rules.history, rules.n_moves) = (checked.config.history as usize, 6);
+    (Settings::of(&checked), rules)
 }
 
 /// The server's status, over a connection of its own.

@@ -269,7 +269,7 @@ fn a_client_that_is_stopped_in_the_middle_disturbs_nobody() {
             let acts = eventually(PATIENCE, || server.observe(1).0.step > step);
             assert!(acts, "{}", agent.stderr());
             std::thread::sleep(Duration::from_micros(37 * round));
-            agent.signal(Signal::STOP);
+            agent.stop();
             step = server.observe(1).0.step;
             assert!(server.observe(1).0.step <= step + 1, "it is stopped");
             agent.signal(Signal::CONT);
@@ -332,44 +332,30 @@ fn the_longest_control_requests_are_answered_in_short() {
 
 #[test]
 fn requests_that_wait_for_a_reset_and_are_given_up_do_not_wear_the_server_out() {
-    let flags = "--height 64 --width 64 --moves 6 --burn-in 30000 --worlds 2";
-    let server = Server::start(flags);
-    let (mut bystander, mut watcher) = (server.acquire(0..1), server.connect());
+    let server = Server::start_with_endless_resets("");
+    let mut bystander = server.acquire(0..1);
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(1, 1).lease;
-    let mut is_resetting = || match watcher.control(&Request::Status {}, PATIENCE) {
-        Ok(Reply::Status(status)) => status.worlds[1].resetting,
-        other => panic!("{other:?}: {}", server.program.stderr()),
-    };
-    let reset = |seed| {
-        format!(r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":1,"seed":{seed}}}]}}"#)
-    };
+    let reset = format!(r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":1}}]}}"#);
     let renew = format!(r#"{{"op":"renew","lease":{lease}}}"#);
-    let (mut n_given_up, mut n_resets) = (0, 0);
-    while n_given_up <= 20 {
-        n_resets += 1;
-        assert!(n_resets <= 50, "{n_given_up} prove little");
-        let given_up = wire
-            .send_control(control_header(0), reset(n_resets).as_bytes())
-            .expect("send");
-        let begins = || is_resetting() || answer(&given_up, Duration::ZERO).is_some();
-        assert!(eventually(PATIENCE, begins));
-        drop(given_up);
-        while is_resetting() {
-            let given_up = wire
-                .send_control(control_header(1), renew.as_bytes())
-                .expect("send");
-            fly(&mut bystander, Paths::new(0).next(6));
-            is_resetting();
-            drop(given_up);
-            n_given_up += 1;
-        }
-    }
-    let Reply::Lease(renewed) = wire.ask(&Request::Renew { lease }) else {
-        panic!("expected the lease");
+    let send = |text: &str| {
+        let sent = wire.send_control(control_header(0), text.as_bytes());
+        sent.expect("send")
     };
-    let begun = &renewed.worlds[0];
-    assert_eq!((begun.seed, begun.episode), (n_resets, n_resets));
+    let given_up = send(&reset);
+    assert!(eventually(PATIENCE, || server.status().worlds[1].resetting));
+    drop(given_up);
+    for step in 1..=50 {
+        let given_up = send(&renew);
+        let seen = fly(&mut bystander, Paths::new(0).next(6));
+        assert_eq!(seen.result.step, step);
+        server.status();
+        drop(given_up);
+    }
+    let Reply::Status(status) = wire.ask(&Request::Status {}) else {
+        panic!("expected a status");
+    };
+    assert_eq!(status.worlds[1].holder_pid, Some(std::process::id()));
 }
 
 #[test]

@@ -1,15 +1,15 @@
 //! Who may act: one holder a world, ended by release, expiry or takeover; the world stays put.
 
 use crate::harness::{
-    PATIENCE, Paths, SMALL, Server, claim, eventually, fly, new_instance, takeover,
+    ENDLESS, PATIENCE, Paths, SMALL, Server, claim, eventually, fly, new_instance, takeover,
 };
-use crate::wire::{RawClient, Wire, step_header};
+use crate::wire::{RawClient, Wire, control_header};
 use agent::client::{Claim, Client};
 use protocol::Connection;
 use protocol::connection::ConnectionError;
-use protocol::control::{Reply, Request, WorldSeed};
+use protocol::control::{Reply, Request, ServerStatus, WorldSeed};
 use protocol::message::Status;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 fn check<T>(result: Result<T, ConnectionError>, expected: Status, expected_detail: u64) {
     match result {
@@ -123,36 +123,6 @@ fn a_renewal_tells_of_the_worlds_that_are_still_held() {
 }
 
 #[test]
-fn a_lease_expires_unless_it_is_used_or_renewed() {
-    let lasts = Duration::from_millis(400);
-    let server = Server::start(&format!("{SMALL} --lease-millis 400 --worlds 2"));
-    let (used, idle) = (Wire::open(&server.instance), Wire::open(&server.instance));
-    let idle_lease = idle.acquire(1, 1).lease;
-    let (mut last_use, mut held_since) = (Instant::now(), Instant::now());
-    let mut lease = used.acquire(0, 1).lease;
-    let mut renews = false;
-    let expired = eventually(PATIENCE, || {
-        let began = Instant::now();
-        renews = !renews;
-        let is_held = match renews {
-            true => matches!(used.ask(&Request::Renew { lease }), Reply::Lease(_)),
-            false => used.step(step_header(lease, 6), &[0; 6]).0.status == Status::Ok as u32,
-        };
-        if !is_held {
-            // Right, if this test was paused for so long: then it begins anew.
-            assert!(last_use.elapsed() > lasts, "lost without need");
-            lease = used.acquire(0, 1).lease;
-            held_since = began;
-        }
-        last_use = began;
-        server.status().worlds[1].holder_pid.is_none() && held_since.elapsed() > 2 * lasts
-    });
-    assert!(expired);
-    let lost = idle.ask(&Request::Renew { lease: idle_lease });
-    assert_eq!(lost.status(), Status::LeaseLost, "{lost:?}");
-}
-
-#[test]
 fn a_client_may_ask_for_a_lease_of_its_own_length() {
     let server = Server::start(SMALL);
     let short = Claim {
@@ -180,27 +150,20 @@ fn a_client_may_ask_for_a_lease_of_its_own_length() {
 
 #[test]
 fn a_lease_outlives_a_burn_in_that_is_longer() {
-    let flags = "--height 32 --width 32 --moves 6 --burn-in 500000 --lease-millis 100";
-    let is_longer = |start: Instant| start.elapsed() > Duration::from_millis(200);
-    let outlives_the_start = || {
-        let server = Server::start_in_burn_in(&new_instance(), flags);
-        let start = Instant::now();
-        let mut client = server.acquire(0..1);
-        is_longer(start) && client.step(0..1, &paths(1)).is_ok()
-    };
-    let server = Server::start(flags);
-    let outlives_a_reset = |seed| {
-        let order = WorldSeed {
-            world: 0,
-            seed: Some(seed),
-        };
-        let mut client = Client::acquire(&server.instance, &takeover(0..1)).expect("acquire");
-        let start = Instant::now();
-        client.reset(&[order]).is_ok() && is_longer(start) && client.step(0..1, &paths(1)).is_ok()
-    };
-    // Of several tries: who is paused after the burn-in loses the lease all the same.
-    assert!((0..10).any(|_| outlives_the_start()));
-    assert!((1..=10).any(outlives_a_reset));
+    let flags = format!("{SMALL} --lease-millis 100").replace("20", &ENDLESS.to_string());
+    let server = Server::start_in_burn_in(&new_instance(), &flags);
+    let wire = Wire::open(&server.instance);
+    let acquire = br#"{"op":"acquire","first_world":0,"n_worlds":1}"#;
+    let _pending = wire.send_control(control_header(1), acquire).expect("send");
+    let is_held = |status: &ServerStatus| status.worlds[0].holder_pid.map(u64::from) == Some(us());
+    assert!(eventually(PATIENCE, || is_held(&server.status())));
+    let due = server.status().uptime_millis + 1_000;
+    let mut late = server.status();
+    assert!(eventually(PATIENCE, || {
+        late = server.status();
+        late.uptime_millis > due
+    }));
+    assert!(is_held(&late));
 }
 
 #[test]

@@ -236,9 +236,8 @@ fn what_a_recorder_misses_is_said_by_it_and_by_the_file() {
     let mut paths = Paths::new(0);
     fly(&mut client, paths.next(6));
     wait_for_step(&file, 1);
-    recorder.signal(Signal::STOP);
+    recorder.stop();
     let mut last = 1;
-    // Stopping takes a moment: what was read before is not lost.
     for _ in 0..400 {
         last = fly(&mut client, paths.next(6)).result.step;
     }

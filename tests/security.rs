@@ -2,7 +2,7 @@
 //!
 //! A thread plays the other user, which only root may let it do; elsewhere those tests say so and pass.
 
-use crate::harness::{SMALL, Server, frames_until};
+use crate::harness::{PATIENCE, SMALL, Server, eventually, frames_until};
 use iceoryx2::node::NodeBuilder;
 use iceoryx2::prelude::{Config, FileName, Path as IpcPath, SemanticString};
 use protocol::channels::{
@@ -16,7 +16,6 @@ use std::io::{ErrorKind, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::channel;
-use std::time::Duration;
 
 /// Users whom nobody is.
 const USERS: [u32; 3] = [64_001, 64_002, 64_003];
@@ -210,12 +209,9 @@ fn threads_that_listen_leave_the_umask_as_it_was() {
         }
     };
     std::thread::scope(|scope| (0..4).for_each(|_| drop(scope.spawn(listen))));
-    let listens = |mask: &String| mask.ends_with("0177"); // another test, now or by a lost race
-    let all_listen = (0..5_000).all(|_| {
-        std::thread::sleep(Duration::from_millis(1));
-        listens(&umask())
-    });
-    assert!(!all_listen, "{}", umask());
+    // While another test listens it is not.
+    let is_as_before = || !umask().ends_with("0177");
+    assert!(eventually(PATIENCE, is_as_before), "{}", umask());
 }
 
 /// Removes what a user who is nobody left.

@@ -12,7 +12,8 @@ use std::time::Duration;
 use tests::fuzz::campaign::memory;
 
 /// Three worlds: the first is the victim's, the second the attacker's, the third anybody's.
-pub const FLAGS: &str = "--height 5 --width 7 --moves 6 --burn-in 20 --worlds 3";
+pub const FLAGS: &str =
+    "--height 5 --width 7 --moves 6 --burn-in 20 --worlds 3 --lease-millis 86400000";
 
 /// How much more memory of its own a server may have in the end than in the beginning: its allocator
 /// keeps some of what the longest request took (5 MiB were seen), and tables of clients have bounds.

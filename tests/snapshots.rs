@@ -1,18 +1,19 @@
 //! Worlds that are written down and go on, bit for bit: snapshots, forks, servers that come back.
 
 use crate::harness::{
-    Ended, PATIENCE, Paths, SMALL, Server, eventually, fly, frames_until, new_instance, reset, run,
-    takeover,
+    ENDLESS, Ended, PATIENCE, Paths, SMALL, Server, eventually, fly, frames_until, new_instance,
+    reset, run, small_settings, takeover,
 };
-use crate::wire::{RawClient, Wire, answer, control_header};
+use crate::wire::{RawClient, Wire, control_header};
 use agent::client::{Client, Observation};
 use env_server::snapshot::folder::{Folder, Outlives};
+use env_server::snapshot::{RestoredWorld, WorldToWrite, decode, encode};
 use protocol::channels::Instance;
 use protocol::control::{Reply, Request};
 use protocol::message::Status;
 use protocol::observer::Observer;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 use tempfile::TempDir;
 
 const N_MOVES: usize = 6;
@@ -423,51 +424,50 @@ fn snapshots_that_cannot_be_written_are_warned_of_now_and_then() {
 
 #[test]
 fn a_world_in_its_burn_in_begins_anew_after_a_restart() {
-    // Of several tries: who is paused misses the burn-in.
-    assert!((0..10).any(|_| restart_in_burn_in()));
-}
-
-/// Whether the world was in its burn-in while snapshots were taken.
-fn restart_in_burn_in() -> bool {
     let folder = TempDir::new().expect("a folder");
-    let flags = format!(
-        "--height 32 --width 32 --moves 6 --burn-in 100000 --worlds 2 --snapshot-every 10 \
-         --snapshot-dir {0} --restore {0}",
+    let server = Server::start_with_endless_resets(&format!(
+        "--snapshot-every 10 --snapshot-dir {}",
         text(folder.path())
-    );
-    let instance = new_instance();
-    let server = Server::start_on(&instance, &flags);
+    ));
     let mut stepping = server.acquire(0..1);
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(1, 1).lease;
-    let worlds = vec![protocol::control::WorldSeed {
-        world: 1,
-        seed: Some(77),
-    }];
-    let text = serde_json::to_vec(&Request::Reset { lease, worlds }).expect("a request");
-    let pending = wire.send_control(control_header(1), &text).expect("send");
-    let is_resetting = || server.status().worlds[1].resetting;
-    let is_over = || answer(&pending, Duration::ZERO).is_some();
-    assert!(eventually(PATIENCE, || is_resetting() || is_over()));
+    let reset = format!(r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":1,"seed":77}}]}}"#);
+    let pending = wire.send_control(control_header(1), reset.as_bytes());
+    assert!(eventually(PATIENCE, || server.status().worlds[1].resetting));
     for k in 0..20 {
         fly(&mut stepping, Paths::new(k).next(N_MOVES));
     }
-    if !is_resetting() {
-        return false;
-    }
-    let entries = || {
-        std::fs::read_dir(folder.path())
-            .expect("the folder")
-            .flatten()
+    let snapshots = || {
+        let entries = std::fs::read_dir(folder.path()).expect("the folder");
+        let mut paths: Vec<_> = entries.flatten().map(|entry| entry.path()).collect();
+        paths.retain(|path| path.extension() == Some("snapshot".as_ref()));
+        paths
     };
-    let written = || entries().any(|entry| entry.path().extension() == Some("snapshot".as_ref()));
-    assert!(eventually(PATIENCE, written));
+    assert!(eventually(PATIENCE, || !snapshots().is_empty()));
     server.kill();
     drop(pending);
-    let server = Server::start_on(&instance, &flags);
-    let worlds = server.status().worlds;
+    let copy = with_short_burn_in(&snapshots()[0]);
+    let flags = format!("{SMALL} --worlds 2 --restore {}", text(&copy));
+    let worlds = Server::start(&flags).status().worlds;
     assert!((10..=20).contains(&worlds[0].info.step), "{worlds:?}");
     let begun = &worlds[1].info;
     assert_eq!((begun.seed, begun.episode, begun.step), (77, 1, 0));
-    true
+}
+
+/// A copy of a snapshot of a server with endless resets, as if that had been a [`SMALL`] one.
+fn with_short_burn_in(file: &Path) -> PathBuf {
+    let bytes = std::fs::read(file).expect("the snapshot");
+    let (settings, rules) = small_settings(ENDLESS);
+    let snapshot = decode(&bytes).expect("a snapshot");
+    let restored = snapshot.restore(&settings, &rules).expect("of that server");
+    let worlds = restored.iter().map(|world| match world {
+        RestoredWorld::Ready(episode) => WorldToWrite::Ready(episode),
+        RestoredWorld::Beginning(beginning) => WorldToWrite::Beginning(*beginning),
+    });
+    let worlds: Vec<_> = worlds.collect();
+    let copy = file.with_extension("copy");
+    let bytes = encode(&small_settings(20).0, &worlds).expect("small");
+    std::fs::write(&copy, bytes).expect("write");
+    copy
 }

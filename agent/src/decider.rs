@@ -160,20 +160,20 @@ impl Decider {
     }
 
     /// How long until the lease wants to be renewed.
-    pub fn until_renewal(&self) -> Duration {
+    pub fn until_renewal(&self, now: Instant) -> Duration {
         let lease = Duration::from_millis(self.client.info().lease_millis);
-        (lease / RENEW_AFTER).saturating_sub(self.last_use.elapsed())
+        (lease / RENEW_AFTER).saturating_sub(now.saturating_duration_since(self.last_use))
     }
 
     /// Checks that the server lives; renews the lease if it is time.
     ///
     /// # Errors
     /// [`RunError::Connection`]: the server is gone, or the lease is lost.
-    pub fn keep_alive(&mut self) -> Result<(), RunError> {
+    pub fn keep_alive(&mut self, now: Instant) -> Result<(), RunError> {
         self.client.check_server()?;
-        if self.until_renewal().is_zero() {
+        if self.until_renewal(now).is_zero() {
             self.client.renew()?;
-            self.last_use = Instant::now();
+            self.last_use = now;
         }
         Ok(())
     }

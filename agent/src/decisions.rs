@@ -141,9 +141,10 @@ impl Service {
                     }
                 }
             }
-            if self.last_look.elapsed() > TICK || self.decider.until_renewal().is_zero() {
-                self.last_look = Instant::now();
-                self.decider.keep_alive()?;
+            let now = Instant::now();
+            if now - self.last_look > TICK || self.decider.until_renewal(now).is_zero() {
+                self.last_look = now;
+                self.decider.keep_alive(now)?;
             }
         }
         Ok(None)
@@ -152,7 +153,7 @@ impl Service {
     /// The next request; `None` after a while or an event.
     fn wait(&mut self) -> Result<Option<ActiveControl>, DecisionsError> {
         let woken = Cell::new(false);
-        let tick = TICK.min(self.decider.until_renewal());
+        let tick = TICK.min(self.decider.until_renewal(Instant::now()));
         let look = || match self.desk.responder.receive() {
             Some(request) => Ok(Some(Found::Request(request))),
             None => Ok(woken.get().then_some(Found::Event)),
@@ -164,7 +165,7 @@ impl Service {
         match found {
             Some(Found::Request(request)) => Ok(Some(request)),
             Some(Found::Event) | None => {
-                self.decider.keep_alive()?;
+                self.decider.keep_alive(Instant::now())?;
                 Ok(None)
             }
         }

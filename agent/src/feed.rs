@@ -16,6 +16,13 @@ const FAREWELL: Duration = Duration::from_millis(500);
 /// What agents of one process show.
 pub struct Feed {
     showcase: Option<Showcase>,
+    turns: Turns,
+}
+
+/// Whose turn it is.
+#[derive(Default)]
+struct Turns {
+    /// When a world was shown last.
     shown: Option<Instant>,
     /// Worlds that were shown.
     n_shown: usize,
@@ -44,8 +51,7 @@ impl Feed {
             .ok();
         Self {
             showcase,
-            shown: None,
-            n_shown: 0,
+            turns: Turns::default(),
         }
     }
 
@@ -54,18 +60,13 @@ impl Feed {
         !self.turn(1).is_empty()
     }
 
-    /// Which of several worlds are to be shown now: one after the other, and no more at once than a reader keeps
-    /// beside one that is still to be read.
+    /// Which of several worlds are to be shown now, if anybody looks.
     pub fn turn(&self, n_worlds: usize) -> Vec<usize> {
-        let share = |shown: Instant| shown.elapsed().as_secs_f64() / INTERVAL.as_secs_f64();
-        let n_due = self
-            .shown
-            .map_or(1, |shown| (share(shown) * n_worlds as f64) as usize);
-        if n_due == 0 || !self.is_watched() {
-            return Vec::new();
+        let due = self.turns.due(Instant::now(), n_worlds);
+        match due.is_empty() || self.is_watched() {
+            true => due,
+            false => Vec::new(),
         }
-        let turn = (self.n_shown..).take(n_due.min(n_worlds).min(AGENT_BUFFER - 1));
-        turn.map(|number| number % n_worlds).collect()
     }
 
     /// Whether anybody looks.
@@ -76,7 +77,7 @@ impl Feed {
     /// Ends, when readers have had time to fetch what was shown last.
     pub fn end(self) {
         let began = Instant::now();
-        while self.shown.is_some() && self.is_watched() && began.elapsed() < FAREWELL {
+        while self.turns.shown.is_some() && self.is_watched() && began.elapsed() < FAREWELL {
             std::thread::sleep(INTERVAL);
         }
     }
@@ -86,8 +87,7 @@ impl Feed {
         let Some(showcase) = &mut self.showcase else {
             return;
         };
-        self.shown = Some(Instant::now());
-        self.n_shown += 1;
+        self.turns.pass(Instant::now());
         let about = AgentHeader {
             world: view.world,
             episode: view.result.episode,
@@ -99,5 +99,50 @@ impl Feed {
             tracing::warn!("beliefs are no longer shown: {error}");
             self.showcase = None;
         }
+    }
+}
+
+impl Turns {
+    /// Which of several worlds are due: one after the other, and no more at once than a reader keeps beside one that
+    /// is still to be read.
+    fn due(&self, now: Instant, n_worlds: usize) -> Vec<usize> {
+        let share = |shown: Instant| (now - shown).as_secs_f64() / INTERVAL.as_secs_f64();
+        let n_due = self
+            .shown
+            .map_or(1, |shown| (share(shown) * n_worlds as f64) as usize);
+        let turn = (self.n_shown..).take(n_due.min(n_worlds).min(AGENT_BUFFER - 1));
+        turn.map(|number| number % n_worlds).collect()
+    }
+
+    /// Takes note of a world that is shown.
+    fn pass(&mut self, now: Instant) {
+        self.shown = Some(now);
+        self.n_shown += 1;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn worlds_take_turns_and_each_is_shown_once_in_an_interval() {
+        let (mut turns, now) = (Turns::default(), Instant::now());
+        assert_eq!(turns.due(now, 5), [0], "the first at once");
+        turns.pass(now);
+        let nothing: [usize; 0] = [];
+        assert_eq!(turns.due(now + INTERVAL / 6, 5), nothing);
+        assert_eq!(turns.due(now + INTERVAL / 4, 5), [1]);
+        assert_eq!(turns.due(now + INTERVAL / 2, 5), [1, 2]);
+        assert_eq!(
+            turns.due(now + INTERVAL * 9, 5),
+            [1, 2, 3],
+            "a reader's buffer"
+        );
+        (1..5).for_each(|_| turns.pass(now));
+        assert_eq!(turns.due(now + INTERVAL / 4, 5), [0], "and from the start");
+        let almost = now + INTERVAL - Duration::from_micros(1);
+        assert_eq!(turns.due(almost, 1), nothing);
+        assert_eq!(turns.due(now + INTERVAL, 1), [0]);
     }
 }

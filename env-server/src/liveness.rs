@@ -145,3 +145,30 @@ fn clean(requests: &Receiver<()>) {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::wait::is_readable;
+    use std::process::Command;
+
+    #[test]
+    fn a_death_wakes_who_waits_for_the_descriptors_and_is_told_once() {
+        let mut clients = Clients::default();
+        let mut child = Command::new("sleep").arg("600").spawn().expect("a process");
+        clients.watch(child.id());
+        clients.watch(child.id());
+        assert_eq!(
+            clients.descriptors().count(),
+            1,
+            "a process is watched once"
+        );
+        assert!(!clients.descriptors().any(is_readable));
+        assert!(clients.take_dead().is_empty());
+        child.kill().expect("kill it");
+        child.wait().expect("wait for it");
+        assert!(clients.descriptors().all(is_readable));
+        assert_eq!(clients.take_dead(), [child.id()]);
+        assert!(clients.take_dead().is_empty());
+    }
+}

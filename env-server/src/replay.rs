@@ -2,11 +2,13 @@
 //!
 //! The file is read twice: once to check all of it before anybody sees anything, once to publish it.
 
+mod pace;
 mod stage;
 
 use crate::liveness::Cleaner;
 use crate::ports::{Place, PortError, Ports};
-use protocol::channels::{ChannelError, FRAME_BUFFER, Instance, ipc_error};
+use pace::Pace;
+use protocol::channels::{ChannelError, Instance, ipc_error};
 use protocol::control::{Reply, ServerInfo};
 use protocol::message::{Status, StepReply, VERSION};
 use protocol::recording::{Event, Reader, Record, RecordingError, Totals};
@@ -19,12 +21,6 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use thiserror::Error;
-
-/// Samples that are published at once: two bursts fit an observer's buffer.
-const BURST: usize = FRAME_BUFFER / 2;
-
-/// How long a burst takes at least: observers look every 500 us, and a machine is sometimes busy.
-const BURST_TIME: Duration = Duration::from_millis(1);
 
 /// How often a replay that waits looks for observers and for the end.
 const TICK: Duration = Duration::from_millis(50);
@@ -100,8 +96,7 @@ pub fn replay(order: &Order, stop: &AtomicBool) -> Result<(), ReplayError> {
         stop,
         ports,
         stage: Stage::new(survey.info, survey.totals.n_truths > 0),
-        n_in_burst: 0,
-        burst_began: Instant::now(),
+        pace: Pace::new(order.speed, Instant::now()),
         is_over: false,
         _cleaner: Cleaner::start(),
     };
@@ -124,8 +119,7 @@ struct Replay<'a> {
     stop: &'a AtomicBool,
     ports: Ports,
     stage: Stage,
-    n_in_burst: usize,
-    burst_began: Instant,
+    pace: Pace,
     is_over: bool,
     _cleaner: Cleaner,
 }
@@ -202,7 +196,7 @@ impl Replay<'_> {
 
     /// Publishes the recording once.
     fn publish_all(&mut self) -> Result<(), ReplayError> {
-        let began = Instant::now();
+        self.pace.begin_round(Instant::now());
         for record in open(&self.order.file)? {
             let record = match record {
                 Ok(record) => record,
@@ -213,7 +207,7 @@ impl Replay<'_> {
             if let Event::Server(_) = record.event {
                 self.stage.show(&record.event);
             } else if time >= self.order.from {
-                self.wait_until_due(began, time - self.order.from)?;
+                self.wait_until_due(time - self.order.from)?;
                 if self.ends() {
                     break;
                 }
@@ -224,22 +218,22 @@ impl Replay<'_> {
     }
 
     /// Waits until a moment of the recording, and gives observers time to follow.
-    fn wait_until_due(&mut self, began: Instant, time: Duration) -> Result<(), ReplayError> {
-        let speed = self.order.speed.unwrap_or(f64::INFINITY);
-        let due = Duration::try_from_secs_f64(time.as_secs_f64() / speed).unwrap_or(Duration::MAX);
-        while !self.ends() && began.elapsed() < due {
-            let left = due.saturating_sub(began.elapsed());
-            self.attend(Instant::now() + left.min(TICK))?;
+    fn wait_until_due(&mut self, time: Duration) -> Result<(), ReplayError> {
+        let due = self.pace.due(time);
+        let mut now = Instant::now();
+        while !self.ends() && due.is_none_or(|due| now < due) {
+            let tick = now + TICK;
+            self.attend(due.map_or(tick, |due| due.min(tick)))?;
+            now = Instant::now();
         }
-        if self.n_in_burst == BURST {
-            self.attend(self.burst_began + BURST_TIME)?;
-            (self.n_in_burst, self.burst_began) = (0, Instant::now());
+        if let Some(pause) = self.pace.pause() {
+            self.attend(pause)?;
         }
         Ok(())
     }
 
     fn publish(&mut self, record: Record) {
-        self.n_in_burst += 1;
+        self.pace.publish(Instant::now());
         self.stage.show(&record.event);
         match record.event {
             Event::Frame(sample) => self

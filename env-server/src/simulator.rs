@@ -393,3 +393,6 @@ impl ResetOrder {
         (self.world, episode)
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,160 @@
+//! What waits for worlds that are being reset, and what leases do meanwhile.
+
+use super::*;
+use crate::config::ServerConfig;
+use protocol::control::{Reply, Request, WorldSeed};
+use rayon::ThreadPoolBuilder;
+use std::time::Duration;
+
+const US: ClientId = ClientId { node: 1, pid: 7 };
+
+/// A lease's length, as this server's settings say.
+const LEASE: Duration = Duration::from_secs(20);
+
+/// Two worlds in their first burn-in, and what ends it.
+fn start() -> (Simulator, Vec<ResetOrder>) {
+    let config = ServerConfig {
+        worlds: 2,
+        height: 3,
+        width: 5,
+        moves: 2,
+        burn_in: 20,
+        lease_millis: LEASE.as_millis() as u64,
+        ..ServerConfig::default()
+    };
+    let threads = ThreadPoolBuilder::new().num_threads(1).build();
+    let mut token = 0;
+    let next_token = Box::new(move || {
+        token += 1;
+        token
+    });
+    let checked = config.check().expect("valid settings");
+    Simulator::new(checked, threads.expect("a thread"), next_token).expect("a valid model")
+}
+
+fn finish(simulator: &mut Simulator, orders: Vec<ResetOrder>) {
+    for order in orders {
+        let (world, episode) = order.carry_out(simulator.rules());
+        simulator.finish_reset(world, episode);
+    }
+}
+
+fn ask(simulator: &mut Simulator, now: Instant, request: &Request) -> Outcome {
+    let text = serde_json::to_vec(request).expect("requests serialise");
+    simulator.control(now, US, VERSION, &text, &Surroundings::default())
+}
+
+/// Asks for what is answered later.
+fn later(simulator: &mut Simulator, now: Instant, request: &Request) -> (Vec<ResetOrder>, Awaited) {
+    match ask(simulator, now, request) {
+        Outcome::Later(orders, awaited) => (orders, awaited),
+        _ => panic!("{request:?} is not answered later"),
+    }
+}
+
+/// Asks for both worlds; the first token is 1.
+fn acquire(simulator: &mut Simulator, now: Instant) -> Awaited {
+    let request = Request::Acquire {
+        first_world: 0,
+        n_worlds: 2,
+        takeover: false,
+        ttl_millis: None,
+    };
+    later(simulator, now, &request).1
+}
+
+/// Resets world 0 to a seed.
+fn reset(seed: u64) -> Request {
+    let seed = Some(seed);
+    Request::Reset {
+        lease: 1,
+        worlds: vec![WorldSeed { world: 0, seed }],
+    }
+}
+
+/// The status of a step of world 0.
+fn step(simulator: &mut Simulator, now: Instant) -> Status {
+    let request = StepRequest {
+        version: VERSION,
+        operation: Operation::Step as u32,
+        lease: 1,
+        n_worlds: 1,
+        n_moves: 2,
+        ..StepRequest::default()
+    };
+    let reply = simulator.step(now, US, &request, &[1, 3], &mut Vec::new());
+    Status::try_from(reply.status).expect("a known status")
+}
+
+#[test]
+fn a_world_in_burn_in_takes_no_step_and_requests_for_it_wait() {
+    let ((mut simulator, orders), now) = (start(), Instant::now());
+    let acquired = acquire(&mut simulator, now);
+    assert_eq!(simulator.answer_awaited(now, &acquired), None);
+    assert_eq!(step(&mut simulator, now), Status::Resetting);
+    finish(&mut simulator, orders);
+    let told = simulator.answer_awaited(now, &acquired);
+    assert!(matches!(told, Some(Reply::Lease(_))), "{told:?}");
+    assert_eq!(step(&mut simulator, now), Status::Ok);
+
+    let (orders, awaited) = later(&mut simulator, now, &reset(77));
+    assert_eq!(simulator.answer_awaited(now, &awaited), None);
+    assert_eq!(step(&mut simulator, now), Status::Resetting);
+    let twice = ask(&mut simulator, now, &reset(78));
+    let is_refused =
+        matches!(&twice, Outcome::Answer(reply) if reply.status() == Status::Resetting);
+    assert!(is_refused, "one reset of a world at a time");
+    finish(&mut simulator, orders);
+    let Some(Reply::Reset { worlds }) = simulator.answer_awaited(now, &awaited) else {
+        panic!("expected a reset");
+    };
+    let begun = (worlds[0].seed, worlds[0].step, worlds[0].episode);
+    assert_eq!(begun, (77, 0, 1), "the step before is forgotten");
+    assert_eq!(step(&mut simulator, now), Status::Ok);
+}
+
+#[test]
+fn a_lease_lasts_from_its_last_use_or_renewal() {
+    let ((mut simulator, orders), now) = (start(), Instant::now());
+    let acquired = acquire(&mut simulator, now);
+    finish(&mut simulator, orders);
+    simulator.answer_awaited(now, &acquired).expect("ready");
+    let almost = LEASE - Duration::from_millis(1);
+    let now = now + almost;
+    assert_eq!(step(&mut simulator, now), Status::Ok);
+    let now = now + almost;
+    let (_, awaited) = later(&mut simulator, now, &Request::Renew { lease: 1 });
+    simulator.answer_awaited(now, &awaited).expect("ready");
+    assert!(simulator.expire(now + almost).is_empty());
+    assert_eq!(step(&mut simulator, now + LEASE), Status::LeaseLost);
+    assert_eq!(simulator.expire(now + LEASE), [US.pid]);
+}
+
+#[test]
+fn a_lease_outlives_the_burn_ins_that_its_client_waits_for() {
+    let ((mut simulator, orders), now) = (start(), Instant::now());
+    let acquired = acquire(&mut simulator, now);
+    let now = now + 9 * LEASE;
+    assert!(simulator.expire(now).is_empty(), "the first");
+    finish(&mut simulator, orders);
+    let told = simulator.answer_awaited(now, &acquired);
+    assert!(matches!(told, Some(Reply::Lease(_))), "{told:?}");
+
+    let (orders, awaited) = later(&mut simulator, now, &reset(77));
+    let now = now + 9 * LEASE;
+    assert!(simulator.expire(now).is_empty(), "that of a reset");
+    finish(&mut simulator, orders);
+    let told = simulator.answer_awaited(now, &awaited);
+    assert!(matches!(told, Some(Reply::Reset { .. })), "{told:?}");
+
+    let (_, awaited) = later(&mut simulator, now, &reset(78));
+    let now = now + 9 * LEASE;
+    simulator.forget_awaited(now, &awaited);
+    let almost = now + LEASE - Duration::from_millis(1);
+    assert!(simulator.expire(almost).is_empty());
+    assert_eq!(
+        simulator.expire(now + LEASE),
+        [US.pid],
+        "but not one that nobody waits for any more"
+    );
+}
