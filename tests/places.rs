@@ -11,8 +11,12 @@ fn apart(script: &str) -> Option<Output> {
     let run = |script: &str| {
         let mut command = Command::new("unshare");
         let script = format!("mount -t tmpfs tmpfs /dev/shm && {script}");
+        let kind = match rustix::process::getuid().is_root() {
+            true => "-m",
+            false => "-rm",
+        };
         command
-            .args(["-rm", "timeout", "60", "sh", "-c", &script])
+            .args([kind, "timeout", "60", "sh", "-c", &script])
             .env("S", program_path("emberwatch-server"))
             .env("RUST_LOG", "info");
         command.output().ok()
@@ -30,7 +34,7 @@ fn a_server_whose_files_are_removed_says_so_and_ends_and_leaves_its_successor_al
     let script = format!(
         "$S {SMALL} & first=$!
          until $S status >/dev/null 2>&1; do sleep 0.01; done
-         rm -r /dev/shm/emberwatch-*
+         rm -rf /dev/shm/emberwatch-*
          $S {SMALL} & second=$!
          wait $first; echo first ended with $?
          until $S status >/dev/null 2>&1; do sleep 0.01; done

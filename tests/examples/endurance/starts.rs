@@ -9,9 +9,13 @@ use std::time::{Duration, Instant};
 
 const N_LOOPS: usize = 5;
 
+/// A server cleans up every two seconds.
+const SETTLED: Duration = Duration::from_secs(3);
+
 /// Kills so many servers in their start, and a quarter as many each in their end and of those who connect.
 pub fn kill(n_starts: usize) {
     let witness = Server::start("--burn-in 0");
+    std::thread::sleep(SETTLED);
     let before = Use::of(witness.program.pid());
     let each = Kills {
         starts: n_starts / N_LOOPS,
@@ -43,7 +47,7 @@ pub fn kill(n_starts: usize) {
     }
     say(&format!("{} names start: {}", starts.len(), spread(starts)));
     assert!(status(&witness.instance).is_ok(), "the witness serves");
-    std::thread::sleep(Duration::from_secs(3)); // The cleaner looks each two.
+    std::thread::sleep(SETTLED);
     say(&format!("a server that watched, before: {before}"));
     say(&format!(
         "                      after:  {}",
