@@ -10,10 +10,11 @@ use crate::program::process_state;
 use crate::turn::Turn;
 use iceoryx2::node::{DeadNodeView, Node, NodeState, NodeView};
 use iceoryx2::prelude::{CallbackProgression, Config};
+use rustix::time::{ClockId, clock_gettime};
 use std::collections::HashSet;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 /// What is younger and of a living process may be in the making, by a client that takes no turns.
 const MAKING: Duration = Duration::from_secs(1);
@@ -61,6 +62,11 @@ impl Places {
     }
 
     fn remove_leftovers(&self, config: &Config) -> usize {
+        // Files before nodes and their tags: what a client without turns makes meanwhile is not among them.
+        let list = |folder: &str| entries(&self.root.join(folder)).collect::<Vec<_>>();
+        let (node_files, services) = (list("nodes"), list("services"));
+        let sockets = entries(&self.root).filter(|path| name(path).starts_with(&self.prefix));
+        let ports: Vec<PathBuf> = self.segments().chain(sockets).collect();
         let Some((mut living, dead)) = nodes(config) else {
             return 0;
         };
@@ -81,10 +87,10 @@ impl Places {
                 living.insert(id);
             }
         }
-        n_removed += self.remove_nodes(&living);
+        n_removed += self.remove_nodes(node_files, &living);
         used = self.used(&living);
-        n_removed += self.remove_services(&used);
-        n_removed + self.remove_ports(&used)
+        n_removed += self.remove_services(services, &used);
+        n_removed + self.remove_ports(ports, &used)
     }
 
     /// Segments that nobody will finish: to open one could take for ever.
@@ -98,7 +104,7 @@ impl Places {
         self.segments().filter(is_left).map(remove).sum()
     }
 
-    fn remove_nodes(&self, living: &HashSet<u128>) -> usize {
+    fn remove_nodes(&self, files: Vec<PathBuf>, living: &HashSet<u128>) -> usize {
         let is_left = |path: &PathBuf| {
             let name = name(path);
             let monitor = name
@@ -107,33 +113,26 @@ impl Places {
             let id = monitor.map_or(&*name, |(id, _)| id).parse();
             id.is_ok_and(|id| !living.contains(&id) && !is_in_the_making(id))
         };
-        let left = entries(&self.root.join("nodes")).filter(is_left);
-        left.map(remove).sum()
+        files.into_iter().filter(is_left).map(remove).sum()
     }
 
-    fn remove_services(&self, used: &Used) -> usize {
+    fn remove_services(&self, files: Vec<PathBuf>, used: &Used) -> usize {
         let is_left = |path: &PathBuf| {
             self.hash(path)
                 .is_some_and(|hash| !used.hashes.contains(&hash))
         };
-        let left = entries(&self.root.join("services")).filter(is_left);
-        left.map(remove).sum()
+        files.into_iter().filter(is_left).map(remove).sum()
     }
 
     /// Segments and sockets that belong to no living port and to no service.
-    fn remove_ports(&self, used: &Used) -> usize {
+    fn remove_ports(&self, files: Vec<PathBuf>, used: &Used) -> usize {
         let services = self.service_ids(used);
         let is_left = |path: &PathBuf| {
             let ids = self.ids(path);
             let is_used = |id: &u128| used.ids.contains(id) || services.contains(id);
             !ids.is_empty() && !ids.iter().any(is_used) && !ids.into_iter().any(is_in_the_making)
         };
-        let sockets = entries(&self.root).filter(|path| name(path).starts_with(&self.prefix));
-        self.segments()
-            .chain(sockets)
-            .filter(is_left)
-            .map(remove)
-            .sum()
+        files.into_iter().filter(is_left).map(remove).sum()
     }
 
     fn used(&self, living: &HashSet<u128>) -> Used {
@@ -226,9 +225,14 @@ fn nodes(config: &Config) -> Option<(HashSet<u128>, Vec<DeadNodeView<Ipc>>)> {
 /// Whether what an id stands for may be in the making: an id has the time when, and the process that, began it.
 fn is_in_the_making(id: u128) -> bool {
     let (seconds, nanos, pid) = (id as u32, (id >> 32) as u32, (id >> 64) as i32);
-    let began = UNIX_EPOCH + Duration::new(seconds.into(), nanos);
-    let age = SystemTime::now().duration_since(began).unwrap_or_default();
+    let age = since_boot().saturating_sub(Duration::new(seconds.into(), nanos));
     age < MAKING && !matches!(process_state(pid), None | Some('Z' | 'X'))
+}
+
+/// The clock of ids.
+fn since_boot() -> Duration {
+    let now = clock_gettime(ClockId::Monotonic);
+    Duration::new(now.tv_sec as u64, now.tv_nsec as u32)
 }
 
 /// A tag, or a node's details, can be written to until it is finished.
@@ -274,7 +278,7 @@ mod tests {
     const NOBODY: u32 = 1 << 30;
 
     fn id(pid: u32, age: Duration) -> u128 {
-        let began = SystemTime::now().duration_since(UNIX_EPOCH).expect("now") - age;
+        let began = since_boot().saturating_sub(age);
         u128::from(pid) << 64 | u128::from(began.subsec_nanos()) << 32 | began.as_secs() as u128
     }
 
@@ -325,7 +329,9 @@ mod tests {
 
         let minute = Duration::from_secs(60);
         let (dead, old) = (id(NOBODY, Duration::ZERO), id(me, minute));
-        let (new, port) = (id(me, Duration::ZERO), publisher.id().value());
+        let new = id(me, Duration::ZERO);
+        let port = publisher.id().value();
+        assert!(is_in_the_making(port), "ids are of our clock: {port}");
         let hash = "0123456789abcdef".repeat(3)[..40].to_owned();
         let segment = |name: String| places.shared.join(format!("{prefix}{hash}_{name}"));
         // Grows now; is in the making by a client without turns; is connected to a living port.

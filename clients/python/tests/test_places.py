@@ -129,13 +129,13 @@ def _identity(pid: int, seconds: float) -> int:
 
 def test_what_dead_processes_left_half_made_is_removed_and_the_young_of_others_stays() -> None:
     nobody = 1 << 30
-    dead = [_segment(f"{_identity(nobody, time.time())}.dynamic")]
-    dead += [_segment(f"{_identity(US, time.time() - 60)}.data")]
+    dead = [_segment(f"{_identity(nobody, time.monotonic())}.dynamic")]
+    dead += [_segment(f"{_identity(US, max(time.monotonic() - 60, 0))}.data")]
     dead += [_segment(f"{_identity(nobody, 0)}_{_identity(nobody, 1)}.connection")]
-    young = _segment(f"{_identity(US, time.time() + 60)}.dynamic")
+    young = _segment(f"{_identity(US, time.monotonic() + 60)}.dynamic")
     for path in (*dead, young):
         path.touch(0o200)
-    node = channels.directory() / "nodes" / str(_identity(nobody, time.time()))
+    node = channels.directory() / "nodes" / str(_identity(nobody, time.monotonic()))
     node.mkdir()
     (node / "emberwatch-0_node.details").touch(0o600)
     try:

@@ -36,6 +36,11 @@ class Places:
 
     def remove_leftovers(self, config: Any) -> None:
         """Removes what dead processes left; to be called in a turn that is ours alone."""
+        # Files before nodes and tags: what others make meanwhile, without turns, is not among them.
+        node_files = list((self._root / "nodes").glob("*"))
+        service_files = list((self._root / "services").glob(f"{self._prefix}*.service"))
+        folders = (self._shared, self._root)
+        port_files = [path for folder in folders for path in folder.glob(f"{self._prefix}*")]
         living: set[int] = set()
         dead: list[Any] = []
         for node in _iox2.Node.list(_iox2.ServiceType.Ipc, config):
@@ -63,25 +68,24 @@ class Places:
                     node.try_remove_stale_resources()
                 except _iox2.NodeCleanupFailure:
                     living.add(identity)
-        self._remove_nodes(living)
+        self._remove_nodes(node_files, living)
         ports, services = self._used(living)
-        used = ports | set(self._remove_services(services))
-        sockets = self._root.glob(f"{self._prefix}*")
-        for path in (*self._shared.glob(f"{self._prefix}*"), *sockets):
+        used = ports | set(self._remove_services(service_files, services))
+        for path in port_files:
             ids = self._ids(path)
             if ids and not ids & used and not any(map(_is_in_the_making, ids)):
                 _remove(path)
 
-    def _remove_nodes(self, living: set[int]) -> None:
-        for path in (self._root / "nodes").glob("*"):
+    def _remove_nodes(self, files: list[Path], living: set[int]) -> None:
+        for path in files:
             identity = path.name.removeprefix(self._prefix).partition(".node_monitor")[0]
             if identity.isdecimal() and int(identity) not in living:
                 if not _is_in_the_making(int(identity)):
                     _remove(path)
 
-    def _remove_services(self, hashes: set[str]) -> Iterator[int]:
+    def _remove_services(self, files: list[Path], hashes: set[str]) -> Iterator[int]:
         """Removes services that nobody uses; yields the ids of the others."""
-        for path in (self._root / "services").glob(f"{self._prefix}*.service"):
+        for path in files:
             if path.stem.removeprefix(self._prefix) not in hashes:
                 _remove(path)
                 continue
@@ -118,7 +122,7 @@ class Places:
 def _is_in_the_making(identity: int) -> bool:
     """Whether an id was begun just now, by a process that lives."""
     seconds, nanos, pid = (identity >> shift & 0xFFFFFFFF for shift in (0, 32, 64))
-    is_young = time.time() - seconds - nanos * 1e-9 < _MAKING
+    is_young = time.monotonic() - seconds - nanos * 1e-9 < _MAKING
     return is_young and process_state(pid) not in (None, "Z", "X")
 
 
