@@ -14,7 +14,7 @@ export function createPointer(changed) {
   addEventListener("pointerdown", follow);
   addEventListener("pointermove", follow);
   document.documentElement.addEventListener("pointerleave", follow);
-  addEventListener("scroll", changed, { capture: true, passive: true });
+  addEventListener("scroll", () => at && changed(), { capture: true, passive: true });
 
   return {
     /** Which of `elements` it is on, and where: { element, clientX, clientY }; null if on none that is seen there. */
