@@ -344,7 +344,7 @@ mod tests {
         make(segment("node.0_10_1.global_mgmt".into()), 0o200);
         make(segment(format!("{dead}.dynamic")), 0o200);
         make(segment(format!("{old}.dynamic")), 0o600);
-        make(segment(format!("{port}_{dead}.connection_2")), 0o200);
+        make(segment(format!("{old}_{dead}.connection_2")), 0o200);
         for name in [
             format!("{dead}.data"),
             format!("{old}__mgmt.data"),

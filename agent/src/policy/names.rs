@@ -77,7 +77,7 @@ fn description(policy: &Policy, model: &Model) -> String {
         EstimatorKind::Learned => "; learned filter, needs --checkpoint",
         EstimatorKind::Autoencoder => "; the paper's autoencoder, needs --checkpoint",
         EstimatorKind::Truth => "; told the hidden states, needs --publish-truth",
-        EstimatorKind::NextTruth => "; told the next hidden states, only in `compare`",
+        EstimatorKind::NextTruth => "; told the next states, only in `compare`",
     };
     format!("{planner} for {}{belief}", goal(policy, model))
 }
@@ -125,7 +125,7 @@ mod tests {
         assert_eq!(
             line("clairvoyant_beam").map(str::trim),
             Some(
-                "clairvoyant_beam         beam search for fire, which pays most; told the next hidden \
+                "clairvoyant_beam         beam search for fire, which pays most; told the next \
                  states, only in `compare`"
             )
         );
