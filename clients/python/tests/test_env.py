@@ -17,6 +17,7 @@ import gymnasium
 import numpy as np
 import pytest
 from environments import (
+    LIVELY,
     MOVES,
     OBJECTIVE,
     SMALL,
