@@ -128,6 +128,8 @@ def _survey(flags: argparse.Namespace, selection: Selection) -> tuple[ServerInfo
                 n_steps += 1
                 has_truth |= step.truth is not None
                 episodes.add(step.frame.result.episode)
+    if server is None and not worlds and caught:
+        raise FilmError(str(caught[-1].message))
     if server is None:
         raise FilmError(
             f"--world: expected one of those recorded, {sorted(worlds)}, got {flags.world}"
