@@ -250,9 +250,6 @@ impl Server {
 
     /// Sleeps until a wake-up, a signal, a death or a finished reset; returns whether there was one.
     fn sleep(&self, limit: Duration) -> Result<bool, ServeError> {
-        if self.ports.drain()? {
-            return Ok(true);
-        }
         let own = [
             self.ports.descriptor(),
             self.resets.descriptor(),
@@ -261,7 +258,10 @@ impl Server {
         let keeper = self.keeper.iter().map(Keeper::descriptor);
         let others = keeper.chain(self.clients.descriptors());
         let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(others).collect();
-        Ok(sleep_until_event(&descriptors, limit).map_err(ipc_error("sleep"))?)
+        let woken = sleep_until_event(&descriptors, limit).map_err(ipc_error("sleep"))?;
+        // Not later: what is left ends the next sleep at once.
+        self.ports.drain()?;
+        Ok(woken)
     }
 
     fn answer_step(&mut self, now: Instant, request: &ActiveStep) {

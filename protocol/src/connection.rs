@@ -323,12 +323,11 @@ impl Wake {
 
     /// Sleeps until woken; returns whether the server has ended.
     fn sleep(&self, timeout: Duration) -> Result<bool, ChannelError> {
-        if drain(&self.listener)? {
-            return Ok(false);
-        }
         let descriptors = [descriptor(&self.listener), self.server_process.as_fd()];
         let readable = sleep_until_readable(&descriptors, timeout)
             .map_err(ipc_error("wait for the server"))?;
+        // Not later: what is left ends the next sleep at once.
+        drain(&self.listener)?;
         Ok(readable[1])
     }
 

@@ -28,6 +28,7 @@ pub mod program;
 pub mod randomness;
 pub mod recording;
 pub mod responder;
+mod spinning;
 pub mod transition;
 pub mod turn;
 pub mod wait;

@@ -1,7 +1,7 @@
 """Requests and answers: one at a time, each with a deadline. Nothing returned is shared memory.
 
-The wait is PROTOCOL.md section 8's: look for about 5 us, look and yield until 50 us, then sleep
-on the listener that the server wakes.
+The wait is PROTOCOL.md section 8's: look for 100 us where that pays, then sleep on the listener
+that the server wakes.
 """
 
 from __future__ import annotations
@@ -22,26 +22,15 @@ from emberwatch.errors import (
     ServerGoneError,
     VersionMismatchError,
 )
+from emberwatch.spinning import Spinning
 
 Reply = TypeVar("Reply", bound=wire.Header)
-
-#: Looks at the answer before the processor is offered to others: about 5 us.
-_SPINS: Final = 12
-
-#: How long to look and yield before sleeping, seconds.
-_YIELD: Final = 45e-6
 
 #: Default timeout of a step, seconds.
 STEP_TIMEOUT: Final = 5.0
 
 #: Default timeout of what may wait for a burn-in, seconds.
 RESET_TIMEOUT: Final = 120.0
-
-#: A yield that takes longer went to a process that never sleeps, seconds.
-_LONG_YIELD: Final = 1e-3
-
-#: How long not to yield after that, seconds.
-_CONTENDED: Final = 0.1
 
 #: Longest sleep between two looks: bounds what a lost wake-up or a dead server can cost.
 _SLEEP: Final = iox2.Duration.from_millis(50)
@@ -75,7 +64,7 @@ class Bell:
         self._process: int | None = None
         self._forget: weakref.finalize[[int], Any] | None = None
         self._poll = select.poll()
-        self._contended_until = 0.0
+        self._spinning = Spinning()
         self._next_clean_up = 0.0
 
     def watch(self, pid: int) -> None:
@@ -114,25 +103,20 @@ class Bell:
             RequestTimeoutError: If none comes in time.
             ServerGoneError: If none can come any more.
         """
-        receive = pending.receive
-        for _ in range(_SPINS):
-            response = receive()
-            if response is not None:
-                return response
+        receive, spinning = pending.receive, self._spinning
         start = now = time.perf_counter()
-        while now - start < _YIELD and now >= self._contended_until:
-            os.sched_yield()
+        spinning.begin(start)
+        while spinning.goes_on(now):
             response = receive()
             if response is not None:
+                spinning.arrived()
                 return response
-            before, now = now, time.perf_counter()
-            if now - before > _LONG_YIELD:
-                self._contended_until = now + _CONTENDED
+            now = time.perf_counter()
         return self._sleep(pending, what, timeout, start)
 
     def _sleep(self, pending: Any, what: str, timeout: float, start: float) -> Any:
+        is_gone = False
         while True:
-            is_gone = self._is_gone(pending)
             # In this order: an answer may have come just before the end.
             response = pending.receive()
             if response is not None:
@@ -145,15 +129,15 @@ class Bell:
                 raise RequestTimeoutError(
                     f"no answer to {what} from instance {self.node.instance!r} within {timeout} s"
                 )
-            # Drained first: what is left from earlier answers must not end the sleep at once.
-            if self._listener.try_wait():
-                continue
             longest = _SLEEP if remaining > 0.05 else iox2.Duration.from_secs_f64(remaining)
             try:
-                self._listener.timed_wait(longest)
+                # What is left from earlier answers ends the first sleep at once.
+                woken = self._listener.timed_wait(longest)
             except iox2.ListenerWaitError as error:
                 if "Interrupt" not in str(error):
                     raise ChannelError(f"wait for the server: {error}") from None
+                woken = False
+            is_gone = not woken and self._is_gone(pending)
 
     def _is_gone(self, pending: Any) -> bool:
         if self._process is not None:
