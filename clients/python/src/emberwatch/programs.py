@@ -82,14 +82,15 @@ class Program:
         # Its own words, for the error if it ends at once. A file never fills up and blocks it.
         self._words: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
         try:
-            # A session of its own: Ctrl-C is for Python, which then stops it.
+            # A process group of its own: Ctrl-C is for Python, which then stops it. Not a session:
+            # each has its own share of the cores, and between shares a wake-up waits longer.
             self._process = subprocess.Popen(
                 command,
                 env=environment,
                 stdin=subprocess.DEVNULL,
                 stdout=self._words,
                 stderr=self._words,
-                start_new_session=True,
+                process_group=0,
             )
         except OSError as error:
             self._words.close()
