@@ -9,10 +9,11 @@ Prints p50 and p99 with their least and greatest over rounds.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import multiprocessing
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium
@@ -142,23 +143,37 @@ def start_up(n: int) -> None:
     )
 
 
+@contextlib.contextmanager
+def busy_processes(n: int) -> Iterator[None]:
+    """So many processes that never sleep."""
+    context = multiprocessing.get_context("spawn")
+    busy = [context.Process(target=spin, daemon=True) for _ in range(n)]
+    for process in busy:
+        process.start()
+    time.sleep(1)
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+
+
 def main() -> None:
     """Prints all rows."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument(
+        "--busy", type=int, nargs="+", help="only single steps, beside so many busy processes"
+    )
     args = parser.parse_args()
-    start_up(5)
-    race([emberwatch_row, async_row, envpool_row], 1, 4000, args.rounds)
-    race([emberwatch_row, async_row, envpool_row], 64, 200, args.rounds)
-    print("beside three busy processes:")
-    context = multiprocessing.get_context("spawn")
-    busy = [context.Process(target=spin, daemon=True) for _ in range(3)]
-    for process in busy:
-        process.start()
-    time.sleep(1)
-    race([emberwatch_row, async_row], 1, 1000, args.rounds)
-    for process in busy:
-        process.kill()
+    if args.busy is None:
+        start_up(5)
+        race([emberwatch_row, async_row, envpool_row], 1, 4000, args.rounds)
+        race([emberwatch_row, async_row, envpool_row], 64, 200, args.rounds)
+    for n in args.busy or [3]:
+        print(f"beside {n} busy processes:")
+        with busy_processes(n):
+            race([emberwatch_row, async_row], 1, 1000, args.rounds)
 
 
 if __name__ == "__main__":
