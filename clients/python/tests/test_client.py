@@ -237,7 +237,7 @@ def test_shutdown_ends_the_server(server: Start) -> None:
     with pytest.raises(errors.ServerGoneError, match=started.instance):
         client.status()
     with pytest.raises(errors.NoServerError):
-        connect(started.instance, timeout=0.1)
+        connect(started.instance)
 
 
 def test_a_client_of_an_ended_server_does_not_ask_the_next(server: Start) -> None:

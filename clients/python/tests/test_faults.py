@@ -98,7 +98,7 @@ def test_a_server_killed_between_steps_is_gone_at_the_next(server: Start) -> Non
         with pytest.raises(errors.ServerGoneError, match=started.instance):
             call()
     with pytest.raises(errors.NoServerError):
-        connect(started.instance, timeout=0.1)
+        connect(started.instance)
 
 
 def test_a_stopped_server_is_a_timeout_and_observing_tells_what_happened(server: Start) -> None:
@@ -203,7 +203,7 @@ def test_nothing_is_left_when_learner_and_private_server_are_killed(script: Run)
 def next_start(instance: str) -> None:
     """What any next start does first; nobody serves the instance of the last one."""
     with pytest.raises(errors.NoServerError):
-        connect(instance, timeout=0.1)
+        connect(instance)
     env = WildfireEnv(**SMALL)
     env.reset(seed=1)
     env.close()
@@ -292,4 +292,4 @@ def test_a_server_of_another_version_elsewhere_is_not_meant(
     monkeypatch.setattr(wire, "VERSION", 2)
     for instance in (started.instance + "0", started.instance[:-1] + "x", "nobody"):
         with pytest.raises(errors.NoServerError):
-            connect(instance, timeout=0.1)
+            connect(instance)

@@ -32,7 +32,7 @@ def test_a_seventeenth_client_is_told_the_limit_and_others_go_on(server: Start) 
 
 def test_without_a_server_the_instance_and_the_remedy_are_named() -> None:
     with pytest.raises(errors.NoServerError) as raised:
-        connect("nobody-here", timeout=0.1)
+        connect("nobody-here")
     assert "'nobody-here'" in str(raised.value)
     assert "emberwatch-server --instance nobody-here" in str(raised.value)
 
@@ -42,7 +42,7 @@ def test_a_server_that_is_started_later_is_waited_for(
 ) -> None:
     instance = unused_instance()
     with ThreadPoolExecutor() as threads:
-        waiting = threads.submit(connect, instance, timeout=PATIENCE)
+        waiting = threads.submit(connect, instance, wait=PATIENCE)
         assert eventually(lambda: "waiting up to 20 s" in caplog.text)
         started = server(instance)
         with waiting.result(2 * PATIENCE) as client:

@@ -287,12 +287,15 @@ class Client(Closing):
         return record(ServerInfo, reply)
 
 
-def connect(instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> Client:
-    """Connects to a running server, or to one that is just starting.
+def connect(
+    instance: str = "default", *, timeout: float = STEP_TIMEOUT, wait: float = 0.0
+) -> Client:
+    """Connects to a running server, or with `wait` to one that is just starting.
 
     Args:
         instance: The server's instance name.
-        timeout: How long to wait until there is a server, and then for its answer, seconds.
+        timeout: How long to wait for the server's answer, seconds.
+        wait: How long to wait until there is a server, seconds; 0: fail at once.
 
     Raises:
         NoServerError: If nobody serves the instance by then.
@@ -300,16 +303,16 @@ def connect(instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> Clie
         RequestTimeoutError: If it does not answer.
         ChannelError: If the channels cannot be opened, also when there are too many clients.
     """
-    return when_served(timeout, lambda: Client(instance, timeout=timeout))
+    return when_served(wait, lambda: Client(instance, timeout=timeout))
 
 
-def when_served(timeout: float, connect: Callable[[], _Connection]) -> _Connection:
+def when_served(wait: float, connect: Callable[[], _Connection]) -> _Connection:
     """Connects as soon as somebody answers there, and says so once if that is not at once.
 
     Raises:
-        NoServerError: If nobody does within `timeout` seconds.
+        NoServerError: If nobody does within `wait` seconds.
     """
-    deadline, waits = time.monotonic() + timeout, False
+    deadline, waits = time.monotonic() + wait, False
     while True:
         try:
             return connect()
@@ -319,6 +322,6 @@ def when_served(timeout: float, connect: Callable[[], _Connection]) -> _Connecti
             if not left > 0:
                 raise
             if not waits:
-                _log.warning("%s; waiting up to %g s for it", error, timeout)
+                _log.warning("%s; waiting up to %g s for it", error, wait)
             waits = True
             time.sleep(min(_RETRY, left))

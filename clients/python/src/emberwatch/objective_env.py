@@ -234,7 +234,7 @@ class WildfireObjectiveEnv(WorldEnv):
                 with self._session.launch(0 if seed is None else seed) as client:
                     instance = client.instance
             else:
-                connect(instance, timeout=settings.timeout).close()
+                connect(instance, timeout=settings.timeout, wait=settings.timeout).close()
             if self.render_mode is not None:
                 self._frames = Observer(instance, world=settings.world)
             if self._reveals:

@@ -67,7 +67,9 @@ class Session:
         if settings.instance is None:
             self.model, self.shape, self.burn_in = private_world(settings)
         else:
-            with connect(settings.instance, timeout=settings.timeout) as client:
+            with connect(
+                settings.instance, timeout=settings.timeout, wait=settings.timeout
+            ) as client:
                 self.model, self.shape, self.burn_in = running_world(
                     settings, n_worlds, client.info
                 )
@@ -182,7 +184,8 @@ class Session:
             if settings.instance is None:
                 self._client = client = self.launch(0 if seed is None else seed % 2**64)
             else:
-                self._client = client = connect(settings.instance, timeout=settings.timeout)
+                client = connect(settings.instance, timeout=settings.timeout, wait=settings.timeout)
+                self._client = client
                 self._check_unchanged(client)
             self._lease = client.acquire(
                 settings.world,
