@@ -305,8 +305,12 @@ impl ServerConfig {
             return Ok(model);
         }
         let path = Path::new(&self.model);
-        Model::from_toml(&read("model file", path)?)
-            .map_err(|error| file_error("model file", path, error))
+        let text = read_text(path).map_err(|error| {
+            let names: Vec<&str> = Model::built_in_names().collect();
+            let problem = format!("{error}: expected one, or {}", names.join(", "));
+            file_error("model file", path, problem)
+        })?;
+        Model::from_toml(&text).map_err(|error| file_error("model file", path, error))
     }
 }
 
