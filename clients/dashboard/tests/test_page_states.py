@@ -161,7 +161,7 @@ def test_a_dashboard_that_goes_is_waited_for(watched, programs):
     # A port of our own: the system gives those from 32768 on to anybody who asks.
     dashboard = programs.dashboard(server.instance, port=20000 + os.getpid() % 10000)
     look.page.goto(dashboard.url)
-    look.eventually(lambda: look.has("frame"), "a world")
+    look.eventually(look.at("panel-frame").is_visible, "a world")
     look.allowed.append("WebSocket connection to .* failed")
     dashboard.kill()
     look.eventually(lambda: "dashboard gone" in look.text("state"), "gone")
