@@ -75,7 +75,7 @@ fn description(policy: &Policy, model: &Model) -> String {
         EstimatorKind::KnownModel if policy.is_decided => ", needs --checkpoint",
         EstimatorKind::None | EstimatorKind::KnownModel => "",
         EstimatorKind::Learned => "; learned filter, needs --checkpoint",
-        EstimatorKind::Autoencoder => "; the paper's autoencoder, needs --checkpoint",
+        EstimatorKind::Autoencoder => "; learned autoencoder, needs --checkpoint",
         EstimatorKind::Truth => "; told the hidden states, needs --publish-truth",
         EstimatorKind::NextTruth => "; told the next states, only in `compare`",
     };
