@@ -22,6 +22,7 @@ use agent::run::{Mission, RunError, run};
 use agent::train::TrainError;
 use anyhow::{Context, Result};
 use clap::Args;
+use network::DeviceKind;
 use protocol::Model;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
@@ -58,6 +59,9 @@ pub struct RunCommand {
     /// What `train` learned, for policies `learned_*`, `autoencoder_*` and `dqn_beam`
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
+    /// Where networks compute: cpu, cuda or metal
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    device: DeviceKind,
     #[command(flatten)]
     settings: AgentFlags,
 }
@@ -74,7 +78,7 @@ impl RunCommand {
             takeover: self.takeover,
             model,
             config: self.settings.effective()?,
-            learned: Learned::read(self.checkpoint.as_deref())?,
+            learned: Learned::read(self.checkpoint.as_deref(), &self.device.open()?)?,
         };
         let summary = run(&mission, &*stop_on_signals().context("handle signals")?)?;
         let mean_reward = summary.reward / summary.steps.max(1) as f64;

@@ -6,10 +6,11 @@ use std::path::{Path, PathBuf};
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
 /// Directories all of whose Rust, Python or JavaScript files are listed.
-const SOURCES: [&str; 7] = [
+const SOURCES: [&str; 8] = [
     "protocol/src",
     "env-server/src",
     "agent/src",
+    "agent/network/src",
     "clients/dashboard/src",
     "clients/dashboard/page",
     "tests/src",
