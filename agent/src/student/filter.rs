@@ -204,10 +204,10 @@ impl Student for FilterStudent {
     }
 
     fn contents(&self) -> Result<Contents, StudentError> {
-        Ok(let mut contents = self.learner.to_contents();
+        let mut contents = self.learner.to_contents();
         let pilots = self.site.worlds.clone().zip(&self.pilots);
         Stand::store(pilots, self.site.shape, &mut contents);
-        contents)
+        Ok(contents)
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {

@@ -15,7 +15,7 @@ pub fn save_tensors(tensors: Vec<NamedTensor>, contents: &mut Contents) {
 
 /// Finds a tensor's numbers by its name and shape.
 pub fn find(contents: &Contents) -> impl Fn(&str, &[usize]) -> Result<Vec<f32>, Problem> + '_ {
-    |name, shape| contents.tensor(name, shape).map(<[f32]>::to_vec)
+    move |name, shape| contents.tensor(name, shape).map(<[f32]>::to_vec)
 }
 
 /// Adds a DQN to a checkpoint.

@@ -48,11 +48,7 @@ impl Progress {
     ///
     /// # Errors
     /// As the device.
-    pub fn first(
-        site: &Site,
-        config: &AgentConfig,
-        device: &Device,
-    ) -> Result<Self, NetworkError> {
+    pub fn first(site: &Site, config: &AgentConfig, device: &Device) -> Result<Self, NetworkError> {
         let shape = network_shape(site.shape, site.n_observations, config);
         let (settings, n_states) = (config.autoencoder.settings(), shape.n_states);
         let autoencoder = Autoencoder::new(settings, shape, config.seed, device)?;
