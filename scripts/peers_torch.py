@@ -1,4 +1,4 @@
-"""PyTorch on the same CPU: the peer of `agent/benches/network.rs`, measured in the same run.
+"""PyTorch on the same CPU: the peer of `agent/network/benches/network.rs`, measured in the same run.
 
 The dynamic autoencoder from the layer table of REPRODUCTION.md and a DQN, with torch's own layers:
 hidden 16, windows of 1,000 frames of 64 x 64 cells. Two threads; single inputs with one as well.

@@ -28,13 +28,7 @@ replay = 20
 /// The same as the paper prints it.
 fn printed() -> String {
     let objective = "[objective]\nbelief = \"estimate\"\n";
-    let loss = "trajectories = 3\nloss = \"sum_of_cells\"\nlog_floor = 0.0\n";
-    SETTINGS
-        .replace(
-            "[autoencoder]\n",
-            &format!("{objective}[autoencoder]\n{loss}"),
-        )
-        .replace("[dqn]\n", "[dqn]\ninput = \"before_frame\"\n")
+    SETTINGS.replace("[autoencoder]\n", &format!("{objective}[autoencoder]\n"))
 }
 
 /// Columns of the metrics.
@@ -136,15 +130,10 @@ fn goes_on_as_if_it_had_not_stopped(settings: &str) {
 }
 
 #[test]
-fn settings_of_the_loss_and_of_plans_reach_the_training() {
+fn settings_of_sizes_and_of_plans_reach_the_training() {
     let settings = [
         ("", ""),
-        ("[autoencoder]\n", "[autoencoder]\ntrajectories = 2\n"),
-        (
-            "[autoencoder]\n",
-            "[autoencoder]\nloss = \"sum_of_cells\"\n",
-        ),
-        ("[autoencoder]\n", "[autoencoder]\nlog_floor = 0.001\n"),
+        ("[autoencoder]\n", "[autoencoder]\nstates = 2\n"),
         (
             "[autoencoder]\n",
             "[objective]\nbelief = \"estimate\"\n[autoencoder]\n",
@@ -175,7 +164,6 @@ fn settings_of_the_loss_and_of_plans_reach_the_training() {
 fn actions_go_by_what_the_settings_say_and_a_checkpoint_by_its_own() {
     let inputs = [
         ("after_frame", 4, Some("state.hidden")),
-        ("before_frame", 4, Some("state.before")),
         ("summary", 74, None),
     ];
     for (input, length, last) in inputs {

@@ -11,12 +11,12 @@ use crate::action::Action;
 use crate::belief::{Belief, BeliefError};
 use crate::checkpoint::Problem;
 use crate::config::AgentConfig;
-use crate::estimator::{Filter, LearnedFilter, ZeroEvidence};
+use crate::estimator::{Filter, Follower, LearnedFilter, StepError, ZeroEvidence};
 use crate::learned::{Learned, LearnedNetwork};
-use crate::network::{self as networks, Autoencoder};
 use crate::planner::{CellValues, Objective, Plan, PlanBasis, Planner, PlanningProblem, Target};
 use crate::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::student::decisions::Decisions;
+use ::network::NetworkError;
 use protocol::model::ModelError;
 use protocol::outlook::Intent;
 use protocol::{Cell, Frame, Grid, Model, Probabilities, Shape, Transition};
@@ -87,9 +87,9 @@ pub enum AgentError {
     /// A frame that the belief held for impossible.
     #[error(transparent)]
     ZeroEvidence(#[from] ZeroEvidence),
-    /// A network whose numbers are too large to be worked with.
+    /// A network whose numbers are too large to be worked with, or whose device fails.
     #[error("checkpoint: {0}")]
-    NotFinite(#[from] networks::NotFinite),
+    Network(#[from] NetworkError),
     /// The model does not fit the grid.
     #[error(transparent)]
     Model(#[from] ModelError),
@@ -138,8 +138,12 @@ enum Estimator {
     None(Belief),
     KnownModel(Box<Filter>),
     Learned(Box<LearnedFilter>),
-    /// The network, and its estimate or predictor.
-    Autoencoder(Box<Autoencoder>, Belief),
+    Autoencoder {
+        network: Arc<LearnedNetwork>,
+        follower: Box<Follower>,
+        /// Its estimate or predictor.
+        belief: Belief,
+    },
     /// One-hot after `correct`, one step ahead of it after `predict`.
     Truth {
         belief: Belief,
@@ -212,7 +216,7 @@ impl Agent {
                     network,
                     objectives,
                 }),
-                Estimator::Autoencoder(follower, _),
+                Estimator::Autoencoder { follower, .. },
             ) => {
                 let input = network.input.of(follower, robot, self.n_moves);
                 objectives[network.dqn.best(&input)]
@@ -261,8 +265,12 @@ impl Agent {
             Estimator::None(_) | Estimator::NextTruth(_) => Ok(()),
             Estimator::KnownModel(filter) => Ok(filter.correct(frame)?),
             Estimator::Learned(filter) => Ok(filter.correct(frame)?),
-            Estimator::Autoencoder(network, belief) => {
-                *belief = network.step(frame)?;
+            Estimator::Autoencoder {
+                network,
+                follower,
+                belief,
+            } => {
+                *belief = follower.step(&network.autoencoder, frame)?;
                 Ok(())
             }
             Estimator::Truth { belief, .. } => {
@@ -282,7 +290,9 @@ impl Agent {
             Estimator::None(_) | Estimator::NextTruth(_) => {}
             Estimator::KnownModel(filter) => filter.predict(),
             Estimator::Learned(filter) => filter.predict(),
-            Estimator::Autoencoder(network, belief) => belief.clone_from(network.prediction()),
+            Estimator::Autoencoder {
+                follower, belief, ..
+            } => belief.clone_from(follower.prediction()),
             Estimator::Truth { belief, transition } => {
                 let mut next = Probabilities::zeros(belief.view().dim());
                 transition.apply(belief.probabilities_mut(), &mut next);
@@ -317,7 +327,7 @@ impl Agent {
     pub fn sees_frames(&self) -> bool {
         matches!(
             self.estimator,
-            Estimator::KnownModel(_) | Estimator::Learned(_) | Estimator::Autoencoder(..)
+            Estimator::KnownModel(_) | Estimator::Learned(_) | Estimator::Autoencoder { .. }
         )
     }
 
@@ -357,11 +367,11 @@ impl Agent {
     }
 }
 
-impl From<networks::StepError> for AgentError {
-    fn from(error: networks::StepError) -> Self {
+impl From<StepError> for AgentError {
+    fn from(error: StepError) -> Self {
         match error {
-            networks::StepError::ZeroEvidence(error) => error.into(),
-            networks::StepError::NotFinite(error) => error.into(),
+            StepError::ZeroEvidence(error) => error.into(),
+            StepError::Network(error) => error.into(),
         }
     }
 }
@@ -372,7 +382,7 @@ impl Estimator {
             Self::None(belief)
             | Self::NextTruth(belief)
             | Self::Truth { belief, .. }
-            | Self::Autoencoder(_, belief) => belief,
+            | Self::Autoencoder { belief, .. } => belief,
             Self::KnownModel(filter) => filter.belief(),
             Self::Learned(filter) => filter.belief(),
         }

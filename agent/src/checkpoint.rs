@@ -48,6 +48,9 @@ pub enum Problem {
     /// Not safetensors, or cut off.
     #[error("expected a whole safetensors file, got one that is damaged or cut off: {0}")]
     Form(String),
+    /// The networks in it.
+    #[error(transparent)]
+    Network(#[from] ::network::NetworkError),
     /// The second of its kind.
     #[error("expected one checkpoint of {0}, got two")]
     Twice(&'static str),

@@ -22,6 +22,7 @@ use agent::run::{Mission, RunError, run};
 use agent::train::TrainError;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
+use network::DeviceKind;
 use protocol::Model;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
@@ -62,6 +63,9 @@ pub struct RunCommand {
     /// What `train` learned, for policies `learned_*`, `autoencoder_*` and `dqn_beam`
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
+    /// Where networks compute: cpu, cuda or metal
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    device: DeviceKind,
     #[command(flatten)]
     settings: AgentFlags,
 }
@@ -78,7 +82,7 @@ impl RunCommand {
             takeover: self.takeover,
             model,
             config: self.settings.effective()?,
-            learned: Learned::read(self.checkpoint.as_deref())?,
+            learned: Learned::read(self.checkpoint.as_deref(), &self.device.open()?)?,
         };
         let stop = stop_on_signals().context("handle signals")?;
         if !self.wait.for_server(&mission.instance, &stop)? {

@@ -398,7 +398,7 @@ mod tests {
             ),
             (
                 "[dqn]\ninput = \"h\"",
-                "unknown variant `h`, expected one of `after_frame`, `before_frame`, `summary`",
+                "unknown variant `h`, expected `after_frame` or `summary`",
             ),
         ] {
             let error = toml::from_str::<AgentConfig>(text).expect_err("no such name");

@@ -145,7 +145,10 @@ impl Examinee {
             let learned = examination.learned;
             let (policy, likelihood) = match kind {
                 EstimatorKind::Learned => ("learned_beam", learned.filter_likelihood()),
-                EstimatorKind::Autoencoder => ("autoencoder_beam", learned.network_likelihood()),
+                EstimatorKind::Autoencoder => {
+                    let likelihood = learned.network_likelihood();
+                    ("autoencoder_beam", likelihood.map_err(AgentError::from)?)
+                }
                 _ => ("beam_exploit", None),
             };
             let likelihood = likelihood.unwrap_or_else(|| model.likelihood().clone());

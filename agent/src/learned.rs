@@ -2,11 +2,12 @@
 
 use crate::checkpoint::{self, CheckpointError, Contents, Problem};
 use crate::config::AgentConfig;
+use crate::dqn_input::DqnInput;
 use crate::learner::{self, LearnedModel};
-use crate::network::{Autoencoder, Dqn, DqnInput};
 use crate::planner::BasisKind;
 use crate::policy::EstimatorKind;
 use crate::student::{decisions, network};
+use ::network::{Autoencoder, Device, Dqn, NetworkError};
 use ndarray::Array2;
 use std::path::Path;
 use std::sync::Arc;
@@ -41,15 +42,18 @@ pub struct LearnedNetwork {
 }
 
 impl Learned {
-    /// What some checkpoints hold, of each kind one at most.
+    /// What some checkpoints hold, of each kind one at most; networks compute on `device`.
     ///
     /// # Errors
     /// [`CheckpointError`] names the file that cannot be read, or is the second of its kind.
-    pub fn read<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<Self, CheckpointError> {
+    pub fn read<'a>(
+        paths: impl IntoIterator<Item = &'a Path>,
+        device: &Device,
+    ) -> Result<Self, CheckpointError> {
         let mut learned = Self::default();
         for path in paths {
             let (kind, contents) = checkpoint::read_any(path, &KINDS)?;
-            let added = learned.add(kind, contents);
+            let added = learned.add(kind, contents, device);
             added.map_err(|problem| problem.of(path))?;
         }
         Ok(learned)
@@ -62,11 +66,16 @@ impl Learned {
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, Problem> {
         let (kind, contents) = checkpoint::decode(&KINDS, bytes)?;
         let mut learned = Self::default();
-        learned.add(kind, contents)?;
+        learned.add(kind, contents, &Device::Cpu)?;
         Ok(learned)
     }
 
-    fn add(&mut self, kind: &'static str, contents: Contents) -> Result<(), Problem> {
+    fn add(
+        &mut self,
+        kind: &'static str,
+        contents: Contents,
+        device: &Device,
+    ) -> Result<(), Problem> {
         let twice = match kind {
             learner::KIND => {
                 let model = learner::Progress::from_contents(&contents, None)?.learned();
@@ -74,7 +83,7 @@ impl Learned {
             }
             decisions::KIND => self.decisions.replace(Arc::new(contents)).is_some(),
             _ => {
-                let network = network::Progress::read(&contents)?.learned();
+                let network = network::Progress::read(&contents, device)?.learned();
                 self.network.replace(Arc::new(network)).is_some()
             }
         };
@@ -104,10 +113,14 @@ impl Learned {
     }
 
     /// `P(y | x)` of the autoencoder, shape `[S, O]`.
-    pub fn network_likelihood(&self) -> Option<Array2<f64>> {
-        self.network
-            .as_ref()
+    ///
+    /// # Errors
+    /// As the network's device.
+    pub fn network_likelihood(&self) -> Result<Option<Array2<f64>>, NetworkError> {
+        let network = self.network.as_ref();
+        network
             .map(|network| likelihood(&network.autoencoder))
+            .transpose()
     }
 }
 
@@ -129,9 +142,13 @@ pub fn settings(contents: &Contents) -> Result<AgentConfig, Problem> {
 }
 
 /// `P(y | x)` of a network, shape `[S, O]`.
-pub fn likelihood(autoencoder: &Autoencoder) -> Array2<f64> {
+///
+/// # Errors
+/// As the network's device.
+pub fn likelihood(autoencoder: &Autoencoder) -> Result<Array2<f64>, NetworkError> {
     let shape = autoencoder.shape();
-    let matrix = autoencoder.observation_matrix();
+    let matrix = autoencoder.observation_matrix()?;
     let entry = |(state, value)| f64::from(matrix[value * shape.n_states + state]);
-    Array2::from_shape_fn((shape.n_states, shape.n_observations), entry)
+    let dim = (shape.n_states, shape.n_observations);
+    Ok(Array2::from_shape_fn(dim, entry))
 }

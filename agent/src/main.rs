@@ -4,7 +4,11 @@
 mod commands;
 
 use clap::{Parser, Subcommand};
+use network::{Allocator, keep_freed_memory};
 use std::process::ExitCode;
+
+#[global_allocator]
+static ALLOCATOR: Allocator = Allocator;
 
 /// Estimates, plans and acts on an Emberwatch server.
 #[derive(Parser)]
@@ -33,6 +37,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
+    keep_freed_memory();
     protocol::program::start_logging();
     let result = match &Cli::parse().command {
         Command::Run(command) => command.run(),

@@ -3,16 +3,17 @@
 pub mod decisions;
 pub mod filter;
 pub mod network;
+mod stored;
 #[cfg(test)]
 mod tests;
 
 use crate::belief::Belief;
 use crate::checkpoint::Contents;
 use crate::client::Observation;
-use crate::estimator::{ZeroEvidence, learned_filter};
+use crate::estimator::{StepError, ZeroEvidence, learned_filter};
 use crate::metrics::Tick;
-use crate::network as networks;
 use crate::policy::EstimatorKind;
+use ::network::NetworkError;
 use protocol::{Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
@@ -78,8 +79,8 @@ pub enum StudentError {
     NotFinite(#[from] NotFinite),
 }
 
-/// A number that is not finite: learning cannot go on; nothing was changed by the step or update that
-/// met it.
+/// A number that is not finite, or a device that fails: learning cannot go on; nothing was changed by the
+/// step or update that met it.
 #[derive(Debug, PartialEq, Error)]
 #[non_exhaustive]
 pub enum NotFinite {
@@ -88,15 +89,21 @@ pub enum NotFinite {
     Filter(#[from] learned_filter::NotFinite),
     /// In the autoencoder or the DQN.
     #[error(transparent)]
-    Network(#[from] networks::NotFinite),
+    Network(#[from] NetworkError),
 }
 
-impl From<networks::StepError> for StudentError {
-    fn from(error: networks::StepError) -> Self {
+impl From<StepError> for StudentError {
+    fn from(error: StepError) -> Self {
         match error {
-            networks::StepError::ZeroEvidence(error) => error.into(),
-            networks::StepError::NotFinite(error) => NotFinite::from(error).into(),
+            StepError::ZeroEvidence(error) => error.into(),
+            StepError::Network(error) => error.into(),
         }
+    }
+}
+
+impl From<NetworkError> for StudentError {
+    fn from(error: NetworkError) -> Self {
+        NotFinite::from(error).into()
     }
 }
 
@@ -165,7 +172,10 @@ pub trait Student {
     fn belief(&self) -> Option<(&Belief, usize)>;
 
     /// What a later run goes on from.
-    fn contents(&self) -> Contents;
+    ///
+    /// # Errors
+    /// Where a network's device fails.
+    fn contents(&self) -> Result<Contents, StudentError>;
 
     /// Time spent so far, by part.
     fn times(&self) -> Vec<(&'static str, Duration)>;

@@ -253,7 +253,8 @@ impl Trainee {
     fn save(&mut self, training: &Training) -> Result<(), TrainError> {
         self.saved = Instant::now();
         if !training.freeze {
-            let mut contents = self.student.contents();
+            let contents = self.student.contents();
+            let mut contents = contents.map_err(|error| training.stopped(error, &*self.student))?;
             let settings = toml::to_string(&training.config)?;
             contents.texts.insert("settings".into(), settings);
             let place = training.out.join(CHECKPOINT);

@@ -10,7 +10,11 @@ const SOURCES: [&str; 8] = [
     "protocol/src",
     "env-server/src",
     "agent/src",
+<<<<<<< HEAD
     "agent/figures/src",
+=======
+    "agent/network/src",
+>>>>>>> net
     "clients/dashboard/src",
     "clients/dashboard/page",
     "tests/src",

@@ -2,7 +2,7 @@
 
 use super::{AgentError, Decider, Estimator, Task};
 use crate::config::AgentConfig;
-use crate::estimator::LearnedFilter;
+use crate::estimator::{Follower, LearnedFilter};
 use crate::learned::settings;
 use crate::learner::LearnedModel;
 use crate::planner::{BasisKind, PlanBasis};
@@ -115,9 +115,12 @@ pub(super) fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<Estimator,
             got: cells(shape.grid.dim()),
         });
     }
-    let follower = learned.autoencoder.follower();
-    let belief = follower.prediction().clone();
-    Ok(Estimator::Autoencoder(Box::new(follower), belief))
+    let follower = Follower::new(&learned.autoencoder)?;
+    Ok(Estimator::Autoencoder {
+        network: learned.clone(),
+        belief: follower.prediction().clone(),
+        follower: Box::new(follower),
+    })
 }
 
 fn present<'a, T>(

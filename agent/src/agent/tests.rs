@@ -1,8 +1,9 @@
 //! Which belief an agent plans on, and what its decisions go by.
 
 use super::*;
-use crate::network::{Dqn, DqnInput, DqnSettings};
+use crate::dqn_input::DqnInput;
 use crate::planner::BasisKind;
+use ::network::{Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, NetworkShape};
 use protocol::randomness::split_mix;
 
 const N_MOVES: usize = 6;
@@ -38,8 +39,15 @@ fn world(step: u64) -> (Grid<u8>, Frame) {
 
 /// A network that never learned, with the first seed whose DQN suits.
 fn network(input: DqnInput, basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> LearnedNetwork {
-    let settings = networks::AutoencoderSettings::paper();
-    let autoencoder = Autoencoder::new(settings, shape(), 3, 3, 1);
+    let settings = AutoencoderSettings::paper();
+    let sizes = NetworkShape {
+        grid: shape(),
+        n_states: 3,
+        n_observations: 3,
+        encoding: settings.encoding,
+        hidden: settings.hidden,
+    };
+    let autoencoder = Autoencoder::new(settings, sizes, 1, &Device::Cpu).expect("a network");
     let n_inputs = input.length(settings.hidden, 3);
     let dqn = |seed| Dqn::new(DqnSettings::paper(), n_inputs, 4, seed);
     LearnedNetwork {
@@ -164,15 +172,13 @@ fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
 
 #[test]
 fn a_network_decides_on_what_it_was_learned_with() {
-    let mut follower = network(DqnInput::AfterFrame, BasisKind::Predictor, |_| true).autoencoder;
-    follower.step(&world(0).1).expect("possible");
+    let learned = network(DqnInput::AfterFrame, BasisKind::Predictor, |_| true).autoencoder;
+    let mut follower = Follower::new(&learned).expect("a network");
+    let before = follower.hidden().to_vec();
+    follower.step(&learned, &world(0).1).expect("possible");
     let of = |input: DqnInput| input.of(&follower, ROBOT, N_MOVES);
-    let [before, after] = [DqnInput::BeforeFrame, DqnInput::AfterFrame].map(of);
-    for input in [
-        DqnInput::AfterFrame,
-        DqnInput::BeforeFrame,
-        DqnInput::Summary,
-    ] {
+    let after = of(DqnInput::AfterFrame);
+    for input in [DqnInput::AfterFrame, DqnInput::Summary] {
         let network = network(input, BasisKind::Predictor, |dqn| {
             input == DqnInput::Summary || dqn.best(&before) != dqn.best(&after)
         });

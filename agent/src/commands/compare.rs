@@ -16,6 +16,7 @@ use agent::report::{
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
+use network::DeviceKind;
 use protocol::Model;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -34,6 +35,9 @@ pub struct CompareCommand {
     /// given for each
     #[arg(long, value_name = "FILE")]
     checkpoint: Vec<PathBuf>,
+    /// Where networks compute: cpu, cuda or metal
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    device: DeviceKind,
     /// Write one line per policy and world to this file
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
@@ -57,7 +61,8 @@ impl CompareCommand {
     pub fn run(&self) -> Result<()> {
         let config = self.settings.effective()?;
         self.make_places()?;
-        let learned = Learned::read(self.checkpoint.iter().map(PathBuf::as_path))?;
+        let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
+        let learned = Learned::read(checkpoints, &self.device.open()?)?;
         let mut worlds = self.worlds.open(self.needs_scouts(), |model| {
             self.policies(model, &learned).map(|_| ())
         })?;

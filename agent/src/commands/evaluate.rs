@@ -13,6 +13,7 @@ use agent::report::{render_table, statistics::Estimate, write_csv};
 use agent::scoring::Score;
 use anyhow::Result;
 use clap::Args;
+use network::DeviceKind;
 use std::path::PathBuf;
 
 /// What rewards are paired against.
@@ -35,6 +36,9 @@ pub struct EvaluateCommand {
     /// What `train` learned; may be given once for each kind of learner
     #[arg(long, value_name = "FILE", required = true)]
     checkpoint: Vec<PathBuf>,
+    /// Where networks compute: cpu, cuda or metal
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    device: DeviceKind,
     /// Only score predictions, not policies
     #[arg(long)]
     predictions_only: bool,
@@ -54,7 +58,8 @@ impl EvaluateCommand {
         if let Some(path) = &self.csv {
             make_folder_of(path)?;
         }
-        let learned = Learned::read(self.checkpoint.iter().map(PathBuf::as_path))?;
+        let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
+        let learned = Learned::read(checkpoints, &self.device.open()?)?;
         let estimators = estimators(&learned);
         let mut worlds = self.worlds.open(false, |_| Ok(()))?;
         let arena = &mut worlds.arena;

@@ -8,6 +8,7 @@ use agent::report::training::draw_training;
 use agent::train::{Training, train};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
+use network::DeviceKind;
 use protocol::channels::Instance;
 use protocol::program::stop_on_signals;
 use std::path::PathBuf;
@@ -49,6 +50,9 @@ pub struct TrainCommand {
     /// Act on the checkpoint's parameters without learning
     #[arg(long, requires = "resume")]
     freeze: bool,
+    /// Where an autoencoder computes: cpu, cuda or metal
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    device: DeviceKind,
     /// Take the worlds from their holder
     #[arg(long)]
     takeover: bool,
@@ -89,6 +93,7 @@ impl TrainCommand {
             out: self.out.clone(),
             resume: self.resume,
             freeze: self.freeze,
+            device: self.device.open()?,
             config,
         };
         let contents = training.check()?;

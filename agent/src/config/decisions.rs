@@ -1,7 +1,7 @@
 //! Settings of what learns to choose among actions: the section `[decisions]` of `config/agent.toml`.
 
 use super::ConfigError;
-use crate::network::{AdamSettings, DqnSettings};
+use ::network::{AdamSettings, DqnSettings};
 use serde::{Deserialize, Serialize};
 
 /// How the DQN of `train --learner decisions` learns.

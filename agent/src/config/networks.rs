@@ -1,17 +1,13 @@
 //! Settings of the paper's networks: the sections `[autoencoder]` and `[dqn]` of `config/agent.toml`.
 
 use super::ConfigError;
-use crate::network::{
-    AdamSettings, AutoencoderSettings, DqnInput, DqnSettings, LossKind, LossSettings,
-};
+use crate::dqn_input::DqnInput;
+use ::network::{AdamSettings, AutoencoderSettings, DqnSettings};
 use serde::{Deserialize, Serialize};
 
 /// The authors' step sizes.
 const PAPER_RATE: f64 = 1e-4;
 const PAPER_DQN_RATE: f64 = 0.01;
-
-/// What the authors add inside the loss' logarithms.
-const PAPER_LOG_FLOOR: f64 = 1e-10;
 
 /// A step size that vanishes: `rate (1 + n / steady)^-power` at iteration n.
 ///
@@ -60,19 +56,12 @@ pub struct AutoencoderConfig {
     pub encoding: usize,
     /// Length of the hidden vector h, 1 to 256.
     pub hidden: usize,
-    /// Frames of a trajectory that is learnt from, 2 to 10,000.
+    /// Frames of a trajectory that is learned from, 2 to 10,000.
     pub window: usize,
-    /// Trajectories L of an update, 1 to 64 (paper eq. 7); each counts alike.
-    pub trajectories: usize,
     /// Frames that the replay keeps, at least a window, at most 100,000.
     pub replay_frames: usize,
     /// First frames that show every cell, if the server gives such.
     pub full_frames: u64,
-    /// What the sum over a trajectory's visited cells is divided by: `mean_of_cells`, their number (the
-    /// authors' code), or `sum_of_cells`, the number of predicted frames K (paper eqs. 8 and 11).
-    pub loss: LossKind,
-    /// Added inside the loss' logarithms, 0 to 0.001; 0: they are exact.
-    pub log_floor: f64,
     /// Adam's decay of the mean of gradients, and of the mean of their squares.
     pub betas: [f32; 2],
     /// Adam's step size.
@@ -101,11 +90,8 @@ impl AutoencoderConfig {
             encoding: settings.encoding,
             hidden: settings.hidden,
             window: settings.window,
-            trajectories: 1,
             replay_frames: settings.replay,
             full_frames: 1_000,
-            loss: settings.loss.kind,
-            log_floor: PAPER_LOG_FLOOR,
             betas: settings.adam.betas,
             step_size: StepSize::constant(PAPER_RATE),
         }
@@ -122,7 +108,6 @@ impl AutoencoderConfig {
             ("autoencoder.encoding", self.encoding, 1, 256),
             ("autoencoder.hidden", self.hidden, 1, 256),
             ("autoencoder.window", self.window, 2, 10_000),
-            ("autoencoder.trajectories", self.trajectories, 1, 64),
             (
                 "autoencoder.replay_frames",
                 self.replay_frames,
@@ -133,7 +118,6 @@ impl AutoencoderConfig {
         for (setting, got, least, most) in sizes {
             between(setting, got, least, most)?;
         }
-        within("autoencoder.log_floor", self.log_floor, 0.001)?;
         for beta in self.betas {
             within("autoencoder.betas", f64::from(beta), 0.999_999)?;
         }
@@ -148,10 +132,6 @@ impl AutoencoderConfig {
             hidden: self.hidden,
             window: self.window,
             replay: self.replay_frames,
-            loss: LossSettings {
-                kind: self.loss,
-                log_floor: self.log_floor as f32,
-            },
             adam: AdamSettings {
                 betas: self.betas,
                 ..AdamSettings::paper(self.step_size.rate as f32)
@@ -164,7 +144,7 @@ impl AutoencoderConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DqnConfig {
-    /// What it sees: `after_frame`, `before_frame` (paper eq. 17) or `summary`.
+    /// What it sees: `after_frame` or `summary`.
     pub input: DqnInput,
     /// Transitions that the replay keeps, at least a batch, at most 1,000,000.
     pub replay: usize,
@@ -304,13 +284,6 @@ mod tests {
     fn settings_reach_the_networks() {
         let settings = AutoencoderConfig::paper().settings();
         assert_eq!(settings, AutoencoderSettings::paper());
-        let printed = AutoencoderConfig {
-            loss: LossKind::SumOfCells,
-            log_floor: 0.0,
-            ..AutoencoderConfig::paper()
-        };
-        let loss = printed.settings().loss;
-        assert_eq!((loss.kind, loss.log_floor), (LossKind::SumOfCells, 0.0));
         assert_eq!(DqnConfig::paper().settings(), DqnSettings::paper());
     }
 
@@ -324,25 +297,6 @@ mod tests {
             small.check().map_err(|error| error.to_string()),
             Err("autoencoder.replay_frames: expected 1000 to 100000, got 999".into())
         );
-        let many = AutoencoderConfig {
-            trajectories: 65,
-            ..AutoencoderConfig::default()
-        };
-        assert_eq!(
-            many.check().map_err(|error| error.to_string()),
-            Err("autoencoder.trajectories: expected 1 to 64, got 65".into())
-        );
-        let coarse = AutoencoderConfig {
-            log_floor: -0.5,
-            ..AutoencoderConfig::default()
-        };
-        assert_eq!(
-            coarse.check().map_err(|error| error.to_string()),
-            Err("autoencoder.log_floor: expected 0 to 0.001, got -0.5".into())
-        );
-        let error = toml::from_str::<AutoencoderConfig>("loss = \"mean\"").expect_err("no loss");
-        let words = "unknown variant `mean`, expected `mean_of_cells` or `sum_of_cells`";
-        assert!(error.to_string().contains(words), "{error}");
         let eager = DqnConfig {
             epsilon: 2.0,
             ..DqnConfig::default()

@@ -10,12 +10,12 @@ use crate::compare::planner_seed;
 use crate::config::{AgentConfig, DecisionsConfig};
 use crate::estimator::{Filter, ZeroEvidence};
 use crate::metrics::Tick;
-use crate::network::dqn::Track;
-use crate::network::{Dqn, Transition};
 use crate::planner::{BeamSearch, PlanBasis};
 use crate::policy::EstimatorKind;
 use crate::scoring::score;
+use crate::student::stored::{load_dqn, save_dqn};
 use crate::summary::{spread_summary, summary_length};
+use ::network::{Dqn, Track, Transition};
 use ndarray::Array2;
 use protocol::{Cell, Model, Move};
 use rayon::prelude::*;
@@ -28,7 +28,7 @@ pub const KIND: &str = "decisions";
 const SEPARATOR: &str = " ";
 
 /// A DQN over the actions of a model.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct Decisions {
     /// Values of actions.
     pub dqn: Dqn,
@@ -89,7 +89,7 @@ impl Decisions {
     /// As a checkpoint, without settings.
     pub fn to_contents(&self) -> Contents {
         let mut contents = Contents::default();
-        self.dqn.save(&mut contents);
+        save_dqn(&self.dqn, &mut contents);
         for (name, text) in [
             ("actions", self.actions.names().join(SEPARATOR)),
             ("states", self.n_states.to_string()),
@@ -120,7 +120,7 @@ impl Decisions {
                 });
             }
         }
-        self.dqn.load(contents)?;
+        load_dqn(&mut self.dqn, contents)?;
         self.world_steps = contents.count("world_steps")?;
         Ok(())
     }
@@ -320,8 +320,8 @@ impl Student for DecisionsStudent {
         Some((pilot.filter.belief(), self.target))
     }
 
-    fn contents(&self) -> Contents {
-        self.decisions.to_contents()
+    fn contents(&self) -> Result<Contents, StudentError> {
+        Ok(self.decisions.to_contents())
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {
@@ -341,7 +341,7 @@ mod tests {
         let contents = decisions.to_contents();
         let mut again = Decisions::first(&model, &config, 4);
         again.load(&contents).expect("of the same model");
-        assert_eq!(again.dqn.tensors(), decisions.dqn.tensors());
+        assert_eq!(again.dqn.named_tensors(), decisions.dqn.named_tensors());
         let mut other = contents.clone();
         other.texts.insert("states".into(), "4".into());
         let error = again.load(&other).expect_err("other states").to_string();

@@ -203,11 +203,11 @@ impl Student for FilterStudent {
         Some((pilot.filter.belief(), self.learned.target))
     }
 
-    fn contents(&self) -> Contents {
+    fn contents(&self) -> Result<Contents, StudentError> {
         let mut contents = self.learner.to_contents();
         let pilots = self.site.worlds.clone().zip(&self.pilots);
         Stand::store(pilots, self.site.shape, &mut contents);
-        contents
+        Ok(contents)
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {

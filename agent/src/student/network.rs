@@ -16,14 +16,14 @@ use crate::checkpoint::Contents;
 use crate::client::Observation;
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
+use crate::estimator::Follower;
 use crate::learned::likelihood;
 use crate::metrics::Tick;
-use crate::network::dqn::Track;
-use crate::network::{Transition, Window};
 use crate::planner::{Objective, Planner, PlanningProblem};
 use crate::policy::{EstimatorKind, Policy};
 use crate::reward::met;
 use crate::scoring::score;
+use ::network::{Track, Transition, Window};
 use protocol::path::fly;
 use protocol::{Frame, Move};
 use std::time::{Duration, Instant};
@@ -88,7 +88,12 @@ impl NetworkStudent {
     /// Reads a frame: `h`, the estimate and the next predictor.
     fn read(&mut self, frame: &Frame) -> Result<Belief, StudentError> {
         let start = Instant::now();
-        let estimate = self.progress.autoencoder.step(frame);
+        let Progress {
+            autoencoder,
+            follower,
+            ..
+        } = &mut self.progress;
+        let estimate = follower.step(autoencoder, frame);
         self.times[1].1 += start.elapsed();
         let estimate = estimate?;
         self.progress.basis.see(&estimate);
@@ -98,9 +103,9 @@ impl NetworkStudent {
     /// What the next action goes by.
     fn input(&self) -> Vec<f32> {
         let Progress {
-            input, autoencoder, ..
+            input, follower, ..
         } = &self.progress;
-        input.of(autoencoder, self.observation().robot(), self.site.n_moves)
+        input.of(follower, self.observation().robot(), self.site.n_moves)
     }
 
     /// Adds the transition to the DQN's replay, and what the path met to the estimate of rewards.
@@ -135,16 +140,14 @@ impl NetworkStudent {
         let number = self.progress.autoencoder.n_updates();
         let config = &self.config.autoencoder;
         let replay = &self.progress.replay;
-        let windows = replay.windows(config.window, self.config.seed, number);
-        let mut windows: Vec<Window> = windows.take(config.trajectories).collect();
-        windows.retain(Window::has_targets);
-        if windows.is_empty() {
+        let window = replay.window(config.window, self.config.seed, number);
+        let Some(window) = window.filter(Window::has_targets) else {
             return Ok([None; 2]);
-        }
+        };
         // Both step sizes go by the iteration, as eq. 20 compares them.
         let rate = config.step_size.at(self.progress.iterations);
         self.progress.autoencoder.set_learning_rate(rate as f32);
-        let loss = self.progress.autoencoder.update_on(&windows);
+        let loss = self.progress.autoencoder.update(&window);
         self.times[3].1 += start.elapsed();
         Ok([Some(loss?), Some(rate)])
     }
@@ -179,7 +182,7 @@ impl Student for NetworkStudent {
     fn begin(&mut self, _: u32, observation: Observation) -> Result<(), StudentError> {
         self.progress.place = Some(observation.place());
         self.track = self.progress.dqn.track();
-        self.progress.autoencoder.forget();
+        self.progress.follower = Follower::new(&self.progress.autoencoder)?;
         self.progress.replay.begin();
         self.read(&observation.frame)?;
         self.progress.replay.push(observation.frame.clone());
@@ -196,7 +199,7 @@ impl Student for NetworkStudent {
             false => dqn.act(&input, self.progress.iterations),
         };
         let value = dqn.values(&input)[action];
-        let belief = basis.belief(self.progress.autoencoder.prediction());
+        let belief = basis.belief(self.progress.follower.prediction());
         let values = self.objectives[action].values(belief);
         let observation = self.observation();
         let problem = PlanningProblem {
@@ -225,8 +228,9 @@ impl Student for NetworkStudent {
     ) -> Result<(Tick, Vec<Impression>), StudentError> {
         let observation = observations.remove(0);
         let frame = observation.frame.clone();
-        let prediction = self.progress.autoencoder.prediction();
-        let score = score(prediction, &likelihood(&self.progress.autoencoder), &frame);
+        let prediction = self.progress.follower.prediction();
+        let likelihood = likelihood(&self.progress.autoencoder)?;
+        let score = score(prediction, &likelihood, &frame);
         self.progress.place = Some(observation.place());
         let reward = observation.result.reward;
         self.observation = Some(observation);
@@ -296,12 +300,12 @@ impl Student for NetworkStudent {
     }
 
     fn belief(&self) -> Option<(&Belief, usize)> {
-        let belief = self.progress.autoencoder.prediction();
+        let belief = self.progress.follower.prediction();
         Some((belief, self.progress.target()))
     }
 
-    fn contents(&self) -> Contents {
-        self.progress.to_contents()
+    fn contents(&self) -> Result<Contents, StudentError> {
+        Ok(self.progress.to_contents()?)
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {

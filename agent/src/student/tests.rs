@@ -121,7 +121,8 @@ fn students_plan_on_the_belief_that_settings_say() {
             };
             vec![path(config, &policy, objective, belief, step)]
         });
-        let student = NetworkStudent::new(Progress::first(&site(), config), site(), config);
+        let progress = Progress::first(&site(), config, &::network::Device::Cpu);
+        let student = NetworkStudent::new(progress.expect("a network"), site(), config);
         check(student, basis, |belief, _, step| {
             let choices = Policy::network_choices(3);
             let path = |choice| path(config, choice, config.objective(choice), belief, step);

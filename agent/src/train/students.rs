@@ -41,7 +41,7 @@ pub fn student(
             })
         }
         LearnerKind::Autoencoder => {
-            let mut progress = network::Progress::first(&site, config);
+            let mut progress = network::Progress::first(&site, config, &training.device)?;
             if let Some(contents) = contents {
                 progress.load(contents).map_err(wrong)?;
             }

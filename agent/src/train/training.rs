@@ -8,6 +8,7 @@ use crate::learner;
 use crate::metrics::MetricsError;
 use crate::student::{Student, StudentError, decisions, network};
 use crate::tensorboard::EventsError;
+use ::network::{Device, NetworkError};
 use protocol::connection::ConnectionError;
 use protocol::model::ModelError;
 use std::ops::Range;
@@ -32,6 +33,8 @@ pub struct Training {
     pub resume: bool,
     /// Act on the parameters as they are.
     pub freeze: bool,
+    /// Where an autoencoder computes.
+    pub device: Device,
     /// Settings.
     pub config: AgentConfig,
 }
@@ -88,6 +91,9 @@ pub enum TrainError {
     /// Worlds that one memory cannot follow.
     #[error("--worlds: expected 1 for the autoencoder, which follows one world, got {0}")]
     OneWorld(usize),
+    /// The networks, before their first step.
+    #[error(transparent)]
+    Network(#[from] NetworkError),
     /// The model that a filter needs.
     #[error(transparent)]
     Model(#[from] ModelError),

@@ -1,26 +1,32 @@
 //! What Algorithm 1 has learned, and where it stands: as a checkpoint, and from one.
 
 use crate::belief::Belief;
-use crate::checkpoint::{Bytes, Contents, Problem, Tensor};
+use crate::checkpoint::{Bytes, Contents, Problem};
 use crate::client::Place;
 use crate::config::AgentConfig;
+use crate::dqn_input::DqnInput;
+use crate::estimator::Follower;
 use crate::learned::{LearnedNetwork, settings};
-use crate::network::{Autoencoder, Dqn, DqnInput, NetworkShape, Replay, Tensors};
 use crate::planner::PlanBasis;
 use crate::policy::Policy;
 use crate::reward::RewardEstimate;
 use crate::student::Site;
+use crate::student::stored::{find, load_dqn, save_dqn, save_tensors};
+use ::network::{Autoencoder, Device, Dqn, NamedTensor, NetworkError, NetworkShape, Replay};
 use protocol::model::MAX_VALUES;
 use protocol::{Frame, Probabilities, Shape};
 
-/// Names in checkpoints of what paths are planned on and actions go by, where these are wanted.
+/// Names in checkpoints of where the world is, and of the estimate where paths are planned on it.
+const HIDDEN: &str = "state.hidden";
+const PREDICTION: &str = "state.prediction";
 const ESTIMATE: &str = "state.estimate";
-const BEFORE: &str = "state.before";
 
 /// What is learned, and where learning stands.
 pub struct Progress {
     /// The model.
     pub autoencoder: Autoencoder,
+    /// What it knows of the world.
+    pub follower: Follower,
     /// The choice of objectives.
     pub dqn: Dqn,
     /// What that sees.
@@ -38,17 +44,20 @@ pub struct Progress {
 }
 
 impl Progress {
-    /// Before the first frame.
-    pub fn first(site: &Site, config: &AgentConfig) -> Self {
-        let n_states = network_shape(site.shape, site.n_observations, config).n_states;
-        let settings = config.autoencoder.settings();
-        let (seed, grid) = (config.seed, site.shape);
-        let autoencoder = Autoencoder::new(settings, grid, n_states, site.n_observations, seed);
+    /// Before the first frame; the autoencoder computes on `device`.
+    ///
+    /// # Errors
+    /// As the device.
+    pub fn first(site: &Site, config: &AgentConfig, device: &Device) -> Result<Self, NetworkError> {
+        let shape = network_shape(site.shape, site.n_observations, config);
+        let (settings, n_states) = (config.autoencoder.settings(), shape.n_states);
+        let autoencoder = Autoencoder::new(settings, shape, config.seed, device)?;
         let n_actions = Policy::network_choices(n_states).len();
         let input = config.dqn.input;
         let n_inputs = input.length(settings.hidden, n_states);
-        Self {
-            dqn: Dqn::new(config.dqn.settings(), n_inputs, n_actions, seed),
+        Ok(Self {
+            follower: Follower::new(&autoencoder)?,
+            dqn: Dqn::new(config.dqn.settings(), n_inputs, n_actions, config.seed),
             input,
             basis: PlanBasis::new(config.objective.belief),
             autoencoder,
@@ -56,7 +65,7 @@ impl Progress {
             reward: RewardEstimate::new(n_states),
             iterations: 0,
             place: None,
-        }
+        })
     }
 
     /// The state that pays most, as far as rewards tell by now.
@@ -77,13 +86,15 @@ impl Progress {
     }
 
     /// As a checkpoint, without the settings.
-    pub fn to_contents(&self) -> Contents {
+    ///
+    /// # Errors
+    /// As the network's device.
+    pub fn to_contents(&self) -> Result<Contents, NetworkError> {
         let mut contents = Contents::default();
-        for (name, shape, numbers) in self.autoencoder.named_numbers() {
-            contents.tensors.insert(name, Tensor { shape, numbers });
-        }
-        self.save_stand(&mut contents);
-        self.dqn.save(&mut contents);
+        let tensors = self.autoencoder.named_tensors()?;
+        save_tensors(tensors, &mut contents);
+        save_tensors(self.state(), &mut contents);
+        save_dqn(&self.dqn, &mut contents);
         let frames = self
             .replay
             .frames()
@@ -123,31 +134,30 @@ impl Progress {
         ] {
             contents.texts.insert(name.into(), count.to_string());
         }
-        contents
+        Ok(contents)
     }
 
-    /// What is behind the state: the estimate and the hidden vector before it.
-    fn save_stand(&self, contents: &mut Contents) {
-        let mut add = |name: &str, shape: &[usize], numbers: &[f32]| {
-            let (shape, numbers) = (shape.to_vec(), numbers.to_vec());
-            contents
-                .tensors
-                .insert(name.into(), Tensor { shape, numbers });
+    /// Where the world is, as tensors.
+    fn state(&self) -> Vec<NamedTensor> {
+        let (hidden, prediction) = (self.follower.hidden(), self.follower.prediction());
+        let belief = |name: &str, belief: &Belief| {
+            let numbers = belief.as_slice().to_vec();
+            (name.to_owned(), belief.view().shape().to_vec(), numbers)
         };
-        if let Some(estimate) = self.basis.estimate() {
-            add(ESTIMATE, estimate.view().shape(), estimate.as_slice());
-        }
-        if self.input == DqnInput::BeforeFrame {
-            let before = self.autoencoder.hidden_before();
-            add(BEFORE, &[before.len()], before);
-        }
+        let mut state = vec![
+            (HIDDEN.to_owned(), vec![hidden.len()], hidden.to_vec()),
+            belief(PREDICTION, prediction),
+        ];
+        let estimate = self.basis.estimate();
+        state.extend(estimate.map(|estimate| belief(ESTIMATE, estimate)));
+        state
     }
 
-    /// From a checkpoint, with its own settings.
+    /// From a checkpoint, with its own settings; the autoencoder computes on `device`.
     ///
     /// # Errors
     /// [`Problem`] names what is missing or of another form.
-    pub fn read(contents: &Contents) -> Result<Self, Problem> {
+    pub fn read(contents: &Contents, device: &Device) -> Result<Self, Problem> {
         let config = settings(contents)?;
         let wrong = |name: &str, expected: &str, got: String| Problem::Value {
             name: name.into(),
@@ -169,7 +179,7 @@ impl Progress {
             n_moves: 0,
             worlds: 0..1,
         };
-        let mut progress = Self::first(&site, &config);
+        let mut progress = Self::first(&site, &config, device)?;
         progress.load(contents)?;
         Ok(progress)
     }
@@ -187,12 +197,11 @@ impl Progress {
                 got: input.label().into(),
             });
         }
-        let numbers = |name: &str, dims: &[usize]| contents.tensor(name, dims).map(<[f32]>::to_vec);
         squares_are_not_negative(contents)?;
         let counters = [contents.count("adam_steps")?, contents.count("updates")?];
-        self.autoencoder.load(numbers, counters)?;
-        self.dqn.load(contents)?;
-        self.load_stand(contents)?;
+        self.autoencoder.load(find(contents), counters)?;
+        load_dqn(&mut self.dqn, contents)?;
+        self.load_state(contents)?;
         let n_states = self.reward.rewards.len();
         self.reward.products = contents.floats("reward.products", n_states * n_states)?;
         self.reward.rewards = contents.floats("reward.rewards", n_states)?;
@@ -210,26 +219,30 @@ impl Progress {
         Ok(())
     }
 
-    /// What [`Self::save_stand`] put there. Without an estimate, as where others were not wanted, the next
-    /// path is planned on the predictor.
-    fn load_stand(&mut self, contents: &Contents) -> Result<(), Problem> {
+    /// What [`Self::state`] gave. Without an estimate, as where others were not wanted, the next path is
+    /// planned on the predictor.
+    fn load_state(&mut self, contents: &Contents) -> Result<(), Problem> {
+        let belief = |name: &str| self.belief_from(contents, name);
+        let hidden = contents.tensor(HIDDEN, &[self.follower.hidden().len()])?;
+        let follower = Follower::at(hidden.to_vec(), belief(PREDICTION)?);
         if contents.tensors.contains_key(ESTIMATE) {
-            let dim = self.autoencoder.prediction().view().dim();
-            let numbers = contents.tensor(ESTIMATE, &[dim.0, dim.1, dim.2])?.to_vec();
-            let estimate = Probabilities::from_shape_vec(dim, numbers);
-            let estimate = estimate.expect("invariant: the tensor has this shape");
-            let estimate = Belief::from_probabilities(estimate);
-            self.basis.see(&estimate.map_err(|error| Problem::Value {
-                name: ESTIMATE.into(),
-                expected: "a belief".into(),
-                got: error.to_string(),
-            })?);
+            let estimate = belief(ESTIMATE)?;
+            self.basis.see(&estimate);
         }
-        if self.input == DqnInput::BeforeFrame {
-            let before = contents.tensor(BEFORE, &[self.autoencoder.hidden().len()])?;
-            self.autoencoder.set_hidden_before(before.to_vec());
-        }
+        self.follower = follower;
         Ok(())
+    }
+
+    fn belief_from(&self, contents: &Contents, name: &str) -> Result<Belief, Problem> {
+        let dim = self.follower.prediction().view().dim();
+        let numbers = contents.tensor(name, &[dim.0, dim.1, dim.2])?.to_vec();
+        let belief = Probabilities::from_shape_vec(dim, numbers);
+        let belief = belief.expect("invariant: the tensor has this shape");
+        Belief::from_probabilities(belief).map_err(|error| Problem::Value {
+            name: name.into(),
+            expected: "a belief".into(),
+            got: error.to_string(),
+        })
     }
 
     fn load_replay(&mut self, contents: &Contents) -> Result<(), Problem> {
@@ -268,7 +281,7 @@ fn network_shape(grid: Shape, n_observations: usize, config: &AgentConfig) -> Ne
 
 /// Refuses sizes whose numbers are not in the file: a few words could ask for all memory otherwise.
 fn check_size(contents: &Contents, shape: &NetworkShape) -> Result<(), Problem> {
-    let expected = Tensors::n_parameters(shape) + shape.n_states * shape.grid.n_cells();
+    let expected = shape.n_numbers() + shape.n_states * shape.grid.n_cells();
     let tensors = contents.tensors.values();
     let got: usize = tensors.map(|tensor| tensor.numbers.len()).sum();
     if got >= expected {

@@ -1,0 +1,112 @@
+//! Time of the autoencoder at the paper's size: 64 x 64 cells, windows of 1,000 frames, hidden 16.
+//!
+//! The authors' code on torch with two threads: an update 1,156 to 1,240 ms, an inference step 0.95 ms.
+
+use criterion::{Criterion, criterion_group};
+use network::{
+    Allocator, Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, NetworkShape,
+    Transition, Window, keep_freed_memory,
+};
+use protocol::frame::Frame;
+use protocol::grid::Shape;
+use protocol::path::{Move, fly};
+use protocol::randomness::split_mix;
+
+#[global_allocator]
+static ALLOCATOR: Allocator = Allocator;
+
+const N_FRAMES: u64 = 1000;
+
+fn shape() -> Shape {
+    Shape::new(64, 64).expect("valid shape")
+}
+
+/// What a random walk of 64 moves sees: about 33 cells, in patches of one value.
+fn path_frame(step: u64) -> Frame {
+    let moves: Vec<Move> = (0..64)
+        .map(|t| Move::from_low_bits(split_mix(step, t) >> 62))
+        .collect();
+    let start = shape().cell((split_mix(step, 1000) % 4096) as usize);
+    let mut frame = Frame::empty(shape());
+    for index in fly(shape(), start, &moves).visited {
+        frame.observe(index, (split_mix(index as u64 / 5, step / 50) % 3) as u8);
+    }
+    frame
+}
+
+fn full_frame(step: u64) -> Frame {
+    let mut frame = Frame::empty(shape());
+    for index in 0..shape().n_cells() {
+        frame.observe(index, (split_mix(index as u64 / 5, step / 50) % 3) as u8);
+    }
+    frame
+}
+
+fn network() -> Autoencoder {
+    let settings = AutoencoderSettings::paper_large();
+    let shape = NetworkShape {
+        grid: shape(),
+        n_states: 3,
+        n_observations: 3,
+        encoding: settings.encoding,
+        hidden: settings.hidden,
+    };
+    Autoencoder::new(settings, shape, 1, &Device::Cpu).expect("a network")
+}
+
+fn updates(c: &mut Criterion) {
+    let mut group = c.benchmark_group("autoencoder");
+    group.sample_size(20);
+    let mut bench = |name: &str, frame: fn(u64) -> Frame| {
+        let frames: Vec<Frame> = (0..N_FRAMES).map(frame).collect();
+        let window = Window::new(&frames);
+        let mut network = network();
+        group.bench_function(name, |b| {
+            b.iter(|| network.update(&window).expect("finite"));
+        });
+    };
+    bench("update on paths (authors: 1.2 s)", path_frame);
+    bench("update on full frames", full_frame);
+    group.finish();
+}
+
+fn steps(c: &mut Criterion) {
+    let (network, frame) = (network(), path_frame(1));
+    let mut hidden = network.first_hidden();
+    c.bench_function("autoencoder: inference step (authors: 0.95 ms)", |b| {
+        b.iter(|| {
+            let window = Window::new([&frame]);
+            hidden = network.advance(&window, &hidden).expect("finite");
+            network.predict(&hidden).expect("a predictor")
+        });
+    });
+}
+
+fn dqn(c: &mut Criterion) {
+    let number = |index: u64| (split_mix(7, index) >> 40) as f32 / (1 << 24) as f32;
+    let vector = |first: u64| (0..16).map(|i| number(first + i)).collect::<Vec<f32>>();
+    let mut dqn = Dqn::new(DqnSettings::paper(), 16, 4, 1);
+    for row in 0..1000 {
+        dqn.remember(Transition {
+            input: vector(row * 100),
+            action: (row % 4) as usize,
+            reward: number(row * 100 + 50),
+            next: vector(row * 100 + 20),
+        });
+    }
+    c.bench_function("dqn: update (torch: 0.65 ms)", |b| {
+        b.iter(|| dqn.update().expect("finite"));
+    });
+    let input = vector(1);
+    c.bench_function("dqn: act (candle: 3.5 us)", |b| {
+        b.iter(|| dqn.act(&input, 3))
+    });
+}
+
+criterion_group!(benches, updates, steps, dqn);
+
+fn main() {
+    keep_freed_memory();
+    benches();
+    Criterion::default().configure_from_args().final_summary();
+}

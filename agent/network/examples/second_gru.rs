@@ -1,0 +1,84 @@
+//! A network with a layer more: a second GRU behind the first.
+//!
+//! Its gradients come from candle, its first values from a seed, and [`Adam`] finds its variables by name.
+//! `cargo run --release -p network --example second_gru`
+
+use candle_core::{DType, Result, Tensor};
+use candle_nn::VarBuilder;
+use network::variables::build;
+use network::{
+    Adam, AdamSettings, Decoder, Device, Dropout, Encoder, Gru, NetworkShape, Observation, Pass,
+    Window,
+};
+use protocol::{Frame, Shape};
+
+struct TwoGrus {
+    encoder: Encoder,
+    first: Gru,
+    second: Gru,
+    decoder: Decoder,
+    observation: Observation,
+}
+
+impl TwoGrus {
+    fn new(vb: &VarBuilder<'_>, shape: &NetworkShape) -> Result<Self> {
+        let n = shape.hidden;
+        Ok(Self {
+            encoder: Encoder::new(&vb.pp("encoder"), shape, false)?,
+            first: Gru::new(&vb.pp("rnn_layer"), shape.encoding, n, false)?,
+            second: Gru::new(&vb.pp("second_rnn_layer"), n, n, false)?,
+            decoder: Decoder::new(&vb.pp("decoder"), shape, false)?,
+            observation: Observation::new(vb, shape.n_observations, shape.n_states, false)?,
+        })
+    }
+
+    fn forward(&self, pass: &Pass<'_>, hidden: &[f32]) -> Result<Tensor> {
+        let x = self.encoder.forward(pass)?;
+        let x = self.first.forward(&x, hidden)?;
+        self.second.forward(&x, hidden)
+    }
+
+    fn loss(&self, pass: &Pass<'_>, hidden: &[f32]) -> Result<Tensor> {
+        let hidden = self.forward(pass, hidden)?;
+        let logits = self.decoder.at_targets(&hidden, pass)?;
+        self.observation.loss(&logits, pass.window)
+    }
+}
+
+/// Frames of a grid whose left half shows 0 and whose right half shows 1.
+fn frames(grid: Shape) -> Vec<Frame> {
+    let (_, width) = grid.dim();
+    let frame = |step: usize| {
+        let mut frame = Frame::empty(grid);
+        for cell in (step..grid.n_cells()).step_by(7) {
+            frame.observe(cell, u8::from(2 * (cell % width) >= width));
+        }
+        frame
+    };
+    (0..40).map(|step| frame(step % 7)).collect()
+}
+
+#[expect(clippy::print_stdout, reason = "an example shows what it does")]
+fn main() -> Result<()> {
+    let shape = NetworkShape {
+        grid: Shape::new(32, 32).map_err(candle_core::Error::wrap)?,
+        n_states: 2,
+        n_observations: 2,
+        encoding: 8,
+        hidden: 8,
+    };
+    let model = |vb| TwoGrus::new(&vb, &shape);
+    let (model, variables) = build(1, DType::F32, &Device::Cpu, model)?;
+    let (mut adam, settings) = (Adam::new(&variables)?, AdamSettings::paper(1e-3));
+    let window = Window::new(&frames(shape.grid));
+    for update in 0..100 {
+        let dropout = Dropout::draw(window.len(), 1, update);
+        let loss = model.loss(&Pass::training(&window, &dropout), &[0.0; 8])?;
+        let step = adam.step(&settings, &variables, &loss.backward()?)?;
+        adam.take(step)?;
+        if update % 20 == 0 {
+            println!("update {update}: loss {:.4}", loss.to_scalar::<f32>()?);
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,304 @@
+//! The network with its optimiser: frames in, predictors out; windows of frames in, learned parameters out.
+
+use crate::adam::{Adam, AdamSettings};
+use crate::batch_norm::moved_statistics;
+use crate::dropout::Dropout;
+use crate::error::{NetworkError, NotFinite};
+use crate::model::{Network, Stock};
+use crate::pass::Pass;
+use crate::shape::NetworkShape;
+use crate::tensors::{NamedTensor, first_not_finite, named, numbers_of, restored};
+use crate::variables::{Variables, build, normal};
+use crate::window::Window;
+use candle_core::backprop::GradStore;
+use candle_core::{DType, Device, Result as CandleResult, Tensor};
+use protocol::grid::Probabilities;
+use protocol::randomness::{Purpose, stream};
+use serde::{Deserialize, Serialize};
+use std::fmt;
+
+/// Sizes and step size.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AutoencoderSettings {
+    /// Length of the encoder's output.
+    pub encoding: usize,
+    /// Length of the hidden vector h.
+    pub hidden: usize,
+    /// Frames in a window that is learned from; all but the first are predicted.
+    pub window: usize,
+    /// Frames remembered.
+    pub replay: usize,
+    /// The optimiser.
+    pub adam: AdamSettings,
+}
+
+impl AutoencoderSettings {
+    /// What the authors ran for their table.
+    pub fn paper() -> Self {
+        Self {
+            encoding: 4,
+            hidden: 4,
+            window: 1000,
+            replay: 5000,
+            adam: AdamSettings::paper(1e-4),
+        }
+    }
+
+    /// The authors' larger network, with the larger of their step sizes.
+    pub fn paper_large() -> Self {
+        Self {
+            encoding: 16,
+            hidden: 16,
+            adam: AdamSettings::paper(1e-3),
+            ..Self::paper()
+        }
+    }
+}
+
+/// The network, its variables and its optimiser.
+pub struct Autoencoder {
+    settings: AutoencoderSettings,
+    shape: NetworkShape,
+    seed: u64,
+    device: Device,
+    network: Network,
+    variables: Variables,
+    adam: Adam,
+    n_updates: u64,
+}
+
+impl Autoencoder {
+    /// A new network of a seed, which is also that of its masks and hidden vectors.
+    ///
+    /// # Errors
+    /// [`NetworkError`] where the device fails.
+    pub fn new(
+        settings: AutoencoderSettings,
+        shape: NetworkShape,
+        seed: u64,
+        device: &Device,
+    ) -> Result<Self, NetworkError> {
+        let network = |vb| Network::new(&vb, &shape, Stock::default());
+        let (network, variables) = build(seed, DType::F32, device, network)?;
+        Ok(Self {
+            adam: Adam::new(&variables)?,
+            settings,
+            shape,
+            seed,
+            device: device.clone(),
+            network,
+            variables,
+            n_updates: 0,
+        })
+    }
+
+    /// Sizes and step size.
+    pub fn settings(&self) -> &AutoencoderSettings {
+        &self.settings
+    }
+
+    /// Grid, states and observations.
+    pub fn shape(&self) -> &NetworkShape {
+        &self.shape
+    }
+
+    /// Updates so far.
+    pub fn n_updates(&self) -> u64 {
+        self.n_updates
+    }
+
+    /// The model.
+    pub fn network(&self) -> &Network {
+        &self.network
+    }
+
+    /// Its parameters and running statistics.
+    pub fn variables(&self) -> &Variables {
+        &self.variables
+    }
+
+    /// Changes the step size.
+    pub fn set_learning_rate(&mut self, learning_rate: f32) {
+        self.settings.adam.learning_rate = learning_rate;
+    }
+
+    /// The learned observation matrix `O`, row-major `[observation][state]`; columns sum to one.
+    ///
+    /// # Errors
+    /// [`NetworkError`] where the device fails.
+    pub fn observation_matrix(&self) -> Result<Vec<f32>, NetworkError> {
+        Ok(numbers_of(&self.network.observation_matrix()?)?)
+    }
+
+    /// `h_0 ~ N(0, I)` of a run, the same for a seed.
+    pub fn first_hidden(&self) -> Vec<f32> {
+        self.draw_hidden(u64::MAX)
+    }
+
+    fn draw_hidden(&self, index: u64) -> Vec<f32> {
+        let mut rng = stream(self.seed, Purpose::Hidden, index);
+        (0..self.shape.hidden).map(|_| normal(&mut rng)).collect()
+    }
+
+    /// The hidden vector that has read a frame too, after a hidden vector and a window of this one frame.
+    ///
+    /// # Errors
+    /// [`NetworkError`] for a number that is not finite, or where the device fails.
+    ///
+    /// # Panics
+    /// If the frame does not fit the network.
+    pub fn advance(&self, window: &Window, hidden: &[f32]) -> Result<Vec<f32>, NetworkError> {
+        assert!(window.fits(&self.shape), "frame: grid or observations");
+        let hidden = self.network.forward(&Pass::inference(window), hidden)?;
+        let hidden = numbers_of(&hidden)?;
+        match hidden.iter().all(|number| number.is_finite()) {
+            true => Ok(hidden),
+            // Softmax and ReLU would make numbers again of what is none.
+            false => Err(self.not_finite("the hidden vector".into())),
+        }
+    }
+
+    /// The predictor `u` that a hidden vector stands for, `[S, H, W]`.
+    ///
+    /// # Errors
+    /// [`NetworkError`] where the device fails.
+    pub fn predict(&self, hidden: &[f32]) -> Result<Probabilities, NetworkError> {
+        let (height, width) = self.shape.grid.dim();
+        let hidden = Tensor::from_slice(hidden, (1, hidden.len()), &self.device)?;
+        let nothing = Window::blank(1);
+        let padded = self.network.predict(&Pass::inference(&nothing), &hidden)?;
+        let cells = padded.narrow(2, 0, height)?.narrow(3, 0, width)?;
+        let dim = (self.shape.n_states, height, width);
+        let predictor = Probabilities::from_shape_vec(dim, numbers_of(&cells)?);
+        Ok(predictor.expect("invariant: one number per state and cell"))
+    }
+
+    /// One step of Adam on a window, with dropout and `h_0` from this update's streams; the loss before it.
+    ///
+    /// # Errors
+    /// [`NetworkError`]; nothing has changed then.
+    ///
+    /// # Panics
+    /// If the window has no targets or does not fit the network.
+    pub fn update(&mut self, window: &Window) -> Result<f64, NetworkError> {
+        let dropout = Dropout::draw(window.len(), self.seed, self.n_updates);
+        self.update_with(window, &dropout, &self.draw_hidden(self.n_updates))
+    }
+
+    /// [`Self::update`] with given masks and `h_0`.
+    ///
+    /// # Errors
+    /// [`NetworkError`]; nothing has changed then.
+    ///
+    /// # Panics
+    /// If the window has no targets or does not fit the network.
+    pub fn update_with(
+        &mut self,
+        window: &Window,
+        dropout: &Dropout,
+        first: &[f32],
+    ) -> Result<f64, NetworkError> {
+        assert!(window.has_targets(), "window: expected cells to predict");
+        assert!(window.fits(&self.shape), "window: grid or observations");
+        let pass = Pass::training(window, dropout);
+        let loss = self.network.loss(&pass, first)?;
+        let gradients = loss.backward()?;
+        let loss = f64::from(loss.to_scalar::<f32>()?);
+        if let Some(tensor) = self.cause(loss, &gradients)? {
+            return Err(self.not_finite(tensor));
+        }
+        let statistics = moved_statistics(&self.variables, &pass.into_moments())?;
+        let step = self
+            .adam
+            .step(&self.settings.adam, &self.variables, &gradients)?;
+        let after = statistics
+            .iter()
+            .map(|(name, tensor)| (format!("{name} after the update"), tensor));
+        if let Some(tensor) = first_not_finite(after.chain(step.tensors()))? {
+            return Err(self.not_finite(tensor));
+        }
+        for (name, tensor) in &statistics {
+            self.variables[name].set(tensor)?;
+        }
+        self.adam.take(step)?;
+        self.n_updates += 1;
+        Ok(loss)
+    }
+
+    /// The first thing that is not finite: a cause before what follows from it.
+    fn cause(&self, loss: f64, gradients: &GradStore) -> CandleResult<Option<String>> {
+        let variables = self.variables.iter();
+        let all = variables.map(|(name, var)| (name.clone(), var.as_tensor()));
+        let gradients = self.variables.iter().filter_map(|(name, var)| {
+            let gradient = gradients.get(var)?;
+            Some((format!("gradient of {name}"), gradient))
+        });
+        let tensor = first_not_finite(all.chain(gradients))?;
+        Ok(tensor.or_else(|| (!loss.is_finite()).then(|| "loss".to_owned())))
+    }
+
+    fn not_finite(&self, tensor: String) -> NetworkError {
+        let update = self.n_updates;
+        NotFinite { update, tensor }.into()
+    }
+
+    /// Everything that a resumed run needs but settings, seed and [`Self::counters`]: variables by PyTorch's
+    /// names, Adam's moments as `adam.first.<name>` and `adam.second.<name>`.
+    ///
+    /// # Errors
+    /// [`NetworkError`] where the device fails.
+    pub fn named_tensors(&self) -> Result<Vec<NamedTensor>, NetworkError> {
+        let variables = self.variables.iter();
+        let variables = variables.map(|(name, var)| (name.clone(), var.as_tensor()));
+        Ok(named(variables.chain(self.adam.tensors("adam")))?)
+    }
+
+    /// Steps of Adam, and updates.
+    pub fn counters(&self) -> [u64; 2] {
+        [self.adam.steps(), self.n_updates]
+    }
+
+    /// Takes over what [`Self::named_tensors`] and [`Self::counters`] gave, of a network of the same sizes.
+    /// `find` gives the numbers of a name and shape.
+    ///
+    /// # Errors
+    /// As of `find`, or where the device fails; nothing has changed then.
+    pub fn load<E: From<NetworkError>>(
+        &mut self,
+        find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
+        [steps, n_updates]: [u64; 2],
+    ) -> Result<(), E> {
+        let moments = self.adam.found("adam", &find)?;
+        self.load_variables(find)?;
+        self.adam.restore(moments, steps);
+        self.n_updates = n_updates;
+        Ok(())
+    }
+
+    /// Takes over parameters and statistics alone, as of a network trained with PyTorch.
+    ///
+    /// # Errors
+    /// As of `find`, or where the device fails; nothing has changed then.
+    pub fn load_variables<E: From<NetworkError>>(
+        &mut self,
+        find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
+    ) -> Result<(), E> {
+        let variables = self.variables.iter();
+        let found = variables.map(|(name, var)| Ok((var, restored(name, var, &find)?)));
+        let found = found.collect::<Result<Vec<_>, E>>()?;
+        for (var, tensor) in found {
+            var.set(&tensor).map_err(NetworkError::from)?;
+        }
+        Ok(())
+    }
+}
+
+impl fmt::Debug for Autoencoder {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut debug = f.debug_struct("Autoencoder");
+        debug.field("shape", &self.shape);
+        debug.field("n_updates", &self.n_updates);
+        debug.finish_non_exhaustive()
+    }
+}

@@ -1,0 +1,110 @@
+//! Batch normalisation: moments of the window in training, running ones otherwise.
+
+use crate::ops::norm::{EPSILON, Moments};
+use crate::pass::Pass;
+use crate::variables::Variables;
+use candle_core::{DType, Result, Tensor};
+use candle_nn::{Init, VarBuilder};
+
+/// Share of a new window in the running statistics, as in PyTorch.
+const MOMENTUM: f64 = 0.1;
+
+/// The parameters and running statistics of one normalisation.
+#[derive(Debug)]
+pub(crate) struct BatchNorm {
+    name: String,
+    gamma: Tensor,
+    beta: Tensor,
+    mean: Tensor,
+    variance: Tensor,
+}
+
+impl BatchNorm {
+    pub(crate) fn new(vb: &VarBuilder<'_>, channels: usize) -> Result<Self> {
+        let get = |name: &str, value: f64| vb.get_with_hints(channels, name, Init::Const(value));
+        Ok(Self {
+            name: vb.prefix(),
+            gamma: get("weight", 1.0)?,
+            beta: get("bias", 0.0)?,
+            mean: get("running_mean", 0.0)?,
+            variance: get("running_var", 1.0)?,
+        })
+    }
+
+    /// `[gamma; beta]`, as our operators take them.
+    pub(crate) fn weights(&self) -> Result<Tensor> {
+        Tensor::stack(&[&self.gamma, &self.beta], 0)
+    }
+
+    /// The moments to normalise with; `of_window` computes those of training.
+    pub(crate) fn moments(
+        &self,
+        pass: &Pass<'_>,
+        of_window: impl FnOnce() -> Result<Moments>,
+    ) -> Result<Moments> {
+        if !pass.trains() {
+            return Ok(Moments {
+                mean: exact(&self.mean)?,
+                variance: exact(&self.variance)?,
+                count: f64::INFINITY,
+            });
+        }
+        let moments = of_window()?;
+        pass.keep_moments(&self.name, &moments);
+        Ok(moments)
+    }
+
+    /// The stock path: normalises `u [frames, channels, rows, cols]`.
+    pub(crate) fn forward(&self, u: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
+        let channels = u.dim(1)?;
+        let per_channel = |tensor: &Tensor| tensor.reshape((1, channels, 1, 1));
+        let (mean, variance) = match pass.trains() {
+            true => {
+                let flat = u.transpose(0, 1)?.flatten_from(1)?;
+                let mean = flat.mean_keepdim(1)?;
+                let variance = flat.broadcast_sub(&mean)?.sqr()?.mean_keepdim(1)?;
+                let moments = Moments {
+                    mean: exact(&mean)?,
+                    variance: exact(&variance)?,
+                    count: flat.dim(1)? as f64,
+                };
+                pass.keep_moments(&self.name, &moments);
+                (mean, variance)
+            }
+            false => (self.mean.clone(), self.variance.clone()),
+        };
+        let deviation = (variance + EPSILON)?.sqrt()?;
+        u.broadcast_sub(&per_channel(&mean)?)?
+            .broadcast_div(&per_channel(&deviation)?)?
+            .broadcast_mul(&per_channel(&self.gamma)?)?
+            .broadcast_add(&per_channel(&self.beta)?)
+    }
+}
+
+fn exact(tensor: &Tensor) -> Result<Vec<f64>> {
+    tensor.flatten_all()?.to_dtype(DType::F64)?.to_vec1()
+}
+
+/// What the running statistics become after a window: variables and their new values, by name.
+pub(crate) fn moved_statistics(
+    variables: &Variables,
+    moments: &[(String, Moments)],
+) -> Result<Vec<(String, Tensor)>> {
+    let mut moved = Vec::with_capacity(2 * moments.len());
+    for (norm, moments) in moments {
+        // PyTorch keeps the variance of the sample, divided by the number of values less one.
+        let sample = moments.count / (moments.count - 1.0).max(1.0);
+        let variance = moments.variance.iter().map(|v| v * sample).collect();
+        for (what, new) in [
+            ("running_mean", moments.mean.clone()),
+            ("running_var", variance),
+        ] {
+            let name = format!("{norm}.{what}");
+            let old = &variables[&name];
+            let new = Tensor::new(new, old.device())?.to_dtype(old.dtype())?;
+            let now = ((old.as_tensor() * (1.0 - MOMENTUM))? + (new * MOMENTUM)?)?;
+            moved.push((name, now));
+        }
+    }
+    Ok(moved)
+}

@@ -1,0 +1,152 @@
+//! Dropout2d: in training, each frame loses each channel with probability one half.
+//!
+//! Kept channels are scaled by two, so that their mean stays. Our operators skip lost channels, so a mask
+//! is a list of channels as well as numbers to multiply with.
+
+use crate::shape::{DECODER_CHANNELS, ENCODER_CHANNELS};
+use candle_core::{DType, Device, Result, Tensor};
+use protocol::randomness::{Purpose, stream};
+use rand_chacha::rand_core::Rng;
+use std::sync::Arc;
+
+/// The channels kept and lost in each frame behind one layer. Clones share them.
+#[derive(Debug, Clone)]
+pub struct Mask {
+    scale: f32,
+    channels: usize,
+    /// Per frame and channel: `scale`, or zero where it is lost.
+    scales: Arc<[f32]>,
+    kept: Arc<[usize]>,
+    /// Where each frame's kept channels begin, and where the last one's end.
+    starts: Arc<[usize]>,
+}
+
+impl Mask {
+    /// Channels are kept where `keeps(frame, channel)`, and multiplied with `scale`.
+    pub fn new(
+        n_frames: usize,
+        channels: usize,
+        scale: f32,
+        keeps: impl Fn(usize, usize) -> bool,
+    ) -> Self {
+        let mut scales = vec![0.0; n_frames * channels];
+        let (mut kept, mut starts) = (Vec::with_capacity(scales.len()), vec![0]);
+        for frame in 0..n_frames {
+            kept.extend((0..channels).filter(|&channel| keeps(frame, channel)));
+            for channel in &kept[starts[frame]..] {
+                scales[frame * channels + channel] = scale;
+            }
+            starts.push(kept.len());
+        }
+        let (scales, kept, starts) = (scales.into(), kept.into(), starts.into());
+        Self {
+            scale,
+            channels,
+            scales,
+            kept,
+            starts,
+        }
+    }
+
+    /// Every channel of every frame is kept as it is.
+    pub fn all(n_frames: usize, channels: usize) -> Self {
+        Self::new(n_frames, channels, 1.0, |_, _| true)
+    }
+
+    /// Number of frames.
+    pub fn n_frames(&self) -> usize {
+        self.starts.len() - 1
+    }
+
+    /// What kept channels are multiplied with.
+    pub fn scale(&self) -> f32 {
+        self.scale
+    }
+
+    /// Number of channels.
+    pub fn channels(&self) -> usize {
+        self.channels
+    }
+
+    /// Channels that a frame keeps, ascending.
+    pub fn kept(&self, frame: usize) -> &[usize] {
+        &self.kept[self.starts[frame]..self.starts[frame + 1]]
+    }
+
+    /// Whether no frame loses a channel.
+    pub fn keeps_all(&self) -> bool {
+        self.kept.len() == self.scales.len()
+    }
+
+    /// What each channel of a frame is multiplied with; lost ones with zero.
+    pub fn scales(&self, frame: usize) -> &[f32] {
+        &self.scales[frame * self.channels..][..self.channels]
+    }
+
+    /// All scales, `[frames, channels]`.
+    pub fn tensor(&self, dtype: DType, device: &Device) -> Result<Tensor> {
+        let dims = (self.n_frames(), self.channels);
+        Tensor::from_slice(&self.scales, dims, device)?.to_dtype(dtype)
+    }
+}
+
+/// The masks of one window behind all seven layers that have dropout.
+#[derive(Debug, Clone)]
+pub struct Dropout {
+    /// After the encoder's convolutions.
+    pub encoder: [Mask; ENCODER_CHANNELS.len()],
+    /// After the decoder's transposed convolutions but the last.
+    pub decoder: [Mask; DECODER_CHANNELS.len()],
+}
+
+impl Dropout {
+    /// Every channel kept, as outside training.
+    pub fn off(n_frames: usize) -> Self {
+        Self {
+            encoder: ENCODER_CHANNELS.map(|channels| Mask::all(n_frames, channels)),
+            decoder: DECODER_CHANNELS.map(|channels| Mask::all(n_frames, channels)),
+        }
+    }
+
+    /// The fair coins of an update under a seed.
+    pub fn draw(n_frames: usize, seed: u64, update: u64) -> Self {
+        let mut rng = stream(seed, Purpose::Dropout, update);
+        let mut toss = |channels: usize| {
+            let words_each = channels.div_ceil(64);
+            let words: Vec<u64> = (0..n_frames * words_each).map(|_| rng.next_u64()).collect();
+            Mask::new(n_frames, channels, 2.0, |frame, channel| {
+                words[frame * words_each + channel / 64] >> (channel % 64) & 1 == 1
+            })
+        };
+        Self {
+            encoder: ENCODER_CHANNELS.map(&mut toss),
+            decoder: DECODER_CHANNELS.map(&mut toss),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn half_of_the_channels_are_kept_and_scaled() {
+        let mask = &Dropout::draw(200, 1, 0).decoder[0];
+        let mut n_kept = 0;
+        for frame in 0..200 {
+            let scaled = (0..128).filter(|&channel| mask.scales(frame)[channel] == 2.0);
+            assert!(scaled.eq(mask.kept(frame).iter().copied()));
+            n_kept += mask.kept(frame).len();
+        }
+        // 25,600 fair coins: a deviation of 400 is five standard deviations.
+        assert!(n_kept.abs_diff(12_800) < 400, "{n_kept}");
+    }
+
+    #[test]
+    fn masks_depend_on_seed_and_update() {
+        let kept = |seed, update| Dropout::draw(4, seed, update).decoder[0].kept.clone();
+        assert_eq!(kept(1, 2), kept(1, 2));
+        assert_ne!(kept(1, 2), kept(2, 2));
+        assert_ne!(kept(1, 2), kept(1, 3));
+    }
+}

@@ -1,0 +1,131 @@
+//! `Encoder(y)` of paper eq. 9: three convolutions, each with Dropout2d, ReLU and normalisation, and a linear
+//! layer.
+
+use crate::batch_norm::BatchNorm;
+use crate::ops::conv::Conv;
+use crate::ops::drop_relu_norm::DropReluNorm;
+use crate::ops::visited_conv::VisitedConv;
+use crate::pass::Pass;
+use crate::shape::{ConvShape, NetworkShape};
+use crate::variables::uniform_init;
+use candle_core::{Result, Tensor};
+use candle_nn::{Linear, Module, VarBuilder};
+
+/// Places of the convolutions and of the normalisations in the authors' list of layers.
+const STAGES: [(usize, usize); 3] = [(0, 3), (4, 7), (8, 11)];
+const LINEAR: usize = 13;
+
+/// Frames to encodings.
+#[derive(Debug)]
+pub struct Encoder {
+    stages: Vec<Stage>,
+    linear: Linear,
+    is_stock: bool,
+}
+
+#[derive(Debug)]
+struct Stage {
+    shape: ConvShape,
+    weight: Tensor,
+    bias: Tensor,
+    norm: BatchNorm,
+}
+
+impl Encoder {
+    /// An encoder of stock operators or ours.
+    pub fn new(vb: &VarBuilder<'_>, shape: &NetworkShape, is_stock: bool) -> Result<Self> {
+        let stages = STAGES.iter().zip(shape.convolutions());
+        let stages = stages.map(|(places, shape)| Stage::new(vb, *places, shape));
+        let init = uniform_init(shape.features());
+        let (vb, dims) = (vb.pp(LINEAR), (shape.encoding, shape.features()));
+        let weight = vb.get_with_hints(dims, "weight", init)?;
+        let bias = vb.get_with_hints(shape.encoding, "bias", init)?;
+        Ok(Self {
+            stages: stages.collect::<Result<_>>()?,
+            linear: Linear::new(weight, Some(bias)),
+            is_stock,
+        })
+    }
+
+    /// The encodings of all frames, `[frames, encoding]`.
+    pub fn forward(&self, pass: &Pass<'_>) -> Result<Tensor> {
+        let features = match self.is_stock {
+            true => self.stock(pass)?,
+            false => self.ours(pass)?,
+        };
+        self.linear.forward(&features)
+    }
+
+    /// Maps are `[frames, channels, rows, cols]`.
+    fn stock(&self, pass: &Pass<'_>) -> Result<Tensor> {
+        let first = &self.stages[0];
+        let (dtype, device) = (first.weight.dtype(), first.weight.device());
+        let shape = &first.shape;
+        let mut x = pass
+            .window
+            .one_hot(shape.channels_in, shape.input, dtype, device)?;
+        for (index, stage) in self.stages.iter().enumerate() {
+            let mask = pass.encoder_mask(index).tensor(dtype, device)?;
+            let z = stage.stock_conv(&x)?;
+            let kept = z.broadcast_mul(&mask.unsqueeze(2)?.unsqueeze(3)?)?;
+            x = stage.norm.forward(&kept.relu()?, pass)?;
+        }
+        x.flatten_from(1)
+    }
+
+    /// Maps are `[frames, rows, cols, channels]`.
+    fn ours(&self, pass: &Pass<'_>) -> Result<Tensor> {
+        let mut x = self.stages[0].visited_conv(pass)?;
+        for (index, stage) in self.stages.iter().enumerate() {
+            if index > 0 {
+                x = stage.conv(&x)?;
+            }
+            let mask = pass.encoder_mask(index).clone();
+            let of_window = || DropReluNorm::moments(&x, &mask);
+            let moments = stage.norm.moments(pass, of_window)?;
+            x = x.apply_op2(&stage.norm.weights()?, DropReluNorm { mask, moments })?;
+            let [rows, cols] = stage.shape.output;
+            x = x.reshape((pass.window.len(), rows, cols, stage.shape.channels_out))?;
+        }
+        x.permute((0, 3, 1, 2))?.flatten_from(1)
+    }
+}
+
+impl Stage {
+    fn new(vb: &VarBuilder<'_>, (conv, norm): (usize, usize), shape: ConvShape) -> Result<Self> {
+        let ([rows, cols], n) = (shape.kernel, shape.channels_out);
+        let init = uniform_init(shape.channels_in * rows * cols);
+        let of_conv = vb.pp(conv);
+        let dims = (n, shape.channels_in, rows, cols);
+        Ok(Self {
+            shape,
+            weight: of_conv.get_with_hints(dims, "weight", init)?,
+            bias: of_conv.get_with_hints(n, "bias", init)?,
+            norm: BatchNorm::new(&vb.pp(norm), n)?,
+        })
+    }
+
+    fn visited_conv(&self, pass: &Pass<'_>) -> Result<Tensor> {
+        let kernels = self.weight.permute((1, 2, 3, 0))?.flatten(0, 2)?;
+        let op = VisitedConv {
+            shape: self.shape,
+            window: pass.window.clone(),
+        };
+        kernels.contiguous()?.apply_op2(&self.bias, op)
+    }
+
+    fn conv(&self, x: &Tensor) -> Result<Tensor> {
+        let kernels = self.weight.permute((2, 3, 1, 0))?.flatten(0, 2)?;
+        let op = Conv {
+            kernel: self.shape.kernel,
+            stride: self.shape.stride,
+        };
+        x.apply_op2(&kernels.contiguous()?, op)?
+            .broadcast_add(&self.bias)
+    }
+
+    fn stock_conv(&self, x: &Tensor) -> Result<Tensor> {
+        let z = x.conv2d(&self.weight, 0, self.shape.stride, 1, 1)?;
+        z.broadcast_add(&self.bias.reshape((1, (), 1, 1))?)
+    }
+}

@@ -1,0 +1,50 @@
+//! The paper's networks as candle models: the dynamic autoencoder (sections III.B and III.C, eqs. 7 to 11)
+//! and the DQN (section III.E).
+//!
+//! In reading order: [`Network`] (the model: encoder, [`Gru`], decoder, observation matrix), [`Autoencoder`]
+//! (its updates and steps), [`Adam`], [`Dqn`]. Layers take their variables from a `VarBuilder` of
+//! [`variables`], and candle's `backward()` derives all of it. Five of them have an operator of ours
+//! with a hand-written kernel and gradient (`ops`) beside candle's stock ones, which run on GPUs.
+//!
+//! To add a layer, make it in `Network::new` and call it in `Network::forward`; `examples/second_gru.rs`
+//! does so outside.
+
+mod adam;
+mod allocator;
+mod autoencoder;
+mod batch_norm;
+mod decoder;
+mod device;
+mod dqn;
+mod dropout;
+mod encoder;
+mod error;
+mod gru;
+mod model;
+mod observation;
+mod ops;
+mod pass;
+mod replay;
+mod shape;
+mod tensors;
+pub mod variables;
+mod window;
+
+pub use adam::{Adam, AdamSettings};
+pub use allocator::{Allocator, keep_freed_memory};
+pub use autoencoder::{Autoencoder, AutoencoderSettings};
+pub use candle_core::Device;
+pub use decoder::Decoder;
+pub use device::{DeviceError, DeviceKind};
+pub use dqn::{Dqn, DqnSettings, Track, Transition};
+pub use dropout::{Dropout, Mask};
+pub use encoder::Encoder;
+pub use error::{NetworkError, NotFinite};
+pub use gru::Gru;
+pub use model::{Network, Stock};
+pub use observation::Observation;
+pub use pass::Pass;
+pub use replay::Replay;
+pub use shape::NetworkShape;
+pub use tensors::NamedTensor;
+pub use window::Window;

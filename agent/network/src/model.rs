@@ -1,0 +1,96 @@
+//! The dynamic autoencoder (paper section III.B) as a candle model.
+
+use crate::decoder::Decoder;
+use crate::encoder::Encoder;
+use crate::gru::Gru;
+use crate::observation::Observation;
+use crate::pass::Pass;
+use crate::shape::NetworkShape;
+use candle_core::{DType, Result, Tensor};
+use candle_nn::VarBuilder;
+use candle_nn::ops::softmax;
+
+/// Which layers use candle's stock operators instead of ours.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Stock {
+    /// The encoder.
+    pub encoder: bool,
+    /// The recurrence.
+    pub gru: bool,
+    /// The decoder.
+    pub decoder: bool,
+    /// The loss.
+    pub loss: bool,
+}
+
+impl Stock {
+    /// All of them.
+    pub const ALL: Self = Self {
+        encoder: true,
+        gru: true,
+        decoder: true,
+        loss: true,
+    };
+
+    /// What is needed where the variables are: ours are for 32-bit floats on the CPU. The recurrence moves
+    /// there.
+    fn at_least(self, vb: &VarBuilder<'_>) -> Self {
+        let must = !vb.device().is_cpu();
+        match vb.dtype() {
+            DType::F32 => Self {
+                encoder: self.encoder || must,
+                gru: self.gru,
+                decoder: self.decoder || must,
+                loss: self.loss || must,
+            },
+            _ => Self::ALL,
+        }
+    }
+}
+
+/// Encoder, recurrence, decoder and observation matrix, by the authors' names.
+#[derive(Debug)]
+pub struct Network {
+    encoder: Encoder,
+    gru: Gru,
+    decoder: Decoder,
+    observation: Observation,
+}
+
+impl Network {
+    /// A network whose layers ask `vb` for their variables.
+    pub fn new(vb: &VarBuilder<'_>, shape: &NetworkShape, stock: Stock) -> Result<Self> {
+        let (stock, gru) = (stock.at_least(vb), vb.pp("rnn_layer"));
+        let (n_observations, n_states) = (shape.n_observations, shape.n_states);
+        Ok(Self {
+            encoder: Encoder::new(&vb.pp("encoder"), shape, stock.encoder)?,
+            gru: Gru::new(&gru, shape.encoding, shape.hidden, stock.gru)?,
+            decoder: Decoder::new(&vb.pp("decoder"), shape, stock.decoder)?,
+            observation: Observation::new(vb, n_observations, n_states, stock.loss)?,
+        })
+    }
+
+    /// The hidden vectors that have read each frame, `[frames, hidden]`; `first` is the one before. A layer
+    /// more is a line more here.
+    pub fn forward(&self, pass: &Pass<'_>, first: &[f32]) -> Result<Tensor> {
+        let x = self.encoder.forward(pass)?;
+        self.gru.forward(&x, first)
+    }
+
+    /// The loss of what the window's frames say about their successors (eqs. 8 and 11).
+    pub fn loss(&self, pass: &Pass<'_>, first: &[f32]) -> Result<Tensor> {
+        let hidden = self.forward(pass, first)?;
+        let logits = self.decoder.at_targets(&hidden, pass)?;
+        self.observation.loss(&logits, pass.window)
+    }
+
+    /// The predictors that hidden vectors stand for, `[frames, states, rows, cols]` of the padded grid.
+    pub fn predict(&self, pass: &Pass<'_>, hidden: &Tensor) -> Result<Tensor> {
+        softmax(&self.decoder.forward(hidden, pass)?, 1)
+    }
+
+    /// The observation matrix `O`, `[observations, states]`; each column sums to one.
+    pub fn observation_matrix(&self) -> Result<Tensor> {
+        self.observation.matrix()
+    }
+}

@@ -1,0 +1,65 @@
+//! The observation matrix `O`, and the loss of paper eqs. 8 and 11 behind it.
+
+use crate::ops::cell_loss::{CellLoss, LOG_FLOOR};
+use crate::window::Window;
+use candle_core::{Result, Tensor};
+use candle_nn::ops::softmax;
+use candle_nn::{Init, VarBuilder};
+
+/// `P(y | x)`, learned.
+#[derive(Debug)]
+pub struct Observation {
+    /// Before the softmax of each column, `[observations, states]`.
+    weight: Tensor,
+    is_stock: bool,
+}
+
+impl Observation {
+    /// A matrix for so many observations and states, with a loss of stock operators or ours.
+    pub fn new(
+        vb: &VarBuilder<'_>,
+        n_observations: usize,
+        n_states: usize,
+        is_stock: bool,
+    ) -> Result<Self> {
+        let (mean, stdev) = (0.0, 1.0);
+        let dims = (n_observations, n_states);
+        let weight = vb.get_with_hints(dims, "W_obs_param", Init::Randn { mean, stdev })?;
+        Ok(Self { weight, is_stock })
+    }
+
+    /// The matrix, `[observations, states]`; each column sums to one.
+    pub fn matrix(&self) -> Result<Tensor> {
+        softmax(&self.weight, 0)
+    }
+
+    /// The cross-entropy of what a window's targets showed, the mean over them, from logits `[targets,
+    /// states]`.
+    pub fn loss(&self, logits: &Tensor, window: &Window) -> Result<Tensor> {
+        let (matrix, targets) = (self.matrix()?, window.all_targets());
+        if !self.is_stock {
+            return logits.apply_op2(&matrix.contiguous()?, CellLoss::of(targets));
+        }
+        let u = softmax(logits, 1)?;
+        let q = u.matmul(&matrix.t()?)?;
+        let y = one_hot(window, &q)?;
+        let hit = (&y * (&q + LOG_FLOOR)?.log()?)?;
+        // Rounding may take q above one.
+        let miss = ((1.0 - &y)? * ((1.0 - &q)?.relu()? + LOG_FLOOR)?.log()?)?;
+        (hit + miss)?.sum_all()?.neg()? / targets.len() as f64
+    }
+}
+
+/// What the targets showed, as rows like those of `q`.
+fn one_hot(window: &Window, q: &Tensor) -> Result<Tensor> {
+    let mut rows = vec![0.0_f32; q.elem_count()];
+    let n_observations = q.dim(1)?;
+    for (row, visit) in rows
+        .chunks_exact_mut(n_observations)
+        .zip(window.all_targets())
+    {
+        row[usize::from(visit.value)] = 1.0;
+    }
+    let rows = Tensor::from_vec(rows, q.shape(), q.device())?;
+    rows.to_dtype(q.dtype())
+}

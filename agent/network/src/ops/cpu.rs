@@ -1,0 +1,192 @@
+//! What the operators share: tensors as slices, frames in parallel, products of small matrices.
+
+use candle_core::{CpuStorage, Device, Layout, Result, Shape, Storage, Tensor};
+use rayon::prelude::*;
+use std::ops::{AddAssign, Deref, Range};
+
+/// Parts of a window that are worked on at the same time, each with sums of its own, which are added in
+/// their order: the number of threads changes no bit of the result.
+const N_CHUNKS: usize = 8;
+
+/// The numbers of an operator's argument.
+pub(super) fn slice<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
+    let Some((start, end)) = layout.contiguous_offsets() else {
+        candle_core::bail!("expected a contiguous tensor, got {layout:?}");
+    };
+    Ok(&storage.as_slice::<f32>()?[start..end])
+}
+
+/// The numbers of a contiguous tensor on the CPU, which is locked meanwhile.
+pub(super) fn numbers(tensor: &Tensor) -> Result<impl Deref<Target = [f32]> + '_> {
+    let (storage, layout) = tensor.storage_and_layout();
+    let range = match (&*storage, layout.contiguous_offsets()) {
+        (Storage::Cpu(CpuStorage::F32(_)), Some((start, end))) => start..end,
+        _ => candle_core::bail!("expected contiguous 32-bit floats on the CPU"),
+    };
+    Ok(Numbers { storage, range })
+}
+
+struct Numbers<G> {
+    storage: G,
+    range: Range<usize>,
+}
+
+impl<G: Deref<Target = Storage>> Deref for Numbers<G> {
+    type Target = [f32];
+
+    fn deref(&self) -> &[f32] {
+        match &*self.storage {
+            Storage::Cpu(CpuStorage::F32(numbers)) => &numbers[self.range.clone()],
+            _ => unreachable!("invariant: `numbers` has looked"),
+        }
+    }
+}
+
+/// A tensor on the CPU.
+pub(super) fn tensor(numbers: Vec<f32>, shape: impl Into<Shape>) -> Result<Tensor> {
+    Tensor::from_vec(numbers, shape.into(), &Device::Cpu)
+}
+
+/// Calls `f(sums, frame, its part of numbers)` for all frames; returns the sums of each chunk of frames.
+pub(super) fn frames<A: Send>(
+    numbers: &mut [f32],
+    per_frame: usize,
+    new: impl Fn() -> A + Sync,
+    f: impl Fn(&mut A, usize, &mut [f32]) + Sync,
+) -> Vec<A> {
+    let n_frames = numbers.len() / per_frame;
+    let chunk = n_frames.div_ceil(N_CHUNKS).max(1);
+    let chunks = numbers.par_chunks_mut(chunk * per_frame).enumerate();
+    let run = |(index, part): (usize, &mut [f32])| {
+        let mut sums = new();
+        // Compiles the loop, and what is inlined into it, for AVX2 and AVX-512 as well.
+        pulp::Arch::new().dispatch(|| {
+            for (at, part) in part.chunks_exact_mut(per_frame).enumerate() {
+                f(&mut sums, index * chunk + at, part);
+            }
+        });
+        sums
+    };
+    chunks.with_max_len(1).map(run).collect()
+}
+
+/// As [`frames`] for sums alone.
+pub(super) fn sums_over_frames<A: Send>(
+    n_frames: usize,
+    new: impl Fn() -> A + Sync,
+    f: impl Fn(&mut A, usize) + Sync,
+) -> Vec<A> {
+    let mut nothing = vec![0.0; n_frames];
+    frames(&mut nothing, 1, new, |sums, frame, _| f(sums, frame))
+}
+
+/// Adds the chunks' sums, in their order.
+pub(super) fn total<T: Copy + AddAssign>(sums: impl IntoIterator<Item = Vec<T>>) -> Vec<T> {
+    let mut sums = sums.into_iter();
+    let mut total = sums.next().unwrap_or_default();
+    for sum in sums {
+        add(&mut total, &sum);
+    }
+    total
+}
+
+/// `to += numbers`.
+#[inline(always)]
+pub(super) fn add<T: Copy + AddAssign>(to: &mut [T], numbers: &[T]) {
+    for (to, number) in to.iter_mut().zip(numbers) {
+        *to += *number;
+    }
+}
+
+/// `to += factor numbers`.
+#[inline(always)]
+pub(super) fn add_scaled(to: &mut [f32], factor: f32, numbers: &[f32]) {
+    for (to, number) in to.iter_mut().zip(numbers) {
+        *to += factor * number;
+    }
+}
+
+/// A dot product in eight lanes.
+#[inline(always)]
+pub(super) fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let mut lanes = [0.0; 8];
+    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<8>(), b.as_chunks::<8>());
+    let rest: f32 = a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum();
+    for (a, b) in a.iter().zip(b) {
+        for lane in 0..8 {
+            lanes[lane] += a[lane] * b[lane];
+        }
+    }
+    rest + lanes.iter().sum::<f32>()
+}
+
+/// A matrix in a slice: rows, columns, and the distance between neighbours of each.
+#[derive(Clone, Copy)]
+pub(super) struct Matrix<'a> {
+    numbers: &'a [f32],
+    rows: usize,
+    cols: usize,
+    row: usize,
+    col: usize,
+}
+
+/// The first numbers of a slice, row-major.
+pub(super) fn matrix(numbers: &[f32], rows: usize, cols: usize) -> Matrix<'_> {
+    assert!(numbers.len() >= rows * cols, "numbers of a matrix");
+    Matrix {
+        numbers,
+        rows,
+        cols,
+        row: cols,
+        col: 1,
+    }
+}
+
+impl Matrix<'_> {
+    pub(super) fn t(self) -> Self {
+        Self {
+            rows: self.cols,
+            cols: self.rows,
+            row: self.col,
+            col: self.row,
+            ..self
+        }
+    }
+}
+
+/// `out = a b` row by row, or `out += a b`.
+pub(super) fn product(out: &mut [f32], a: Matrix<'_>, b: Matrix<'_>, adds: bool) {
+    assert!(a.cols == b.rows, "sizes of a product");
+    let out = &mut out[..a.rows * b.cols];
+    if a.cols == 0 && !adds {
+        out.fill(0.0);
+    }
+    if out.is_empty() || a.cols == 0 {
+        return;
+    }
+    #[expect(unsafe_code, reason = "gemm takes pointers")]
+    // SAFETY: each matrix lies in its slice, as is asserted here and in `matrix`.
+    unsafe {
+        gemm::gemm(
+            a.rows,
+            b.cols,
+            a.cols,
+            out.as_mut_ptr(),
+            1,
+            b.cols as isize,
+            adds,
+            a.numbers.as_ptr(),
+            a.col as isize,
+            a.row as isize,
+            b.numbers.as_ptr(),
+            b.col as isize,
+            b.row as isize,
+            1.0,
+            1.0,
+            false,
+            false,
+            false,
+            gemm::Parallelism::None,
+        );
+    }
+}

@@ -1,0 +1,71 @@
+//! What the layers are told about one pass over a window.
+
+use crate::dropout::{Dropout, Mask};
+use crate::ops::norm::Moments;
+use crate::window::Window;
+use std::cell::RefCell;
+
+/// One pass: the frames, and either the dropout of training or none.
+///
+/// In training, normalisations use the moments of the window and leave them here; afterwards they use the
+/// running ones.
+#[derive(Debug)]
+pub struct Pass<'a> {
+    /// The frames.
+    pub window: &'a Window,
+    dropout: Dropout,
+    trains: bool,
+    moments: RefCell<Vec<(String, Moments)>>,
+}
+
+impl<'a> Pass<'a> {
+    /// An update's pass.
+    ///
+    /// # Panics
+    /// If the masks are of another number of frames.
+    pub fn training(window: &'a Window, dropout: &Dropout) -> Self {
+        assert_eq!(
+            dropout.encoder[0].n_frames(),
+            window.len(),
+            "frames of the masks"
+        );
+        Self {
+            window,
+            dropout: dropout.clone(),
+            trains: true,
+            moments: RefCell::default(),
+        }
+    }
+
+    /// An estimator's pass, with running statistics and every channel.
+    pub fn inference(window: &'a Window) -> Self {
+        Self {
+            window,
+            dropout: Dropout::off(window.len()),
+            trains: false,
+            moments: RefCell::default(),
+        }
+    }
+
+    pub(crate) fn trains(&self) -> bool {
+        self.trains
+    }
+
+    pub(crate) fn encoder_mask(&self, stage: usize) -> &Mask {
+        &self.dropout.encoder[stage]
+    }
+
+    pub(crate) fn decoder_mask(&self, level: usize) -> &Mask {
+        &self.dropout.decoder[level]
+    }
+
+    pub(crate) fn keep_moments(&self, norm: &str, moments: &Moments) {
+        let mut kept = self.moments.borrow_mut();
+        kept.push((norm.to_owned(), moments.clone()));
+    }
+
+    /// The window's moments, by the names of the normalisations.
+    pub(crate) fn into_moments(self) -> Vec<(String, Moments)> {
+        self.moments.into_inner()
+    }
+}

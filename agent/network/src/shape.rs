@@ -1,0 +1,144 @@
+//! The sizes of every layer, from the grid and the numbers of states and observations.
+//!
+//! The authors' network is for 64 x 64 cells. Ours fits any grid by two rules that leave theirs as it is:
+//!
+//! - The decoder doubles a seed of `ceil(H / 16) x ceil(W / 16)` cells four times; what lies beyond the
+//!   grid's lower and right edge is cut off. (64 x 64: 4 x 4.)
+//! - The encoder sees a grid of that padded size, unseen beyond the edge, and no kernel is larger than
+//!   its input.
+
+use crate::model::Network;
+use crate::variables::count_numbers;
+use protocol::grid::Shape;
+
+/// Channels after each convolution of the encoder.
+pub const ENCODER_CHANNELS: [usize; 3] = [32, 16, 8];
+
+/// Channels after each transposed convolution of the decoder but the last.
+pub const DECODER_CHANNELS: [usize; 4] = [128, 64, 32, 16];
+
+/// Kernel side and stride of the encoder's convolutions.
+const ENCODER_KERNELS: [(usize, usize); 3] = [(8, 4), (4, 2), (3, 1)];
+
+/// Cells of the padded grid per side of a seed cell: four doublings.
+const SEED_CELL: usize = 16;
+
+/// Everything that decides a tensor's size.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct NetworkShape {
+    /// The grid, H x W.
+    pub grid: Shape,
+    /// Number of states S.
+    pub n_states: usize,
+    /// Number of observations O.
+    pub n_observations: usize,
+    /// Length of the encoder's output.
+    pub encoding: usize,
+    /// Length of the hidden vector h.
+    pub hidden: usize,
+}
+
+/// One convolution of the encoder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ConvShape {
+    /// Channels of its input.
+    pub channels_in: usize,
+    /// Channels of its output.
+    pub channels_out: usize,
+    /// Rows and columns.
+    pub kernel: [usize; 2],
+    /// Of rows and columns.
+    pub stride: usize,
+    /// Rows and columns.
+    pub input: [usize; 2],
+    /// Rows and columns.
+    pub output: [usize; 2],
+}
+
+impl NetworkShape {
+    /// The decoder's first cells, `ceil(H / 16) x ceil(W / 16)`.
+    pub fn seed(&self) -> [usize; 2] {
+        let (height, width) = self.grid.dim();
+        [height.div_ceil(SEED_CELL), width.div_ceil(SEED_CELL)]
+    }
+
+    /// Rows and columns of the padded grid, what the decoder's doublings give.
+    pub fn padded(&self) -> [usize; 2] {
+        self.seed().map(|side| side * SEED_CELL)
+    }
+
+    /// The encoder's convolutions.
+    pub fn convolutions(&self) -> [ConvShape; 3] {
+        let (mut input, mut channels_in) = (self.padded(), self.n_observations);
+        std::array::from_fn(|stage| {
+            let (side, stride) = ENCODER_KERNELS[stage];
+            let kernel = input.map(|length| side.min(length));
+            let conv = ConvShape {
+                channels_in,
+                channels_out: ENCODER_CHANNELS[stage],
+                kernel,
+                stride,
+                input,
+                output: [0, 1].map(|axis| (input[axis] - kernel[axis]) / stride + 1),
+            };
+            (input, channels_in) = (conv.output, conv.channels_out);
+            conv
+        })
+    }
+
+    /// Length of the encoder's last map, flattened.
+    pub fn features(&self) -> usize {
+        let [.., last] = self.convolutions();
+        last.channels_out * last.output[0] * last.output[1]
+    }
+
+    /// How many numbers the network's parameters and statistics have; none of them is made.
+    pub fn n_numbers(&self) -> usize {
+        count_numbers(|vb| Network::new(&vb, self, Default::default()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shape(height: usize, width: usize) -> NetworkShape {
+        NetworkShape {
+            grid: Shape::new(height, width).expect("valid shape"),
+            n_states: 3,
+            n_observations: 3,
+            encoding: 4,
+            hidden: 4,
+        }
+    }
+
+    #[test]
+    fn the_paper_s_grid_gives_the_authors_sizes() {
+        let shape = shape(64, 64);
+        assert_eq!(shape.seed(), [4, 4]);
+        let outputs = shape.convolutions().map(|conv| conv.output);
+        assert_eq!(outputs, [[15, 15], [6, 6], [4, 4]]);
+        assert_eq!(shape.features(), 128);
+    }
+
+    #[test]
+    fn other_grids_are_padded_and_their_kernels_cut() {
+        let sizes = |height, width| {
+            let shape = shape(height, width);
+            let [.., last] = shape.convolutions();
+            (shape.padded(), last.kernel, last.output)
+        };
+        assert_eq!(sizes(32, 32), ([32, 32], [2, 2], [1, 1]));
+        assert_eq!(sizes(48, 80), ([48, 80], [3, 3], [2, 6]));
+        assert_eq!(sizes(6, 6), ([16, 16], [1, 1], [1, 1]));
+        assert_eq!(sizes(20, 33), ([32, 48], [2, 3], [1, 2]));
+    }
+
+    #[test]
+    fn numbers_are_counted_before_they_are_made() {
+        // Convolutions 6,176 + 8,208 + 1,160, linear 516, GRU 120, decoder 8,192 + 131,072 + 32,768 + 8,192
+        // + 768, observation matrix 9; four numbers per channel for each of the seven normalisations.
+        assert_eq!(shape(64, 64).n_numbers(), 197_181 + 4 * 296);
+        assert!(shape(4096, 4096).n_numbers() > 40_000_000);
+    }
+}

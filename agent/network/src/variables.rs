@@ -1,0 +1,205 @@
+//! Named variables whose first values come from our own seeded streams: candle's generator on the CPU
+//! cannot be seeded.
+
+use candle_core::{DType, Device, Result, Shape, Tensor, Var};
+use candle_nn::init::NormalOrUniform;
+use candle_nn::var_builder::SimpleBackend;
+use candle_nn::{Init, VarBuilder, VarMap};
+use protocol::randomness::{Purpose, stream};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::Rng;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// Variables by name, in the order of names.
+pub type Variables = BTreeMap<String, Var>;
+
+/// Makes a model of layers that ask a [`VarBuilder`] for their variables; returns it and these.
+///
+/// A variable's first value depends on the seed and its own name alone, so a new layer leaves the others'
+/// as they were.
+///
+/// # Errors
+/// As the layers'.
+pub fn build<M>(
+    seed: u64,
+    dtype: DType,
+    device: &Device,
+    model: impl FnOnce(VarBuilder<'static>) -> Result<M>,
+) -> Result<(M, Variables)> {
+    let variables = VarMap::new();
+    let backend = Seeded {
+        seed,
+        variables: variables.clone(),
+    };
+    let vb = VarBuilder::from_backend(Box::new(backend), dtype, device.clone());
+    let model = model(vb)?;
+    let named = variables.data().lock();
+    let named = named.expect("invariant: no layer panicked");
+    let named = named.iter().map(|(name, var)| (name.clone(), var.clone()));
+    Ok((model, named.collect()))
+}
+
+/// Whether a name is that of a running statistic, which no gradient moves.
+pub(crate) fn is_statistic(name: &str) -> bool {
+    name.ends_with("running_mean") || name.ends_with("running_var")
+}
+
+/// As PyTorch's layers begin: uniform in plus minus one over the root of `fan_in`.
+pub(crate) fn uniform_init(fan_in: usize) -> Init {
+    let up = 1.0 / (fan_in.max(1) as f64).sqrt();
+    Init::Uniform { lo: -up, up }
+}
+
+/// How many numbers a model's variables have; none of them is made.
+pub(crate) fn count_numbers<M>(model: impl FnOnce(VarBuilder<'static>) -> Result<M>) -> usize {
+    let count = Arc::new(AtomicUsize::new(0));
+    let backend = Box::new(Counting(count.clone()));
+    let made = model(VarBuilder::from_backend(backend, DType::F32, Device::Cpu));
+    made.expect("invariant: layers of any size can be described");
+    count.load(Ordering::Relaxed)
+}
+
+/// Uniform in [0, 1), in steps of 2^-24.
+pub(crate) fn uniform(rng: &mut ChaCha8Rng) -> f32 {
+    (rng.next_u32() >> 8) as f32 / (1 << 24) as f32
+}
+
+/// Standard normal, by Box and Muller.
+pub(crate) fn normal(rng: &mut ChaCha8Rng) -> f32 {
+    let radius = (-2.0 * (1.0 - uniform(rng)).ln()).sqrt();
+    radius * (std::f32::consts::TAU * uniform(rng)).cos()
+}
+
+/// By which a uniform distribution's bound exceeds its standard deviation.
+const SQRT_3: f64 = 1.732_050_807_568_877_2;
+
+struct Seeded {
+    seed: u64,
+    variables: VarMap,
+}
+
+impl Seeded {
+    fn draw(&self, name: &str, shape: &Shape, init: Init) -> Vec<f32> {
+        let mut rng = stream(self.seed, Purpose::Weights, hash(name));
+        let mut uniform = |lo: f64, up: f64| lo + (up - lo) * f64::from(uniform(&mut rng));
+        let mut rng = stream(self.seed, Purpose::Weights, hash(name));
+        let mut normal = |mean: f64, stdev: f64| mean + stdev * f64::from(normal(&mut rng));
+        let mut draw = || match init {
+            Init::Const(value) => value,
+            Init::Uniform { lo, up } => uniform(lo, up),
+            Init::Randn { mean, stdev } => normal(mean, stdev),
+            Init::Kaiming {
+                dist,
+                fan,
+                non_linearity,
+            } => {
+                let stdev = non_linearity.gain() / (fan.for_shape(shape) as f64).sqrt();
+                match dist {
+                    NormalOrUniform::Uniform => uniform(-SQRT_3 * stdev, SQRT_3 * stdev),
+                    NormalOrUniform::Normal => normal(0.0, stdev),
+                }
+            }
+        };
+        (0..shape.elem_count()).map(|_| draw() as f32).collect()
+    }
+}
+
+impl SimpleBackend for Seeded {
+    fn get(
+        &self,
+        shape: Shape,
+        name: &str,
+        init: Init,
+        dtype: DType,
+        device: &Device,
+    ) -> Result<Tensor> {
+        if !self.contains_tensor(name) {
+            let numbers = self.draw(name, &shape, init);
+            let first = Tensor::from_vec(numbers, shape.clone(), device)?.to_dtype(dtype)?;
+            let variables = self.variables.data().lock();
+            let mut variables = variables.expect("invariant: no layer panicked");
+            variables.insert(name.to_owned(), Var::from_tensor(&first)?);
+        }
+        // What is there already is shared, if it has this shape.
+        self.variables.get(shape, name, init, dtype, device)
+    }
+
+    fn get_unchecked(&self, name: &str, _: DType, _: &Device) -> Result<Tensor> {
+        candle_core::bail!("variable {name}: expected a shape, got none")
+    }
+
+    fn contains_tensor(&self, name: &str) -> bool {
+        let variables = self.variables.data().lock();
+        let variables = variables.expect("invariant: no layer panicked");
+        variables.contains_key(name)
+    }
+}
+
+struct Counting(Arc<AtomicUsize>);
+
+impl SimpleBackend for Counting {
+    fn get(&self, s: Shape, _: &str, _: Init, dtype: DType, device: &Device) -> Result<Tensor> {
+        self.0.fetch_add(s.elem_count(), Ordering::Relaxed);
+        // One number, read everywhere.
+        Tensor::zeros((), dtype, device)?.broadcast_as(s)
+    }
+
+    fn get_unchecked(&self, name: &str, _: DType, _: &Device) -> Result<Tensor> {
+        candle_core::bail!("variable {name}: expected a shape, got none")
+    }
+
+    fn contains_tensor(&self, _: &str) -> bool {
+        true
+    }
+}
+
+/// FNV-1a (Fowler, Noll, Vo).
+fn hash(name: &str) -> u64 {
+    name.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn numbers(seed: u64, name: &str, init: Init) -> Vec<f32> {
+        let build = build(seed, DType::F32, &Device::Cpu, |vb| {
+            vb.get_with_hints(1000, name, init)
+        });
+        build.expect("a tensor").0.to_vec1().expect("numbers")
+    }
+
+    #[test]
+    fn first_values_depend_on_seed_and_name_alone() {
+        let init = uniform_init(16);
+        assert_eq!(numbers(1, "a", init), numbers(1, "a", init));
+        assert_ne!(numbers(1, "a", init), numbers(2, "a", init));
+        assert_ne!(numbers(1, "a", init), numbers(1, "b", init));
+    }
+
+    #[test]
+    fn first_values_have_the_distribution_asked_for() {
+        let largest = |numbers: Vec<f32>| numbers.iter().fold(0.0_f32, |max, x| max.max(x.abs()));
+        let root_of_mean_square = |numbers: Vec<f32>| {
+            let squares: f32 = numbers.iter().map(|x| x * x).sum();
+            (squares / numbers.len() as f32).sqrt()
+        };
+        assert!((0.24..=0.25).contains(&largest(numbers(1, "a", uniform_init(16)))));
+        let normal = Init::Randn {
+            mean: 0.0,
+            stdev: 2.0,
+        };
+        // 1,000 draws: a deviation of 0.1 in 2 is more than two of its standard deviations.
+        let spread = root_of_mean_square(numbers(1, "a", normal));
+        assert!((1.9..2.1).contains(&spread), "{spread}");
+        assert_eq!(largest(numbers(1, "a", Init::Const(3.0))), 3.0);
+        // ReLU's gain is the root of two, and the fan of a vector 1.
+        let kaiming = numbers(1, "a", candle_nn::init::DEFAULT_KAIMING_NORMAL);
+        let spread = root_of_mean_square(kaiming);
+        assert!((1.34..1.49).contains(&spread), "{spread}");
+    }
+}

@@ -1,0 +1,116 @@
+//! Consecutive frames as lists of what was seen, the form in which the network reads them.
+
+use crate::shape::NetworkShape;
+use candle_core::{DType, Device, Result, Tensor};
+use protocol::frame::Frame;
+use std::sync::Arc;
+
+/// One visited cell of a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Visit {
+    pub(crate) row: u16,
+    pub(crate) col: u16,
+    pub(crate) value: u8,
+}
+
+/// Consecutive frames: all are read, and all but the first predicted. Clones share them.
+#[derive(Debug, Clone)]
+pub struct Window {
+    visits: Arc<[Visit]>,
+    /// Where each frame's visits begin, and where the last ends.
+    starts: Arc<[usize]>,
+}
+
+impl Window {
+    /// A window of frames of one grid.
+    pub fn new<'a>(frames: impl IntoIterator<Item = &'a Frame>) -> Self {
+        let (mut visits, mut starts) = (Vec::new(), vec![0]);
+        for frame in frames {
+            let (_, width) = frame.values().dim();
+            visits.extend(frame.observed().map(|(cell, value)| Visit {
+                row: (cell / width) as u16,
+                col: (cell % width) as u16,
+                value,
+            }));
+            starts.push(visits.len());
+        }
+        let (visits, starts) = (visits.into(), starts.into());
+        Self { visits, starts }
+    }
+
+    /// So many frames that show nothing.
+    pub(crate) fn blank(n_frames: usize) -> Self {
+        Self {
+            visits: Arc::new([]),
+            starts: vec![0; n_frames + 1].into(),
+        }
+    }
+
+    /// Number of frames.
+    pub fn len(&self) -> usize {
+        self.starts.len() - 1
+    }
+
+    /// Whether it holds no frame.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The visited cells of one frame, in row-major order.
+    pub(crate) fn visits(&self, frame: usize) -> &[Visit] {
+        &self.visits[self.starts[frame]..self.starts[frame + 1]]
+    }
+
+    /// What is to be predicted after a frame: the visited cells of the next one, none after the last.
+    pub(crate) fn targets(&self, frame: usize) -> &[Visit] {
+        match frame + 1 < self.len() {
+            true => self.visits(frame + 1),
+            false => &[],
+        }
+    }
+
+    /// Place of a frame's first target among all.
+    pub(crate) fn target_start(&self, frame: usize) -> usize {
+        self.starts[(frame + 1).min(self.len())] - self.starts[1.min(self.len())]
+    }
+
+    /// The targets of all frames: the terms of the loss.
+    pub(crate) fn all_targets(&self) -> &[Visit] {
+        &self.visits[self.starts[1.min(self.len())]..]
+    }
+
+    /// Whether there is anything to predict.
+    pub fn has_targets(&self) -> bool {
+        !self.all_targets().is_empty()
+    }
+
+    /// Whether each visit is a cell and an observation of the network.
+    pub(crate) fn fits(&self, shape: &NetworkShape) -> bool {
+        let (height, width) = shape.grid.dim();
+        self.visits.iter().all(|visit| {
+            usize::from(visit.row) < height
+                && usize::from(visit.col) < width
+                && usize::from(visit.value) < shape.n_observations
+        })
+    }
+
+    /// The frames as `[frames, observations, rows, cols]` of the padded grid; zero where nothing was seen.
+    pub(crate) fn one_hot(
+        &self,
+        n_observations: usize,
+        [rows, cols]: [usize; 2],
+        dtype: DType,
+        device: &Device,
+    ) -> Result<Tensor> {
+        let mut numbers = vec![0.0_f32; self.len() * n_observations * rows * cols];
+        for frame in 0..self.len() {
+            for visit in self.visits(frame) {
+                let plane = frame * n_observations + usize::from(visit.value);
+                numbers[(plane * rows + usize::from(visit.row)) * cols + usize::from(visit.col)] =
+                    1.0;
+            }
+        }
+        let dims = (self.len(), n_observations, rows, cols);
+        Tensor::from_vec(numbers, dims, device)?.to_dtype(dtype)
+    }
+}

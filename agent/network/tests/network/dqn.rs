@@ -1,0 +1,340 @@
+//! The DQN beside candle's stock linear layers and AdamW, whose weight decay of zero makes it Adam.
+
+use candle_core::{DType, Device, Result, Tensor, Var};
+use candle_nn::{AdamW, Optimizer, ParamsAdamW};
+use network::{Dqn, DqnSettings, NamedTensor, NetworkError, NotFinite, Transition};
+use protocol::randomness::split_mix;
+
+const N_INPUTS: usize = 6;
+const N_ACTIONS: usize = 4;
+
+fn number(index: u64) -> f32 {
+    (split_mix(3, index) >> 40) as f32 / (1 << 23) as f32 - 1.0
+}
+
+fn batch(update: u64) -> Vec<Transition> {
+    let row = |row: u64| {
+        let first = (update * 64 + row) * 100;
+        let vector = |offset: u64| {
+            (0..N_INPUTS as u64)
+                .map(|i| number(first + offset + i))
+                .collect()
+        };
+        Transition {
+            input: vector(0),
+            action: (split_mix(4, first) % N_ACTIONS as u64) as usize,
+            reward: 3.0 * number(first + 50),
+            next: vector(20),
+        }
+    };
+    (0..64).map(row).collect()
+}
+
+/// The network's weights and biases, layer by layer.
+fn layers(dqn: &Dqn) -> impl Iterator<Item = NamedTensor> {
+    let tensors = dqn.named_tensors();
+    let layer = move |name: &str| {
+        let found = tensors.iter().find(|tensor| tensor.0 == name);
+        found.expect("a layer").clone()
+    };
+    [0, 2, 4].into_iter().flat_map(move |at| {
+        ["weight", "bias"].map(|what| layer(&format!("dqn.network.{at}.{what}")))
+    })
+}
+
+fn values(layers: &[Tensor], input: &Tensor) -> Result<Tensor> {
+    let mut x = input.clone();
+    for (index, layer) in layers.chunks(2).enumerate() {
+        x = x.matmul(&layer[0].t()?)?.broadcast_add(&layer[1])?;
+        x = if index < 2 { x.relu()? } else { x };
+    }
+    Ok(x)
+}
+
+fn stock_loss(
+    layers: &[Tensor],
+    targets: &[Tensor],
+    batch: &[Transition],
+    double: bool,
+) -> Result<Tensor> {
+    let stack =
+        |rows: Vec<&[f32]>| Tensor::from_vec(rows.concat(), (batch.len(), N_INPUTS), &Device::Cpu);
+    let next = stack(batch.iter().map(|row| &row.next[..]).collect())?;
+    let of_target = values(targets, &next)?;
+    let judge = if double {
+        values(layers, &next)?
+    } else {
+        of_target.clone()
+    };
+    let chosen = judge.argmax_keepdim(1)?;
+    let bootstrap = (of_target.gather(&chosen, 1)?.squeeze(1)? * f64::from(0.99_f32))?;
+    let rewards: Vec<f32> = batch.iter().map(|row| row.reward).collect();
+    let goal = (Tensor::new(rewards, &Device::Cpu)? + bootstrap)?.detach();
+    let actions: Vec<u32> = batch.iter().map(|row| row.action as u32).collect();
+    let inputs = stack(batch.iter().map(|row| &row.input[..]).collect())?;
+    let actions = Tensor::new(actions, &Device::Cpu)?.unsqueeze(1)?;
+    let got = values(layers, &inputs)?.gather(&actions, 1)?.squeeze(1)?;
+    (got - goal)?.sqr()?.mean_all()
+}
+
+fn check(double: bool) -> Result<()> {
+    let settings = DqnSettings {
+        double,
+        ..DqnSettings::paper()
+    };
+    let mut dqn = Dqn::new(settings, N_INPUTS, N_ACTIONS, 1);
+    let var = |(_, dims, numbers)| -> Result<Var> {
+        let (dims, numbers): (Vec<usize>, Vec<f32>) = (dims, numbers);
+        Var::from_tensor(&Tensor::from_vec(numbers, dims, &Device::Cpu)?)
+    };
+    let vars: Vec<Var> = layers(&dqn).map(var).collect::<Result<_>>()?;
+    let copies = || {
+        vars.iter()
+            .map(|var| var.as_detached_tensor().copy())
+            .collect::<Result<Vec<_>>>()
+    };
+    let mut targets = copies()?;
+    let adam = ParamsAdamW {
+        lr: 0.01,
+        beta1: 0.9,
+        beta2: 0.999,
+        eps: 1e-8,
+        weight_decay: 0.0,
+    };
+    let mut optimiser = AdamW::new(vars.clone(), adam)?;
+    for update in 0..5 {
+        let batch = batch(update);
+        let layers: Vec<Tensor> = vars.iter().map(|var| var.as_tensor().clone()).collect();
+        let loss = stock_loss(&layers, &targets, &batch, double)?;
+        let expected: f32 = loss.to_dtype(DType::F32)?.to_scalar()?;
+        optimiser.backward_step(&loss)?;
+        let got = dqn.learn(&batch).expect("finite");
+        assert!(
+            (got / expected - 1.0).abs() < 1e-4,
+            "{update}: loss {got}, expected {expected}"
+        );
+        for (target, now) in targets.iter_mut().zip(copies()?) {
+            *target = ((&*target * 0.99)? + (now * 0.01)?)?;
+        }
+    }
+    for ((name, _, got), var) in layers(&dqn).zip(&vars) {
+        let expected: Vec<f32> = var.flatten_all()?.to_vec1()?;
+        let worst = got
+            .iter()
+            .zip(&expected)
+            .map(|(got, expected)| (got - expected).abs());
+        let worst = worst.fold(0.0, f32::max);
+        // Adam's step is .01 whatever the gradient, so rounding near zero gradients shows.
+        assert!(worst < 1e-3, "{name}: off by {worst}");
+    }
+    Ok(())
+}
+
+#[test]
+fn updates_are_those_of_stock_layers() {
+    check(false).expect("stock layers");
+}
+
+#[test]
+fn double_updates_are_those_of_stock_layers() {
+    check(true).expect("stock layers");
+}
+
+#[test]
+fn it_learns_which_action_pays() {
+    let settings = DqnSettings {
+        gamma: 0.0,
+        ..DqnSettings::paper()
+    };
+    let mut dqn = Dqn::new(settings, 1, 2, 1);
+    for index in 0..200_u64 {
+        let input = if index % 2 == 0 { 1.0 } else { -1.0 };
+        let action = (index / 2 % 2) as usize;
+        let pays = (input > 0.0) == (action == 1);
+        let reward = if pays { 1.0 } else { 0.0 };
+        dqn.remember(Transition {
+            input: vec![input],
+            action,
+            reward,
+            next: vec![input],
+        });
+    }
+    for _ in 0..200 {
+        let loss = dqn.update().expect("finite");
+        loss.expect("enough transitions");
+    }
+    let greedy = |input: f32| {
+        let values = dqn.values(&[input]);
+        usize::from(values[1] > values[0])
+    };
+    assert_eq!([greedy(1.0), greedy(-1.0)], [1, 0]);
+    let random = (0..1000).filter(|&step| dqn.act(&[1.0], step) == 0).count();
+    // One in ten is random, half of those the other action: 50 in 1000, standard deviation 7.
+    assert!((20..90).contains(&random), "{random}");
+}
+
+/// With a full replay, and one update made.
+fn learner(settings: DqnSettings, seed: u64) -> Dqn {
+    let mut dqn = Dqn::new(settings, N_INPUTS, N_ACTIONS, seed);
+    for transition in (0..3).flat_map(batch) {
+        dqn.remember(transition);
+    }
+    dqn.update().expect("finite").expect("enough transitions");
+    dqn
+}
+
+fn small() -> DqnSettings {
+    DqnSettings {
+        replay: 150,
+        ..DqnSettings::paper()
+    }
+}
+
+/// Finds tensors by name, and says what is wrong with them.
+fn load(dqn: &mut Dqn, tensors: &[NamedTensor]) -> std::result::Result<(), Problem> {
+    let find = |name: &str, dims: &[usize]| {
+        let found = tensors.iter().find(|tensor| tensor.0 == name);
+        let found = found.ok_or_else(|| Problem(format!("{name}: missing")))?;
+        match found.1 == dims {
+            true => Ok(found.2.clone()),
+            false => Err(Problem(format!("{name}: {dims:?}, got {:?}", found.1))),
+        }
+    };
+    let n = find_rewards(tensors).len();
+    dqn.load(find, n, 1)
+}
+
+fn find_rewards(tensors: &[NamedTensor]) -> &[f32] {
+    let found = tensors
+        .iter()
+        .find(|tensor| tensor.0 == "dqn.replay.reward");
+    &found.expect("rewards").2
+}
+
+#[derive(Debug, PartialEq)]
+struct Problem(String);
+
+impl From<NetworkError> for Problem {
+    fn from(error: NetworkError) -> Self {
+        Self(error.to_string())
+    }
+}
+
+#[test]
+fn a_saved_dqn_resumes_bit_for_bit() {
+    let mut dqn = learner(small(), 2);
+    dqn.set_learning_rate(0.003);
+    let mut resumed = Dqn::new(*dqn.settings(), N_INPUTS, N_ACTIONS, 2);
+    load(&mut resumed, &dqn.named_tensors()).expect("the same sizes");
+    assert_eq!(resumed.n_updates(), 1);
+    assert_eq!(resumed.n_remembered(), 150);
+    for update in 0..5 {
+        let transition = batch(9).swap_remove(update);
+        dqn.remember(transition.clone());
+        resumed.remember(transition);
+        let bits = |dqn: &mut Dqn| dqn.update().expect("finite").map(f32::to_bits);
+        assert_eq!(bits(&mut dqn), bits(&mut resumed), "update {update}");
+    }
+    assert_eq!(dqn.named_tensors(), resumed.named_tensors());
+}
+
+#[test]
+fn a_shorter_replay_loads_the_latest_transitions() {
+    let tensors = learner(small(), 2).named_tensors();
+    let settings = DqnSettings {
+        replay: 70,
+        ..small()
+    };
+    let mut dqn = Dqn::new(settings, N_INPUTS, N_ACTIONS, 2);
+    load(&mut dqn, &tensors).expect("the same sizes");
+    assert_eq!(
+        find_rewards(&dqn.named_tensors()),
+        &find_rewards(&tensors)[80..]
+    );
+}
+
+#[test]
+fn tensors_of_something_else_are_refused_by_name_and_change_nothing() {
+    let tensors = learner(small(), 2).named_tensors();
+    let check = |change: fn(&mut NamedTensor), name: &str, words: &str| {
+        let mut tensors = tensors.clone();
+        let found = tensors.iter_mut().find(|tensor| tensor.0 == name);
+        change(found.expect("a tensor"));
+        let mut dqn = learner(small(), 3);
+        let before = dqn.named_tensors();
+        assert_eq!(load(&mut dqn, &tensors), Err(Problem(words.into())));
+        assert_eq!(dqn.named_tensors(), before, "{words}");
+    };
+    check(
+        |tensor| tensor.0.clear(),
+        "dqn.target.2.bias",
+        "dqn.target.2.bias: missing",
+    );
+    check(
+        |tensor| tensor.2[7] = 4.0,
+        "dqn.replay.action",
+        "dqn.replay.action: expected actions below 4, got 4",
+    );
+    check(
+        |tensor| tensor.1 = vec![75, 12],
+        "dqn.replay.next",
+        "dqn.replay.next: [150, 6], got [75, 12]",
+    );
+}
+
+/// Whose number is not finite, and after how many updates.
+fn tensor_of<T>(result: std::result::Result<T, NetworkError>) -> (u64, String) {
+    match result {
+        Err(NetworkError::NotFinite(NotFinite { update, tensor })) => (update, tensor),
+        Err(error) => panic!("{error}"),
+        Ok(_) => panic!("expected a number that is not finite"),
+    }
+}
+
+#[test]
+fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
+    let check = |name: &str, at: usize, words: &str| {
+        let mut dqn = learner(small(), 2);
+        let mut rows = batch(7);
+        match name {
+            "dqn.replay.input" => rows[at].input[2] = f32::NAN,
+            "dqn.replay.next" => rows[at].next[2] = f32::INFINITY,
+            "dqn.replay.reward" => rows[at].reward = f32::NEG_INFINITY,
+            // Squared, it is no longer finite.
+            _ => rows[at].reward = 1e30,
+        }
+        let before = dqn.named_tensors();
+        assert_eq!(tensor_of(dqn.learn(&rows)), (1, words.to_owned()));
+        assert_eq!(dqn.named_tensors(), before, "{words}");
+        dqn.learn(&batch(7)).expect("finite again");
+    };
+    check("dqn.replay.input", 5, "dqn.replay.input");
+    check("dqn.replay.next", 63, "dqn.replay.next");
+    check("dqn.replay.reward", 0, "dqn.replay.reward");
+    check("large", 3, "loss");
+}
+
+#[test]
+fn a_step_that_overflows_is_not_made() {
+    let mut dqn = learner(small(), 2);
+    let before = dqn.named_tensors();
+    dqn.set_learning_rate(f32::INFINITY);
+    let words = "dqn.network.0.bias after the update";
+    assert_eq!(tensor_of(dqn.update()), (1, words.to_owned()));
+    assert_eq!(dqn.named_tensors(), before);
+}
+
+#[test]
+fn what_follows_several_steps_is_discounted_as_often() {
+    let targets = |gamma: f32, n_step: usize| {
+        let settings = DqnSettings {
+            gamma,
+            n_step,
+            ..small()
+        };
+        let mut dqn = Dqn::new(settings, N_INPUTS, N_ACTIONS, 2);
+        dqn.learn(&batch(0)).expect("finite")
+    };
+    assert_eq!(targets(0.5, 3), targets(0.125, 1));
+    assert_ne!(targets(0.5, 3), targets(0.5, 1));
+}

@@ -1,0 +1,199 @@
+//! Numbers from the unmodified PyTorch code of the paper's authors (torch 2.15.0, CPU, one thread).
+//!
+//! Stored uncompressed; of the masked steps the first and the last:
+//!
+//! ```python
+//! for name in "a4_net_weights", "a4_update_nodropout", "a4_masked_step":
+//!     z = dict(np.load(f"golden/{name}.npz"))
+//!     if name == "a4_masked_step":
+//!         z |= {"saved_steps": np.array([0, 5])}
+//!         z |= {k: z[k][[0, 5]] for k in ("u_next", "state_est")}
+//!     np.savez(f"{name}.npz", **z)
+//! ```
+
+use candle_core::Tensor;
+use ndarray::{Array, Array1, Array3, Array4, ArrayD, ArrayView2, Axis, Dimension, IxDyn};
+use ndarray_npy::{NpzReader, ReadableElement};
+use network::{
+    AdamSettings, Autoencoder, AutoencoderSettings, Device, Dropout, NetworkError, NetworkShape,
+    Pass, Window,
+};
+use protocol::frame::{Frame, UNOBSERVED};
+use protocol::grid::Shape;
+use std::borrow::Borrow;
+use std::fs::File;
+
+struct Golden(NpzReader<File>);
+
+impl Golden {
+    fn open(name: &str) -> Self {
+        let path = format!("{}/tests/data/{name}.npz", env!("CARGO_MANIFEST_DIR"));
+        Self(NpzReader::new(File::open(path).expect("golden file")).expect("npz"))
+    }
+
+    fn get<T: ReadableElement, D: Dimension>(&mut self, name: &str) -> Array<T, D> {
+        let array = self.0.by_name(&format!("{name}.npy"));
+        array.unwrap_or_else(|error| panic!("{name}: {error}"))
+    }
+
+    fn names(&mut self) -> Vec<String> {
+        let names = self.0.names().expect("names");
+        let stems = names.iter().map(|name| name.trim_end_matches(".npy"));
+        stems.map(str::to_owned).collect()
+    }
+}
+
+/// The authors' network with their weights.
+fn authors_network() -> Autoencoder {
+    let settings = AutoencoderSettings {
+        adam: AdamSettings::paper(1e-4),
+        ..AutoencoderSettings::paper()
+    };
+    let shape = NetworkShape {
+        grid: Shape::new(64, 64).expect("shape"),
+        n_states: 3,
+        n_observations: 3,
+        encoding: settings.encoding,
+        hidden: settings.hidden,
+    };
+    let mut network = Autoencoder::new(settings, shape, 0, &Device::Cpu).expect("a network");
+    let find = |name: &str, dims: &[usize]| {
+        let array: ArrayD<f32> = Golden::open("a4_net_weights").get::<f32, IxDyn>(name);
+        assert_eq!(array.shape(), dims, "{name}");
+        Ok::<_, NetworkError>(array.as_slice().expect("row-major").to_vec())
+    };
+    network.load_variables(find).expect("the authors' sizes");
+    network
+}
+
+fn frame_from(observations: ArrayView2<'_, u8>, mask: ArrayView2<'_, u8>) -> Frame {
+    let seen = |(&value, &visited): (&u8, &u8)| if visited > 0 { value } else { UNOBSERVED };
+    let bytes: Vec<u8> = observations.iter().zip(mask).map(seen).collect();
+    let (height, width) = observations.dim();
+    let shape = Shape::new(height, width).expect("shape");
+    Frame::from_bytes(shape, 3, &bytes).expect("valid frame")
+}
+
+fn frames(golden: &mut Golden) -> Vec<Frame> {
+    let observations: Array3<u8> = golden.get("obs");
+    let masks: Array3<u8> = golden.get("mask");
+    let pairs = observations.outer_iter().zip(masks.outer_iter());
+    pairs
+        .map(|(observed, mask)| frame_from(observed, mask))
+        .collect()
+}
+
+/// The largest difference, relative to the largest number.
+fn relative<'a>(
+    got: impl IntoIterator<Item = &'a f32>,
+    expected: impl IntoIterator<Item = impl Borrow<f32>>,
+) -> f32 {
+    let (mut worst, mut largest) = (0.0_f32, 1e-12_f32);
+    for (got, expected) in got.into_iter().zip(expected) {
+        let expected = expected.borrow();
+        worst = worst.max((got - expected).abs());
+        largest = largest.max(expected.abs());
+    }
+    worst / largest
+}
+
+/// Bayes' rule (eq. 10) at visited cells, in place of a predictor `[S, H, W]`.
+fn correct(prediction: &mut Array3<f32>, frame: &Frame, matrix: &[f32]) {
+    for ((row, col), &value) in frame.values().indexed_iter() {
+        if value != UNOBSERVED {
+            let mut cell = prediction.slice_mut(ndarray::s![.., row, col]);
+            let likelihood = &matrix[usize::from(value) * cell.len()..];
+            let joint = cell.iter_mut().zip(likelihood);
+            joint.for_each(|(p, likelihood)| *p *= likelihood);
+            let evidence = cell.sum();
+            cell.mapv_inplace(|p| p / evidence);
+        }
+    }
+}
+
+#[test]
+fn masked_steps_reproduce_estimate_prediction_and_hidden_vector() {
+    let mut golden = Golden::open("a4_masked_step");
+    let network = authors_network();
+    let matrix = network.observation_matrix().expect("a matrix");
+    let mut hidden = golden.get::<f32, ndarray::Ix1>("h0").to_vec();
+    let first: Array3<f32> = golden.get("u0");
+    let mut prediction = first.permuted_axes([2, 0, 1]);
+    let expected: Array<f32, ndarray::Ix2> = golden.get("h_next");
+    let saved: Array1<i64> = golden.get("saved_steps");
+    let estimates: Array4<f32> = golden.get("state_est");
+    let predictions: Array4<f32> = golden.get("u_next");
+    for (step, frame) in frames(&mut golden).iter().enumerate() {
+        let mut estimate = prediction.clone();
+        correct(&mut estimate, frame, &matrix);
+        let window = Window::new([frame]);
+        hidden = network.advance(&window, &hidden).expect("finite");
+        prediction = network.predict(&hidden).expect("a predictor");
+        let error = relative(&hidden, expected.row(step).iter());
+        assert!(error < 1e-4, "h after step {step}: off by {error}");
+        if let Some(index) = saved.iter().position(|&at| at == step as i64) {
+            for (got, expected) in [(&estimate, &estimates), (&prediction, &predictions)] {
+                let expected = expected.index_axis(Axis(0), index);
+                let expected = expected.permuted_axes([2, 0, 1]);
+                let error = relative(got, expected.iter());
+                assert!(error < 1e-4, "beliefs of step {step}: off by {error}");
+            }
+        }
+    }
+}
+
+fn numbers(tensor: &Tensor) -> Vec<f32> {
+    let numbers = tensor.flatten_all().and_then(|flat| flat.to_vec1());
+    numbers.expect("numbers")
+}
+
+#[test]
+fn an_update_without_dropout_reproduces_loss_gradients_and_parameters() {
+    let mut golden = Golden::open("a4_update_nodropout");
+    let mut network = authors_network();
+    let frames = frames(&mut golden);
+    let window = Window::new(&frames);
+    let hidden: Array1<f32> = golden.get("h0");
+    let dropout = Dropout::off(window.len());
+    let pass = Pass::training(&window, &dropout);
+    let loss = network.network().loss(&pass, &hidden.to_vec());
+    let gradients = loss.and_then(|loss| loss.backward()).expect("gradients");
+    let gradient = |name: &str| {
+        let gradient = gradients.get(&network.variables()[name]);
+        numbers(gradient.expect("a gradient"))
+    };
+    let gradients = network
+        .variables()
+        .keys()
+        .filter(|name| !name.contains("running"));
+    let gradients = gradients.map(|name| (name.clone(), gradient(name)));
+    let gradients: std::collections::BTreeMap<_, _> = gradients.collect();
+    let loss = network.update_with(&window, &dropout, &hidden.to_vec());
+    let loss = loss.expect("finite");
+    let expected: f64 = golden.get::<f64, ndarray::Ix0>("loss").into_scalar();
+    assert!(
+        (loss / expected - 1.0).abs() < 1e-4,
+        "loss {loss}, expected {expected}"
+    );
+    for name in golden.names() {
+        let (what, tensor) = name.split_once('.').unwrap_or((&name, ""));
+        let got = match what {
+            "grad" => gradients[tensor].clone(),
+            "after_adam" | "after" => numbers(&network.variables()[tensor]),
+            "gradnorm" => {
+                let expected = golden.get::<f64, ndarray::Ix0>(&name).into_scalar();
+                let squares = gradients[tensor].iter().map(|&d| f64::from(d).powi(2));
+                let norm = squares.sum::<f64>().sqrt();
+                assert!(
+                    (norm / expected - 1.0).abs() < 1e-4,
+                    "{name}: {norm}, expected {expected}"
+                );
+                continue;
+            }
+            _ => continue,
+        };
+        let expected: ArrayD<f32> = golden.get(&name);
+        let error = relative(&got, expected.iter());
+        assert!(error < 1e-4, "{name}: off by {error}");
+    }
+}

@@ -1,0 +1,238 @@
+//! Our operators in 32 bits beside candle's stock operators in 64 bits.
+//!
+//! Windows of 40 frames with fixed masks, on several grids and numbers of states and observations. Each
+//! tensor's gradient passes through every operator behind it, so a wrong operator shows in its own
+//! tensors and in those before it.
+
+use crate::synthetic::{coin, dropout, frames};
+use candle_core::backprop::GradStore;
+use candle_core::{DType, Device, Tensor};
+use network::variables::{Variables, build};
+use network::{Network, NetworkShape, Pass, Stock, Window};
+use protocol::grid::Shape;
+
+const FIRST: [f32; 5] = [0.3, -1.2, 0.7, 0.1, 2.0];
+
+/// The largest difference of two tensors, relative to the largest number.
+fn relative(got: &[f64], expected: &[f64]) -> f64 {
+    assert_eq!(got.len(), expected.len());
+    let pairs = got.iter().zip(expected);
+    let worst = pairs.map(|(got, expected)| (got - expected).abs());
+    let largest = expected.iter().map(|expected| expected.abs());
+    worst.fold(0.0, f64::max) / largest.fold(1e-30, f64::max)
+}
+
+struct Case {
+    grid: [usize; 2],
+    n_states: usize,
+    n_observations: usize,
+    n_frames: u64,
+    /// One cell in so many is seen.
+    one_in: u64,
+    drops: bool,
+}
+
+const CASE: Case = Case {
+    grid: [64, 64],
+    n_states: 3,
+    n_observations: 3,
+    n_frames: 40,
+    one_in: 100,
+    drops: true,
+};
+
+struct Model {
+    network: Network,
+    variables: Variables,
+}
+
+impl Model {
+    fn new(shape: &NetworkShape, dtype: DType, stock: Stock) -> Self {
+        let network = |vb| Network::new(&vb, shape, stock);
+        let (network, variables) = build(3, dtype, &Device::Cpu, network).expect("a network");
+        // Weights and biases of normalisations that are not all alike; the numbers of 32 bits.
+        for (index, (name, var)) in variables.iter().enumerate() {
+            let mut numbers = numbers(var);
+            if var.rank() == 1 && !name.contains("running") {
+                for (at, number) in numbers.iter_mut().enumerate() {
+                    *number += 0.3 * ((7 * index + at) as f64).sin();
+                }
+            }
+            let numbers: Vec<f32> = numbers.into_iter().map(|number| number as f32).collect();
+            let tensor = Tensor::from_vec(numbers, var.shape(), &Device::Cpu);
+            let tensor = tensor.and_then(|tensor| tensor.to_dtype(dtype));
+            var.set(&tensor.expect("tensor")).expect("the same shape");
+        }
+        Self { network, variables }
+    }
+
+    fn loss(&self, pass: &Pass<'_>) -> (f64, GradStore) {
+        let loss = self.network.loss(pass, &FIRST).expect("a loss");
+        (numbers(&loss)[0], loss.backward().expect("gradients"))
+    }
+}
+
+fn numbers(tensor: &Tensor) -> Vec<f64> {
+    let numbers = tensor
+        .to_dtype(DType::F64)
+        .and_then(|tensor| tensor.flatten_all()?.to_vec1());
+    numbers.expect("numbers")
+}
+
+fn check(case: Case) {
+    check_with(case, Stock::default());
+}
+
+fn check_with(case: Case, stock: Stock) {
+    let shape = NetworkShape {
+        grid: Shape::new(case.grid[0], case.grid[1]).expect("shape"),
+        n_states: case.n_states,
+        n_observations: case.n_observations,
+        encoding: 6,
+        hidden: 5,
+    };
+    let frames = frames(
+        shape.grid,
+        case.n_observations as u64,
+        case.n_frames,
+        case.one_in,
+    );
+    let dropout = match case.drops {
+        true => dropout(frames.len(), 2.0, coin),
+        false => dropout(frames.len(), 1.0, |_, _, _| true),
+    };
+    let window = Window::new(&frames);
+    let pass = Pass::training(&window, &dropout);
+    let exact = Model::new(&shape, DType::F64, Stock::ALL);
+    let (expected, derivatives) = exact.loss(&pass);
+    let model = Model::new(&shape, DType::F32, stock);
+    let (got, gradients) = model.loss(&pass);
+    assert!(
+        (got / expected - 1.0).abs() < 1e-5,
+        "loss {got}, expected {expected}"
+    );
+    for (name, var) in &exact.variables {
+        let Some(expected) = derivatives.get(var) else {
+            assert!(name.contains("running"), "{name} has no gradient");
+            continue;
+        };
+        let got = gradients.get(&model.variables[name]).expect("a gradient");
+        let error = relative(&numbers(got), &numbers(expected));
+        assert!(error < 1e-4, "gradient of {name}: off by {error}");
+    }
+    predictions_agree(&exact, &model, &window);
+}
+
+/// With running statistics, which are those of the start.
+fn predictions_agree(exact: &Model, model: &Model, window: &Window) {
+    let predictions = [exact, model].map(|model| {
+        let pass = Pass::inference(window);
+        let hidden = model
+            .network
+            .forward(&pass, &FIRST)
+            .expect("hidden vectors");
+        let prediction = model.network.predict(&pass, &hidden);
+        numbers(&prediction.expect("a prediction"))
+    });
+    let error = relative(&predictions[1], &predictions[0]);
+    assert!(error < 1e-4, "predictions: off by {error}");
+}
+
+#[test]
+fn each_operator_alone_and_none() {
+    let all = Stock::ALL;
+    for stock in [
+        all,
+        Stock {
+            encoder: false,
+            ..all
+        },
+        Stock { gru: false, ..all },
+        Stock {
+            decoder: false,
+            ..all
+        },
+        Stock { loss: false, ..all },
+    ] {
+        let case = Case {
+            grid: [32, 32],
+            n_frames: 12,
+            one_in: 9,
+            ..CASE
+        };
+        check_with(case, stock);
+    }
+}
+
+#[test]
+fn on_paths() {
+    check(CASE);
+}
+
+#[test]
+fn on_full_frames() {
+    check(Case {
+        one_in: 1,
+        n_frames: 12,
+        ..CASE
+    });
+}
+
+#[test]
+fn without_dropout() {
+    check(Case {
+        drops: false,
+        n_frames: 20,
+        ..CASE
+    });
+}
+
+#[test]
+fn on_a_smaller_grid_with_other_states_and_observations() {
+    check(Case {
+        grid: [32, 32],
+        n_states: 2,
+        n_observations: 4,
+        ..CASE
+    });
+    check(Case {
+        grid: [32, 32],
+        n_states: 4,
+        n_observations: 2,
+        one_in: 3,
+        ..CASE
+    });
+}
+
+#[test]
+fn on_a_grid_that_is_not_square() {
+    check(Case {
+        grid: [48, 80],
+        n_states: 2,
+        n_observations: 2,
+        n_frames: 20,
+        ..CASE
+    });
+    check(Case {
+        grid: [48, 80],
+        n_states: 4,
+        n_observations: 4,
+        n_frames: 20,
+        one_in: 2,
+        ..CASE
+    });
+}
+
+#[test]
+fn on_a_grid_that_must_be_padded() {
+    check(Case {
+        grid: [20, 33],
+        one_in: 10,
+        ..CASE
+    });
+    check(Case {
+        grid: [6, 6],
+        one_in: 2,
+        ..CASE
+    });
+}

@@ -1,0 +1,43 @@
+//! Frames to learn from, and masks.
+
+use network::{Dropout, Mask};
+use protocol::frame::Frame;
+use protocol::grid::Shape;
+use protocol::randomness::split_mix;
+
+/// Frames in which each cell is seen with a probability of one in `one_in`.
+pub fn frames(shape: Shape, n_observations: u64, n_frames: u64, one_in: u64) -> Vec<Frame> {
+    let frame = |index: u64| {
+        let mut frame = Frame::empty(shape);
+        for cell in 0..shape.n_cells() {
+            let bits = split_mix(index, cell as u64);
+            if bits.is_multiple_of(one_in) {
+                frame.observe(cell, ((bits >> 32) % n_observations) as u8);
+            }
+        }
+        frame
+    };
+    (0..n_frames).map(frame).collect()
+}
+
+/// Coins for every frame and channel, kept if `keeps` of the layer, frame and channel.
+pub fn dropout(
+    n_frames: usize,
+    scale: f32,
+    keeps: impl Fn(usize, usize, usize) -> bool,
+) -> Dropout {
+    let mask = |layer: usize, channels: usize| {
+        Mask::new(n_frames, channels, scale, |frame, channel| {
+            keeps(layer, frame, channel)
+        })
+    };
+    Dropout {
+        encoder: [mask(0, 32), mask(1, 16), mask(2, 8)],
+        decoder: [mask(3, 128), mask(4, 64), mask(5, 32), mask(6, 16)],
+    }
+}
+
+/// A fixed coin.
+pub fn coin(layer: usize, frame: usize, channel: usize) -> bool {
+    split_mix(layer as u64 * 1000 + frame as u64, channel as u64) & 1 == 1
+}
