@@ -6,15 +6,12 @@ use std::path::{Path, PathBuf};
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
 /// Directories all of whose Rust, Python or JavaScript files are listed.
-const SOURCES: [&str; 8] = [
+const SOURCES: [&str; 9] = [
     "protocol/src",
     "env-server/src",
     "agent/src",
-<<<<<<< HEAD
     "agent/figures/src",
-=======
     "agent/network/src",
->>>>>>> net
     "clients/dashboard/src",
     "clients/dashboard/page",
     "tests/src",
