@@ -226,5 +226,5 @@ fn an_agent_told_to_stop_leaves_its_belief() {
         panic!("expected a belief");
     };
     assert_eq!(info.length, 3 * 16 * 16 * 4);
-    assert!(info.kind.starts_with("known_model "), "{}", info.kind);
+    assert!(info.kind.starts_with("bayes_filter "), "{}", info.kind);
 }

@@ -23,14 +23,14 @@ pub fn resume(
     present: &Observation,
 ) -> Result<bool, RunError> {
     let step = present.result.step;
-    if let Some(kind) = agent.belief_kind().map(str::to_owned)
+    if let Some(kind) = agent.estimator().kind()
         && let Some(belief) = belief_left(client, &kind, agent.belief())?
     {
         tracing::info!(step, "going on from the belief that was left");
         agent.take_over(belief);
         return Ok(true);
     }
-    if !agent.sees_frames() {
+    if !agent.estimator().sees_frames() {
         return Ok(false);
     }
     let first = first_kept(client, step)?;
@@ -61,12 +61,12 @@ pub fn leave(
     agent: &Agent,
     present: &Observation,
 ) -> Result<(), ConnectionError> {
-    let Some(kind) = agent.belief_kind() else {
+    let Some(kind) = agent.estimator().kind() else {
         return Ok(());
     };
     let numbers = agent.belief().as_slice();
     let bytes: Vec<u8> = numbers.iter().flat_map(|p| p.to_le_bytes()).collect();
-    match client.leave_belief(&present.result, kind, &bytes) {
+    match client.leave_belief(&present.result, &kind, &bytes) {
         // A server that keeps no beliefs.
         Err(ConnectionError::Refused {
             status: Status::Malformed,

@@ -1,7 +1,7 @@
 //! Which belief an agent plans on, and what its decisions go by.
 
 use super::*;
-use crate::network::{Dqn, DqnInput, DqnSettings};
+use crate::network::{Autoencoder, AutoencoderSettings, Dqn, DqnInput, DqnSettings};
 use crate::planner::BasisKind;
 use protocol::randomness::split_mix;
 
@@ -38,7 +38,7 @@ fn world(step: u64) -> (Grid<u8>, Frame) {
 
 /// A network that never learned, with the first seed whose DQN suits.
 fn network(input: DqnInput, basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> LearnedNetwork {
-    let settings = networks::AutoencoderSettings::paper();
+    let settings = AutoencoderSettings::paper();
     let autoencoder = Autoencoder::new(settings, shape(), 3, 3, 1);
     let n_inputs = input.length(settings.hidden, 3);
     let dqn = |seed| Dqn::new(DqnSettings::paper(), n_inputs, 4, seed);

@@ -5,7 +5,7 @@ use super::FilmError;
 use super::story::{Beat, Link, Story};
 use crate::belief::Belief;
 use crate::config::AgentConfig;
-use crate::estimator::Filter;
+use crate::estimator::BayesFilter;
 use protocol::recording::{Record, RecordingError};
 use protocol::{Cell, Frame, Grid, Model, Shape};
 use std::collections::HashMap;
@@ -100,7 +100,7 @@ fn n_lost(beat: &Beat) -> u64 {
 pub struct Scenes<'a, R> {
     story: Story<R>,
     selection: &'a Selection,
-    filter: Filter,
+    filter: BayesFilter,
     priors: Priors<'a>,
     past: Past,
     /// The scene behind that of a gap.
@@ -142,7 +142,7 @@ impl<'a, R: Iterator<Item = Result<Record, RecordingError>>> Scenes<'a, R> {
         Ok(Self {
             story,
             selection,
-            filter: Filter::new(model, Belief::uniform(model.n_states(), shape))?,
+            filter: BayesFilter::known(model, Belief::uniform(model.n_states(), shape))?,
             priors: Priors {
                 model,
                 shape,

@@ -4,7 +4,7 @@ use super::scenes::{MOST_LOST, Scene, Scenes, Selection};
 use super::story::{Beat, Link, Story, StoryError};
 use crate::belief::Belief;
 use crate::config::{AgentConfig, PriorKind};
-use crate::estimator::Filter;
+use crate::estimator::BayesFilter;
 use protocol::control::{CoverageRule, ServerInfo};
 use protocol::message::{FrameHeader, StepResult, TruthHeader};
 use protocol::observer::Sample;
@@ -158,7 +158,8 @@ fn beliefs_are_those_of_the_filter_also_through_gaps() {
     let scenes = scenes(events, &all());
     let shape = Shape::new(2, 3).expect("test shape");
     let seen = Frame::from_bytes(shape, 3, &SEEN).expect("a frame");
-    let mut filter = Filter::new(&Model::wildfire(), Belief::uniform(3, shape)).expect("valid");
+    let mut filter =
+        BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape)).expect("valid");
     let mut expected = Vec::new();
     for n_predictions in [0, 1] {
         (0..n_predictions).for_each(|_| filter.predict());

@@ -4,7 +4,7 @@ use super::{TrainError, Training};
 use crate::checkpoint::{Contents, Problem};
 use crate::client::Client;
 use crate::config::{AgentConfig, LearnerKind};
-use crate::estimator::Filter;
+use crate::estimator::BayesFilter;
 use crate::estimator::learned_filter::{Dimensions, DimensionsError};
 use crate::student::decisions::{Decisions, DecisionsStudent};
 use crate::student::filter::FilterStudent;
@@ -59,7 +59,8 @@ pub fn student(
                 decisions.load(contents).map_err(wrong)?;
             }
             let prior = config.prior(info.burn_in);
-            let filter = Filter::new(&model, prior.belief(&model, site.shape, config.seed)?)?;
+            let filter =
+                BayesFilter::known(&model, prior.belief(&model, site.shape, config.seed)?)?;
             Box::new(DecisionsStudent::new(
                 decisions, filter, &model, site, config,
             ))
