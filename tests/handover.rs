@@ -2,7 +2,7 @@
 
 use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly};
 use crate::wire::{RawClient, Wire, step_header};
-use agent::agent::known_model_kind;
+use agent::estimator::filter::known_model_kind;
 use protocol::Model;
 use protocol::Move;
 use protocol::control::{LeftPart, Reply, Request, WorldSeed};
@@ -248,5 +248,5 @@ fn an_agent_told_to_stop_leaves_its_belief() {
         panic!("expected a belief");
     };
     assert_eq!(info.length, 3 * 16 * 16 * 4);
-    assert!(info.kind.starts_with("known_model "), "{}", info.kind);
+    assert!(info.kind.starts_with("bayes_filter "), "{}", info.kind);
 }

@@ -1,8 +1,8 @@
 //! Time of learning at the paper's size: 64 x 64 cells, 64 moves, 3 states, 16 streams x 16 frames.
 
 use agent::config::LearningConfig;
-use agent::estimator::LearnedFilter;
-use agent::estimator::learned_filter::{Dimensions, Parameters, Trainer};
+use agent::estimator::BayesFilter;
+use agent::estimator::learned_filter::{Dimensions, Parameters, Tables, Trainer};
 use agent::replay::Replay;
 use criterion::{Criterion, criterion_group, criterion_main};
 use protocol::path::fly;
@@ -80,7 +80,8 @@ fn updates(c: &mut Criterion) {
 }
 
 fn filter(c: &mut Criterion) {
-    let mut filter = LearnedFilter::new(&parameters().tables(), shape());
+    let tables: Tables = parameters().tables();
+    let mut filter = BayesFilter::learned(&tables, tables.prior(shape()));
     let frame = frame(&(0..40).collect::<Vec<_>>());
     c.bench_function("learned filter: correct + predict", |b| {
         b.iter(|| {

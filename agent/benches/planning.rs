@@ -3,7 +3,7 @@
 //! The authors' PyTorch code, one CPU thread: planner with 2048 samples 1.5 s, Bayes update 0.12 ms.
 
 use agent::belief::{Belief, EntropyKind};
-use agent::estimator::Filter;
+use agent::estimator::BayesFilter;
 use agent::planner::{
     BeamSearch, CellValues, Objective, Planner, PlanningProblem, RandomWalk, Shooting, Target,
 };
@@ -22,9 +22,9 @@ fn shape() -> Shape {
 }
 
 /// What 40 random walks saw, so that the belief has bumps like those of a running filter.
-fn filter() -> Filter {
+fn filter() -> BayesFilter {
     let mut filter =
-        Filter::new(&Model::wildfire(), Belief::uniform(3, shape())).expect("valid model");
+        BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape())).expect("valid model");
     for step in 0..40 {
         filter.correct(&frame(step)).expect("possible frame");
         filter.predict();

@@ -4,22 +4,21 @@ mod parts;
 #[cfg(test)]
 mod tests;
 
-pub use self::parts::{known_model_kind, numbered_states};
+pub use self::parts::numbered_states;
 
-use self::parts::{autoencoder, basis, belief_kind, decider, learned_filter, state_names};
+use self::parts::{basis, decider, estimator, state_names};
 use crate::action::Action;
 use crate::belief::{Belief, BeliefError};
 use crate::checkpoint::Problem;
 use crate::config::AgentConfig;
-use crate::estimator::{Filter, Follower, LearnedFilter, StepError, ZeroEvidence};
+use crate::estimator::{Estimator, EstimatorError};
 use crate::learned::{Learned, LearnedNetwork};
 use crate::planner::{CellValues, Objective, Plan, PlanBasis, Planner, PlanningProblem, Target};
-use crate::policy::{EstimatorKind, PlannerKind, Policy};
+use crate::policy::{PlannerKind, Policy};
 use crate::student::decisions::Decisions;
-use ::network::NetworkError;
 use protocol::model::ModelError;
 use protocol::outlook::Intent;
-use protocol::{Cell, Frame, Grid, Model, Probabilities, Shape, Transition};
+use protocol::{Cell, Frame, Grid, Model, Shape};
 use std::sync::Arc;
 use std::time::Duration;
 use thiserror::Error;
@@ -31,10 +30,8 @@ pub const RANDOM_MOVES: &str = "random moves";
 pub struct Agent {
     policy: Policy,
     objective: Objective,
-    estimator: Estimator,
+    estimator: Box<dyn Estimator>,
     basis: PlanBasis,
-    /// Says to other agents what the belief is, where it is all that the estimator knows.
-    belief_kind: Option<String>,
     planner: Box<dyn Planner + Send>,
     decider: Option<Decider>,
     /// The state that pays most, where that is learned.
@@ -84,18 +81,12 @@ pub struct Task<'a> {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum AgentError {
-    /// A frame that the belief held for impossible.
+    /// What was seen does not fit the belief.
     #[error(transparent)]
-    ZeroEvidence(#[from] ZeroEvidence),
-    /// A network whose numbers are too large to be worked with, or whose device fails.
-    #[error("checkpoint: {0}")]
-    Network(#[from] NetworkError),
+    Estimator(#[from] EstimatorError),
     /// The model does not fit the grid.
     #[error(transparent)]
     Model(#[from] ModelError),
-    /// Hidden states of another model.
-    #[error("hidden states: {0}")]
-    Belief(#[from] BeliefError),
     /// A policy that needs a learned model was not given it.
     #[error("policy {policy:?} needs what `train` learned: expected --checkpoint FILE of {kind}")]
     NeedsCheckpoint {
@@ -133,50 +124,13 @@ pub enum AgentError {
     },
 }
 
-enum Estimator {
-    /// Always the prior.
-    None(Belief),
-    KnownModel(Box<Filter>),
-    Learned(Box<LearnedFilter>),
-    Autoencoder {
-        network: Arc<LearnedNetwork>,
-        follower: Box<Follower>,
-        /// Its estimate or predictor.
-        belief: Belief,
-    },
-    /// One-hot after `correct`, one step ahead of it after `predict`.
-    Truth {
-        belief: Belief,
-        transition: Box<Transition>,
-    },
-    /// One-hot, the state that the next path meets.
-    NextTruth(Belief),
-}
-
 impl Agent {
     /// An agent before its first frame.
     ///
     /// # Errors
     /// [`AgentError::Model`].
     pub fn new(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Self, AgentError> {
-        let prior = task.prior.clone();
-        let estimator = match policy.estimator {
-            EstimatorKind::None => Estimator::None(prior),
-            EstimatorKind::KnownModel => {
-                Estimator::KnownModel(Box::new(Filter::new(task.model, prior)?))
-            }
-            EstimatorKind::Learned => Estimator::Learned(Box::new(learned_filter(policy, &task)?)),
-            EstimatorKind::Autoencoder => autoencoder(policy, &task)?,
-            EstimatorKind::Truth => {
-                let transition = Box::new(Transition::new(task.model, task.shape)?);
-                Estimator::Truth {
-                    belief: prior,
-                    transition,
-                }
-            }
-            EstimatorKind::NextTruth => Estimator::NextTruth(prior),
-        };
-        let belief_kind = belief_kind(&estimator, &task);
+        let estimator = estimator(policy, &task)?;
         let n_states = estimator.belief().n_states();
         let target = task.learned.target(policy.estimator);
         let mut objective = config.objective(policy);
@@ -192,7 +146,6 @@ impl Agent {
             objective,
             basis: basis(policy, &task, config)?,
             estimator,
-            belief_kind,
             planner: config.planner(policy),
             decider,
             target,
@@ -210,20 +163,20 @@ impl Agent {
 
     /// The path for step k -> k + 1, from where the robot is (paper eq. 15).
     pub fn plan(&mut self, robot: Cell, step: u64) -> Plan {
-        let objective = match (&self.decider, &self.estimator) {
+        let objective = match (&self.decider, self.estimator.follower()) {
             (
                 Some(Decider::Objective {
                     network,
                     objectives,
                 }),
-                Estimator::Autoencoder { follower, .. },
+                Some(follower),
             ) => {
                 let input = network.input.of(follower, robot, self.n_moves);
                 objectives[network.dqn.best(&input)]
             }
-            (Some(Decider::Action(decisions)), estimator) => {
+            (Some(Decider::Action(decisions)), _) => {
                 let decisions = decisions.clone();
-                let action = decisions.decide(estimator.belief(), robot, self.n_moves);
+                let action = decisions.decide(self.estimator.belief(), robot, self.n_moves);
                 return self.plan_action(action, robot, step);
             }
             _ => match self.policy.action.clone() {
@@ -261,55 +214,28 @@ impl Agent {
     /// # Errors
     /// [`AgentError`]; the belief is then as it was.
     pub fn correct(&mut self, frame: &Frame, truth: Option<&Grid<u8>>) -> Result<(), AgentError> {
-        match &mut self.estimator {
-            Estimator::None(_) | Estimator::NextTruth(_) => Ok(()),
-            Estimator::KnownModel(filter) => Ok(filter.correct(frame)?),
-            Estimator::Learned(filter) => Ok(filter.correct(frame)?),
-            Estimator::Autoencoder {
-                network,
-                follower,
-                belief,
-            } => {
-                *belief = follower.step(&network.autoencoder, frame)?;
-                Ok(())
-            }
-            Estimator::Truth { belief, .. } => {
-                let truth = truth.ok_or_else(|| AgentError::NeedsTruth {
+        self.estimator
+            .correct(frame, truth)
+            .map_err(|error| match error {
+                EstimatorError::NoTruth => AgentError::NeedsTruth {
                     policy: self.policy.name.clone(),
-                })?;
-                *belief = Belief::from_states(truth, belief.n_states())?;
-                Ok(())
-            }
-        }
+                },
+                error => error.into(),
+            })
     }
 
     /// Moves the belief from X_k to X_{k+1} (paper eq. 6).
     pub fn predict(&mut self) {
         self.basis.see(self.estimator.belief());
-        match &mut self.estimator {
-            Estimator::None(_) | Estimator::NextTruth(_) => {}
-            Estimator::KnownModel(filter) => filter.predict(),
-            Estimator::Learned(filter) => filter.predict(),
-            Estimator::Autoencoder {
-                follower, belief, ..
-            } => belief.clone_from(follower.prediction()),
-            Estimator::Truth { belief, transition } => {
-                let mut next = Probabilities::zeros(belief.view().dim());
-                transition.apply(belief.probabilities_mut(), &mut next);
-                *belief.probabilities_mut() = next;
-            }
-        }
+        self.estimator.predict();
     }
 
     /// Tells a clairvoyant agent the state X_{k+1} that its next path will meet; others ignore it.
     ///
     /// # Errors
-    /// [`AgentError::Belief`].
-    pub fn foresee(&mut self, next: &Grid<u8>) -> Result<(), AgentError> {
-        if let Estimator::NextTruth(belief) = &mut self.estimator {
-            *belief = Belief::from_states(next, belief.n_states())?;
-        }
-        Ok(())
+    /// [`BeliefError`] for states that the model does not have.
+    pub fn foresee(&mut self, next: &Grid<u8>) -> Result<(), BeliefError> {
+        self.estimator.foresee(next)
     }
 
     /// The belief: about X_k after `correct`, about X_{k+1} after `predict`.
@@ -317,27 +243,14 @@ impl Agent {
         self.estimator.belief()
     }
 
-    /// What says to other agents what the belief is; `None` for estimators that see no frames or know
-    /// more than their belief.
-    pub fn belief_kind(&self) -> Option<&str> {
-        self.belief_kind.as_deref()
-    }
-
-    /// Whether frames are what its belief is made of.
-    pub fn sees_frames(&self) -> bool {
-        matches!(
-            self.estimator,
-            Estimator::KnownModel(_) | Estimator::Learned(_) | Estimator::Autoencoder { .. }
-        )
+    /// Where its belief comes from.
+    pub fn estimator(&self) -> &dyn Estimator {
+        &*self.estimator
     }
 
     /// Goes on from a belief about X_{k+1} of its own kind and shape.
     pub fn take_over(&mut self, belief: Belief) {
-        match &mut self.estimator {
-            Estimator::KnownModel(filter) => filter.set_belief(belief),
-            Estimator::Learned(filter) => filter.set_belief(belief),
-            _ => {}
-        }
+        self.estimator.set_belief(belief);
     }
 
     /// What the last path was for, in a word or two.
@@ -364,27 +277,5 @@ impl Agent {
     /// The policy.
     pub fn policy(&self) -> &Policy {
         &self.policy
-    }
-}
-
-impl From<StepError> for AgentError {
-    fn from(error: StepError) -> Self {
-        match error {
-            StepError::ZeroEvidence(error) => error.into(),
-            StepError::Network(error) => error.into(),
-        }
-    }
-}
-
-impl Estimator {
-    fn belief(&self) -> &Belief {
-        match self {
-            Self::None(belief)
-            | Self::NextTruth(belief)
-            | Self::Truth { belief, .. }
-            | Self::Autoencoder { belief, .. } => belief,
-            Self::KnownModel(filter) => filter.belief(),
-            Self::Learned(filter) => filter.belief(),
-        }
     }
 }

@@ -5,6 +5,7 @@
 //! on the path, so a scout shows the future lawfully); and one *spare*, for full observations.
 
 use crate::client::{Claim, Client, Observation, server_info};
+use crate::rollout::Seen;
 use crate::truth::{TruthError, TruthFeed};
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
@@ -140,10 +141,7 @@ impl Arena {
     ///
     /// # Errors
     /// [`ArenaError`].
-    pub fn reset(
-        &mut self,
-        seeds: &[u64],
-    ) -> Result<(Vec<Observation>, Vec<Grid<u8>>), ArenaError> {
+    pub fn reset(&mut self, seeds: &[u64]) -> Result<Vec<Seen>, ArenaError> {
         let orders = |first: u32| {
             seeds.iter().zip(first..).map(|(&seed, world)| WorldSeed {
                 world,
@@ -158,7 +156,7 @@ impl Arena {
             self.client.reset(&scouts)?;
         }
         let observations = self.client.observe(self.range(&self.main, seeds))?;
-        Ok((observations, truth))
+        Ok(seen(observations, truth))
     }
 
     /// Flies a path in each main world; returns observations and hidden states at `step`.
@@ -170,10 +168,11 @@ impl Arena {
         seeds: &[u64],
         paths: &[Vec<Move>],
         step: u64,
-    ) -> Result<(Vec<Observation>, Vec<Grid<u8>>), ArenaError> {
+    ) -> Result<Vec<Seen>, ArenaError> {
         let worlds = self.range(&self.main, seeds);
         let observations = self.client.step(worlds.clone(), paths)?;
-        Ok((observations, self.truth.states(worlds, seeds, step)?))
+        let truth = self.truth.states(worlds, seeds, step)?;
+        Ok(seen(observations, truth))
     }
 
     /// The hidden states at `step` before the main worlds get there, from the scouts.
@@ -224,4 +223,13 @@ impl Arena {
     fn range(&self, worlds: &Range<u32>, seeds: &[u64]) -> Range<u32> {
         worlds.start..worlds.start + seeds.len() as u32
     }
+}
+
+fn seen(observations: Vec<Observation>, truths: Vec<Grid<u8>>) -> Vec<Seen> {
+    let both = observations.into_iter().zip(truths);
+    let seen = both.map(|(observation, truth)| Seen {
+        observation,
+        truth: Some(truth),
+    });
+    seen.collect()
 }

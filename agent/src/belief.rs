@@ -168,12 +168,18 @@ impl Belief {
         slice.expect("invariant: beliefs are row-major")
     }
 
+    /// The probabilities, for estimators, which keep each cell on the simplex themselves.
+    pub(crate) fn as_mut_slice(&mut self) -> &mut [f32] {
+        let slice = self.probabilities.as_slice_mut();
+        slice.expect("invariant: beliefs are row-major")
+    }
+
     /// For estimators, which keep each cell on the simplex themselves.
     pub(crate) fn probabilities_mut(&mut self) -> &mut Probabilities {
         &mut self.probabilities
     }
 
-    fn everywhere(distribution: &[f32], shape: Shape) -> Self {
+    pub(crate) fn everywhere(distribution: &[f32], shape: Shape) -> Self {
         let (height, width) = shape.dim();
         let dim = (distribution.len(), height, width);
         let probabilities = Probabilities::from_shape_fn(dim, |(state, _, _)| distribution[state]);

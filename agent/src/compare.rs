@@ -5,18 +5,18 @@ use crate::arena::{Arena, ArenaError};
 use crate::belief::Belief;
 use crate::client::Observation;
 use crate::config::AgentConfig;
+use crate::estimator::EstimatorError;
 use crate::feed::{Feed, View};
 use crate::first_belief::first_belief;
 use crate::learned::Learned;
-use crate::planner::Plan;
 use crate::policy::{EstimatorKind, Policy};
 use crate::report::PolicyRun;
+use crate::rollout::{self, Robot, Seen, Turn};
 use protocol::model::ModelError;
 use protocol::path::fly;
 use protocol::{Cell, Frame, Grid};
-use rayon::iter::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
 use std::ops::Range;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 use thiserror::Error;
 
 /// What is compared.
@@ -84,14 +84,13 @@ pub enum CompareError {
 
 /// One world's run of one policy.
 struct Run {
-    agent: Agent,
-    observation: Observation,
+    robot: Robot,
     seed: u64,
     tally: Tally,
     moment: Option<Moment>,
-    /// Time that the last plan took.
-    planning: Duration,
-    /// The posterior after the last frame, while it is shown.
+    /// Whether the posterior after the next frame is to be shown.
+    is_shown: bool,
+    /// That posterior.
     posterior: Option<Belief>,
 }
 
@@ -185,8 +184,10 @@ impl Match<'_> {
     ) -> Result<Vec<Run>, CompareError> {
         let mut runs = self.start(arena)?;
         for step in 0..self.comparison.steps {
-            let shown = feed.turn(runs.len());
-            self.step(arena, &mut runs, step, &shown)?;
+            for index in feed.turn(runs.len()) {
+                runs[index].is_shown = true;
+            }
+            self.step(arena, &mut runs, step)?;
             for (world, run) in arena.worlds().zip(&mut runs) {
                 run.show(feed, world);
             }
@@ -196,19 +197,15 @@ impl Match<'_> {
     }
 
     fn start(&self, arena: &mut Arena) -> Result<Vec<Run>, CompareError> {
-        let (observations, truths) = arena.reset(self.seeds)?;
-        let worlds = self.seeds.iter().zip(observations).zip(&truths);
-        let run = |((&seed, observation), truth): ((&u64, Observation), &Grid<u8>)| {
-            let mut agent = self.agent(arena, seed)?;
-            agent.correct(&observation.frame, Some(truth))?;
-            agent.predict();
+        let worlds = arena.reset(self.seeds)?;
+        let worlds = self.seeds.iter().zip(worlds);
+        let run = |(&seed, seen): (&u64, Seen)| {
             Ok(Run {
-                agent,
-                observation,
+                robot: Robot::at(self.agent(arena, seed)?, seen)?,
                 seed,
                 tally: Tally::default(),
                 moment: None,
-                planning: Duration::ZERO,
+                is_shown: false,
                 posterior: None,
             })
         };
@@ -218,38 +215,36 @@ impl Match<'_> {
             .map_err(|problem| self.wrong(problem))
     }
 
-    fn step(
-        &self,
-        arena: &mut Arena,
-        runs: &mut [Run],
-        step: u64,
-        shown: &[usize],
-    ) -> Result<(), CompareError> {
+    fn step(&self, arena: &mut Arena, runs: &mut [Run], step: u64) -> Result<(), CompareError> {
         if self.policy.estimator == EstimatorKind::NextTruth {
             let next = arena.foresee(self.seeds, step + 1)?;
             let foreseen = runs
                 .iter_mut()
                 .zip(&next)
-                .try_for_each(|(run, next)| run.agent.foresee(next));
-            foreseen.map_err(|problem| self.wrong(problem))?;
+                .try_for_each(|(run, next)| run.robot.agent.foresee(next))
+                .map_err(EstimatorError::from);
+            foreseen.map_err(|problem| self.wrong(problem.into()))?;
         }
-        let plans: Vec<Plan> = runs.par_iter_mut().map(|run| run.plan(step)).collect();
-        let paths: Vec<_> = plans.iter().map(|plan| plan.moves.clone()).collect();
-        let (observations, truths) = arena.step(self.seeds, &paths, step + 1)?;
         let is_last = step + 1 == self.comparison.steps;
         let target = arena.model().target_state();
-        let seen = runs.par_iter_mut().zip(plans).zip(observations).zip(truths);
-        let taken = seen
-            .enumerate()
-            .map(|(index, (((run, plan), observation), truth))| {
-                let taken = run.take_in(&plan, observation, truth, target, is_last);
-                run.posterior = shown.contains(&index).then(|| run.agent.belief().clone());
-                run.agent.predict();
-                taken
-            });
-        taken
-            .collect::<Result<(), AgentError>>()
-            .map_err(|problem| self.wrong(problem))
+        rollout::step(
+            runs,
+            |run| &mut run.robot,
+            Robot::plan,
+            |paths| {
+                arena
+                    .step(self.seeds, paths, step + 1)
+                    .map_err(StepError::Arena)
+            },
+            |run, turn| {
+                run.look(turn, target, is_last);
+                Ok(())
+            },
+        )
+        .map_err(|error| match error {
+            StepError::Arena(error) => error.into(),
+            StepError::Agent(problem) => self.wrong(problem),
+        })
     }
 
     fn agent(&self, arena: &Arena, seed: u64) -> Result<Agent, AgentError> {
@@ -274,38 +269,30 @@ impl Match<'_> {
     }
 }
 
-impl Run {
-    fn plan(&mut self, step: u64) -> Plan {
-        let start = Instant::now();
-        let plan = self.agent.plan(self.observation.robot(), step);
-        self.planning = start.elapsed();
-        self.tally.planning += self.planning;
-        plan
-    }
+/// Why a step failed.
+enum StepError {
+    Arena(ArenaError),
+    Agent(AgentError),
+}
 
-    fn take_in(
-        &mut self,
-        plan: &Plan,
-        observation: Observation,
-        truth: Grid<u8>,
-        target: usize,
-        is_last: bool,
-    ) -> Result<(), AgentError> {
-        let before = std::mem::replace(&mut self.observation, observation);
-        self.agent.correct(&self.observation.frame, Some(&truth))?;
-        self.tally.add(
-            &self.observation,
-            brier_score(
-                self.agent.belief(),
-                &truth,
-                target,
-                self.agent.target(target),
-            ),
-        );
-        if is_last && self.agent.policy().estimator == EstimatorKind::KnownModel {
-            self.moment = Some(self.moment(&before, plan, truth));
+impl From<AgentError> for StepError {
+    fn from(error: AgentError) -> Self {
+        Self::Agent(error)
+    }
+}
+
+impl Run {
+    fn look(&mut self, turn: Turn<'_>, target: usize, is_last: bool) {
+        let agent = &self.robot.agent;
+        let truth = turn.truth.expect("invariant: an arena shows hidden states");
+        let brier = brier_score(agent.belief(), truth, target, agent.target(target));
+        self.posterior = std::mem::take(&mut self.is_shown).then(|| agent.belief().clone());
+        let is_known = agent.policy().estimator == EstimatorKind::KnownModel;
+        self.tally.planning += self.robot.planning();
+        self.tally.add(self.robot.observation(), brier);
+        if is_last && is_known {
+            self.moment = Some(self.moment(turn));
         }
-        Ok(())
     }
 
     /// Shows the belief that was kept for it.
@@ -313,31 +300,34 @@ impl Run {
         if let Some(belief) = self.posterior.take() {
             feed.show(&View {
                 world,
-                result: &self.observation.result,
+                result: &self.robot.observation().result,
                 belief: &belief,
-                intent: self.agent.intent(self.planning),
+                intent: self.robot.agent.intent(self.robot.planning()),
             });
         }
     }
 
-    fn moment(&self, before: &Observation, plan: &Plan, truth: Grid<u8>) -> Moment {
-        let shape = self.agent.belief().shape();
-        let mut path_cells = vec![before.robot()];
-        for (index, _) in plan.moves.iter().enumerate() {
-            path_cells.push(fly(shape, before.robot(), &plan.moves[..=index]).end);
-        }
+    fn moment(&self, turn: Turn<'_>) -> Moment {
+        let (agent, observation) = (&self.robot.agent, self.robot.observation());
+        let (shape, start) = (agent.belief().shape(), turn.before.robot());
+        let moves = &turn.plan.moves;
+        let mut path_cells = vec![start];
+        path_cells.extend((1..=moves.len()).map(|n| fly(shape, start, &moves[..n]).end));
         Moment {
             seed: self.seed,
-            step: self.observation.result.step,
-            truth,
-            frame: self.observation.frame.clone(),
+            step: observation.result.step,
+            truth: turn
+                .truth
+                .expect("invariant: an arena shows hidden states")
+                .clone(),
+            frame: observation.frame.clone(),
             path_cells,
-            belief: self.agent.belief().clone(),
+            belief: agent.belief().clone(),
         }
     }
 
     fn into_policy_run(self) -> PolicyRun {
-        let (tally, policy) = (self.tally, self.agent.policy());
+        let (tally, policy) = (self.tally, self.robot.agent.policy());
         let steps = tally.rewards.len() as u64;
         let mean = |sum: f64| sum / steps.max(1) as f64;
         let hit_rate = tally.n_hits as f64 / tally.n_visited.max(1) as f64;

@@ -6,17 +6,16 @@
 use crate::agent::{Agent, AgentError, Task};
 use crate::arena::{Arena, ArenaError};
 use crate::belief::Belief;
-use crate::client::Observation;
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
+use crate::estimator::EstimatorError;
 use crate::first_belief::first_belief;
 use crate::learned::Learned;
 use crate::policy::{EstimatorKind, Policy, UnknownPolicy};
+use crate::rollout::{self, Robot, Seen};
 use crate::scoring::{Score, score};
 use ndarray::Array2;
-use protocol::Move;
 use protocol::model::ModelError;
-use rayon::prelude::*;
 use std::ops::Range;
 use thiserror::Error;
 
@@ -80,18 +79,18 @@ pub fn examine(
     let seeds: Vec<u64> = examination.seeds.clone().collect();
     let mut marks = Vec::new();
     for batch in seeds.chunks(arena.batch_size()) {
-        let (observations, _) = arena.reset(batch)?;
-        let examinees = batch.iter().zip(observations);
-        let examinee = |(&seed, observation): (&u64, Observation)| {
-            Examinee::new(arena, examination, &prior, seed, observation)
-        };
+        let examinees = batch.iter().zip(arena.reset(batch)?);
+        let examinee =
+            |(&seed, seen): (&u64, Seen)| Examinee::new(arena, examination, &prior, seed, seen);
         let mut examinees: Vec<Examinee> = examinees.map(examinee).collect::<Result<_, _>>()?;
-        for step in 0..examination.steps {
-            let plan = |examinee: &mut Examinee| examinee.plan(step);
-            let paths: Vec<Vec<Move>> = examinees.par_iter_mut().map(plan).collect();
-            let (observations, _) = arena.step(batch, &paths, step + 1)?;
-            let seen = examinees.par_iter_mut().zip(observations);
-            seen.try_for_each(|(examinee, observation)| examinee.take_in(observation))?;
+        for step in 1..=examination.steps {
+            rollout::step(
+                &mut examinees,
+                |examinee| &mut examinee.guide,
+                Robot::plan,
+                |paths| Ok::<_, ExaminationError>(arena.step(batch, paths, step)?),
+                |examinee, _| examinee.look(),
+            )?;
         }
         marks.extend(examinees.into_iter().map(|examinee| examinee.marks));
     }
@@ -114,9 +113,8 @@ pub fn score_of_frequencies(all: &[Marks], counts: &[u64]) -> Score {
 
 /// Estimators on one world, and who chooses the paths.
 struct Examinee {
-    guide: Agent,
+    guide: Robot,
     estimators: Vec<(Agent, Array2<f64>)>,
-    observation: Observation,
     marks: Marks,
 }
 
@@ -126,7 +124,7 @@ impl Examinee {
         examination: &Examination<'_>,
         prior: &Belief,
         seed: u64,
-        observation: Observation,
+        seen: Seen,
     ) -> Result<Self, ExaminationError> {
         let model = arena.model();
         let agent = |name: &str| -> Result<Agent, ExaminationError> {
@@ -147,7 +145,12 @@ impl Examinee {
                 EstimatorKind::Learned => ("learned_beam", learned.filter_likelihood()),
                 EstimatorKind::Autoencoder => {
                     let likelihood = learned.network_likelihood();
-                    ("autoencoder_beam", likelihood.map_err(AgentError::from)?)
+                    (
+                        "autoencoder_beam",
+                        likelihood
+                            .map_err(EstimatorError::from)
+                            .map_err(AgentError::from)?,
+                    )
                 }
                 _ => ("beam_exploit", None),
             };
@@ -156,26 +159,21 @@ impl Examinee {
         };
         let estimators = examination.estimators.iter().map(estimator);
         let mut examinee = Self {
-            guide: agent(examination.guide)?,
+            guide: Robot::at(agent(examination.guide)?, seen)?,
             estimators: estimators.collect::<Result<_, _>>()?,
             marks: Marks {
                 seed,
                 scores: vec![Score::default(); examination.estimators.len()],
                 counts: vec![0; model.n_observations()],
             },
-            observation,
         };
         examinee.filter()?;
         Ok(examinee)
     }
 
-    fn plan(&mut self, step: u64) -> Vec<Move> {
-        self.guide.plan(self.observation.robot(), step).moves
-    }
-
-    fn take_in(&mut self, observation: Observation) -> Result<(), AgentError> {
-        self.observation = observation;
-        let frame = &self.observation.frame;
+    /// Scores each estimator's prediction of the frame that the guide has seen, then feeds them with it.
+    fn look(&mut self) -> Result<(), AgentError> {
+        let frame = &self.guide.observation().frame;
         let scores = self.marks.scores.iter_mut().zip(&self.estimators);
         for (sum, (agent, likelihood)) in scores {
             *sum += score(agent.belief(), likelihood, frame);
@@ -187,9 +185,8 @@ impl Examinee {
     }
 
     fn filter(&mut self) -> Result<(), AgentError> {
-        let estimators = self.estimators.iter_mut().map(|(agent, _)| agent);
-        for agent in estimators.chain([&mut self.guide]) {
-            agent.correct(&self.observation.frame, None)?;
+        for (agent, _) in &mut self.estimators {
+            agent.correct(&self.guide.observation().frame, None)?;
             agent.predict();
         }
         Ok(())

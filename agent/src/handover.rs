@@ -26,7 +26,7 @@ pub fn resume(
     if take_over_left(client, agent, present)? {
         return Ok(true);
     }
-    if !agent.sees_frames() {
+    if !agent.estimator().sees_frames() {
         return Ok(false);
     }
     let first = first_kept(client, step)?;
@@ -58,7 +58,7 @@ pub fn take_over_left(
     agent: &mut Agent,
     present: &Observation,
 ) -> Result<bool, ConnectionError> {
-    let Some(kind) = agent.belief_kind().map(str::to_owned) else {
+    let Some(kind) = agent.estimator().kind() else {
         return Ok(false);
     };
     let Some(belief) = belief_left(client, &kind, agent.belief())? else {
@@ -79,12 +79,12 @@ pub fn leave(
     agent: &Agent,
     present: &Observation,
 ) -> Result<(), ConnectionError> {
-    let Some(kind) = agent.belief_kind() else {
+    let Some(kind) = agent.estimator().kind() else {
         return Ok(());
     };
     let numbers = agent.belief().as_slice();
     let bytes: Vec<u8> = numbers.iter().flat_map(|p| p.to_le_bytes()).collect();
-    match client.leave_belief(&present.result, kind, &bytes) {
+    match client.leave_belief(&present.result, &kind, &bytes) {
         // A server that keeps no beliefs.
         Err(ConnectionError::Refused {
             status: Status::Malformed,

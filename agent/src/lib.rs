@@ -29,6 +29,7 @@ pub mod policy;
 pub mod replay;
 pub mod report;
 pub mod reward;
+pub mod rollout;
 pub mod run;
 pub mod scoring;
 pub mod student;

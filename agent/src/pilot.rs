@@ -7,7 +7,7 @@ pub use stored::Stand;
 use crate::client::Observation;
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
-use crate::estimator::{LearnedFilter, ZeroEvidence};
+use crate::estimator::{BayesFilter, ZeroEvidence};
 use crate::learner::{LearnedModel, Learner};
 use crate::planner::{PlanBasis, Planner, PlanningProblem, Target};
 use crate::policy::{PlannerKind, Policy};
@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 /// Acts on one world on a learned belief.
 pub struct Pilot {
     /// The belief.
-    pub filter: LearnedFilter,
+    pub filter: BayesFilter,
     /// What paths are planned on.
     basis: PlanBasis,
     /// What the world shows.
@@ -42,7 +42,7 @@ impl Pilot {
         config: &AgentConfig,
     ) -> Self {
         Self {
-            filter: LearnedFilter::new(&learned.tables, shape),
+            filter: BayesFilter::learned(&learned.tables, learned.tables.prior(shape)),
             basis: PlanBasis::new(config.objective.belief),
             walk: config.planner(&Policy::learned(PlannerKind::RandomWalk)),
             beam: config.planner(&Policy::learned(PlannerKind::Beam)),
@@ -85,8 +85,7 @@ impl Pilot {
     ) -> Result<bool, ZeroEvidence> {
         match stand {
             Some(stand) if stand.is_of(&self.observation) && learner.has_track(world) => {
-                let belief = stand.belief.clone();
-                self.filter = LearnedFilter::with_prior(self.filter.tables(), belief);
+                self.filter.set_belief(stand.belief.clone());
                 if let Some(estimate) = &stand.estimate {
                     self.basis.see(estimate);
                 }
@@ -141,8 +140,7 @@ impl Pilot {
     ) -> Result<Score, ZeroEvidence> {
         self.observation = observation;
         let Observation { result, frame } = &self.observation;
-        let likelihood = self.filter.tables().likelihood_array();
-        let score = score(self.filter.belief(), &likelihood, frame);
+        let score = score(self.filter.belief(), self.filter.likelihood(), frame);
         learner.see(world, self.filter.belief(), frame);
         self.filter.correct(frame)?;
         learner.reward(self.filter.belief(), &self.visited, result.reward);

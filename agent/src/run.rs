@@ -1,6 +1,6 @@
 //! The agent's life on one world: attach, act, reconnect, leave.
 
-use crate::agent::{Agent, AgentError, Task, known_model_kind};
+use crate::agent::{Agent, AgentError, Task};
 use crate::belief::Belief;
 use crate::client::{
     Claim, Client, Observation, RETRY_INTERVAL, is_away, is_belief_left, server_info, shape_of,
@@ -8,6 +8,7 @@ use crate::client::{
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
 use crate::estimator::Prior;
+use crate::estimator::filter::known_model_kind;
 use crate::feed::{Feed, View};
 use crate::first_belief::first_belief;
 use crate::handover::{leave, resume, take_over_left};

@@ -10,7 +10,7 @@ mod tests;
 use crate::belief::Belief;
 use crate::checkpoint::Contents;
 use crate::client::Observation;
-use crate::estimator::{StepError, ZeroEvidence, learned_filter};
+use crate::estimator::{EstimatorError, ZeroEvidence, learned_filter};
 use crate::metrics::Tick;
 use crate::policy::EstimatorKind;
 use ::network::NetworkError;
@@ -92,11 +92,12 @@ pub enum NotFinite {
     Network(#[from] NetworkError),
 }
 
-impl From<StepError> for StudentError {
-    fn from(error: StepError) -> Self {
+impl From<EstimatorError> for StudentError {
+    fn from(error: EstimatorError) -> Self {
         match error {
-            StepError::ZeroEvidence(error) => error.into(),
-            StepError::Network(error) => error.into(),
+            EstimatorError::ZeroEvidence(error) => error.into(),
+            EstimatorError::Network(error) => error.into(),
+            other => unreachable!("no truth was asked for: {other}"),
         }
     }
 }

@@ -10,7 +10,7 @@
 //! ```
 
 use agent::belief::Belief;
-use agent::estimator::Filter;
+use agent::estimator::BayesFilter;
 use agent::planner::{Integration, Objective, Target};
 use ndarray::{Array, Array1, Array2, Array3, Array4, ArrayView2, ArrayView3, Dimension, s};
 use ndarray_npy::{NpzReader, ReadableElement};
@@ -69,7 +69,7 @@ fn the_filter_reproduces_posterior_and_predictor() {
         let predictors: Array4<f32> = golden.get(&format!("{case}_estimate"));
         let (_, height, width) = observations.dim();
         let prior = Belief::uniform(3, shape_of((height, width)));
-        let mut filter = Filter::new(&Model::wildfire(), prior).expect("valid model");
+        let mut filter = BayesFilter::known(&Model::wildfire(), prior).expect("valid model");
         let everything = Array2::from_elem((height, width), 1);
         for (step, observed) in observations.outer_iter().enumerate() {
             let index = saved.iter().position(|&at| at == step as i64);
@@ -116,7 +116,7 @@ fn check_masked(
     what: &str,
 ) {
     let model = model_observed_through(weights);
-    let mut filter = Filter::new(&model, belief_from(prior)).expect("valid model");
+    let mut filter = BayesFilter::known(&model, belief_from(prior)).expect("valid model");
     filter.correct(frame).expect("possible frame");
     assert_close(filter.belief(), posterior, what);
 }

@@ -2,9 +2,9 @@
 
 use agent::Belief;
 use agent::config::LearningConfig;
+use agent::estimator::BayesFilter;
 use agent::estimator::learned_filter::window::{Start, Window};
 use agent::estimator::learned_filter::{Dimensions, Parameters, Tables, Trainer, Update};
-use agent::estimator::{Filter, LearnedFilter};
 use agent::replay::{Replay, Sighting};
 use protocol::randomness::split_mix;
 use protocol::{Frame, Model, Shape};
@@ -54,8 +54,8 @@ fn with_the_true_parameters_it_is_the_known_model_filter() {
         for (height, width) in [(1, 1), (5, 9), (20, 33), (64, 64)] {
             let shape = Shape::new(height, width).expect("test shape");
             let prior = Belief::uniform(model.n_states(), shape);
-            let mut known = Filter::new(&model, prior.clone()).expect("valid model");
-            let mut learned = LearnedFilter::with_prior(&Tables::of_model(&model), prior);
+            let mut known = BayesFilter::known(&model, prior.clone()).expect("valid model");
+            let mut learned = BayesFilter::learned(&Tables::of_model(&model), prior);
             for number in 0..30 {
                 let frame = frame(shape, model.n_observations(), number);
                 known.correct(&frame).expect("possible");
@@ -157,7 +157,7 @@ fn a_window_ends_with_the_filters_prediction() {
         kernel: (3, 3),
     };
     let tables: Tables = Parameters::first(dimensions, 2).tables();
-    let mut filter = LearnedFilter::new(&tables, shape);
+    let mut filter = BayesFilter::learned(&tables, tables.prior(shape));
     let mut window = Window::new(tables, shape, 8);
     let frames: Vec<_> = (0..8).map(|number| sightings(shape, 3, number)).collect();
     let mut end = vec![0.0; 3 * shape.n_cells()];

@@ -1,7 +1,7 @@
 //! What holds for every planner, filter and summary, on random problems.
 
 use agent::belief::Belief;
-use agent::estimator::Filter;
+use agent::estimator::BayesFilter;
 use agent::planner::{
     BeamSearch, CellValues, Integration, Objective, Plan, Planner, PlanningProblem, RandomWalk,
     Shooting, Target,
@@ -260,7 +260,7 @@ proptest! {
     ) {
         let shape = field.belief.shape();
         let prior = Belief::uniform(3, shape);
-        let mut filter = Filter::new(&Model::wildfire(), prior).expect("valid model");
+        let mut filter = BayesFilter::known(&Model::wildfire(), prior).expect("valid model");
         for values in steps {
             let values = values.iter().take(shape.n_cells());
             let bytes: Vec<u8> = values.map(|&v| if v < 3 { v } else { UNOBSERVED }).collect();

@@ -14,7 +14,7 @@
 
 use crate::grid::Shape;
 use crate::model::{Model, ModelError};
-use ndarray::{Array3, NdFloat};
+use ndarray::{Array3, Array4, NdFloat};
 
 /// Cells computed at once, four SSE registers of `f32`. Independent sums hide the latency of adds.
 const LANES: usize = 16;
@@ -64,20 +64,25 @@ impl<T: NdFloat> Transition<T> {
     /// [`ModelError::ZeroWeight`] where eq. 3 could divide by zero ([`Model::check_on`]).
     pub fn new(model: &Model, shape: Shape) -> Result<Self, ModelError> {
         model.check_on(shape)?;
-        let n_states = model.n_states();
-        let (_, _, kernel_height, kernel_width) = model.kernel().dim();
+        let bias = model.bias().to_vec();
+        Ok(Self::of_weights(model.kernel(), &bias, shape))
+    }
+
+    /// Lays out weights `w[m, n, a, c]`, shape `[S, S, KH, KW]` with odd sides, and biases `b[m]` for a grid.
+    /// All are finite and 0 or more; where a cell's weights can all be 0, its prediction is NaN.
+    pub fn of_weights(kernel: &Array4<f64>, bias: &[f64], shape: Shape) -> Self {
+        let (n_states, _, kernel_height, kernel_width) = kernel.dim();
         let layout = Layout::new(shape, kernel_height, kernel_width);
         // Eq. 3 cancels a common factor; taken out, no weight overflows T.
-        let largest = model.kernel().iter().chain(model.bias()).copied();
-        let largest = largest.fold(0.0, f64::max);
+        let largest = kernel.iter().chain(bias).copied().fold(0.0, f64::max);
         let scaled = |weight: f64| T::from(weight / largest).expect("invariant: f64 casts to T");
         let row = |&bias| Row {
             bias: scaled(bias),
             terms: Vec::new(),
         };
-        let mut rows: Vec<Row<T>> = model.bias().iter().map(row).collect();
+        let mut rows: Vec<Row<T>> = bias.iter().map(row).collect();
         let mut groups = Vec::new();
-        for (column, offsets) in taps_that_weigh_alike(model, layout) {
+        for (column, offsets) in taps_that_weigh_alike(kernel, layout) {
             for (row, weight) in rows.iter_mut().zip(column) {
                 if weight > 0.0 {
                     row.terms.push((groups.len(), scaled(weight)));
@@ -85,7 +90,7 @@ impl<T: NdFloat> Transition<T> {
             }
             groups.push(offsets);
         }
-        Ok(Self {
+        Self {
             shape,
             n_states,
             layout,
@@ -94,7 +99,7 @@ impl<T: NdFloat> Transition<T> {
             weights: vec![[T::zero(); LANES]; n_states],
             groups,
             rows,
-        })
+        }
     }
 
     /// Writes `Phi(belief)` to `out`, both `[S, H, W]`; each cell of the belief must sum to one.
@@ -205,14 +210,14 @@ fn add_up<T: NdFloat>(planes: &[T], offsets: &[usize]) -> [T; LANES] {
 
 /// The taps of each state by the column of weights `w[.., n, a, c]` they share: `(column, offsets)`.
 /// Taps without weight are left out.
-fn taps_that_weigh_alike(model: &Model, layout: Layout) -> Vec<(Vec<f64>, Vec<usize>)> {
-    let (n_states, _, kernel_height, kernel_width) = model.kernel().dim();
+fn taps_that_weigh_alike(kernel: &Array4<f64>, layout: Layout) -> Vec<(Vec<f64>, Vec<usize>)> {
+    let (n_states, _, kernel_height, kernel_width) = kernel.dim();
     let mut groups: Vec<(Vec<f64>, Vec<usize>)> = Vec::new();
     for from in 0..n_states {
         let first = groups.len();
         for (row, col) in (0..kernel_height).flat_map(|a| (0..kernel_width).map(move |c| (a, c))) {
             let column: Vec<f64> = (0..n_states)
-                .map(|to| model.kernel()[[to, from, row, col]])
+                .map(|to| kernel[[to, from, row, col]])
                 .collect();
             if column.iter().all(|&weight| weight == 0.0) {
                 continue;

@@ -5,7 +5,7 @@
 
 use agent::action::{ActionSet, Region};
 use agent::belief::Belief;
-use agent::estimator::{Filter, Prior};
+use agent::estimator::{BayesFilter, Prior};
 use agent::planner::BeamSearch;
 use env_server::episode::{Episode, Rules, Start};
 use protocol::{Cell, Coverage, Model, Shape};
@@ -30,13 +30,14 @@ struct Setup {
 /// A robot in a world.
 #[derive(Clone)]
 struct Robot {
-    filter: Filter,
+    filter: BayesFilter,
     episode: Episode,
 }
 
 impl Robot {
     fn new(setup: &Setup, seed: u64) -> Self {
-        let mut filter = Filter::new(&setup.model, setup.prior.clone()).expect("a valid model");
+        let mut filter =
+            BayesFilter::known(&setup.model, setup.prior.clone()).expect("a valid model");
         filter.predict();
         let episode = Episode::new(&setup.rules, seed);
         Self { filter, episode }

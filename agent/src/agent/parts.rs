@@ -1,8 +1,9 @@
 //! What an agent is made of, as its policy wants it.
 
-use super::{AgentError, Decider, Estimator, Task};
+use super::{AgentError, Decider, Task};
 use crate::config::AgentConfig;
-use crate::estimator::{Follower, LearnedFilter};
+use crate::estimator::truth::{Clairvoyant, Oracle, Unchanged};
+use crate::estimator::{AutoencoderEstimator, BayesFilter, Estimator, EstimatorError};
 use crate::learned::settings;
 use crate::learner::LearnedModel;
 use crate::planner::{BasisKind, PlanBasis};
@@ -26,30 +27,20 @@ pub fn numbered_states(n_states: usize) -> Vec<String> {
         .collect()
 }
 
-/// The kind of belief, with a checksum of the parameters that give it its meaning.
-pub(super) fn belief_kind(estimator: &Estimator, task: &Task<'_>) -> Option<String> {
-    let (kind, checksum) = match estimator {
-        Estimator::KnownModel(_) => return Some(known_model_kind(task.model)),
-        Estimator::Learned(filter) => {
-            let tables = filter.tables();
-            let numbers = [&tables.kernel, &tables.likelihood, &tables.initial];
-            let numbers = numbers.into_iter().flatten();
-            let bytes: Vec<u8> = numbers.flat_map(|number| number.to_le_bytes()).collect();
-            ("learned_filter", crc32fast::hash(&bytes))
-        }
-        _ => return None,
-    };
-    Some(kind_of(kind, checksum))
-}
-
-/// The kind of the known-model filter's belief.
-pub fn known_model_kind(model: &Model) -> String {
-    let text = format!("{:?}", model.file());
-    kind_of("known_model", crc32fast::hash(text.as_bytes()))
-}
-
-fn kind_of(estimator: &str, checksum: u32) -> String {
-    format!("{estimator} {checksum:08x}, probabilities [S, H, W] as f32")
+/// Where a policy's belief comes from, before the first frame. A new estimator is a line here.
+pub(super) fn estimator(
+    policy: &Policy,
+    task: &Task<'_>,
+) -> Result<Box<dyn Estimator>, AgentError> {
+    let prior = task.prior.clone();
+    Ok(match policy.estimator {
+        EstimatorKind::None => Box::new(Unchanged(prior)),
+        EstimatorKind::KnownModel => Box::new(BayesFilter::known(task.model, prior)?),
+        EstimatorKind::Learned => Box::new(learned_filter(policy, task)?),
+        EstimatorKind::Autoencoder => Box::new(autoencoder(policy, task)?),
+        EstimatorKind::Truth => Box::new(Oracle::new(task.model, prior)?),
+        EstimatorKind::NextTruth => Box::new(Clairvoyant(prior)),
+    })
 }
 
 /// What a policy plans on: what the settings say, but where a DQN decides what it was trained with, as
@@ -95,16 +86,14 @@ pub(super) fn decider(
     })
 }
 
-pub(super) fn learned_filter(
-    policy: &Policy,
-    task: &Task<'_>,
-) -> Result<LearnedFilter, AgentError> {
+fn learned_filter(policy: &Policy, task: &Task<'_>) -> Result<BayesFilter, AgentError> {
     let learned: &LearnedModel = present(policy, &task.learned.filter, "a filter")?;
     same_observations(task, learned.tables.dimensions.n_observations)?;
-    Ok(LearnedFilter::new(&learned.tables, task.shape))
+    let prior = learned.tables.prior(task.shape);
+    Ok(BayesFilter::learned(&learned.tables, prior))
 }
 
-pub(super) fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<Estimator, AgentError> {
+fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<AutoencoderEstimator, AgentError> {
     let learned = present(policy, &task.learned.network, "an autoencoder")?;
     let shape = learned.autoencoder.shape();
     same_observations(task, shape.n_observations)?;
@@ -115,12 +104,7 @@ pub(super) fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<Estimator,
             got: cells(shape.grid.dim()),
         });
     }
-    let follower = Follower::new(&learned.autoencoder)?;
-    Ok(Estimator::Autoencoder {
-        network: learned.clone(),
-        belief: follower.prediction().clone(),
-        follower: Box::new(follower),
-    })
+    Ok(AutoencoderEstimator::new(learned.clone()).map_err(EstimatorError::from)?)
 }
 
 fn present<'a, T>(

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::dqn_input::DqnInput;
+use crate::estimator::Follower;
 use crate::planner::BasisKind;
 use ::network::{Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, NetworkShape};
 use protocol::randomness::split_mix;

@@ -1,21 +1,54 @@
 //! The autoencoder as an estimator: a hidden vector that reads frames (paper eq. 9), and Bayes' rule at
 //! visited cells (eq. 10).
 
+use super::filter::correct;
+use super::{Estimator, EstimatorError};
 use crate::belief::Belief;
-use crate::estimator::ZeroEvidence;
+use crate::learned::{LearnedNetwork, likelihood};
 use ::network::{Autoencoder, NetworkError, Window};
-use protocol::{Frame, Probabilities};
-use thiserror::Error;
+use protocol::{Frame, Grid, Probabilities};
+use std::sync::Arc;
 
-/// Why a frame was not taken in; nothing has changed then.
-#[derive(Debug, Error, PartialEq)]
-pub enum StepError {
-    /// The predictor rules out what was seen.
-    #[error(transparent)]
-    ZeroEvidence(#[from] ZeroEvidence),
-    /// The network.
-    #[error(transparent)]
-    Network(#[from] NetworkError),
+/// A trained network that follows one world.
+pub struct AutoencoderEstimator {
+    network: Arc<LearnedNetwork>,
+    follower: Follower,
+    /// The estimate `p_k` or the predictor `u_{k+1}`.
+    belief: Belief,
+}
+
+impl AutoencoderEstimator {
+    /// Before the first frame.
+    ///
+    /// # Errors
+    /// Where the network's device fails.
+    pub fn new(network: Arc<LearnedNetwork>) -> Result<Self, NetworkError> {
+        let follower = Follower::new(&network.autoencoder)?;
+        Ok(Self {
+            belief: follower.prediction().clone(),
+            follower,
+            network,
+        })
+    }
+}
+
+impl Estimator for AutoencoderEstimator {
+    fn correct(&mut self, frame: &Frame, _: Option<&Grid<u8>>) -> Result<(), EstimatorError> {
+        self.belief = self.follower.step(&self.network.autoencoder, frame)?;
+        Ok(())
+    }
+
+    fn predict(&mut self) {
+        self.belief.clone_from(self.follower.prediction());
+    }
+
+    fn belief(&self) -> &Belief {
+        &self.belief
+    }
+
+    fn follower(&self) -> Option<&Follower> {
+        Some(&self.follower)
+    }
 }
 
 /// What a network knows of one world. Every method takes the same network.
@@ -57,8 +90,8 @@ impl Follower {
     /// [`Self::hidden`] is `h_{k+1}`.
     ///
     /// # Errors
-    /// [`StepError`]; nothing has changed then.
-    pub fn step(&mut self, network: &Autoencoder, frame: &Frame) -> Result<Belief, StepError> {
+    /// [`EstimatorError`]; nothing has changed then.
+    pub fn step(&mut self, network: &Autoencoder, frame: &Frame) -> Result<Belief, EstimatorError> {
         let estimate = self.correct(network, frame)?;
         let hidden = network.advance(&Window::new([frame]), &self.hidden)?;
         self.prediction = accepted(network.predict(&hidden)?);
@@ -67,34 +100,9 @@ impl Follower {
     }
 
     /// Bayes' rule with the learned `O` at visited cells; the predictor elsewhere.
-    fn correct(&self, network: &Autoencoder, frame: &Frame) -> Result<Belief, StepError> {
-        let shape = network.shape();
-        let (n_states, n_cells) = (shape.n_states, shape.grid.n_cells());
-        let matrix = network.observation_matrix()?;
+    fn correct(&self, network: &Autoencoder, frame: &Frame) -> Result<Belief, EstimatorError> {
         let mut estimate = self.prediction.clone();
-        let cells = estimate.probabilities_mut().as_slice_mut();
-        let cells = cells.expect("invariant: beliefs are row-major");
-        for (cell, observed) in frame.observed() {
-            let likelihood = &matrix[usize::from(observed) * n_states..][..n_states];
-            let prior = self.prediction.as_slice()[cell..].iter().step_by(n_cells);
-            let joint = || {
-                let pairs = prior.clone().zip(likelihood);
-                pairs.map(|(&u, &o)| f64::from(u) * f64::from(o))
-            };
-            let evidence: f64 = joint().sum();
-            if evidence <= 0.0 {
-                let (cell, belief) = (shape.grid.cell(cell), prior.copied().collect());
-                return Err(ZeroEvidence {
-                    cell,
-                    observed,
-                    belief,
-                }
-                .into());
-            }
-            for (p, joint) in cells[cell..].iter_mut().step_by(n_cells).zip(joint()) {
-                *p = (joint / evidence) as f32;
-            }
-        }
+        correct(&mut estimate, &likelihood(network)?, frame)?;
         Ok(estimate)
     }
 }

@@ -8,7 +8,7 @@ use crate::checkpoint::{Contents, Problem};
 use crate::client::Observation;
 use crate::compare::planner_seed;
 use crate::config::{AgentConfig, DecisionsConfig};
-use crate::estimator::{Filter, ZeroEvidence};
+use crate::estimator::{BayesFilter, ZeroEvidence};
 use crate::metrics::Tick;
 use crate::planner::{BeamSearch, PlanBasis};
 use crate::policy::EstimatorKind;
@@ -16,7 +16,6 @@ use crate::scoring::score;
 use crate::student::stored::{load_dqn, save_dqn};
 use crate::summary::{spread_summary, summary_length};
 use ::network::{Dqn, Track, Transition};
-use ndarray::Array2;
 use protocol::{Cell, Model, Move};
 use rayon::prelude::*;
 use std::time::{Duration, Instant};
@@ -44,8 +43,7 @@ pub struct DecisionsStudent {
     site: Site,
     config: AgentConfig,
     decisions: Decisions,
-    filter: Filter,
-    likelihood: Array2<f64>,
+    filter: BayesFilter,
     /// The state that pays most.
     target: usize,
     state_names: Vec<String>,
@@ -57,7 +55,7 @@ pub struct DecisionsStudent {
 
 /// One world's robot.
 struct Pilot {
-    filter: Filter,
+    filter: BayesFilter,
     basis: PlanBasis,
     planner: BeamSearch,
     observation: Observation,
@@ -130,7 +128,7 @@ impl DecisionsStudent {
     /// Goes on from some decisions, or begins. `filter` is that of the worlds' model before its first frame.
     pub fn new(
         decisions: Decisions,
-        filter: Filter,
+        filter: BayesFilter,
         model: &Model,
         site: Site,
         config: &AgentConfig,
@@ -140,7 +138,6 @@ impl DecisionsStudent {
             config: config.clone(),
             decisions,
             filter,
-            likelihood: model.likelihood().clone(),
             target: model.target_state(),
             state_names: model.state_names(),
             pilots: Vec::new(),
@@ -237,7 +234,8 @@ impl Student for DecisionsStudent {
         let mut tick = Tick::default();
         for (pilot, observation) in self.pilots.iter_mut().zip(observations) {
             tick.reward += observation.result.reward;
-            tick.score += score(pilot.filter.belief(), &self.likelihood, &observation.frame);
+            let likelihood = pilot.filter.likelihood();
+            tick.score += score(pilot.filter.belief(), likelihood, &observation.frame);
             pilot.filter.correct(&observation.frame)?;
             pilot.observation = observation;
         }

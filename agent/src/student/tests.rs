@@ -9,7 +9,7 @@ use crate::belief::Belief;
 use crate::client::Observation;
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
-use crate::estimator::Filter;
+use crate::estimator::BayesFilter;
 use crate::estimator::learned_filter::Dimensions;
 use crate::planner::{BasisKind, Objective, PlanningProblem, Target};
 use crate::policy::{PlannerKind, Policy};
@@ -129,7 +129,7 @@ fn students_plan_on_the_belief_that_settings_say() {
             choices.iter().map(path).collect()
         });
         let model = Model::wildfire();
-        let filter = Filter::new(&model, Belief::uniform(3, site().shape)).expect("valid");
+        let filter = BayesFilter::known(&model, Belief::uniform(3, site().shape)).expect("valid");
         let decisions = Decisions::first(&model, &config.decisions, 0);
         let student = DecisionsStudent::new(decisions, filter, &model, site(), config);
         let actions = ActionSet::beam(&model);

@@ -4,7 +4,7 @@ use super::{TrainError, Training};
 use crate::checkpoint::{Contents, Problem};
 use crate::client::Client;
 use crate::config::{AgentConfig, LearnerKind};
-use crate::estimator::Filter;
+use crate::estimator::BayesFilter;
 use crate::estimator::learned_filter::{Dimensions, DimensionsError};
 use crate::first_belief::first_belief;
 use crate::student::decisions::{Decisions, DecisionsStudent};
@@ -61,7 +61,7 @@ pub fn student(
             }
             let prior = config.prior(info.burn_in);
             let prior = first_belief(prior, &model, site.shape, config.seed)?;
-            let filter = Filter::new(&model, prior)?;
+            let filter = BayesFilter::known(&model, prior)?;
             Box::new(DecisionsStudent::new(
                 decisions, filter, &model, site, config,
             ))

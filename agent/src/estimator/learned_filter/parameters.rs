@@ -4,10 +4,11 @@
 //! are kept in ±[`BOUND`], so that no weight or probability vanishes and eqs. 3 and 5 never divide
 //! by zero.
 
+use crate::belief::Belief;
 use ndarray::{Array2, NdFloat};
-use protocol::Model;
 use protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
 use protocol::randomness::split_mix;
+use protocol::{Model, Shape};
 use thiserror::Error;
 
 /// Largest size of a free number: weights from 1e-7, probabilities from 1e-14 on.
@@ -211,6 +212,11 @@ impl Parameters {
 }
 
 impl Tables<f32> {
+    /// The learned belief before the first frame, in every cell.
+    pub fn prior(&self, shape: Shape) -> Belief {
+        Belief::everywhere(&self.initial, shape)
+    }
+
     /// A model's own parameters: what learning would have to find. Without its bias: beliefs sum to
     /// one, so away from the edges a bias is equal weights of all states.
     pub fn of_model(model: &Model) -> Self {
