@@ -5,6 +5,9 @@ use super::norm::{Moments, Norm, Sums};
 use crate::dropout::Mask;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor};
 
+/// Positions whose sum is kept in 32 bits. A variance is a difference of two sums, so longer ones lose digits.
+const ROWS: usize = 16;
+
 /// `norm(relu(dropout(z)))`. Arguments: `z [frames, positions, channels]`; `[gamma; beta]`.
 pub(crate) struct DropReluNorm {
     pub(crate) mask: Mask,
@@ -61,19 +64,22 @@ fn sums_of(z: &[f32], mask: &Mask, f: impl Fn(f32, f32, usize) -> [f32; 2] + Syn
     let channels = mask.channels();
     let new = || Sums::new(channels);
     let sums = sums_over_frames(mask.n_frames(), new, |sums, frame| {
-        let (mut s, mut q) = (vec![0.0_f32; channels], vec![0.0_f32; channels]);
         let scales = mask.scales(frame);
-        for first in (frame * per_frame..(frame + 1) * per_frame).step_by(channels) {
-            let z = &z[first..][..channels];
-            for c in 0..channels {
-                let [one, other] = f(z[c], scales[c], first + c);
-                s[c] += one;
-                q[c] += other;
+        let mut first = frame * per_frame;
+        for rows in z[first..][..per_frame].chunks(ROWS * channels) {
+            let (mut s, mut q) = (vec![0.0_f32; channels], vec![0.0_f32; channels]);
+            for z in rows.chunks_exact(channels) {
+                for c in 0..channels {
+                    let [one, other] = f(z[c], scales[c], first + c);
+                    s[c] += one;
+                    q[c] += other;
+                }
+                first += channels;
             }
-        }
-        for c in 0..channels {
-            sums.first[c] += f64::from(s[c]);
-            sums.with_z[c] += f64::from(q[c]);
+            for c in 0..channels {
+                sums.first[c] += f64::from(s[c]);
+                sums.with_z[c] += f64::from(q[c]);
+            }
         }
     });
     Sums::total(sums)
