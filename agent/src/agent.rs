@@ -13,8 +13,11 @@ use crate::checkpoint::Problem;
 use crate::config::AgentConfig;
 use crate::estimator::{Estimator, EstimatorError};
 use crate::learned::{Learned, LearnedNetwork};
-use crate::planner::{CellValues, Objective, Plan, PlanBasis, Planner, PlanningProblem, Target};
+use crate::planner::{
+    CellValues, Objective, Plan, PlanBasis, Planner, PlanningProblem, RandomWalk, Target,
+};
 use crate::policy::{PlannerKind, Policy};
+use crate::scoring::Score;
 use crate::student::decisions::Decisions;
 use protocol::model::ModelError;
 use protocol::outlook::Intent;
@@ -47,6 +50,7 @@ pub struct Agent {
 /// What a path was for.
 enum Aim {
     Nothing,
+    Walk,
     Objective(Target),
     Action(String),
 }
@@ -75,6 +79,19 @@ pub struct Task<'a> {
     pub seed: u64,
     /// What was learned, for policies that act on it.
     pub learned: &'a Learned,
+}
+
+/// What an agent has beside its estimator and its policy.
+#[derive(Debug, Clone)]
+pub struct Setup {
+    /// What paths are planned on.
+    pub basis: PlanBasis,
+    /// Names of the belief's states.
+    pub state_names: Vec<String>,
+    /// Moves in a path.
+    pub n_moves: usize,
+    /// Seed of the planner's random numbers: the agent's and the world's.
+    pub seed: u64,
 }
 
 /// Why an agent cannot go on.
@@ -132,28 +149,43 @@ impl Agent {
     pub fn new(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Self, AgentError> {
         let estimator = estimator(policy, &task)?;
         let n_states = estimator.belief().n_states();
-        let target = task.learned.target(policy.estimator);
-        let mut objective = config.objective(policy);
-        if let (Target::State(state), Some(target)) = (&mut objective.target, target) {
-            *state = target;
-        }
-        let decider = policy
-            .is_decided
-            .then(|| decider(policy, &task, config))
-            .transpose()?;
-        Ok(Self {
-            policy: policy.clone(),
-            objective,
+        let setup = Setup {
             basis: basis(policy, &task, config)?,
-            estimator,
-            planner: config.planner(policy),
-            decider,
-            target,
-            aim: Aim::Nothing,
             state_names: state_names(policy.estimator, task.model, n_states),
             n_moves: task.n_moves,
             seed: task.seed,
-        })
+        };
+        let mut agent = Self::with(estimator, policy, config, setup);
+        agent.target = task.learned.target(policy.estimator);
+        if let (Target::State(state), Some(target)) = (&mut agent.objective.target, agent.target) {
+            *state = target;
+        }
+        if policy.is_decided {
+            agent.decider = Some(decider(policy, &task, config)?);
+        }
+        Ok(agent)
+    }
+
+    /// An agent with an estimator of its own.
+    pub fn with(
+        estimator: Box<dyn Estimator>,
+        policy: &Policy,
+        config: &AgentConfig,
+        setup: Setup,
+    ) -> Self {
+        Self {
+            policy: policy.clone(),
+            objective: config.objective(policy),
+            estimator,
+            basis: setup.basis,
+            planner: config.planner(policy),
+            decider: None,
+            target: None,
+            aim: Aim::Nothing,
+            state_names: setup.state_names,
+            n_moves: setup.n_moves,
+            seed: setup.seed,
+        }
     }
 
     /// The state that the belief calls what pays most; `otherwise` unless that is learned.
@@ -209,6 +241,27 @@ impl Agent {
         self.planner.plan(&problem)
     }
 
+    /// As [`Self::plan`], a path of random moves.
+    pub fn walk(&mut self, robot: Cell, step: u64) -> Plan {
+        self.aim = Aim::Walk;
+        let values = self.objective.values(self.estimator.belief());
+        RandomWalk.plan(&PlanningProblem {
+            start: robot,
+            n_moves: self.n_moves,
+            values: &values,
+            seed: self.seed,
+            step,
+        })
+    }
+
+    /// How well the belief predicts a frame; `None` of an estimator that predicts none.
+    ///
+    /// # Errors
+    /// Where a network's device fails.
+    pub fn score(&self, frame: &Frame) -> Result<Option<Score>, AgentError> {
+        Ok(self.estimator.score(frame)?)
+    }
+
     /// Takes in a frame of X_k (paper eq. 5); `truth` is X_k, for policies that are fed with it.
     ///
     /// # Errors
@@ -248,6 +301,21 @@ impl Agent {
         &*self.estimator
     }
 
+    /// The same, to be changed.
+    pub fn estimator_mut(&mut self) -> &mut dyn Estimator {
+        &mut *self.estimator
+    }
+
+    /// What paths are planned on.
+    pub fn basis_mut(&mut self) -> &mut PlanBasis {
+        &mut self.basis
+    }
+
+    /// The estimate p_k, where paths are planned on it.
+    pub fn estimate(&self) -> Option<&Belief> {
+        self.basis.estimate()
+    }
+
     /// Goes on from a belief about X_{k+1} of its own kind and shape.
     pub fn take_over(&mut self, belief: Belief) {
         self.estimator.set_belief(belief);
@@ -257,6 +325,7 @@ impl Agent {
     fn aim(&self) -> String {
         match &self.aim {
             _ if self.policy.planner == PlannerKind::RandomWalk => RANDOM_MOVES.into(),
+            Aim::Walk => RANDOM_MOVES.into(),
             Aim::Nothing => "nothing yet".into(),
             Aim::Objective(target) => target.label(&self.state_names),
             Aim::Action(name) => name.clone(),

@@ -19,6 +19,8 @@ use std::ops::Range;
 use std::time::Duration;
 use thiserror::Error;
 
+const SHOWS_TRUTH: &str = "invariant: an arena shows hidden states";
+
 /// What is compared.
 #[derive(Debug, Clone)]
 pub struct Comparison {
@@ -88,10 +90,6 @@ struct Run {
     seed: u64,
     tally: Tally,
     moment: Option<Moment>,
-    /// Whether the posterior after the next frame is to be shown.
-    is_shown: bool,
-    /// That posterior.
-    posterior: Option<Belief>,
 }
 
 /// Sums over the steps of a run.
@@ -184,13 +182,7 @@ impl Match<'_> {
     ) -> Result<Vec<Run>, CompareError> {
         let mut runs = self.start(arena)?;
         for step in 0..self.comparison.steps {
-            for index in feed.turn(runs.len()) {
-                runs[index].is_shown = true;
-            }
-            self.step(arena, &mut runs, step)?;
-            for (world, run) in arena.worlds().zip(&mut runs) {
-                run.show(feed, world);
-            }
+            self.step(arena, feed, &mut runs, step)?;
             progress(&self.policy.name, runs.len() as u64);
         }
         Ok(runs)
@@ -205,8 +197,6 @@ impl Match<'_> {
                 seed,
                 tally: Tally::default(),
                 moment: None,
-                is_shown: false,
-                posterior: None,
             })
         };
         worlds
@@ -215,7 +205,13 @@ impl Match<'_> {
             .map_err(|problem| self.wrong(problem))
     }
 
-    fn step(&self, arena: &mut Arena, runs: &mut [Run], step: u64) -> Result<(), CompareError> {
+    fn step(
+        &self,
+        arena: &mut Arena,
+        feed: &mut Feed,
+        runs: &mut [Run],
+        step: u64,
+    ) -> Result<(), CompareError> {
         if self.policy.estimator == EstimatorKind::NextTruth {
             let next = arena.foresee(self.seeds, step + 1)?;
             let foreseen = runs
@@ -227,17 +223,21 @@ impl Match<'_> {
         }
         let is_last = step + 1 == self.comparison.steps;
         let target = arena.model().target_state();
+        let (first_world, shown) = (arena.worlds().start, feed.turn(runs.len()));
         rollout::step(
             runs,
             |run| &mut run.robot,
-            Robot::plan,
+            |run| run.robot.plan(),
             |paths| {
                 arena
                     .step(self.seeds, paths, step + 1)
                     .map_err(StepError::Arena)
             },
-            |run, turn| {
+            |index, run, turn| {
                 run.look(turn, target, is_last);
+                if shown.contains(&index) {
+                    run.show(feed, first_world + index as u32);
+                }
                 Ok(())
             },
         )
@@ -282,11 +282,10 @@ impl From<AgentError> for StepError {
 }
 
 impl Run {
-    fn look(&mut self, turn: Turn<'_>, target: usize, is_last: bool) {
+    fn look(&mut self, turn: Turn, target: usize, is_last: bool) {
         let agent = &self.robot.agent;
-        let truth = turn.truth.expect("invariant: an arena shows hidden states");
+        let truth = turn.truth.as_ref().expect(SHOWS_TRUTH);
         let brier = brier_score(agent.belief(), truth, target, agent.target(target));
-        self.posterior = std::mem::take(&mut self.is_shown).then(|| agent.belief().clone());
         let is_known = agent.policy().estimator == EstimatorKind::KnownModel;
         self.tally.planning += self.robot.planning();
         self.tally.add(self.robot.observation(), brier);
@@ -295,19 +294,16 @@ impl Run {
         }
     }
 
-    /// Shows the belief that was kept for it.
-    fn show(&mut self, feed: &mut Feed, world: u32) {
-        if let Some(belief) = self.posterior.take() {
-            feed.show(&View {
-                world,
-                result: &self.robot.observation().result,
-                belief: &belief,
-                intent: self.robot.agent.intent(self.robot.planning()),
-            });
-        }
+    fn show(&self, feed: &mut Feed, world: u32) {
+        feed.show(&View {
+            world,
+            result: &self.robot.observation().result,
+            belief: self.robot.agent.belief(),
+            intent: self.robot.intent(),
+        });
     }
 
-    fn moment(&self, turn: Turn<'_>) -> Moment {
+    fn moment(&self, turn: Turn) -> Moment {
         let (agent, observation) = (&self.robot.agent, self.robot.observation());
         let (shape, start) = (agent.belief().shape(), turn.before.robot());
         let moves = &turn.plan.moves;
@@ -316,10 +312,7 @@ impl Run {
         Moment {
             seed: self.seed,
             step: observation.result.step,
-            truth: turn
-                .truth
-                .expect("invariant: an arena shows hidden states")
-                .clone(),
+            truth: turn.truth.expect(SHOWS_TRUTH),
             frame: observation.frame.clone(),
             path_cells,
             belief: agent.belief().clone(),

@@ -7,12 +7,13 @@ use crate::belief::Belief;
 use crate::client::{Claim, Client, Observation};
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
-use crate::feed::{Feed, View};
+use crate::feed::Feed;
 use crate::handover::{leave, resume};
 use crate::learned::Learned;
 use crate::planner::Objective;
 use crate::policy::{PlannerKind, Policy};
-use crate::run::RunError;
+use crate::rollout::{self, Robot, Seen};
+use crate::run::{RunError, show};
 use crate::summary::{summarise, summary_names};
 use protocol::Model;
 use protocol::channels::Instance;
@@ -47,13 +48,11 @@ pub struct Decider {
     prior: Belief,
     config: AgentConfig,
     choices: Vec<Policy>,
-    agent: Agent,
-    observation: Observation,
+    robot: Robot,
     last: Decision,
     last_use: Instant,
     info: AgentInfo,
     feed: Feed,
-    planning: Duration,
 }
 
 impl Decider {
@@ -71,7 +70,7 @@ impl Decider {
         let last_use = Instant::now();
         let choices = Policy::choices(task.planner, &model);
         let observation = observe(&mut client)?;
-        let mut agent = agent(
+        let agent = agent(
             &client,
             &model,
             &prior,
@@ -79,26 +78,24 @@ impl Decider {
             &choices,
             &observation,
         )?;
-        if !resume(&mut client, &mut agent, &observation)? {
-            agent.correct(&observation.frame, None)?;
-            agent.predict();
+        let mut robot = Robot::new(agent, observation);
+        if !resume(&mut client, &mut robot)? {
+            robot.begin(None, |_| ())?;
         }
-        let feed = Feed::open(&task.instance, agent.belief());
+        let feed = Feed::open(&task.instance, robot.agent.belief());
         let info = agent_info(task, &model, &choices, &client);
-        let last = decision(&agent, &observation, &client, None);
+        let last = decision(&robot, &client, None);
         Ok(Self {
             client,
             model,
             prior,
             config: task.config.clone(),
             choices,
-            agent,
-            observation,
+            robot,
             last,
             last_use,
             info,
             feed,
-            planning: Duration::ZERO,
         })
     }
 
@@ -120,21 +117,24 @@ impl Decider {
         let world = self.client.worlds().start;
         self.client.reset(&[WorldSeed { world, seed }])?;
         self.last_use = Instant::now();
-        self.observation = observe(&mut self.client)?;
-        self.agent = agent(
+        let observation = observe(&mut self.client)?;
+        let agent = agent(
             &self.client,
             &self.model,
             &self.prior,
             &self.config,
             &self.choices,
-            &self.observation,
+            &observation,
         )?;
-        self.take_in()?;
-        self.last = decision(&self.agent, &self.observation, &self.client, None);
+        self.robot = Robot::new(agent, observation);
+        let feed = &mut self.feed;
+        let look = |robot: &Robot| show(feed, world, robot, false);
+        self.robot.begin(None, look)?;
+        self.last = decision(&self.robot, &self.client, None);
         Ok(&self.last)
     }
 
-    /// Plans, flies, corrects, predicts; `None` if there is no such objective.
+    /// One step of the rollout, for an objective; `None` if there is no such objective.
     ///
     /// # Errors
     /// [`RunError`]; after a refusal everything is as it was.
@@ -142,20 +142,23 @@ impl Decider {
         let Some(target) = self.objective(objective) else {
             return Ok(None);
         };
-        let (robot, step) = (self.observation.robot(), self.observation.result.step);
-        let start = Instant::now();
-        let plan = self.agent.plan_for(target, robot, step);
-        self.planning = start.elapsed();
-        let worlds = self.client.worlds();
-        self.observation = self.client.step(worlds, &[plan.moves])?.remove(0);
-        self.last_use = Instant::now();
-        self.take_in()?;
-        self.last = decision(
-            &self.agent,
-            &self.observation,
-            &self.client,
-            Some(objective),
-        );
+        let world = self.client.worlds().start;
+        rollout::step(
+            std::slice::from_mut(&mut self.robot),
+            |robot| robot,
+            |robot| robot.plan_with(|agent, cell, step| agent.plan_for(target, cell, step)),
+            |paths| {
+                let observation = self.client.step(world..world + 1, paths)?.remove(0);
+                self.last_use = Instant::now();
+                let truth = None;
+                Ok::<_, RunError>(vec![Seen { observation, truth }])
+            },
+            |_, robot, _| {
+                show(&mut self.feed, world, robot, false);
+                Ok(())
+            },
+        )?;
+        self.last = decision(&self.robot, &self.client, Some(objective));
         Ok(Some(&self.last))
     }
 
@@ -188,22 +191,8 @@ impl Decider {
     /// # Errors
     /// [`RunError::Connection`].
     pub fn release(mut self) -> Result<(), RunError> {
-        leave(&mut self.client, &self.agent, &self.observation)?;
+        leave(&mut self.client, &self.robot)?;
         Ok(self.client.release()?)
-    }
-
-    fn take_in(&mut self) -> Result<(), RunError> {
-        self.agent.correct(&self.observation.frame, None)?;
-        if self.feed.is_due() {
-            self.feed.show(&View {
-                world: self.client.worlds().start,
-                result: &self.observation.result,
-                belief: self.agent.belief(),
-                intent: self.agent.intent(self.planning),
-            });
-        }
-        self.agent.predict();
-        Ok(())
     }
 
     fn objective(&self, index: u64) -> Option<Objective> {
@@ -237,12 +226,8 @@ fn agent(
     Ok(Agent::new(&choices[0], config, task)?)
 }
 
-fn decision(
-    agent: &Agent,
-    observation: &Observation,
-    client: &Client,
-    objective: Option<u64>,
-) -> Decision {
+fn decision(robot: &Robot, client: &Client, objective: Option<u64>) -> Decision {
+    let observation = robot.observation();
     let result = &observation.result;
     Decision {
         step: result.step,
@@ -256,7 +241,11 @@ fn decision(
         seed: result.seed,
         episode: result.episode,
         objective,
-        summary: summarise(agent.belief(), observation.robot(), client.info().n_moves),
+        summary: summarise(
+            robot.agent.belief(),
+            observation.robot(),
+            client.info().n_moves,
+        ),
     }
 }
 

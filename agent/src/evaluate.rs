@@ -8,14 +8,13 @@ use crate::arena::{Arena, ArenaError};
 use crate::belief::Belief;
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
-use crate::estimator::EstimatorError;
 use crate::first_belief::first_belief;
 use crate::learned::Learned;
 use crate::policy::{EstimatorKind, Policy, UnknownPolicy};
 use crate::rollout::{self, Robot, Seen};
-use crate::scoring::{Score, score};
-use ndarray::Array2;
+use crate::scoring::Score;
 use protocol::model::ModelError;
+use rayon::prelude::*;
 use std::ops::Range;
 use thiserror::Error;
 
@@ -87,10 +86,11 @@ pub fn examine(
             rollout::step(
                 &mut examinees,
                 |examinee| &mut examinee.guide,
-                Robot::plan,
+                |examinee| examinee.guide.plan(),
                 |paths| Ok::<_, ExaminationError>(arena.step(batch, paths, step)?),
-                |examinee, _| examinee.look(),
+                |_, _, _| Ok(()),
             )?;
+            examinees.par_iter_mut().try_for_each(Examinee::look)?;
         }
         marks.extend(examinees.into_iter().map(|examinee| examinee.marks));
     }
@@ -114,7 +114,7 @@ pub fn score_of_frequencies(all: &[Marks], counts: &[u64]) -> Score {
 /// Estimators on one world, and who chooses the paths.
 struct Examinee {
     guide: Robot,
-    estimators: Vec<(Agent, Array2<f64>)>,
+    estimators: Vec<Agent>,
     marks: Marks,
 }
 
@@ -139,23 +139,10 @@ impl Examinee {
             let policy = Policy::named(name, model)?;
             Ok(Agent::new(&policy, examination.config, task)?)
         };
-        let estimator = |&kind: &EstimatorKind| -> Result<_, ExaminationError> {
-            let learned = examination.learned;
-            let (policy, likelihood) = match kind {
-                EstimatorKind::Learned => ("learned_beam", learned.filter_likelihood()),
-                EstimatorKind::Autoencoder => {
-                    let likelihood = learned.network_likelihood();
-                    (
-                        "autoencoder_beam",
-                        likelihood
-                            .map_err(EstimatorError::from)
-                            .map_err(AgentError::from)?,
-                    )
-                }
-                _ => ("beam_exploit", None),
-            };
-            let likelihood = likelihood.unwrap_or_else(|| model.likelihood().clone());
-            Ok((agent(policy)?, likelihood))
+        let estimator = |kind: &EstimatorKind| match kind {
+            EstimatorKind::Learned => agent("learned_beam"),
+            EstimatorKind::Autoencoder => agent("autoencoder_beam"),
+            _ => agent("beam_exploit"),
         };
         let estimators = examination.estimators.iter().map(estimator);
         let mut examinee = Self {
@@ -175,8 +162,8 @@ impl Examinee {
     fn look(&mut self) -> Result<(), AgentError> {
         let frame = &self.guide.observation().frame;
         let scores = self.marks.scores.iter_mut().zip(&self.estimators);
-        for (sum, (agent, likelihood)) in scores {
-            *sum += score(agent.belief(), likelihood, frame);
+        for (sum, agent) in scores {
+            *sum += agent.score(frame)?.unwrap_or_default();
         }
         for (_, value) in frame.observed() {
             self.marks.counts[usize::from(value)] += 1;
@@ -185,7 +172,7 @@ impl Examinee {
     }
 
     fn filter(&mut self) -> Result<(), AgentError> {
-        for (agent, _) in &mut self.estimators {
+        for agent in &mut self.estimators {
             agent.correct(&self.guide.observation().frame, None)?;
             agent.predict();
         }

@@ -1,9 +1,9 @@
 //! How an agent goes on with what another believed: from the belief that it left with the server, or
 //! else from the frames that the server keeps.
 
-use crate::agent::Agent;
 use crate::belief::Belief;
-use crate::client::{Client, Observation};
+use crate::client::Client;
+use crate::rollout::Robot;
 use crate::run::RunError;
 use protocol::Probabilities;
 use protocol::connection::ConnectionError;
@@ -12,20 +12,17 @@ use protocol::message::Status;
 /// Frames that are recalled before the lease is renewed: much less than the shortest lease takes.
 const RENEW_AFTER: u64 = 500;
 
-/// Gives an agent what is known of a world before its present frame; returns whether that frame is in it
-/// already, and the belief about X_{k+1}.
+/// Gives a robot's agent what is known of its world before the present frame; returns whether that frame is in
+/// it already, and the belief about X_{k+1}.
 ///
 /// # Errors
 /// [`RunError`].
-pub fn resume(
-    client: &mut Client,
-    agent: &mut Agent,
-    present: &Observation,
-) -> Result<bool, RunError> {
-    let step = present.result.step;
-    if take_over_left(client, agent, present)? {
+pub fn resume(client: &mut Client, robot: &mut Robot) -> Result<bool, RunError> {
+    if take_over_left(client, robot)? {
         return Ok(true);
     }
+    let step = robot.observation().result.step;
+    let agent = &mut robot.agent;
     if !agent.estimator().sees_frames() {
         return Ok(false);
     }
@@ -53,18 +50,15 @@ pub fn resume(
 ///
 /// # Errors
 /// [`ConnectionError`].
-pub fn take_over_left(
-    client: &mut Client,
-    agent: &mut Agent,
-    present: &Observation,
-) -> Result<bool, ConnectionError> {
+pub fn take_over_left(client: &mut Client, robot: &mut Robot) -> Result<bool, ConnectionError> {
+    let step = robot.observation().result.step;
+    let agent = &mut robot.agent;
     let Some(kind) = agent.estimator().kind() else {
         return Ok(false);
     };
     let Some(belief) = belief_left(client, &kind, agent.belief())? else {
         return Ok(false);
     };
-    let step = present.result.step;
     tracing::info!(step, "going on from the belief that was left");
     agent.take_over(belief);
     Ok(true)
@@ -74,11 +68,8 @@ pub fn take_over_left(
 ///
 /// # Errors
 /// [`ConnectionError`].
-pub fn leave(
-    client: &mut Client,
-    agent: &Agent,
-    present: &Observation,
-) -> Result<(), ConnectionError> {
+pub fn leave(client: &mut Client, robot: &Robot) -> Result<(), ConnectionError> {
+    let (agent, present) = (&robot.agent, robot.observation());
     let Some(kind) = agent.estimator().kind() else {
         return Ok(());
     };

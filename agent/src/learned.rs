@@ -104,24 +104,6 @@ impl Learned {
             _ => None,
         }
     }
-
-    /// `P(y | x)` of the filter, shape `[S, O]`.
-    pub fn filter_likelihood(&self) -> Option<Array2<f64>> {
-        self.filter
-            .as_ref()
-            .map(|filter| filter.tables.likelihood_array())
-    }
-
-    /// `P(y | x)` of the autoencoder, shape `[S, O]`.
-    ///
-    /// # Errors
-    /// As the network's device.
-    pub fn network_likelihood(&self) -> Result<Option<Array2<f64>>, NetworkError> {
-        let network = self.network.as_ref();
-        network
-            .map(|network| likelihood(&network.autoencoder))
-            .transpose()
-    }
 }
 
 /// The settings that a checkpoint was trained with.

@@ -68,7 +68,7 @@ impl Learner {
         }
     }
 
-    /// A world's track begins, here or anew.
+    /// A world's track begins, for the first time or again.
     pub fn begin(&mut self, world: u32) {
         self.replay.begin(world);
     }
@@ -78,11 +78,15 @@ impl Learner {
         self.replay.has_track(world)
     }
 
-    /// A world's next frame, with the belief before it.
-    pub fn see(&mut self, world: u32, predictor: &Belief, frame: &Frame) {
+    /// The belief before a world's next frame.
+    pub fn expect(&mut self, world: u32, predictor: &Belief) {
         if self.replay.wants_belief(world) {
             self.replay.give_belief(world, predictor.as_slice());
         }
+    }
+
+    /// A world's next frame.
+    pub fn see(&mut self, world: u32, frame: &Frame) {
         self.replay.push(world, frame);
     }
 

@@ -23,7 +23,6 @@ pub mod launch;
 pub mod learned;
 pub mod learner;
 pub mod metrics;
-pub mod pilot;
 pub mod planner;
 pub mod policy;
 pub mod replay;

@@ -1,10 +1,12 @@
-//! One step of agents on their worlds: plan, fly, correct, look, predict. Every command steps this way.
+//! One step of robots on their worlds: plan, fly, correct, look, predict. Every command steps this way.
 //!
 //! Pure but for what flies the paths, which the caller gives.
 
 use crate::agent::{Agent, AgentError};
 use crate::client::Observation;
 use crate::planner::Plan;
+use crate::scoring::Score;
+use protocol::outlook::Intent;
 use protocol::{Cell, Grid, Move};
 use rayon::prelude::*;
 use std::time::{Duration, Instant};
@@ -22,23 +24,25 @@ pub struct Robot {
 pub struct Seen {
     /// Result and frame.
     pub observation: Observation,
-    /// The hidden states X_k, shape `[H, W]`, where somebody knows them.
+    /// The hidden states X_k, shape `[H, W]`, where they are published.
     pub truth: Option<Grid<u8>>,
 }
 
-/// What a step did to one robot, told between correction and prediction: its agent's belief is the posterior.
-pub struct Turn<'a> {
+/// What a step did to one robot. Between correction and prediction: its agent's belief is the posterior.
+pub struct Turn {
     /// What the world showed before.
     pub before: Observation,
     /// The path that was flown.
     pub plan: Plan,
-    /// The hidden states X_{k+1}, where somebody knows them.
-    pub truth: Option<&'a Grid<u8>>,
+    /// The hidden states X_{k+1}, where they are published.
+    pub truth: Option<Grid<u8>>,
+    /// How well the prediction before the frame fits it, where the estimator has one.
+    pub score: Option<Score>,
 }
 
 impl Robot {
-    /// An agent that has taken in all that its world shows: its belief is about X_{k+1}.
-    pub fn resumed(agent: Agent, observation: Observation) -> Self {
+    /// An agent before it takes in what its world shows.
+    pub fn new(agent: Agent, observation: Observation) -> Self {
         Self {
             agent,
             observation,
@@ -46,15 +50,34 @@ impl Robot {
         }
     }
 
-    /// An agent before its first frame takes in what its world shows.
+    /// Takes in what the world shows; `look` finds the posterior. The belief is then about X_{k+1}.
     ///
     /// # Errors
-    /// [`AgentError`] if the frame is impossible or the hidden states are missing.
+    /// If the frame is impossible or the hidden states are missing.
+    pub fn begin(
+        &mut self,
+        truth: Option<&Grid<u8>>,
+        look: impl FnOnce(&Self),
+    ) -> Result<(), AgentError> {
+        self.correct(truth)?;
+        look(self);
+        self.agent.predict();
+        Ok(())
+    }
+
+    /// [`Self::new`] and [`Self::begin`].
+    ///
+    /// # Errors
+    /// As [`Self::begin`].
     pub fn at(agent: Agent, seen: Seen) -> Result<Self, AgentError> {
-        let mut robot = Self::resumed(agent, seen.observation);
-        robot.correct(seen.truth.as_ref())?;
-        robot.agent.predict();
+        let mut robot = Self::new(agent, seen.observation);
+        robot.begin(seen.truth.as_ref(), |_| ())?;
         Ok(robot)
+    }
+
+    /// What it tells those who look on.
+    pub fn intent(&self) -> Intent {
+        self.agent.intent(self.planning)
     }
 
     /// What its world shows.
@@ -81,15 +104,17 @@ impl Robot {
         plan
     }
 
-    /// Puts in what the world shows by now, and corrects the belief; returns what it showed before.
-    fn see(
-        &mut self,
-        seen: Observation,
-        truth: Option<&Grid<u8>>,
-    ) -> Result<Observation, AgentError> {
-        let before = std::mem::replace(&mut self.observation, seen);
-        self.correct(truth)?;
-        Ok(before)
+    fn see(&mut self, plan: Plan, seen: Seen) -> Result<Turn, AgentError> {
+        let Seen { observation, truth } = seen;
+        let score = self.agent.score(&observation.frame)?;
+        let before = std::mem::replace(&mut self.observation, observation);
+        self.correct(truth.as_ref())?;
+        Ok(Turn {
+            before,
+            plan,
+            truth,
+            score,
+        })
     }
 
     fn correct(&mut self, truth: Option<&Grid<u8>>) -> Result<(), AgentError> {
@@ -98,36 +123,25 @@ impl Robot {
 }
 
 /// One step of all robots. `robot` finds a run's own; `plan` chooses its path; `fly` flies all paths and gives what
-/// each world shows then, in order; `look` is told of each robot's turn.
+/// each world shows then, in order; `look` is told of each run's turn, by its index, one after the other.
 ///
 /// # Errors
-/// Those of `fly`, and [`AgentError`] of the first agent that cannot take in what it sees.
-pub fn step<R: Send, E: From<AgentError> + Send>(
+/// Those of `fly` and `look`, and that of the first agent that cannot take in what it sees.
+pub fn step<R: Send, E: From<AgentError>>(
     runs: &mut [R],
     robot: impl Fn(&mut R) -> &mut Robot + Sync,
-    plan: impl Fn(&mut Robot) -> Plan + Sync,
+    plan: impl Fn(&mut R) -> Plan + Sync,
     fly: impl FnOnce(&[Vec<Move>]) -> Result<Vec<Seen>, E>,
-    look: impl Fn(&mut R, Turn<'_>) -> Result<(), AgentError> + Sync,
+    mut look: impl FnMut(usize, &mut R, Turn) -> Result<(), E>,
 ) -> Result<(), E> {
-    let plans = in_parallel(runs.iter_mut(), |run| plan(robot(run)));
+    let plans = in_parallel(runs.iter_mut(), plan);
     let paths: Vec<Vec<Move>> = plans.iter().map(|plan| plan.moves.clone()).collect();
-    let seen = fly(&paths)?;
-    let turns = runs.iter_mut().zip(plans).zip(seen);
-    let taken = in_parallel(turns, |((run, plan), Seen { observation, truth })| {
-        let truth = truth.as_ref();
-        let before = robot(run).see(observation, truth)?;
-        look(
-            run,
-            Turn {
-                before,
-                plan,
-                truth,
-            },
-        )?;
-        robot(run).agent.predict();
-        Ok(())
-    });
-    taken.into_iter().collect::<Result<(), AgentError>>()?;
+    let seen = runs.iter_mut().zip(plans).zip(fly(&paths)?);
+    let turns = in_parallel(seen, |((run, plan), seen)| robot(run).see(plan, seen));
+    for (index, (run, turn)) in runs.iter_mut().zip(turns).enumerate() {
+        look(index, run, turn?)?;
+    }
+    in_parallel(runs.iter_mut(), |run| robot(run).agent.predict());
     Ok(())
 }
 

@@ -14,6 +14,7 @@ use crate::first_belief::first_belief;
 use crate::handover::{leave, resume, take_over_left};
 use crate::learned::Learned;
 use crate::policy::{EstimatorKind, Policy, UnknownPolicy};
+use crate::rollout::{self, Robot, Seen};
 use crate::truth::{TruthError, TruthFeed};
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
@@ -138,14 +139,13 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
     }
     let Attached {
         mut client,
-        agent,
-        observation,
+        robot,
         feed,
         ..
     } = attached;
     // After an outage nobody knows where the world stands.
     let left = match is_in_step {
-        true => leave(&mut client, &agent, &observation),
+        true => leave(&mut client, &robot),
         false => Ok(()),
     };
     let released = left.and_then(|()| client.release());
@@ -160,10 +160,8 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
 struct Attached {
     client: Client,
     truth: Option<TruthFeed>,
-    agent: Agent,
-    observation: Observation,
+    robot: Robot,
     feed: Feed,
-    planning: Duration,
     report: Report,
 }
 
@@ -197,9 +195,8 @@ impl Attached {
         };
         let prior = first_belief(prior, &model, shape, mission.config.seed)?;
         let mut attached = Self::acquire(mission, takeover, &model, &policy, &prior)?;
-        let present = &attached.observation;
-        if !resume(&mut attached.client, &mut attached.agent, present)? {
-            attached.take_in(false)?;
+        if !resume(&mut attached.client, &mut attached.robot)? {
+            attached.begin()?;
         }
         Ok(attached)
     }
@@ -217,8 +214,7 @@ impl Attached {
             return Ok(None);
         }
         let mut attached = Self::acquire(mission, takeover, model, policy, any)?;
-        let present = &attached.observation;
-        if take_over_left(&mut attached.client, &mut attached.agent, present)? {
+        if take_over_left(&mut attached.client, &mut attached.robot)? {
             return Ok(Some(attached));
         }
         // Another agent acted since.
@@ -274,52 +270,64 @@ impl Attached {
         Ok(Self {
             client,
             truth,
-            agent,
-            observation,
+            robot: Robot::new(agent, observation),
             feed,
-            planning: Duration::ZERO,
             report,
         })
     }
 
-    /// Plans, flies, corrects, predicts; returns the reward. The last belief is shown in any case.
+    fn begin(&mut self) -> Result<(), RunError> {
+        let truth = self.truth.as_ref();
+        let truth = truth_of(truth, &self.client, self.robot.observation())?;
+        let (feed, world) = (&mut self.feed, self.client.worlds().start);
+        let look = |robot: &Robot| show(feed, world, robot, false);
+        Ok(self.robot.begin(truth.as_ref(), look)?)
+    }
+
+    /// One step of the rollout; returns the reward. The last belief is shown in any case.
     fn step(&mut self, is_last: bool) -> Result<f64, RunError> {
-        let start = Instant::now();
-        let plan = self
-            .agent
-            .plan(self.observation.robot(), self.observation.result.step);
-        self.planning = start.elapsed();
-        self.observation = self
-            .client
-            .step(self.client.worlds(), &[plan.moves])?
-            .remove(0);
-        self.take_in(is_last)?;
-        Ok(self.observation.result.reward)
+        let world = self.client.worlds().start;
+        rollout::step(
+            std::slice::from_mut(&mut self.robot),
+            |robot| robot,
+            Robot::plan,
+            |paths| {
+                let observation = self.client.step(world..world + 1, paths)?.remove(0);
+                let truth = truth_of(self.truth.as_ref(), &self.client, &observation)?;
+                Ok::<_, RunError>(vec![Seen { observation, truth }])
+            },
+            |_, robot, _| {
+                show(&mut self.feed, world, robot, is_last);
+                Ok(())
+            },
+        )?;
+        Ok(self.robot.observation().result.reward)
     }
+}
 
-    fn take_in(&mut self, is_last: bool) -> Result<(), RunError> {
-        let truth = self.read_truth()?;
-        self.agent
-            .correct(&self.observation.frame, truth.as_ref())?;
-        if self.feed.is_due() || is_last {
-            self.feed.show(&View {
-                world: self.client.worlds().start,
-                result: &self.observation.result,
-                belief: self.agent.belief(),
-                intent: self.agent.intent(self.planning),
-            });
-        }
-        self.agent.predict();
-        Ok(())
-    }
+/// The hidden states that an observation shows part of, for policies that are told them.
+fn truth_of(
+    feed: Option<&TruthFeed>,
+    client: &Client,
+    observation: &Observation,
+) -> Result<Option<Grid<u8>>, TruthError> {
+    let Some(feed) = feed else {
+        return Ok(None);
+    };
+    let result = &observation.result;
+    let states = feed.states(client.worlds(), &[result.seed], result.step)?;
+    Ok(states.into_iter().next())
+}
 
-    fn read_truth(&self) -> Result<Option<Grid<u8>>, TruthError> {
-        let Some(feed) = &self.truth else {
-            return Ok(None);
-        };
-        let result = &self.observation.result;
-        let states = feed.states(self.client.worlds(), &[result.seed], result.step)?;
-        Ok(states.into_iter().next())
+/// Shows a robot's posterior to those who look on, if it is time or in any case.
+pub fn show(feed: &mut Feed, world: u32, robot: &Robot, in_any_case: bool) {
+    if feed.is_due() || in_any_case {
+        feed.show(&View {
+            world,
+            result: &robot.observation().result,
+            belief: robot.agent.belief(),
+            intent: robot.intent(),
+        });
     }
 }
 

@@ -7,13 +7,15 @@ mod stored;
 #[cfg(test)]
 mod tests;
 
+use crate::agent::AgentError;
 use crate::belief::Belief;
 use crate::checkpoint::Contents;
 use crate::client::Observation;
-use crate::estimator::{EstimatorError, ZeroEvidence, learned_filter};
+use crate::estimator::learned_filter;
 use crate::metrics::Tick;
-use crate::policy::EstimatorKind;
+use crate::rollout::{Robot, Seen};
 use ::network::NetworkError;
+use protocol::connection::ConnectionError;
 use protocol::{Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
@@ -32,16 +34,11 @@ pub struct Site {
     pub worlds: Range<u32>,
 }
 
-/// What a student makes of a world.
-#[derive(Debug, Clone)]
-pub struct Impression {
-    /// What it believes after the last frame, the posterior.
-    pub belief: Belief,
-    /// What its path was for, in a word or two.
-    pub objective: String,
-    /// Time that the path's plan took.
-    pub planning: Duration,
-}
+/// Flies a path in each world; gives what they show then, in order.
+pub type Fly<'a> = &'a mut dyn FnMut(&[Vec<Move>]) -> Result<Vec<Observation>, ConnectionError>;
+
+/// Is told of each robot, by its index, when its belief is the posterior.
+pub type Look<'a> = &'a mut dyn FnMut(usize, &Robot);
 
 /// What one update did.
 #[derive(Debug, Clone, PartialEq)]
@@ -69,11 +66,14 @@ impl Lesson {
 }
 
 /// Why a student cannot go on.
-#[derive(Debug, PartialEq, Error)]
+#[derive(Debug, Error)]
 pub enum StudentError {
-    /// A frame that the belief held for impossible.
+    /// What it sees does not fit what it believes.
     #[error(transparent)]
-    ZeroEvidence(#[from] ZeroEvidence),
+    Agent(#[from] AgentError),
+    /// The worlds cannot be reached.
+    #[error(transparent)]
+    Connection(#[from] ConnectionError),
     /// A number that is not finite.
     #[error(transparent)]
     NotFinite(#[from] NotFinite),
@@ -90,16 +90,6 @@ pub enum NotFinite {
     /// In the autoencoder or the DQN.
     #[error(transparent)]
     Network(#[from] NetworkError),
-}
-
-impl From<EstimatorError> for StudentError {
-    fn from(error: EstimatorError) -> Self {
-        match error {
-            EstimatorError::ZeroEvidence(error) => error.into(),
-            EstimatorError::Network(error) => error.into(),
-            other => unreachable!("no truth was asked for: {other}"),
-        }
-    }
 }
 
 impl From<NetworkError> for StudentError {
@@ -128,25 +118,17 @@ pub trait Student {
     /// [`StudentError`].
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError>;
 
-    /// A world begins anew.
+    /// A world begins again.
     ///
     /// # Errors
     /// [`StudentError`].
     fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError>;
 
-    /// The next path of each world.
-    fn plan(&mut self) -> Vec<Vec<Move>>;
-
-    /// Takes in what the paths showed: scores the prediction, corrects, predicts, remembers. Gives what it makes
-    /// of the worlds that are `watched`, by their index.
+    /// One step of the rollout in all worlds: plans, flies, scores, corrects, remembers, predicts.
     ///
     /// # Errors
     /// [`StudentError`].
-    fn take_in(
-        &mut self,
-        observations: Vec<Observation>,
-        watched: &[usize],
-    ) -> Result<(Tick, Vec<Impression>), StudentError>;
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError>;
 
     /// Makes the updates that the steps since the last call have earned.
     ///
@@ -163,12 +145,6 @@ pub trait Student {
     /// Updates of the model so far.
     fn n_updates(&self) -> u64;
 
-    /// Where its beliefs come from.
-    fn estimator(&self) -> EstimatorKind;
-
-    /// Names of its beliefs' states.
-    fn state_names(&self) -> Vec<String>;
-
     /// What it predicts of its first world, and the state of that which it thinks pays most.
     fn belief(&self) -> Option<(&Belief, usize)>;
 
@@ -180,4 +156,13 @@ pub trait Student {
 
     /// Time spent so far, by part.
     fn times(&self) -> Vec<(&'static str, Duration)>;
+}
+
+/// Observations without hidden states, as learners get them.
+fn without_truth(observations: Vec<Observation>) -> Vec<Seen> {
+    let seen = |observation| Seen {
+        observation,
+        truth: None,
+    };
+    observations.into_iter().map(seen).collect()
 }

@@ -16,14 +16,14 @@ use crate::checkpoint::{self, Contents};
 use crate::client::{Claim, Client, Observation};
 use crate::feed::{Feed, View};
 use crate::metrics::{FROZEN, METRICS, Metrics, MetricsError, Tick};
+use crate::rollout::Robot;
 use crate::scoring::Score;
-use crate::student::{Impression, Student, StudentError};
+use crate::student::{Student, StudentError};
 use crate::tensorboard::EventsError;
 use protocol::Move;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::WorldSeed;
-use protocol::message::StepResult;
 use protocol::outlook::Intent;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -166,10 +166,8 @@ impl Trainee {
         let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
         let is_done = |steps: u64| training.steps > 0 && steps >= training.steps;
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
-            let paths = self.student.plan();
-            let observations = self.fly(&paths)?;
-            let taken = self.take_in(observations)?;
-            let tick = taken.map_err(|problem| training.stopped(problem, &*self.student))?;
+            let tick = self.step();
+            let tick = tick.map_err(|problem| training.stopped(problem, &*self.student))?;
             let lessons = match training.freeze {
                 true => Ok(Vec::new()),
                 false => self.student.learn(),
@@ -188,65 +186,50 @@ impl Trainee {
         Ok(())
     }
 
-    /// One step of each world.
-    fn fly(&mut self, paths: &[Vec<Move>]) -> Result<Vec<Observation>, ConnectionError> {
-        let worlds = self.client.worlds();
-        match self.student.wants_full_frames() {
-            true => self.client.step_full(worlds, paths),
-            false => self.client.step(worlds, paths),
-        }
-    }
-
-    /// Scores, corrects, predicts; worlds at the end of their episodes begin anew.
-    fn take_in(
-        &mut self,
-        observations: Vec<Observation>,
-    ) -> Result<Result<Tick, StudentError>, ConnectionError> {
-        let ended = self.client.worlds().zip(&observations);
-        let ended = ended.filter(|(_, seen)| is_over(seen));
-        let ended: Vec<u32> = ended.map(|(world, _)| world).collect();
-        let feed = self.feed.as_ref();
-        let watched = feed.map_or_else(Vec::new, |feed| feed.turn(observations.len()));
-        let results: Vec<_> = watched
-            .iter()
-            .map(|&index| observations[index].result)
-            .collect();
-        let (tick, impressions) = match self.student.take_in(observations, &watched) {
-            Ok(taken) => taken,
-            Err(problem) => return Ok(Err(problem)),
+    /// One step of each world; worlds at the end of their episodes begin again.
+    fn step(&mut self) -> Result<Tick, StudentError> {
+        let Self {
+            client,
+            student,
+            feed,
+            ..
+        } = self;
+        let (worlds, wants_full) = (client.worlds(), student.wants_full_frames());
+        let shown = feed
+            .as_ref()
+            .map_or_else(Vec::new, |feed| feed.turn(worlds.len()));
+        let (policy, mut ended) = (format!("train {}", student.kind()), Vec::new());
+        let mut fly = |paths: &[Vec<Move>]| {
+            let observations = match wants_full {
+                true => client.step_full(worlds.clone(), paths)?,
+                false => client.step(worlds.clone(), paths)?,
+            };
+            let over = worlds.clone().zip(&observations);
+            let over = over.filter(|(_, seen)| is_over(seen));
+            ended.extend(over.map(|(world, _)| world));
+            Ok(observations)
         };
-        for ((index, result), seen) in watched.into_iter().zip(&results).zip(impressions) {
-            self.show(self.client.worlds().start + index as u32, result, seen);
-        }
-        for world in ended {
-            let observation = reset(&mut self.client, world)?;
-            if let Err(problem) = self.student.begin(world, observation) {
-                return Ok(Err(problem));
+        let mut look = |index: usize, robot: &Robot| {
+            if let Some(feed) = feed.as_mut().filter(|_| shown.contains(&index)) {
+                feed.show(&View {
+                    world: worlds.start + index as u32,
+                    result: &robot.observation().result,
+                    belief: robot.agent.belief(),
+                    intent: Intent {
+                        policy: policy.clone(),
+                        ..robot.intent()
+                    },
+                });
             }
+        };
+        let tick = student.step(&mut fly, &mut look)?;
+        for world in ended {
+            let observation = reset(client, world)?;
+            student.begin(world, observation)?;
         }
         self.summary.steps += tick.n_worlds;
         self.summary.reward += tick.reward;
-        Ok(Ok(tick))
-    }
-
-    /// Shows what the student makes of a world.
-    fn show(&mut self, world: u32, result: &StepResult, seen: Impression) {
-        let estimator = self.student.estimator().label();
-        let intent = Intent {
-            policy: format!("train {}", self.student.kind()),
-            belief_from: estimator.into(),
-            objective: seen.objective,
-            states: self.student.state_names(),
-            plan_millis: seen.planning.as_secs_f64() * 1e3,
-        };
-        if let Some(feed) = &mut self.feed {
-            feed.show(&View {
-                world,
-                result,
-                belief: &seen.belief,
-                intent,
-            });
-        }
+        Ok(tick)
     }
 
     /// Writes the checkpoint, unless nothing is learned, and the metrics.

@@ -34,7 +34,7 @@ impl AdamSettings {
 }
 
 /// Adam's moments of each variable, by name, and how many steps they have seen.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 pub struct Adam {
     moments: BTreeMap<String, [Tensor; 2]>,
     steps: u64,

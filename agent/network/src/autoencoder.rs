@@ -16,6 +16,7 @@ use protocol::grid::Probabilities;
 use protocol::randomness::{Purpose, stream};
 use serde::{Deserialize, Serialize};
 use std::fmt;
+use std::sync::Arc;
 
 /// Sizes and step size.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -62,7 +63,7 @@ pub struct Autoencoder {
     shape: NetworkShape,
     seed: u64,
     device: Device,
-    network: Network,
+    network: Arc<Network>,
     variables: Variables,
     adam: Adam,
     n_updates: u64,
@@ -87,10 +88,24 @@ impl Autoencoder {
             shape,
             seed,
             device: device.clone(),
-            network,
+            network: Arc::new(network),
             variables,
             n_updates: 0,
         })
+    }
+
+    /// The same network for another owner, who reads it: both see the updates that one makes.
+    pub fn shared(&self) -> Self {
+        Self {
+            settings: self.settings,
+            shape: self.shape.clone(),
+            seed: self.seed,
+            device: self.device.clone(),
+            network: self.network.clone(),
+            variables: self.variables.clone(),
+            adam: self.adam.clone(),
+            n_updates: self.n_updates,
+        }
     }
 
     /// Sizes and step size.

@@ -104,7 +104,7 @@ fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<AutoencoderEstimator,
             got: cells(shape.grid.dim()),
         });
     }
-    Ok(AutoencoderEstimator::new(learned.clone()).map_err(EstimatorError::from)?)
+    Ok(AutoencoderEstimator::new(&learned.autoencoder).map_err(EstimatorError::from)?)
 }
 
 fn present<'a, T>(

@@ -4,14 +4,14 @@
 use super::filter::correct;
 use super::{Estimator, EstimatorError};
 use crate::belief::Belief;
-use crate::learned::{LearnedNetwork, likelihood};
+use crate::learned::likelihood;
+use crate::scoring::{Score, score};
 use ::network::{Autoencoder, NetworkError, Window};
 use protocol::{Frame, Grid, Probabilities};
-use std::sync::Arc;
 
-/// A trained network that follows one world.
+/// A network that follows one world.
 pub struct AutoencoderEstimator {
-    network: Arc<LearnedNetwork>,
+    network: Autoencoder,
     follower: Follower,
     /// The estimate `p_k` or the predictor `u_{k+1}`.
     belief: Belief,
@@ -22,19 +22,23 @@ impl AutoencoderEstimator {
     ///
     /// # Errors
     /// Where the network's device fails.
-    pub fn new(network: Arc<LearnedNetwork>) -> Result<Self, NetworkError> {
-        let follower = Follower::new(&network.autoencoder)?;
-        Ok(Self {
+    pub fn new(network: &Autoencoder) -> Result<Self, NetworkError> {
+        Ok(Self::at(network, Follower::new(network)?))
+    }
+
+    /// Where another follower was.
+    pub fn at(network: &Autoencoder, follower: Follower) -> Self {
+        Self {
+            network: network.shared(),
             belief: follower.prediction().clone(),
             follower,
-            network,
-        })
+        }
     }
 }
 
 impl Estimator for AutoencoderEstimator {
     fn correct(&mut self, frame: &Frame, _: Option<&Grid<u8>>) -> Result<(), EstimatorError> {
-        self.belief = self.follower.step(&self.network.autoencoder, frame)?;
+        self.belief = self.follower.step(&self.network, frame)?;
         Ok(())
     }
 
@@ -44,6 +48,11 @@ impl Estimator for AutoencoderEstimator {
 
     fn belief(&self) -> &Belief {
         &self.belief
+    }
+
+    fn score(&self, frame: &Frame) -> Result<Option<Score>, EstimatorError> {
+        let likelihood = likelihood(&self.network)?;
+        Ok(Some(score(&self.belief, &likelihood, frame)))
     }
 
     fn follower(&self) -> Option<&Follower> {

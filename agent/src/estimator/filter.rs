@@ -7,6 +7,7 @@
 use super::learned_filter::Tables;
 use super::{Estimator, EstimatorError};
 use crate::belief::Belief;
+use crate::scoring::{Score, score};
 use ndarray::{Array2, Array4};
 use protocol::frame::Frame;
 use protocol::grid::{Cell, Grid, Probabilities};
@@ -112,11 +113,6 @@ impl BayesFilter {
         Self::of(transition, likelihood, prior, checksum)
     }
 
-    /// Takes newer learned parameters of the same dimensions; the belief stays.
-    pub fn set(&mut self, tables: &Tables) {
-        (self.transition, self.likelihood, self.checksum) = parameters(tables, &self.belief);
-    }
-
     fn of(transition: Transition, likelihood: Array2<f64>, belief: Belief, checksum: u32) -> Self {
         Self {
             transition,
@@ -177,6 +173,14 @@ impl Estimator for BayesFilter {
 
     fn belief(&self) -> &Belief {
         BayesFilter::belief(self)
+    }
+
+    fn score(&self, frame: &Frame) -> Result<Option<Score>, EstimatorError> {
+        Ok(Some(score(&self.belief, &self.likelihood, frame)))
+    }
+
+    fn set_tables(&mut self, tables: &Tables) {
+        (self.transition, self.likelihood, self.checksum) = parameters(tables, &self.belief);
     }
 
     fn kind(&self) -> Option<String> {

@@ -14,6 +14,8 @@ pub use filter::{BayesFilter, ZeroEvidence};
 pub use prior::Prior;
 
 use crate::belief::{Belief, BeliefError};
+use crate::estimator::learned_filter::Tables;
+use crate::scoring::Score;
 use ::network::NetworkError;
 use protocol::{Frame, Grid};
 use thiserror::Error;
@@ -55,6 +57,17 @@ pub trait Estimator: Send {
 
     /// Goes on from a belief about X_{k+1} of its own [`Self::kind`] and shape. Others ignore it.
     fn set_belief(&mut self, _belief: Belief) {}
+
+    /// How well the belief predicts a frame; `None` of estimators that predict none.
+    ///
+    /// # Errors
+    /// Where a network's device fails.
+    fn score(&self, _frame: &Frame) -> Result<Option<Score>, EstimatorError> {
+        Ok(None)
+    }
+
+    /// Takes newer learned parameters of the same dimensions; the belief stays. Others ignore them.
+    fn set_tables(&mut self, _tables: &Tables) {}
 
     /// The hidden vector behind the belief, for a DQN that decides on it (paper section III.E).
     fn follower(&self) -> Option<&Follower> {

@@ -178,7 +178,8 @@ mod tests {
         learner.begin(4);
         for value in [0, 1, 1, 0, 1] {
             let frame = Frame::from_bytes(shape, 2, &[value, 255, 1]).expect("a frame");
-            learner.see(4, &belief, &frame);
+            learner.expect(4, &belief);
+            learner.see(4, &frame);
             let visited: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
             learner.reward(&belief, &visited, 0.3);
         }

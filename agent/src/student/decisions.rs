@@ -1,22 +1,23 @@
 //! Learns which action of [`ActionSet::beam`] to take (paper section III.E): beam search plans on the
 //! known-model filter's belief, and a DQN that sees a summary of it chooses what each path is for.
 
-use super::{Impression, Lesson, NotFinite, Site, Student, StudentError};
+use super::{Fly, Lesson, Look, NotFinite, Site, Student, StudentError, without_truth};
 use crate::action::{Action, ActionSet};
+use crate::agent::{Agent, Setup};
 use crate::belief::Belief;
 use crate::checkpoint::{Contents, Problem};
 use crate::client::Observation;
 use crate::compare::planner_seed;
 use crate::config::{AgentConfig, DecisionsConfig};
-use crate::estimator::{BayesFilter, ZeroEvidence};
+use crate::estimator::BayesFilter;
 use crate::metrics::Tick;
-use crate::planner::{BeamSearch, PlanBasis};
-use crate::policy::EstimatorKind;
-use crate::scoring::score;
+use crate::planner::PlanBasis;
+use crate::policy::Policy;
+use crate::rollout::{self, Robot};
 use crate::student::stored::{load_dqn, save_dqn};
 use crate::summary::{spread_summary, summary_length};
 use ::network::{Dqn, Track, Transition};
-use protocol::{Cell, Model, Move};
+use protocol::{Cell, Model};
 use rayon::prelude::*;
 use std::time::{Duration, Instant};
 
@@ -42,27 +43,24 @@ pub struct Decisions {
 pub struct DecisionsStudent {
     site: Site,
     config: AgentConfig,
+    policy: Policy,
     decisions: Decisions,
     filter: BayesFilter,
     /// The state that pays most.
     target: usize,
     state_names: Vec<String>,
-    pilots: Vec<Pilot>,
+    runs: Vec<Run>,
     owed: f64,
     is_frozen: bool,
     times: [(&'static str, Duration); 2],
 }
 
 /// One world's robot.
-struct Pilot {
-    filter: BayesFilter,
-    basis: PlanBasis,
-    planner: BeamSearch,
-    observation: Observation,
+struct Run {
+    robot: Robot,
+    /// What the last decision went by, and what it was.
     input: Vec<f32>,
     action: usize,
-    /// Time that its last plan took.
-    planning: Duration,
     track: Track,
 }
 
@@ -136,44 +134,52 @@ impl DecisionsStudent {
         Self {
             site,
             config: config.clone(),
+            policy: Policy::named("dqn_beam", model).expect("invariant: every model has it"),
             decisions,
             filter,
             target: model.target_state(),
             state_names: model.state_names(),
-            pilots: Vec::new(),
+            runs: Vec::new(),
             owed: 0.0,
             is_frozen: false,
             times: ["planning", "learning"].map(|part| (part, Duration::ZERO)),
         }
     }
-}
 
-impl Pilot {
     /// A robot that has taken in what its world shows.
-    fn new(student: &DecisionsStudent, observation: Observation) -> Result<Self, ZeroEvidence> {
-        let mut filter = student.filter.clone();
-        filter.correct(&observation.frame)?;
-        let mut basis = PlanBasis::new(student.config.objective.belief);
-        basis.see(filter.belief());
-        filter.predict();
-        Ok(Self {
-            basis,
-            input: spread_summary(filter.belief(), observation.robot(), student.site.n_moves),
-            filter,
-            planner: BeamSearch::new(student.config.beam_width),
-            observation,
+    fn run(&self, observation: Observation) -> Result<Run, StudentError> {
+        let setup = Setup {
+            basis: PlanBasis::new(self.config.objective.belief),
+            state_names: self.state_names.clone(),
+            n_moves: self.site.n_moves,
+            seed: planner_seed(&self.config, observation.result.seed),
+        };
+        let (filter, policy) = (Box::new(self.filter.clone()), &self.policy);
+        let agent = Agent::with(filter, policy, &self.config, setup);
+        let mut robot = Robot::new(agent, observation);
+        robot.begin(None, |_| ())?;
+        Ok(Run {
+            input: input(&robot, self.site.n_moves),
+            robot,
             action: 0,
-            planning: Duration::ZERO,
-            track: student.decisions.dqn.track(),
+            track: self.decisions.dqn.track(),
         })
     }
+}
 
+/// What a decision goes by.
+fn input(robot: &Robot, n_moves: usize) -> Vec<f32> {
+    spread_summary(robot.agent.belief(), robot.observation().robot(), n_moves)
+}
+
+impl Run {
     /// Takes in what an action brought, and gives the transition that is complete by then.
-    fn bring(&mut self, config: &DecisionsConfig, next: Vec<f32>) -> Option<Transition> {
+    fn bring(&mut self, reward_scale: f32, n_moves: usize) -> Option<Transition> {
+        let next = input(&self.robot, n_moves);
         self.track.add(Transition {
             input: std::mem::replace(&mut self.input, next.clone()),
             action: self.action,
-            reward: self.observation.result.reward as f32 * config.reward_scale,
+            reward: self.robot.observation().result.reward as f32 * reward_scale,
             next,
         })
     }
@@ -189,83 +195,60 @@ impl Student for DecisionsStudent {
     }
 
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError> {
-        let pilots = observations.into_iter().map(|seen| Pilot::new(self, seen));
-        self.pilots = pilots.collect::<Result<_, _>>()?;
-        // Beliefs begin anew, wherever the worlds stand.
+        let runs = observations.into_iter().map(|seen| self.run(seen));
+        self.runs = runs.collect::<Result<_, _>>()?;
+        // Beliefs begin again, wherever the worlds stand.
         Ok(0)
     }
 
     fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {
-        let pilot = Pilot::new(self, observation)?;
-        self.pilots[(world - self.site.worlds.start) as usize] = pilot;
+        let run = self.run(observation)?;
+        self.runs[(world - self.site.worlds.start) as usize] = run;
         Ok(())
     }
 
-    fn plan(&mut self) -> Vec<Vec<Move>> {
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError> {
         let start = Instant::now();
-        let (decisions, config, n_moves) = (&self.decisions, &self.config, self.site.n_moves);
-        let is_frozen = self.is_frozen;
-        let plan = |(index, pilot): (usize, &mut Pilot)| {
-            let start = Instant::now();
-            let step = decisions.world_steps + index as u64;
-            pilot.action = match is_frozen {
-                true => decisions.dqn.best(&pilot.input),
-                false => decisions.dqn.act(&pilot.input, step),
+        let (decisions, is_frozen) = (&self.decisions, self.is_frozen);
+        for (index, run) in self.runs.iter_mut().enumerate() {
+            run.action = match is_frozen {
+                true => decisions.dqn.best(&run.input),
+                false => decisions
+                    .dqn
+                    .act(&run.input, decisions.world_steps + index as u64),
             };
-            let action = &decisions.actions.actions()[pilot.action];
-            let result = &pilot.observation.result;
-            let random = (planner_seed(config, result.seed), result.step);
-            let robot = pilot.observation.robot();
-            let belief = pilot.basis.belief(pilot.filter.belief());
-            let plan = action.plan(&mut pilot.planner, belief, robot, n_moves, random);
-            pilot.planning = start.elapsed();
-            plan.moves
-        };
-        let paths = self.pilots.par_iter_mut().enumerate().map(plan).collect();
-        self.times[0].1 += start.elapsed();
-        paths
-    }
-
-    fn take_in(
-        &mut self,
-        observations: Vec<Observation>,
-        watched: &[usize],
-    ) -> Result<(Tick, Vec<Impression>), StudentError> {
-        let mut tick = Tick::default();
-        for (pilot, observation) in self.pilots.iter_mut().zip(observations) {
-            tick.reward += observation.result.reward;
-            let likelihood = pilot.filter.likelihood();
-            tick.score += score(pilot.filter.belief(), likelihood, &observation.frame);
-            pilot.filter.correct(&observation.frame)?;
-            pilot.observation = observation;
         }
-        let impression = |&index: &usize| {
-            let pilot = &self.pilots[index];
-            Impression {
-                belief: pilot.filter.belief().clone(),
-                objective: self.decisions.actions.actions()[pilot.action].name.clone(),
-                planning: pilot.planning,
-            }
-        };
-        let impressions = watched.iter().map(impression).collect();
-        let n_moves = self.site.n_moves;
-        let config = &self.config.decisions;
-        let bring = |pilot: &mut Pilot| {
-            pilot.basis.see(pilot.filter.belief());
-            pilot.filter.predict();
-            let robot = pilot.observation.robot();
-            let next = spread_summary(pilot.filter.belief(), robot, n_moves);
-            pilot.bring(config, next)
-        };
-        let transitions: Vec<_> = self.pilots.par_iter_mut().map(bring).collect();
+        let mut tick = Tick::default();
+        rollout::step(
+            &mut self.runs,
+            |run| &mut run.robot,
+            |run| {
+                let action = &decisions.actions.actions()[run.action];
+                run.robot
+                    .plan_with(|agent, cell, step| agent.plan_action(action, cell, step))
+            },
+            |paths| {
+                self.times[0].1 += start.elapsed();
+                Ok::<_, StudentError>(without_truth(fly(paths)?))
+            },
+            |index, run, turn| {
+                tick.reward += run.robot.observation().result.reward;
+                tick.score += turn.score.unwrap_or_default();
+                look(index, &run.robot);
+                Ok(())
+            },
+        )?;
+        let (n_moves, config) = (self.site.n_moves, &self.config.decisions);
+        let bring = |run: &mut Run| run.bring(config.reward_scale, n_moves);
+        let transitions: Vec<_> = self.runs.par_iter_mut().map(bring).collect();
         for transition in transitions.into_iter().flatten() {
             self.decisions.dqn.remember(transition);
         }
-        tick.n_worlds = self.pilots.len() as u64;
+        tick.n_worlds = self.runs.len() as u64;
         self.decisions.world_steps += tick.n_worlds;
         tick.world_steps = self.decisions.world_steps;
         self.owed += tick.n_worlds as f64 * config.updates_per_step;
-        Ok((tick, impressions))
+        Ok(tick)
     }
 
     fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {
@@ -305,17 +288,9 @@ impl Student for DecisionsStudent {
         self.decisions.dqn.n_updates()
     }
 
-    fn estimator(&self) -> EstimatorKind {
-        EstimatorKind::KnownModel
-    }
-
-    fn state_names(&self) -> Vec<String> {
-        self.state_names.clone()
-    }
-
     fn belief(&self) -> Option<(&Belief, usize)> {
-        let pilot = self.pilots.first()?;
-        Some((pilot.filter.belief(), self.target))
+        let run = self.runs.first()?;
+        Some((run.robot.agent.belief(), self.target))
     }
 
     fn contents(&self) -> Result<Contents, StudentError> {

@@ -1,22 +1,32 @@
 //! Learns the filter's parameters on several worlds at once: robots walk at random first, then plan on
 //! the belief of the filter as it is.
 
-use super::{Impression, Lesson, NotFinite, Site, Student, StudentError};
-use crate::agent::{RANDOM_MOVES, numbered_states};
+mod saved;
+
+use self::saved::SavedWorld;
+use super::{Fly, Lesson, Look, NotFinite, Site, Student, StudentError, without_truth};
+use crate::agent::{Agent, Setup, numbered_states};
 use crate::belief::Belief;
 use crate::checkpoint::{Contents, Problem};
 use crate::client::Observation;
+use crate::compare::planner_seed;
 use crate::config::AgentConfig;
-use crate::estimator::learned_filter::Dimensions;
+use crate::estimator::BayesFilter;
+use crate::estimator::learned_filter::{Dimensions, Tables};
 use crate::learner::{KIND, LearnedModel, Learner, Progress};
 use crate::metrics::Tick;
-use crate::pilot::{Pilot, Stand};
-use crate::planner::Target;
-use crate::policy::{EstimatorKind, PlannerKind};
-use protocol::Move;
-use rayon::prelude::*;
+use crate::planner::{Objective, Plan, PlanBasis, Target};
+use crate::policy::{PlannerKind, Policy};
+use crate::rollout::{self, Robot};
+use protocol::path;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
+
+/// One world's robot.
+struct Run {
+    robot: Robot,
+    is_walking: bool,
+}
 
 /// A filter that is learned.
 pub struct FilterStudent {
@@ -24,9 +34,9 @@ pub struct FilterStudent {
     config: AgentConfig,
     learner: Learner,
     learned: LearnedModel,
-    pilots: Vec<Pilot>,
+    runs: Vec<Run>,
     /// Where a checkpoint left the worlds.
-    stands: BTreeMap<u32, Stand>,
+    left: BTreeMap<u32, SavedWorld>,
     is_frozen: bool,
     planning: Duration,
     learning: Duration,
@@ -51,27 +61,54 @@ impl FilterStudent {
         config: &AgentConfig,
     ) -> Result<Self, Problem> {
         let learner = Learner::from_contents(contents, dimensions, site.shape, config)?;
-        let stands = Stand::restored(dimensions.n_states, site.shape, contents)?;
-        Ok(Self::of(learner, stands, site, config))
+        let left = SavedWorld::restored(dimensions.n_states, site.shape, contents)?;
+        Ok(Self::of(learner, left, site, config))
     }
 
     fn of(
         learner: Learner,
-        stands: BTreeMap<u32, Stand>,
+        left: BTreeMap<u32, SavedWorld>,
         site: Site,
         config: &AgentConfig,
     ) -> Self {
         Self {
             learned: learner.learned(),
             learner,
-            stands,
+            left,
             site,
             config: config.clone(),
-            pilots: Vec::new(),
+            runs: Vec::new(),
             is_frozen: false,
             planning: Duration::ZERO,
             learning: Duration::ZERO,
         }
+    }
+
+    /// A robot before it takes in what its world shows.
+    fn robot(&self, observation: Observation) -> Robot {
+        let tables = &self.learned.tables;
+        let filter = BayesFilter::learned(tables, tables.prior(self.site.shape));
+        let setup = Setup {
+            basis: PlanBasis::new(self.config.objective.belief),
+            state_names: numbered_states(tables.dimensions.n_states),
+            n_moves: self.site.n_moves,
+            seed: planner_seed(&self.config, observation.result.seed),
+        };
+        let policy = Policy::learned(PlannerKind::Beam);
+        let agent = Agent::with(Box::new(filter), &policy, &self.config, setup);
+        Robot::new(agent, observation)
+    }
+
+    /// A robot that has taken in what its world shows, with a track that begins there.
+    fn begun(&mut self, world: u32, observation: Observation) -> Result<Run, StudentError> {
+        self.learner.begin(world);
+        self.learner.see(world, &observation.frame);
+        let mut robot = self.robot(observation);
+        robot.begin(None, |_| ())?;
+        Ok(Run {
+            robot,
+            is_walking: false,
+        })
     }
 
     /// Worlds whose robots walk at random: all at first, some for good; none of a frozen student.
@@ -81,9 +118,9 @@ impl FilterStudent {
         }
         let learning = &self.config.learning;
         if self.learner.world_steps() < learning.explore_steps {
-            return self.pilots.len();
+            return self.runs.len();
         }
-        (learning.explore_share * self.pilots.len() as f64).round() as usize
+        (learning.explore_share * self.runs.len() as f64).round() as usize
     }
 }
 
@@ -99,70 +136,77 @@ impl Student for FilterStudent {
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError> {
         let worlds = self.site.worlds.clone();
         let mut n_gone_on = 0;
-        if !Stand::any_is_of(&self.stands, worlds.clone(), &observations) {
+        if !SavedWorld::any_is_of(&self.left, worlds.clone(), &observations) {
             // Frames of other worlds, perhaps of another model.
             self.learner.forget();
         }
         for (world, observation) in worlds.zip(observations) {
-            let mut pilot = Pilot::new(&self.learned, self.site.shape, observation, &self.config);
-            let stand = self.stands.get(&world);
-            n_gone_on += usize::from(pilot.go_on(world, stand, &mut self.learner)?);
-            self.pilots.push(pilot);
+            let left = self.left.get(&world);
+            let left =
+                left.filter(|left| left.is_of(&observation) && self.learner.has_track(world));
+            let run = if let Some(left) = left {
+                let mut robot = self.robot(observation);
+                left.restore(&mut robot.agent);
+                n_gone_on += 1;
+                Run {
+                    robot,
+                    is_walking: false,
+                }
+            } else {
+                self.begun(world, observation)?
+            };
+            self.runs.push(run);
         }
         Ok(n_gone_on)
     }
 
     fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {
-        let mut pilot = Pilot::new(&self.learned, self.site.shape, observation, &self.config);
-        pilot.begin(world, &mut self.learner)?;
-        self.pilots[(world - self.site.worlds.start) as usize] = pilot;
+        let run = self.begun(world, observation)?;
+        self.runs[(world - self.site.worlds.start) as usize] = run;
         Ok(())
     }
 
-    fn plan(&mut self) -> Vec<Vec<Move>> {
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError> {
         let start = Instant::now();
         if !self.is_frozen {
             self.learned = self.learner.learned();
         }
-        let n_walking = self.n_walking();
-        let plan = |(index, pilot): (usize, &mut Pilot)| {
-            pilot.filter.set(&self.learned.tables);
-            let kind = match index < n_walking {
-                true => PlannerKind::RandomWalk,
-                false => PlannerKind::Beam,
-            };
-            pilot.plan(kind, self.learned.target, &self.config, self.site.n_moves)
-        };
-        let paths = self.pilots.par_iter_mut().enumerate().map(plan).collect();
-        self.planning += start.elapsed();
-        paths
-    }
-
-    fn take_in(
-        &mut self,
-        observations: Vec<Observation>,
-        watched: &[usize],
-    ) -> Result<(Tick, Vec<Impression>), StudentError> {
-        let mut tick = Tick::default();
-        let n_walking = self.n_walking();
-        let worlds = self.site.worlds.clone().zip(observations);
-        for ((world, observation), pilot) in worlds.zip(&mut self.pilots) {
-            tick.reward += observation.result.reward;
-            tick.score += pilot.take_in(world, observation, &mut self.learner)?;
+        let (n_walking, first_world) = (self.n_walking(), self.site.worlds.start);
+        for (index, run) in self.runs.iter_mut().enumerate() {
+            run.is_walking = index < n_walking;
+            let world = first_world + index as u32;
+            self.learner.expect(world, run.robot.agent.belief());
         }
-        let impression = |&index: &usize| Impression {
-            belief: self.pilots[index].filter.belief().clone(),
-            objective: match index < n_walking {
-                true => RANDOM_MOVES.into(),
-                false => Target::State(self.learned.target).label(&self.state_names()),
-            },
-            planning: self.pilots[index].planning,
+        let objective = Objective {
+            target: Target::State(self.learned.target),
+            ..self.config.objective(&Policy::learned(PlannerKind::Beam))
         };
-        let impressions = watched.iter().map(impression).collect();
-        self.pilots.par_iter_mut().for_each(Pilot::predict);
-        tick.n_worlds = self.pilots.len() as u64;
+        let mut tick = Tick::default();
+        rollout::step(
+            &mut self.runs,
+            |run| &mut run.robot,
+            |run| run.plan(&self.learned.tables, objective),
+            |paths| {
+                self.planning += start.elapsed();
+                Ok::<_, StudentError>(without_truth(fly(paths)?))
+            },
+            |index, run, turn| {
+                let (agent, observation) = (&run.robot.agent, run.robot.observation());
+                let visited = path::fly(self.site.shape, turn.before.robot(), &turn.plan.moves);
+                let reward = observation.result.reward;
+                self.learner
+                    .see(first_world + index as u32, &observation.frame);
+                self.learner
+                    .reward(agent.belief(), &visited.visited, reward);
+                tick.reward += reward;
+                tick.score += turn.score.unwrap_or_default();
+                look(index, &run.robot);
+                Ok(())
+            },
+        )?;
+        tick.n_worlds = self.runs.len() as u64;
         tick.world_steps = self.learner.world_steps();
-        Ok((tick, impressions))
+        Ok(tick)
     }
 
     fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {
@@ -190,27 +234,32 @@ impl Student for FilterStudent {
         self.learner.n_updates()
     }
 
-    fn estimator(&self) -> EstimatorKind {
-        EstimatorKind::Learned
-    }
-
-    fn state_names(&self) -> Vec<String> {
-        numbered_states(self.learned.tables.dimensions.n_states)
-    }
-
     fn belief(&self) -> Option<(&Belief, usize)> {
-        let pilot = self.pilots.first()?;
-        Some((pilot.filter.belief(), self.learned.target))
+        let run = self.runs.first()?;
+        Some((run.robot.agent.belief(), self.learned.target))
     }
 
     fn contents(&self) -> Result<Contents, StudentError> {
         let mut contents = self.learner.to_contents();
-        let pilots = self.site.worlds.clone().zip(&self.pilots);
-        Stand::store(pilots, self.site.shape, &mut contents);
+        let robots = self.runs.iter().map(|run| &run.robot);
+        let robots = self.site.worlds.clone().zip(robots);
+        SavedWorld::store(robots, self.site.shape, &mut contents);
         Ok(contents)
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {
         vec![("planning", self.planning), ("updates", self.learning)]
+    }
+}
+
+impl Run {
+    /// The next path on newer parameters.
+    fn plan(&mut self, tables: &Tables, objective: Objective) -> Plan {
+        let is_walking = self.is_walking;
+        self.robot.agent.estimator_mut().set_tables(tables);
+        self.robot.plan_with(|agent, cell, step| match is_walking {
+            true => agent.walk(cell, step),
+            false => agent.plan_for(objective, cell, step),
+        })
     }
 }

@@ -9,23 +9,21 @@ mod progress;
 
 pub use self::progress::Progress;
 
-use super::{Impression, Lesson, NotFinite, Site, Student, StudentError};
-use crate::agent::numbered_states;
+use super::{Fly, Lesson, Look, NotFinite, Site, Student, StudentError, without_truth};
+use crate::agent::{Agent, Setup, numbered_states};
 use crate::belief::Belief;
 use crate::checkpoint::Contents;
 use crate::client::Observation;
 use crate::compare::planner_seed;
 use crate::config::AgentConfig;
-use crate::estimator::Follower;
-use crate::learned::likelihood;
+use crate::estimator::{AutoencoderEstimator, Follower};
 use crate::metrics::Tick;
-use crate::planner::{Objective, Planner, PlanningProblem};
-use crate::policy::{EstimatorKind, Policy};
+use crate::planner::PlanBasis;
+use crate::policy::Policy;
 use crate::reward::met;
-use crate::scoring::score;
+use crate::rollout::{self, Robot};
 use ::network::{Track, Transition, Window};
-use protocol::path::fly;
-use protocol::{Frame, Move};
+use protocol::path;
 use std::time::{Duration, Instant};
 
 /// How checkpoints of this learner call it.
@@ -38,20 +36,17 @@ pub struct NetworkStudent {
     site: Site,
     config: AgentConfig,
     progress: Progress,
-    objectives: Vec<Objective>,
-    planner: Box<dyn Planner + Send>,
-    observation: Option<Observation>,
+    choices: Vec<Policy>,
+    /// Its world's, once it is attached.
+    robot: Option<Robot>,
     decision: Option<Decision>,
     track: Track,
     is_frozen: bool,
-    /// Time that the last plan took.
-    planning: Duration,
-    times: [(&'static str, Duration); 4],
+    times: [(&'static str, Duration); 3],
 }
 
-/// The action of a step, what it was chosen on, and the cells that its path visits.
+/// The action of a step, and what it was chosen on.
 struct Decision {
-    visited: Vec<usize>,
     input: Vec<f32>,
     action: usize,
     value: f32,
@@ -60,69 +55,64 @@ struct Decision {
 impl NetworkStudent {
     /// Goes on from some progress, or begins.
     pub fn new(progress: Progress, site: Site, config: &AgentConfig) -> Self {
-        let choices = Policy::network_choices(progress.autoencoder.shape().n_states);
         Self {
-            objectives: choices
-                .iter()
-                .map(|choice| config.objective(choice))
-                .collect(),
-            planner: config.planner(&choices[0]),
+            choices: Policy::network_choices(progress.autoencoder.shape().n_states),
             track: progress.dqn.track(),
             progress,
             site,
             config: config.clone(),
-            observation: None,
+            robot: None,
             decision: None,
             is_frozen: false,
-            planning: Duration::ZERO,
-            times: ["planning", "inference", "dqn", "autoencoder"]
-                .map(|part| (part, Duration::ZERO)),
+            times: ["planning", "dqn", "autoencoder"].map(|part| (part, Duration::ZERO)),
         }
     }
 
-    fn observation(&self) -> &Observation {
-        let observation = self.observation.as_ref();
-        observation.expect("invariant: a world begins before it is acted on")
-    }
-
-    /// Reads a frame: `h`, the estimate and the next predictor.
-    fn read(&mut self, frame: &Frame) -> Result<Belief, StudentError> {
-        let start = Instant::now();
-        let Progress {
-            autoencoder,
-            follower,
-            ..
-        } = &mut self.progress;
-        let estimate = follower.step(autoencoder, frame);
-        self.times[1].1 += start.elapsed();
-        let estimate = estimate?;
-        self.progress.basis.see(&estimate);
-        Ok(estimate)
+    /// A robot whose hidden vector is where another was, before it takes in what its world shows.
+    fn robot(&self, follower: Follower, observation: Observation) -> Robot {
+        let network = &self.progress.autoencoder;
+        let estimator = AutoencoderEstimator::at(network, follower);
+        let setup = Setup {
+            basis: PlanBasis::new(self.config.objective.belief),
+            state_names: numbered_states(network.shape().n_states),
+            n_moves: self.site.n_moves,
+            seed: planner_seed(&self.config, observation.result.seed),
+        };
+        let agent = Agent::with(Box::new(estimator), &self.choices[0], &self.config, setup);
+        Robot::new(agent, observation)
     }
 
     /// What the next action goes by.
-    fn input(&self) -> Vec<f32> {
-        let Progress {
-            input, follower, ..
-        } = &self.progress;
-        input.of(follower, self.observation().robot(), self.site.n_moves)
+    fn input(&self, robot: &Robot) -> Vec<f32> {
+        let cell = robot.observation().robot();
+        self.progress
+            .input
+            .of(follower(robot), cell, self.site.n_moves)
     }
 
-    /// Adds the transition to the DQN's replay, and what the path met to the estimate of rewards.
-    fn remember(&mut self, estimate: &Belief, reward: f64) {
-        let next = self.input();
-        if let Some(decision) = &self.decision {
-            let met = met(estimate, decision.visited.iter().copied());
-            self.progress.reward.add(&met, reward);
-            let step = Transition {
-                input: decision.input.clone(),
-                action: decision.action,
-                reward: reward as f32,
-                next,
-            };
-            if let Some(transition) = self.track.add(step) {
-                self.progress.dqn.remember(transition);
-            }
+    fn decide(&self, robot: &Robot) -> Decision {
+        let (dqn, input) = (&self.progress.dqn, self.input(robot));
+        let action = match self.is_frozen {
+            true => dqn.best(&input),
+            false => dqn.act(&input, self.progress.iterations),
+        };
+        Decision {
+            value: dqn.values(&input)[action],
+            input,
+            action,
+        }
+    }
+
+    /// Adds the transition to the DQN's replay.
+    fn remember(&mut self, robot: &Robot, decision: &Decision) {
+        let step = Transition {
+            input: decision.input.clone(),
+            action: decision.action,
+            reward: robot.observation().result.reward as f32,
+            next: self.input(robot),
+        };
+        if let Some(transition) = self.track.add(step) {
+            self.progress.dqn.remember(transition);
         }
     }
 
@@ -131,7 +121,7 @@ impl NetworkStudent {
         let rate = self.config.dqn.step_size.at(self.progress.iterations);
         self.progress.dqn.set_learning_rate(rate as f32);
         let loss = self.progress.dqn.update();
-        self.times[2].1 += start.elapsed();
+        self.times[1].1 += start.elapsed();
         Ok([loss?.map(f64::from), Some(rate)])
     }
 
@@ -148,9 +138,54 @@ impl NetworkStudent {
         let rate = config.step_size.at(self.progress.iterations);
         self.progress.autoencoder.set_learning_rate(rate as f32);
         let loss = self.progress.autoencoder.update(&window);
-        self.times[3].1 += start.elapsed();
+        self.times[2].1 += start.elapsed();
         Ok([Some(loss?), Some(rate)])
     }
+
+    fn step_with(
+        &mut self,
+        robot: &mut Robot,
+        fly: Fly<'_>,
+        look: Look<'_>,
+    ) -> Result<Tick, StudentError> {
+        let start = Instant::now();
+        let decision = self.decide(robot);
+        let objective = self.config.objective(&self.choices[decision.action]);
+        let (mut planning, mut tick) = (Duration::ZERO, Tick::default());
+        rollout::step(
+            std::slice::from_mut(robot),
+            |robot| robot,
+            |robot| robot.plan_with(|agent, cell, step| agent.plan_for(objective, cell, step)),
+            |paths| {
+                planning = start.elapsed();
+                Ok::<_, StudentError>(without_truth(fly(paths)?))
+            },
+            |index, robot, turn| {
+                tick.score = turn.score.unwrap_or_default();
+                tick.reward = robot.observation().result.reward;
+                let cells = path::fly(self.site.shape, turn.before.robot(), &turn.plan.moves);
+                let met = met(robot.agent.belief(), cells.visited.iter().copied());
+                self.progress.reward.add(&met, tick.reward);
+                look(index, robot);
+                Ok(())
+            },
+        )?;
+        self.times[0].1 += planning;
+        self.remember(robot, &decision);
+        self.decision = Some(decision);
+        let frame = robot.observation().frame.clone();
+        self.progress.replay.push(frame);
+        self.progress.iterations += 1;
+        tick.world_steps = self.progress.iterations;
+        tick.n_worlds = 1;
+        Ok(tick)
+    }
+}
+
+/// What the network of a robot's agent knows of its world.
+fn follower(robot: &Robot) -> &Follower {
+    let follower = robot.agent.estimator().follower();
+    follower.expect("invariant: its estimator is an autoencoder")
 }
 
 impl Student for NetworkStudent {
@@ -172,7 +207,11 @@ impl Student for NetworkStudent {
         let goes_on =
             self.progress.place == Some(observation.place()) && shown == Some(&observation.frame);
         if goes_on {
-            self.observation = Some(observation);
+            let mut robot = self.robot(self.progress.follower.clone(), observation);
+            if let Some(estimate) = &self.progress.estimate {
+                robot.agent.basis_mut().see(estimate);
+            }
+            self.robot = Some(robot);
         } else {
             self.begin(self.site.worlds.start, observation)?;
         }
@@ -180,78 +219,22 @@ impl Student for NetworkStudent {
     }
 
     fn begin(&mut self, _: u32, observation: Observation) -> Result<(), StudentError> {
-        self.progress.place = Some(observation.place());
         self.track = self.progress.dqn.track();
-        self.progress.follower = Follower::new(&self.progress.autoencoder)?;
         self.progress.replay.begin();
-        self.read(&observation.frame)?;
         self.progress.replay.push(observation.frame.clone());
-        self.observation = Some(observation);
+        let follower = Follower::new(&self.progress.autoencoder)?;
+        let mut robot = self.robot(follower, observation);
+        robot.begin(None, |_| ())?;
+        self.robot = Some(robot);
         Ok(())
     }
 
-    fn plan(&mut self) -> Vec<Vec<Move>> {
-        let start = Instant::now();
-        let input = self.input();
-        let Progress { dqn, basis, .. } = &self.progress;
-        let action = match self.is_frozen {
-            true => dqn.best(&input),
-            false => dqn.act(&input, self.progress.iterations),
-        };
-        let value = dqn.values(&input)[action];
-        let belief = basis.belief(self.progress.follower.prediction());
-        let values = self.objectives[action].values(belief);
-        let observation = self.observation();
-        let problem = PlanningProblem {
-            start: observation.robot(),
-            n_moves: self.site.n_moves,
-            values: &values,
-            seed: planner_seed(&self.config, observation.result.seed),
-            step: observation.result.step,
-        };
-        let plan = self.planner.plan(&problem);
-        self.decision = Some(Decision {
-            visited: fly(self.site.shape, problem.start, &plan.moves).visited,
-            input,
-            action,
-            value,
-        });
-        self.planning = start.elapsed();
-        self.times[0].1 += self.planning;
-        vec![plan.moves]
-    }
-
-    fn take_in(
-        &mut self,
-        mut observations: Vec<Observation>,
-        watched: &[usize],
-    ) -> Result<(Tick, Vec<Impression>), StudentError> {
-        let observation = observations.remove(0);
-        let frame = observation.frame.clone();
-        let prediction = self.progress.follower.prediction();
-        let likelihood = likelihood(&self.progress.autoencoder)?;
-        let score = score(prediction, &likelihood, &frame);
-        self.progress.place = Some(observation.place());
-        let reward = observation.result.reward;
-        self.observation = Some(observation);
-        let estimate = self.read(&frame)?;
-        self.remember(&estimate, reward);
-        self.progress.replay.push(frame);
-        self.progress.iterations += 1;
-        let tick = Tick {
-            world_steps: self.progress.iterations,
-            n_worlds: 1,
-            reward,
-            score,
-        };
-        let action = self.decision.as_ref().map(|decision| decision.action);
-        let target = action.map(|action| self.objectives[action].target);
-        let impression = |_: &usize| Impression {
-            belief: estimate.clone(),
-            objective: target.map_or_else(String::new, |target| target.label(&self.state_names())),
-            planning: self.planning,
-        };
-        Ok((tick, watched.iter().map(impression).collect()))
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError> {
+        let robot = self.robot.take();
+        let mut robot = robot.expect("invariant: a world begins before it is acted on");
+        let stepped = self.step_with(&mut robot, fly, look);
+        self.robot = Some(robot);
+        stepped
     }
 
     fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {
@@ -291,21 +274,19 @@ impl Student for NetworkStudent {
         self.progress.autoencoder.n_updates()
     }
 
-    fn estimator(&self) -> EstimatorKind {
-        EstimatorKind::Autoencoder
-    }
-
-    fn state_names(&self) -> Vec<String> {
-        numbered_states(self.progress.autoencoder.shape().n_states)
-    }
-
     fn belief(&self) -> Option<(&Belief, usize)> {
-        let belief = self.progress.follower.prediction();
+        let belief = follower(self.robot.as_ref()?).prediction();
         Some((belief, self.progress.target()))
     }
 
     fn contents(&self) -> Result<Contents, StudentError> {
-        Ok(self.progress.to_contents()?)
+        let robot = self.robot.as_ref();
+        let robot = robot.expect("invariant: a world begins before it is saved");
+        let place = robot.observation().place();
+        let estimate = robot.agent.estimate();
+        Ok(self
+            .progress
+            .to_contents(place, follower(robot), estimate)?)
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {

@@ -13,6 +13,7 @@ use crate::estimator::BayesFilter;
 use crate::estimator::learned_filter::Dimensions;
 use crate::planner::{BasisKind, Objective, PlanningProblem, Target};
 use crate::policy::{PlannerKind, Policy};
+use crate::rollout::Robot;
 use protocol::message::StepResult;
 use protocol::randomness::split_mix;
 use protocol::{Cell, Frame, Model, Move, Shape};
@@ -74,6 +75,18 @@ fn path(
     config.planner(policy).plan(&problem).moves
 }
 
+/// One step: the path, and the posterior after its frame.
+fn fly(student: &mut impl Student, step: u64) -> (Vec<Move>, Belief) {
+    let (mut path, mut posterior) = (Vec::new(), None);
+    let mut fly = |paths: &[Vec<Move>]| {
+        path = paths[0].clone();
+        Ok(vec![observation(step)])
+    };
+    let mut look = |_: usize, robot: &Robot| posterior = Some(robot.agent.belief().clone());
+    student.step(&mut fly, &mut look).expect("possible");
+    (path, posterior.expect("a look"))
+}
+
 /// A frozen student must plan on one of the beliefs. `paths`: what it may choose among on a belief, where
 /// a state pays most, at a step.
 fn check(
@@ -83,15 +96,14 @@ fn check(
 ) {
     student.freeze();
     student.attach(vec![observation(0)]).expect("possible");
-    let mut all = [true; 2];
+    let (mut all, mut before) = ([true; 2], None);
     for step in 1..9 {
-        student.plan();
-        let seen = vec![observation(step)];
-        let (_, impressions) = student.take_in(seen, &[0]).expect("possible");
+        let (path, estimate) = fly(&mut student, step);
         let (predictor, target) = student.belief().expect("a belief");
-        let beliefs = [&impressions[0].belief, predictor];
-        let paths = beliefs.map(|belief| paths(belief, target, step));
-        let path = student.plan().remove(0);
+        let now = [&estimate, predictor].map(|belief| paths(belief, target, step));
+        let Some(paths) = before.replace(now) else {
+            continue;
+        };
         for (all, paths) in all.iter_mut().zip(&paths) {
             *all &= paths.contains(&path);
         }

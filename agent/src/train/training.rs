@@ -142,6 +142,9 @@ impl Training {
 
     /// The error for a student that cannot go on; what it learned is saved when training ends.
     pub(super) fn stopped(&self, problem: StudentError, student: &dyn Student) -> TrainError {
+        if let StudentError::Connection(problem) = problem {
+            return problem.into();
+        }
         TrainError::Student {
             problem,
             world_steps: student.world_steps(),

@@ -91,7 +91,8 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         learned => learned,
     };
     let Ok(learned) = learned else { return false };
-    if let Some(likelihood) = learned.filter_likelihood() {
+    if let Some(filter) = learned.filter {
+        let likelihood = filter.tables.likelihood_array();
         let sums = likelihood.sum_axis(Axis(1));
         assert!(
             sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3),

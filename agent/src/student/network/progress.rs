@@ -7,7 +7,7 @@ use crate::config::AgentConfig;
 use crate::dqn_input::DqnInput;
 use crate::estimator::Follower;
 use crate::learned::{LearnedNetwork, settings};
-use crate::planner::PlanBasis;
+use crate::planner::BasisKind;
 use crate::policy::Policy;
 use crate::reward::RewardEstimate;
 use crate::student::Site;
@@ -31,8 +31,10 @@ pub struct Progress {
     pub dqn: Dqn,
     /// What that sees.
     pub input: DqnInput,
+    /// The estimate where paths are planned on it, as a checkpoint left it.
+    pub estimate: Option<Belief>,
     /// What paths are planned on.
-    pub basis: PlanBasis,
+    pub basis: BasisKind,
     /// The frames that are learned from.
     pub replay: Replay,
     /// Which state pays.
@@ -59,7 +61,8 @@ impl Progress {
             follower: Follower::new(&autoencoder)?,
             dqn: Dqn::new(config.dqn.settings(), n_inputs, n_actions, config.seed),
             input,
-            basis: PlanBasis::new(config.objective.belief),
+            estimate: None,
+            basis: config.objective.belief,
             autoencoder,
             replay: Replay::new(settings.replay),
             reward: RewardEstimate::new(n_states),
@@ -81,19 +84,24 @@ impl Progress {
             autoencoder: self.autoencoder,
             dqn: self.dqn,
             input: self.input,
-            basis: self.basis.kind(),
+            basis: self.basis,
         }
     }
 
-    /// As a checkpoint, without the settings.
+    /// As a checkpoint, without the settings: the world stands at `place`.
     ///
     /// # Errors
     /// As the network's device.
-    pub fn to_contents(&self) -> Result<Contents, NetworkError> {
+    pub fn to_contents(
+        &self,
+        place: Place,
+        follower: &Follower,
+        estimate: Option<&Belief>,
+    ) -> Result<Contents, NetworkError> {
         let mut contents = Contents::default();
         let tensors = self.autoencoder.named_tensors()?;
         save_tensors(tensors, &mut contents);
-        save_tensors(self.state(), &mut contents);
+        save_tensors(state(follower, estimate), &mut contents);
         save_dqn(&self.dqn, &mut contents);
         let frames = self
             .replay
@@ -102,7 +110,6 @@ impl Progress {
         let shape = self.autoencoder.shape().grid;
         let (height, width) = shape.dim();
         let [adam_steps, updates] = self.autoencoder.counters();
-        let place = self.place.iter().flatten().copied();
         for (name, bytes) in [
             (
                 "replay.frames",
@@ -135,22 +142,6 @@ impl Progress {
             contents.texts.insert(name.into(), count.to_string());
         }
         Ok(contents)
-    }
-
-    /// Where the world is, as tensors.
-    fn state(&self) -> Vec<NamedTensor> {
-        let (hidden, prediction) = (self.follower.hidden(), self.follower.prediction());
-        let belief = |name: &str, belief: &Belief| {
-            let numbers = belief.as_slice().to_vec();
-            (name.to_owned(), belief.view().shape().to_vec(), numbers)
-        };
-        let mut state = vec![
-            (HIDDEN.to_owned(), vec![hidden.len()], hidden.to_vec()),
-            belief(PREDICTION, prediction),
-        ];
-        let estimate = self.basis.estimate();
-        state.extend(estimate.map(|estimate| belief(ESTIMATE, estimate)));
-        state
     }
 
     /// From a checkpoint, with its own settings; the autoencoder computes on `device`.
@@ -219,16 +210,14 @@ impl Progress {
         Ok(())
     }
 
-    /// What [`Self::state`] gave. Without an estimate, as where others were not wanted, the next path is
+    /// What [`state`] gave. Without an estimate, as where others were not wanted, the next path is
     /// planned on the predictor.
     fn load_state(&mut self, contents: &Contents) -> Result<(), Problem> {
         let belief = |name: &str| self.belief_from(contents, name);
         let hidden = contents.tensor(HIDDEN, &[self.follower.hidden().len()])?;
         let follower = Follower::at(hidden.to_vec(), belief(PREDICTION)?);
-        if contents.tensors.contains_key(ESTIMATE) {
-            let estimate = belief(ESTIMATE)?;
-            self.basis.see(&estimate);
-        }
+        let has_estimate = contents.tensors.contains_key(ESTIMATE);
+        self.estimate = has_estimate.then(|| belief(ESTIMATE)).transpose()?;
         self.follower = follower;
         Ok(())
     }
@@ -262,6 +251,21 @@ impl Progress {
         }
         Ok(())
     }
+}
+
+/// What a network knows of its world, as tensors.
+fn state(follower: &Follower, estimate: Option<&Belief>) -> Vec<NamedTensor> {
+    let (hidden, prediction) = (follower.hidden(), follower.prediction());
+    let belief = |name: &str, belief: &Belief| {
+        let numbers = belief.as_slice().to_vec();
+        (name.to_owned(), belief.view().shape().to_vec(), numbers)
+    };
+    let mut state = vec![
+        (HIDDEN.to_owned(), vec![hidden.len()], hidden.to_vec()),
+        belief(PREDICTION, prediction),
+    ];
+    state.extend(estimate.map(|estimate| belief(ESTIMATE, estimate)));
+    state
 }
 
 /// The network that settings ask for.

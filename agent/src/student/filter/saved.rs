@@ -1,9 +1,10 @@
-//! Where pilots are, in a checkpoint.
+//! Where a learner's robots are, in a checkpoint.
 
-use super::Pilot;
+use crate::agent::Agent;
 use crate::belief::Belief;
 use crate::checkpoint::{Bytes, Contents, Problem, Tensor};
 use crate::client::{Observation, Place};
+use crate::rollout::Robot;
 use ndarray::Array3;
 use protocol::Shape;
 use std::collections::BTreeMap;
@@ -21,14 +22,14 @@ const N_PLACE: usize = size_of::<Place>() / size_of::<u64>();
 /// Where a checkpoint left a world: what it showed, the belief about what comes next, and the estimate
 /// behind it, where paths are planned on that.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Stand {
+pub struct SavedWorld {
     place: Place,
     frame: Vec<u8>,
-    pub(super) belief: Belief,
-    pub(super) estimate: Option<Belief>,
+    belief: Belief,
+    estimate: Option<Belief>,
 }
 
-impl Stand {
+impl SavedWorld {
     /// Whether a world shows what it showed then. That may be another server's: seeds, step, flight
     /// and noise of sensors would all have to be the same.
     pub fn is_of(&self, observation: &Observation) -> bool {
@@ -37,45 +38,54 @@ impl Stand {
 
     /// Whether any of these worlds shows what it showed then.
     pub fn any_is_of(
-        stands: &BTreeMap<u32, Self>,
+        all: &BTreeMap<u32, Self>,
         worlds: Range<u32>,
         observations: &[Observation],
     ) -> bool {
         worlds.zip(observations).any(|(world, observation)| {
-            let stand = stands.get(&world);
-            stand.is_some_and(|stand| stand.is_of(observation))
+            let saved = all.get(&world);
+            saved.is_some_and(|saved| saved.is_of(observation))
         })
     }
 
-    /// Puts where pilots are into a checkpoint.
+    /// Gives an agent the belief, and the estimate if its paths are planned on that.
+    pub fn restore(&self, agent: &mut Agent) {
+        agent.take_over(self.belief.clone());
+        if let Some(estimate) = &self.estimate {
+            agent.basis_mut().see(estimate);
+        }
+    }
+
+    /// Puts where robots are into a checkpoint.
     pub fn store<'a>(
-        pilots: impl Iterator<Item = (u32, &'a Pilot)>,
+        robots: impl Iterator<Item = (u32, &'a Robot)>,
         shape: Shape,
         contents: &mut Contents,
     ) {
         let (height, width) = shape.dim();
         let (mut places, mut frames) = (Vec::new(), Vec::new());
         let (mut beliefs, mut estimates) = (Vec::new(), Vec::new());
-        let (mut n_pilots, mut n_states) = (0, 0);
-        for (world, pilot) in pilots {
+        let (mut n_worlds, mut n_states) = (0, 0);
+        for (world, robot) in robots {
+            let (agent, observation) = (&robot.agent, robot.observation());
             places.push(u64::from(world));
-            places.extend(pilot.observation.place());
-            frames.extend_from_slice(pilot.observation.frame.as_bytes());
-            beliefs.extend_from_slice(pilot.filter.belief().as_slice());
-            estimates.extend(pilot.basis.estimate().map(Belief::as_slice));
-            n_states = pilot.filter.belief().n_states();
-            n_pilots += 1;
+            places.extend(observation.place());
+            frames.extend_from_slice(observation.frame.as_bytes());
+            beliefs.extend_from_slice(agent.belief().as_slice());
+            estimates.extend(agent.estimate().map(Belief::as_slice));
+            n_states = agent.belief().n_states();
+            n_worlds += 1;
         }
         let tensor = |numbers| Tensor {
-            shape: vec![n_pilots, n_states, height, width],
+            shape: vec![n_worlds, n_states, height, width],
             numbers,
         };
-        if estimates.len() == n_pilots {
+        if estimates.len() == n_worlds {
             let estimates = tensor(estimates.concat());
             contents.tensors.insert(ESTIMATES.into(), estimates);
         }
         let frames = Bytes {
-            shape: vec![n_pilots, height, width],
+            shape: vec![n_worlds, height, width],
             bytes: frames,
         };
         let places = Bytes::of_counts(places);
@@ -116,20 +126,20 @@ impl Stand {
             belief.map_err(|error| wrong(name, "beliefs", error))
         };
         let each = places.iter().zip(frames.chunks_exact(n_cells));
-        let stand = |(index, (numbers, frame)): (usize, (&[u64; N_PLACE + 1], &[u8]))| {
+        let saved = |(index, (numbers, frame)): (usize, (&[u64; N_PLACE + 1], &[u8]))| {
             // Before the place, the world.
             let &[world, ref place @ ..] = numbers;
             let world = u32::try_from(world).map_err(|_| wrong(PLACES, "worlds", world))?;
             let estimate = estimates.map(|estimates| belief(ESTIMATES, estimates, index));
-            let stand = Self {
+            let saved = Self {
                 place: *place,
                 frame: frame.to_vec(),
                 belief: belief(BELIEFS, beliefs, index)?,
                 estimate: estimate.transpose()?,
             };
-            Ok((world, stand))
+            Ok((world, saved))
         };
-        each.enumerate().map(stand).collect()
+        each.enumerate().map(saved).collect()
     }
 }
 
