@@ -98,7 +98,7 @@ impl Autoencoder {
     pub fn shared(&self) -> Self {
         Self {
             settings: self.settings,
-            shape: self.shape.clone(),
+            shape: self.shape,
             seed: self.seed,
             device: self.device.clone(),
             network: self.network.clone(),

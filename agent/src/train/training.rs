@@ -65,7 +65,7 @@ pub enum TrainError {
     #[error("after {world_steps} world steps: {problem}; what was learned before is in {saved}")]
     Student {
         /// What is wrong.
-        problem: StudentError,
+        problem: Box<StudentError>,
         /// World steps that were learned from.
         world_steps: u64,
         /// The checkpoint.
@@ -146,7 +146,7 @@ impl Training {
             return problem.into();
         }
         TrainError::Student {
-            problem,
+            problem: problem.into(),
             world_steps: student.world_steps(),
             saved: self.out.join(CHECKPOINT).display().to_string(),
         }

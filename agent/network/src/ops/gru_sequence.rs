@@ -49,8 +49,8 @@ impl GruSequence {
         let (mut h, mut out) = (self.first.clone(), Vec::with_capacity(inputs.len() / 3));
         for input in inputs.chunks_exact(3 * n) {
             let step = weights.step(input, &h);
-            for i in 0..n {
-                h[i] = (1.0 - step.z[i]) * step.candidate[i] + step.z[i] * h[i];
+            for ((h, z), candidate) in h.iter_mut().zip(&step.z).zip(&step.candidate) {
+                *h = (1.0 - z) * candidate + z * *h;
             }
             out.extend_from_slice(&h);
         }
