@@ -82,8 +82,9 @@ fn agent(words: &str) -> Ended {
 }
 
 /// What a checkpoint holds, but for its settings.
-fn contents(path: &Path) -> agent::checkpoint::Contents {
-    let mut contents = agent::checkpoint::read(path, "autoencoder").expect("a checkpoint");
+fn contents(path: &Path) -> agent::learning::checkpoint::Contents {
+    let mut contents =
+        agent::learning::checkpoint::read(path, "autoencoder").expect("a checkpoint");
     contents.texts.remove("settings");
     contents
 }
@@ -155,8 +156,9 @@ fn settings_of_sizes_and_of_plans_reach_the_training() {
         stored.bytes["replay.frames"],
         planned.bytes["replay.frames"]
     );
-    let has_estimate =
-        |stored: &agent::checkpoint::Contents| stored.tensors.contains_key("state.estimate");
+    let has_estimate = |stored: &agent::learning::checkpoint::Contents| {
+        stored.tensors.contains_key("state.estimate")
+    };
     assert!(!has_estimate(&stored) && has_estimate(&planned));
 }
 
@@ -290,7 +292,8 @@ fn numbers_that_are_not_finite_stop_training_with_a_checkpoint() {
         let place = Place::new(SETTINGS);
         place.train("out", &format!("{WORLD} --steps 10"));
         let path = place.checkpoint("out");
-        let mut broken = agent::checkpoint::read(&path, "autoencoder").expect("a checkpoint");
+        let mut broken =
+            agent::learning::checkpoint::read(&path, "autoencoder").expect("a checkpoint");
         let numbers = broken.tensors.iter_mut();
         for (name, stored) in numbers {
             if name.starts_with(tensor) {
@@ -298,7 +301,7 @@ fn numbers_that_are_not_finite_stop_training_with_a_checkpoint() {
                 stored.numbers.fill(3e38);
             }
         }
-        agent::checkpoint::write(&path, "autoencoder", &broken).expect("written");
+        agent::learning::checkpoint::write(&path, "autoencoder", &broken).expect("written");
         let resume = place.words("out", &format!("{WORLD} --steps 10 --resume"));
         let words = ["world steps: update ", "expected finite numbers", "is in"];
         check(AGENT, &resume, &words);

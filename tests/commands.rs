@@ -1,7 +1,7 @@
 //! Wrong input to every command: an exit code, one line that says what was expected, no panic.
 
 use crate::harness::{Ended, PATIENCE, Program, SMALL, Server, new_instance, run};
-use agent::policy;
+use agent::planning::policy;
 use protocol::Model;
 use rustix::process::Signal;
 use std::time::Duration;

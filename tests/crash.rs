@@ -4,7 +4,7 @@ use crate::harness::{
     PATIENCE, Paths, Program, Server, claim, eventually, fly, frames_until, status, takeover,
 };
 use crate::wire::{RawClient, Wire, answer, control_header, step_header};
-use agent::client::{Claim, Client, Observation};
+use agent::server::client::{Claim, Client, Observation};
 use protocol::channels::{ChannelError, Instance};
 use protocol::connection::ConnectionError;
 use protocol::control::{Reply, Request};

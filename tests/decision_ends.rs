@@ -1,13 +1,13 @@
 //! How agents that serve decisions begin, keep their world and end; and learners that are killed.
 
 use crate::harness::{PATIENCE, Program, SMALL, Server, eventually, takeover};
-use crate::learner::{Learner, refusal, reply_to, start_agent, start_with_learner};
+use crate::learning::learner::{Learner, refusal, reply_to, start_agent, start_with_learner};
 use crate::wire::control_header;
-use agent::client::{Claim, Client, shape_of};
+use agent::acting::decider::{Assignment, Decider};
+use agent::acting::run::{RunError, prepare};
 use agent::config::AgentConfig;
-use agent::decider::{Assignment, Decider};
-use agent::policy::PlannerKind;
-use agent::run::{RunError, prepare};
+use agent::planning::policy::PlannerKind;
+use agent::server::client::{Claim, Client, shape_of};
 use protocol::channels::{ChannelError, Instance};
 use protocol::connection::ConnectionError;
 use protocol::decisions::{Reply, Request};

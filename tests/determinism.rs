@@ -1,7 +1,7 @@
 //! A world is a function of model, seed and k: nothing beside it, before it or around it counts.
 
 use crate::harness::{PATIENCE, Paths, Server, claim, fly, reset, takeover};
-use agent::client::{Client, Observation};
+use agent::server::client::{Client, Observation};
 use protocol::Move;
 use protocol::observer::Observer;
 

@@ -2,7 +2,7 @@
 
 use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly};
 use crate::wire::{RawClient, Wire, step_header};
-use agent::estimator::filter::known_model_kind;
+use agent::estimation::filter::known_model_kind;
 use protocol::Model;
 use protocol::Move;
 use protocol::control::{LeftPart, Reply, Request, WorldSeed};

@@ -1,6 +1,6 @@
 //! Programs as children: started on names of their own, waited for with deadlines, killed on drop.
 
-use agent::client::{Claim, Client, Observation};
+use agent::server::client::{Claim, Client, Observation};
 use env_server::config::ServerConfig;
 use env_server::episode::{Episode, Rules};
 use env_server::snapshot::{Settings, WorldToWrite, encode};

@@ -7,7 +7,7 @@ use crate::attacker::Attacker;
 use crate::harness::{PATIENCE, Paths, Program, Server, claim, eventually, fly};
 use crate::siege::{FLAGS, besiege};
 use crate::wire::{RawClient, Wire, answer, client, control_header, step_header};
-use agent::client::Client;
+use agent::server::client::Client;
 use protocol::Connection;
 use protocol::channels::{Channel, MAX_CLIENTS, MAX_OBSERVERS, Services, create_node};
 use protocol::connection::ConnectionError;

@@ -4,7 +4,7 @@ use crate::harness::{
     ENDLESS, PATIENCE, Paths, SMALL, Server, claim, eventually, fly, new_instance, takeover,
 };
 use crate::wire::{RawClient, Wire, control_header};
-use agent::client::{Claim, Client};
+use agent::server::client::{Claim, Client};
 use protocol::Connection;
 use protocol::connection::ConnectionError;
 use protocol::control::{Reply, Request, ServerStatus, WorldSeed};

@@ -5,7 +5,7 @@ use crate::harness::{
     reset, run, small_settings, takeover,
 };
 use crate::wire::{RawClient, Wire, control_header};
-use agent::client::{Client, Observation};
+use agent::server::client::{Client, Observation};
 use env_server::snapshot::folder::{Folder, Outlives};
 use env_server::snapshot::{RestoredWorld, WorldToWrite, decode, encode};
 use protocol::channels::Instance;

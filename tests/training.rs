@@ -2,8 +2,8 @@
 
 use crate::commands::{AGENT, check, check_table};
 use crate::harness::{Ended, Program, SMALL, Server, eventually, fly, run};
-use agent::checkpoint::{self, Contents};
-use agent::learner::KIND;
+use agent::learning::checkpoint::{self, Contents};
+use agent::learning::learner::KIND;
 use protocol::Move;
 use rustix::process::Signal;
 use std::ffi::OsString;

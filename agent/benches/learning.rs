@@ -1,9 +1,10 @@
 //! Time of learning at the paper's size: 64 x 64 cells, 64 moves, 3 states, 16 streams x 16 frames.
 
 use agent::config::LearningConfig;
-use agent::estimator::BayesFilter;
-use agent::estimator::learned_filter::{Dimensions, Parameters, Tables, Trainer};
-use agent::replay::Replay;
+use agent::estimation::BayesFilter;
+use agent::estimation::parameters::{Dimensions, Parameters, Tables};
+use agent::learning::filter::Trainer;
+use agent::learning::replay::Replay;
 use criterion::{Criterion, criterion_group, criterion_main};
 use protocol::path::fly;
 use protocol::randomness::split_mix;

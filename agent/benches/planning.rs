@@ -2,9 +2,9 @@
 //!
 //! The authors' PyTorch code, one CPU thread: planner with 2048 samples 1.5 s, Bayes update 0.12 ms.
 
-use agent::belief::{Belief, EntropyKind};
-use agent::estimator::BayesFilter;
-use agent::planner::{
+use agent::estimation::BayesFilter;
+use agent::estimation::belief::{Belief, EntropyKind};
+use agent::planning::{
     BeamSearch, CellValues, Objective, Planner, PlanningProblem, RandomWalk, Shooting, Target,
 };
 use criterion::{Criterion, criterion_group, criterion_main};

@@ -3,8 +3,8 @@
 //!
 //! `cargo run -p agent --example time_scales -- docs/time-scales.png`
 
+use agent::benchmark::report::save;
 use agent::config::{AgentConfig, StepSize};
-use agent::report::save;
 use figures::{Curve, Lines, Panel, Scale};
 use std::path::Path;
 

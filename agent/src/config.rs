@@ -8,13 +8,14 @@ pub use decisions::DecisionsConfig;
 pub use learning::LearningConfig;
 pub use networks::{AutoencoderConfig, DqnConfig, StepSize};
 
-use crate::belief::EntropyKind;
-use crate::estimator::Prior;
-use crate::planner::beam::DEFAULT_WIDTH;
-use crate::planner::{
+use crate::estimation::Prior;
+use crate::estimation::belief::EntropyKind;
+use crate::planning::beam::DEFAULT_WIDTH;
+use crate::planning::objective::BEAM_BONUS;
+use crate::planning::policy::{PlannerKind, Policy};
+use crate::planning::{
     BasisKind, BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target,
 };
-use crate::policy::{BEAM_BONUS, PlannerKind, Policy};
 use clap::{Args, ValueEnum};
 use protocol::program::read_text;
 use serde::{Deserialize, Serialize};
@@ -270,6 +271,11 @@ impl AgentConfig {
             entropy: settings.entropy,
             revisits: settings.revisits,
         }
+    }
+
+    /// Seed of a planner: its world's, told apart by the agent's own.
+    pub fn planner_seed(&self, world_seed: u64) -> u64 {
+        world_seed ^ self.seed.rotate_left(32)
     }
 
     /// The planner of a policy.

@@ -1,41 +1,25 @@
 //! Estimates, plans and acts on an Emberwatch server, and compares ways to do so.
 //!
-//! One step, in reading order: [`client`] (frames in, paths out), [`estimator`] (frame to
-//! [`belief`]), [`planner`] (belief to path).
+//! Rooms, each using only those below it:
+//!
+//! - `commands` (of the program): flags in, words out
+//! - [`benchmark`]: policies on the same worlds, scored
+//! - [`acting`]: one world of a running server, for a policy or for a learner outside
+//! - [`learning`]: models that are learned while acting, and their checkpoints
+//! - [`rollout`]: an agent, and the one step that all of these take
+//! - [`server`]: the ends of the wire
+//! - [`config`]: settings
+//! - [`planning`]: from a belief to a path
+//! - [`estimation`]: from frames to a belief
 
-pub mod action;
-pub mod agent;
-pub mod arena;
-pub mod belief;
-pub mod checkpoint;
-pub mod client;
-pub mod compare;
+pub mod acting;
+pub mod benchmark;
 pub mod config;
-pub mod decider;
-pub mod decisions;
-pub mod dqn_input;
-pub mod estimator;
-pub mod evaluate;
-pub mod feed;
-pub mod first_belief;
-pub mod handover;
-pub mod launch;
-pub mod learned;
-pub mod learner;
-pub mod metrics;
-pub mod planner;
-pub mod policy;
-pub mod replay;
-pub mod report;
-pub mod reward;
+pub mod estimation;
+pub mod learning;
+pub mod planning;
 pub mod rollout;
-pub mod run;
-pub mod scoring;
-pub mod student;
-pub mod summary;
-pub mod tensorboard;
-pub mod train;
-pub mod truth;
+pub mod server;
 
-pub use belief::{Belief, EntropyKind};
-pub use planner::{Objective, Planner, PlanningProblem};
+pub use estimation::belief::{Belief, EntropyKind};
+pub use planning::{Objective, Planner, PlanningProblem};

@@ -9,9 +9,9 @@
 //!     np.savez(f"{name}.npz", **{k: z[k] for k in z.files if z[k].dtype.kind != "U"})
 //! ```
 
-use agent::belief::Belief;
-use agent::estimator::BayesFilter;
-use agent::planner::{Integration, Objective, Target};
+use agent::estimation::BayesFilter;
+use agent::estimation::belief::Belief;
+use agent::planning::{Integration, Objective, Target};
 use ndarray::{Array, Array1, Array2, Array3, Array4, ArrayView2, ArrayView3, Dimension, s};
 use ndarray_npy::{NpzReader, ReadableElement};
 use protocol::frame::{Frame, UNOBSERVED};

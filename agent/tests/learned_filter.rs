@@ -2,10 +2,11 @@
 
 use agent::Belief;
 use agent::config::LearningConfig;
-use agent::estimator::BayesFilter;
-use agent::estimator::learned_filter::window::{Start, Window};
-use agent::estimator::learned_filter::{Dimensions, Parameters, Tables, Trainer, Update};
-use agent::replay::{Replay, Sighting};
+use agent::estimation::BayesFilter;
+use agent::estimation::parameters::{Dimensions, Parameters, Tables};
+use agent::learning::filter::window::{Start, Window};
+use agent::learning::filter::{Trainer, Update};
+use agent::learning::replay::{Replay, Sighting};
 use protocol::randomness::split_mix;
 use protocol::{Frame, Model, Shape};
 

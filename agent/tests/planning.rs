@@ -1,12 +1,12 @@
 //! What holds for every planner, filter and summary, on random problems.
 
-use agent::belief::Belief;
-use agent::estimator::BayesFilter;
-use agent::planner::{
+use agent::estimation::BayesFilter;
+use agent::estimation::belief::Belief;
+use agent::estimation::summary::{N_BLOCKS, summarise, summary_length};
+use agent::planning::{
     BeamSearch, CellValues, Integration, Objective, Plan, Planner, PlanningProblem, RandomWalk,
     Shooting, Target,
 };
-use agent::summary::{N_BLOCKS, summarise, summary_length};
 use proptest::prelude::*;
 use protocol::frame::{Frame, UNOBSERVED};
 use protocol::grid::{Cell, Probabilities, Shape};

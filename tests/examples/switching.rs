@@ -3,10 +3,10 @@
 //!
 //! `cargo run --release -p tests --example switching -- MODEL MOVES BURN_IN FIRST_SEED WORLDS STEPS`
 
-use agent::action::{ActionSet, Region};
-use agent::belief::Belief;
-use agent::estimator::{BayesFilter, Prior};
-use agent::planner::BeamSearch;
+use agent::estimation::belief::Belief;
+use agent::estimation::{BayesFilter, Prior};
+use agent::planning::BeamSearch;
+use agent::planning::action::{ActionSet, Region};
 use env_server::episode::{Episode, Rules, Start};
 use protocol::{Cell, Coverage, Model, Shape};
 use std::io::Write;

@@ -2,17 +2,17 @@
 
 use super::worlds::WorldFlags;
 use super::{make_folder, make_folder_of, write};
-use agent::agent::AgentError;
-use agent::arena::Arena;
-use agent::compare::{Comparison, Moment, Results, compare};
-use agent::config::AgentFlags;
-use agent::launch::OwnDashboard;
-use agent::learned::Learned;
-use agent::policy::{EstimatorKind, Policy};
-use agent::report::{
+use agent::benchmark::arena::Arena;
+use agent::benchmark::compare::{Comparison, Moment, Results, compare};
+use agent::benchmark::report::{
     Snapshot, draw_ladder, draw_rewards, draw_snapshot, figures::FIRE_CELLS_PER_STEP, render_table,
     write_csv, write_events,
 };
+use agent::config::AgentFlags;
+use agent::learning::learned::Learned;
+use agent::planning::policy::{EstimatorKind, Policy};
+use agent::rollout::agent::AgentError;
+use agent::server::launch::OwnDashboard;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};

@@ -1,10 +1,10 @@
 //! `serve-decisions`: a learner outside decides, this program estimates, plans and steps.
 
 use super::{WaitFlag, model_named};
+use agent::acting::decider::Assignment;
+use agent::acting::decisions::serve_decisions;
 use agent::config::AgentFlags;
-use agent::decider::Assignment;
-use agent::decisions::serve_decisions;
-use agent::policy::PlannerKind;
+use agent::planning::policy::PlannerKind;
 use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
 use protocol::channels::Instance;

@@ -2,8 +2,8 @@
 
 use super::model_named;
 use agent::Belief;
-use agent::estimator::Prior;
-use agent::first_belief::first_belief;
+use agent::estimation::Prior;
+use agent::estimation::first_belief::first_belief;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use ndarray_npy::WriteNpyExt;

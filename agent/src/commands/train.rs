@@ -2,10 +2,10 @@
 
 use super::worlds::GridFlags;
 use super::{WaitFlag, make_folder, parse_seconds};
+use agent::benchmark::report::training::draw_training;
 use agent::config::{AgentFlags, LearnerKind, Preset};
-use agent::launch::OwnServer;
-use agent::report::training::draw_training;
-use agent::train::{Training, train};
+use agent::learning::train::{Training, train};
+use agent::server::launch::OwnServer;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use network::DeviceKind;

@@ -1,8 +1,8 @@
 //! The worlds that policies meet: a running server's, or a private one's.
 
 use super::{WaitFlag, model_named};
-use agent::arena::{Arena, MAX_BATCH};
-use agent::launch::OwnServer;
+use agent::benchmark::arena::{Arena, MAX_BATCH};
+use agent::server::launch::OwnServer;
 use anyhow::{Result, ensure};
 use clap::Args;
 use protocol::channels::Instance;

@@ -1,7 +1,7 @@
 //! Settings of the paper's networks: the sections `[autoencoder]` and `[dqn]` of `config/agent.toml`.
 
-use super::ConfigError;
-use crate::dqn_input::DqnInput;
+use crate::config::ConfigError;
+use crate::estimation::dqn_input::DqnInput;
 use ::network::{AdamSettings, AutoencoderSettings, DqnSettings};
 use serde::{Deserialize, Serialize};
 

@@ -1,9 +1,11 @@
 //! The figures' worst cases; the pictures stay in `target/tmp/report` for people to look at.
 
 use crate::synthetic::{Scene, ladder, model, noise, run, scene};
-use agent::report::figures::FIRE_CELLS_PER_STEP;
-use agent::report::training::{FIGURES, draw_training};
-use agent::report::{PolicyRun, ReportError, Snapshot, draw_ladder, draw_rewards, draw_snapshot};
+use agent::benchmark::report::figures::FIRE_CELLS_PER_STEP;
+use agent::benchmark::report::training::{FIGURES, draw_training};
+use agent::benchmark::report::{
+    PolicyRun, ReportError, Snapshot, draw_ladder, draw_rewards, draw_snapshot,
+};
 use protocol::Model;
 use std::path::{Path, PathBuf};
 

@@ -1,6 +1,6 @@
 //! Results and worlds made up for the tests.
 
-use agent::report::PolicyRun;
+use agent::benchmark::report::PolicyRun;
 use protocol::model::{ModelFile, ObservationEntry, StateEntry};
 use protocol::{Cell, Frame, Grid, Model, Probabilities, Shape, UNOBSERVED};
 
@@ -103,7 +103,7 @@ pub fn model(n: usize) -> Model {
     Model::new(file).expect("test model")
 }
 
-/// What a [`agent::report::Snapshot`] borrows or owns.
+/// What a [`agent::benchmark::report::Snapshot`] borrows or owns.
 pub struct Scene {
     pub model: Model,
     pub truth: Grid<u8>,

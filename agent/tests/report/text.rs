@@ -1,5 +1,5 @@
 use crate::synthetic::{ladder, run};
-use agent::report::{PolicyRun, ReportError, render_table, write_csv};
+use agent::benchmark::report::{PolicyRun, ReportError, render_table, write_csv};
 
 /// Rewards 1, 3, 5 and 2, 5, 8 on worlds 1, 2, 3; the oracle earns 4, 8, 8.
 fn three_policies() -> Vec<PolicyRun> {

@@ -2,7 +2,7 @@
 
 use crate::harness::{Paths, Server, new_instance, takeover};
 use crate::{say, spread};
-use agent::client::{Client, Observation};
+use agent::server::client::{Client, Observation};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;

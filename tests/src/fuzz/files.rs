@@ -1,9 +1,9 @@
 //! What the programs read from files: models, checkpoints.
 
 use super::Seed;
-use agent::checkpoint::{Contents, Problem, encode};
-use agent::estimator::learned_filter::Dimensions;
-use agent::learned::Learned;
+use agent::estimation::parameters::Dimensions;
+use agent::learning::checkpoint::{Contents, Problem, encode};
+use agent::learning::learned::Learned;
 use agent::{learner, student};
 use ndarray::{Array3, Axis};
 use protocol::model::ModelFile;

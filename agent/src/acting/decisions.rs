@@ -1,0 +1,316 @@
+//! Serves decisions: a learner outside says what each path is for, this program does the rest.
+//!
+//! One request after the other, each answered before the next is taken; between them the lease is kept
+//! alive. Without the world there is nothing to serve, so a lost lease or a server that ends is the end.
+
+use crate::acting::decider::{Assignment, Decider};
+use crate::acting::run::{RunError, is_outage, prepare};
+use crate::estimation::first_belief::first_belief;
+use crate::server::client::shape_of;
+use protocol::Model;
+use protocol::channels::{ChannelError, ipc_error};
+use protocol::connection::ConnectionError;
+use protocol::control::parse;
+use protocol::decisions::{Reply, Request};
+use protocol::message::{Status, VERSION};
+use protocol::program::Keeper;
+use protocol::responder::{ActiveControl, Responder, ResponderError, wait_until_taken};
+use protocol::wait::{Waiter, sleep_until_event};
+use std::cell::Cell;
+use std::fmt::Display;
+use std::os::fd::BorrowedFd;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+use thiserror::Error;
+
+/// How often to look around without being asked: bounds how late a signal is noticed.
+const TICK: Duration = Duration::from_millis(250);
+
+/// Why no decisions are served any more, or none in the first place.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum DecisionsError {
+    /// The world, the server or the model; a lost lease too.
+    #[error(transparent)]
+    Run(#[from] RunError),
+    /// The place of the one that answers could not be taken.
+    #[error(transparent)]
+    Responder(#[from] ResponderError),
+    /// A channel failed.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+}
+
+/// Serves until `stop` is set, a client asks to shut down, or the keeper ends; then
+/// releases the world. `model` is for servers that do not reveal theirs.
+///
+/// # Errors
+/// [`DecisionsError`]; whoever waits for an answer then is refused first.
+pub fn serve_decisions(
+    task: &Assignment,
+    model: Option<&Model>,
+    keeper: Option<Keeper>,
+    stop: &AtomicBool,
+) -> Result<(), DecisionsError> {
+    let mut service = Service::start(task, model, keeper)?;
+    match service.serve(stop) {
+        Ok(asked) => service.stop(asked),
+        Err(error) => {
+            service.desk.refuse_everybody(&ending(&error));
+            Err(error)
+        }
+    }
+}
+
+struct Service {
+    desk: Desk,
+    decider: Decider,
+    keeper: Option<Keeper>,
+    waiter: Waiter,
+    last_look: Instant,
+}
+
+/// Where requests come in and answers go out.
+struct Desk {
+    responder: Responder,
+    /// The last requests, whose clients may still be reading.
+    answered: Vec<ActiveControl>,
+}
+
+/// What came of waiting.
+enum Found {
+    Request(ActiveControl),
+    /// A wake-up without a request, or a death.
+    Event,
+}
+
+/// How a request is answered.
+enum Answer {
+    Reply(Reply),
+    Shutdown,
+}
+
+impl Service {
+    fn start(
+        task: &Assignment,
+        model: Option<&Model>,
+        keeper: Option<Keeper>,
+    ) -> Result<Self, DecisionsError> {
+        // What takes long is done before anybody can ask and before the lease begins to run.
+        let (info, model) = prepare(&task.instance, task.world, model)?;
+        let shape = shape_of(&info).map_err(RunError::from)?;
+        let prior = task.config.prior(info.burn_in);
+        let prior = first_belief(prior, &model, shape, task.config.seed).map_err(RunError::from)?;
+        let responder = Responder::open(&task.instance, task.world)?;
+        let decider = Decider::attach(task, model, prior)?;
+        let (instance, pid) = (task.instance.name(), std::process::id());
+        let (seed, step) = (decider.last().seed, decider.last().step);
+        tracing::info!(
+            instance,
+            pid,
+            world = task.world,
+            seed,
+            step,
+            "serving decisions"
+        );
+        Ok(Self {
+            desk: Desk {
+                responder,
+                answered: Vec::new(),
+            },
+            decider,
+            keeper,
+            waiter: Waiter::default(),
+            last_look: Instant::now(),
+        })
+    }
+
+    /// Serves to the end; returns the request that asked for it, if it was one.
+    fn serve(&mut self, stop: &AtomicBool) -> Result<Option<ActiveControl>, DecisionsError> {
+        while !stop.load(Ordering::Relaxed) && !self.keeper_has_ended() {
+            if let Some(request) = self.wait()? {
+                match self.handle(&request) {
+                    Ok(Answer::Reply(reply)) => self.desk.answer(&request, &reply),
+                    Ok(Answer::Shutdown) => return Ok(Some(request)),
+                    Err(error) => {
+                        self.desk.answer(&request, &refusal(&error));
+                        if is_the_end(&error) {
+                            self.desk.answered.push(request);
+                            return Err(error.into());
+                        }
+                    }
+                }
+            }
+            let now = Instant::now();
+            if now - self.last_look > TICK || self.decider.until_renewal(now).is_zero() {
+                self.last_look = now;
+                self.decider.keep_alive(now)?;
+            }
+        }
+        Ok(None)
+    }
+
+    /// The next request; `None` after a while or an event.
+    fn wait(&mut self) -> Result<Option<ActiveControl>, DecisionsError> {
+        let woken = Cell::new(false);
+        let tick = TICK.min(self.decider.until_renewal(Instant::now()));
+        let look = || match self.desk.responder.receive() {
+            Some(request) => Ok(Some(Found::Request(request))),
+            None => Ok(woken.get().then_some(Found::Event)),
+        };
+        let found = self.waiter.wait(tick, look, |limit| {
+            woken.set(self.sleep(limit)?);
+            Ok::<_, ChannelError>(())
+        })?;
+        match found {
+            Some(Found::Request(request)) => Ok(Some(request)),
+            Some(Found::Event) | None => {
+                self.decider.keep_alive(Instant::now())?;
+                Ok(None)
+            }
+        }
+    }
+
+    /// Sleeps until a wake-up, a signal or a death; returns whether there was one.
+    fn sleep(&self, limit: Duration) -> Result<bool, ChannelError> {
+        if self.desk.responder.drain()? {
+            return Ok(true);
+        }
+        let own = [
+            self.desk.responder.descriptor(),
+            self.decider.server_process(),
+        ];
+        let keeper = self.keeper.iter().map(Keeper::descriptor);
+        let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(keeper).collect();
+        sleep_until_event(&descriptors, limit).map_err(ipc_error("sleep"))
+    }
+
+    fn handle(&mut self, request: &ActiveControl) -> Result<Answer, RunError> {
+        let version = request.user_header().version;
+        if version != VERSION {
+            return Ok(Answer::Reply(mismatch(version)));
+        }
+        let reply = match parse(request.payload()) {
+            Err(message) => error_reply(Status::Malformed, 0, message),
+            Ok(Request::Hello { protocol, .. }) if protocol != VERSION => mismatch(protocol),
+            Ok(Request::Hello { client, .. }) => {
+                tracing::info!(client, "hello");
+                Reply::Decisions(Box::new(self.decider.info().clone()))
+            }
+            Ok(Request::Reset { seed }) => {
+                let decision = self.decider.reset(seed)?.clone();
+                tracing::info!(seed = decision.seed, episode = decision.episode, "reset");
+                Reply::Decision(decision)
+            }
+            Ok(Request::Decide { objective }) => self.decide(objective)?,
+            Ok(Request::Last {}) => Reply::Decision(self.decider.last().clone()),
+            Ok(Request::Shutdown {}) => return Ok(Answer::Shutdown),
+        };
+        Ok(Answer::Reply(reply))
+    }
+
+    fn decide(&mut self, objective: u64) -> Result<Reply, RunError> {
+        if let Some(decision) = self.decider.decide(objective)? {
+            let decision = decision.clone();
+            tracing::debug!(
+                step = decision.step,
+                objective,
+                reward = decision.reward,
+                "decision"
+            );
+            return Ok(Reply::Decision(decision));
+        }
+        let n_objectives = self.decider.info().objectives.len() as u64;
+        let expected = Status::BadObjective.explain(n_objectives);
+        let message = format!("{expected}, got {objective}");
+        Ok(error_reply(Status::BadObjective, n_objectives, message))
+    }
+
+    /// Releases the world, then answers the client that asked for it.
+    fn stop(self, asked: Option<ActiveControl>) -> Result<(), DecisionsError> {
+        let Self {
+            mut desk, decider, ..
+        } = self;
+        let released = decider.release();
+        if let Some(request) = asked {
+            desk.answer(&request, &Reply::Done);
+            desk.answered.push(request);
+        }
+        let told = because("it was told to stop");
+        desk.refuse_everybody(&error_reply(Status::AgentEnds, 0, told));
+        match released {
+            Err(error) if !is_outage(&error) => Err(error.into()),
+            _ => Ok(()),
+        }
+    }
+
+    fn keeper_has_ended(&self) -> bool {
+        self.keeper.as_ref().is_some_and(Keeper::has_ended)
+    }
+}
+
+impl Desk {
+    fn answer(&mut self, request: &ActiveControl, reply: &Reply) {
+        if reply.status() != Status::Ok {
+            tracing::debug!(status = ?reply.status(), "refused a request");
+        }
+        self.responder.answer(request, reply.status(), reply);
+    }
+
+    /// Refuses whoever still asks, and lets clients read before the channel closes.
+    fn refuse_everybody(&mut self, reply: &Reply) {
+        while let Some(request) = self.responder.receive() {
+            self.answer(&request, reply);
+            self.answered.push(request);
+        }
+        wait_until_taken(&self.answered);
+    }
+}
+
+/// Refusals of the server pass through; whatever else fails ends the agent.
+fn refusal(error: &RunError) -> Reply {
+    match error {
+        RunError::Connection(ConnectionError::Refused {
+            status,
+            detail,
+            message,
+        }) => error_reply(*status, *detail, message.clone()),
+        other => error_reply(Status::AgentEnds, 0, because(other)),
+    }
+}
+
+/// The refusal of everybody who asks when the agent ends early.
+fn ending(error: &DecisionsError) -> Reply {
+    match error {
+        DecisionsError::Run(error) => refusal(error),
+        other => error_reply(Status::AgentEnds, 0, because(other)),
+    }
+}
+
+/// Whether the agent cannot go on after an error.
+fn is_the_end(error: &RunError) -> bool {
+    !matches!(
+        error,
+        RunError::Connection(ConnectionError::Refused { status, .. })
+            if !matches!(status, Status::LeaseLost | Status::NoLease)
+    )
+}
+
+fn because(reason: impl Display) -> String {
+    format!("{}: {reason}", Status::AgentEnds.explain(0))
+}
+
+fn error_reply(status: Status, detail: u64, message: String) -> Reply {
+    Reply::Error {
+        status,
+        detail,
+        message,
+    }
+}
+
+/// The refusal of a client that speaks another version.
+fn mismatch(client: u32) -> Reply {
+    let detail = u64::from(VERSION);
+    let message = Status::version_mismatch(client, detail);
+    error_reply(Status::VersionMismatch, detail, message)
+}

@@ -1,0 +1,114 @@
+//! How an agent goes on with what another believed: from the belief that it left with the server, or
+//! else from the frames that the server keeps.
+
+use crate::acting::run::RunError;
+use crate::estimation::belief::Belief;
+use crate::rollout::Robot;
+use crate::server::client::Client;
+use protocol::Probabilities;
+use protocol::connection::ConnectionError;
+use protocol::message::Status;
+
+/// Frames that are recalled before the lease is renewed: much less than the shortest lease takes.
+const RENEW_AFTER: u64 = 500;
+
+/// Gives a robot's agent what is known of its world before the present frame; returns whether that frame is in
+/// it already, and the belief about X_{k+1}.
+///
+/// # Errors
+/// [`RunError`].
+pub fn resume(client: &mut Client, robot: &mut Robot) -> Result<bool, RunError> {
+    if take_over_left(client, robot)? {
+        return Ok(true);
+    }
+    let step = robot.observation().result.step;
+    let agent = &mut robot.agent;
+    if !agent.estimator().sees_frames() {
+        return Ok(false);
+    }
+    let first = first_kept(client, step)?;
+    for past in first..step {
+        if past % RENEW_AFTER == RENEW_AFTER - 1 {
+            client.renew()?; // Recalling is no use of the lease.
+        }
+        let Ok(mut seen) = client.recall(client.worlds(), past) else {
+            client.renew()?; // Says so if the world is another's by now.
+            break;
+        };
+        let seen = seen.remove(0);
+        agent.correct(&seen.frame, None)?;
+        agent.predict();
+    }
+    if first < step {
+        tracing::info!(first, step, "going on from the frames that were kept");
+    }
+    Ok(false)
+}
+
+/// Gives an agent the belief that was left for it, if there is one; whatever it believed before is
+/// forgotten.
+///
+/// # Errors
+/// [`ConnectionError`].
+pub fn take_over_left(client: &mut Client, robot: &mut Robot) -> Result<bool, ConnectionError> {
+    let step = robot.observation().result.step;
+    let agent = &mut robot.agent;
+    let Some(kind) = agent.estimator().kind() else {
+        return Ok(false);
+    };
+    let Some(belief) = belief_left(client, &kind, agent.belief())? else {
+        return Ok(false);
+    };
+    tracing::info!(step, "going on from the belief that was left");
+    agent.take_over(belief);
+    Ok(true)
+}
+
+/// Leaves an agent's belief about X_{k+1}, after its last observation, to the next one.
+///
+/// # Errors
+/// [`ConnectionError`].
+pub fn leave(client: &mut Client, robot: &Robot) -> Result<(), ConnectionError> {
+    let (agent, present) = (&robot.agent, robot.observation());
+    let Some(kind) = agent.estimator().kind() else {
+        return Ok(());
+    };
+    let numbers = agent.belief().as_slice();
+    let bytes: Vec<u8> = numbers.iter().flat_map(|p| p.to_le_bytes()).collect();
+    match client.leave_belief(&present.result, &kind, &bytes) {
+        // A server that keeps no beliefs.
+        Err(ConnectionError::Refused {
+            status: Status::Malformed,
+            ..
+        }) => Ok(()),
+        left => left,
+    }
+}
+
+/// The belief that was left about the world as it stands, if it is of a kind and of the shape of one's
+/// own.
+fn belief_left(
+    client: &mut Client,
+    kind: &str,
+    own: &Belief,
+) -> Result<Option<Belief>, ConnectionError> {
+    let Some(bytes) = client.belief(kind)? else {
+        return Ok(None);
+    };
+    let (numbers, _) = bytes.as_chunks::<4>();
+    let numbers = numbers.iter().map(|&p| f32::from_le_bytes(p)).collect();
+    let belief = Probabilities::from_shape_vec(own.probabilities().dim(), numbers).ok();
+    Ok(belief.and_then(|belief| Belief::from_probabilities(belief).ok()))
+}
+
+/// The first step from which on all frames are kept; the present one where a server keeps none.
+fn first_kept(client: &mut Client, step: u64) -> Result<u64, ConnectionError> {
+    match client.recall(client.worlds(), 0) {
+        Ok(_) => Ok(0),
+        Err(ConnectionError::Refused { status, detail, .. }) => match status {
+            Status::NotKept => Ok(detail.min(step)),
+            _ => Ok(step),
+        },
+        Err(error) => Err(error),
+    }
+}

@@ -1,0 +1,7 @@
+//! Acting on one world of a running server: for a policy, or for a learner outside.
+
+pub mod decider;
+pub mod decisions;
+pub mod handover;
+pub mod registry;
+pub mod run;

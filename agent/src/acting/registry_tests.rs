@@ -1,0 +1,203 @@
+//! Which belief an agent plans on, and what its decisions go by.
+
+use crate::estimation::Follower;
+use crate::estimation::dqn_input::DqnInput;
+use crate::planning::BasisKind;
+use crate::rollout::agent::*;
+use ::network::{Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, NetworkShape};
+use protocol::randomness::split_mix;
+
+const N_MOVES: usize = 6;
+const ROBOT: Cell = Cell { row: 4, col: 4 };
+
+fn shape() -> Shape {
+    Shape::new(8, 9).expect("test shape")
+}
+
+fn config(belief: BasisKind) -> AgentConfig {
+    let mut config = AgentConfig {
+        beam_width: 8,
+        shooting_samples: 64,
+        ..AgentConfig::default()
+    };
+    config.objective.belief = belief;
+    config
+}
+
+/// Hidden states, and what some cells show of them.
+fn world(step: u64) -> (Grid<u8>, Frame) {
+    let states = Grid::from_shape_fn(shape().dim(), |(row, col)| {
+        (split_mix(step / 3, (row / 3 * 3 + col / 3) as u64) % 3) as u8
+    });
+    let mut frame = Frame::empty(shape());
+    for (cell, &state) in states.iter().enumerate() {
+        if split_mix(step + 100, cell as u64).is_multiple_of(4) {
+            frame.observe(cell, state);
+        }
+    }
+    (states, frame)
+}
+
+/// A network that never learned, with the first seed whose DQN suits.
+fn network(input: DqnInput, basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> LearnedNetwork {
+    let settings = AutoencoderSettings::paper();
+    let sizes = NetworkShape {
+        grid: shape(),
+        n_states: 3,
+        n_observations: 3,
+        encoding: settings.encoding,
+        hidden: settings.hidden,
+    };
+    let autoencoder = Autoencoder::new(settings, sizes, 1, &Device::Cpu).expect("a network");
+    let n_inputs = input.length(settings.hidden, 3);
+    let dqn = |seed| Dqn::new(DqnSettings::paper(), n_inputs, 4, seed);
+    LearnedNetwork {
+        autoencoder,
+        dqn: (0..1000).map(dqn).find(suits).expect("a seed that suits"),
+        input,
+        basis,
+        target: 2,
+    }
+}
+
+fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent, AgentError> {
+    let model = Model::wildfire();
+    let task = Task {
+        model: &model,
+        shape: shape(),
+        n_moves: N_MOVES,
+        prior: &Belief::uniform(3, shape()),
+        seed: 7,
+        learned,
+    };
+    super::agent(&Policy::named(policy, &model).expect("known"), config, task)
+}
+
+/// Whether all plans of some steps are those on an estimate, a predictor.
+fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
+    let mut agent = agent(policy, config, learned).expect("an agent");
+    let mut all = [true; 2];
+    for step in 0..6 {
+        let (states, frame) = world(step);
+        agent.correct(&frame, Some(&states)).expect("possible");
+        let estimate = agent.belief().clone();
+        agent.predict();
+        agent.foresee(&world(step + 1).0).expect("valid states");
+        let predictor = agent.belief().clone();
+        let got = agent.plan(ROBOT, step);
+        for (all, belief) in all.iter_mut().zip([estimate, predictor]) {
+            let mut planner = config.planner(agent.policy());
+            let expected = match (&agent.policy().action, &agent.aim) {
+                (Some(action), _) => action.plan(&mut *planner, &belief, ROBOT, N_MOVES, (7, step)),
+                (None, Aim::Objective(target)) => {
+                    let objective = Objective {
+                        target: *target,
+                        ..agent.objective
+                    };
+                    planner.plan(&PlanningProblem {
+                        start: ROBOT,
+                        n_moves: N_MOVES,
+                        values: &objective.values(&belief),
+                        seed: 7,
+                        step,
+                    })
+                }
+                _ => panic!("{policy}: nothing was aimed at"),
+            };
+            *all &= got == expected;
+        }
+    }
+    all
+}
+
+#[test]
+fn every_policy_plans_on_the_belief_that_settings_say() {
+    let network = network(DqnInput::AfterFrame, BasisKind::Predictor, |_| true);
+    let dimensions = crate::estimation::parameters::Dimensions {
+        n_states: 3,
+        n_observations: 3,
+        kernel: (3, 3),
+    };
+    let learned = Learned {
+        filter: Some(crate::learning::learner::Progress::first(dimensions, 0).learned()),
+        network: Some(Arc::new(network)),
+        decisions: None,
+    };
+    for policy in [
+        "shooting_exploit",
+        "beam_exploit",
+        "act_exploit_at_0_3",
+        "oracle_beam",
+        "learned_beam",
+        "autoencoder_explore",
+        "autoencoder_beam",
+    ] {
+        let [predictor, estimate] = [BasisKind::Predictor, BasisKind::Estimate]
+            .map(|belief| plans(policy, &config(belief), &learned));
+        assert_eq!(predictor, [false, true], "{policy}");
+        assert_eq!(estimate, [true, false], "{policy}");
+    }
+    // The state that the path will meet is no prediction.
+    let clairvoyant = plans("clairvoyant_beam", &config(BasisKind::Estimate), &learned);
+    assert_eq!(clairvoyant, [false, true]);
+}
+
+#[test]
+fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
+    for basis in [BasisKind::Predictor, BasisKind::Estimate] {
+        let other = config(match basis {
+            BasisKind::Predictor => BasisKind::Estimate,
+            BasisKind::Estimate => BasisKind::Predictor,
+        });
+        let network = network(DqnInput::AfterFrame, basis, |_| true);
+        let mut learned = Learned {
+            network: Some(Arc::new(network)),
+            ..Learned::default()
+        };
+        let expected = [basis == BasisKind::Estimate, basis == BasisKind::Predictor];
+        assert_eq!(plans("autoencoder_policy", &other, &learned), expected);
+        let decisions = Decisions::first(&Model::wildfire(), &other.decisions, 0);
+        let mut contents = decisions.to_contents();
+        learned.decisions = Some(Arc::new(contents.clone()));
+        let error = agent("dqn_beam", &other, &learned)
+            .err()
+            .expect("no settings");
+        assert!(error.to_string().contains("\"settings\""), "{error}");
+        let settings = toml::to_string(&config(basis)).expect("TOML");
+        contents.texts.insert("settings".into(), settings);
+        learned.decisions = Some(Arc::new(contents));
+        let agent = agent("dqn_beam", &other, &learned).expect("an agent");
+        assert_eq!(agent.basis.kind(), basis);
+    }
+}
+
+#[test]
+fn a_network_decides_on_what_it_was_learned_with() {
+    let learned = network(DqnInput::AfterFrame, BasisKind::Predictor, |_| true).autoencoder;
+    let mut follower = Follower::new(&learned).expect("a network");
+    let before = follower.hidden().to_vec();
+    follower.step(&learned, &world(0).1).expect("possible");
+    let of = |input: DqnInput| input.of(&follower, ROBOT, N_MOVES);
+    let after = of(DqnInput::AfterFrame);
+    for input in [DqnInput::AfterFrame, DqnInput::Summary] {
+        let network = network(input, BasisKind::Predictor, |dqn| {
+            input == DqnInput::Summary || dqn.best(&before) != dqn.best(&after)
+        });
+        let best = network.dqn.best(&of(input));
+        let expected = Policy::network_choices(3)[best].objective.target;
+        let learned = Learned {
+            network: Some(Arc::new(network)),
+            ..Learned::default()
+        };
+        let config = config(BasisKind::Predictor);
+        let mut agent = agent("autoencoder_policy", &config, &learned).expect("an agent");
+        agent.correct(&world(0).1, None).expect("possible");
+        agent.predict();
+        agent.plan(ROBOT, 0);
+        assert!(
+            matches!(agent.aim, Aim::Objective(target) if target == expected),
+            "{}",
+            input.label()
+        );
+    }
+}

@@ -1,0 +1,439 @@
+//! The agent's life on one world: attach, act, reconnect, leave.
+
+use crate::acting::handover::{leave, resume, take_over_left};
+use crate::acting::registry::{self, Task};
+use crate::config::AgentConfig;
+use crate::estimation::Prior;
+use crate::estimation::belief::Belief;
+use crate::estimation::filter::known_model_kind;
+use crate::estimation::first_belief::first_belief;
+use crate::learning::learned::Learned;
+use crate::planning::policy::{EstimatorKind, Policy, UnknownPolicy};
+use crate::rollout::agent::AgentError;
+use crate::rollout::{self, Robot, Seen};
+use crate::server::client::{
+    Claim, Client, Observation, RETRY_INTERVAL, is_away, is_belief_left, server_info, shape_of,
+};
+use crate::server::feed::{Feed, View};
+use crate::server::truth::{TruthError, TruthFeed};
+use protocol::channels::Instance;
+use protocol::connection::ConnectionError;
+use protocol::control::ServerInfo;
+use protocol::message::Status;
+use protocol::model::ModelError;
+use protocol::{Grid, Model};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+use thiserror::Error;
+
+/// How often progress is told.
+const REPORT_INTERVAL: Duration = Duration::from_secs(2);
+
+/// What to do on one world.
+#[derive(Debug, Clone)]
+pub struct Mission {
+    /// The server.
+    pub instance: Instance,
+    /// The world.
+    pub world: u32,
+    /// The policy's name.
+    pub policy: String,
+    /// Steps to act for; 0: until stopped.
+    pub steps: u64,
+    /// Take the world from its holder.
+    pub takeover: bool,
+    /// The model, where the server does not reveal its own.
+    pub model: Option<Model>,
+    /// Settings of planners and estimators.
+    pub config: AgentConfig,
+    /// What was learned, for policies that act on it.
+    pub learned: Learned,
+}
+
+/// Why a mission ended early.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum RunError {
+    /// The server refused, or cannot be reached in the first place.
+    #[error(transparent)]
+    Connection(#[from] ConnectionError),
+    /// The agent failed.
+    #[error(transparent)]
+    Agent(#[from] AgentError),
+    /// The policy's name.
+    #[error(transparent)]
+    Policy(#[from] UnknownPolicy),
+    /// The model.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// The hidden states that an oracle needs.
+    #[error(transparent)]
+    Truth(#[from] TruthError),
+    /// The server hides its model and none was given.
+    #[error("instance {instance:?} does not reveal its model: expected --model FILE")]
+    NoModel {
+        /// The instance.
+        instance: String,
+    },
+    /// A model of other observations than the server's.
+    #[error("model: expected the server's {expected} observations, got {got}")]
+    OtherModel {
+        /// The server's number of observations.
+        expected: usize,
+        /// The model's.
+        got: usize,
+    },
+    /// A model that contradicts the one that the server reveals.
+    #[error(
+        "model: expected the server's own, {expected:?}, as it reveals it, got another, {got:?}"
+    )]
+    RevealedModel {
+        /// The server's.
+        expected: String,
+        /// The one given.
+        got: String,
+    },
+    /// A policy that only `compare` can feed.
+    #[error("policy {policy:?} needs worlds that run one step ahead: only `compare` has them")]
+    Clairvoyant {
+        /// The policy.
+        policy: String,
+    },
+}
+
+/// What a mission did.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Summary {
+    /// Steps acted.
+    pub steps: u64,
+    /// Sum of their rewards.
+    pub reward: f64,
+}
+
+/// Acts until the steps are done or `stop` is set. Waits for a server that ends, however often.
+///
+/// # Errors
+/// [`RunError`]; a lost lease is one.
+pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
+    let (mut summary, mut is_in_step) = (Summary::default(), true);
+    let mut attached = Attached::attach(mission, mission.takeover)?;
+    while !stop.load(Ordering::Relaxed) && (mission.steps == 0 || summary.steps < mission.steps) {
+        match attached.step(summary.steps + 1 == mission.steps) {
+            Ok(reward) => {
+                summary.steps += 1;
+                summary.reward += reward;
+                attached.report.tell(&summary);
+            }
+            Err(error) if is_outage(&error) => {
+                tracing::warn!("{error}; waiting for it to come back");
+                match attach_again(mission, stop)? {
+                    Some(again) => attached = again,
+                    None => {
+                        is_in_step = false;
+                        break;
+                    }
+                }
+            }
+            Err(error) => return Err(error),
+        }
+    }
+    let Attached {
+        mut client,
+        robot,
+        feed,
+        ..
+    } = attached;
+    // After an outage nobody knows where the world stands.
+    let left = match is_in_step {
+        true => leave(&mut client, &robot),
+        false => Ok(()),
+    };
+    let released = left.and_then(|()| client.release());
+    feed.end();
+    match released.map_err(RunError::from) {
+        Err(error) if !is_outage(&error) => Err(error),
+        _ => Ok(summary),
+    }
+}
+
+/// An agent at its world.
+struct Attached {
+    client: Client,
+    truth: Option<TruthFeed>,
+    robot: Robot,
+    feed: Feed,
+    report: Report,
+}
+
+/// Tells of progress now and then.
+struct Report {
+    since: Instant,
+    last: Summary,
+}
+
+impl Attached {
+    /// Acquires the world where it stands and takes in its last frame.
+    fn attach(mission: &Mission, takeover: bool) -> Result<Self, RunError> {
+        let (info, model) = prepare(&mission.instance, mission.world, mission.model.as_ref())?;
+        let policy = Policy::named(&mission.policy, &model)?;
+        if policy.estimator == EstimatorKind::NextTruth {
+            return Err(RunError::Clairvoyant {
+                policy: policy.name,
+            });
+        }
+        let shape = shape_of(&info)?;
+        // What takes long is done before the lease begins to run, and not at all where a belief was left.
+        let prior = match policy.estimator {
+            EstimatorKind::KnownModel => {
+                let any = Belief::from_initial(&model, shape);
+                if let Some(attached) = Self::go_on(mission, takeover, &model, &policy, &any)? {
+                    return Ok(attached);
+                }
+                mission.config.prior(info.burn_in)
+            }
+            _ => Prior::Initial,
+        };
+        let prior = first_belief(prior, &model, shape, mission.config.seed)?;
+        let mut attached = Self::acquire(mission, takeover, &model, &policy, &prior)?;
+        if !resume(&mut attached.client, &mut attached.robot)? {
+            attached.begin()?;
+        }
+        Ok(attached)
+    }
+
+    /// Acquires the world if a belief was left about it, in the place of `any`.
+    fn go_on(
+        mission: &Mission,
+        takeover: bool,
+        model: &Model,
+        policy: &Policy,
+        any: &Belief,
+    ) -> Result<Option<Self>, RunError> {
+        let kind = known_model_kind(model);
+        if !is_belief_left(&mission.instance, mission.world, &kind)? {
+            return Ok(None);
+        }
+        let mut attached = Self::acquire(mission, takeover, model, policy, any)?;
+        if take_over_left(&mut attached.client, &mut attached.robot)? {
+            return Ok(Some(attached));
+        }
+        // Another agent acted since.
+        attached.client.release()?;
+        Ok(None)
+    }
+
+    /// Acquires the world for an agent before its first frame.
+    fn acquire(
+        mission: &Mission,
+        takeover: bool,
+        model: &Model,
+        policy: &Policy,
+        prior: &Belief,
+    ) -> Result<Self, RunError> {
+        let worlds = mission.world..mission.world + 1;
+        let claim = Claim {
+            worlds: worlds.clone(),
+            takeover,
+            time_to_live: None,
+        };
+        let mut client = Client::acquire(&mission.instance, &claim)?;
+        let observation = client.observe(worlds)?.remove(0);
+        let (seed, step) = (observation.result.seed, observation.result.step);
+        tracing::info!(
+            world = mission.world,
+            seed,
+            step,
+            policy = policy.name,
+            "acting"
+        );
+        let n_moves = client.info().n_moves;
+        let seed = mission.config.planner_seed(seed);
+        let task = Task {
+            model,
+            shape: client.shape(),
+            n_moves,
+            prior,
+            seed,
+            learned: &mission.learned,
+        };
+        let agent = registry::agent(policy, &mission.config, task)?;
+        let truth = if policy.estimator == EstimatorKind::Truth {
+            Some(open_truth(mission, &client)?)
+        } else {
+            None
+        };
+        let feed = Feed::open(&mission.instance, agent.belief());
+        let report = Report {
+            since: Instant::now(),
+            last: Summary::default(),
+        };
+        Ok(Self {
+            client,
+            truth,
+            robot: Robot::new(agent, observation),
+            feed,
+            report,
+        })
+    }
+
+    fn begin(&mut self) -> Result<(), RunError> {
+        let truth = self.truth.as_ref();
+        let truth = truth_of(truth, &self.client, self.robot.observation())?;
+        let (feed, world) = (&mut self.feed, self.client.worlds().start);
+        let look = |robot: &Robot| show(feed, world, robot, false);
+        Ok(self.robot.begin(truth.as_ref(), look)?)
+    }
+
+    /// One step of the rollout; returns the reward. The last belief is shown in any case.
+    fn step(&mut self, is_last: bool) -> Result<f64, RunError> {
+        let world = self.client.worlds().start;
+        rollout::step(
+            std::slice::from_mut(&mut self.robot),
+            |robot| robot,
+            Robot::plan,
+            |paths| {
+                let observation = self.client.step(world..world + 1, paths)?.remove(0);
+                let truth = truth_of(self.truth.as_ref(), &self.client, &observation)?;
+                Ok::<_, RunError>(vec![Seen { observation, truth }])
+            },
+            |_, robot, _| {
+                show(&mut self.feed, world, robot, is_last);
+                Ok(())
+            },
+        )?;
+        Ok(self.robot.observation().result.reward)
+    }
+}
+
+/// The hidden states that an observation shows part of, for policies that are told them.
+fn truth_of(
+    feed: Option<&TruthFeed>,
+    client: &Client,
+    observation: &Observation,
+) -> Result<Option<Grid<u8>>, TruthError> {
+    let Some(feed) = feed else {
+        return Ok(None);
+    };
+    let result = &observation.result;
+    let states = feed.states(client.worlds(), &[result.seed], result.step)?;
+    Ok(states.into_iter().next())
+}
+
+/// Shows a robot's posterior to those who look on, if it is time or in any case.
+pub fn show(feed: &mut Feed, world: u32, robot: &Robot, in_any_case: bool) {
+    if feed.is_due() || in_any_case {
+        feed.show(&View {
+            world,
+            result: &robot.observation().result,
+            belief: robot.agent.belief(),
+            intent: robot.intent(),
+        });
+    }
+}
+
+impl Report {
+    fn tell(&mut self, summary: &Summary) {
+        let elapsed = self.since.elapsed();
+        if elapsed < REPORT_INTERVAL {
+            return;
+        }
+        let steps = summary.steps - self.last.steps;
+        let mean_reward = (summary.reward - self.last.reward) / steps.max(1) as f64;
+        let steps_per_second = (steps as f64 / elapsed.as_secs_f64()).round();
+        tracing::info!(
+            steps = summary.steps,
+            mean_reward,
+            steps_per_second,
+            "acting"
+        );
+        *self = Self {
+            since: Instant::now(),
+            last: *summary,
+        };
+    }
+}
+
+/// What a server says of itself, and its model, or the one given; checks that it has the world.
+///
+/// # Errors
+/// [`RunError`].
+pub fn prepare(
+    instance: &Instance,
+    world: u32,
+    model: Option<&Model>,
+) -> Result<(ServerInfo, Model), RunError> {
+    let info = server_info(instance)?;
+    if world >= info.n_worlds {
+        let (status, detail) = (Status::NoSuchWorld, info.n_worlds.into());
+        let message = status.explain(detail);
+        return Err(ConnectionError::Refused {
+            status,
+            detail,
+            message,
+        }
+        .into());
+    }
+    let revealed = info.model.as_deref().map(Model::from_toml).transpose()?;
+    let model = match (model, revealed) {
+        (Some(given), Some(revealed)) if *given != revealed => {
+            return Err(RunError::RevealedModel {
+                expected: revealed.file().name.clone(),
+                got: given.file().name.clone(),
+            });
+        }
+        (Some(given), _) => given.clone(),
+        (None, Some(revealed)) => revealed,
+        (None, None) => {
+            let instance = instance.name().into();
+            return Err(RunError::NoModel { instance });
+        }
+    };
+    let (expected, got) = (info.n_observations, model.file().observations.len());
+    if got != expected {
+        return Err(RunError::OtherModel { expected, got });
+    }
+    Ok((info, model))
+}
+
+fn open_truth(mission: &Mission, client: &Client) -> Result<TruthFeed, RunError> {
+    if client.info().publish_truth {
+        return Ok(TruthFeed::open(&mission.instance, client.shape())?);
+    }
+    Err(AgentError::NeedsTruth {
+        policy: mission.policy.clone(),
+    }
+    .into())
+}
+
+/// Attaches to a server that has come back; `None` if it is time to stop.
+fn attach_again(mission: &Mission, stop: &AtomicBool) -> Result<Option<Attached>, RunError> {
+    let mut takeover = false;
+    while !stop.load(Ordering::Relaxed) {
+        match Attached::attach(mission, takeover) {
+            Ok(attached) => return Ok(Some(attached)),
+            // The server did not end, it paused: our former connection holds the world still.
+            Err(error) if is_own_lease(&error) && !takeover => takeover = true,
+            Err(error) if is_outage(&error) => {
+                takeover = false;
+                std::thread::sleep(RETRY_INTERVAL);
+            }
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(None)
+}
+
+/// Whether a world is taken by this very process.
+fn is_own_lease(error: &RunError) -> bool {
+    let own_pid = u64::from(std::process::id());
+    matches!(
+        error,
+        RunError::Connection(ConnectionError::Refused { status: Status::Busy, detail, .. })
+            if *detail == own_pid
+    )
+}
+
+/// Whether the server is away and may come back.
+pub fn is_outage(error: &RunError) -> bool {
+    matches!(error, RunError::Connection(error) if is_away(error))
+}

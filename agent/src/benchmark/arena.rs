@@ -1,0 +1,235 @@
+//! The worlds on which policies are compared: all policies meet the same ones.
+//!
+//! Worlds of one server are used in three parts: the *main* worlds, on which policies act; as many
+//! *scouts* of the same seeds, kept one step ahead for clairvoyant policies (a world does not depend
+//! on the path, so a scout shows the future lawfully); and one *spare*, for full observations.
+
+use crate::rollout::Seen;
+use crate::server::client::{Claim, Client, Observation, server_info};
+use crate::server::truth::{TruthError, TruthFeed};
+use protocol::channels::Instance;
+use protocol::connection::ConnectionError;
+use protocol::control::{CoverageRule, ServerInfo, WorldSeed};
+use protocol::model::ModelError;
+use protocol::{Grid, Model, Move, Shape};
+use std::ops::Range;
+use std::time::Duration;
+use thiserror::Error;
+
+/// Most main worlds of a batch: with scouts and a spare, their hidden states fit a reader's buffer.
+pub const MAX_BATCH: u32 = 32;
+
+/// How long the lease on a comparison's worlds lives without use.
+const LEASE: Duration = Duration::from_secs(3600);
+
+/// Worlds of one server, held for a comparison.
+pub struct Arena {
+    instance: Instance,
+    client: Client,
+    truth: TruthFeed,
+    model: Model,
+    main: Range<u32>,
+    scouts: Range<u32>,
+    spare: Option<u32>,
+}
+
+/// Why worlds cannot be used or went wrong.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ArenaError {
+    /// The server or the way to it.
+    #[error(transparent)]
+    Connection(#[from] ConnectionError),
+    /// The hidden states.
+    #[error(transparent)]
+    Truth(#[from] TruthError),
+    /// The model that the server reveals.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// The server is not set up for a comparison.
+    #[error("instance {instance:?}: comparing needs {needs}")]
+    Unfit {
+        /// The instance.
+        instance: String,
+        /// What is missing, and the flag that gives it.
+        needs: String,
+    },
+}
+
+impl Arena {
+    /// Acquires up to `n_seeds` main worlds, as many scouts if asked, and a spare if there is one.
+    ///
+    /// # Errors
+    /// [`ArenaError::Unfit`] if the server hides its model or its truth or has too few worlds.
+    pub fn open(instance: &Instance, n_seeds: u32, needs_scouts: bool) -> Result<Self, ArenaError> {
+        let unfit = |needs: String| ArenaError::Unfit {
+            instance: instance.name().into(),
+            needs,
+        };
+        let n_worlds = server_info(instance)?.n_worlds;
+        let per_main = if needs_scouts { 2 } else { 1 };
+        let n_main = (n_worlds / per_main).min(n_seeds).min(MAX_BATCH);
+        if n_main == 0 {
+            return Err(unfit(format!(
+                "{per_main} worlds for these policies, it has {n_worlds}: --worlds {per_main}"
+            )));
+        }
+        let used = n_main * per_main;
+        let spare = (n_worlds > used).then_some(used);
+        let claim = Claim {
+            worlds: 0..used + u32::from(spare.is_some()),
+            takeover: false,
+            // Simulating the prior may take long; closing the connection ends the lease all the same.
+            time_to_live: Some(LEASE),
+        };
+        let client = Client::acquire(instance, &claim)?;
+        let info = client.info();
+        if !info.publish_truth {
+            return Err(unfit(
+                "the hidden states, for scores: --publish-truth".into(),
+            ));
+        }
+        let model = info
+            .model
+            .as_ref()
+            .ok_or_else(|| unfit("the model, for filters: --reveal-model true".into()))?;
+        let model = Model::from_toml(model)?;
+        let truth = TruthFeed::open(instance, client.shape())?;
+        Ok(Self {
+            instance: instance.clone(),
+            client,
+            truth,
+            model,
+            main: 0..n_main,
+            scouts: n_main..used,
+            spare,
+        })
+    }
+
+    /// The server's instance.
+    pub fn instance(&self) -> &Instance {
+        &self.instance
+    }
+
+    /// The main worlds.
+    pub fn worlds(&self) -> Range<u32> {
+        self.main.clone()
+    }
+
+    /// The model.
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
+    /// The grid.
+    pub fn shape(&self) -> Shape {
+        self.client.shape()
+    }
+
+    /// What the server said of itself.
+    pub fn info(&self) -> &ServerInfo {
+        self.client.info()
+    }
+
+    /// Number of main worlds: how many seeds are run at a time.
+    pub fn batch_size(&self) -> usize {
+        self.main.len()
+    }
+
+    /// Starts the main worlds (and scouts) with these seeds; returns observations and hidden states
+    /// at k = 0.
+    ///
+    /// # Errors
+    /// [`ArenaError`].
+    pub fn reset(&mut self, seeds: &[u64]) -> Result<Vec<Seen>, ArenaError> {
+        let orders = |first: u32| {
+            seeds.iter().zip(first..).map(|(&seed, world)| WorldSeed {
+                world,
+                seed: Some(seed),
+            })
+        };
+        let main: Vec<WorldSeed> = orders(self.main.start).collect();
+        self.client.reset(&main)?;
+        let truth = self.truth.states(self.range(&self.main, seeds), seeds, 0)?;
+        if !self.scouts.is_empty() {
+            let scouts: Vec<WorldSeed> = orders(self.scouts.start).collect();
+            self.client.reset(&scouts)?;
+        }
+        let observations = self.client.observe(self.range(&self.main, seeds))?;
+        Ok(seen(observations, truth))
+    }
+
+    /// Flies a path in each main world; returns observations and hidden states at `step`.
+    ///
+    /// # Errors
+    /// [`ArenaError`].
+    pub fn step(
+        &mut self,
+        seeds: &[u64],
+        paths: &[Vec<Move>],
+        step: u64,
+    ) -> Result<Vec<Seen>, ArenaError> {
+        let worlds = self.range(&self.main, seeds);
+        let observations = self.client.step(worlds.clone(), paths)?;
+        let truth = self.truth.states(worlds, seeds, step)?;
+        Ok(seen(observations, truth))
+    }
+
+    /// The hidden states at `step` before the main worlds get there, from the scouts.
+    ///
+    /// # Errors
+    /// [`ArenaError`].
+    pub fn foresee(&mut self, seeds: &[u64], step: u64) -> Result<Vec<Grid<u8>>, ArenaError> {
+        let worlds = self.range(&self.scouts, seeds);
+        let paths = vec![self.any_path(); worlds.len()];
+        self.client.step(worlds.clone(), &paths)?;
+        Ok(self.truth.states(worlds, seeds, step)?)
+    }
+
+    /// What a robot that sees every cell would have seen of a seed's world at a step, at least 1;
+    /// `None` if the server has no spare world or gives no full frames.
+    ///
+    /// # Errors
+    /// [`ArenaError`].
+    pub fn full_observation(
+        &mut self,
+        seed: u64,
+        step: u64,
+    ) -> Result<Option<Grid<u8>>, ArenaError> {
+        let Some(spare) = self
+            .spare
+            .filter(|_| self.info().coverage != CoverageRule::Path)
+        else {
+            return Ok(None);
+        };
+        self.client.reset(&[WorldSeed {
+            world: spare,
+            seed: Some(seed),
+        }])?;
+        let path = [self.any_path()];
+        for _ in 1..step {
+            self.client.step(spare..spare + 1, &path)?;
+        }
+        let seen = self.client.step_full(spare..spare + 1, &path)?;
+        Ok(seen
+            .first()
+            .map(|observation| observation.frame.values().to_owned()))
+    }
+
+    fn any_path(&self) -> Vec<Move> {
+        vec![Move::Up; self.info().n_moves]
+    }
+
+    fn range(&self, worlds: &Range<u32>, seeds: &[u64]) -> Range<u32> {
+        worlds.start..worlds.start + seeds.len() as u32
+    }
+}
+
+fn seen(observations: Vec<Observation>, truths: Vec<Grid<u8>>) -> Vec<Seen> {
+    let both = observations.into_iter().zip(truths);
+    let seen = both.map(|(observation, truth)| Seen {
+        observation,
+        truth: Some(truth),
+    });
+    seen.collect()
+}

@@ -1,0 +1,199 @@
+//! How well learned beliefs predict what robots see, beside the known model's and none.
+//!
+//! All are fed the same frames, of paths that none of them, or the known-model filter, chose. What
+//! is scored is each frame's log-likelihood per visited cell under the prediction made before it.
+
+use crate::acting::registry::{self, Task};
+use crate::benchmark::arena::{Arena, ArenaError};
+use crate::config::AgentConfig;
+use crate::estimation::belief::Belief;
+use crate::estimation::first_belief::first_belief;
+use crate::estimation::scoring::Score;
+use crate::learning::learned::Learned;
+use crate::planning::policy::{EstimatorKind, Policy, UnknownPolicy};
+use crate::rollout::agent::{Agent, AgentError};
+use crate::rollout::{self, Robot, Seen};
+use protocol::model::ModelError;
+use rayon::prelude::*;
+use std::ops::Range;
+use thiserror::Error;
+
+/// What is scored.
+#[derive(Debug, Clone)]
+pub struct Examination<'a> {
+    /// Chooses the paths: its name.
+    pub guide: &'a str,
+    /// The worlds.
+    pub seeds: Range<u64>,
+    /// Steps of each world.
+    pub steps: u64,
+    /// Settings of planners and estimators.
+    pub config: &'a AgentConfig,
+    /// Whose predictions.
+    pub estimators: &'a [EstimatorKind],
+    /// What was learned.
+    pub learned: &'a Learned,
+}
+
+/// Scores on one world.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Marks {
+    /// The world.
+    pub seed: u64,
+    /// Of each estimator.
+    pub scores: Vec<Score>,
+    /// How often each value was seen.
+    pub counts: Vec<u64>,
+}
+
+/// Why an examination failed.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ExaminationError {
+    /// The worlds.
+    #[error(transparent)]
+    Arena(#[from] ArenaError),
+    /// An agent.
+    #[error(transparent)]
+    Agent(#[from] AgentError),
+    /// The guide.
+    #[error(transparent)]
+    Policy(#[from] UnknownPolicy),
+    /// The model.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+}
+
+/// Flies the guide's paths and scores each estimator's prediction of every frame.
+///
+/// # Errors
+/// [`ExaminationError`].
+pub fn examine(
+    arena: &mut Arena,
+    examination: &Examination<'_>,
+) -> Result<Vec<Marks>, ExaminationError> {
+    let config = examination.config;
+    let prior = config.prior(arena.info().burn_in);
+    let prior = first_belief(prior, arena.model(), arena.shape(), config.seed)?;
+    let seeds: Vec<u64> = examination.seeds.clone().collect();
+    let mut marks = Vec::new();
+    for batch in seeds.chunks(arena.batch_size()) {
+        let examinees = batch.iter().zip(arena.reset(batch)?);
+        let examinee =
+            |(&seed, seen): (&u64, Seen)| Examinee::new(arena, examination, &prior, seed, seen);
+        let mut examinees: Vec<Examinee> = examinees.map(examinee).collect::<Result<_, _>>()?;
+        for step in 1..=examination.steps {
+            rollout::step(
+                &mut examinees,
+                |examinee| &mut examinee.guide,
+                |examinee| examinee.guide.plan(),
+                |paths| Ok::<_, ExaminationError>(arena.step(batch, paths, step)?),
+                |_, _, _| Ok(()),
+            )?;
+            examinees.par_iter_mut().try_for_each(Examinee::look)?;
+        }
+        marks.extend(examinees.into_iter().map(|examinee| examinee.marks));
+    }
+    Ok(marks)
+}
+
+/// Score of telling each cell alike the frequencies with which values were seen in all worlds, with
+/// hindsight.
+pub fn score_of_frequencies(all: &[Marks], counts: &[u64]) -> Score {
+    let total = |value: usize| all.iter().map(|marks| marks.counts[value]).sum::<u64>();
+    let totals: Vec<u64> = (0..counts.len()).map(total).collect();
+    let sum: u64 = totals.iter().sum();
+    let mut score = Score::default();
+    for (&count, &total) in counts.iter().zip(&totals).filter(|(count, _)| **count > 0) {
+        score.log_likelihood += count as f64 * (total as f64 / sum as f64).ln();
+        score.n_seen += count;
+    }
+    score
+}
+
+/// Estimators on one world, and who chooses the paths.
+struct Examinee {
+    guide: Robot,
+    estimators: Vec<Agent>,
+    marks: Marks,
+}
+
+impl Examinee {
+    fn new(
+        arena: &Arena,
+        examination: &Examination<'_>,
+        prior: &Belief,
+        seed: u64,
+        seen: Seen,
+    ) -> Result<Self, ExaminationError> {
+        let model = arena.model();
+        let agent = |name: &str| -> Result<Agent, ExaminationError> {
+            let task = Task {
+                model,
+                shape: arena.shape(),
+                n_moves: arena.info().n_moves,
+                prior,
+                seed: examination.config.planner_seed(seed),
+                learned: examination.learned,
+            };
+            let policy = Policy::named(name, model)?;
+            Ok(registry::agent(&policy, examination.config, task)?)
+        };
+        let estimator = |kind: &EstimatorKind| match kind {
+            EstimatorKind::Learned => agent("learned_beam"),
+            EstimatorKind::Autoencoder => agent("autoencoder_beam"),
+            _ => agent("beam_exploit"),
+        };
+        let estimators = examination.estimators.iter().map(estimator);
+        let mut examinee = Self {
+            guide: Robot::at(agent(examination.guide)?, seen)?,
+            estimators: estimators.collect::<Result<_, _>>()?,
+            marks: Marks {
+                seed,
+                scores: vec![Score::default(); examination.estimators.len()],
+                counts: vec![0; model.n_observations()],
+            },
+        };
+        examinee.filter()?;
+        Ok(examinee)
+    }
+
+    /// Scores each estimator's prediction of the frame that the guide has seen, then feeds them with it.
+    fn look(&mut self) -> Result<(), AgentError> {
+        let frame = &self.guide.observation().frame;
+        let scores = self.marks.scores.iter_mut().zip(&self.estimators);
+        for (sum, agent) in scores {
+            *sum += agent.score(frame)?.unwrap_or_default();
+        }
+        for (_, value) in frame.observed() {
+            self.marks.counts[usize::from(value)] += 1;
+        }
+        self.filter()
+    }
+
+    fn filter(&mut self) -> Result<(), AgentError> {
+        for agent in &mut self.estimators {
+            agent.correct(&self.guide.observation().frame, None)?;
+            agent.predict();
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frequencies_score_the_entropy_of_what_was_seen() {
+        let marks = |counts: [u64; 3]| Marks {
+            seed: 0,
+            scores: Vec::new(),
+            counts: counts.to_vec(),
+        };
+        let all = [marks([3, 0, 1]), marks([1, 0, 3])];
+        let score = score_of_frequencies(&all, &all[0].counts);
+        assert_eq!(score.n_seen, 4);
+        assert!((score.mean() - 0.5_f64.ln()).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,6 @@
+//! Policies on the same worlds, scored against the hidden states.
+
+pub mod arena;
+pub mod compare;
+pub mod evaluate;
+pub mod report;

@@ -1,0 +1,52 @@
+//! Rewards over time for TensorBoard: a run of each policy.
+
+use crate::benchmark::report::statistics::Estimate;
+use crate::benchmark::report::{Group, PolicyRun, groups};
+use crate::learning::tensorboard::{EventFile, EventsError, Value};
+use std::path::Path;
+
+/// Writes the reward of each step, mean and standard error over worlds, into a folder of each policy's
+/// own; steps are counted from 1.
+///
+/// # Errors
+/// [`EventsError`].
+pub fn write_events(folder: &Path, runs: &[PolicyRun]) -> Result<(), EventsError> {
+    let groups = groups(runs);
+    for group in &groups {
+        let twins = groups.iter().filter(|other| other.policy == group.policy);
+        let name = match twins.count() {
+            1 => group.policy.to_owned(),
+            _ => format!("{}-{}", group.policy, group.estimator),
+        };
+        let mut file = EventFile::begin(&folder.join(plain(&name)), 0)?;
+        for (index, reward) in rewards(group).into_iter().enumerate() {
+            let error = reward.standard_error;
+            let error = error.map(|error| ("reward_standard_error", Value::Scalar(error)));
+            let mean = ("reward", Value::Scalar(reward.mean));
+            file.add(index as u64 + 1, [mean].into_iter().chain(error))?;
+        }
+        file.flush()?;
+    }
+    Ok(())
+}
+
+/// Over the worlds that made each step.
+fn rewards(group: &Group<'_>) -> Vec<Estimate> {
+    let rewards = group.runs.iter().map(|run| &run.rewards);
+    let n_steps = rewards.clone().map(Vec::len).max().unwrap_or(0);
+    let of_step = |step: usize| {
+        let there = rewards.clone().filter_map(|rewards| rewards.get(step));
+        let there: Vec<f64> = there.copied().map(f64::from).collect();
+        Estimate::of(&there)
+    };
+    (0..n_steps).filter_map(of_step).collect()
+}
+
+/// A name as one of a folder.
+fn plain(name: &str) -> String {
+    let plain = |letter: char| match letter {
+        'a'..='z' | 'A'..='Z' | '0'..='9' | '-' | '_' => letter,
+        _ => '_',
+    };
+    name.chars().map(plain).collect()
+}

@@ -1,0 +1,222 @@
+//! The figures of a comparison: results in, files out. The crate `figures` draws them.
+
+use crate::benchmark::report::number::{decimals, with_error};
+use crate::benchmark::report::rewards::rewards;
+use crate::benchmark::report::statistics::Estimate;
+use crate::benchmark::report::{Group, PolicyRun, ReportError, groups, replace_file};
+use figures::{Bar, Color, Ladder, Named};
+use protocol::model::parse_color;
+use protocol::{Cell, Frame, Grid, Model, Probabilities};
+use std::collections::BTreeSet;
+use std::path::Path;
+
+/// What the reward of the wildfire model counts: the label of a reward axis.
+pub const FIRE_CELLS_PER_STEP: &str = "distinct fire cells found per step";
+
+/// What feeds a policy's plans, and the colour of its bar.
+const FAMILIES: [(&str, Color); 5] = [
+    ("no belief", Color(0xa3, 0xa3, 0xa3)),
+    ("shooting, known model", Color(0x56, 0xb4, 0xe9)),
+    ("beam search, known model", Color(0x00, 0x72, 0xb2)),
+    ("learned", Color(0x00, 0x9e, 0x73)),
+    ("fed with the truth", Color(0xe6, 0x9f, 0x00)),
+];
+
+/// One step of one world, with hindsight.
+pub struct Snapshot<'a> {
+    /// Names and colours of states and observations.
+    pub model: &'a Model,
+    /// The hidden state of each cell.
+    pub truth: Grid<u8>,
+    /// What the sensor would have shown of each cell.
+    pub observation: Grid<u8>,
+    /// What the robot saw.
+    pub frame: Frame,
+    /// The robot's cells, the start first.
+    pub path_cells: Vec<Cell>,
+    /// The belief after the frame, shape `[S, H, W]`.
+    pub belief: &'a Probabilities,
+    /// The step k.
+    pub step: u64,
+    /// Seed of the world.
+    pub seed: u64,
+}
+
+/// Puts a page at `path`: as SVG where the path ends so, else as PNG.
+///
+/// # Errors
+/// [`ReportError::Write`] names `path`.
+pub fn save(path: &Path, svg: &str) -> Result<(), ReportError> {
+    let is_svg = path.extension().is_some_and(|extension| extension == "svg");
+    replace_file(path, if is_svg { "svg" } else { "png" }, |temporary| {
+        let file = match is_svg {
+            true => svg.as_bytes().to_vec(),
+            false => figures::png(svg).map_err(|error| error.to_string())?,
+        };
+        std::fs::write(temporary, file).map_err(|error| error.to_string())
+    })
+}
+
+/// Draws mean reward per policy, the best at the top. `axis_label` says what the reward counts, see
+/// [`FIRE_CELLS_PER_STEP`].
+///
+/// # Errors
+/// [`ReportError::Empty`] without runs; a reward that is not finite, or a file that cannot be written.
+pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<(), ReportError> {
+    if runs.is_empty() {
+        return Err(ReportError::Empty { what: "ladder" });
+    }
+    for run in runs {
+        check_finite(run, "mean reward", std::iter::once(run.mean_reward))?;
+    }
+    let groups = groups(runs);
+    let mut bars: Vec<(&Group<'_>, Estimate)> = groups.iter().filter_map(estimated).collect();
+    bars.sort_by(|a, b| b.1.mean.total_cmp(&a.1.mean));
+    let decimals = decimals(bars.iter().map(|bar| bar.1.mean));
+    let bars: Vec<Bar> = bars
+        .into_iter()
+        .map(|it| bar(it.0, it.1, decimals))
+        .collect();
+    let is_used = |family: &(&str, Color)| bars.iter().any(|bar| bar.color == family.1);
+    let ladder = Ladder {
+        title: "Reward of each policy on the same worlds".into(),
+        note: ladder_note(runs),
+        axis: axis_label.into(),
+        legend: FAMILIES.into_iter().filter(is_used).collect(),
+        bars,
+    };
+    save(path, &ladder.svg())
+}
+
+fn estimated<'a>(group: &'a Group<'a>) -> Option<(&'a Group<'a>, Estimate)> {
+    let estimate = Estimate::of(&group.values(|run| run.mean_reward));
+    estimate.map(|estimate| (group, estimate))
+}
+
+fn bar(group: &Group<'_>, reward: Estimate, decimals: usize) -> Bar {
+    let remark = match group.estimator {
+        "none" => String::new(),
+        estimator => format!(" ({})", readable(estimator)),
+    };
+    let pair = |run: &&PolicyRun| (run.world_seed, run.mean_reward);
+    Bar {
+        name: readable(group.policy),
+        remark,
+        label: with_error(Some(reward), decimals),
+        color: FAMILIES[family(group)].1,
+        value: reward.mean,
+        error: reward.standard_error,
+        worlds: group.runs.iter().map(pair).collect(),
+    }
+}
+
+/// The number of a policy's family.
+fn family(group: &Group<'_>) -> usize {
+    let policy = group.policy.to_lowercase();
+    match group.estimator {
+        "truth" | "next_truth" => 4,
+        "none" => 0,
+        "known_model" if policy.contains("beam") => 2,
+        "known_model" if !policy.contains("learn") => 1,
+        _ => 3,
+    }
+}
+
+fn ladder_note(runs: &[PolicyRun]) -> String {
+    let worlds: BTreeSet<u64> = runs.iter().map(|run| run.world_seed).collect();
+    let steps = runs.iter().map(|run| run.steps).max().unwrap_or(0);
+    match worlds.len() {
+        1 => format!(
+            "1 world, {steps} steps: bars are means over steps; one world gives no standard error"
+        ),
+        n => format!(
+            "{n} worlds, {steps} steps each: bars are means over worlds, whiskers ±1 standard error, dots single worlds"
+        ),
+    }
+}
+
+/// Draws the rewards over time of up to eight policies (those with the highest mean), means over worlds;
+/// `fire_cells` is the number of burning cells per step, shaded in the background.
+///
+/// # Errors
+/// [`ReportError::Empty`] without rewards; a reward that is not finite, or a file that cannot be written.
+pub fn draw_rewards(
+    path: &Path,
+    runs: &[PolicyRun],
+    axis_label: &str,
+    fire_cells: Option<&[f32]>,
+) -> Result<(), ReportError> {
+    let recorded: Vec<PolicyRun> = runs
+        .iter()
+        .filter(|run| !run.rewards.is_empty())
+        .cloned()
+        .collect();
+    for run in &recorded {
+        check_finite(run, "reward", run.rewards.iter().copied().map(f64::from))?;
+    }
+    let page = rewards(&recorded, axis_label, fire_cells.unwrap_or_default());
+    let svg = page.svg().ok_or(ReportError::Empty { what: "rewards" })?;
+    save(path, &svg)
+}
+
+/// Draws a step; the picture grows in height with the number of states.
+///
+/// # Errors
+/// [`ReportError::Snapshot`] names the part that does not fit the grid or the model; a file that cannot be
+/// written.
+pub fn draw_snapshot(path: &Path, snapshot: &Snapshot<'_>) -> Result<(), ReportError> {
+    let (file, shape) = (snapshot.model.file(), snapshot.truth.dim());
+    let states = file.states.iter().map(|it| named(&it.name, &it.color));
+    let observations = file
+        .observations
+        .iter()
+        .map(|it| named(&it.name, &it.color));
+    let page = figures::Snapshot {
+        title: format!("{}, step k = {}", snapshot.model.name(), snapshot.step),
+        note: format!(
+            "world seed {}, {} x {} cells",
+            snapshot.seed, shape.0, shape.1
+        ),
+        states: states.collect(),
+        observations: observations.collect(),
+        truth: snapshot.truth.view(),
+        observation: snapshot.observation.view(),
+        frame: snapshot.frame.values(),
+        path: snapshot
+            .path_cells
+            .iter()
+            .map(|cell| (cell.row, cell.col))
+            .collect(),
+        belief: snapshot.belief.view(),
+    };
+    save(path, &page.svg()?)
+}
+
+fn named(name: &str, color: &str) -> Named {
+    let [red, green, blue] = parse_color(color).expect("invariant: a model's colours are checked");
+    Named {
+        name: name.into(),
+        color: Color(red, green, blue),
+    }
+}
+
+/// A policy's name as a person would write it.
+pub(super) fn readable(name: &str) -> String {
+    name.replace('_', " ")
+}
+
+fn check_finite(
+    run: &PolicyRun,
+    what: &'static str,
+    mut values: impl Iterator<Item = f64>,
+) -> Result<(), ReportError> {
+    match values.find(|value| !value.is_finite()) {
+        Some(got) => Err(ReportError::NotFinite {
+            policy: run.policy.clone(),
+            world_seed: run.world_seed,
+            what,
+            got,
+        }),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,165 @@
+//! Rewards over time: a moving average per policy, with its standard error over worlds, over the worlds'
+//! fire.
+
+use crate::benchmark::report::figures::readable;
+use crate::benchmark::report::statistics::Estimate;
+use crate::benchmark::report::{Group, PolicyRun, groups};
+use figures::{Curve, Lines, MOST_CURVES, Panel, Scale, Shade};
+use std::collections::BTreeSet;
+
+/// More points are hardly seen, but fill files.
+const MAX_POINTS: usize = 500;
+/// The moving average spans about this part of the steps.
+const WINDOWS: usize = 40;
+
+/// The page of these runs, each with a reward at least. `fire_cells`: burning cells per step, or none.
+pub fn rewards(runs: &[PolicyRun], axis_label: &str, fire_cells: &[f32]) -> Lines {
+    let groups = groups(runs);
+    let n_steps = runs.iter().map(|run| run.rewards.len()).max();
+    let window = window(n_steps.unwrap_or(0));
+    let curves = curves(&groups, window);
+    Lines {
+        title: title(runs),
+        note: note(runs, window, (curves.len(), groups.len())),
+        axis: "step k".into(),
+        panels: vec![Panel {
+            title: axis_label.into(),
+            scale: Scale::Linear,
+            curves,
+            shade: (!fire_cells.is_empty()).then(|| shade(fire_cells, window)),
+        }],
+    }
+}
+
+fn title(runs: &[PolicyRun]) -> String {
+    let worlds: BTreeSet<u64> = runs.iter().map(|run| run.world_seed).collect();
+    match worlds.first() {
+        Some(seed) if worlds.len() == 1 => format!("Reward over time on world {seed}"),
+        _ => format!("Reward over time, mean over {} worlds", worlds.len()),
+    }
+}
+
+fn note(runs: &[PolicyRun], window: usize, (shown, n_policies): (usize, usize)) -> String {
+    let mut note = match window {
+        1 => "each step".to_string(),
+        window => format!("moving average over the last {window} steps"),
+    };
+    if runs.iter().any(|run| run.world_seed != runs[0].world_seed) {
+        note += "; bands: ±1 standard error over worlds";
+    }
+    if shown < n_policies {
+        note += &format!("; the best {shown} of {n_policies} policies");
+    }
+    note
+}
+
+fn shade(fire_cells: &[f32], window: usize) -> Shade {
+    let points = moving_average(fire_cells, window);
+    let cells = || {
+        points
+            .iter()
+            .map(|point| point.1)
+            .filter(|cells| cells.is_finite())
+    };
+    let most = cells().fold(0.0, f64::max);
+    let least = cells().fold(most, f64::min);
+    Shade {
+        name: format!("shaded: burning cells of a world, {least:.0} to {most:.0}"),
+        points,
+    }
+}
+
+/// The best policies' curves, from the highest mean down.
+fn curves(groups: &[Group<'_>], window: usize) -> Vec<Curve> {
+    let mean = |group: &Group<'_>| {
+        let rewards = || group.runs.iter().flat_map(|run| &run.rewards);
+        rewards().copied().map(f64::from).sum::<f64>() / rewards().count() as f64
+    };
+    let mut ranked: Vec<&Group<'_>> = groups.iter().collect();
+    ranked.sort_by(|a, b| mean(b).total_cmp(&mean(a)));
+    let best = ranked.into_iter().take(MOST_CURVES);
+    best.map(|group| curve(group, short_name(group, groups), window))
+        .collect()
+}
+
+/// The policy, with its estimator where the policy stands more than once.
+fn short_name(group: &Group<'_>, groups: &[Group<'_>]) -> String {
+    let same = groups.iter().filter(|other| other.policy == group.policy);
+    let policy = readable(group.policy);
+    match same.count() {
+        0 | 1 => policy,
+        _ => format!("{policy} ({})", readable(group.estimator)),
+    }
+}
+
+/// Over the steps that all worlds made.
+fn curve(group: &Group<'_>, name: String, window: usize) -> Curve {
+    let lengths = group.runs.iter().map(|run| run.rewards.len());
+    let n_steps = lengths.min().unwrap_or(0);
+    let worlds = group.runs.iter().map(|run| &run.rewards[..n_steps]);
+    let worlds: Vec<_> = worlds
+        .map(|rewards| moving_average(rewards, window))
+        .collect();
+    let estimate = |at: usize| {
+        let values: Vec<f64> = worlds.iter().map(|averages| averages[at].1).collect();
+        Estimate::of(&values).map(|estimate| (worlds[0][at].0, estimate))
+    };
+    let n_points = worlds.first().map_or(0, Vec::len);
+    let points: Vec<(f64, Estimate)> = (0..n_points).filter_map(estimate).collect();
+    Curve {
+        name,
+        points: points.iter().map(|it| (it.0, it.1.mean)).collect(),
+        errors: points.iter().filter_map(|it| it.1.standard_error).collect(),
+    }
+}
+
+/// A round number of steps, about a fortieth of all.
+fn window(n_steps: usize) -> usize {
+    let target = (n_steps / WINDOWS).max(1);
+    let round = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000];
+    round
+        .into_iter()
+        .rev()
+        .find(|&window| window <= target)
+        .unwrap_or(1)
+}
+
+/// `(step, mean of the `window` values up to and including that step)`, steps counted from 1.
+fn moving_average(values: &[f32], window: usize) -> Vec<(f64, f64)> {
+    let window = window.min(values.len()).max(1);
+    let mut sums = vec![0.0_f64];
+    for &value in values {
+        sums.push(sums[sums.len() - 1] + f64::from(value));
+    }
+    let stride = values.len().div_ceil(MAX_POINTS).max(1);
+    let last = values.len();
+    // Counting back from the last step keeps it, whatever the stride.
+    let mut ends: Vec<usize> = (window..=last).rev().step_by(stride).collect();
+    ends.reverse();
+    let average = |end: usize| (end as f64, (sums[end] - sums[end - window]) / window as f64);
+    ends.into_iter().map(average).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn moving_averages_look_back_over_the_window() {
+        let values = [1.0, 3.0, 5.0, 7.0];
+        assert_eq!(
+            moving_average(&values, 2),
+            [(2.0, 2.0), (3.0, 4.0), (4.0, 6.0)]
+        );
+        assert_eq!(moving_average(&values, 9), [(4.0, 4.0)]);
+        assert_eq!(moving_average(&[], 3), []);
+        let long = vec![1.0; 25_000];
+        let points = moving_average(&long, 500);
+        assert!(points.len() <= MAX_POINTS && points.last() == Some(&(25_000.0, 1.0)));
+    }
+
+    #[test]
+    fn windows_are_round_and_never_zero() {
+        assert_eq!([0, 1, 100, 1_500, 25_000].map(window), [1, 1, 2, 20, 500]);
+    }
+}

@@ -1,0 +1,188 @@
+//! The comparison as text: fits a terminal, and pastes into Markdown as a table.
+
+use crate::benchmark::report::number::{NOTHING, decimals, number, with_error};
+use crate::benchmark::report::statistics::{Estimate, median, ratio_of_means};
+use crate::benchmark::report::{Group, PolicyRun, groups};
+use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// The policy that others are given as a percentage of: the best planner fed with the true state.
+const ORACLE: &str = "oracle_beam";
+
+/// Every policy over all worlds, then over the worlds with less and with more fire.
+///
+/// Policies stand in the order given; `baseline` names the one that paired differences are to.
+pub fn render_table(runs: &[PolicyRun], baseline: &str) -> String {
+    let groups = groups(runs);
+    if groups.is_empty() {
+        return "No results: no policy was run.\n".into();
+    }
+    let heading = heading(runs, &groups, baseline);
+    let summary = summary(&groups, baseline);
+    let split = split_by_fire(runs, &groups);
+    format!("{heading}\n\n{summary}\n\n{split}\n")
+}
+
+fn heading(runs: &[PolicyRun], groups: &[Group<'_>], baseline: &str) -> String {
+    let seeds: BTreeSet<u64> = runs.iter().map(|run| run.world_seed).collect();
+    let worlds = match seeds.len() {
+        1 => "1 world".to_string(),
+        n => format!("{n} worlds"),
+    };
+    let steps = || runs.iter().map(|run| run.steps);
+    let steps = match (steps().min().unwrap_or(0), steps().max().unwrap_or(0)) {
+        (1, 1) => "1 step".to_string(),
+        (least, most) if least == most => format!("{most} steps"),
+        (least, most) => format!("{least} to {most} steps"),
+    };
+    let error = match seeds.len() {
+        1 => "one world: no standard error is possible",
+        _ => "± is one standard error over worlds",
+    };
+    let baseline = if groups.iter().any(|group| group.policy == baseline) {
+        format!("differences are paired by world, to {baseline}")
+    } else {
+        format!("no differences: baseline {baseline:?} was not run")
+    };
+    format!("{worlds}, {steps} each; {error}; {baseline}.")
+}
+
+/// What every row of the summary is compared with: mean rewards by world.
+struct References<'a> {
+    baseline: &'a str,
+    base: Option<BTreeMap<u64, f64>>,
+    oracle: Option<BTreeMap<u64, f64>>,
+}
+
+fn summary(groups: &[Group<'_>], baseline: &str) -> Table {
+    let reward = |run: &PolicyRun| run.mean_reward;
+    let of_policy = |name: &str| {
+        let group = groups.iter().find(|group| group.policy == name);
+        group.map(|group| group.by_seed(reward))
+    };
+    let references = References {
+        baseline,
+        base: of_policy(baseline),
+        oracle: of_policy(ORACLE),
+    };
+    let decimals = decimals(groups.iter().flat_map(|group| group.values(reward)));
+    let mut header = vec!["policy", "estimator", "mean reward", "difference"];
+    header.extend(["distinct cells", "hit rate"]);
+    header.extend(references.oracle.is_some().then_some("% of oracle"));
+    header.extend(["Brier", "ms/plan"]);
+    let mut table = plain_table(&header);
+    for group in groups {
+        table.add_row(summary_row(group, &references, decimals));
+    }
+    table
+}
+
+fn summary_row(group: &Group<'_>, references: &References<'_>, decimals: usize) -> Vec<String> {
+    let rewards = group.by_seed(|run| run.mean_reward);
+    let difference = match &references.base {
+        Some(_) if group.policy == references.baseline => "baseline".into(),
+        Some(base) => signed(Estimate::of_difference(&rewards, base), decimals),
+        None => NOTHING.into(),
+    };
+    let percent = references.oracle.as_ref().map(|oracle| {
+        let ratio = ratio_of_means(&rewards, oracle);
+        ratio.map_or(NOTHING.into(), |ratio| number(100.0 * ratio, 1))
+    });
+    let reward = Estimate::of(&group.values(|run| run.mean_reward));
+    let brier = group.runs.iter().filter_map(|run| run.brier).collect();
+    let mut row = vec![group.policy.to_string(), group.estimator.to_string()];
+    row.push(with_error(reward, decimals));
+    row.push(difference);
+    row.push(mean(group.values(|run| run.mean_distinct_cells), 1));
+    row.push(mean(group.values(|run| run.hit_rate), 3));
+    row.extend(percent);
+    row.push(mean(brier, 4));
+    row.push(mean(group.values(|run| run.mean_plan_millis), 3));
+    row
+}
+
+/// Mean rewards over the half of the worlds with less fire and the half with more; the middle one
+/// of an odd number of worlds goes to the latter.
+fn split_by_fire(runs: &[PolicyRun], groups: &[Group<'_>]) -> String {
+    let mut fire_of: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
+    for run in runs {
+        fire_of
+            .entry(run.world_seed)
+            .or_default()
+            .push(run.mean_fire_cells);
+    }
+    if fire_of.len() < 2 {
+        return "No split by fire: one world has no halves.".into();
+    }
+    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+    let mut worlds: Vec<(f64, u64)> = fire_of
+        .iter()
+        .map(|(&seed, fires)| (mean(fires), seed))
+        .collect();
+    worlds.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    let fires: Vec<f64> = worlds.iter().map(|world| world.0).collect();
+    let (less, more) = worlds.split_at(worlds.len() / 2);
+    let heading = format!(
+        "Mean reward by fire, split at the median of {} burning cells:",
+        number(median(&fires).unwrap_or(0.0), 1)
+    );
+    format!("{heading}\n\n{}", split_table(groups, less, more))
+}
+
+fn split_table(groups: &[Group<'_>], less: &[(f64, u64)], more: &[(f64, u64)]) -> Table {
+    let worlds = |half: &[(f64, u64)]| match half.len() {
+        1 => "1 world".to_string(),
+        n => format!("{n} worlds"),
+    };
+    let less_title = format!("less fire ({})", worlds(less));
+    let more_title = format!("more fire ({})", worlds(more));
+    let mut table = plain_table(&["policy", "estimator", &less_title, &more_title]);
+    let all = groups
+        .iter()
+        .flat_map(|group| group.values(|run| run.mean_reward));
+    let decimals = decimals(all);
+    for group in groups {
+        let rewards = group.by_seed(|run| run.mean_reward);
+        let half = |half: &[(f64, u64)]| {
+            let values: Vec<f64> = half
+                .iter()
+                .filter_map(|(_, seed)| rewards.get(seed).copied())
+                .collect();
+            with_error(Estimate::of(&values), decimals)
+        };
+        table.add_row([
+            group.policy.into(),
+            group.estimator.into(),
+            half(less),
+            half(more),
+        ]);
+    }
+    table
+}
+
+/// A Markdown table; all but the two columns of names are right-aligned.
+fn plain_table(header: &[&str]) -> Table {
+    let mut table = Table::new();
+    table
+        .load_preset(presets::ASCII_MARKDOWN)
+        .set_content_arrangement(ContentArrangement::Disabled)
+        .set_header(header);
+    for column in table.column_iter_mut().skip(2) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    table
+}
+
+fn signed(estimate: Option<Estimate>, decimals: usize) -> String {
+    let text = with_error(estimate, decimals);
+    let sign = if estimate.is_some() && !text.starts_with('-') {
+        "+"
+    } else {
+        ""
+    };
+    format!("{sign}{text}")
+}
+
+fn mean(values: Vec<f64>, decimals: usize) -> String {
+    Estimate::of(&values).map_or(NOTHING.into(), |estimate| number(estimate.mean, decimals))
+}

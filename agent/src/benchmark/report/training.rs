@@ -1,0 +1,118 @@
+//! A training's metrics as curves: the paper's figure of improvement over iterations, and step sizes.
+
+use crate::benchmark::report::ReportError;
+use crate::benchmark::report::figures::save;
+use crate::benchmark::report::statistics::Estimate;
+use crate::learning::metrics::{MetricsError, Rows};
+use figures::{Curve, Lines, Panel, Scale};
+use std::path::Path;
+use thiserror::Error;
+
+/// The figure's names in the folder of a training.
+pub const FIGURES: [&str; 2] = ["training.png", "training.svg"];
+
+/// Points of a curve: each is the mean over a part of the rows.
+const POINTS: usize = 200;
+
+/// A figure that cannot be drawn.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum TrainingFigureError {
+    /// Metrics that cannot be read.
+    #[error(transparent)]
+    Metrics(#[from] MetricsError),
+    /// The figure.
+    #[error(transparent)]
+    Report(#[from] ReportError),
+}
+
+/// Draws a training's metrics into its folder.
+///
+/// # Errors
+/// [`TrainingFigureError`].
+pub fn draw_training(folder: &Path) -> Result<(), TrainingFigureError> {
+    let rows = Rows::read(folder)?;
+    let curve = |column: &str, name: &str| averages(&rows, column, name);
+    let panel = |title: &str, scale, curves| Panel {
+        title: title.into(),
+        scale,
+        curves,
+        shade: None,
+    };
+    let (linear, logarithmic) = (Scale::Linear, Scale::Logarithmic);
+    let rates = [curve("rate", "model"), curve("dqn_rate", "DQN")];
+    let quotient = quotient(&rates);
+    let [model, dqn] = rates;
+    let panels = vec![
+        panel(
+            "reward per world step",
+            linear,
+            vec![curve("mean_reward", "reward")],
+        ),
+        panel(
+            "loss of the model on its window, nats per observed cell",
+            linear,
+            vec![curve("loss", "loss")],
+        ),
+        panel(
+            "log-likelihood of new frames before they are learned from, nats per observed cell",
+            linear,
+            vec![curve("held_out_log_likelihood", "log-likelihood")],
+        ),
+        panel(
+            "loss of the DQN",
+            logarithmic,
+            vec![curve("dqn_loss", "DQN loss")],
+        ),
+        panel("step sizes", logarithmic, vec![model, dqn, quotient]),
+    ];
+    let per_point = rows.len().div_ceil(POINTS).max(1);
+    let page = Lines {
+        title: "Learning while acting".into(),
+        note: match per_point {
+            1 => "each row of metrics.csv".into(),
+            n => format!(
+                "means over {n} rows of metrics.csv each; bands: ±1 standard error over those rows, as if \
+                 each were a draw of its own"
+            ),
+        },
+        axis: "world steps, of all worlds together".into(),
+        panels,
+    };
+    let svg = page.svg().ok_or(ReportError::Empty { what: "curves" })?;
+    for name in FIGURES {
+        save(&folder.join(name), &svg)?;
+    }
+    Ok(())
+}
+
+/// A column's means over equal parts of the rows, at the last world step of each, with their standard
+/// errors where a part has several rows.
+fn averages(rows: &Rows, column: &str, name: &str) -> Curve {
+    let (steps, values) = (rows.column("world_steps"), rows.column(column));
+    let part = rows.len().div_ceil(POINTS).max(1);
+    let parts = steps.chunks(part).zip(values.chunks(part));
+    let average = |(steps, values): (&[Option<f64>], &[Option<f64>])| {
+        let there: Vec<f64> = values.iter().flatten().copied().collect();
+        let last = steps.iter().flatten().last()?;
+        Some((*last, Estimate::of(&there)?))
+    };
+    let averages: Vec<(f64, Estimate)> = parts.filter_map(average).collect();
+    let error = |(_, average): &(f64, Estimate)| average.standard_error.unwrap_or(0.0);
+    let errors = averages.iter().map(error).collect();
+    Curve {
+        name: name.into(),
+        points: averages.iter().map(|it| (it.0, it.1.mean)).collect(),
+        errors: if part > 1 { errors } else { Vec::new() },
+    }
+}
+
+/// The model's step size as a share of the DQN's, where both are there (paper eq. 20).
+fn quotient([model, dqn]: &[Curve; 2]) -> Curve {
+    let of_dqn = |x: f64| dqn.points.iter().find(|point| point.0 == x);
+    let share = |&(x, rate): &(f64, f64)| Some((x, rate / of_dqn(x)?.1));
+    Curve::new(
+        "model / DQN",
+        model.points.iter().filter_map(share).collect(),
+    )
+}

@@ -1,0 +1,83 @@
+//! What an estimator is: frames in, a belief about every cell out (paper sections III.A to III.C).
+
+use crate::estimation::autoencoder::Follower;
+use crate::estimation::belief::{Belief, BeliefError};
+use crate::estimation::filter::ZeroEvidence;
+use crate::estimation::parameters::Tables;
+use crate::estimation::scoring::Score;
+use ::network::NetworkError;
+use protocol::{Frame, Grid};
+use thiserror::Error;
+
+/// Keeps a belief about one world: [`Self::correct`] with each frame, then [`Self::predict`].
+pub trait Estimator: Send {
+    /// Takes in a frame of X_k (eq. 5). `truth` is X_k, shape `[H, W]`, where somebody knows it: for upper
+    /// bounds only.
+    ///
+    /// # Errors
+    /// [`EstimatorError`] if the frame is impossible, or `truth` is needed and missing; the belief is then as
+    /// it was.
+    fn correct(&mut self, frame: &Frame, truth: Option<&Grid<u8>>) -> Result<(), EstimatorError>;
+
+    /// Moves the belief from X_k to X_{k+1} (eq. 6).
+    fn predict(&mut self);
+
+    /// The belief: about X_k after [`Self::correct`], about X_{k+1} after [`Self::predict`].
+    fn belief(&self) -> &Belief;
+
+    /// Takes in the state X_{k+1} that the next path will meet, where somebody knows it.
+    ///
+    /// # Errors
+    /// [`BeliefError`] for states that the model does not have.
+    fn foresee(&mut self, _next: &Grid<u8>) -> Result<(), BeliefError> {
+        Ok(())
+    }
+
+    /// Whether the belief is made of frames.
+    fn sees_frames(&self) -> bool {
+        true
+    }
+
+    /// Tells what kind of belief this is, where it is all that the estimator remembers: another estimator of
+    /// the same kind may go on from it.
+    fn kind(&self) -> Option<String> {
+        None
+    }
+
+    /// Goes on from a belief about X_{k+1} of its own [`Self::kind`] and shape. Others ignore it.
+    fn set_belief(&mut self, _belief: Belief) {}
+
+    /// How well the belief predicts a frame; `None` of estimators that predict none.
+    ///
+    /// # Errors
+    /// Where a network's device fails.
+    fn score(&self, _frame: &Frame) -> Result<Option<Score>, EstimatorError> {
+        Ok(None)
+    }
+
+    /// Takes newer learned parameters of the same dimensions; the belief stays. Others ignore them.
+    fn set_tables(&mut self, _tables: &Tables) {}
+
+    /// The hidden vector behind the belief, for a DQN that decides on it (paper section III.E).
+    fn follower(&self) -> Option<&Follower> {
+        None
+    }
+}
+
+/// Why an estimator did not take in what was seen.
+#[derive(Debug, Error, PartialEq)]
+#[non_exhaustive]
+pub enum EstimatorError {
+    /// A frame that the belief rules out.
+    #[error(transparent)]
+    ZeroEvidence(#[from] ZeroEvidence),
+    /// A network whose numbers are too large to be worked with, or whose device fails.
+    #[error("checkpoint: {0}")]
+    Network(#[from] NetworkError),
+    /// Hidden states of another model.
+    #[error("hidden states: {0}")]
+    Belief(#[from] BeliefError),
+    /// An upper bound that is not told the hidden states.
+    #[error("expected the hidden states, got none")]
+    NoTruth,
+}

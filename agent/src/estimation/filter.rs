@@ -1,0 +1,288 @@
+//! The Bayes filter, for known and learned parameters (paper section III.A, in the masked form of section III.C).
+//!
+//! A frame turns the predictor `u_k` into the posterior `p_k` (eq. 5); the transition turns that into
+//! the next predictor `u_{k+1} = Phi(p_k)` (eq. 6). Cells are treated as independent given the
+//! frames, so this is an approximation even with the true model.
+
+use crate::estimation::belief::Belief;
+use crate::estimation::estimator::{Estimator, EstimatorError};
+use crate::estimation::parameters::Tables;
+use crate::estimation::scoring::{Score, score};
+use ndarray::{Array2, Array4};
+use protocol::frame::Frame;
+use protocol::grid::{Cell, Grid, Probabilities};
+use protocol::model::{Model, ModelError};
+use protocol::transition::Transition;
+use thiserror::Error;
+
+/// Filter of one world: call [`BayesFilter::correct`] with each frame and [`BayesFilter::predict`] after it.
+#[derive(Debug, Clone)]
+pub struct BayesFilter {
+    transition: Transition,
+    /// `P(y | x)`, shape `[S, O]`.
+    likelihood: Array2<f64>,
+    belief: Belief,
+    /// Where the transition writes.
+    predictor: Probabilities,
+    /// Checksum of the parameters, which give the belief its meaning.
+    checksum: u32,
+}
+
+/// A frame that the belief holds impossible.
+#[derive(Debug, Error, PartialEq)]
+#[error(
+    "frame: cell {cell}: expected an observation that the belief {belief:?} allows, got {observed}"
+)]
+pub struct ZeroEvidence {
+    /// The first such cell.
+    pub cell: Cell,
+    /// The value observed there.
+    pub observed: u8,
+    /// The belief about the cell, one probability per state.
+    pub belief: Vec<f32>,
+}
+
+/// Bayes' rule on the cells that a frame shows, `p = B(y) u / (b(y)' u)` (eq. 5); `p = u` elsewhere.
+/// `likelihood` is `P(y | x)`, shape `[S, O]`.
+///
+/// # Errors
+/// [`ZeroEvidence`] where `b(y)' u = 0`; the belief is then as it was.
+///
+/// # Panics
+/// If the frame is of another grid or was decoded for more observations.
+pub fn correct(
+    belief: &mut Belief,
+    likelihood: &Array2<f64>,
+    frame: &Frame,
+) -> Result<(), ZeroEvidence> {
+    let shape = belief.shape();
+    let dim = frame.values().dim();
+    assert_eq!(dim, shape.dim(), "frame: expected the belief's grid");
+    let (n_states, n_cells) = (belief.n_states(), shape.n_cells());
+    // Kept apart until the whole frame is known to be possible.
+    let mut posteriors: Vec<f32> = Vec::new();
+    for (index, observed) in frame.observed() {
+        let prior = belief.as_slice()[index..].iter().step_by(n_cells);
+        let likelihood = likelihood.column(usize::from(observed));
+        // In f64, where the product of two f32 cannot underflow to zero.
+        let joint = || {
+            let pairs = prior.clone().zip(&likelihood);
+            pairs.map(|(&u, b)| f64::from(u) * b)
+        };
+        let evidence: f64 = joint().sum();
+        if evidence <= 0.0 {
+            return Err(ZeroEvidence {
+                cell: shape.cell(index),
+                observed,
+                belief: prior.copied().collect(),
+            });
+        }
+        posteriors.extend(joint().map(|p| (p / evidence) as f32));
+    }
+    let probabilities = belief.as_mut_slice();
+    for ((index, _), posterior) in frame.observed().zip(posteriors.chunks_exact(n_states)) {
+        let cell = probabilities[index..].iter_mut().step_by(n_cells);
+        cell.zip(posterior).for_each(|(to, &p)| *to = p);
+    }
+    Ok(())
+}
+
+impl BayesFilter {
+    /// A filter of a known model with the predictor `u_0`.
+    ///
+    /// # Errors
+    /// [`ModelError`] where the transition could divide by zero on the prior's grid.
+    ///
+    /// # Panics
+    /// If the prior has another number of states than the model.
+    pub fn known(model: &Model, prior: Belief) -> Result<Self, ModelError> {
+        let expected = model.n_states();
+        assert_eq!(prior.n_states(), expected, "prior: expected other states");
+        let transition = Transition::new(model, prior.shape())?;
+        let checksum = known_checksum(model);
+        let likelihood = model.likelihood().clone();
+        Ok(Self::of(transition, likelihood, prior, checksum))
+    }
+
+    /// A filter with learned parameters and the predictor `u_0`.
+    ///
+    /// # Panics
+    /// If the prior has another number of states.
+    pub fn learned(tables: &Tables, prior: Belief) -> Self {
+        let (transition, likelihood, checksum) = parameters(tables, &prior);
+        Self::of(transition, likelihood, prior, checksum)
+    }
+
+    fn of(transition: Transition, likelihood: Array2<f64>, belief: Belief, checksum: u32) -> Self {
+        Self {
+            transition,
+            likelihood,
+            predictor: belief.probabilities().clone(),
+            belief,
+            checksum,
+        }
+    }
+
+    /// `P(y | x)`, shape `[S, O]`.
+    pub fn likelihood(&self) -> &Array2<f64> {
+        &self.likelihood
+    }
+
+    /// The predictor `u_k`, or after [`BayesFilter::correct`] the posterior `p_k`.
+    pub fn belief(&self) -> &Belief {
+        &self.belief
+    }
+
+    /// Believes something else of the same shape.
+    ///
+    /// # Panics
+    /// If the shape is another.
+    pub fn set_belief(&mut self, belief: Belief) {
+        let dim = |belief: &Belief| belief.probabilities().dim();
+        assert_eq!(dim(&belief), dim(&self.belief), "belief: another shape");
+        self.belief = belief;
+    }
+
+    /// Bayes' rule on the visited cells ([`correct`]).
+    ///
+    /// # Errors
+    /// [`ZeroEvidence`]; the belief is then as it was.
+    ///
+    /// # Panics
+    /// If the frame is of another grid or was decoded for more observations than the model has.
+    pub fn correct(&mut self, frame: &Frame) -> Result<(), ZeroEvidence> {
+        correct(&mut self.belief, &self.likelihood, frame)
+    }
+
+    /// The predictor of the next step, `u_{k+1} = Phi(p_k)` (eq. 6).
+    pub fn predict(&mut self) {
+        let belief = self.belief.probabilities_mut();
+        self.transition.apply(belief, &mut self.predictor);
+        std::mem::swap(belief, &mut self.predictor);
+    }
+}
+
+impl Estimator for BayesFilter {
+    fn correct(&mut self, frame: &Frame, _: Option<&Grid<u8>>) -> Result<(), EstimatorError> {
+        Ok(BayesFilter::correct(self, frame)?)
+    }
+
+    fn predict(&mut self) {
+        BayesFilter::predict(self);
+    }
+
+    fn belief(&self) -> &Belief {
+        BayesFilter::belief(self)
+    }
+
+    fn score(&self, frame: &Frame) -> Result<Option<Score>, EstimatorError> {
+        Ok(Some(score(&self.belief, &self.likelihood, frame)))
+    }
+
+    fn set_tables(&mut self, tables: &Tables) {
+        (self.transition, self.likelihood, self.checksum) = parameters(tables, &self.belief);
+    }
+
+    fn kind(&self) -> Option<String> {
+        Some(kind(self.checksum))
+    }
+
+    fn set_belief(&mut self, belief: Belief) {
+        BayesFilter::set_belief(self, belief);
+    }
+}
+
+/// What [`Estimator::kind`] says of a known model's filter.
+pub fn known_model_kind(model: &Model) -> String {
+    kind(known_checksum(model))
+}
+
+fn kind(checksum: u32) -> String {
+    format!("bayes_filter {checksum:08x}, probabilities [S, H, W] as f32")
+}
+
+fn known_checksum(model: &Model) -> u32 {
+    let numbers = model.kernel().iter().chain(model.bias()).copied();
+    checksum(numbers, model.likelihood())
+}
+
+fn parameters(tables: &Tables, belief: &Belief) -> (Transition, Array2<f64>, u32) {
+    let dimensions = tables.dimensions;
+    let n_states = dimensions.n_states;
+    assert_eq!(belief.n_states(), n_states, "belief: expected other states");
+    let (height, width) = dimensions.kernel;
+    let kernel = tables
+        .kernel
+        .iter()
+        .map(|&weight| f64::from(weight))
+        .collect();
+    let kernel = Array4::from_shape_vec((n_states, n_states, height, width), kernel);
+    let kernel = kernel.expect("invariant: S x S kernels");
+    let likelihood = tables.likelihood_array();
+    let checksum = checksum(kernel.iter().copied(), &likelihood);
+    let transition = Transition::of_weights(&kernel, &vec![0.0; n_states], belief.shape());
+    (transition, likelihood, checksum)
+}
+
+fn checksum(weights: impl Iterator<Item = f64>, likelihood: &Array2<f64>) -> u32 {
+    let numbers = weights.chain(likelihood.iter().copied());
+    let bytes: Vec<u8> = numbers.flat_map(f64::to_le_bytes).collect();
+    crc32fast::hash(&bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::grid::Shape;
+
+    fn frame(shape: Shape, values: &[u8]) -> Frame {
+        Frame::from_bytes(shape, 3, values).expect("test frame")
+    }
+
+    #[test]
+    fn correct_leaves_unseen_cells_unchanged() {
+        let shape = Shape::new(1, 3).expect("test shape");
+        let mut filter =
+            BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape)).expect("valid");
+        filter
+            .correct(&frame(shape, &[255, 2, 255]))
+            .expect("possible");
+        let fire = filter.belief().probability(2);
+        assert_eq!([fire[[0, 0]], fire[[0, 2]]], [1.0 / 3.0; 2]);
+        // .98 / (.01 + .05 + .98), the column of O for an observed fire.
+        assert!((fire[[0, 1]] - 0.98 / 1.04).abs() < 1e-6);
+    }
+
+    #[test]
+    fn an_impossible_frame_is_rejected_whole() {
+        let mut file = Model::wildfire().file().clone();
+        file.states[0].observed_as = vec![1.0, 0.0, 0.0];
+        let model = Model::new(file).expect("valid model");
+        let shape = Shape::new(2, 2).expect("test shape");
+        let mut states = Grid::from_elem((2, 2), 2);
+        states[[1, 0]] = 0;
+        let prior = Belief::from_states(&states, 3).expect("valid states");
+        let mut filter = BayesFilter::known(&model, prior.clone()).expect("valid");
+        // Cell 0 could be corrected, cell 2 is certainly normal and never looks like fire.
+        let error = filter.correct(&frame(shape, &[1, 255, 2, 2]));
+        let error = error.expect_err("a normal cell seen as fire");
+        assert_eq!(error.cell, Cell { row: 1, col: 0 });
+        assert_eq!(error.observed, 2);
+        assert_eq!(filter.belief(), &prior);
+    }
+
+    #[test]
+    fn a_tiny_probability_is_evidence() {
+        let shape = Shape::new(1, 1).expect("test shape");
+        let numbers = [1.0, 0.0, f32::MIN_POSITIVE];
+        let numbers = Probabilities::from_shape_fn((3, 1, 1), |(state, _, _)| numbers[state]);
+        let prior = Belief::from_probabilities(numbers).expect("valid");
+        let mut file = Model::wildfire().file().clone();
+        file.states[0].observed_as = vec![1.0, 0.0, 0.0];
+        file.states[2].observed_as = vec![0.999, 0.0005, 0.0005];
+        let mut filter =
+            BayesFilter::known(&Model::new(file).expect("valid"), prior).expect("valid");
+        filter.correct(&frame(shape, &[2])).expect("possible");
+        assert_eq!(filter.belief().probability(2)[[0, 0]], 1.0);
+    }
+}

@@ -1,0 +1,140 @@
+//! What a filter believes before its first frame: the predictor `u_0` of paper section III.A.
+
+use crate::estimation::belief::Belief;
+use protocol::dynamics::Dynamics;
+use protocol::grid::{Probabilities, Shape};
+use protocol::model::{Model, ModelError};
+use protocol::randomness::{Purpose, stream};
+use rand_chacha::rand_core::Rng;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// How much the average over the grid weighs in a cell's prior, in worlds: a choice that hardly
+/// matters, as the first frames soon outweigh it.
+const POOLED_WORLDS: f64 = 16.0;
+
+/// The first prior of a filter.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Prior {
+    /// How often each cell of simulated worlds is in each state after burn-in: the best that can be
+    /// known before the first frame.
+    Simulated {
+        /// Worlds to simulate.
+        n_worlds: usize,
+        /// Steps from the initial distribution.
+        burn_in: u64,
+    },
+    /// The model's initial distribution, which is right for a world without burn-in.
+    Initial,
+    /// Every state equally likely, as in the authors' demonstration.
+    Uniform,
+}
+
+impl Prior {
+    /// The default number of simulated worlds: 64.
+    pub const N_WORLDS: usize = 64;
+
+    /// The belief before the first frame; `seed` only matters to [`Prior::Simulated`].
+    ///
+    /// # Errors
+    /// [`ModelError`] for a model that cannot be simulated on the grid.
+    pub fn belief(self, model: &Model, shape: Shape, seed: u64) -> Result<Belief, ModelError> {
+        match self {
+            Self::Simulated { n_worlds, burn_in } => {
+                let worlds = simulate(model, shape, seed, n_worlds, burn_in)?;
+                Ok(average(&worlds, model.n_states(), shape))
+            }
+            Self::Initial => Ok(Belief::from_initial(model, shape)),
+            Self::Uniform => Ok(Belief::uniform(model.n_states(), shape)),
+        }
+    }
+}
+
+/// Counts of each state in each cell over worlds simulated side by side, shape `[S, H, W]`.
+///
+/// Counts are integers, so their sum does not depend on the order in which threads add them.
+fn simulate(
+    model: &Model,
+    shape: Shape,
+    seed: u64,
+    n_worlds: usize,
+    burn_in: u64,
+) -> Result<ndarray::Array3<u32>, ModelError> {
+    let dynamics = Dynamics::new(model, shape)?;
+    let (height, width) = shape.dim();
+    let none = || ndarray::Array3::zeros((model.n_states(), height, width));
+    let count = |mut counts: ndarray::Array3<u32>, world: usize| {
+        let world_seed = stream(seed, Purpose::Prior, world as u64).next_u64();
+        let mut dynamics = dynamics.clone();
+        let mut states = dynamics.initial(world_seed);
+        for n in 0..burn_in {
+            dynamics.step(world_seed, n, &mut states);
+        }
+        for ((row, col), &state) in states.indexed_iter() {
+            counts[[usize::from(state), row, col]] += 1;
+        }
+        counts
+    };
+    let counts = (0..n_worlds).into_par_iter().fold(none, count);
+    Ok(counts.reduce(none, |a, b| a + b))
+}
+
+/// Relative frequencies, drawn towards those of the whole grid, as if [`POOLED_WORLDS`] more worlds
+/// had been seen that are alike everywhere: a few worlds say little about one cell, and a state not
+/// seen in a cell is still possible there.
+fn average(counts: &ndarray::Array3<u32>, n_states: usize, shape: Shape) -> Belief {
+    let in_all = |state: usize| -> u32 { counts.index_axis(ndarray::Axis(0), state).sum() };
+    let totals: Vec<f64> = (0..n_states)
+        .map(|state| f64::from(in_all(state)))
+        .collect();
+    let total: f64 = totals.iter().sum();
+    // One more count of each state: nothing is impossible because it was not seen.
+    let pooled = |state: usize| (totals[state] + 1.0) / (total + n_states as f64);
+    let n_worlds = total / shape.n_cells() as f64;
+    let probability = |(state, row, col): (usize, usize, usize)| {
+        let seen = f64::from(counts[[state, row, col]]);
+        ((seen + POOLED_WORLDS * pooled(state)) / (n_worlds + POOLED_WORLDS)) as f32
+    };
+    Belief::from_probabilities(Probabilities::from_shape_fn(counts.dim(), probability))
+        .expect("invariant: relative frequencies sum to one")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn simulated(n_worlds: usize, burn_in: u64) -> Prior {
+        Prior::Simulated { n_worlds, burn_in }
+    }
+
+    #[test]
+    fn a_simulated_prior_is_the_same_on_any_number_of_threads() {
+        let shape = Shape::new(9, 12).expect("test shape");
+        let model = Model::wildfire();
+        let on = |n_threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new()
+                .num_threads(n_threads)
+                .build();
+            let belief = || simulated(10, 40).belief(&model, shape, 5);
+            pool.expect("threads").install(belief).expect("valid model")
+        };
+        assert_eq!(on(1), on(3));
+        let other = simulated(10, 40)
+            .belief(&model, shape, 6)
+            .expect("valid model");
+        assert_ne!(on(1), other);
+    }
+
+    #[test]
+    fn without_burn_in_it_approaches_the_initial_distribution() {
+        let shape = Shape::new(20, 20).expect("test shape");
+        let prior = simulated(64, 0)
+            .belief(&Model::wildfire(), shape, 0)
+            .expect("valid model");
+        let mean = prior.probability(1).mean().expect("not empty");
+        // 25,600 cells latent with .01: four standard errors are .0025.
+        assert!((mean - 0.01).abs() < 0.0025, "{mean}");
+        assert!(prior.view().iter().all(|&p| p > 0.0));
+    }
+}

@@ -1,0 +1,310 @@
+//! Updates of the unknown parameters from what the replay holds.
+//!
+//! As many streams as there are windows in an update run through the replay's blocks in random
+//! order, each with the belief that it has come to; at the end of a block that belief is handed on
+//! to the block after it. So every window starts from a belief that knows the frames before it,
+//! though gradients only run back through the window.
+
+use crate::config::LearningConfig;
+use crate::estimation::parameters::{Dimensions, Parameters, Tables};
+use crate::learning::filter::adam::{Adam, StepSize};
+use crate::learning::filter::window::{Outcome, Start, Window};
+use crate::learning::replay::{Block, Replay};
+use protocol::Shape;
+use protocol::randomness::{Purpose, stream};
+use rand_chacha::rand_core::Rng;
+use rayon::prelude::*;
+use thiserror::Error;
+
+/// Parts that the streams are dealt into, each with its own work space: as many threads are of use.
+/// The parts do not depend on the number of threads, nor does the order in which gradients are added.
+const N_PARTS: usize = 8;
+
+/// Learns the parameters; holds all that a later update depends on but the replay.
+#[derive(Debug, Clone)]
+pub struct Trainer {
+    iterates: Iterates,
+    pub(super) config: LearningConfig,
+    seed: u64,
+    pub(super) streams: Vec<Stream>,
+    windows: Vec<Window<f32>>,
+    /// Blocks still to be run through in this lap.
+    pub(super) lap: Vec<u64>,
+    pub(super) n_laps: u64,
+}
+
+/// Where the updates have come to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Iterates {
+    /// The parameters.
+    pub parameters: Parameters,
+    /// The optimiser.
+    pub adam: Adam,
+}
+
+/// What one update did.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Update {
+    /// Number of this update, from 1.
+    pub number: u64,
+    /// Minus the mean log-likelihood of a visited cell, before the update.
+    pub loss: f64,
+    /// The kernel's step size.
+    pub rate: f64,
+}
+
+/// A number that is not finite: nothing was changed by the update that met it.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("update {update}: {tensor}: expected finite numbers, got {what}")]
+pub struct NotFinite {
+    /// The update.
+    pub update: u64,
+    /// The tensor.
+    pub tensor: &'static str,
+    /// Which number of it.
+    pub what: &'static str,
+}
+
+/// A place in the replay, and the belief before the frame there.
+#[derive(Debug, Clone)]
+pub(super) struct Stream {
+    pub(super) block: Option<u64>,
+    pub(super) n_done: usize,
+    pub(super) belief: Vec<f32>,
+    end: Vec<f32>,
+}
+
+impl Iterates {
+    /// Before the first update.
+    pub fn first(parameters: Parameters) -> Self {
+        Self {
+            adam: Adam::new(parameters.dimensions),
+            parameters,
+        }
+    }
+}
+
+impl Trainer {
+    /// Before the first update.
+    pub fn new(parameters: Parameters, shape: Shape, config: LearningConfig, seed: u64) -> Self {
+        Self::resume(Iterates::first(parameters), shape, config, seed)
+    }
+
+    /// After some updates; the streams are not yet in any block.
+    pub fn resume(iterates: Iterates, shape: Shape, config: LearningConfig, seed: u64) -> Self {
+        let parameters = &iterates.parameters;
+        let tables: Tables = parameters.tables();
+        let numbers = vec![0.0; parameters.dimensions.n_states * shape.n_cells()];
+        let stream = Stream {
+            block: None,
+            n_done: 0,
+            belief: numbers.clone(),
+            end: numbers,
+        };
+        Self {
+            n_laps: iterates.adam.n_steps,
+            iterates,
+            config,
+            seed,
+            streams: vec![stream; config.streams],
+            windows: vec![Window::new(tables, shape, config.window); N_PARTS],
+            lap: Vec::new(),
+        }
+    }
+
+    /// Where the updates have come to.
+    pub fn iterates(&self) -> &Iterates {
+        &self.iterates
+    }
+
+    /// The parameters.
+    pub fn parameters(&self) -> &Parameters {
+        &self.iterates.parameters
+    }
+
+    /// Their dimensions.
+    pub fn dimensions(&self) -> Dimensions {
+        self.iterates.parameters.dimensions
+    }
+
+    /// One update; `None` while the replay has no block for each stream, or nothing was seen.
+    /// `sure`: the state to be seen almost surely.
+    ///
+    /// # Errors
+    /// [`NotFinite`]; the parameters are then as they were.
+    pub fn update(
+        &mut self,
+        replay: &mut Replay,
+        sure: Option<usize>,
+    ) -> Result<Option<Update>, NotFinite> {
+        if replay.n_blocks() < self.streams.len() {
+            return Ok(None);
+        }
+        if let Some(tensor) = self.iterates.parameters.not_finite() {
+            return Err(self.wrong(tensor, "a parameter that is not"));
+        }
+        self.place_streams(replay);
+        let outcomes = self.run_windows(replay);
+        let (log_likelihood, n_seen, mut gradient) = add_up(&outcomes, self.dimensions());
+        // Before a belief that is not finite gets into the replay.
+        if !log_likelihood.is_finite() {
+            return Err(self.wrong("loss", "a sum that is not"));
+        }
+        self.move_streams(replay);
+        if n_seen == 0 {
+            return Ok(None);
+        }
+        gradient
+            .iter_mut()
+            .flatten()
+            .for_each(|slope| *slope /= n_seen as f64);
+        if let Some(state) = sure {
+            self.add_anchor(state, &mut gradient[1]);
+        }
+        let loss = -log_likelihood / n_seen as f64;
+        self.step(loss, &gradient).map(Some)
+    }
+
+    /// Takes the streams out of their blocks: the replay is another.
+    pub fn leave_replay(&mut self) {
+        self.lap.clear();
+        self.streams
+            .iter_mut()
+            .for_each(|stream| stream.block = None);
+    }
+
+    /// Gives streams at the end of a block, or whose block is gone, another one.
+    fn place_streams(&mut self, replay: &Replay) {
+        let n_windows = self.config.block_windows;
+        for index in 0..self.streams.len() {
+            let stream = &self.streams[index];
+            let block = stream.block.filter(|_| stream.n_done < n_windows);
+            if block.is_none_or(|number| replay.block(number).is_none()) {
+                let (number, block) = self.next_block(replay);
+                let stream = &mut self.streams[index];
+                (stream.block, stream.n_done) = (Some(number), 0);
+                if let Some(start) = &block.start {
+                    stream.belief.clone_from(start);
+                }
+            }
+        }
+    }
+
+    /// The next block of the lap, or the first of a new lap through all blocks.
+    fn next_block<'a>(&mut self, replay: &'a Replay) -> (u64, &'a Block) {
+        loop {
+            match self.lap.pop() {
+                Some(number) => {
+                    if let Some(block) = replay.block(number) {
+                        return (number, block);
+                    }
+                }
+                None => {
+                    self.lap = replay.blocks().collect();
+                    shuffle(&mut self.lap, self.seed, self.n_laps);
+                    self.n_laps += 1;
+                }
+            }
+        }
+    }
+
+    fn run_windows(&mut self, replay: &Replay) -> Vec<Outcome> {
+        let tables = self.iterates.parameters.tables();
+        let length = self.config.window;
+        let part = self.streams.len().div_ceil(N_PARTS);
+        let parts = self.streams.par_chunks_mut(part).zip(&mut self.windows);
+        let outcomes = parts.flat_map_iter(|(streams, window)| {
+            window.set(&tables);
+            streams.iter_mut().filter_map(move |stream| {
+                let block = replay.block(stream.block?)?;
+                let first = stream.n_done * length;
+                let start = match block.start {
+                    None if first == 0 => Start::Initial,
+                    _ => Start::Belief(&stream.belief),
+                };
+                Some(window.run(start, &block.frames[first..first + length], &mut stream.end))
+            })
+        });
+        outcomes.collect()
+    }
+
+    fn move_streams(&mut self, replay: &mut Replay) {
+        for stream in &mut self.streams {
+            std::mem::swap(&mut stream.belief, &mut stream.end);
+            stream.n_done += 1;
+            if let Some(block) = stream.block
+                && stream.n_done == self.config.block_windows
+            {
+                replay.hand_on(block, &stream.belief);
+            }
+        }
+    }
+
+    /// The prior `anchor * ln P(y | x)` on the observation that a state shows most: "there is a
+    /// state which is observable with negligible uncertainties" (paper section III.E, remark).
+    fn add_anchor(&self, state: usize, by_likelihood: &mut [f64]) {
+        let n_observations = self.dimensions().n_observations;
+        let likelihood = self.iterates.parameters.tables::<f64>().likelihood;
+        let row = &likelihood[state * n_observations..][..n_observations];
+        let shown = (0..n_observations).max_by(|&a, &b| row[a].total_cmp(&row[b]));
+        if let Some(shown) = shown {
+            by_likelihood[state * n_observations + shown] -= self.config.anchor / row[shown];
+        }
+    }
+
+    fn step(&mut self, loss: f64, by_tables: &[Vec<f64>; 3]) -> Result<Update, NotFinite> {
+        let number = self.iterates.adam.n_steps + 1;
+        let gradient = self.iterates.parameters.chain(by_tables);
+        if let Some(tensor) = gradient.not_finite() {
+            return Err(self.wrong(tensor, "a gradient that is not"));
+        }
+        let rate = self.config.rate * self.config.rate_at(number - 1);
+        let observation_rate = rate * self.config.observation_rate;
+        let size = StepSize {
+            rates: [rate, observation_rate, observation_rate],
+            beta1: self.config.beta1,
+            beta2: self.config.beta2,
+        };
+        let mut next = self.iterates.clone();
+        next.adam.step(&mut next.parameters, &gradient, size);
+        if let Some(tensor) = next.parameters.not_finite() {
+            return Err(self.wrong(tensor, "a step to a number that is not"));
+        }
+        next.parameters.bound();
+        self.iterates = next;
+        Ok(Update { number, loss, rate })
+    }
+
+    /// What the update under way met.
+    fn wrong(&self, tensor: &'static str, what: &'static str) -> NotFinite {
+        let update = self.iterates.adam.n_steps + 1;
+        NotFinite {
+            update,
+            tensor,
+            what,
+        }
+    }
+}
+
+/// Sums in the order of the streams.
+fn add_up(outcomes: &[Outcome], dimensions: Dimensions) -> (f64, usize, [Vec<f64>; 3]) {
+    let mut gradient = dimensions.lengths().map(|length| vec![0.0; length]);
+    let (mut log_likelihood, mut n_seen) = (0.0, 0);
+    for outcome in outcomes {
+        log_likelihood += outcome.log_likelihood;
+        n_seen += outcome.n_seen;
+        let slopes = outcome.gradient.iter().flatten();
+        let sums = gradient.iter_mut().flatten();
+        sums.zip(slopes).for_each(|(sum, slope)| *sum += slope);
+    }
+    (log_likelihood, n_seen, gradient)
+}
+
+/// Fisher and Yates's shuffle.
+fn shuffle(numbers: &mut [u64], seed: u64, lap: u64) {
+    let mut random = stream(seed, Purpose::Learner, lap);
+    for last in (1..numbers.len()).rev() {
+        let other = random.next_u64() % (last as u64 + 1);
+        numbers.swap(last, other as usize);
+    }
+}

@@ -1,0 +1,273 @@
+//! One stream through one window of frames: the filter's recursion forward, its derivatives backward.
+//!
+//! Forward, for each frame: `p = B(y) u / (b(y)' u)` on visited cells (paper eq. 5), then `u = Phi_w(p)`
+//! (eq. 6). The value is the sum of `ln b(y)' u` over visited cells: how well each frame was
+//! predicted. Backward runs the same steps in reverse and stops at the window's first predictor
+//! (truncated backpropagation). Gradients are zero far from the cells that later frames visit, and
+//! only the region where they are not is computed.
+
+use crate::estimation::parameters::Tables;
+use crate::learning::filter::layout::Layout;
+use crate::learning::filter::operator::{Operator, Region};
+use crate::learning::filter::vector::{Lanes, Real, Vectorised, on_widest};
+use crate::learning::replay::Sighting;
+use protocol::Shape;
+
+/// Where a window's first predictor comes from.
+#[derive(Debug, Clone, Copy)]
+pub enum Start<'a> {
+    /// The first belief, which learns too.
+    Initial,
+    /// A belief of shape `[S, H, W]` that an earlier window ended with.
+    Belief(&'a [f32]),
+}
+
+/// What a window gives.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Outcome {
+    /// Derivatives of `-log_likelihood` by the kernel, the likelihood and the first belief.
+    pub gradient: [Vec<f64>; 3],
+    /// Sum of `ln P(y)` over visited cells.
+    pub log_likelihood: f64,
+    /// Number of visited cells.
+    pub n_seen: usize,
+}
+
+/// The recursion with its work space: give each thread its own.
+#[derive(Debug, Clone)]
+pub struct Window<T> {
+    operator: Operator<T>,
+    tables: Tables<T>,
+    /// Posteriors of each frame, and the predictor after the last.
+    planes: Vec<Vec<T>>,
+    /// One over the weights' sums behind each of them.
+    factors: Vec<Vec<T>>,
+    seen: Vec<Seen>,
+    /// Predictors of the seen cells before their correction, S of each.
+    predictors: Vec<T>,
+    /// `dL/dp` or `dL/du`, and `dL/dv`.
+    by_belief: Vec<T>,
+    by_weights: Vec<T>,
+}
+
+/// A visited cell of a window.
+#[derive(Debug, Clone, Copy)]
+struct Seen {
+    frame: usize,
+    cell: usize,
+    place: usize,
+    value: usize,
+}
+
+impl<T: Real> Window<T> {
+    /// For windows of up to `n_frames` frames.
+    pub fn new(tables: Tables<T>, shape: Shape, n_frames: usize) -> Self {
+        let dimensions = tables.dimensions;
+        let layout = Layout::new(shape, dimensions.n_states, dimensions.kernel);
+        Self {
+            operator: Operator::new(layout, &tables.kernel),
+            tables,
+            planes: vec![layout.planes(); n_frames + 1],
+            factors: vec![vec![T::zero(); layout.plane]; n_frames + 1],
+            seen: Vec::new(),
+            predictors: Vec::new(),
+            by_belief: layout.planes(),
+            by_weights: layout.planes(),
+        }
+    }
+
+    /// Takes other parameters of the same dimensions.
+    pub fn set(&mut self, tables: &Tables<T>) {
+        self.operator.set(&tables.kernel);
+        self.tables.clone_from(tables);
+    }
+
+    /// Runs over frames; `end` gets the predictor after the last, shape `[S, H, W]`.
+    ///
+    /// # Panics
+    /// If there are more frames than there is room for, or cells off the grid.
+    pub fn run(&mut self, start: Start<'_>, frames: &[Vec<Sighting>], end: &mut [f32]) -> Outcome {
+        on_widest(Pass {
+            window: self,
+            start,
+            frames,
+            end,
+        })
+    }
+
+    fn layout(&self) -> Layout {
+        self.operator.layout
+    }
+
+    fn begin(&mut self, start: Start<'_>) {
+        let layout = self.layout();
+        let cast = |p: f32| T::from(p).expect("invariant: f32 casts to T");
+        match start {
+            Start::Belief(belief) => layout.load(belief, &mut self.planes[0], cast),
+            Start::Initial => {
+                let n_cells = layout.shape.n_cells();
+                let states = self.tables.initial.iter();
+                let belief: Vec<T> = states
+                    .flat_map(|&p| std::iter::repeat_n(p, n_cells))
+                    .collect();
+                layout.load(&belief, &mut self.planes[0], |p| p);
+            }
+        }
+        self.seen.clear();
+        self.predictors.clear();
+    }
+
+    /// Eq. 5 on a frame's cells; returns the sum of `ln b(y)' u`.
+    fn correct(&mut self, frame: usize, sightings: &[Sighting]) -> f64 {
+        let layout = self.layout();
+        let n_states = layout.n_states;
+        let n_observations = self.tables.dimensions.n_observations;
+        let planes = &mut self.planes[frame];
+        let mut log_likelihood = 0.0;
+        for sighting in sightings {
+            let (cell, value) = (sighting.cell as usize, usize::from(sighting.value));
+            let place = layout.place(cell);
+            let seen_as = |state: usize| self.tables.likelihood[state * n_observations + value];
+            let mut evidence = T::zero();
+            for state in 0..n_states {
+                let u = planes[state * layout.plane + place];
+                self.predictors.push(u);
+                evidence += u * seen_as(state);
+            }
+            for state in 0..n_states {
+                let p = &mut planes[state * layout.plane + place];
+                *p = *p * seen_as(state) / evidence;
+            }
+            log_likelihood += evidence.to_f64().expect("invariant: floats cast").ln();
+            self.seen.push(Seen {
+                frame,
+                cell,
+                place,
+                value,
+            });
+        }
+        log_likelihood
+    }
+
+    /// Eq. 6.
+    #[inline(always)]
+    fn predict<V: Lanes<T>>(&mut self, frame: usize) {
+        let (before, after) = self.planes.split_at_mut(frame + 1);
+        let factors = &mut self.factors[frame + 1];
+        self.operator
+            .forward::<V>(&before[frame], &mut after[0], factors);
+    }
+
+    #[inline(always)]
+    fn backward<V: Lanes<T>>(&mut self, n_frames: usize, outcome: &mut Outcome) {
+        self.by_belief.fill(T::zero());
+        self.by_weights.fill(T::zero());
+        let mut region = Region::default();
+        for frame in (0..n_frames).rev() {
+            self.uncorrect(frame, outcome, &mut region);
+            if frame > 0 && !region.rows.is_empty() {
+                region = self.unpredict::<V>(frame, &region, outcome);
+            }
+        }
+    }
+
+    /// Eq. 5 backward: `dL/dp` of a frame's cells becomes `dL/du`, and their predictors are put back.
+    fn uncorrect(&mut self, frame: usize, outcome: &mut Outcome, region: &mut Region) {
+        let layout = self.layout();
+        let (n_states, width) = (layout.n_states, layout.shape.width());
+        let n_observations = self.tables.dimensions.n_observations;
+        let float = |x: T| x.to_f64().expect("invariant: floats cast");
+        let planes = &mut self.planes[frame];
+        while let Some(seen) = self.seen.pop_if(|seen| seen.frame == frame) {
+            region.add(seen.cell / width, seen.cell % width);
+            let first = self.predictors.len() - n_states;
+            let at = |state: usize| state * layout.plane + seen.place;
+            let entry = |state: usize| state * n_observations + seen.value;
+            let (mut evidence, mut mean) = (T::zero(), T::zero());
+            for state in 0..n_states {
+                evidence += self.predictors[first + state] * self.tables.likelihood[entry(state)];
+                mean += self.by_belief[at(state)] * planes[at(state)];
+            }
+            for state in 0..n_states {
+                let u = self.predictors[first + state];
+                // The 1 is of -ln(evidence) itself.
+                let by_joint = (self.by_belief[at(state)] - mean - T::one()) / evidence;
+                outcome.gradient[1][entry(state)] += float(by_joint * u);
+                self.by_belief[at(state)] = by_joint * self.tables.likelihood[entry(state)];
+                planes[at(state)] = u;
+            }
+            self.predictors.truncate(first);
+        }
+    }
+
+    /// Eqs. 2 and 3 backward: from `dL/du` of a frame to `dL/dp` of the one before.
+    #[inline(always)]
+    fn unpredict<V: Lanes<T>>(
+        &mut self,
+        frame: usize,
+        region: &Region,
+        outcome: &mut Outcome,
+    ) -> Region {
+        let (u, p) = (&self.planes[frame], &self.planes[frame - 1]);
+        let operator = &self.operator;
+        let h = &mut self.by_weights;
+        operator.backward_normalise::<V>(&self.by_belief, u, &self.factors[frame], h, region);
+        operator.add_weight_gradient::<V>(p, h, region, &mut outcome.gradient[0]);
+        let reached = region.reached(&operator.layout);
+        operator.backward_correlate::<V>(h, &mut self.by_belief, reached.rows.clone());
+        reached
+    }
+
+    /// The gradient of the first belief, which is the same in every cell.
+    fn add_initial_gradient(&self, outcome: &mut Outcome) {
+        let layout = self.layout();
+        for row in 0..layout.shape.height() {
+            for (state, sum) in outcome.gradient[2].iter_mut().enumerate() {
+                let at = state * layout.plane + layout.row(row);
+                let cells = &self.by_belief[at..][..layout.shape.width()];
+                let cells = cells
+                    .iter()
+                    .map(|x| x.to_f64().expect("invariant: floats cast"));
+                *sum += cells.sum::<f64>();
+            }
+        }
+    }
+}
+
+/// One call of [`Window::run`].
+struct Pass<'a, T> {
+    window: &'a mut Window<T>,
+    start: Start<'a>,
+    frames: &'a [Vec<Sighting>],
+    end: &'a mut [f32],
+}
+
+impl<T: Real> Vectorised for Pass<'_, T> {
+    type Number = T;
+    type Output = Outcome;
+
+    #[inline(always)]
+    fn run<V: Lanes<T>>(self) -> Outcome {
+        let (window, n_frames) = (self.window, self.frames.len());
+        let mut outcome = Outcome {
+            gradient: window.tables.dimensions.lengths().map(|n| vec![0.0; n]),
+            log_likelihood: 0.0,
+            n_seen: 0,
+        };
+        window.begin(self.start);
+        for (frame, sightings) in self.frames.iter().enumerate() {
+            outcome.log_likelihood += window.correct(frame, sightings);
+            outcome.n_seen += sightings.len();
+            window.predict::<V>(frame);
+        }
+        let cast = |p: T| p.to_f32().expect("invariant: floats cast");
+        window
+            .layout()
+            .unload(&window.planes[n_frames], self.end, cast);
+        window.backward::<V>(n_frames, &mut outcome);
+        if matches!(self.start, Start::Initial) {
+            window.add_initial_gradient(&mut outcome);
+        }
+        outcome
+    }
+}

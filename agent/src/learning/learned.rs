@@ -1,0 +1,123 @@
+//! What checkpoints hold, by kind: all that policies on a learned belief need.
+
+use crate::config::AgentConfig;
+use crate::estimation::dqn_input::DqnInput;
+use crate::learning::checkpoint::{self, CheckpointError, Contents, Problem};
+use crate::learning::learner::{self, LearnedModel};
+use crate::learning::student::{decisions, network};
+use crate::planning::BasisKind;
+use crate::planning::policy::EstimatorKind;
+use ::network::{Autoencoder, Device, Dqn};
+use std::path::Path;
+use std::sync::Arc;
+
+/// Kinds of checkpoints that policies act on.
+const KINDS: [&str; 3] = [learner::KIND, network::KIND, decisions::KIND];
+
+/// Everything that was learned.
+#[derive(Debug, Clone, Default)]
+pub struct Learned {
+    /// A filter, for policies `learned_*`.
+    pub filter: Option<LearnedModel>,
+    /// An autoencoder and a DQN, for policies `autoencoder_*`.
+    pub network: Option<Arc<LearnedNetwork>>,
+    /// Decisions, for `dqn_beam`; they fit a model or not.
+    pub decisions: Option<Arc<Contents>>,
+}
+
+/// What Algorithm 1 learned, with its parameters fixed.
+#[derive(Debug)]
+pub struct LearnedNetwork {
+    /// The model; each world follows it with a copy of its own.
+    pub autoencoder: Autoencoder,
+    /// The choice of objectives.
+    pub dqn: Dqn,
+    /// What that sees.
+    pub input: DqnInput,
+    /// What the paths were planned on that it values.
+    pub basis: BasisKind,
+    /// The state that pays most.
+    pub target: usize,
+}
+
+impl Learned {
+    /// What some checkpoints hold, of each kind one at most; networks compute on `device`.
+    ///
+    /// # Errors
+    /// [`CheckpointError`] names the file that cannot be read, or is the second of its kind.
+    pub fn read<'a>(
+        paths: impl IntoIterator<Item = &'a Path>,
+        device: &Device,
+    ) -> Result<Self, CheckpointError> {
+        let mut learned = Self::default();
+        for path in paths {
+            let (kind, contents) = checkpoint::read_any(path, &KINDS)?;
+            let added = learned.add(kind, contents, device);
+            added.map_err(|problem| problem.of(path))?;
+        }
+        Ok(learned)
+    }
+
+    /// What one checkpoint holds, of whatever kind.
+    ///
+    /// # Errors
+    /// [`Problem`].
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, Problem> {
+        let (kind, contents) = checkpoint::decode(&KINDS, bytes)?;
+        let mut learned = Self::default();
+        learned.add(kind, contents, &Device::Cpu)?;
+        Ok(learned)
+    }
+
+    fn add(
+        &mut self,
+        kind: &'static str,
+        contents: Contents,
+        device: &Device,
+    ) -> Result<(), Problem> {
+        let twice = match kind {
+            learner::KIND => {
+                let model = learner::Progress::from_contents(&contents, None)?.learned();
+                self.filter.replace(model).is_some()
+            }
+            decisions::KIND => self.decisions.replace(Arc::new(contents)).is_some(),
+            _ => {
+                let network = network::Progress::read(&contents, device)?.learned();
+                self.network.replace(Arc::new(network)).is_some()
+            }
+        };
+        if twice {
+            Err(Problem::Twice(kind))
+        } else {
+            Ok(())
+        }
+    }
+}
+
+impl Learned {
+    /// The state that pays most, as the one who learned an estimator's model found it.
+    pub fn target(&self, estimator: EstimatorKind) -> Option<usize> {
+        match estimator {
+            EstimatorKind::Learned => self.filter.as_ref().map(|filter| filter.target),
+            EstimatorKind::Autoencoder => self.network.as_ref().map(|network| network.target),
+            _ => None,
+        }
+    }
+}
+
+/// The settings that a checkpoint was trained with.
+///
+/// # Errors
+/// [`Problem`] for none, or others than an agent's.
+pub fn settings(contents: &Contents) -> Result<AgentConfig, Problem> {
+    const SETTINGS: &str = "settings";
+    let text = contents.texts.get(SETTINGS);
+    let text = text.ok_or_else(|| Problem::Missing(SETTINGS.into()))?;
+    let wrong = |got: String| Problem::Value {
+        name: SETTINGS.into(),
+        expected: "those of an agent".into(),
+        got,
+    };
+    let config: AgentConfig = toml::from_str(text).map_err(|error| wrong(error.to_string()))?;
+    config.check().map_err(|error| wrong(error.to_string()))
+}

@@ -1,0 +1,284 @@
+//! Metrics of a training as CSV: one row per update, and one per step without any.
+
+use crate::estimation::scoring::Score;
+use crate::learning::student::Lesson;
+use std::path::{Path, PathBuf};
+use thiserror::Error;
+
+/// The file's name in the folder of a training.
+pub const METRICS: &str = "metrics.csv";
+
+/// The name of that of a run without learning.
+pub const FROZEN: &str = "frozen.csv";
+
+const HEADER: [&str; 6] = [
+    "update",
+    "world_steps",
+    "loss",
+    "held_out_log_likelihood",
+    "mean_reward",
+    "rate",
+];
+
+/// One step of all worlds.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Tick {
+    /// World steps so far, of all worlds together.
+    pub world_steps: u64,
+    /// Worlds that made the step.
+    pub n_worlds: u64,
+    /// Sum of their rewards.
+    pub reward: f64,
+    /// How well their frames were predicted before anything was learned from them.
+    pub score: Score,
+}
+
+/// A file that cannot be written or read, or is another learner's.
+#[derive(Debug, Error)]
+#[error("metrics {}: {problem}", path.display())]
+pub struct MetricsError {
+    path: PathBuf,
+    problem: Box<dyn std::error::Error + Send + Sync>,
+}
+
+impl MetricsError {
+    fn new(path: &Path, problem: csv::Error) -> Self {
+        let (path, problem) = (path.to_owned(), problem.into());
+        Self { path, problem }
+    }
+
+    fn columns(path: &Path, expected: &csv::StringRecord, got: &csv::StringRecord) -> Self {
+        let names = |record: &csv::StringRecord| record.iter().collect::<Vec<_>>().join(",");
+        let problem = format!(
+            "expected the columns {}, got {}",
+            names(expected),
+            names(got)
+        );
+        let (path, problem) = (path.to_owned(), problem.into());
+        Self { path, problem }
+    }
+}
+
+/// The open file.
+pub struct Metrics {
+    path: PathBuf,
+    writer: csv::Writer<std::fs::File>,
+    /// Columns of the learner's own.
+    n_more: usize,
+}
+
+impl Metrics {
+    /// Begins a file. `more`: columns of the learner's own.
+    ///
+    /// # Errors
+    /// [`MetricsError`].
+    pub fn begin(path: &Path, more: &[&str]) -> Result<Self, MetricsError> {
+        Self::write(path, more, &[])
+    }
+
+    /// Goes on with a file, from which rows after some world step go, as they came after what is gone on
+    /// from, and rows that a kill cut off; begins it if it is not there.
+    ///
+    /// # Errors
+    /// [`MetricsError`], also for a file with other columns.
+    pub fn go_on(path: &Path, more: &[&str], world_steps: u64) -> Result<Self, MetricsError> {
+        if !path.exists() {
+            return Self::begin(path, more);
+        }
+        let fail = |problem: csv::Error| MetricsError::new(path, problem);
+        let reader = csv::ReaderBuilder::new().flexible(true).from_path(path);
+        let mut reader = reader.map_err(fail)?;
+        let got = reader.headers().map_err(fail)?;
+        let expected = csv::StringRecord::from_iter(HEADER.iter().chain(more));
+        if *got != expected {
+            return Err(MetricsError::columns(path, &expected, got));
+        }
+        let is_kept = |row: &csv::StringRecord| {
+            let step = row.get(1).and_then(|step| step.parse().ok());
+            row.len() == expected.len() && step.is_some_and(|step: u64| step <= world_steps)
+        };
+        let rows = reader
+            .records()
+            .collect::<Result<Vec<_>, _>>()
+            .map_err(fail)?;
+        let rows: Vec<_> = rows.into_iter().filter(is_kept).collect();
+        let beside = path.with_extension("csv.new");
+        let written = Self::write(&beside, more, &rows)?;
+        std::fs::rename(&beside, path).map_err(|error| fail(error.into()))?;
+        Ok(Self {
+            path: path.to_owned(),
+            ..written
+        })
+    }
+
+    fn write(path: &Path, more: &[&str], rows: &[csv::StringRecord]) -> Result<Self, MetricsError> {
+        let fail = |problem: csv::Error| MetricsError::new(path, problem);
+        let mut writer = csv::Writer::from_path(path).map_err(fail)?;
+        let header = HEADER.iter().chain(more);
+        writer.write_record(header).map_err(fail)?;
+        for row in rows {
+            writer.write_record(row).map_err(fail)?;
+        }
+        writer.flush().map_err(|error| fail(error.into()))?;
+        let (path, n_more) = (path.to_owned(), more.len());
+        Ok(Self {
+            path,
+            writer,
+            n_more,
+        })
+    }
+
+    /// Adds a step's rows.
+    ///
+    /// # Errors
+    /// [`MetricsError`].
+    pub fn add(
+        &mut self,
+        tick: &Tick,
+        lessons: &[Lesson],
+        n_updates: u64,
+    ) -> Result<(), MetricsError> {
+        let nothing = Lesson::nothing(n_updates, self.n_more);
+        let nothing = lessons.is_empty().then_some(&nothing);
+        for lesson in lessons.iter().chain(nothing) {
+            let written = self.writer.write_record(row(tick, lesson));
+            written.map_err(|problem| self.fail(problem))?;
+        }
+        Ok(())
+    }
+
+    /// Writes what is still in memory.
+    ///
+    /// # Errors
+    /// [`MetricsError`].
+    pub fn flush(&mut self) -> Result<(), MetricsError> {
+        let flushed = self.writer.flush();
+        flushed.map_err(|problem| self.fail(problem.into()))
+    }
+
+    fn fail(&self, problem: csv::Error) -> MetricsError {
+        MetricsError::new(&self.path, problem)
+    }
+}
+
+fn row(tick: &Tick, lesson: &Lesson) -> Vec<String> {
+    let counts = [lesson.number, tick.world_steps].map(|count| count.to_string());
+    // The shortest form that reads back as the same number.
+    let text = |number: f64| format!("{number:?}");
+    let numbers = numbers(tick, lesson).map(|number| number.map_or(String::new(), text));
+    counts.into_iter().chain(numbers).collect()
+}
+
+/// What stands behind the two counts of a row.
+fn numbers<'a>(tick: &Tick, lesson: &'a Lesson) -> impl Iterator<Item = Option<f64>> + 'a {
+    let held_out = (tick.score.n_seen > 0).then(|| tick.score.mean());
+    let mean_reward = tick.reward / tick.n_worlds.max(1) as f64;
+    let numbers = [lesson.loss, held_out, Some(mean_reward), lesson.rate];
+    numbers.into_iter().chain(lesson.more.iter().copied())
+}
+
+/// A step's numbers by column, means over its rows; without `world_steps`, and without columns that have
+/// no number. `more`: columns of the learner's own.
+pub fn averages(
+    tick: &Tick,
+    lessons: &[Lesson],
+    n_updates: u64,
+    more: &[&'static str],
+) -> Vec<(&'static str, f64)> {
+    let nothing = [Lesson::nothing(n_updates, more.len())];
+    let lessons = if lessons.is_empty() {
+        &nothing
+    } else {
+        lessons
+    };
+    let rows: Vec<Vec<Option<f64>>> = lessons
+        .iter()
+        .map(|lesson| numbers(tick, lesson).collect())
+        .collect();
+    let mean = |(column, name): (usize, &&'static str)| {
+        let there: Vec<f64> = rows.iter().filter_map(|row| row[column]).collect();
+        let mean = there.iter().sum::<f64>() / there.len() as f64;
+        (!there.is_empty()).then_some((*name, mean))
+    };
+    let names = HEADER[2..].iter().chain(more).enumerate();
+    let counted = [(HEADER[0], n_updates as f64)];
+    counted.into_iter().chain(names.filter_map(mean)).collect()
+}
+
+/// The rows of a file, as numbers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Rows {
+    names: Vec<String>,
+    rows: Vec<Vec<Option<f64>>>,
+}
+
+impl Rows {
+    /// Reads the file of a folder. What is no number is as if it were not there.
+    ///
+    /// # Errors
+    /// [`MetricsError`].
+    pub fn read(folder: &Path) -> Result<Self, MetricsError> {
+        let path = folder.join(METRICS);
+        let fail = |problem: csv::Error| MetricsError::new(&path, problem);
+        let reader = csv::ReaderBuilder::new().flexible(true).from_path(&path);
+        let mut reader = reader.map_err(fail)?;
+        let names = reader.headers().map_err(fail)?;
+        let names = names.iter().map(String::from).collect();
+        let mut rows = Vec::new();
+        for record in reader.records() {
+            let record = record.map_err(fail)?;
+            rows.push(record.iter().map(|field| field.parse().ok()).collect());
+        }
+        Ok(Self { names, rows })
+    }
+
+    /// Number of rows.
+    pub fn len(&self) -> usize {
+        self.rows.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+
+    /// A column, one entry per row; nothing but `None` where there is no such column.
+    pub fn column(&self, name: &str) -> Vec<Option<f64>> {
+        let at = self.names.iter().position(|known| known == name);
+        let field = |row: &Vec<Option<f64>>| at.and_then(|at| row.get(at).copied().flatten());
+        self.rows.iter().map(field).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn averages_are_over_the_updates_of_a_step() {
+        let lesson = |loss: f64, more: Option<f64>| Lesson {
+            number: 7,
+            loss: Some(loss),
+            rate: Some(0.1),
+            more: vec![more],
+        };
+        let tick = Tick {
+            world_steps: 32,
+            n_worlds: 16,
+            reward: 48.0,
+            score: Score::default(),
+        };
+        let lessons = [lesson(1.0, None), lesson(2.0, Some(5.0))];
+        let got = averages(&tick, &lessons, 7, &["dqn_loss"]);
+        let expected = [
+            ("update", 7.0),
+            ("loss", 1.5),
+            ("mean_reward", 3.0),
+            ("rate", 0.1),
+            ("dqn_loss", 5.0),
+        ];
+        assert_eq!(got, expected);
+        let without = averages(&tick, &[], 7, &["dqn_loss"]);
+        assert_eq!(without, [("update", 7.0), ("mean_reward", 3.0)]);
+    }
+}

@@ -1,0 +1,12 @@
+//! Learning while acting: a filter's parameters, the paper's networks, decisions; and their checkpoints.
+
+pub mod checkpoint;
+pub mod filter;
+pub mod learned;
+pub mod learner;
+pub mod metrics;
+pub mod replay;
+pub mod reward;
+pub mod student;
+pub mod tensorboard;
+pub mod train;

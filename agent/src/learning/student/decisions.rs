@@ -1,0 +1,335 @@
+//! Learns which action of [`ActionSet::beam`] to take (paper section III.E): beam search plans on the
+//! known-model filter's belief, and a DQN that sees a summary of it chooses what each path is for.
+
+use crate::config::{AgentConfig, DecisionsConfig};
+use crate::estimation::BayesFilter;
+use crate::estimation::belief::Belief;
+use crate::estimation::summary::{spread_summary, summary_length};
+use crate::learning::checkpoint::{Contents, Problem};
+use crate::learning::metrics::Tick;
+use crate::learning::student::stored::{load_dqn, save_dqn};
+use crate::learning::student::{
+    Fly, Lesson, Look, NotFinite, Site, Student, StudentError, without_truth,
+};
+use crate::planning::PlanBasis;
+use crate::planning::action::{Action, ActionSet};
+use crate::planning::policy::Policy;
+use crate::rollout::agent::{Agent, Setup};
+use crate::rollout::{self, Robot};
+use crate::server::client::Observation;
+use ::network::{Dqn, Track, Transition};
+use protocol::{Cell, Model};
+use rayon::prelude::*;
+use std::time::{Duration, Instant};
+
+/// How checkpoints of this learner call it.
+pub const KIND: &str = "decisions";
+
+/// Between the names of actions in a checkpoint.
+const SEPARATOR: &str = " ";
+
+/// A DQN over the actions of a model.
+#[derive(Debug)]
+pub struct Decisions {
+    /// Values of actions.
+    pub dqn: Dqn,
+    /// The actions, in the order of the values.
+    pub actions: ActionSet,
+    /// World steps that were learned from.
+    pub world_steps: u64,
+    n_states: usize,
+}
+
+/// A DQN that learns on several worlds.
+pub struct DecisionsStudent {
+    site: Site,
+    config: AgentConfig,
+    policy: Policy,
+    decisions: Decisions,
+    filter: BayesFilter,
+    /// The state that pays most.
+    target: usize,
+    state_names: Vec<String>,
+    runs: Vec<Run>,
+    owed: f64,
+    is_frozen: bool,
+    times: [(&'static str, Duration); 2],
+}
+
+/// One world's robot.
+struct Run {
+    robot: Robot,
+    /// What the last decision went by, and what it was.
+    input: Vec<f32>,
+    action: usize,
+    track: Track,
+}
+
+impl Decisions {
+    /// Before the first step, for worlds of a model.
+    pub fn first(model: &Model, config: &DecisionsConfig, seed: u64) -> Self {
+        let actions = ActionSet::beam(model);
+        let (n_states, n_actions) = (model.n_states(), actions.actions().len());
+        Self {
+            dqn: Dqn::new(config.settings(), summary_length(n_states), n_actions, seed),
+            actions,
+            world_steps: 0,
+            n_states,
+        }
+    }
+
+    /// The action that is worth most on a belief.
+    pub fn best_action(&self, belief: &Belief, robot: Cell, n_moves: usize) -> &Action {
+        &self.actions.actions()[self.dqn.best(&spread_summary(belief, robot, n_moves))]
+    }
+
+    /// As a checkpoint, without settings.
+    pub fn to_contents(&self) -> Contents {
+        let mut contents = Contents::default();
+        save_dqn(&self.dqn, &mut contents);
+        for (name, text) in [
+            ("actions", self.actions.names().join(SEPARATOR)),
+            ("states", self.n_states.to_string()),
+            ("world_steps", self.world_steps.to_string()),
+        ] {
+            contents.texts.insert(name.into(), text);
+        }
+        contents
+    }
+
+    /// Takes over a checkpoint.
+    ///
+    /// # Errors
+    /// [`Problem`] names what is missing, of another form, or of a model with other states or actions.
+    pub fn load(&mut self, contents: &Contents) -> Result<(), Problem> {
+        for (name, expected) in [
+            ("states", self.n_states.to_string()),
+            ("actions", self.actions.names().join(SEPARATOR)),
+        ] {
+            let got = contents.texts.get(name);
+            let got = got.ok_or_else(|| Problem::Missing(name.into()))?.clone();
+            if got != expected {
+                let name = name.into();
+                return Err(Problem::Value {
+                    name,
+                    expected,
+                    got,
+                });
+            }
+        }
+        load_dqn(&mut self.dqn, contents)?;
+        self.world_steps = contents.count("world_steps")?;
+        Ok(())
+    }
+}
+
+impl DecisionsStudent {
+    /// Goes on from some decisions, or begins. `filter` is that of the worlds' model before its first frame.
+    pub fn new(
+        decisions: Decisions,
+        filter: BayesFilter,
+        model: &Model,
+        site: Site,
+        config: &AgentConfig,
+    ) -> Self {
+        Self {
+            site,
+            config: config.clone(),
+            policy: Policy::named("dqn_beam", model).expect("invariant: every model has it"),
+            decisions,
+            filter,
+            target: model.target_state(),
+            state_names: model.state_names(),
+            runs: Vec::new(),
+            owed: 0.0,
+            is_frozen: false,
+            times: ["planning", "learning"].map(|part| (part, Duration::ZERO)),
+        }
+    }
+
+    /// A robot that has taken in what its world shows.
+    fn run(&self, observation: Observation) -> Result<Run, StudentError> {
+        let setup = Setup {
+            basis: PlanBasis::new(self.config.objective.belief),
+            state_names: self.state_names.clone(),
+            n_moves: self.site.n_moves,
+            seed: self.config.planner_seed(observation.result.seed),
+        };
+        let (filter, policy) = (Box::new(self.filter.clone()), &self.policy);
+        let agent = Agent::new(filter, policy, &self.config, setup);
+        let mut robot = Robot::new(agent, observation);
+        robot.begin(None, |_| ())?;
+        Ok(Run {
+            input: input(&robot, self.site.n_moves),
+            robot,
+            action: 0,
+            track: self.decisions.dqn.track(),
+        })
+    }
+}
+
+/// What a decision goes by.
+fn input(robot: &Robot, n_moves: usize) -> Vec<f32> {
+    spread_summary(robot.agent.belief(), robot.observation().robot(), n_moves)
+}
+
+impl Run {
+    /// Takes in what an action brought, and gives the transition that is complete by then.
+    fn bring(&mut self, reward_scale: f32, n_moves: usize) -> Option<Transition> {
+        let next = input(&self.robot, n_moves);
+        self.track.add(Transition {
+            input: std::mem::replace(&mut self.input, next.clone()),
+            action: self.action,
+            reward: self.robot.observation().result.reward as f32 * reward_scale,
+            next,
+        })
+    }
+}
+
+impl Student for DecisionsStudent {
+    fn kind(&self) -> &'static str {
+        KIND
+    }
+
+    fn columns(&self) -> &'static [&'static str] {
+        &["dqn_loss", "dqn_rate", "epsilon"]
+    }
+
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError> {
+        let runs = observations.into_iter().map(|seen| self.run(seen));
+        self.runs = runs.collect::<Result<_, _>>()?;
+        // Beliefs begin again, wherever the worlds stand.
+        Ok(0)
+    }
+
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {
+        let run = self.run(observation)?;
+        self.runs[(world - self.site.worlds.start) as usize] = run;
+        Ok(())
+    }
+
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError> {
+        let start = Instant::now();
+        let (decisions, is_frozen) = (&self.decisions, self.is_frozen);
+        for (index, run) in self.runs.iter_mut().enumerate() {
+            run.action = match is_frozen {
+                true => decisions.dqn.best(&run.input),
+                false => decisions
+                    .dqn
+                    .act(&run.input, decisions.world_steps + index as u64),
+            };
+        }
+        let mut tick = Tick::default();
+        rollout::step(
+            &mut self.runs,
+            |run| &mut run.robot,
+            |run| {
+                let action = &decisions.actions.actions()[run.action];
+                run.robot
+                    .plan_with(|agent, cell, step| agent.plan_action(action, cell, step))
+            },
+            |paths| {
+                self.times[0].1 += start.elapsed();
+                Ok::<_, StudentError>(without_truth(fly(paths)?))
+            },
+            |index, run, turn| {
+                tick.reward += run.robot.observation().result.reward;
+                tick.score += turn.score.unwrap_or_default();
+                look(index, &run.robot);
+                Ok(())
+            },
+        )?;
+        let (n_moves, config) = (self.site.n_moves, &self.config.decisions);
+        let bring = |run: &mut Run| run.bring(config.reward_scale, n_moves);
+        let transitions: Vec<_> = self.runs.par_iter_mut().map(bring).collect();
+        for transition in transitions.into_iter().flatten() {
+            self.decisions.dqn.remember(transition);
+        }
+        tick.n_worlds = self.runs.len() as u64;
+        self.decisions.world_steps += tick.n_worlds;
+        tick.world_steps = self.decisions.world_steps;
+        self.owed += tick.n_worlds as f64 * config.updates_per_step;
+        Ok(tick)
+    }
+
+    fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {
+        let start = Instant::now();
+        let settings = self.config.decisions.settings();
+        let epsilon = f64::from(settings.epsilon_at(self.decisions.world_steps));
+        let mut lessons = Vec::new();
+        while self.owed >= 1.0 {
+            self.owed -= 1.0;
+            let Some(loss) = self.decisions.dqn.update()? else {
+                continue;
+            };
+            lessons.push(Lesson {
+                number: self.n_updates(),
+                loss: None,
+                rate: None,
+                more: vec![
+                    Some(f64::from(loss)),
+                    Some(f64::from(settings.adam.learning_rate)),
+                    Some(epsilon),
+                ],
+            });
+        }
+        self.times[1].1 += start.elapsed();
+        Ok(lessons)
+    }
+
+    fn freeze(&mut self) {
+        self.is_frozen = true;
+    }
+
+    fn world_steps(&self) -> u64 {
+        self.decisions.world_steps
+    }
+
+    fn n_updates(&self) -> u64 {
+        self.decisions.dqn.n_updates()
+    }
+
+    fn belief(&self) -> Option<(&Belief, usize)> {
+        let run = self.runs.first()?;
+        Some((run.robot.agent.belief(), self.target))
+    }
+
+    fn contents(&self) -> Result<Contents, StudentError> {
+        Ok(self.decisions.to_contents())
+    }
+
+    fn times(&self) -> Vec<(&'static str, Duration)> {
+        self.times.to_vec()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn decisions_survive_a_checkpoint_and_others_are_refused_by_name() {
+        let model = Model::wildfire();
+        let config = DecisionsConfig::default();
+        let decisions = Decisions::first(&model, &config, 3);
+        let contents = decisions.to_contents();
+        let mut again = Decisions::first(&model, &config, 4);
+        again.load(&contents).expect("of the same model");
+        assert_eq!(again.dqn.named_tensors(), decisions.dqn.named_tensors());
+        let mut other = contents.clone();
+        other.texts.insert("states".into(), "4".into());
+        let error = again.load(&other).expect_err("other states").to_string();
+        assert_eq!(error, "states: expected 3, got 4");
+        other = contents.clone();
+        other.texts.insert("actions".into(), "exploit".into());
+        let error = again.load(&other).expect_err("other actions").to_string();
+        assert!(
+            error.starts_with("actions: expected exploit exploit_explore"),
+            "{error}"
+        );
+        other = contents;
+        other.texts.remove("actions");
+        let error = again.load(&other).expect_err("none").to_string();
+        assert_eq!(error, "expected \"actions\" in it, found none");
+    }
+}

@@ -1,0 +1,266 @@
+//! Learns the filter's parameters on several worlds at once: robots walk at random first, then plan on
+//! the belief of the filter as it is.
+
+mod saved;
+
+use self::saved::SavedWorld;
+use crate::config::AgentConfig;
+use crate::estimation::BayesFilter;
+use crate::estimation::belief::Belief;
+use crate::estimation::parameters::{Dimensions, Tables};
+use crate::learning::checkpoint::{Contents, Problem};
+use crate::learning::learner::{KIND, LearnedModel, Learner, Progress};
+use crate::learning::metrics::Tick;
+use crate::learning::student::{
+    Fly, Lesson, Look, NotFinite, Site, Student, StudentError, without_truth,
+};
+use crate::planning::policy::{PlannerKind, Policy};
+use crate::planning::{Objective, Plan, PlanBasis, Target};
+use crate::rollout::agent::{Agent, Setup, numbered_states};
+use crate::rollout::{self, Robot};
+use crate::server::client::Observation;
+use protocol::path;
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+/// One world's robot.
+struct Run {
+    robot: Robot,
+    is_walking: bool,
+}
+
+/// A filter that is learned.
+pub struct FilterStudent {
+    site: Site,
+    config: AgentConfig,
+    learner: Learner,
+    learned: LearnedModel,
+    runs: Vec<Run>,
+    /// Where a checkpoint left the worlds.
+    left: BTreeMap<u32, SavedWorld>,
+    is_frozen: bool,
+    planning: Duration,
+    learning: Duration,
+}
+
+impl FilterStudent {
+    /// A student before its first frame.
+    pub fn new(dimensions: Dimensions, site: Site, config: &AgentConfig) -> Self {
+        let progress = Progress::first(dimensions, config.seed);
+        let learner = Learner::new(progress, site.shape, config);
+        Self::of(learner, BTreeMap::new(), site, config)
+    }
+
+    /// Goes on from a checkpoint.
+    ///
+    /// # Errors
+    /// [`Problem`] names what is missing or of another shape.
+    pub fn resume(
+        contents: &Contents,
+        dimensions: Dimensions,
+        site: Site,
+        config: &AgentConfig,
+    ) -> Result<Self, Problem> {
+        let learner = Learner::from_contents(contents, dimensions, site.shape, config)?;
+        let left = SavedWorld::restored(dimensions.n_states, site.shape, contents)?;
+        Ok(Self::of(learner, left, site, config))
+    }
+
+    fn of(
+        learner: Learner,
+        left: BTreeMap<u32, SavedWorld>,
+        site: Site,
+        config: &AgentConfig,
+    ) -> Self {
+        Self {
+            learned: learner.learned(),
+            learner,
+            left,
+            site,
+            config: config.clone(),
+            runs: Vec::new(),
+            is_frozen: false,
+            planning: Duration::ZERO,
+            learning: Duration::ZERO,
+        }
+    }
+
+    /// A robot before it takes in what its world shows.
+    fn robot(&self, observation: Observation) -> Robot {
+        let tables = &self.learned.tables;
+        let filter = BayesFilter::learned(tables, tables.prior(self.site.shape));
+        let setup = Setup {
+            basis: PlanBasis::new(self.config.objective.belief),
+            state_names: numbered_states(tables.dimensions.n_states),
+            n_moves: self.site.n_moves,
+            seed: self.config.planner_seed(observation.result.seed),
+        };
+        let policy = Policy::learned(PlannerKind::Beam);
+        let agent = Agent::new(Box::new(filter), &policy, &self.config, setup);
+        Robot::new(agent, observation)
+    }
+
+    /// A robot that has taken in what its world shows, with a track that begins there.
+    fn begun(&mut self, world: u32, observation: Observation) -> Result<Run, StudentError> {
+        self.learner.begin(world);
+        self.learner.see(world, &observation.frame);
+        let mut robot = self.robot(observation);
+        robot.begin(None, |_| ())?;
+        Ok(Run {
+            robot,
+            is_walking: false,
+        })
+    }
+
+    /// Worlds whose robots walk at random: all at first, some for good; none of a frozen student.
+    fn n_walking(&self) -> usize {
+        if self.is_frozen {
+            return 0;
+        }
+        let learning = &self.config.learning;
+        if self.learner.world_steps() < learning.explore_steps {
+            return self.runs.len();
+        }
+        (learning.explore_share * self.runs.len() as f64).round() as usize
+    }
+}
+
+impl Student for FilterStudent {
+    fn kind(&self) -> &'static str {
+        KIND
+    }
+
+    fn columns(&self) -> &'static [&'static str] {
+        &[]
+    }
+
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError> {
+        let worlds = self.site.worlds.clone();
+        let mut n_gone_on = 0;
+        if !SavedWorld::any_is_of(&self.left, worlds.clone(), &observations) {
+            // Frames of other worlds, perhaps of another model.
+            self.learner.forget();
+        }
+        for (world, observation) in worlds.zip(observations) {
+            let left = self.left.get(&world);
+            let left =
+                left.filter(|left| left.is_of(&observation) && self.learner.has_track(world));
+            let run = if let Some(left) = left {
+                let mut robot = self.robot(observation);
+                left.restore(&mut robot.agent);
+                n_gone_on += 1;
+                Run {
+                    robot,
+                    is_walking: false,
+                }
+            } else {
+                self.begun(world, observation)?
+            };
+            self.runs.push(run);
+        }
+        Ok(n_gone_on)
+    }
+
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {
+        let run = self.begun(world, observation)?;
+        self.runs[(world - self.site.worlds.start) as usize] = run;
+        Ok(())
+    }
+
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError> {
+        let start = Instant::now();
+        if !self.is_frozen {
+            self.learned = self.learner.learned();
+        }
+        let (n_walking, first_world) = (self.n_walking(), self.site.worlds.start);
+        for (index, run) in self.runs.iter_mut().enumerate() {
+            run.is_walking = index < n_walking;
+            let world = first_world + index as u32;
+            self.learner.expect(world, run.robot.agent.belief());
+        }
+        let objective = Objective {
+            target: Target::State(self.learned.target),
+            ..self.config.objective(&Policy::learned(PlannerKind::Beam))
+        };
+        let mut tick = Tick::default();
+        rollout::step(
+            &mut self.runs,
+            |run| &mut run.robot,
+            |run| run.plan(&self.learned.tables, objective),
+            |paths| {
+                self.planning += start.elapsed();
+                Ok::<_, StudentError>(without_truth(fly(paths)?))
+            },
+            |index, run, turn| {
+                let (agent, observation) = (&run.robot.agent, run.robot.observation());
+                let visited = path::fly(self.site.shape, turn.before.robot(), &turn.plan.moves);
+                let reward = observation.result.reward;
+                self.learner
+                    .see(first_world + index as u32, &observation.frame);
+                self.learner
+                    .reward(agent.belief(), &visited.visited, reward);
+                tick.reward += reward;
+                tick.score += turn.score.unwrap_or_default();
+                look(index, &run.robot);
+                Ok(())
+            },
+        )?;
+        tick.n_worlds = self.runs.len() as u64;
+        tick.world_steps = self.learner.world_steps();
+        Ok(tick)
+    }
+
+    fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {
+        let start = Instant::now();
+        let updates = self.learner.learn();
+        self.learning += start.elapsed();
+        let lesson = |update: crate::learning::filter::Update| Lesson {
+            number: update.number,
+            loss: Some(update.loss),
+            rate: Some(update.rate),
+            more: Vec::new(),
+        };
+        Ok(updates?.into_iter().map(lesson).collect())
+    }
+
+    fn freeze(&mut self) {
+        self.is_frozen = true;
+    }
+
+    fn world_steps(&self) -> u64 {
+        self.learner.world_steps()
+    }
+
+    fn n_updates(&self) -> u64 {
+        self.learner.n_updates()
+    }
+
+    fn belief(&self) -> Option<(&Belief, usize)> {
+        let run = self.runs.first()?;
+        Some((run.robot.agent.belief(), self.learned.target))
+    }
+
+    fn contents(&self) -> Result<Contents, StudentError> {
+        let mut contents = self.learner.to_contents();
+        let robots = self.runs.iter().map(|run| &run.robot);
+        let robots = self.site.worlds.clone().zip(robots);
+        SavedWorld::store(robots, self.site.shape, &mut contents);
+        Ok(contents)
+    }
+
+    fn times(&self) -> Vec<(&'static str, Duration)> {
+        vec![("planning", self.planning), ("updates", self.learning)]
+    }
+}
+
+impl Run {
+    /// The next path on newer parameters.
+    fn plan(&mut self, tables: &Tables, objective: Objective) -> Plan {
+        let is_walking = self.is_walking;
+        self.robot.agent.estimator_mut().set_tables(tables);
+        self.robot.plan_with(|agent, cell, step| match is_walking {
+            true => agent.walk(cell, step),
+            false => agent.plan_for(objective, cell, step),
+        })
+    }
+}

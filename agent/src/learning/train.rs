@@ -1,0 +1,306 @@
+//! Learns while acting: attach, fly, correct, learn, predict, save.
+//!
+//! The learner is told the grid, the number of observations and each path's reward and frame; the
+//! model that a server may reveal is read only where decisions are learned. One message steps all worlds.
+//! What is learned, and how it acts meanwhile, is a [`Student`]'s.
+
+mod events;
+mod students;
+mod training;
+
+pub use self::training::{TrainError, Training};
+
+use self::events::Events;
+use self::students::student;
+use crate::estimation::scoring::Score;
+use crate::learning::checkpoint::{self, Contents};
+use crate::learning::metrics::{FROZEN, METRICS, Metrics, MetricsError, Tick};
+use crate::learning::student::{Student, StudentError};
+use crate::learning::tensorboard::EventsError;
+use crate::rollout::Robot;
+use crate::server::client::{Claim, Client, Observation};
+use crate::server::feed::{Feed, View};
+use protocol::Move;
+use protocol::channels::Instance;
+use protocol::connection::ConnectionError;
+use protocol::control::WorldSeed;
+use protocol::outlook::Intent;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// The checkpoint's name in the folder of a training.
+pub const CHECKPOINT: &str = "checkpoint.safetensors";
+
+/// The folder of a run without learning, for TensorBoard.
+const FROZEN_EVENTS: &str = "frozen";
+
+/// How often a checkpoint is written while training goes on.
+const SAVE_INTERVAL: Duration = Duration::from_secs(30);
+
+/// How often progress is told.
+const REPORT_INTERVAL: Duration = Duration::from_secs(5);
+
+/// The lease outlives a pause of this length, such as a slow disk's or that in which a prior is simulated.
+const LEASE: Duration = Duration::from_secs(600);
+
+/// What a training did.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct TrainSummary {
+    /// World steps acted, of all worlds together.
+    pub steps: u64,
+    /// Updates made, with those before a resume.
+    pub updates: u64,
+    /// Sum of rewards.
+    pub reward: f64,
+    /// Time spent, by part.
+    pub times: Vec<(&'static str, Duration)>,
+}
+
+/// Trains on a server until the steps are done, the time is over or `stop` is set; saves in any case.
+/// `contents`: what [`Training::check`] gave.
+///
+/// # Errors
+/// [`TrainError`].
+pub fn train(
+    instance: &Instance,
+    training: &Training,
+    contents: Option<Contents>,
+    stop: &AtomicBool,
+) -> Result<TrainSummary, TrainError> {
+    let mut trainee = Trainee::attach(instance, training, contents)?;
+    let deadline = training.time_limit.map(|limit| Instant::now() + limit);
+    let outcome = trainee.act(training, stop, deadline);
+    let saved = trainee.save(training);
+    trainee.summary.times = trainee.student.times();
+    match (outcome, saved) {
+        (Ok(()), saved) => saved?,
+        (Err(problem), Ok(())) => return Err(problem),
+        (Err(problem), Err(also)) => {
+            let [problem, also] = [problem, also].map(Box::new);
+            return Err(TrainError::NotSaved { problem, also });
+        }
+    }
+    trainee.client.release()?;
+    if let Some(feed) = trainee.feed {
+        feed.end();
+    }
+    Ok(trainee.summary)
+}
+
+/// A learner at its worlds.
+struct Trainee {
+    client: Client,
+    student: Box<dyn Student>,
+    metrics: Metrics,
+    events: Events,
+    feed: Option<Feed>,
+    summary: TrainSummary,
+    saved: Instant,
+    told: Told,
+}
+
+/// What was told last, and what to tell next.
+struct Told {
+    at: Instant,
+    steps: u64,
+    reward: f64,
+    score: Score,
+}
+
+impl Trainee {
+    fn attach(
+        instance: &Instance,
+        training: &Training,
+        contents: Option<Contents>,
+    ) -> Result<Self, TrainError> {
+        let place = training.out.join(CHECKPOINT);
+        let claim = Claim {
+            worlds: training.worlds.clone(),
+            takeover: training.takeover,
+            time_to_live: Some(LEASE),
+        };
+        let mut client = Client::acquire(instance, &claim)?;
+        let mut student = student(training, &client, contents.as_ref(), &place)?;
+        let metrics = metrics(training, &*student)?;
+        let events = events(training, &*student)?;
+        if training.freeze {
+            student.freeze();
+        }
+        let mut observations = client.observe(client.worlds())?;
+        for (world, seen) in client.worlds().zip(&mut observations) {
+            if is_over(seen) {
+                *seen = reset(&mut client, world)?;
+            }
+        }
+        let attached = student.attach(observations);
+        let n_gone_on = attached.map_err(|problem| training.stopped(problem, &*student))?;
+        let n_new = training.worlds.len() - n_gone_on;
+        if training.resume && n_new > 0 {
+            let worlds = n_new;
+            tracing::info!(
+                worlds,
+                "not where the checkpoint left them: beliefs begin anew"
+            );
+        }
+        let belief = student.belief();
+        let feed = belief.map(|(belief, _)| Feed::open(instance, belief));
+        let now = Instant::now();
+        Ok(Self {
+            client,
+            student,
+            metrics,
+            events,
+            feed,
+            summary: TrainSummary::default(),
+            saved: now,
+            told: Told::at(now, &TrainSummary::default()),
+        })
+    }
+
+    fn act(
+        &mut self,
+        training: &Training,
+        stop: &AtomicBool,
+        deadline: Option<Instant>,
+    ) -> Result<(), TrainError> {
+        let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
+        let is_done = |steps: u64| training.steps > 0 && steps >= training.steps;
+        while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
+            let tick = self.step();
+            let tick = tick.map_err(|problem| training.stopped(problem, &*self.student))?;
+            let lessons = match training.freeze {
+                true => Ok(Vec::new()),
+                false => self.student.learn(),
+            };
+            let lessons =
+                lessons.map_err(|problem| training.stopped(problem.into(), &*self.student))?;
+            self.summary.updates = self.student.n_updates();
+            let n_updates = self.student.n_updates();
+            self.metrics.add(&tick, &lessons, n_updates)?;
+            self.events.add(&tick, &lessons, &*self.student)?;
+            self.report(&tick);
+            if self.saved.elapsed() > SAVE_INTERVAL {
+                self.save(training)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// One step of each world; worlds at the end of their episodes begin again.
+    fn step(&mut self) -> Result<Tick, StudentError> {
+        let Self {
+            client,
+            student,
+            feed,
+            ..
+        } = self;
+        let (worlds, wants_full) = (client.worlds(), student.wants_full_frames());
+        let shown = feed
+            .as_ref()
+            .map_or_else(Vec::new, |feed| feed.turn(worlds.len()));
+        let (policy, mut ended) = (format!("train {}", student.kind()), Vec::new());
+        let mut fly = |paths: &[Vec<Move>]| {
+            let observations = match wants_full {
+                true => client.step_full(worlds.clone(), paths)?,
+                false => client.step(worlds.clone(), paths)?,
+            };
+            let over = worlds.clone().zip(&observations);
+            let over = over.filter(|(_, seen)| is_over(seen));
+            ended.extend(over.map(|(world, _)| world));
+            Ok(observations)
+        };
+        let mut look = |index: usize, robot: &Robot| {
+            if let Some(feed) = feed.as_mut().filter(|_| shown.contains(&index)) {
+                feed.show(&View {
+                    world: worlds.start + index as u32,
+                    result: &robot.observation().result,
+                    belief: robot.agent.belief(),
+                    intent: Intent {
+                        policy: policy.clone(),
+                        ..robot.intent()
+                    },
+                });
+            }
+        };
+        let tick = student.step(&mut fly, &mut look)?;
+        for world in ended {
+            let observation = reset(client, world)?;
+            student.begin(world, observation)?;
+        }
+        self.summary.steps += tick.n_worlds;
+        self.summary.reward += tick.reward;
+        Ok(tick)
+    }
+
+    /// Writes the checkpoint, unless nothing is learned, and the metrics.
+    fn save(&mut self, training: &Training) -> Result<(), TrainError> {
+        self.saved = Instant::now();
+        if !training.freeze {
+            let contents = self.student.contents();
+            let mut contents = contents.map_err(|error| training.stopped(error, &*self.student))?;
+            let settings = toml::to_string(&training.config)?;
+            contents.texts.insert("settings".into(), settings);
+            let place = training.out.join(CHECKPOINT);
+            checkpoint::write(&place, self.student.kind(), &contents)?;
+        }
+        self.metrics.flush()?;
+        Ok(self.events.flush()?)
+    }
+
+    fn report(&mut self, tick: &Tick) {
+        let told = &mut self.told;
+        told.score += tick.score;
+        if told.at.elapsed() < REPORT_INTERVAL {
+            return;
+        }
+        let steps = self.summary.steps - told.steps;
+        tracing::info!(
+            world_steps = tick.world_steps,
+            updates = self.student.n_updates(),
+            log_likelihood = told.score.mean(),
+            mean_reward = (self.summary.reward - told.reward) / steps.max(1) as f64,
+            "training"
+        );
+        *told = Told::at(Instant::now(), &self.summary);
+    }
+}
+
+impl Told {
+    fn at(at: Instant, summary: &TrainSummary) -> Self {
+        Self {
+            at,
+            steps: summary.steps,
+            reward: summary.reward,
+            score: Score::default(),
+        }
+    }
+}
+
+fn is_over(seen: &Observation) -> bool {
+    seen.result.truncated != 0 || seen.result.terminated != 0
+}
+
+/// Starts a world's next episode.
+fn reset(client: &mut Client, world: u32) -> Result<Observation, ConnectionError> {
+    client.reset(&[WorldSeed { world, seed: None }])?;
+    Ok(client.observe(world..world + 1)?.remove(0))
+}
+
+/// The file of metrics: a run without learning has one of its own.
+fn metrics(training: &Training, student: &dyn Student) -> Result<Metrics, MetricsError> {
+    let (columns, world_steps) = (student.columns(), student.world_steps());
+    match (training.freeze, training.resume) {
+        (true, _) => Metrics::begin(&training.out.join(FROZEN), columns),
+        (false, true) => Metrics::go_on(&training.out.join(METRICS), columns, world_steps),
+        (false, false) => Metrics::begin(&training.out.join(METRICS), columns),
+    }
+}
+
+/// The file of TensorBoard's events: a run without learning has a folder of its own, and begins anew.
+fn events(training: &Training, student: &dyn Student) -> Result<Events, EventsError> {
+    match (training.freeze, training.resume) {
+        (true, _) => Events::begin(&training.out.join(FROZEN_EVENTS), 0),
+        (false, true) => Events::begin(&training.out, student.world_steps()),
+        (false, false) => Events::begin(&training.out, 0),
+    }
+}

@@ -1,0 +1,67 @@
+//! What TensorBoard shows of a training: the columns of the CSV, and now and then the belief.
+
+use crate::estimation::belief::Belief;
+use crate::learning::metrics::{Tick, averages};
+use crate::learning::student::{Lesson, Student};
+use crate::learning::tensorboard::{EventFile, EventsError, Value};
+use figures::{Heat, heat};
+use std::path::Path;
+
+/// Steps of all worlds from one picture to the next.
+const TICKS_PER_PICTURE: u64 = 100;
+
+/// The event file of a training.
+pub struct Events {
+    file: EventFile,
+    n_ticks: u64,
+}
+
+impl Events {
+    /// Begins a file; what the folder's files tell of later world steps counts no more.
+    ///
+    /// # Errors
+    /// [`EventsError`].
+    pub fn begin(folder: &Path, world_steps: u64) -> Result<Self, EventsError> {
+        let file = EventFile::begin(folder, world_steps + 1)?;
+        Ok(Self { file, n_ticks: 0 })
+    }
+
+    /// Adds a step: one number a column, as TensorBoard shows one value a step.
+    ///
+    /// # Errors
+    /// [`EventsError`].
+    pub fn add(
+        &mut self,
+        tick: &Tick,
+        lessons: &[Lesson],
+        student: &dyn Student,
+    ) -> Result<(), EventsError> {
+        let averages = averages(tick, lessons, student.n_updates(), student.columns());
+        let scalars = averages
+            .iter()
+            .map(|&(name, value)| (name, Value::Scalar(value)));
+        self.file.add(tick.world_steps, scalars)?;
+        let is_due = self.n_ticks.is_multiple_of(TICKS_PER_PICTURE);
+        self.n_ticks += 1;
+        match student.belief().filter(|_| is_due) {
+            Some((belief, state)) => self.show(tick.world_steps, belief, state),
+            None => Ok(()),
+        }
+    }
+
+    /// Writes what is still in memory.
+    ///
+    /// # Errors
+    /// [`EventsError`].
+    pub fn flush(&mut self) -> Result<(), EventsError> {
+        self.file.flush()
+    }
+
+    fn show(&mut self, step: u64, belief: &Belief, state: usize) -> Result<(), EventsError> {
+        let picture = heat(belief.probability(state).view());
+        let Heat { height, width, png } = picture.expect("invariant: a grid has cells, and fits");
+        let png = &png;
+        let image = Value::Image { height, width, png };
+        self.file.add(step, [("belief_of_first_world", image)])
+    }
+}

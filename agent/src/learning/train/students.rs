@@ -1,0 +1,85 @@
+//! Which student the settings ask for.
+
+use crate::config::{AgentConfig, LearnerKind};
+use crate::estimation::BayesFilter;
+use crate::estimation::first_belief::first_belief;
+use crate::estimation::parameters::{Dimensions, DimensionsError};
+use crate::learning::checkpoint::{Contents, Problem};
+use crate::learning::student::decisions::{Decisions, DecisionsStudent};
+use crate::learning::student::filter::FilterStudent;
+use crate::learning::student::network::{self, NetworkStudent};
+use crate::learning::student::{Site, Student};
+use crate::learning::train::{TrainError, Training};
+use crate::server::client::Client;
+use protocol::Model;
+use protocol::control::CoverageRule;
+use std::path::Path;
+
+/// What the settings say that learns, going on from a checkpoint's contents if there are any.
+pub fn student(
+    training: &Training,
+    client: &Client,
+    contents: Option<&Contents>,
+    place: &Path,
+) -> Result<Box<dyn Student>, TrainError> {
+    let (info, config) = (client.info(), &training.config);
+    let site = Site {
+        shape: client.shape(),
+        n_observations: info.n_observations,
+        n_moves: info.n_moves,
+        worlds: training.worlds.clone(),
+    };
+    let wrong = |problem: Problem| problem.of(place);
+    Ok(match config.learner {
+        LearnerKind::Filter => {
+            let dimensions = dimensions(config, site.n_observations)?;
+            Box::new(match contents {
+                Some(contents) => {
+                    FilterStudent::resume(contents, dimensions, site, config).map_err(wrong)?
+                }
+                None => FilterStudent::new(dimensions, site, config),
+            })
+        }
+        LearnerKind::Autoencoder => {
+            let mut progress = network::Progress::first(&site, config, &training.device)?;
+            if let Some(contents) = contents {
+                progress.load(contents).map_err(wrong)?;
+            }
+            let full_frames = config.autoencoder.full_frames;
+            let wants = progress.iterations < full_frames && !training.freeze;
+            if wants && info.coverage == CoverageRule::Path {
+                return Err(TrainError::NoFullFrames(full_frames));
+            }
+            Box::new(NetworkStudent::new(progress, site, config))
+        }
+        LearnerKind::Decisions => {
+            let model = info.model.as_deref().ok_or(TrainError::NoModel)?;
+            let model = Model::from_toml(model)?;
+            let mut decisions = Decisions::first(&model, &config.decisions, config.seed);
+            if let Some(contents) = contents {
+                decisions.load(contents).map_err(wrong)?;
+            }
+            let prior = config.prior(info.burn_in);
+            let prior = first_belief(prior, &model, site.shape, config.seed)?;
+            let filter = BayesFilter::known(&model, prior)?;
+            Box::new(DecisionsStudent::new(
+                decisions, filter, &model, site, config,
+            ))
+        }
+    })
+}
+
+fn dimensions(config: &AgentConfig, n_observations: usize) -> Result<Dimensions, DimensionsError> {
+    let learning = config.learning;
+    let n_states = match learning.states {
+        0 => n_observations,
+        states => states,
+    };
+    let kernel = (learning.kernel[0], learning.kernel[1]);
+    let dimensions = Dimensions {
+        n_states,
+        n_observations,
+        kernel,
+    };
+    dimensions.check()
+}

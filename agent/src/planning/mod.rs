@@ -1,0 +1,21 @@
+//! Planners: from a value per cell to a path (paper section III.D).
+//!
+//! An [`Objective`] turns a belief into [`CellValues`] once; a [`Planner`] then looks for the path
+//! with the best score, which is eq. 15 with the sign turned and without its constant factor.
+
+pub mod action;
+pub mod basis;
+pub mod beam;
+pub mod objective;
+mod planner;
+pub mod policy;
+pub mod random_walk;
+pub mod shooting;
+mod window;
+
+pub use basis::{BasisKind, PlanBasis};
+pub use beam::BeamSearch;
+pub use objective::{CellValues, Objective, Target};
+pub use planner::{Plan, Planner, PlanningProblem};
+pub use random_walk::RandomWalk;
+pub use shooting::{Integration, Shooting};

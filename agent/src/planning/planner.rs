@@ -1,0 +1,35 @@
+//! What a planner is: a value per cell in, a path out (paper section III.D).
+
+use super::objective::CellValues;
+use protocol::grid::Cell;
+use protocol::path::Move;
+
+/// One path to be planned.
+#[derive(Debug, Clone, Copy)]
+pub struct PlanningProblem<'a> {
+    /// Where the robot is; must lie on the grid.
+    pub start: Cell,
+    /// Number of moves T of the path.
+    pub n_moves: usize,
+    /// What the cells are worth.
+    pub values: &'a CellValues,
+    /// Seed of the planner's random stream.
+    pub seed: u64,
+    /// The environment's step k: each step has its own random numbers.
+    pub step: u64,
+}
+
+/// A path and what it is worth.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    /// The moves, `n_moves` of them.
+    pub moves: Vec<Move>,
+    /// [`CellValues::score`] of the moves, up to rounding.
+    pub score: f32,
+}
+
+/// Something that finds paths; the same problem always gets the same plan.
+pub trait Planner {
+    /// Plans a path of exactly `problem.n_moves` moves.
+    fn plan(&mut self, problem: &PlanningProblem<'_>) -> Plan;
+}

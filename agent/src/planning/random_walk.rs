@@ -1,0 +1,20 @@
+//! The random walk: the paper's baseline, and the path of its sections III.B and III.C.
+
+use crate::planning::planner::{Plan, Planner, PlanningProblem};
+use protocol::path::Move;
+use protocol::randomness::{Purpose, stream};
+use rand_chacha::rand_core::Rng;
+
+/// Moves drawn uniformly and independently, whatever the cells are worth.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct RandomWalk;
+
+impl Planner for RandomWalk {
+    fn plan(&mut self, problem: &PlanningProblem<'_>) -> Plan {
+        let mut rng = stream(problem.seed, Purpose::Planner, problem.step);
+        let random_move = |_| Move::from_low_bits(rng.next_u64() >> 62);
+        let moves: Vec<Move> = (0..problem.n_moves).map(random_move).collect();
+        let score = problem.values.score(problem.start, &moves);
+        Plan { moves, score }
+    }
+}
