@@ -14,7 +14,8 @@ pub use prior::PriorCommand;
 pub use train::TrainCommand;
 
 use agent::acting::decisions::DecisionsError;
-use agent::acting::run::{Mission, RunError, run};
+use agent::acting::error::RunError;
+use agent::acting::run::{Mission, run};
 use agent::config::AgentFlags;
 use agent::learning::learned::Learned;
 use agent::learning::train::TrainError;

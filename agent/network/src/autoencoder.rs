@@ -11,7 +11,7 @@ use crate::tensors::{NamedTensor, first_not_finite, named, numbers_of, restored}
 use crate::variables::{Variables, build, normal};
 use crate::window::Window;
 use candle_core::backprop::GradStore;
-use candle_core::{DType, Device, Result as CandleResult, Tensor};
+use candle_core::{DType, Device, Result as CandleResult, Tensor, Var};
 use protocol::grid::Probabilities;
 use protocol::randomness::{Purpose, stream};
 use serde::{Deserialize, Serialize};
@@ -284,8 +284,9 @@ impl Autoencoder {
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
         [steps, n_updates]: [u64; 2],
     ) -> Result<(), E> {
+        let found = self.found(&find)?;
         let moments = self.adam.found("adam", &find)?;
-        self.load_variables(find)?;
+        set(found)?;
         self.adam.restore(moments, steps);
         self.n_updates = n_updates;
         Ok(())
@@ -299,14 +300,24 @@ impl Autoencoder {
         &mut self,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
     ) -> Result<(), E> {
-        let variables = self.variables.iter();
-        let found = variables.map(|(name, var)| Ok((var, restored(name, var, &find)?)));
-        let found = found.collect::<Result<Vec<_>, E>>()?;
-        for (var, tensor) in found {
-            var.set(&tensor).map_err(NetworkError::from)?;
-        }
-        Ok(())
+        Ok(set(self.found(&find)?)?)
     }
+
+    fn found<E: From<NetworkError>>(
+        &self,
+        find: &impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
+    ) -> Result<Vec<(&Var, Tensor)>, E> {
+        let variables = self.variables.iter();
+        let found = variables.map(|(name, var)| Ok((var, restored(name, var, find)?)));
+        found.collect()
+    }
+}
+
+fn set(found: Vec<(&Var, Tensor)>) -> Result<(), NetworkError> {
+    for (var, tensor) in found {
+        var.set(&tensor)?;
+    }
+    Ok(())
 }
 
 impl fmt::Debug for Autoencoder {

@@ -2,9 +2,10 @@
 //!
 //! What [`crate::acting::run`] does with an objective of its own, one step at a time.
 
+use crate::acting::error::RunError;
 use crate::acting::handover::{leave, resume};
 use crate::acting::registry::{self, Task};
-use crate::acting::run::{RunError, show};
+use crate::acting::run::show;
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
 use crate::estimation::summary::{summarise, summary_names};

@@ -4,7 +4,8 @@
 //! alive. Without the world there is nothing to serve, so a lost lease or a server that ends is the end.
 
 use crate::acting::decider::{Assignment, Decider};
-use crate::acting::run::{RunError, is_outage, prepare};
+use crate::acting::error::{RunError, is_outage};
+use crate::acting::run::prepare;
 use crate::estimation::first_belief::first_belief;
 use crate::server::client::shape_of;
 use protocol::Model;

@@ -1,7 +1,7 @@
 //! How an agent goes on with what another believed: from the belief that it left with the server, or
 //! else from the frames that the server keeps.
 
-use crate::acting::run::RunError;
+use crate::acting::error::RunError;
 use crate::estimation::belief::Belief;
 use crate::rollout::Robot;
 use crate::server::client::Client;

@@ -2,6 +2,7 @@
 
 pub mod decider;
 pub mod decisions;
+pub mod error;
 pub mod handover;
 pub mod registry;
 pub mod run;

@@ -1,7 +1,7 @@
 //! Which belief an agent plans on, and what its decisions go by.
 
-use crate::estimation::Follower;
 use crate::estimation::dqn_input::DqnInput;
+use crate::estimation::{AutoencoderEstimator, Estimator};
 use crate::planning::BasisKind;
 use crate::rollout::agent::*;
 use ::network::{Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, NetworkShape};
@@ -174,9 +174,11 @@ fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
 #[test]
 fn a_network_decides_on_what_it_was_learned_with() {
     let learned = network(DqnInput::AfterFrame, BasisKind::Predictor, |_| true).autoencoder;
-    let mut follower = Follower::new(&learned).expect("a network");
-    let before = follower.hidden().to_vec();
-    follower.step(&learned, &world(0).1).expect("possible");
+    let mut estimator = AutoencoderEstimator::new(&learned).expect("a network");
+    let hidden = |estimator: &AutoencoderEstimator| estimator.follower().expect("one").clone();
+    let before = hidden(&estimator).hidden().to_vec();
+    estimator.correct(&world(0).1, None).expect("possible");
+    let follower = hidden(&estimator);
     let of = |input: DqnInput| input.of(&follower, ROBOT, N_MOVES);
     let after = of(DqnInput::AfterFrame);
     for input in [DqnInput::AfterFrame, DqnInput::Summary] {

@@ -1,5 +1,6 @@
 //! The agent's life on one world: attach, act, reconnect, leave.
 
+use crate::acting::error::{RunError, is_outage};
 use crate::acting::handover::{leave, resume, take_over_left};
 use crate::acting::registry::{self, Task};
 use crate::config::AgentConfig;
@@ -8,11 +9,11 @@ use crate::estimation::belief::Belief;
 use crate::estimation::filter::known_model_kind;
 use crate::estimation::first_belief::first_belief;
 use crate::learning::learned::Learned;
-use crate::planning::policy::{EstimatorKind, Policy, UnknownPolicy};
+use crate::planning::policy::{EstimatorKind, Policy};
 use crate::rollout::agent::AgentError;
 use crate::rollout::{self, Robot, Seen};
 use crate::server::client::{
-    Claim, Client, Observation, RETRY_INTERVAL, is_away, is_belief_left, server_info, shape_of,
+    Claim, Client, Observation, RETRY_INTERVAL, is_belief_left, server_info, shape_of,
 };
 use crate::server::feed::{Feed, View};
 use crate::server::truth::{TruthError, TruthFeed};
@@ -20,11 +21,9 @@ use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::ServerInfo;
 use protocol::message::Status;
-use protocol::model::ModelError;
 use protocol::{Grid, Model};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-use thiserror::Error;
 
 /// How often progress is told.
 const REPORT_INTERVAL: Duration = Duration::from_secs(2);
@@ -48,57 +47,6 @@ pub struct Mission {
     pub config: AgentConfig,
     /// What was learned, for policies that act on it.
     pub learned: Learned,
-}
-
-/// Why a mission ended early.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum RunError {
-    /// The server refused, or cannot be reached in the first place.
-    #[error(transparent)]
-    Connection(#[from] ConnectionError),
-    /// The agent failed.
-    #[error(transparent)]
-    Agent(#[from] AgentError),
-    /// The policy's name.
-    #[error(transparent)]
-    Policy(#[from] UnknownPolicy),
-    /// The model.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// The hidden states that an oracle needs.
-    #[error(transparent)]
-    Truth(#[from] TruthError),
-    /// The server hides its model and none was given.
-    #[error("instance {instance:?} does not reveal its model: expected --model FILE")]
-    NoModel {
-        /// The instance.
-        instance: String,
-    },
-    /// A model of other observations than the server's.
-    #[error("model: expected the server's {expected} observations, got {got}")]
-    OtherModel {
-        /// The server's number of observations.
-        expected: usize,
-        /// The model's.
-        got: usize,
-    },
-    /// A model that contradicts the one that the server reveals.
-    #[error(
-        "model: expected the server's own, {expected:?}, as it reveals it, got another, {got:?}"
-    )]
-    RevealedModel {
-        /// The server's.
-        expected: String,
-        /// The one given.
-        got: String,
-    },
-    /// A policy that only `compare` can feed.
-    #[error("policy {policy:?} needs worlds that run one step ahead: only `compare` has them")]
-    Clairvoyant {
-        /// The policy.
-        policy: String,
-    },
 }
 
 /// What a mission did.
@@ -431,9 +379,4 @@ fn is_own_lease(error: &RunError) -> bool {
         RunError::Connection(ConnectionError::Refused { status: Status::Busy, detail, .. })
             if *detail == own_pid
     )
-}
-
-/// Whether the server is away and may come back.
-pub fn is_outage(error: &RunError) -> bool {
-    matches!(error, RunError::Connection(error) if is_away(error))
 }

@@ -1,13 +1,14 @@
 //! The autoencoder as an estimator: a hidden vector that reads frames (paper eq. 9), and Bayes' rule at
 //! visited cells (eq. 10).
 
+use crate::estimation::bayes::correct;
 use crate::estimation::belief::Belief;
 use crate::estimation::estimator::{Estimator, EstimatorError};
-use crate::estimation::filter::correct;
+use crate::estimation::follower::{Follower, accepted};
 use crate::estimation::scoring::{Score, score};
 use ::network::{Autoencoder, NetworkError, Window};
 use ndarray::Array2;
-use protocol::{Frame, Grid, Probabilities};
+use protocol::{Frame, Grid};
 
 /// A network that follows one world.
 pub struct AutoencoderEstimator {
@@ -38,7 +39,12 @@ impl AutoencoderEstimator {
 
 impl Estimator for AutoencoderEstimator {
     fn correct(&mut self, frame: &Frame, _: Option<&Grid<u8>>) -> Result<(), EstimatorError> {
-        self.belief = self.follower.step(&self.network, frame)?;
+        let estimate = estimate(&self.network, self.follower.prediction(), frame)?;
+        let window = Window::new([frame]);
+        let hidden = self.network.advance(&window, self.follower.hidden())?;
+        let prediction = accepted(self.network.predict(&hidden)?);
+        self.follower = Follower::at(hidden, prediction);
+        self.belief = estimate;
         Ok(())
     }
 
@@ -60,64 +66,15 @@ impl Estimator for AutoencoderEstimator {
     }
 }
 
-/// What a network knows of one world. Every method takes the same network.
-#[derive(Debug, Clone)]
-pub struct Follower {
-    /// `h_k`.
-    hidden: Vec<f32>,
-    /// The predictor `u_k` of the next frame.
-    prediction: Belief,
-}
-
-impl Follower {
-    /// Before the first frame: `h ~ N(0, I)`, the same for a network's seed.
-    ///
-    /// # Errors
-    /// As the network's device.
-    pub fn new(network: &Autoencoder) -> Result<Self, NetworkError> {
-        let hidden = network.first_hidden();
-        let prediction = accepted(network.predict(&hidden)?);
-        Ok(Self { hidden, prediction })
-    }
-
-    /// Where another follower was.
-    pub fn at(hidden: Vec<f32>, prediction: Belief) -> Self {
-        Self { hidden, prediction }
-    }
-
-    /// The hidden vector.
-    pub fn hidden(&self) -> &[f32] {
-        &self.hidden
-    }
-
-    /// The predictor of the next frame.
-    pub fn prediction(&self) -> &Belief {
-        &self.prediction
-    }
-
-    /// Reads a frame: returns the estimate `p_k`, after which [`Self::prediction`] is `u_{k+1}` and
-    /// [`Self::hidden`] is `h_{k+1}`.
-    ///
-    /// # Errors
-    /// [`EstimatorError`]; nothing has changed then.
-    pub fn step(&mut self, network: &Autoencoder, frame: &Frame) -> Result<Belief, EstimatorError> {
-        let estimate = self.correct(network, frame)?;
-        let hidden = network.advance(&Window::new([frame]), &self.hidden)?;
-        self.prediction = accepted(network.predict(&hidden)?);
-        self.hidden = hidden;
-        Ok(estimate)
-    }
-
-    /// Bayes' rule with the learned `O` at visited cells; the predictor elsewhere.
-    fn correct(&self, network: &Autoencoder, frame: &Frame) -> Result<Belief, EstimatorError> {
-        let mut estimate = self.prediction.clone();
-        correct(&mut estimate, &likelihood(network)?, frame)?;
-        Ok(estimate)
-    }
-}
-
-fn accepted(probabilities: Probabilities) -> Belief {
-    Belief::from_probabilities(probabilities).expect("invariant: a softmax is on the simplex")
+/// Bayes' rule with the learned `O` at visited cells (eq. 10); the predictor elsewhere.
+fn estimate(
+    network: &Autoencoder,
+    prediction: &Belief,
+    frame: &Frame,
+) -> Result<Belief, EstimatorError> {
+    let mut estimate = prediction.clone();
+    correct(&mut estimate, &likelihood(network)?, frame)?;
+    Ok(estimate)
 }
 
 /// `P(y | x)` of a network, shape `[S, O]`.

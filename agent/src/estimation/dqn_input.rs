@@ -1,6 +1,6 @@
 //! What the DQN of Algorithm 1 sees when it chooses an action (paper eq. 17).
 
-use crate::estimation::Follower;
+use crate::estimation::follower::Follower;
 use crate::estimation::summary::{spread_summary, summary_length};
 use protocol::Cell;
 use serde::{Deserialize, Serialize};

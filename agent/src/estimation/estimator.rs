@@ -1,8 +1,8 @@
 //! What an estimator is: frames in, a belief about every cell out (paper sections III.A to III.C).
 
-use crate::estimation::autoencoder::Follower;
+use crate::estimation::bayes::ZeroEvidence;
 use crate::estimation::belief::{Belief, BeliefError};
-use crate::estimation::filter::ZeroEvidence;
+use crate::estimation::follower::Follower;
 use crate::estimation::parameters::Tables;
 use crate::estimation::scoring::Score;
 use ::network::NetworkError;

@@ -4,16 +4,16 @@
 //! the next predictor `u_{k+1} = Phi(p_k)` (eq. 6). Cells are treated as independent given the
 //! frames, so this is an approximation even with the true model.
 
+use crate::estimation::bayes::{ZeroEvidence, correct};
 use crate::estimation::belief::Belief;
 use crate::estimation::estimator::{Estimator, EstimatorError};
 use crate::estimation::parameters::Tables;
 use crate::estimation::scoring::{Score, score};
 use ndarray::{Array2, Array4};
 use protocol::frame::Frame;
-use protocol::grid::{Cell, Grid, Probabilities};
+use protocol::grid::{Grid, Probabilities};
 use protocol::model::{Model, ModelError};
 use protocol::transition::Transition;
-use thiserror::Error;
 
 /// Filter of one world: call [`BayesFilter::correct`] with each frame and [`BayesFilter::predict`] after it.
 #[derive(Debug, Clone)]
@@ -26,65 +26,6 @@ pub struct BayesFilter {
     predictor: Probabilities,
     /// Checksum of the parameters, which give the belief its meaning.
     checksum: u32,
-}
-
-/// A frame that the belief holds impossible.
-#[derive(Debug, Error, PartialEq)]
-#[error(
-    "frame: cell {cell}: expected an observation that the belief {belief:?} allows, got {observed}"
-)]
-pub struct ZeroEvidence {
-    /// The first such cell.
-    pub cell: Cell,
-    /// The value observed there.
-    pub observed: u8,
-    /// The belief about the cell, one probability per state.
-    pub belief: Vec<f32>,
-}
-
-/// Bayes' rule on the cells that a frame shows, `p = B(y) u / (b(y)' u)` (eq. 5); `p = u` elsewhere.
-/// `likelihood` is `P(y | x)`, shape `[S, O]`.
-///
-/// # Errors
-/// [`ZeroEvidence`] where `b(y)' u = 0`; the belief is then as it was.
-///
-/// # Panics
-/// If the frame is of another grid or was decoded for more observations.
-pub fn correct(
-    belief: &mut Belief,
-    likelihood: &Array2<f64>,
-    frame: &Frame,
-) -> Result<(), ZeroEvidence> {
-    let shape = belief.shape();
-    let dim = frame.values().dim();
-    assert_eq!(dim, shape.dim(), "frame: expected the belief's grid");
-    let (n_states, n_cells) = (belief.n_states(), shape.n_cells());
-    // Kept apart until the whole frame is known to be possible.
-    let mut posteriors: Vec<f32> = Vec::new();
-    for (index, observed) in frame.observed() {
-        let prior = belief.as_slice()[index..].iter().step_by(n_cells);
-        let likelihood = likelihood.column(usize::from(observed));
-        // In f64, where the product of two f32 cannot underflow to zero.
-        let joint = || {
-            let pairs = prior.clone().zip(&likelihood);
-            pairs.map(|(&u, b)| f64::from(u) * b)
-        };
-        let evidence: f64 = joint().sum();
-        if evidence <= 0.0 {
-            return Err(ZeroEvidence {
-                cell: shape.cell(index),
-                observed,
-                belief: prior.copied().collect(),
-            });
-        }
-        posteriors.extend(joint().map(|p| (p / evidence) as f32));
-    }
-    let probabilities = belief.as_mut_slice();
-    for ((index, _), posterior) in frame.observed().zip(posteriors.chunks_exact(n_states)) {
-        let cell = probabilities[index..].iter_mut().step_by(n_cells);
-        cell.zip(posterior).for_each(|(to, &p)| *to = p);
-    }
-    Ok(())
 }
 
 impl BayesFilter {
@@ -233,7 +174,7 @@ fn checksum(weights: impl Iterator<Item = f64>, likelihood: &Array2<f64>) -> u32
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::grid::Shape;
+    use protocol::grid::{Cell, Shape};
 
     fn frame(shape: Shape, values: &[u8]) -> Frame {
         Frame::from_bytes(shape, 3, values).expect("test frame")

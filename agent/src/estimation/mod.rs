@@ -4,18 +4,22 @@
 //! ([`crate::acting::registry`]).
 
 pub mod autoencoder;
+pub mod bayes;
 pub mod belief;
 pub mod dqn_input;
 pub mod estimator;
 pub mod filter;
 pub mod first_belief;
+pub mod follower;
 pub mod parameters;
 pub mod prior;
 pub mod scoring;
 pub mod summary;
 pub mod truth;
 
-pub use autoencoder::{AutoencoderEstimator, Follower};
+pub use autoencoder::AutoencoderEstimator;
+pub use bayes::ZeroEvidence;
 pub use estimator::{Estimator, EstimatorError};
-pub use filter::{BayesFilter, ZeroEvidence};
+pub use filter::BayesFilter;
+pub use follower::Follower;
 pub use prior::Prior;

@@ -1,13 +1,11 @@
 //! What checkpoints hold, by kind: all that policies on a learned belief need.
 
-use crate::config::AgentConfig;
-use crate::estimation::dqn_input::DqnInput;
 use crate::learning::checkpoint::{self, CheckpointError, Contents, Problem};
 use crate::learning::learner::{self, LearnedModel};
+use crate::learning::student::network::LearnedNetwork;
 use crate::learning::student::{decisions, network};
-use crate::planning::BasisKind;
 use crate::planning::policy::EstimatorKind;
-use ::network::{Autoencoder, Device, Dqn};
+use ::network::Device;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -23,21 +21,6 @@ pub struct Learned {
     pub network: Option<Arc<LearnedNetwork>>,
     /// Decisions, for `dqn_beam`; they fit a model or not.
     pub decisions: Option<Arc<Contents>>,
-}
-
-/// What Algorithm 1 learned, with its parameters fixed.
-#[derive(Debug)]
-pub struct LearnedNetwork {
-    /// The model; each world follows it with a copy of its own.
-    pub autoencoder: Autoencoder,
-    /// The choice of objectives.
-    pub dqn: Dqn,
-    /// What that sees.
-    pub input: DqnInput,
-    /// What the paths were planned on that it values.
-    pub basis: BasisKind,
-    /// The state that pays most.
-    pub target: usize,
 }
 
 impl Learned {
@@ -103,21 +86,4 @@ impl Learned {
             _ => None,
         }
     }
-}
-
-/// The settings that a checkpoint was trained with.
-///
-/// # Errors
-/// [`Problem`] for none, or others than an agent's.
-pub fn settings(contents: &Contents) -> Result<AgentConfig, Problem> {
-    const SETTINGS: &str = "settings";
-    let text = contents.texts.get(SETTINGS);
-    let text = text.ok_or_else(|| Problem::Missing(SETTINGS.into()))?;
-    let wrong = |got: String| Problem::Value {
-        name: SETTINGS.into(),
-        expected: "those of an agent".into(),
-        got,
-    };
-    let config: AgentConfig = toml::from_str(text).map_err(|error| wrong(error.to_string()))?;
-    config.check().map_err(|error| wrong(error.to_string()))
 }

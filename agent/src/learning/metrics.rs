@@ -1,7 +1,6 @@
 //! Metrics of a training as CSV: one row per update, and one per step without any.
 
 use crate::estimation::scoring::Score;
-use crate::learning::student::Lesson;
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 
@@ -31,6 +30,31 @@ pub struct Tick {
     pub reward: f64,
     /// How well their frames were predicted before anything was learned from them.
     pub score: Score,
+}
+
+/// What one update did.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Lesson {
+    /// Number of updates of the model so far.
+    pub number: u64,
+    /// The model's loss before it, if the model was updated.
+    pub loss: Option<f64>,
+    /// The model's step size, if it was updated.
+    pub rate: Option<f64>,
+    /// What [`crate::learning::student::Student::columns`] names.
+    pub more: Vec<Option<f64>>,
+}
+
+impl Lesson {
+    /// No update, after so many; `n_more`: length of [`crate::learning::student::Student::columns`].
+    pub fn nothing(number: u64, n_more: usize) -> Self {
+        Self {
+            number,
+            loss: None,
+            rate: None,
+            more: vec![None; n_more],
+        }
+    }
 }
 
 /// A file that cannot be written or read, or is another learner's.

@@ -10,7 +10,7 @@ mod tests;
 use crate::estimation::belief::Belief;
 use crate::learning::checkpoint::Contents;
 
-use crate::learning::metrics::Tick;
+use crate::learning::metrics::{Lesson, Tick};
 use crate::rollout::agent::AgentError;
 use crate::rollout::{Robot, Seen};
 use crate::server::client::Observation;
@@ -39,31 +39,6 @@ pub type Fly<'a> = &'a mut dyn FnMut(&[Vec<Move>]) -> Result<Vec<Observation>, C
 
 /// Is told of each robot, by its index, when its belief is the posterior.
 pub type Look<'a> = &'a mut dyn FnMut(usize, &Robot);
-
-/// What one update did.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Lesson {
-    /// Number of updates of the model so far.
-    pub number: u64,
-    /// The model's loss before it, if the model was updated.
-    pub loss: Option<f64>,
-    /// The model's step size, if it was updated.
-    pub rate: Option<f64>,
-    /// What [`Student::columns`] names.
-    pub more: Vec<Option<f64>>,
-}
-
-impl Lesson {
-    /// No update, after so many; `n_more`: length of [`Student::columns`].
-    pub fn nothing(number: u64, n_more: usize) -> Self {
-        Self {
-            number,
-            loss: None,
-            rate: None,
-            more: vec![None; n_more],
-        }
-    }
-}
 
 /// Why a student cannot go on.
 #[derive(Debug, Error)]

@@ -8,7 +8,7 @@ mod events;
 mod students;
 mod training;
 
-pub use self::training::{TrainError, Training};
+pub use self::training::{CHECKPOINT, TrainError, Training};
 
 use self::events::Events;
 use self::students::student;
@@ -27,9 +27,6 @@ use protocol::control::WorldSeed;
 use protocol::outlook::Intent;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-
-/// The checkpoint's name in the folder of a training.
-pub const CHECKPOINT: &str = "checkpoint.safetensors";
 
 /// The folder of a run without learning, for TensorBoard.
 const FROZEN_EVENTS: &str = "frozen";

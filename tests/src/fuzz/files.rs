@@ -4,7 +4,7 @@ use super::Seed;
 use agent::estimation::parameters::Dimensions;
 use agent::learning::checkpoint::{Contents, Problem, encode};
 use agent::learning::learned::Learned;
-use agent::{learner, student};
+use agent::learning::{learner, student};
 use ndarray::{Array3, Axis};
 use protocol::model::ModelFile;
 use protocol::{Dynamics, Model, Shape, Transition};

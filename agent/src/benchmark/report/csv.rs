@@ -1,6 +1,7 @@
 //! One CSV row per policy and world: the numbers behind the table, for other tools to read.
 
-use crate::benchmark::report::{PolicyRun, ReportError, replace_file};
+use crate::benchmark::report::file::{ReportError, replace_file};
+use crate::benchmark::report::policy_run::PolicyRun;
 use std::path::Path;
 
 const HEADER: [&str; 10] = [

@@ -1,7 +1,7 @@
 //! Rewards over time for TensorBoard: a run of each policy.
 
+use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::Estimate;
-use crate::benchmark::report::{Group, PolicyRun, groups};
 use crate::learning::tensorboard::{EventFile, EventsError, Value};
 use std::path::Path;
 

@@ -1,9 +1,10 @@
 //! The figures of a comparison: results in, files out. The crate `figures` draws them.
 
-use crate::benchmark::report::number::{decimals, with_error};
+use crate::benchmark::report::file::{ReportError, replace_file};
+use crate::benchmark::report::number::{decimals, readable, with_error};
+use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::rewards::rewards;
 use crate::benchmark::report::statistics::Estimate;
-use crate::benchmark::report::{Group, PolicyRun, ReportError, groups, replace_file};
 use figures::{Bar, Color, Ladder, Named};
 use protocol::model::parse_color;
 use protocol::{Cell, Frame, Grid, Model, Probabilities};
@@ -198,11 +199,6 @@ fn named(name: &str, color: &str) -> Named {
         name: name.into(),
         color: Color(red, green, blue),
     }
-}
-
-/// A policy's name as a person would write it.
-pub(super) fn readable(name: &str) -> String {
-    name.replace('_', " ")
 }
 
 fn check_finite(

@@ -36,6 +36,11 @@ pub fn number(value: f64, decimals: usize) -> String {
     if is_zero { text[1..].into() } else { text }
 }
 
+/// A policy's name as a person would write it.
+pub(super) fn readable(name: &str) -> String {
+    name.replace('_', " ")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,9 +1,9 @@
 //! Rewards over time: a moving average per policy, with its standard error over worlds, over the worlds'
 //! fire.
 
-use crate::benchmark::report::figures::readable;
+use crate::benchmark::report::number::readable;
+use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::Estimate;
-use crate::benchmark::report::{Group, PolicyRun, groups};
 use figures::{Curve, Lines, MOST_CURVES, Panel, Scale, Shade};
 use std::collections::BTreeSet;
 

@@ -1,8 +1,8 @@
 //! The comparison as text: fits a terminal, and pastes into Markdown as a table.
 
 use crate::benchmark::report::number::{NOTHING, decimals, number, with_error};
+use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::{Estimate, median, ratio_of_means};
-use crate::benchmark::report::{Group, PolicyRun, groups};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use std::collections::{BTreeMap, BTreeSet};
 

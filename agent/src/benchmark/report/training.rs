@@ -1,7 +1,7 @@
 //! A training's metrics as curves: the paper's figure of improvement over iterations, and step sizes.
 
-use crate::benchmark::report::ReportError;
 use crate::benchmark::report::figures::save;
+use crate::benchmark::report::file::ReportError;
 use crate::benchmark::report::statistics::Estimate;
 use crate::learning::metrics::{MetricsError, Rows};
 use figures::{Curve, Lines, Panel, Scale};

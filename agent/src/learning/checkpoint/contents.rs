@@ -1,6 +1,6 @@
 //! What a checkpoint holds: tensors, bytes and texts by name, each read back as what it must be or refused.
 
-use crate::learning::checkpoint::Problem;
+use crate::learning::checkpoint::problem::Problem;
 use std::collections::BTreeMap;
 
 /// Largest count: far from where one more would not fit.

@@ -6,11 +6,9 @@ use crate::estimation::BayesFilter;
 use crate::estimation::belief::Belief;
 use crate::estimation::summary::{spread_summary, summary_length};
 use crate::learning::checkpoint::{Contents, Problem};
-use crate::learning::metrics::Tick;
+use crate::learning::metrics::{Lesson, Tick};
 use crate::learning::student::stored::{load_dqn, save_dqn};
-use crate::learning::student::{
-    Fly, Lesson, Look, NotFinite, Site, Student, StudentError, without_truth,
-};
+use crate::learning::student::{Fly, Look, NotFinite, Site, Student, StudentError, without_truth};
 use crate::planning::PlanBasis;
 use crate::planning::action::{Action, ActionSet};
 use crate::planning::policy::Policy;

@@ -10,10 +10,8 @@ use crate::estimation::belief::Belief;
 use crate::estimation::parameters::{Dimensions, Tables};
 use crate::learning::checkpoint::{Contents, Problem};
 use crate::learning::learner::{KIND, LearnedModel, Learner, Progress};
-use crate::learning::metrics::Tick;
-use crate::learning::student::{
-    Fly, Lesson, Look, NotFinite, Site, Student, StudentError, without_truth,
-};
+use crate::learning::metrics::{Lesson, Tick};
+use crate::learning::student::{Fly, Look, NotFinite, Site, Student, StudentError, without_truth};
 use crate::planning::policy::{PlannerKind, Policy};
 use crate::planning::{Objective, Plan, PlanBasis, Target};
 use crate::rollout::agent::{Agent, Setup, numbered_states};

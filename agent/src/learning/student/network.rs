@@ -7,17 +7,15 @@
 
 mod progress;
 
-pub use self::progress::Progress;
+pub use self::progress::{LearnedNetwork, Progress};
 
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
 use crate::estimation::{AutoencoderEstimator, Follower};
 use crate::learning::checkpoint::Contents;
-use crate::learning::metrics::Tick;
+use crate::learning::metrics::{Lesson, Tick};
 use crate::learning::reward::met;
-use crate::learning::student::{
-    Fly, Lesson, Look, NotFinite, Site, Student, StudentError, without_truth,
-};
+use crate::learning::student::{Fly, Look, NotFinite, Site, Student, StudentError, without_truth};
 use crate::planning::PlanBasis;
 use crate::planning::policy::Policy;
 use crate::rollout::agent::{Agent, Setup, numbered_states};

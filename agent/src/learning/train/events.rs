@@ -1,8 +1,8 @@
 //! What TensorBoard shows of a training: the columns of the CSV, and now and then the belief.
 
 use crate::estimation::belief::Belief;
-use crate::learning::metrics::{Tick, averages};
-use crate::learning::student::{Lesson, Student};
+use crate::learning::metrics::{Lesson, Tick, averages};
+use crate::learning::student::Student;
 use crate::learning::tensorboard::{EventFile, EventsError, Value};
 use figures::{Heat, heat};
 use std::path::Path;

@@ -9,7 +9,7 @@ use crate::learning::student::decisions::{Decisions, DecisionsStudent};
 use crate::learning::student::filter::FilterStudent;
 use crate::learning::student::network::{self, NetworkStudent};
 use crate::learning::student::{Site, Student};
-use crate::learning::train::{TrainError, Training};
+use crate::learning::train::training::{TrainError, Training};
 use crate::server::client::Client;
 use protocol::Model;
 use protocol::control::CoverageRule;

@@ -7,7 +7,6 @@ use crate::learning::learner;
 use crate::learning::metrics::MetricsError;
 use crate::learning::student::{Student, StudentError, decisions, network};
 use crate::learning::tensorboard::EventsError;
-use crate::learning::train::CHECKPOINT;
 use ::network::{Device, NetworkError};
 use protocol::connection::ConnectionError;
 use protocol::model::ModelError;
@@ -15,6 +14,9 @@ use std::ops::Range;
 use std::path::PathBuf;
 use std::time::Duration;
 use thiserror::Error;
+
+/// The checkpoint's name in the folder of a training.
+pub const CHECKPOINT: &str = "checkpoint.safetensors";
 
 /// What to train on, for how long.
 #[derive(Debug, Clone)]

@@ -5,8 +5,8 @@ use crate::estimation::Follower;
 use crate::estimation::belief::Belief;
 use crate::estimation::dqn_input::DqnInput;
 use crate::learning::checkpoint::{Bytes, Contents, Problem};
-use crate::learning::learned::{LearnedNetwork, settings};
 use crate::learning::reward::RewardEstimate;
+use crate::learning::settings::settings;
 use crate::learning::student::Site;
 use crate::learning::student::stored::{find, load_dqn, save_dqn, save_tensors};
 use crate::planning::BasisKind;
@@ -43,6 +43,21 @@ pub struct Progress {
     pub iterations: u64,
     /// Where the world is that the hidden vector knows, if any.
     pub place: Option<Place>,
+}
+
+/// What Algorithm 1 learned, with its parameters fixed.
+#[derive(Debug)]
+pub struct LearnedNetwork {
+    /// The model; each world follows it with a copy of its own.
+    pub autoencoder: Autoencoder,
+    /// The choice of objectives.
+    pub dqn: Dqn,
+    /// What that sees.
+    pub input: DqnInput,
+    /// What the paths were planned on that it values.
+    pub basis: BasisKind,
+    /// The state that pays most.
+    pub target: usize,
 }
 
 impl Progress {

@@ -1,0 +1,66 @@
+//! What a comparison measured, and its groups.
+
+use std::collections::BTreeMap;
+
+/// One policy on one world: what `emberwatch-agent compare` measured.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PolicyRun {
+    /// Name of the policy, such as `beam`.
+    pub policy: String,
+    /// Where the belief came from: `none`, `known_model`, `truth`, `next_truth` or a learned one.
+    pub estimator: String,
+    /// Seed of the world.
+    pub world_seed: u64,
+    /// Number of scored steps.
+    pub steps: u64,
+    /// Mean reward of a step.
+    pub mean_reward: f64,
+    /// Mean number of distinct cells visited in a step.
+    pub mean_distinct_cells: f64,
+    /// Distinct visited cells on target, as a fraction of the distinct visited cells, in `0..=1`.
+    pub hit_rate: f64,
+    /// Mean number of burning cells of the world.
+    pub mean_fire_cells: f64,
+    /// Mean time of one plan in milliseconds.
+    pub mean_plan_millis: f64,
+    /// Mean Brier score of the belief, where there is a belief.
+    pub brier: Option<f64>,
+    /// Reward of each step, in order.
+    pub rewards: Vec<f32>,
+}
+
+/// The runs of one policy with one estimator, in the order given.
+pub(super) struct Group<'a> {
+    pub(super) policy: &'a str,
+    pub(super) estimator: &'a str,
+    pub(super) runs: Vec<&'a PolicyRun>,
+}
+
+impl Group<'_> {
+    pub(super) fn values(&self, value: impl Fn(&PolicyRun) -> f64) -> Vec<f64> {
+        self.runs.iter().map(|run| value(run)).collect()
+    }
+
+    pub(super) fn by_seed(&self, value: impl Fn(&PolicyRun) -> f64) -> BTreeMap<u64, f64> {
+        let pair = |run: &&PolicyRun| (run.world_seed, value(run));
+        self.runs.iter().map(pair).collect()
+    }
+}
+
+/// Groups runs by policy and estimator, ordered by first appearance.
+pub(super) fn groups(runs: &[PolicyRun]) -> Vec<Group<'_>> {
+    let mut groups: Vec<Group<'_>> = Vec::new();
+    for run in runs {
+        let (policy, estimator) = (run.policy.as_str(), run.estimator.as_str());
+        let same = |group: &&mut Group<'_>| (group.policy, group.estimator) == (policy, estimator);
+        match groups.iter_mut().find(same) {
+            Some(group) => group.runs.push(run),
+            None => groups.push(Group {
+                policy,
+                estimator,
+                runs: vec![run],
+            }),
+        }
+    }
+    groups
+}

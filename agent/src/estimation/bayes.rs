@@ -1,0 +1,65 @@
+//! Bayes' rule on the cells that a frame shows (paper eqs. 5 and 10).
+
+use crate::estimation::belief::Belief;
+use ndarray::Array2;
+use protocol::{Cell, Frame};
+use thiserror::Error;
+
+/// A frame that the belief holds impossible.
+#[derive(Debug, Error, PartialEq)]
+#[error(
+    "frame: cell {cell}: expected an observation that the belief {belief:?} allows, got {observed}"
+)]
+pub struct ZeroEvidence {
+    /// The first such cell.
+    pub cell: Cell,
+    /// The value observed there.
+    pub observed: u8,
+    /// The belief about the cell, one probability per state.
+    pub belief: Vec<f32>,
+}
+
+/// Bayes' rule on the cells that a frame shows, `p = B(y) u / (b(y)' u)` (eq. 5); `p = u` elsewhere.
+/// `likelihood` is `P(y | x)`, shape `[S, O]`.
+///
+/// # Errors
+/// [`ZeroEvidence`] where `b(y)' u = 0`; the belief is then as it was.
+///
+/// # Panics
+/// If the frame is of another grid or was decoded for more observations.
+pub fn correct(
+    belief: &mut Belief,
+    likelihood: &Array2<f64>,
+    frame: &Frame,
+) -> Result<(), ZeroEvidence> {
+    let shape = belief.shape();
+    let dim = frame.values().dim();
+    assert_eq!(dim, shape.dim(), "frame: expected the belief's grid");
+    let (n_states, n_cells) = (belief.n_states(), shape.n_cells());
+    // Kept apart until the whole frame is known to be possible.
+    let mut posteriors: Vec<f32> = Vec::new();
+    for (index, observed) in frame.observed() {
+        let prior = belief.as_slice()[index..].iter().step_by(n_cells);
+        let likelihood = likelihood.column(usize::from(observed));
+        // In f64, where the product of two f32 cannot underflow to zero.
+        let joint = || {
+            let pairs = prior.clone().zip(&likelihood);
+            pairs.map(|(&u, b)| f64::from(u) * b)
+        };
+        let evidence: f64 = joint().sum();
+        if evidence <= 0.0 {
+            return Err(ZeroEvidence {
+                cell: shape.cell(index),
+                observed,
+                belief: prior.copied().collect(),
+            });
+        }
+        posteriors.extend(joint().map(|p| (p / evidence) as f32));
+    }
+    let probabilities = belief.as_mut_slice();
+    for ((index, _), posterior) in frame.observed().zip(posteriors.chunks_exact(n_states)) {
+        let cell = probabilities[index..].iter_mut().step_by(n_cells);
+        cell.zip(posterior).for_each(|(to, &p)| *to = p);
+    }
+    Ok(())
+}

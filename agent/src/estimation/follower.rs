@@ -1,0 +1,45 @@
+//! What the autoencoder knows of one world: its hidden vector and its predictor (paper eq. 9).
+
+use crate::estimation::belief::Belief;
+use ::network::{Autoencoder, NetworkError};
+use protocol::Probabilities;
+
+/// What a network knows of one world. Every method takes the same network.
+#[derive(Debug, Clone)]
+pub struct Follower {
+    /// `h_k`.
+    hidden: Vec<f32>,
+    /// The predictor `u_k` of the next frame.
+    prediction: Belief,
+}
+
+impl Follower {
+    /// Before the first frame: `h ~ N(0, I)`, the same for a network's seed.
+    ///
+    /// # Errors
+    /// As the network's device.
+    pub fn new(network: &Autoencoder) -> Result<Self, NetworkError> {
+        let hidden = network.first_hidden();
+        let prediction = accepted(network.predict(&hidden)?);
+        Ok(Self { hidden, prediction })
+    }
+
+    /// Where another follower was.
+    pub fn at(hidden: Vec<f32>, prediction: Belief) -> Self {
+        Self { hidden, prediction }
+    }
+
+    /// The hidden vector.
+    pub fn hidden(&self) -> &[f32] {
+        &self.hidden
+    }
+
+    /// The predictor of the next frame.
+    pub fn prediction(&self) -> &Belief {
+        &self.prediction
+    }
+}
+
+pub(super) fn accepted(probabilities: Probabilities) -> Belief {
+    Belief::from_probabilities(probabilities).expect("invariant: a softmax is on the simplex")
+}
