@@ -2,7 +2,7 @@
 
 A frame turns the predictor ``u_k`` into the posterior ``p_k`` (eq. 5); the transition turns that
 into the next predictor ``u_{k+1} = Phi(p_k)`` (eq. 6). Cells are treated as independent given the
-frames, so this is an approximation even with the true model. `emberwatch.wrappers.Belief` runs it
+frames, so this is an approximation even with the true model. `wrappers.BeliefObservation` runs it
 beside an environment.
 
 Beliefs have shape (S, H, W): one probability per state and cell, a distribution in each cell.
@@ -13,30 +13,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch.errors import EmberwatchError, InvalidArgumentError
 from emberwatch.model import Model
-
-UNOBSERVED = 255
-"""Value of a frame's cell where nothing was observed."""
+from emberwatch.wire import UNOBSERVED
 
 _SUM_TOLERANCE = 5e-5  # of a cell's probabilities, as the Rust agent's: 400 float32 roundings
-
-
-class ZeroEvidenceError(ValueError):
-    """A frame that the belief holds impossible."""
-
-    def __init__(self, *, cell: tuple[int, int], observed: int, belief: tuple[float, ...]) -> None:
-        """Names the first such cell (row, column), the value seen and the belief before it."""
-        super().__init__(
-            f"frame: cell {cell}: expected an observation that the belief {list(belief)} allows, "
-            f"got {observed}"
-        )
-        self.cell = cell
-        self.observed = observed
-        self.belief = belief
-
-    def __reduce__(self) -> tuple[object, ...]:
-        """For pickle, which repeats positional arguments only."""
-        return (_zero_evidence, (self.cell, self.observed, self.belief))
 
 
 class Filter:
@@ -49,10 +30,6 @@ class Filter:
             model: The world's model.
             prior: Predictor ``u_0``, shape (S, H, W); each cell sums to one within 5e-5, and is
                 divided by its sum.
-
-        Raises:
-            ValueError: The prior is of another shape, or a cell is no distribution.
-            ModelError: On the prior's grid the transition could divide by zero.
         """
         self._belief = _distribution(prior, n_states=model.n_states)
         _, height, width = self._belief.shape
@@ -72,14 +49,12 @@ class Filter:
 
         Args:
             frame: Observed values below O, 255 where nothing was observed; shape (H, W).
-
-        Raises:
-            ZeroEvidenceError: Where ``b(y)' u = 0``; the belief is then as it was.
-            ValueError: The frame is of another grid or type, or holds a value that is neither.
         """
         if frame.shape != self._belief.shape[1:] or frame.dtype != np.uint8:
             expected = f"shape {self._belief.shape[1:]} and type uint8"
-            raise ValueError(f"frame: expected {expected}, got {frame.shape} and {frame.dtype}")
+            raise InvalidArgumentError(
+                f"frame: expected {expected}, got {frame.shape} and {frame.dtype}"
+            )
         values = frame.ravel()
         cells = np.flatnonzero(values != UNOBSERVED)
         observed = values[cells]
@@ -87,7 +62,7 @@ class Filter:
         if (observed >= n_observations).any():
             index = int(cells[np.argmax(observed >= n_observations)])
             expected = f"a value below {n_observations}, or {UNOBSERVED}"
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"frame: cell {self._cell(index)}: expected {expected}, got {values[index]}"
             )
         belief = self._belief.reshape(len(self._belief), -1)
@@ -96,10 +71,10 @@ class Filter:
         evidence = joint.sum(axis=0)
         if not evidence.all():
             first = int(np.argmin(evidence))
-            raise ZeroEvidenceError(
-                cell=self._cell(int(cells[first])),
-                observed=int(observed[first]),
-                belief=tuple(prior[:, first].tolist()),
+            raise EmberwatchError(
+                f"frame: cell {self._cell(int(cells[first]))}: expected an observation that the "
+                f"belief {prior[:, first].tolist()} allows, got {observed[first]}",
+                "impossible_frame",
             )
         belief[:, cells] = joint / evidence
 
@@ -128,17 +103,14 @@ class Transition:
     """
 
     def __init__(self, model: Model, *, height: int, width: int) -> None:
-        """Lays out a model's operator for a grid, both sides in cells and at least 1.
-
-        Raises:
-            ModelError: On this grid eq. 3 could divide by zero.
-        """
-        model.check_on(height=height, width=width)
+        """Lays out a model's operator for a grid, both sides in cells and at least 1."""
         n_states, _, kernel_height, kernel_width = model.kernel.shape
         self._shape = (n_states, height, width)
         self._stride = width + kernel_width - 1
         self._length = (height - 1) * self._stride + width
-        largest = max(model.kernel.max(), model.bias.max())  # a common factor, which eq. 3 cancels
+        largest = (
+            max(model.kernel.max(), model.bias.max()) or 1.0
+        )  # a common factor, which eq. 3 cancels
         self._groups = [_taps_that_weigh_alike(w / largest) for w in model.kernel.swapaxes(0, 1)]
         self._bias = (model.bias / largest)[:, None]
         top, left = kernel_height // 2, kernel_width // 2
@@ -147,13 +119,9 @@ class Transition:
         self._sums = np.empty((max(len(taps) for _, taps in self._groups), self._length))
 
     def apply(self, belief: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``Phi(belief)``, a new array; both of shape (S, H, W), each cell's sum is one.
-
-        Raises:
-            ValueError: The belief is of another shape.
-        """
+        """``Phi(belief)``, a new array; both of shape (S, H, W), each cell's sum is one."""
         if belief.shape != self._shape:
-            raise ValueError(f"belief: expected shape {self._shape}, got {belief.shape}")
+            raise InvalidArgumentError(f"belief: expected shape {self._shape}, got {belief.shape}")
         n_states, height, width = self._shape
         self._inside[:] = belief
         out = np.empty((n_states, height * self._stride))
@@ -164,7 +132,13 @@ class Transition:
                 self._add_up(plane.ravel(), group, total)
             weights += columns @ self._sums[: len(groups)]
         on_grid = out.reshape(n_states, height, self._stride)[:, :, :width]
-        return np.divide(on_grid, on_grid.sum(axis=0), out=np.empty(self._shape))
+        totals = on_grid.sum(axis=0)
+        if not totals.all():
+            row, col = (int(at) for at in np.argwhere(totals == 0.0)[0])
+            raise InvalidArgumentError(
+                f"model: transition weights of cell ({row}, {col}): expected a positive sum"
+            )
+        return np.divide(on_grid, totals, out=np.empty(self._shape))
 
     def _add_up(
         self, plane: NDArray[np.float64], taps: list[tuple[int, int]], total: NDArray[np.float64]
@@ -220,20 +194,14 @@ def _distribution(prior: NDArray[np.floating], *, n_states: int) -> NDArray[np.f
     """A copy of the prior, each cell's sum exactly one."""
     belief = np.array(prior, dtype=np.float64, order="C")
     if belief.ndim != 3 or belief.shape[0] != n_states or not belief.size:
-        raise ValueError(f"prior: expected shape ({n_states}, H, W), got {belief.shape}")
+        raise InvalidArgumentError(f"prior: expected shape ({n_states}, H, W), got {belief.shape}")
     total = belief.sum(axis=0)
     fine = (np.abs(total - 1.0) <= _SUM_TOLERANCE) & (belief >= 0.0).all(axis=0)
     if not fine.all():
         row, col = (int(i) for i in np.argwhere(~fine)[0])
         got = belief[:, row, col].tolist()
-        raise ValueError(
+        raise InvalidArgumentError(
             f"prior: cell ({row}, {col}): expected probabilities >= 0 with sum 1, got {got}"
         )
     belief /= total
     return belief
-
-
-def _zero_evidence(
-    cell: tuple[int, int], observed: int, belief: tuple[float, ...]
-) -> ZeroEvidenceError:
-    return ZeroEvidenceError(cell=cell, observed=observed, belief=belief)

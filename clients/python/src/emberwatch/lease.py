@@ -5,21 +5,18 @@ from __future__ import annotations
 import os
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
-from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
 from emberwatch.arguments import as_moves, as_seed
-from emberwatch.errors import InvalidActionError, SettingError
+from emberwatch.connection import ServerConnection
+from emberwatch.errors import InvalidArgumentError
 from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
 from emberwatch.replies import Grant, WorldInfo, records
 from emberwatch.wire import StepAnswer, StepResult
-
-if TYPE_CHECKING:
-    from emberwatch.client import Client
 
 #: Most bytes of a belief in one message.
 _BELIEF_PART: Final = 1 << 19
@@ -29,9 +26,8 @@ class Lease:
     """The right to act on consecutive worlds. Ends by `release`, or leaving its `with`."""
 
     def __init__(
-        self, client: Client, grant: Grant, start: tuple[WorldInfo, ...], worlds: range
+        self, client: ServerConnection, grant: Grant, start: tuple[WorldInfo, ...], worlds: range
     ) -> None:
-        """Made by `Client.acquire`."""
         self.client: Final = client
         #: The server's number for it.
         self.number: Final = grant.lease
@@ -61,9 +57,11 @@ class Lease:
             timeout: How long to wait for the answer, seconds.
 
         Raises:
-            InvalidActionError: If the paths are not of that shape, type and range; nothing is sent.
+            InvalidArgumentError: If the paths are not of that shape, type and range.
             LeaseLostError: If the lease ended or a world was taken over.
-            EpisodeOverError: If a world's episode was truncated: reset it.
+            RequestTimeoutError: If no answer comes; `observe` tells whether the step was made.
+            ServerGoneError: If the server ended.
+            EmberwatchError: With code `"episode_over"`: reset that world.
         """
         chosen = self.worlds if worlds is None else self._part(worlds)
         moves = as_moves(paths, len(chosen), self.client.info.n_moves)
@@ -103,14 +101,11 @@ class Lease:
 
         Returns:
             Where the worlds stand, in the order asked.
-
-        Raises:
-            LeaseLostError: If the lease ended or a world was taken over.
         """
         chosen = list(self.worlds if worlds is None else worlds)
         given = [None] * len(chosen) if seeds is None else list(seeds)
         if len(given) != len(chosen):
-            raise InvalidActionError(f"seeds: expected {len(chosen)}, got {len(given)}")
+            raise InvalidArgumentError(f"seeds: expected {len(chosen)}, got {len(given)}")
         pairs = [
             {"world": world, "seed": None if seed is None else as_seed(seed)}
             for world, seed in zip(chosen, given, strict=True)
@@ -133,9 +128,6 @@ class Lease:
             worlds: Only these worlds, consecutive; None: all of the lease.
             first: The first of the file's worlds that is read.
             timeout: How long to wait for the answer, seconds.
-
-        Raises:
-            BadFileError: If the file is damaged, too short, or of a server with other settings.
         """
         chosen = self.worlds if worlds is None else self._part(worlds)
         request = {
@@ -164,7 +156,7 @@ class Lease:
         world: int | None = None,
         timeout: float = STEP_TIMEOUT,
     ) -> None:
-        """Leaves bytes about a world as it stands to whoever acts on it next (`Client.belief`).
+        """Leaves bytes about a world as it stands for its next client (`Client.belief`).
 
         Args:
             result: The world's last result; another step is refused.
@@ -189,10 +181,9 @@ class Lease:
             self.client.control(request, timeout=timeout)
 
     def _part(self, worlds: range) -> range:
-        """Checks worlds to step: consecutive, of this lease."""
         is_part = isinstance(worlds, range) and worlds.step == 1 and len(worlds) > 0  # pyright: ignore[reportUnnecessaryIsInstance]
         if not is_part or worlds.start < self.worlds.start or worlds.stop > self.worlds.stop:
-            raise SettingError(
+            raise InvalidArgumentError(
                 f"worlds: expected a range of consecutive worlds within {self.worlds}, got {worlds}"
             )
         return worlds
@@ -208,20 +199,11 @@ class Lease:
             self.client.control({"op": "release", "lease": self.number}, timeout=timeout)
 
     def __enter__(self) -> Self:
-        """Returns itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Releases it; after an error, without a second one."""
-        if kind is None:
-            self.release()
-            return
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             self.release()
         except Exception:
-            pass  # the first error says more
+            if kind is None:  # else the first error says more
+                raise

@@ -17,18 +17,17 @@ from emberwatch.base import WorldEnv, reported, wants_to_resume
 from emberwatch.client import connect, when_served
 from emberwatch.decisions import Decisions
 from emberwatch.errors import (
-    AgentEndsError,
-    ClosedError,
+    InvalidArgumentError,
     LeaseLostError,
     NoServerError,
     RequestTimeoutError,
     ServerGoneError,
-    SettingError,
 )
 from emberwatch.observer import Frame, Observer
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program
 from emberwatch.replies import Decision
+from emberwatch.session import not_reset, timed_out_before
 from emberwatch.settings import Settings, WorldArguments, draw_seed
 from emberwatch.truth import HiddenStates
 from emberwatch.view import fly
@@ -93,24 +92,18 @@ class WildfireObjectiveEnv(WorldEnv):
         planner: Literal["beam", "shooting"] = "beam",
         prior: Literal["simulated", "initial", "uniform"] = "simulated",
         agent: Literal["own", "running"] = "own",
-        render_mode: str | None = None,
         **world: Unpack[WorldArguments],
     ) -> None:
-        """Checks the arguments; see the class. Nothing is started before the first reset.
-
-        Raises:
-            SettingError: If an argument is impossible or contradicts the running server.
-            NoServerError: If nobody serves `instance`.
-        """
+        """See the class. Nothing is started before the first reset."""
         _check_choice("planner", planner, ("beam", "shooting"))
         _check_choice("prior", prior, ("simulated", "initial", "uniform"))
         _check_choice("agent", agent, ("own", "running"))
         settings = Settings.of(WildfireObjectiveEnv, world)
         if agent == "running" and settings.instance is None:
-            raise SettingError("agent='running': expected instance=..., where it runs")
-        super().__init__(settings, render_mode, reveals=settings.truth)
+            raise InvalidArgumentError("agent='running': expected instance=..., where it runs")
+        super().__init__(settings, reveals=settings.truth)
         if self.model is None:
-            raise SettingError("model: expected one, as the server does not reveal its own")
+            raise InvalidArgumentError("model: expected one, as the server does not reveal its own")
         self._arguments = {"planner": planner, "prior": prior}
         self._agent: Program | None = None
         self._owns_agent = agent == "own"
@@ -118,7 +111,7 @@ class WildfireObjectiveEnv(WorldEnv):
         self._frames: Observer | None = None
         self._truths: HiddenStates | None = None
         self._frame: Frame | None = None
-        #: Whether a decision has timed out, so that the world may stand elsewhere than thought.
+        #: Whether a decision has timed out, so that the world may stand elsewhere than expected.
         self._is_lost = False
         n_objectives = self.model.n_states + 1
         self.action_space = spaces.Discrete(n_objectives)
@@ -142,13 +135,7 @@ class WildfireObjectiveEnv(WorldEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begins an episode; see `WildfireEnv`.
-
-        Raises:
-            LaunchError: If the agent does not start, in its own words, such as that another client
-                holds the world of a running server.
-            SettingError: If an option is unknown.
-        """
+        """Begins an episode; see `WildfireEnv`. An agent that does not start says why."""
         super(WorldEnv, self).reset(seed=seed)
         resume = wants_to_resume(options, seed)
         world_seed = draw_seed(self.np_random) if seed is None and not resume else seed
@@ -156,7 +143,7 @@ class WildfireObjectiveEnv(WorldEnv):
         may_move = self._is_open() and not resume
         try:
             decision = self._begin_with(world_seed, resume)
-        except (AgentEndsError, ServerGoneError):
+        except ServerGoneError:
             if not may_move:
                 raise
             decision = self._begin_with(world_seed, resume)
@@ -170,44 +157,41 @@ class WildfireObjectiveEnv(WorldEnv):
         """Plans and flies a path for an objective.
 
         Raises:
-            InvalidActionError: If it is not an integer in 0 to S. Nothing is sent.
+            InvalidArgumentError: If it is not an integer in 0 to S. Nothing is sent.
             LeaseLostError: If another client took the world over.
             ServerGoneError: If agent or server have ended, with the agent's words.
             RequestTimeoutError: If there is no answer; the world may have moved: reset or resume.
         """
         objective = as_choice(action, len(self._opened().info.objectives))
         if self._is_lost:
-            raise ClosedError(
-                "an earlier decision timed out, and the world may have moved: reset, or go on from "
-                "where it stands with reset(options={'resume': True})"
-            )
-        with self._closing_when_lost():
+            raise timed_out_before()
+        with self._closed_when_lost():
             decision = self._opened().decide(objective, timeout=self._session.settings.timeout)
         observation, info = self._seen(decision)
         return observation, decision.reward, decision.terminated, decision.truncated, info
 
     def close(self) -> None:
         """Ends the agent and the private server, if they are its own. Again is fine."""
-        readers, self._frames, self._truths = (self._frames, self._truths), None, None
-        for part in (*readers, self._decisions):
+        for part in (self._frames, self._truths, self._decisions):
             if part is not None:
                 part.close()
-        self._decisions = None
+        self._frames = self._truths = self._decisions = None
         agent, self._agent = self._agent, None
         if agent is not None:
             agent.stop()
         super().close()
 
     @contextlib.contextmanager
-    def _closing_when_lost(self) -> Generator[None]:
-        """What is gone is given up, in the agent's own words, so that a reset opens anew."""
+    def _closed_when_lost(self) -> Generator[None]:
+        """Closes what is gone, with an error in the agent's own words; a reset opens it again."""
         try:
             yield
         except RequestTimeoutError:
             self._is_lost = True
             raise
-        except (LeaseLostError, AgentEndsError, ServerGoneError) as error:
-            code, words = (None, "") if self._agent is None else self._agent.ended()
+        except (LeaseLostError, ServerGoneError) as error:
+            code = None if self._agent is None else self._agent.exit_code()
+            words = "" if self._agent is None or code is None else self._agent.output()
             self.close()
             if isinstance(error, LeaseLostError) or code is None:
                 raise
@@ -220,7 +204,7 @@ class WildfireObjectiveEnv(WorldEnv):
     def _begin_with(self, seed: int | None, resume: bool) -> Decision:
         """Where an episode begins, or goes on."""
         decisions = self._open(seed)
-        with self._closing_when_lost():
+        with self._closed_when_lost():
             return decisions.last() if resume else decisions.reset(seed)
 
     def _open(self, seed: int | None) -> Decisions:
@@ -238,7 +222,8 @@ class WildfireObjectiveEnv(WorldEnv):
             if self.render_mode is not None:
                 self._frames = Observer(instance, world=settings.world)
             if self._reveals:
-                self._truths = HiddenStates(instance, settings, 1, self._shape)
+                shape = (1, self._spec.height, self._spec.width)
+                self._truths = HiddenStates(instance, settings.world, shape)
             self._decisions = self._start_agent(instance)
         except BaseException:
             self.close()
@@ -255,7 +240,7 @@ class WildfireObjectiveEnv(WorldEnv):
             decisions = connect_to_any()
             if self._agent is not None and decisions.info.pid == self._agent.pid:
                 return decisions
-            # Another agent serves the world: ours is about to end, and to say so.
+            # Another agent serves the world: ours will end with an error that says so.
             decisions.close()
             raise NoServerError(f"world {settings.world} has another agent")
 
@@ -267,7 +252,7 @@ class WildfireObjectiveEnv(WorldEnv):
         if settings.takeover:
             command.append("--takeover")
         if settings.instance is not None and settings.model is not None:
-            command.append(f"--model={settings.model_argument}")
+            command.append(f"--model={settings.model}")
         self._agent = Program("emberwatch-agent", command)
         # For environments that nobody closes. Does nothing where it has been stopped before.
         weakref.finalize(self, self._agent.stop)
@@ -275,7 +260,7 @@ class WildfireObjectiveEnv(WorldEnv):
 
     def _opened(self) -> Decisions:
         if self._decisions is None:
-            raise ClosedError("the environment is closed: reset it first")
+            raise not_reset()
         return self._decisions
 
     def _seen(self, decision: Decision) -> tuple[NDArray[np.float32], dict[str, Any]]:
@@ -287,7 +272,7 @@ class WildfireObjectiveEnv(WorldEnv):
             info["truth"] = truth.copy()
         if self._frames is not None:
             self._frame = frame = self._await_frame(self._frames, moment)
-            self._path = fly(frame.start, frame.path, self._shape) if len(frame.path) else None
+            self._path = fly(frame.start, frame.path, self._spec) if len(frame.path) else None
         if self.render_mode == "human":
             self._draw()
         return np.array(decision.summary, np.float32), info
@@ -311,4 +296,4 @@ class WildfireObjectiveEnv(WorldEnv):
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
-        raise SettingError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+        raise InvalidArgumentError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")

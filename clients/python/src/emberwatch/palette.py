@@ -12,8 +12,9 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.belief import UNOBSERVED
+from emberwatch.errors import InvalidArgumentError
 from emberwatch.model import MAX_VALUES, Color, Model
+from emberwatch.wire import UNOBSERVED
 
 DARK: Final[Color] = (0x14, 0x14, 0x14)
 """Marks on light cells."""
@@ -61,19 +62,11 @@ class Palette:
         )
 
     def paint_frame(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Colours (H, W, 3) of a frame (H, W).
-
-        Raises:
-            ValueError: A value is neither an observation nor 255.
-        """
+        """Colours (H, W, 3) of a frame (H, W)."""
         return _paint(frame, {**dict(enumerate(self.observations)), UNOBSERVED: self.unobserved})
 
     def paint_truth(self, truth: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Colours (H, W, 3) of hidden states (H, W).
-
-        Raises:
-            ValueError: A value is no state.
-        """
+        """Colours (H, W, 3) of hidden states (H, W)."""
         return _paint(truth, dict(enumerate(self.states)))
 
 
@@ -98,7 +91,7 @@ def _paint(values: NDArray[np.uint8], colors: dict[int, Color]) -> NDArray[np.ui
     unknown = np.isin(values, list(colors), invert=True)
     if unknown.any():
         got = int(values[unknown][0])
-        raise ValueError(f"picture: expected values out of {sorted(colors)}, got {got}")
+        raise InvalidArgumentError(f"picture: expected values out of {sorted(colors)}, got {got}")
     return table[values]
 
 

@@ -21,9 +21,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.belief import UNOBSERVED
+from emberwatch.errors import InvalidArgumentError
 from emberwatch.palette import DARK, LIGHT, mark_on
 from emberwatch.palette import Palette as Palette
+from emberwatch.wire import UNOBSERVED
 
 _EDGE = (0xB4, 0xB4, 0xB4)
 _LONG_SIDE = 512  # pixels of a panel, about, unless a scale is given
@@ -65,16 +66,13 @@ def rgb_array(
 
     Returns:
         Shape (height, width, 3), red, green, blue.
-
-    Raises:
-        ValueError: An argument is of another shape, leaves the grid or the palette.
     """
     cells = _check(frame, robot, path, truth)
     height, width = frame.shape
     if scale is None:  # even, where cells can be
         scale = max(1, 2 * round(_LONG_SIDE / max(height, width) / 2))
     if scale < 1:
-        raise ValueError(f"scale: expected at least 1 pixel, got {scale}")
+        raise InvalidArgumentError(f"scale: expected at least 1 pixel, got {scale}")
     colors = palette.paint_frame(frame)
     if scale < LEAST_LINE_SCALE:
         panels = [_enlarge(_tinted(colors, cells), scale)]
@@ -106,9 +104,6 @@ def ansi(
     which tints the path. Without colour it is two ASCII characters: the value as ``0-9A-Za-z+/``,
     or ``.`` where nothing was observed, then ``@`` for the robot, ``*`` for the path or a space.
     The other arguments are those of `rgb_array`.
-
-    Raises:
-        ValueError: An argument is of another shape, leaves the grid or the palette.
     """
     cells = _check(frame, robot, path, truth)
     grids = [(frame, palette.paint_frame(frame), cells)]
@@ -165,11 +160,7 @@ class Screen:
         path: Cells | None = None,
         truth: NDArray[np.uint8] | None = None,
     ) -> None:
-        """Draws what `rgb_array` or `ansi` draws from the same, in place of the last picture.
-
-        Raises:
-            ValueError: An argument is of another shape, leaves the grid or the palette.
-        """
+        """Draws what `rgb_array` or `ansi` draws from the same, in place of the last picture."""
         if self._kind == "window":
             self._show_in_window(
                 rgb_array(frame=frame, robot=robot, palette=palette, path=path, truth=truth)
@@ -217,20 +208,20 @@ def _check(
 ) -> NDArray[np.intp]:
     """The path as cells (n, 2), all arguments checked."""
     if frame.ndim != 2 or not frame.size:
-        raise ValueError(f"frame: expected shape (H, W), got {frame.shape}")
+        raise InvalidArgumentError(f"frame: expected shape (H, W), got {frame.shape}")
     if truth is not None and truth.shape != frame.shape:
-        raise ValueError(f"truth: expected shape {frame.shape}, got {truth.shape}")
+        raise InvalidArgumentError(f"truth: expected shape {frame.shape}, got {truth.shape}")
     cells = np.asarray([] if path is None else path, dtype=np.intp).reshape(-1, 2)
     for what, places in (("robot", np.asarray([robot or (0, 0)])), ("path", cells)):
         off = ((places < 0) | (places >= frame.shape)).any(axis=1)
         if off.any():
             got = tuple(places[np.argmax(off)].tolist())
-            raise ValueError(f"{what}: expected cells of a {frame.shape} grid, got {got}")
+            raise InvalidArgumentError(f"{what}: expected cells of a {frame.shape} grid, got {got}")
     jumps = np.abs(np.diff(cells, axis=0)).sum(axis=1) > 1
     if jumps.any():
         at = int(np.argmax(jumps))
         got = [tuple(cell) for cell in cells[at : at + 2].tolist()]
-        raise ValueError(f"path: expected neighbours one after the other, got {got}")
+        raise InvalidArgumentError(f"path: expected neighbours one after the other, got {got}")
     return cells
 
 

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from emberwatch.errors import ChannelError
+from emberwatch.errors import EmberwatchError
 
 #: How long to wait for others, each of which takes milliseconds, seconds.
 _LONGEST_WAIT: Final = 10.0
@@ -42,9 +42,6 @@ def turn(directory: Path) -> Generator[bool]:
     """A turn, which may be within another of the same thread; yields whether nobody else has it.
 
     A stopped process that has it is not waited for.
-
-    Raises:
-        ChannelError: If it does not come in time, or the directory cannot be written to.
     """
     if _held.alone is not None:
         yield _held.alone
@@ -71,15 +68,14 @@ def process_state(pid: int) -> str | None:
         return None
 
 
-def unusable(path: Path, error: OSError) -> ChannelError:
+def unusable(path: Path, error: OSError) -> EmberwatchError:
     """The error of a file or folder that the system does not let be used."""
     remedy = (
         ": channels need a /dev/shm that can be written to; as root, "
         "`mount -o remount,rw /dev/shm`, or mount a tmpfs there"
     )
-    return ChannelError(
-        f"create {path}: {error.strerror}{remedy if error.errno == errno.EROFS else ''}"
-    )
+    remedy = remedy if error.errno == errno.EROFS else ""
+    return EmberwatchError(f"create {path}: {error.strerror}{remedy}", "channel")
 
 
 def _wait(path: Path) -> int | None:
@@ -98,9 +94,10 @@ def _wait(path: Path) -> int | None:
                 if holder is not None and process_state(holder) == "T":
                     return None
                 if waited > _LONGEST_WAIT:
-                    raise ChannelError(
+                    raise EmberwatchError(
                         f"{path}: expected the lock within {_LONGEST_WAIT} s, got it held by "
-                        f"pid {holder}"
+                        f"pid {holder}",
+                        "channel",
                     ) from None
                 time.sleep(_INTERVAL)
             finally:

@@ -7,11 +7,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emberwatch.errors import SettingError
-from emberwatch.model import Model
+from emberwatch.errors import InvalidArgumentError
 from emberwatch.render import Palette, Screen, ansi, rgb_array
 from emberwatch.replies import ServerInfo
-from emberwatch.settings import Shape
+from emberwatch.settings import WorldSpec
 
 #: The render modes of every environment here.
 RENDER_MODES: Final = ("human", "rgb_array", "ansi")
@@ -26,20 +25,14 @@ _DIRECTIONS: Final[tuple[tuple[int, int], ...]] = ((-1, 0), (1, 0), (0, -1), (0,
 class View:
     """Draws one world: the frame, the path flown, the robot, and the truth where it is known."""
 
-    def __init__(self, render_mode: str | None, shape: Shape, model: Model | None) -> None:
-        """Chooses the mode.
-
-        Raises:
-            SettingError: If there is no such mode.
-        """
+    def __init__(self, render_mode: str | None, spec: WorldSpec) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
-            raise SettingError(
+            raise InvalidArgumentError(
                 f"render_mode: expected None or one of {', '.join(RENDER_MODES)}, "
                 f"got {render_mode!r}"
             )
         self.mode: Final = render_mode
-        self._shape = shape
-        self._palette = Palette.of(shape.n_observations if model is None else model)
+        self._palette = Palette.of(spec.n_observations if spec.model is None else spec.model)
         self._screen: Screen | None = None
 
     def draw(
@@ -73,13 +66,13 @@ class View:
             self._screen = None
 
 
-def fly(start: tuple[int, int], moves: ArrayLike, shape: Shape | ServerInfo) -> NDArray[np.intp]:
+def fly(start: tuple[int, int], moves: ArrayLike, grid: WorldSpec | ServerInfo) -> NDArray[np.intp]:
     """The cells of a path after each move, `(n_moves, 2)`: a move off the grid stays in place."""
     row, col = start
     cells: list[tuple[int, int]] = []
     for move in np.asarray(moves).tolist():
         down, right = _DIRECTIONS[int(move)]
-        row = min(max(row + down, 0), shape.height - 1)
-        col = min(max(col + right, 0), shape.width - 1)
+        row = min(max(row + down, 0), grid.height - 1)
+        col = min(max(col + right, 0), grid.width - 1)
         cells.append((row, col))
     return np.array(cells, np.intp).reshape(-1, 2)

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import GarbledAnswerError
+from emberwatch.errors import EmberwatchError
 
 #: The protocol version that this package speaks.
 VERSION: Final = 1
@@ -162,34 +162,30 @@ CONTROL_REQUEST: Final = struct.Struct("=IIQQQ")
 
 
 class StepResult(NamedTuple):
-    """How one world stands after a step or a reset (PROTOCOL.md, `StepResult`).
+    """How one world stands after a step or a reset (PROTOCOL.md, `StepResult`)."""
 
-    Attributes:
-        step: k, the number of steps since the last reset.
-        seed: Seed of the episode. With the model it gives the hidden state away: not for learners.
-        episode: Resets of this world since the server started.
-        reward: Sum of the model's rewards over the distinct cells visited.
-        n_target_cells: Cells of the whole grid in the state that pays most (fire): for reports.
-        n_visited: Distinct cells visited.
-        n_hits: Distinct cells visited in the state that pays most.
-        row: The robot's row.
-        col: The robot's column.
-        coverage: What the frame shows: 0 nothing, 1 the path, 2 every cell.
-        terminated: 1 if the episode ended by itself.
-        truncated: 1 if the server's `max_steps` ended it.
-    """
-
+    #: k, the number of steps since the last reset.
     step: int
+    #: Seed of the episode. With the model it gives the hidden state away: not for learners.
     seed: int
+    #: Resets of this world since the server started.
     episode: int
+    #: Sum of the model's rewards over the distinct cells visited.
     reward: float
+    #: Cells of the whole grid in the state that pays most (fire): for reports.
     n_target_cells: int
+    #: Distinct cells visited.
     n_visited: int
+    #: Distinct cells visited in the state that pays most.
     n_hits: int
+    #: The robot's place.
     row: int
     col: int
+    #: What the frame shows: 0 nothing, 1 the path, 2 every cell.
     coverage: int
+    #: 1 if the episode ended by itself.
     terminated: int
+    #: 1 if the server's `max_steps` ended it.
     truncated: int
 
 
@@ -222,21 +218,15 @@ class StepAnswer:
     __slots__ = ("_payload", "first_world", "frames", "simulation_nanos")
 
     def __init__(self, reply: StepReply, payload: bytearray, n_observations: int) -> None:
-        """Takes a payload apart.
-
-        Raises:
-            GarbledAnswerError: If its length or a value of a frame is impossible.
-        """
+        """Takes a payload apart."""
         n_worlds, height, width = reply.n_worlds, reply.height, reply.width
         if not n_worlds * height * width:
-            raise GarbledAnswerError(
+            raise bad_answer(
                 f"answer to step: expected worlds, got {n_worlds} of {height} x {width} cells"
             )
         expected = n_worlds * (RESULT.size + height * width)
         if len(payload) != expected:
-            raise GarbledAnswerError(
-                f"answer to step: expected {expected} bytes, got {len(payload)}"
-            )
+            raise bad_answer(f"answer to step: expected {expected} bytes, got {len(payload)}")
         self._payload = payload
         self.first_world: int = reply.first_world
         self.simulation_nanos: int = reply.simulation_nanos
@@ -263,42 +253,33 @@ class StepAnswer:
         return StepResult(*RESULT.unpack_from(self._payload, index * RESULT.size))
 
 
-def check_frame(values: NDArray[np.uint8], n_observations: int) -> None:
-    """Refuses frames whole that hold anything but observations and 255.
+def bad_answer(message: str) -> EmberwatchError:
+    """The error of an answer that makes no sense."""
+    return EmberwatchError(message, "bad_answer")
 
-    Raises:
-        GarbledAnswerError: Naming the value.
-    """
+
+def check_frame(values: NDArray[np.uint8], n_observations: int) -> None:
+    """Refuses frames whole that hold anything but observations and 255."""
     # 255 wraps to 0, observation o becomes o + 1: one addition and one maximum check all.
     highest = int((values + np.uint8(1)).max(initial=0))
     if highest > n_observations:
-        raise GarbledAnswerError(
+        raise bad_answer(
             f"frame: expected observations below {n_observations} or 255, got {highest - 1}"
         )
 
 
 def check_worlds(reply: StepReply, expected: tuple[int, int, int, int]) -> None:
-    """Refuses an answer about other worlds, or of another size: first, number, height, width.
-
-    Raises:
-        GarbledAnswerError: Naming both.
-    """
+    """Refuses an answer about other worlds, or of another size: first, number, height, width."""
     got = (reply.first_world, reply.n_worlds, reply.height, reply.width)
     if got != expected:
-        raise GarbledAnswerError(
+        raise bad_answer(
             f"answer to step: expected first world, worlds, height, width {expected}, got {got}"
         )
 
 
 def check_answer(what: str, reply: Any, sequence: int) -> None:
-    """Refuses an answer of another version or to another request.
-
-    Raises:
-        GarbledAnswerError: Naming both.
-    """
+    """Refuses an answer of another version or to another request."""
     if reply.version != VERSION:
-        raise GarbledAnswerError(f"{what}: expected version {VERSION}, got {reply.version}")
+        raise bad_answer(f"{what}: expected version {VERSION}, got {reply.version}")
     if reply.sequence != sequence:
-        raise GarbledAnswerError(
-            f"{what}: expected sequence number {sequence}, got {reply.sequence}"
-        )
+        raise bad_answer(f"{what}: expected sequence number {sequence}, got {reply.sequence}")

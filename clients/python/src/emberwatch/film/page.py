@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from emberwatch.belief import entropy
-from emberwatch.film.scenes import FilmError, Scene
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.film.scenes import Scene
 from emberwatch.model import Color, Model
 from emberwatch.palette import DARK, LIGHT, Palette
 from emberwatch.render import LEAST_LINE_SCALE, rgb_array
@@ -57,11 +58,7 @@ class Page:
         scale: int | None,
         has_truth: bool,
     ) -> None:
-        """Lays out and draws what all pictures of a world share; no model leaves the belief out.
-
-        Raises:
-            FilmError: The pictures are too large.
-        """
+        """Lays out and draws what all pictures of a world share; no model leaves the belief out."""
         height, width = server.height, server.width
         self._name = f"{model.name if model else 'hidden model'}, world {world}"
         self._scale = scale or min(max(_LONG_SIDE // max(height, width), 1), _MOST_SCALE)
@@ -78,7 +75,9 @@ class Page:
         size = 2 * _MARGIN + n_panels * (self._room + _GAP) - _GAP, self._foot + _LINE
         if max(size) > _MOST_SIDE or size[0] * size[1] > _MOST_AREA:
             most = f"at most {_MOST_SIDE} pixels a side and {_MOST_AREA} in all"
-            raise FilmError(f"--scale: expected pictures of {most}, got {size[0]} x {size[1]}")
+            raise InvalidArgumentError(
+                f"--scale: expected pictures of {most}, got {size[0]} x {size[1]}"
+            )
         self._base = Image.new("RGB", size, LIGHT)
         for left, panel, legend in zip(self._lefts(), self._panels, legends, strict=True):
             _write(self._base, (left, _TOP - 13), _fit(panel.title, self._room))
@@ -106,8 +105,8 @@ class Page:
         _write(image, (left, middle), _fit(place, right - _GAP - left))
         for left, panel in zip(self._lefts(), self._panels, strict=True):
             self._draw_panel(image, left, panel, scene)
-        note, color = _small_print(scene)
-        _write(image, (_MARGIN, self._foot), _fit(note, image.width - 2 * _MARGIN), ink=color)
+        text, color = _small_print(scene)
+        _write(image, (_MARGIN, self._foot), _fit(text, image.width - 2 * _MARGIN), ink=color)
         return image
 
     def indexed(self, image: Image.Image) -> Image.Image:
@@ -122,9 +121,9 @@ class Page:
         draw.rectangle((left - 1, _TOP - 1, left + width, _TOP + height), LIGHT, _EDGE)
         cells = panel.cells(scene)
         if cells is None:
-            note = _fit("not recorded", width)
-            at = left + (width - _length(note)) // 2, _TOP + height // 2
-            _write(image, at, note, ink=_WARNING)
+            text = _fit("not recorded", width)
+            at = left + (width - _length(text)) // 2, _TOP + height // 2
+            _write(image, at, text, ink=_WARNING)
             return
         robot: tuple[int, int] | None = None
         if scene.path is not None:
@@ -275,5 +274,5 @@ def _small_print(scene: Scene) -> tuple[str, Color]:
         return f"{lost} not recorded{predicted}", _WARNING
     begins = f"the belief begins at step {scene.since}"
     lost = f"{scene.n_lost} steps before this one are not recorded"
-    notes = [begins] * (scene.since > 0) + [lost] * (scene.n_lost > 0)
-    return "; ".join(notes), _INK
+    texts = [begins] * (scene.since > 0) + [lost] * (scene.n_lost > 0)
+    return "; ".join(texts), _INK
