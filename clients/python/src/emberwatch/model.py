@@ -8,7 +8,7 @@ reads what the server has accepted. `emberwatch.belief` applies the parameters t
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import resources
 from importlib.resources.abc import Traversable
 from os import PathLike, fspath
@@ -33,7 +33,7 @@ class Model:
     """A model; make one with `named` or `from_toml`.
 
     S is the number of states, O that of observations, (KH, KW) the kernel's size, both odd. Two
-    models are equal if their files differ in comments and layout only.
+    models are equal if all they say is, whatever their files look like.
     """
 
     name: str
@@ -104,12 +104,15 @@ class Model:
         return int(np.argmax(self.reward))
 
     def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Model):
-            return NotImplemented
-        return tomllib.loads(self.toml) == tomllib.loads(other.toml)
+        return isinstance(other, Model) and self._values() == other._values()
 
     def __hash__(self) -> int:
         return hash(self.name)
+
+    def _values(self) -> list[object]:
+        """All but the text."""
+        values = [getattr(self, field.name) for field in fields(self) if field.name != "toml"]
+        return [value.tolist() if isinstance(value, np.ndarray) else value for value in values]
 
 
 def built_in_models() -> dict[str, Traversable]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from inspect import signature
 from pathlib import Path
-from typing import Any, Final, TypedDict, get_type_hints
+from typing import Any, Final, TypedDict, cast, get_type_hints
 
 import numpy as np
 
@@ -60,7 +60,7 @@ class Settings:
             value: Any = getattr(self, field.name)
             kind = kinds[field.name]
             if isinstance(value, np.generic):
-                value = value.item()
+                value = cast("Any", value.item())
                 object.__setattr__(self, field.name, value)
             is_kind = isinstance(value, int | float if kind is float else kind)
             if not is_kind or (isinstance(value, bool) and kind is not bool):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.render import Palette, Screen, ansi, rgb_array
+from emberwatch.render import Palette, Picture, Screen, ansi, rgb_array
 from emberwatch.replies import ServerInfo
 from emberwatch.settings import WorldSpec
 
@@ -43,20 +43,14 @@ class View:
         truth: NDArray[np.uint8] | None,
     ) -> Any:
         """An image, a text, or `None` after showing it to a human, as the mode has it."""
-        parts: dict[str, Any] = {
-            "frame": frame,
-            "path": path,
-            "robot": robot,
-            "truth": truth,
-            "palette": self._palette,
-        }
+        picture = Picture(frame, robot, self._palette, path, truth)
         if self.mode == "rgb_array":
-            return rgb_array(**parts)
+            return rgb_array(picture)
         if self.mode == "ansi":
-            return ansi(**parts)
+            return ansi(picture)
         if self._screen is None:
             self._screen = Screen(fps=RENDER_FPS)
-        self._screen.show(**parts)
+        self._screen.show(picture)
         return None
 
     def close(self) -> None:

@@ -16,7 +16,7 @@ from emberwatch.errors import InvalidArgumentError
 from emberwatch.film.scenes import Scene
 from emberwatch.model import Color, Model
 from emberwatch.palette import DARK, LIGHT, Palette
-from emberwatch.render import LEAST_LINE_SCALE, rgb_array
+from emberwatch.render import LEAST_LINE_SCALE, Picture, rgb_array
 from emberwatch.replies import ServerInfo
 
 _MARGIN, _GAP, _LINE, _SWATCH = 14, 16, 20, 11  # pixels
@@ -129,9 +129,7 @@ class Page:
         if scene.path is not None:
             robot = (int(scene.path[-1, 0]), int(scene.path[-1, 1]))
         path = scene.path if panel.has_path and self._scale >= LEAST_LINE_SCALE else None
-        pixels = rgb_array(
-            frame=cells, robot=robot, palette=panel.palette, path=path, scale=self._scale
-        )
+        pixels = rgb_array(Picture(cells, robot, panel.palette, path), scale=self._scale)
         image.paste(Image.fromarray(pixels[:height, :width]), (left, _TOP))
 
     def _placed(self, marks: list[tuple[_Mark, str]]) -> list[tuple[_Mark, str, tuple[int, int]]]:
@@ -153,7 +151,7 @@ class Page:
         if mark == "robot":
             blank = Palette(states=(), observations=(LIGHT,), unobserved=LIGHT, path=DARK)
             frame = np.zeros((1, 1), np.uint8)
-            robot = rgb_array(frame=frame, robot=(0, 0), palette=blank, scale=_SWATCH + 1)
+            robot = rgb_array(Picture(frame, (0, 0), blank), scale=_SWATCH + 1)
             self._base.paste(Image.fromarray(robot), (x, top))
         elif mark == "scale":
             _write(self._base, (x, y), "0")
