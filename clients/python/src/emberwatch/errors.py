@@ -16,7 +16,7 @@ class EmberwatchError(Exception):
             `"busy"`, and changed nothing in the world. Others: `"closed"`, `"forked"` (shared
             memory does not survive `fork`), `"channel"` (iceoryx2 failed), `"bad_answer"` (client
             and server are not of one release), `"program"` (could not be started, or failed),
-            `"impossible_frame"`, `"recording"`, `"film"`.
+            `"impossible_frame"`, `"recording"`.
         detail: The number that comes with a refusal; its meaning depends on the status.
     """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -110,8 +110,7 @@ class Lease:
             {"world": world, "seed": None if seed is None else as_seed(seed)}
             for world, seed in zip(chosen, given, strict=True)
         ]
-        request = {"op": "reset", "lease": self.number, "worlds": pairs}
-        return records(WorldInfo, self.client.control(request, timeout=timeout))
+        return records(WorldInfo, self._ask("reset", timeout, worlds=pairs))
 
     def restore(
         self,
@@ -130,22 +129,15 @@ class Lease:
             timeout: How long to wait for the answer, seconds.
         """
         chosen = self.worlds if worlds is None else self._part(worlds)
-        request = {
-            "op": "restore",
-            "lease": self.number,
-            "first_world": chosen.start,
-            "n_worlds": len(chosen),
-            "from": first,
-            "path": os.path.abspath(path),
-        }
-        return records(WorldInfo, self.client.control(request, timeout=timeout))
+        place = {"first_world": chosen.start, "n_worlds": len(chosen), "from": first}
+        reply = self._ask("restore", timeout, **place, path=os.path.abspath(path))
+        return records(WorldInfo, reply)
 
     def fork(
         self, source: int, target: int, *, timeout: float = STEP_TIMEOUT
     ) -> tuple[WorldInfo, ...]:
         """Puts a copy of any world in the place of one of its own: both have the same future."""
-        request = {"op": "fork", "lease": self.number, "from": source, "to": target}
-        return records(WorldInfo, self.client.control(request, timeout=timeout))
+        return records(WorldInfo, self._ask("fork", timeout, **{"from": source, "to": target}))
 
     def leave_belief(
         self,
@@ -166,19 +158,31 @@ class Lease:
             timeout: How long to wait for each answer, seconds.
         """
         for offset in range(0, max(len(data), 1), _BELIEF_PART):
-            part = data[offset : offset + _BELIEF_PART]
-            request = {
-                "op": "leave_belief",
-                "lease": self.number,
-                "world": self.worlds.start if world is None else world,
-                "episode": result.episode,
-                "step": result.step,
-                "kind": kind,
-                "offset": offset,
-                "length": len(data),
-                "data": b64encode(part).decode(),
-            }
-            self.client.control(request, timeout=timeout)
+            self._ask(
+                "leave_belief",
+                timeout,
+                world=self.worlds.start if world is None else world,
+                episode=result.episode,
+                step=result.step,
+                kind=kind,
+                offset=offset,
+                length=len(data),
+                data=b64encode(data[offset : offset + _BELIEF_PART]).decode(),
+            )
+
+    def renew(self, *, timeout: float = RESET_TIMEOUT) -> None:
+        """Starts the lease's clock again without acting."""
+        self._ask("renew", timeout)
+
+    def release(self, *, timeout: float = STEP_TIMEOUT) -> None:
+        """Gives the worlds back. Again is fine."""
+        if not self._is_over:
+            self._is_over = True
+            self._ask("release", timeout)
+
+    def _ask(self, operation: str, timeout: float, **keys: Any) -> dict[str, Any]:
+        request = {"op": operation, "lease": self.number, **keys}
+        return self.client.control(request, timeout=timeout)
 
     def _part(self, worlds: range) -> range:
         is_part = isinstance(worlds, range) and worlds.step == 1 and len(worlds) > 0  # pyright: ignore[reportUnnecessaryIsInstance]
@@ -187,16 +191,6 @@ class Lease:
                 f"worlds: expected a range of consecutive worlds within {self.worlds}, got {worlds}"
             )
         return worlds
-
-    def renew(self, *, timeout: float = RESET_TIMEOUT) -> None:
-        """Starts the lease's clock again without acting."""
-        self.client.control({"op": "renew", "lease": self.number}, timeout=timeout)
-
-    def release(self, *, timeout: float = STEP_TIMEOUT) -> None:
-        """Gives the worlds back. Again is fine."""
-        if not self._is_over:
-            self._is_over = True
-            self.client.control({"op": "release", "lease": self.number}, timeout=timeout)
 
     def __enter__(self) -> Self:
         return self

@@ -95,9 +95,14 @@ class WildfireObjectiveEnv(WorldEnv):
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class. Nothing is started before the first reset."""
-        _check_choice("planner", planner, ("beam", "shooting"))
-        _check_choice("prior", prior, ("simulated", "initial", "uniform"))
-        _check_choice("agent", agent, ("own", "running"))
+        for name, value, choices in (
+            ("planner", planner, ("beam", "shooting")),
+            ("prior", prior, ("simulated", "initial", "uniform")),
+            ("agent", agent, ("own", "running")),
+        ):
+            if value not in choices:
+                expected = f"one of {', '.join(choices)}"
+                raise InvalidArgumentError(f"{name}: expected {expected}, got {value!r}")
         settings = Settings.of(WildfireObjectiveEnv, world)
         if agent == "running" and settings.instance is None:
             raise InvalidArgumentError("agent='running': expected instance=..., where it runs")
@@ -142,11 +147,11 @@ class WildfireObjectiveEnv(WorldEnv):
         world_seed = None if world_seed is None else as_seed(world_seed)
         may_move = self._is_open() and not resume
         try:
-            decision = self._begin_with(world_seed, resume)
+            decision = self._begin_at(world_seed, resume)
         except ServerGoneError:
             if not may_move:
                 raise
-            decision = self._begin_with(world_seed, resume)
+            decision = self._begin_at(world_seed, resume)
         self._is_lost = False
         self._path = None
         return self._seen(decision)
@@ -201,7 +206,7 @@ class WildfireObjectiveEnv(WorldEnv):
     def _is_open(self) -> bool:
         return self._decisions is not None
 
-    def _begin_with(self, seed: int | None, resume: bool) -> Decision:
+    def _begin_at(self, seed: int | None, resume: bool) -> Decision:
         """Where an episode begins, or goes on."""
         decisions = self._open(seed)
         with self._closed_when_lost():
@@ -232,31 +237,31 @@ class WildfireObjectiveEnv(WorldEnv):
 
     def _start_agent(self, instance: str) -> Decisions:
         settings = self._session.settings
-
-        def connect_to_any() -> Decisions:
-            return Decisions(instance, settings.world, timeout=settings.timeout)
+        if not self._owns_agent:
+            return when_served(settings.timeout, lambda: self._connect(instance))
+        flags = {"instance": instance, "world": settings.world, "wait": 0, **self._arguments}
+        if settings.instance is not None and settings.model is not None:
+            flags["model"] = str(settings.model)
+        command = ["serve-decisions", *(f"--{flag}={value}" for flag, value in flags.items())]
+        self._agent = agent = Program(
+            "emberwatch-agent", command + ["--takeover"] * settings.takeover
+        )
+        # For environments that nobody closes. Does nothing where it has been stopped before.
+        weakref.finalize(self, agent.stop)
 
         def connect_to_own() -> Decisions:
-            decisions = connect_to_any()
-            if self._agent is not None and decisions.info.pid == self._agent.pid:
+            decisions = self._connect(instance)
+            if decisions.info.pid == agent.pid:
                 return decisions
             # Another agent serves the world: ours will end with an error that says so.
             decisions.close()
             raise NoServerError(f"world {settings.world} has another agent")
 
-        if not self._owns_agent:
-            return when_served(settings.timeout, connect_to_any)
-        flags = {"instance": instance, "world": str(settings.world), "wait": "0"}
-        flags |= self._arguments
-        command = ["serve-decisions", *(f"--{flag}={value}" for flag, value in flags.items())]
-        if settings.takeover:
-            command.append("--takeover")
-        if settings.instance is not None and settings.model is not None:
-            command.append(f"--model={settings.model}")
-        self._agent = Program("emberwatch-agent", command)
-        # For environments that nobody closes. Does nothing where it has been stopped before.
-        weakref.finalize(self, self._agent.stop)
-        return self._agent.wait_for(connect_to_own, RESET_TIMEOUT)
+        return agent.wait_for(connect_to_own, RESET_TIMEOUT)
+
+    def _connect(self, instance: str) -> Decisions:
+        settings = self._session.settings
+        return Decisions(instance, settings.world, timeout=settings.timeout)
 
     def _opened(self) -> Decisions:
         if self._decisions is None:
@@ -292,8 +297,3 @@ class WildfireObjectiveEnv(WorldEnv):
             return None
         robot = (self._frame.result.row, self._frame.result.col)
         return self._view.draw(self._frame.frame, robot, self._path, self._truth)
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise InvalidArgumentError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")

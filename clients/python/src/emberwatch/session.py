@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import warnings
 import weakref
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from typing import Any, Final
 
 import numpy as np
@@ -87,11 +88,8 @@ class Session:
                 "options: expected a reset before resume=True, got the first one"
             )
         self._open(0)
-        try:
+        with self._closed_when_lost():
             return self._observe()
-        except (LeaseLostError, ServerGoneError):
-            self.close()
-            raise
 
     def reset(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
         """Begins new episodes in some of the worlds, counted from 0; returns how all stand.
@@ -113,14 +111,8 @@ class Session:
         if self._is_lost:
             raise timed_out_before()
         worlds = lease.worlds if indices is None else lease.worlds[indices.start : indices.stop]
-        try:
+        with self._closed_when_lost():
             return lease.step_moves(moves, worlds, full=False, timeout=self.settings.timeout)
-        except (LeaseLostError, ServerGoneError):
-            self.close()
-            raise
-        except RequestTimeoutError:
-            self._is_lost = True
-            raise
 
     def truth(self, answer: StepAnswer) -> NDArray[np.uint8]:
         """The hidden states that belong to an answer, `(n_worlds, H, W)`; a copy."""
@@ -194,9 +186,17 @@ class Session:
     def _begin(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
         self._open((seeds[0] - indices[0]) % 2**64)
         lease = self._opened()
-        try:
+        with self._closed_when_lost():
             lease.reset(seeds, worlds=[lease.worlds[index] for index in indices])
             return self._observe()
+
+    @contextmanager
+    def _closed_when_lost(self) -> Generator[None]:
+        try:
+            yield
+        except RequestTimeoutError:
+            self._is_lost = True
+            raise
         except (LeaseLostError, ServerGoneError):
             self.close()
             raise

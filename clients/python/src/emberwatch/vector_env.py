@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, Unpack, cast
+from collections.abc import Sequence
+from typing import Any, Unpack
 
 import gymnasium
 import numpy as np
@@ -104,9 +104,9 @@ class WildfireVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], N
         if not mask.all() and not self._session.is_open:
             raise gymnasium.error.ResetNeeded("reset_mask: expected a reset of all worlds before")
         self.closed = False
-        chosen = [int(index) for index in np.flatnonzero(mask)]
+        chosen = np.flatnonzero(mask).tolist()
         if resumes:
-            self._take(self._session.resume(), range(self.num_envs))
+            self._take(self._session.resume())
             self._reset_episodes(chosen)
         else:
             self._restart(chosen, seeds)
@@ -132,7 +132,7 @@ class WildfireVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], N
         elif self._mode is AutoresetMode.NEXT_STEP:
             for run in _runs(~over):
                 self._fly(moves, run)
-            self._restart([int(index) for index in np.flatnonzero(over)], [None] * self.num_envs)
+            self._restart(np.flatnonzero(over).tolist(), [None] * self.num_envs)
         else:
             raise gymnasium.error.ResetNeeded(
                 f"worlds {np.flatnonzero(over).tolist()}: the episode is over; reset with "
@@ -160,7 +160,8 @@ class WildfireVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], N
         """Steps consecutive worlds."""
         before = self._results
         answer = self._session.step(moves[run.start : run.stop], run)
-        self._take(answer, run)
+        if len(run) == self.num_envs:  # else the reset of the others brings all results again
+            self._take(answer)
         self._observations.update(answer, run.start)
         self._elapsed[run.start : run.stop] += 1
         if self.render_mode is not None:
@@ -177,11 +178,10 @@ class WildfireVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], N
                 generator, _ = seeding.np_random(seed)
                 self._generators[index] = generator
             chosen.append(draw_seed(generator) if seed is None else seed)
-        self._take(self._session.reset(indices, chosen), range(self.num_envs))
+        self._take(self._session.reset(indices, chosen))
         self._reset_episodes(indices)
 
-    def _reset_episodes(self, indices: Sequence[int]) -> None:
-        chosen = list(indices)
+    def _reset_episodes(self, chosen: list[int]) -> None:
         self._elapsed[chosen] = 0
         self._over = self._over.copy()
         self._over[chosen] = False
@@ -189,21 +189,10 @@ class WildfireVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], N
         for index in chosen:
             self._paths[index] = None
 
-    def _take(self, answer: StepAnswer, run: range) -> None:
-        """Takes over an answer. What was handed out before is never written to."""
-        if len(run) == self.num_envs:
-            self._frames, self._results = answer.frames, answer.results
-        else:
-            self._frames, self._results = self._frames.copy(), self._results.copy()
-            self._frames[run.start : run.stop] = answer.frames
-            self._results[run.start : run.stop] = answer.results
+    def _take(self, answer: StepAnswer) -> None:
+        self._frames, self._results = answer.frames, answer.results
         if self._session.settings.truth:
-            truths = self._session.truth(answer)
-            if self._truths is None or len(run) == self.num_envs:
-                self._truths = truths
-            else:
-                self._truths = self._truths.copy()
-                self._truths[run.start : run.stop] = truths
+            self._truths = self._session.truth(answer)
 
     def _outcome(
         self, flown: NDArray[np.bool_]
@@ -218,7 +207,7 @@ class WildfireVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], N
         infos: dict[str, Any] = {}
         if self._mode is AutoresetMode.SAME_STEP and over.any():
             infos = self._final(over)
-            self._restart([int(index) for index in np.flatnonzero(over)], [None] * self.num_envs)
+            self._restart(np.flatnonzero(over).tolist(), [None] * self.num_envs)
         else:
             self._over = over
         infos |= self._infos(np.ones(self.num_envs, np.bool_))
@@ -274,29 +263,19 @@ class WildfireVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], N
         # Checked before any world's generator is replaced.
         return [None if one is None else as_seed(one) for one in seed]
 
-    def _check_mask(self, mask: object) -> NDArray[np.bool_]:
-        if mask is None:
-            return np.ones(self.num_envs, np.bool_)
+    def _check_mask(self, mask: Any) -> NDArray[np.bool_]:
         shape = (self.num_envs,)
-        if not isinstance(mask, np.ndarray):
+        if mask is None:
+            return np.ones(shape, np.bool_)
+        got = f"{mask.dtype} {mask.shape}" if hasattr(mask, "dtype") else repr(mask.__class__)
+        if got != f"bool {shape}" or not mask.any():
             raise InvalidArgumentError(
-                f"reset_mask: expected an array {shape} of bool, got {type(mask)}"
+                f"reset_mask: expected an array {shape} of bool with at least one True, got {got}"
             )
-        array = cast("NDArray[Any]", mask)
-        if array.dtype != np.bool_ or array.shape != shape or not array.any():
-            raise InvalidArgumentError(
-                f"reset_mask: expected an array {shape} of bool with at least one True, "
-                f"got {array.dtype} {array.shape}"
-            )
-        return array
+        return mask
 
 
-def _runs(mask: NDArray[np.bool_]) -> Iterator[range]:
+def _runs(mask: NDArray[np.bool_]) -> list[range]:
     """The runs of consecutive true entries."""
-    start = None
-    for index, is_true in enumerate([*mask.tolist(), False]):
-        if is_true and start is None:
-            start = index
-        elif not is_true and start is not None:
-            yield range(start, index)
-            start = None
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False]))))
+    return [range(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]

@@ -134,39 +134,25 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
             belief = np.ascontiguousarray(image.transpose(1, 2, 0))
         else:
             belief = belief.astype(np.float32)
-        if not self._keep:
-            return belief
-        return {**_parts_of(observation), "belief": belief}
+        return {**_parts_of(observation), "belief": belief} if self._keep else belief
 
     def _space(
         self, original: dict[str, spaces.Space[Any]], height: int, width: int
     ) -> spaces.Space[Any]:
+        n_states = self._model.n_states
         if self._dtype == "uint8":
-            image = (height, width, self._model.n_states)
-            belief = spaces.Box(0, 255, image, np.uint8)
+            belief = spaces.Box(0, 255, (height, width, n_states), np.uint8)
         else:
-            planes = (self._model.n_states, height, width)
-            belief = spaces.Box(0.0, 1.0, planes, np.float32)
-        if not self._keep:
-            return belief
-        return spaces.Dict({**original, "belief": belief})
+            belief = spaces.Box(0.0, 1.0, (n_states, height, width), np.float32)
+        return spaces.Dict({**original, "belief": belief}) if self._keep else belief
 
 
 @functools.lru_cache(maxsize=8)
 def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> NDArray[np.floating]:
     """How often each cell of 64 simulated worlds is in each state after the burn-in.
 
-    Runs ``emberwatch-agent prior``, whose worlds do not depend on any environment's seed. The same
-    array again for the same arguments, so it cannot be written to.
-
-    Args:
-        model: The worlds' model.
-        height: Grid height, cells.
-        width: Grid width, cells.
-        burn_in: Steps from the initial distribution, at least 0.
-
-    Returns:
-        Shape (S, H, W), each cell's sum one, read-only.
+    Runs ``emberwatch-agent prior``, whose worlds do not depend on any environment's seed. Shape
+    (S, H, W); the same array again for the same arguments, so it cannot be written to.
     """
     name = "emberwatch-agent"
     with tempfile.TemporaryDirectory(prefix="emberwatch-prior-") as directory:
