@@ -767,7 +767,7 @@ def test_a_stopped_server_times_out_and_resume_finds_the_step() -> None:
         env.step([1, 1, 3, 3])
     with fails("closed", match="timed out"):
         env.step([1, 1, 3, 3])
-    for _ in range(100):  # the server takes a moment to let go of the request given up
+    for _ in range(100):  # the server takes a moment to drop the request that timed out
         observation, info = env.reset(options={"resume": True})
         assert observation["robot"].tolist() == ([2, 2] if info["step"] else [0, 0])
     assert env.step([0, 0, 0, 0])[4]["step"] == info["step"] + 1

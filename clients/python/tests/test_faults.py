@@ -235,10 +235,10 @@ def test_killed_clients_use_up_no_limit(server: Start, script: Run) -> None:
         "print('connected', flush=True); input()"
     )
     for _ in range(3):
-        crowd = script(code, started.instance)
-        assert crowd.line() == "connected"
-        crowd.signal(signal.SIGKILL)
-        crowd.end()
+        clients = script(code, started.instance)
+        assert clients.line() == "connected"
+        clients.signal(signal.SIGKILL)
+        clients.end()
     assert eventually(lambda: started.status().n_clients == 1)
     assert all(eventually(lambda: connects(started)) for _ in range(15))
 

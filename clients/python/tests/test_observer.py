@@ -195,7 +195,7 @@ def test_iterating_ends_when_no_frame_comes_in_time(server: Start) -> None:
     started = server()
     frames: list[Frame] = []
     with observe(started.instance, timeout=0.2) as observer:
-        # A server may take its time to greet.
+        # A server may publish the first frames late.
         assert eventually(lambda: bool(frames.extend(observer) or frames))
     assert all(frame.result.step == 0 for frame in frames)
     assert list(observe(unused_instance(), timeout=0)) == []

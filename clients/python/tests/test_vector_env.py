@@ -102,7 +102,7 @@ def test_episodes_end_and_begin_anew_as_in_single_environments(
 ) -> None:
     ours, theirs = pair(4, mode, observation=PARTS, truth=truth, max_episode_steps=3)
     assert_same_flight(ours, theirs, 2, seed=0)
-    # Some begin anew in between, so that episodes end at different times.
+    # Some are reset in between, so that episodes end at different times.
     for mask in ([True, False, True, False], [False, False, True, False]):
         for env_seed in (5, [7, None, 8, None], None):
             left = ours.reset(seed=env_seed, options={"reset_mask": np.array(mask)})

@@ -19,7 +19,7 @@ NOTHING_TO_DRAW: Final = (
     "render: nothing to draw; give a render_mode to gymnasium.make and reset first"
 )
 
-#: Fields of a result that become `info`: not the seed, which tells the hidden states.
+#: Fields of a result that become `info`: not the seed, which gives the hidden states away.
 REPORTED: Final = ("step", "n_target_cells", "n_visited", "n_hits")
 
 

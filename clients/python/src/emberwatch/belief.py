@@ -24,13 +24,7 @@ class Filter:
     """Filter of one world: `correct` with each frame, and `predict` for each step of the world."""
 
     def __init__(self, model: Model, *, prior: NDArray[np.floating]) -> None:
-        """A filter that believes the prior.
-
-        Args:
-            model: The world's model.
-            prior: Predictor ``u_0``, shape (S, H, W); each cell sums to one within 5e-5, and is
-                divided by its sum.
-        """
+        """Begins with the prior: predictor ``u_0``, shape (S, H, W), each cell a distribution."""
         self._belief = _distribution(prior, n_states=model.n_states)
         _, height, width = self._belief.shape
         self._transition = Transition(model, height=height, width=width)
@@ -45,7 +39,7 @@ class Filter:
         """Bayes' rule on the observed cells (eq. 5); the others keep their belief.
 
         ``p = B(y) u / (b(y)' u)`` with ``b(y)`` the column of the observation matrix for ``y``, and
-        ``B(y)`` the diagonal matrix of it.
+        ``B(y)`` the diagonal matrix of it. An impossible frame leaves the belief as it was.
 
         Args:
             frame: Observed values below O, 255 where nothing was observed; shape (H, W).
@@ -103,14 +97,12 @@ class Transition:
     """
 
     def __init__(self, model: Model, *, height: int, width: int) -> None:
-        """Lays out a model's operator for a grid, both sides in cells and at least 1."""
         n_states, _, kernel_height, kernel_width = model.kernel.shape
         self._shape = (n_states, height, width)
         self._stride = width + kernel_width - 1
         self._length = (height - 1) * self._stride + width
-        largest = (
-            max(model.kernel.max(), model.bias.max()) or 1.0
-        )  # a common factor, which eq. 3 cancels
+        # A common factor, which eq. 3 cancels.
+        largest = max(model.kernel.max(), model.bias.max()) or 1.0
         self._groups = [_taps_that_weigh_alike(w / largest) for w in model.kernel.swapaxes(0, 1)]
         self._bias = (model.bias / largest)[:, None]
         top, left = kernel_height // 2, kernel_width // 2
@@ -161,14 +153,7 @@ def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float6
 
 
 def entropy(belief: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shannon entropy of each cell in nats (eq. 14), with ``0 log 0 = 0``.
-
-    Args:
-        belief: Shape (S, H, W), each cell a distribution.
-
-    Returns:
-        Shape (H, W), 0 to log S.
-    """
+    """Shannon entropy of each cell in nats (eq. 14), with ``0 log 0 = 0``; shape (H, W)."""
     logarithm = np.log(belief, out=np.zeros_like(belief), where=belief > 0.0)
     return np.maximum(0.0, 0.0 - (belief * logarithm).sum(axis=0))
 
@@ -176,11 +161,7 @@ def entropy(belief: NDArray[np.float64]) -> NDArray[np.float64]:
 def _taps_that_weigh_alike(
     kernel: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], list[list[tuple[int, int]]]]:
-    """Taps (row, col) of one state by the weights they share, and those weights (S, groups).
-
-    Args:
-        kernel: Weights of this state for each next one, shape (S, KH, KW).
-    """
+    """Weights (S, groups) of a kernel (S, KH, KW), and the taps (row, col) that share each."""
     groups: dict[tuple[float, ...], list[tuple[int, int]]] = {}
     for row, col in np.ndindex(*kernel.shape[1:]):
         column = tuple(kernel[:, row, col].tolist())

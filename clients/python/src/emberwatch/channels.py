@@ -110,18 +110,15 @@ class Node:
         """The protocol version of a server on the instance that speaks another one, if any."""
         # Of the files themselves: iceoryx2 opens each service, and may wait for one without end.
         pattern = re.compile(rf'service_name = "emberwatch/v(\d+)/{self.instance}/{service}"')
-        texts = map(_text, (directory() / "services").glob(f"{_prefix()}*.service"))
-        versions = {int(match[1]) for text in texts for match in pattern.finditer(text)}
+        versions: set[int] = set()
+        for path in (directory() / "services").glob(f"{_prefix()}*.service"):
+            with contextlib.suppress(OSError):  # a service that has ended
+                found = pattern.finditer(path.read_text(errors="replace"))
+                versions |= {int(match[1]) for match in found}
         return max(versions - {wire.VERSION}, default=None)
 
     def open_publications(
-        self,
-        service: str,
-        header: type[wire.Header],
-        readers: int,
-        buffer: int,
-        *,
-        publishers: int = 1,
+        self, service: str, header: type[wire.Header], readers: int, buffer: int, publishers: int
     ) -> Any:
         """Opens or creates `frames`, `truth` or `agent`."""
         builder = self.node.service_builder(self._name(service)).publish_subscribe(_BYTES)
@@ -195,23 +192,13 @@ def _remove_leftovers(is_alone: bool) -> None:
         places.remove_leftovers(_config())
         return
     for segment in places.unfinished():
-        raise EmberwatchError(
-            f"{segment}: a stopped process is in the middle of making it: continue that, or kill "
-            "it",
-            "channel",
-        )
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(errors="replace")
-    except OSError:
-        return ""
+        problem = "a stopped process is in the middle of making it: continue that, or kill it"
+        raise EmberwatchError(f"{segment}: {problem}", "channel")
 
 
 def _config() -> Any:
     config = iox2.config.default()
-    # Not whenever it likes, but in turn.
+    # Only in turn.
     config.global_cfg.node.cleanup_dead_nodes_on_creation = False
     config.global_cfg.node.cleanup_dead_nodes_on_destruction = False
     config.global_cfg.service.cleanup_dead_nodes_on_open = False
@@ -230,11 +217,8 @@ def _own_segments(folder: Path, prefix: str) -> None:
         try:
             found = path.lstat()
             if not stat.S_ISREG(found.st_mode) or found.st_uid != os.getuid():
-                raise EmberwatchError(
-                    f"{path}: expected shared memory of this user, got something of user "
-                    f"{found.st_uid}",
-                    "channel",
-                )
+                problem = f"shared memory of this user, got something of user {found.st_uid}"
+                raise EmberwatchError(f"{path}: expected {problem}", "channel")
             if found.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
                 path.chmod(0o600)
         except FileNotFoundError:  # It belonged to a process that ended.

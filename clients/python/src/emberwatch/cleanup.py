@@ -27,7 +27,6 @@ class Places:
     """Where channels' files are, and what their names begin with."""
 
     def __init__(self, root: Path, shared: Path, prefix: str) -> None:
-        """Names them."""
         self._root, self._shared, self._prefix = root, shared, prefix
 
     def unfinished(self) -> list[Path]:
@@ -35,21 +34,13 @@ class Places:
         return [path for path in self._shared.glob(f"{self._prefix}*") if _is_unfinished(path)]
 
     def remove_leftovers(self, config: Any) -> None:
-        """Removes what dead processes left; to be called in a turn that is ours alone."""
+        """Removes what dead processes left; call it in a turn that no other process shares."""
         # Files before nodes and tags: what others make meanwhile, without turns, is not among them.
         node_files = list((self._root / "nodes").glob("*"))
         service_files = list((self._root / "services").glob(f"{self._prefix}*.service"))
         folders = (self._shared, self._root)
         port_files = [path for folder in folders for path in folder.glob(f"{self._prefix}*")]
-        living: set[int] = set()
-        dead: list[Any] = []
-        for node in _iox2.Node.list(_iox2.ServiceType.Ipc, config):
-            if isinstance(node, _iox2.NodeState.Dead):
-                dead.append(node._0)
-            elif isinstance(node, _iox2.NodeState.Alive):
-                living.add(int(node._0.id.value))
-            elif isinstance(node, _iox2.NodeState.Inaccessible):
-                living.add(int(node._0.value))
+        living, dead = _nodes(config)
         ports, services = self._used(living)
         for path in self.unfinished():
             ids = self._ids(path)
@@ -59,10 +50,10 @@ class Places:
                 _remove(path)
         for node in dead:
             identity = int(node.id.value)
-            # Unfinished tags were for nothing yet, but iceoryx2 could not remove the folder.
+            # iceoryx2 cannot remove a folder with unfinished tags, which mean nothing yet.
             for path in filter(_is_writable, self._folder(identity).glob("*")):
                 _remove(path)
-            # Else nothing of it is in memory that others use; the details go last.
+            # Else none of its memory is used by others; the details go last.
             if node.details is not None and services & self._tags(identity, ".service_tag"):
                 try:
                     node.try_remove_stale_resources()
@@ -117,6 +108,20 @@ class Places:
         words = path.name.removeprefix(self._prefix).partition(".")[0].split("_")
         # The segments of one port are numbered; a hash has letters, or more digits than an id.
         return {int(word) for word in words if word.isdecimal() and 10 < len(word) < 40}
+
+
+def _nodes(config: Any) -> tuple[set[int], list[Any]]:
+    """The ids of living nodes, and the dead ones."""
+    living: set[int] = set()
+    dead: list[Any] = []
+    for node in _iox2.Node.list(_iox2.ServiceType.Ipc, config):
+        if isinstance(node, _iox2.NodeState.Dead):
+            dead.append(node._0)
+        elif isinstance(node, _iox2.NodeState.Alive):
+            living.add(int(node._0.id.value))
+        elif isinstance(node, _iox2.NodeState.Inaccessible):
+            living.add(int(node._0.value))
+    return living, dead
 
 
 def _is_in_the_making(identity: int) -> bool:

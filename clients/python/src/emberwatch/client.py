@@ -1,4 +1,4 @@
-"""A connection to a server: worlds to act on, to look at, to keep.
+"""A connection to a server: worlds to act on, to observe, to store.
 
 `connect` gives a `Client`, its `acquire` a `Lease`, and that one's `step` a `StepAnswer`.
 Every call has a timeout in seconds; everything returned is a copy.
@@ -40,9 +40,6 @@ _RETRY: Final = 0.2
 
 class Client(ServerConnection):
     """A connection to one server. Make it with `connect`; close it, or use it in a `with`."""
-
-    def __init__(self, instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> None:
-        super().__init__(instance, timeout)
 
     def acquire(
         self,
@@ -120,12 +117,9 @@ class Client(ServerConnection):
         Returns:
             The worlds in the file, as they were.
         """
-        request = {
-            "op": "snapshot",
-            "first_world": first_world,
-            "n_worlds": self.info.n_worlds - first_world if n_worlds is None else n_worlds,
-            "path": os.path.abspath(path),
-        }
+        n_worlds = self.info.n_worlds - first_world if n_worlds is None else n_worlds
+        place = {"first_world": first_world, "n_worlds": n_worlds}
+        request = {"op": "snapshot", **place, "path": os.path.abspath(path)}
         return records(WorldInfo, self.control(request, timeout=timeout))
 
     def belief(self, world: int = 0, *, timeout: float = STEP_TIMEOUT) -> LeftBelief | None:
@@ -180,15 +174,15 @@ def connect(
 
     Raises:
         NoServerError: If nobody serves the instance by then.
-        VersionMismatchError: If the server speaks another protocol version.
-        RequestTimeoutError: If it does not answer.
-        ChannelError: If the channels cannot be opened, also when there are too many clients.
+        RequestTimeoutError: If the server does not answer.
+        EmberwatchError: With code `"version_mismatch"` if it speaks another protocol version, or
+            `"channel"`, also when there are too many clients.
     """
     return when_served(wait, lambda: Client(instance, timeout=timeout))
 
 
 def when_served(wait: float, connect: Callable[[], _Connection]) -> _Connection:
-    """Connects as soon as somebody answers, within `wait` seconds; logs that it waits."""
+    """Connects as soon as somebody answers, within `wait` seconds; logs once that it waits."""
     deadline, waits = time.monotonic() + wait, False
     while True:
         try:

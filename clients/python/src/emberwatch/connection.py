@@ -88,7 +88,7 @@ class Connection(Closing):
 class ServerConnection(Connection):
     """A connection to a server, which also steps worlds."""
 
-    def __init__(self, instance: str, timeout: float) -> None:
+    def __init__(self, instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> None:
         super().__init__(instance, "control", "wake-server", "server")
         with self._closed_on_error():
             self.info: Final = self._shake_hands(ServerInfo, timeout)

@@ -31,7 +31,7 @@ class Lease:
         self.client: Final = client
         #: The server's number for it.
         self.number: Final = grant.lease
-        #: It ends so many seconds after its last use.
+        #: It ends this many seconds after its last use.
         self.ttl: Final = grant.ttl_millis / 1000
         #: The worlds it covers.
         self.worlds: Final = worlds
@@ -120,7 +120,7 @@ class Lease:
         first: int = 0,
         timeout: float = RESET_TIMEOUT,
     ) -> tuple[WorldInfo, ...]:
-        """Puts the worlds of a snapshot file in the place of its own: they go on bit for bit.
+        """Replaces its worlds with those of a snapshot file, which go on as they would have.
 
         Args:
             path: The file, written by `Client.snapshot` or `emberwatch-server snapshot`.

@@ -47,8 +47,8 @@ class Model:
     observation_colors: tuple[Color, ...]
     """By observed value."""
     kernel: NDArray[np.float64]
-    """``w[next state, state of the neighbour, row, col]``, shape (S, S, KH, KW); eq. 2 looks
-    ``(row - KH // 2, col - KW // 2)`` away."""
+    """``w[next state, state of the neighbour, row, col]``, shape (S, S, KH, KW); the centre is the
+    cell itself, rows grow downward."""
     bias: NDArray[np.float64]
     """``b``, added to each next state's weight, shape (S,)."""
     observation_matrix: NDArray[np.float64]

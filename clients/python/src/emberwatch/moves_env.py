@@ -56,19 +56,15 @@ class WildfireMovesEnv(WorldEnv):
     comparable. The environment needs the `truth` channel for it: a private server publishes it,
     a running one must.
 
-    ## Starting State
-
-    As `WildfireEnv`.
-
     ## Episode End
 
     Never `terminated`. `truncated` after `max_episode_steps` moves (64,000, thus 1,000 paths of
     the default length, unless `gymnasium.make` is told otherwise), or after the running server's
     own `--max-steps`.
 
-    ## Information
+    ## Starting State, Information
 
-    As `WildfireEnv`, about the last complete path.
+    As `WildfireEnv`; the information is about the last complete path.
 
     ## Arguments
 

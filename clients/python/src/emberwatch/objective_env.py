@@ -56,19 +56,11 @@ class WildfireObjectiveEnv(WorldEnv):
     in place of the paper's h_k. It is as long for every grid; PROTOCOL.md section 13 says what
     each number is, and `summary_names` names them.
 
-    ## Rewards
-
-    As `WildfireEnv`.
-
     ## Starting State
 
     As `WildfireEnv`, with the belief that the world's burn-in leaves one with (`prior`).
 
-    ## Episode End
-
-    As `WildfireEnv`.
-
-    ## Information
+    ## Rewards, Episode End, Information
 
     As `WildfireEnv`.
 

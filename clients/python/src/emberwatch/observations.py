@@ -19,7 +19,7 @@ Part: TypeAlias = Literal["frame", "robot", "age"]
 #: One part makes a plain observation, several make a flat dictionary.
 Parts: TypeAlias = Part | Sequence[Part]
 
-#: Age of a cell that was not seen for so many steps, or never.
+#: Age of a cell that was not seen for this many steps or more.
 MAX_AGE: Final = 255
 
 

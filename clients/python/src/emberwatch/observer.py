@@ -113,9 +113,7 @@ class _Reader(Closing, Generic[_Sample]):
         self._busy_at = time.perf_counter()
         self._node = Node(instance)
         try:
-            factory = self._node.open_publications(
-                service, header, readers, buffer, publishers=publishers
-            )
+            factory = self._node.open_publications(service, header, readers, buffer, publishers)
             with in_turn(), guard(f"read {service} (are there more than {readers} readers?)"):
                 port = factory.subscriber_builder().buffer_size(buffer).create()
                 self._subscriber: Any = self._node.keep(port)
@@ -137,7 +135,7 @@ class _Reader(Closing, Generic[_Sample]):
         self._node.close()
 
     def receive(self, timeout: float) -> _Sample | None:
-        """The next sample; `None` if none comes within so many seconds."""
+        """The next sample; `None` if none comes within `timeout` seconds."""
         return self._receive(timeout, None)
 
     def _receive(self, timeout: float, world: int | None) -> _Sample | None:
@@ -201,7 +199,7 @@ class Observer(_Reader[Frame]):
         self._timeout = timeout
 
     def receive(self, timeout: float) -> Frame | None:
-        """The next frame; `None` if none comes within so many seconds."""
+        """The next frame; `None` if none comes within `timeout` seconds."""
         return self._receive(timeout, self._world)
 
     def __iter__(self) -> Iterator[Frame]:
@@ -224,7 +222,7 @@ class TruthReader(_Reader[Truth]):
 
 
 class OutlookReader(_Reader[Outlook]):
-    """Reads what agents believe, which they publish now and then while somebody reads."""
+    """Reads what agents believe, which they publish while there is a reader."""
 
     def __init__(self, instance: str = "default") -> None:
         limits = {"readers": wire.MAX_AGENT_READERS, "buffer": wire.AGENT_BUFFER}

@@ -229,7 +229,7 @@ _ARRAYS: dict[int, Any] = {}
 
 
 def _array(length: int) -> Any:
-    """The ctypes array of so many bytes; making the type each time would cost 5 us a message."""
+    """The ctypes array type of this length; making the type each time would cost 5 us a message."""
     if length not in _ARRAYS:
         if len(_ARRAYS) > 256:
             _ARRAYS.clear()

@@ -131,7 +131,7 @@ class Program:
     def wait_for(
         self, connect: Callable[[], _Connection], timeout: float | None = None
     ) -> _Connection:
-        """Connects to it, again and again until it answers, for 20 s unless told otherwise."""
+        """Tries to connect until it answers, for 20 s unless `timeout` says otherwise."""
         timeout = _START_TIMEOUT if timeout is None else timeout
         deadline, pause = time.monotonic() + timeout, 0.002
         while True:

@@ -10,6 +10,7 @@ import warnings
 import weakref
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -29,7 +30,7 @@ from emberwatch.lease import Lease
 from emberwatch.model import Model
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program, unused_instance
-from emberwatch.settings import Settings, WorldSpec, private_spec, running_spec
+from emberwatch.settings import Settings, private_spec, running_spec
 from emberwatch.truth import HiddenStates
 from emberwatch.wire import StepAnswer
 
@@ -217,7 +218,8 @@ class Session:
         if spec != self.spec:
             raise InvalidArgumentError(
                 f"instance {client.instance!r}: expected the server as it was when the environment "
-                f"was made, {_said(self.spec)}, got {_said(spec)}: make the environment again"
+                f"was made, {replace(self.spec, model=None)}, got {replace(spec, model=None)} or "
+                "another model: make the environment again"
             )
 
 
@@ -267,12 +269,4 @@ def timed_out_before() -> EmberwatchError:
         "an earlier step timed out, and the world may have moved: reset, or go on from "
         "where it stands with reset(options={'resume': True})",
         "closed",
-    )
-
-
-def _said(spec: WorldSpec) -> str:
-    name = "hidden" if spec.model is None else repr(spec.model.name)
-    return (
-        f"height={spec.height}, width={spec.width}, n_moves={spec.n_moves}, "
-        f"burn_in={spec.burn_in}, model {name}"
     )

@@ -39,9 +39,9 @@ _locks: Final[set[int]] = set()
 
 @contextmanager
 def turn(directory: Path) -> Generator[bool]:
-    """A turn, which may be within another of the same thread; yields whether nobody else has it.
+    """Takes a turn; turns of one thread may nest. Yields whether no other process has it.
 
-    A stopped process that has it is not waited for.
+    It does not wait for a stopped process.
     """
     if _held.alone is not None:
         yield _held.alone
@@ -111,7 +111,7 @@ def _holder(lock: int) -> int | None:
     """The process that has the lock, as the kernel says."""
     found = os.fstat(lock)
     inode = f"{os.major(found.st_dev):02x}:{os.minor(found.st_dev):02x}:{found.st_ino}"
-    # "1: FLOCK  ADVISORY  WRITE 4711 00:1a:5678 0 EOF"; who waits has an arrow in front.
+    # "1: FLOCK  ADVISORY  WRITE 4711 00:1a:5678 0 EOF"; a process that waits has an arrow in front.
     for line in Path("/proc/locks").read_text().splitlines():
         words = line.split()
         if words[1] == "FLOCK" and words[3] == "WRITE" and words[5] == inode:

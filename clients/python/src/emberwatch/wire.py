@@ -42,7 +42,12 @@ TRUTH_BUFFER: Final = 128
 AGENT_BUFFER: Final = 4
 MAX_NODES: Final = 64
 
-_U16, _U32, _U64, _F64 = ctypes.c_uint16, ctypes.c_uint32, ctypes.c_uint64, ctypes.c_double
+_STEP_REQUEST: Final = "IIQQIIIIQQQ"
+_CONTROL_REQUEST: Final = "IIQQQ"
+
+#: The two request headers as bytes, field by field.
+STEP_REQUEST: Final = struct.Struct("=" + _STEP_REQUEST)
+CONTROL_REQUEST: Final = struct.Struct("=" + _CONTROL_REQUEST)
 
 
 class Header(ctypes.Structure):
@@ -54,72 +59,54 @@ class Header(ctypes.Structure):
         return f"emberwatch.v1.{cls.__name__}"
 
 
+def _fields(format: str, names: str) -> list[tuple[str, Any]]:
+    """Fields by `struct`'s letters."""
+    kinds = {"I": ctypes.c_uint32, "Q": ctypes.c_uint64}
+    return [(name, kinds[letter]) for name, letter in zip(names.split(), format, strict=True)]
+
+
 class StepRequest(Header):
     """In front of the paths: `n_worlds * n_moves` bytes."""
 
-    _fields_ = [
-        ("version", _U32),
-        ("operation", _U32),
-        ("lease", _U64),
-        ("sequence", _U64),
-        ("first_world", _U32),
-        ("n_worlds", _U32),
-        ("n_moves", _U32),
-        ("flags", _U32),
-        ("listener_low", _U64),
-        ("listener_high", _U64),
-        ("step", _U64),
-    ]
+    _fields_ = _fields(
+        _STEP_REQUEST,
+        "version operation lease sequence first_world n_worlds n_moves flags listener_low "
+        "listener_high step",
+    )
 
 
 class StepReply(Header):
     """In front of `n_worlds` results and as many frames."""
 
     _fields_ = [
-        ("version", _U32),
-        ("status", _U32),
-        ("sequence", _U64),
-        ("first_world", _U32),
-        ("n_worlds", _U32),
-        ("height", _U32),
-        ("width", _U32),
-        ("simulation_nanos", _U64),
-        ("detail", _U64),
-        ("reserved", _U64 * 2),
+        *_fields(
+            "IIQIIIIQQ",
+            "version status sequence first_world n_worlds height width simulation_nanos detail",
+        ),
+        ("reserved", ctypes.c_uint64 * 2),
     ]
 
 
 class ControlRequest(Header):
     """In front of one JSON object."""
 
-    _fields_ = [
-        ("version", _U32),
-        ("reserved", _U32),
-        ("sequence", _U64),
-        ("listener_low", _U64),
-        ("listener_high", _U64),
-    ]
+    _fields_ = _fields(_CONTROL_REQUEST, "version reserved sequence listener_low listener_high")
 
 
 class ControlReply(Header):
     """In front of one JSON object."""
 
-    _fields_ = [("version", _U32), ("status", _U32), ("sequence", _U64)]
+    _fields_ = _fields("IIQ", "version status sequence")
 
 
 class FrameHeader(Header):
     """In front of a published frame and its path."""
 
     _fields_ = [
-        ("version", _U32),
-        ("world", _U32),
-        ("sequence", _U64),
-        ("height", _U32),
-        ("width", _U32),
-        ("n_moves", _U32),
-        ("start_row", _U32),
-        ("start_col", _U32),
-        ("reserved", _U32),
+        *_fields(
+            "IIQIIIIII",
+            "version world sequence height width n_moves start_row start_col reserved",
+        ),
         ("result", ctypes.c_ubyte * 64),
     ]
 
@@ -127,38 +114,15 @@ class FrameHeader(Header):
 class TruthHeader(Header):
     """In front of published hidden states."""
 
-    _fields_ = [
-        ("version", _U32),
-        ("world", _U32),
-        ("sequence", _U64),
-        ("episode", _U64),
-        ("step", _U64),
-        ("seed", _U64),
-        ("height", _U32),
-        ("width", _U32),
-    ]
+    _fields_ = _fields("IIQQQQII", "version world sequence episode step seed height width")
 
 
 class AgentHeader(Header):
     """In front of an agent's belief and what it wants."""
 
-    _fields_ = [
-        ("version", _U32),
-        ("world", _U32),
-        ("sequence", _U64),
-        ("episode", _U64),
-        ("step", _U64),
-        ("seed", _U64),
-        ("height", _U32),
-        ("width", _U32),
-        ("n_states", _U32),
-        ("pid", _U32),
-    ]
-
-
-#: The two request headers as bytes, field by field.
-STEP_REQUEST: Final = struct.Struct("=IIQQIIIIQQQ")
-CONTROL_REQUEST: Final = struct.Struct("=IIQQQ")
+    _fields_ = _fields(
+        "IIQQQQIIII", "version world sequence episode step seed height width n_states pid"
+    )
 
 
 class StepResult(NamedTuple):
@@ -194,14 +158,7 @@ RESULT: Final = struct.Struct("=QQQdIIIIIIHH4x")
 
 #: The same for many at once.
 RESULT_DTYPE: Final = np.dtype(
-    [
-        *zip(
-            StepResult._fields,
-            ["u8", "u8", "u8", "f8", "u4", "u4", "u4", "u4", "u4", "u4", "u2", "u2"],
-            strict=True,
-        ),
-        ("reserved", "u4"),
-    ]
+    [*zip(StepResult._fields, "QQQdIIIIIIHH", strict=True), ("reserved", "I")]
 )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import tempfile
 from pathlib import Path
-from typing import Any, Final, Literal, SupportsFloat, cast
+from typing import Any, Final, Literal, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -61,8 +61,10 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
     - An array of shape (S, H, W), each cell's sum one.
     - ``None``: ``"simulated"`` if the environment has a burn-in, else ``"initial"``.
 
-    ## Version history
-    - v1: first version.
+    ## Arguments
+    `env` observes the frame, a `Box` of shape (H, W, 1) and type uint8, or a `Dict` with
+    ``"frame"``. `model`, a `Model`, its name or the path of its file, is for servers that do not
+    reveal theirs; else it is ``env.unwrapped.model``.
     """
 
     def __init__(
@@ -74,24 +76,13 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
         prior: PriorKind | NDArray[np.floating] | None = None,
         model: Model | str | Path | None = None,
     ) -> None:
-        """Wraps an environment.
-
-        Args:
-            env: Observes the frame, a `Box` of shape (H, W, 1) and type uint8, or a `Dict` with
-                ``"frame"``. ``env.unwrapped`` has ``model``, a `Model` or None, and ``burn_in``.
-            keep: Whether the original observations stay beside the belief.
-            dtype: Type and layout of the belief.
-            prior: The belief about ``X_0``.
-            model: The world's model, its name, or the path of its file, for servers that do not
-                reveal it.
-        """
         RecordConstructorArgs.__init__(self, keep=keep, dtype=dtype, prior=prior, model=model)
         gymnasium.Wrapper.__init__(self, env)  # pyright: ignore[reportUnknownMemberType]
         if dtype not in ("float32", "uint8"):
             raise InvalidArgumentError(f"dtype: expected 'float32' or 'uint8', got {dtype!r}")
         self._keep, self._dtype = keep, dtype
         self._model = _model_of(env, model)
-        original = _spaces_of(env.observation_space)
+        original = _parts_of(env.observation_space, spaces.Dict)
         height, width = _grid_of(original)
         self._prior = _prior_of(env, prior, self._model, height=height, width=width)
         Filter(self._model, prior=self._prior)  # refuses what does not fit, now
@@ -189,18 +180,9 @@ def _model_of(env: gymnasium.Env[Any, Any], model: Model | str | Path | None) ->
     return revealed
 
 
-def _spaces_of(space: spaces.Space[Any]) -> dict[str, spaces.Space[Any]]:
-    """The observation's parts: those of a `Dict`, or a lone frame."""
-    if isinstance(space, spaces.Dict):
-        parts = cast("spaces.Dict", space).spaces  # pyright: ignore[reportUnknownMemberType]
-        return dict(parts)
-    return {"frame": space}
-
-
-def _parts_of(observation: Any) -> dict[str, Any]:
-    if isinstance(observation, dict):
-        return cast("dict[str, Any]", observation)
-    return {"frame": observation}
+def _parts_of(whole: Any, kind: type[Any] = dict) -> dict[str, Any]:
+    """The parts of an observation, or of its space: those of a dictionary, or a lone frame."""
+    return dict(whole) if isinstance(whole, kind) else {"frame": whole}
 
 
 def _grid_of(parts: dict[str, spaces.Space[Any]]) -> tuple[int, int]:

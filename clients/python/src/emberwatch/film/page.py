@@ -29,7 +29,7 @@ _SHADES = 24  # of a probability: more make larger files and are hardly told apa
 # ColorBrewer's YlGnBu (Apache-2.0): its lightness falls evenly.
 _RAMP = "ffffd9 edf8b1 c7e9b4 7fcdbb 41b6c4 1d91c0 225ea8 253494 081d58".split()
 
-_FINE = 4  # texts are written so many times larger
+_FINE = 4  # texts are drawn this many times larger, then reduced
 _TEXT = cast("ImageFont.FreeTypeFont", ImageFont.load_default(13 * _FINE))
 _TITLE = cast("ImageFont.FreeTypeFont", ImageFont.load_default(16 * _FINE))
 
@@ -193,7 +193,7 @@ def _fit(text: str, room: float) -> str:
 
 
 def _film_palette(palette: Palette) -> Image.Image:
-    """Whatever cells, marks and letters can look like, of as few colours as a GIF can have."""
+    """All colours of cells, marks and letters, few enough for a GIF."""
     cells = np.array([*palette.observations, palette.unobserved])
     inks = np.linspace(LIGHT, [_INK, _WARNING], 8).reshape(-1, 3)
     marks = np.array([DARK, LIGHT, _EDGE, *palette.states, *_ramp(_SHADES)])

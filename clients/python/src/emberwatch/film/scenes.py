@@ -13,13 +13,13 @@ from emberwatch.errors import EmberwatchError
 from emberwatch.film.steps import Step
 from emberwatch.view import fly
 
-# Behind a longer gap the belief begins again: a fire forgets itself within about 5,500 steps.
+# After a longer gap the belief begins again: a fire depends on the last 5,500 steps or so.
 _MOST_LOST = 10_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """Which steps k to show: every so many of them, from the first to the last."""
+    """Which steps k to show: every n-th from the first to the last."""
 
     first: int
     last: float
