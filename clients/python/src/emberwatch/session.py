@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import warnings
 import weakref
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -41,6 +40,9 @@ _PRIVATE_LEASE: Final = 86400.0
 
 #: How long a private server may take to answer that it ends, seconds.
 _SHUTDOWN_TIMEOUT: Final = 0.5
+
+#: After these the worlds are no longer held, or stand elsewhere than expected.
+_LOST: Final = (LeaseLostError, RequestTimeoutError, ServerGoneError)
 
 
 class Session:
@@ -89,8 +91,11 @@ class Session:
                 "options: expected a reset before resume=True, got the first one"
             )
         self._open(0)
-        with self._closed_when_lost():
+        try:
             return self._observe()
+        except _LOST as error:
+            self._lose(error)
+            raise
 
     def reset(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
         """Begins new episodes in some of the worlds, counted from 0; returns how all stand.
@@ -112,8 +117,11 @@ class Session:
         if self._is_lost:
             raise timed_out_before()
         worlds = lease.worlds if indices is None else lease.worlds[indices.start : indices.stop]
-        with self._closed_when_lost():
+        try:
             return lease.step_moves(moves, worlds, full=False, timeout=self.settings.timeout)
+        except _LOST as error:
+            self._lose(error)
+            raise
 
     def truth(self, answer: StepAnswer) -> NDArray[np.uint8]:
         """The hidden states that belong to an answer, `(n_worlds, H, W)`; a copy."""
@@ -187,20 +195,18 @@ class Session:
     def _begin(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
         self._open((seeds[0] - indices[0]) % 2**64)
         lease = self._opened()
-        with self._closed_when_lost():
+        try:
             lease.reset(seeds, worlds=[lease.worlds[index] for index in indices])
             return self._observe()
+        except _LOST as error:
+            self._lose(error)
+            raise
 
-    @contextmanager
-    def _closed_when_lost(self) -> Generator[None]:
-        try:
-            yield
-        except RequestTimeoutError:
+    def _lose(self, error: EmberwatchError) -> None:
+        if isinstance(error, RequestTimeoutError):
             self._is_lost = True
-            raise
-        except (LeaseLostError, ServerGoneError):
+        else:
             self.close()
-            raise
 
     def _opened(self) -> Lease:
         if self._lease is None:
