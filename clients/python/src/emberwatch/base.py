@@ -49,7 +49,6 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
         return None if self.render_mode == "human" else self._draw()
 
     def close(self) -> None:
-        """Gives the world back; a private server stops. Again is fine."""
         self._session.close()
         self._view.close()
 

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from emberwatch import wire
-from emberwatch.cleanup import Places
+from emberwatch.cleanup import ChannelFiles
 from emberwatch.errors import EmberwatchError, InvalidArgumentError
-from emberwatch.turn import turn, unusable
+from emberwatch.turn import cannot_create, turn
 
 _INSTANCE: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -52,7 +52,7 @@ class Node:
         self._forked = False
         builder = iox2.NodeBuilder.new().signal_handling_mode(iox2.SignalHandlingMode.Disabled)
         config = _config()
-        with in_turn() as is_alone, guard("create a node"):
+        with in_turn() as is_alone, channel_errors("create a node"):
             _own_segments(_SHARED_MEMORY, _prefix())
             _remove_leftovers(is_alone)
             self.node: Any = builder.config(config).create(iox2.ServiceType.Ipc)
@@ -79,7 +79,7 @@ class Node:
         raise EmberwatchError(f"the connection to instance {self.instance!r} is closed", "closed")
 
     def close(self) -> None:
-        """Leaves the channels. Again is fine; in a forked child it does nothing."""
+        """Leaves the channels; in a forked child it does nothing. May be called again."""
         if not self._usable:
             return
         self._usable = False
@@ -120,24 +120,26 @@ class Node:
     def open_publications(
         self, service: str, header: type[wire.Header], readers: int, buffer: int, publishers: int
     ) -> Any:
-        """Opens or creates `frames`, `truth` or `agent`."""
         builder = self.node.service_builder(self._name(service)).publish_subscribe(_BYTES)
         builder = builder.user_header(header).max_publishers(publishers)
         builder = builder.max_subscribers(readers).max_nodes(wire.MAX_NODES).history_size(1)
         builder = builder.subscriber_max_buffer_size(buffer).subscriber_max_borrowed_samples(1)
-        with in_turn(), guard(f"open {service} on instance {self.instance!r}"):
+        with in_turn(), channel_errors(f"open {service} on instance {self.instance!r}"):
             return self.keep(builder.enable_safe_overflow(True).open_or_create())
 
     def open_wake(self, service: str) -> Any:
-        """Opens or creates an event service."""
         builder = self.node.service_builder(self._name(service)).event()
         builder = builder.max_listeners(wire.MAX_NODES).max_notifiers(wire.MAX_NODES)
-        with in_turn(), guard(f"open {service} on instance {self.instance!r}"):
+        with in_turn(), channel_errors(f"open {service} on instance {self.instance!r}"):
             return self.keep(builder.max_nodes(wire.MAX_NODES).open_or_create())
 
     def clean_up(self) -> None:
-        """Removes what dead processes left behind, if others let us."""
-        with contextlib.suppress(EmberwatchError), in_turn() as is_alone, guard("clean up"):
+        """Removes what dead processes left behind, unless another process has the turn."""
+        with (
+            contextlib.suppress(EmberwatchError),
+            in_turn() as is_alone,
+            channel_errors("clean up"),
+        ):
             if is_alone:
                 _remove_leftovers(is_alone)
 
@@ -151,11 +153,11 @@ class Node:
         return iox2.ServiceName.new(f"emberwatch/v{wire.VERSION}/{self.instance}/{service}")
 
 
-class Closing:
+class Closable:
     """What `with` closes."""
 
     def close(self) -> None:
-        """Closes it. Again is fine."""
+        """Closes it; may be called again."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:
@@ -166,7 +168,7 @@ class Closing:
 
 
 @contextlib.contextmanager
-def guard(what: str) -> Generator[None]:
+def channel_errors(what: str) -> Generator[None]:
     """Turns iceoryx2's errors into one that says what was attempted."""
     try:
         yield
@@ -182,12 +184,12 @@ def directory() -> Path:
 
 
 def in_turn() -> contextlib.AbstractContextManager[bool]:
-    """A turn of making and removing; yields whether nobody else has it."""
+    """A turn of making and removing; yields whether no other process has it."""
     return turn(_own_directory(directory()))
 
 
 def _remove_leftovers(is_alone: bool) -> None:
-    places = Places(directory(), _SHARED_MEMORY, _prefix())
+    places = ChannelFiles(directory(), _SHARED_MEMORY, _prefix())
     if is_alone:
         places.remove_leftovers(_config())
         return
@@ -232,7 +234,7 @@ def _own_directory(path: Path) -> Path:
     except FileExistsError:
         pass
     except OSError as error:
-        raise unusable(path, error) from None
+        raise cannot_create(path, error) from None
     found = path.lstat()
     if (
         not stat.S_ISDIR(found.st_mode)

@@ -19,11 +19,11 @@ from emberwatch.turn import process_state
 
 _iox2: Final[Any] = importlib.import_module("iceoryx2")
 
-#: What is younger, seconds, and of a living process may be in the making: not all take turns.
+#: What a living process made less than this ago may be unfinished, as not all take turns; seconds.
 _MAKING: Final = 1.0
 
 
-class Places:
+class ChannelFiles:
     """Where channels' files are, and what their names begin with."""
 
     def __init__(self, root: Path, shared: Path, prefix: str) -> None:
@@ -35,7 +35,7 @@ class Places:
 
     def remove_leftovers(self, config: Any) -> None:
         """Removes what dead processes left; call it in a turn that no other process shares."""
-        # Files before nodes and tags: what others make meanwhile, without turns, is not among them.
+        # Files before nodes and tags, to leave out what others make meanwhile without turns.
         node_files = list((self._root / "nodes").glob("*"))
         service_files = list((self._root / "services").glob(f"{self._prefix}*.service"))
         folders = (self._shared, self._root)

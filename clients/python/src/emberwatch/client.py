@@ -1,7 +1,7 @@
 """A connection to a server: worlds to act on, to observe, to store.
 
 `connect` gives a `Client`, its `acquire` a `Lease`, and that one's `step` a `StepAnswer`.
-Every call has a timeout in seconds; everything returned is a copy.
+Every call waits `timeout` seconds for its answer; everything returned is a copy.
 """
 
 from __future__ import annotations
@@ -56,11 +56,8 @@ class Client(ServerConnection):
         cell and the last frame. To start again, `lease.reset()`.
 
         Args:
-            first_world: The first world.
-            n_worlds: How many.
             takeover: Take them from whoever holds them.
             ttl: The lease ends this long after its last use, seconds; None: the server's default.
-            timeout: How long to wait for the answer, seconds.
 
         Raises:
             EmberwatchError: With code `"busy"` if somebody else holds one of them, or
@@ -110,9 +107,7 @@ class Client(ServerConnection):
 
         Args:
             path: The file; a relative path is one from this process's folder.
-            first_world: The first world.
             n_worlds: How many; None: all from the first.
-            timeout: How long to wait for the answer, seconds.
 
         Returns:
             The worlds in the file, as they were.
@@ -123,7 +118,7 @@ class Client(ServerConnection):
         return records(WorldInfo, self.control(request, timeout=timeout))
 
     def belief(self, world: int = 0, *, timeout: float = STEP_TIMEOUT) -> LeftBelief | None:
-        """What belief was left about a world as it stands; None if there is none."""
+        """The belief that was left about the present step of a world; None if there is none."""
         data, first = b"", None
         while True:
             request = {"op": "belief", "world": world, "offset": len(data)}
@@ -152,13 +147,12 @@ class Client(ServerConnection):
                 raise wire.bad_answer(problem)
 
     def status(self, *, timeout: float = STEP_TIMEOUT) -> ServerStatus:
-        """What is going on."""
         reply = self.control({"op": "status"}, timeout=timeout)
         worlds = records(WorldStatus, reply)
         return record(ServerStatus, {**reply, "worlds": worlds})
 
     def shutdown(self, *, timeout: float = STEP_TIMEOUT) -> None:
-        """Stops the server, for everybody."""
+        """Stops the server for all its clients."""
         self.control({"op": "shutdown"}, timeout=timeout)
 
 
@@ -168,8 +162,6 @@ def connect(
     """Connects to a running server, or with `wait` to one that is just starting.
 
     Args:
-        instance: The server's instance name.
-        timeout: How long to wait for the server's answer, seconds.
         wait: How long to wait until there is a server, seconds; 0: fail at once.
 
     Raises:
@@ -178,10 +170,10 @@ def connect(
         EmberwatchError: With code `"version_mismatch"` if it speaks another protocol version, or
             `"channel"`, also when there are too many clients.
     """
-    return when_served(wait, lambda: Client(instance, timeout=timeout))
+    return connect_with_retry(wait, lambda: Client(instance, timeout=timeout))
 
 
-def when_served(wait: float, connect: Callable[[], _Connection]) -> _Connection:
+def connect_with_retry(wait: float, connect: Callable[[], _Connection]) -> _Connection:
     """Connects as soon as somebody answers, within `wait` seconds; logs once that it waits."""
     deadline, waits = time.monotonic() + wait, False
     while True:

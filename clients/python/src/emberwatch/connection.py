@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any, Final, TypeVar, cast
 
 from emberwatch import wire
-from emberwatch.channels import Closing, Node
+from emberwatch.channels import Closable, Node
 from emberwatch.errors import refusal
 from emberwatch.ports import STEP_TIMEOUT, Peer, RequestPort
 from emberwatch.release import VERSION
@@ -19,7 +19,7 @@ from emberwatch.wire import StepAnswer
 _Record = TypeVar("_Record")
 
 
-class Connection(Closing):
+class Connection(Closable):
     """A channel of JSON messages. Threads may share it: they take turns."""
 
     def __init__(self, instance: str, service: str, wake: str, who: str) -> None:
@@ -36,11 +36,10 @@ class Connection(Closing):
 
     @property
     def instance(self) -> str:
-        """The instance's name."""
         return self._node.instance
 
     def close(self) -> None:
-        """Closes the connection; its leases end. Again is fine."""
+        """Closes the connection; its leases end. May be called again."""
         for part in self._parts:
             part.close()
         self._node.close()

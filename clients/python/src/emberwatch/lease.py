@@ -54,7 +54,6 @@ class Lease:
                 one world.
             worlds: Only these, consecutive; None: all of the lease.
             full: Observe every cell; needs a server with coverage "client" or "full".
-            timeout: How long to wait for the answer, seconds.
 
         Raises:
             InvalidArgumentError: If the paths are not of that shape, type and range.
@@ -97,7 +96,6 @@ class Lease:
         Args:
             seeds: One per world; None: the server derives the next from the world's last.
             worlds: Only these worlds; None: all of the lease.
-            timeout: How long to wait for the burn-ins, seconds.
 
         Returns:
             Where the worlds stand, in the order asked.
@@ -126,7 +124,6 @@ class Lease:
             path: The file, written by `Client.snapshot` or `emberwatch-server snapshot`.
             worlds: Only these worlds, consecutive; None: all of the lease.
             first: The first of the file's worlds that is read.
-            timeout: How long to wait for the answer, seconds.
         """
         chosen = self.worlds if worlds is None else self._part(worlds)
         place = {"first_world": chosen.start, "n_worlds": len(chosen), "from": first}
@@ -148,14 +145,13 @@ class Lease:
         world: int | None = None,
         timeout: float = STEP_TIMEOUT,
     ) -> None:
-        """Leaves bytes about a world as it stands for its next client (`Client.belief`).
+        """Leaves bytes about the present step of a world to its next client (`Client.belief`).
 
         Args:
             result: The world's last result; another step is refused.
             kind: Says to other agents what the bytes are, in at most 256 bytes.
             data: At most 64 bytes per cell.
             world: Which world; None: the first of the lease.
-            timeout: How long to wait for each answer, seconds.
         """
         for offset in range(0, max(len(data), 1), _BELIEF_PART):
             self._ask(
@@ -175,7 +171,7 @@ class Lease:
         self._ask("renew", timeout)
 
     def release(self, *, timeout: float = STEP_TIMEOUT) -> None:
-        """Gives the worlds back. Again is fine."""
+        """Gives the worlds back. May be called again."""
         if not self._is_over:
             self._is_over = True
             self._ask("release", timeout)

@@ -90,12 +90,10 @@ class Model:
 
     @property
     def n_states(self) -> int:
-        """S."""
         return len(self.state_names)
 
     @property
     def n_observations(self) -> int:
-        """O."""
         return len(self.observation_names)
 
     @property
@@ -110,7 +108,6 @@ class Model:
         return hash(self.name)
 
     def _values(self) -> list[object]:
-        """All but the text."""
         values = [getattr(self, field.name) for field in fields(self) if field.name != "toml"]
         return [value.tolist() if isinstance(value, np.ndarray) else value for value in values]
 
@@ -135,9 +132,11 @@ def _fields(file: dict[str, Any]) -> dict[str, Any]:
     return {
         "name": file["name"],
         "state_names": names,
-        "state_colors": tuple(_color(state["color"]) for state in states),
+        "state_colors": tuple(color_from_hex(state["color"]) for state in states),
         "observation_names": tuple(observation["name"] for observation in observations),
-        "observation_colors": tuple(_color(observation["color"]) for observation in observations),
+        "observation_colors": tuple(
+            color_from_hex(observation["color"]) for observation in observations
+        ),
         "kernel": kernel,
         "bias": np.array([state.get("bias", 0.0) for state in states], np.float64),
         "observation_matrix": matrix / matrix.sum(axis=1, keepdims=True),
@@ -146,6 +145,7 @@ def _fields(file: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _color(text: str) -> Color:
+def color_from_hex(text: str) -> Color:
+    """A colour such as `#c8371b`."""
     red, green, blue = bytes.fromhex(text.removeprefix("#"))
     return red, green, blue

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from emberwatch.arguments import as_choice, as_seed
 from emberwatch.base import WorldEnv, reported, wants_to_resume
-from emberwatch.client import connect, when_served
+from emberwatch.client import connect, connect_with_retry
 from emberwatch.decisions import Decisions
 from emberwatch.errors import (
     InvalidArgumentError,
@@ -168,7 +168,7 @@ class WildfireObjectiveEnv(WorldEnv):
         return observation, decision.reward, decision.terminated, decision.truncated, info
 
     def close(self) -> None:
-        """Ends the agent and the private server, if they are its own. Again is fine."""
+        """Ends the agent and the private server, if they are its own. May be called again."""
         for part in (self._frames, self._truths, self._decisions):
             if part is not None:
                 part.close()
@@ -230,7 +230,7 @@ class WildfireObjectiveEnv(WorldEnv):
     def _start_agent(self, instance: str) -> Decisions:
         settings = self._session.settings
         if not self._owns_agent:
-            return when_served(settings.timeout, lambda: self._connect(instance))
+            return connect_with_retry(settings.timeout, lambda: self._connect(instance))
         flags = {"instance": instance, "world": settings.world, "wait": 0, **self._arguments}
         if settings.instance is not None and settings.model is not None:
             flags["model"] = str(settings.model)

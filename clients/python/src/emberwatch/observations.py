@@ -59,9 +59,7 @@ class Observations:
     def reset(self, indices: Sequence[int], frames: NDArray[np.uint8]) -> None:
         """Forgets the ages of worlds whose episode has begun, or been resumed with a frame.
 
-        Args:
-            indices: The worlds.
-            frames: The frames of all worlds, `(n_worlds, H, W)`.
+        `frames` are those of all worlds, `(n_worlds, H, W)`.
         """
         if self._ages is not None:
             chosen = list(indices)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch import wire
-from emberwatch.channels import Closing, Node, guard, in_turn
+from emberwatch.channels import Closable, Node, channel_errors, in_turn
 from emberwatch.errors import EmberwatchError, InvalidArgumentError
 from emberwatch.wire import StepResult
 
@@ -75,23 +75,18 @@ class Outlook:
     seed: int
     #: The belief after that step's frame, `(S, H, W)`, each in 0..=1.
     belief: NDArray[np.float32]
-    #: Names of its states.
     states: tuple[str, ...]
-    #: The agent's policy.
     policy: str
-    #: Where the belief comes from.
     belief_from: str
     #: What the last path was for.
     objective: str
-    #: Time that its plan took, milliseconds.
     plan_millis: float
-    #: The agent's process.
     pid: int
     #: Samples of this agent that this reader missed since the last one it got.
     n_lost: int
 
 
-class _Reader(Closing, Generic[_Sample]):
+class _Reader(Closable, Generic[_Sample]):
     """A subscriber of one channel."""
 
     def __init__(
@@ -114,7 +109,10 @@ class _Reader(Closing, Generic[_Sample]):
         self._node = Node(instance)
         try:
             factory = self._node.open_publications(service, header, readers, buffer, publishers)
-            with in_turn(), guard(f"read {service} (are there more than {readers} readers?)"):
+            with (
+                in_turn(),
+                channel_errors(f"read {service} (are there more than {readers} readers?)"),
+            ):
                 port = factory.subscriber_builder().buffer_size(buffer).create()
                 self._subscriber: Any = self._node.keep(port)
                 if publishers == 1:  # the server, which publishes the current state on this
@@ -126,11 +124,9 @@ class _Reader(Closing, Generic[_Sample]):
 
     @property
     def instance(self) -> str:
-        """The instance's name."""
         return self._node.instance
 
     def close(self) -> None:
-        """Stops reading. Again is fine."""
         self._subscriber = None
         self._node.close()
 
@@ -154,7 +150,7 @@ class _Reader(Closing, Generic[_Sample]):
         self._node.check()
         start = time.perf_counter()
         while True:
-            with guard("receive a sample"):
+            with channel_errors("receive a sample"):
                 sample = self._subscriber.receive()
             if sample is not None:
                 self._n_found += 1

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.model import MAX_VALUES, Color, Model
+from emberwatch.model import MAX_VALUES, Color, Model, color_from_hex
 from emberwatch.wire import UNOBSERVED
 
 DARK: Final[Color] = (0x14, 0x14, 0x14)
@@ -43,16 +43,16 @@ class Palette:
 
     @classmethod
     def of(cls, source: Model | int, *, on_paper: bool = False) -> Self:
-        """The model's colours, or eight others in turn for a hidden model.
+        """The model's colours, or of a number of observations eight colours in turn.
 
-        Args:
-            source: The model, or its number of observations, 1 to 64.
-            on_paper: Whether what was not observed is light if it can be, as the page around it.
+        `on_paper` makes what was not observed light if it can be, as the page around it.
         """
         if isinstance(source, Model):
             states, observations = source.state_colors, source.observation_colors
         else:
-            states = tuple(_color(i) for i in range(MAX_VALUES))  # however many there may be
+            states = tuple(
+                color_from_hex(_COLORS[i % len(_COLORS)]) for i in range(MAX_VALUES)
+            )  # however many there may be
             observations = states[:source]
         return cls(
             states=states,
@@ -93,11 +93,6 @@ def _paint(values: NDArray[np.uint8], colors: dict[int, Color]) -> NDArray[np.ui
         got = int(values[unknown][0])
         raise InvalidArgumentError(f"picture: expected values out of {sorted(colors)}, got {got}")
     return table[values]
-
-
-def _color(index: int) -> Color:
-    red, green, blue = bytes.fromhex(_COLORS[index % len(_COLORS)])
-    return red, green, blue
 
 
 def _grey_unlike(colors: tuple[Color, ...], greys: tuple[int, ...]) -> Color:

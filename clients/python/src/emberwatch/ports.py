@@ -14,7 +14,7 @@ import weakref
 from typing import Any, Final, Generic, TypeVar
 
 from emberwatch import wire
-from emberwatch.channels import Node, guard, in_turn, iox2
+from emberwatch.channels import Node, channel_errors, in_turn, iox2
 from emberwatch.errors import EmberwatchError, NoServerError, RequestTimeoutError, ServerGoneError
 from emberwatch.spinning import Spinning
 
@@ -43,7 +43,10 @@ class Peer:
         """`wake` is the event service that it listens on, `who` its name in errors."""
         self.node: Final = node
         self._who = who
-        with in_turn(), guard("open the wake services (are there more than 64 processes?)"):
+        with (
+            in_turn(),
+            channel_errors("open the wake services (are there more than 64 processes?)"),
+        ):
             notifier = node.open_wake(wake).notifier_builder().create()
             listener = node.open_wake("wake-client").listener_builder().create()
         self.notify: Any = node.keep(notifier).notify
@@ -67,7 +70,6 @@ class Peer:
         self._poll.register(self._process, select.POLLIN)
 
     def close(self) -> None:
-        """Stops watching and notifying."""
         if self._close_process is not None:
             self._close_process()
         self._process = self._close_process = None
@@ -83,7 +85,6 @@ class Peer:
         return ServerGoneError(f"the {self._who} on instance {self.node.instance!r} is gone")
 
     def wait(self, pending: Any, what: str, timeout: float) -> Any:
-        """The answer to a request."""
         receive, spinning = pending.receive, self._spinning
         start = now = time.perf_counter()
         spinning.begin(start)
@@ -141,14 +142,9 @@ class RequestPort(Generic[Reply]):
         slice_len: int,
         grows: bool,
     ) -> None:
-        """Opens a client port.
+        """Opens the service below the instance.
 
-        Args:
-            peer: The process that answers.
-            service: The service's name below the instance.
-            headers: Types of the headers of requests and replies.
-            slice_len: Longest payload of a request, bytes; with `grows`, to begin with.
-            grows: Whether longer ones get more memory.
+        `slice_len` is the longest payload of a request, bytes; with `grows`, to begin with.
         """
         self._peer = peer
         self._request, self._reply = headers
@@ -161,7 +157,7 @@ class RequestPort(Generic[Reply]):
             if factory is None or factory.dynamic_config.number_of_servers == 0:
                 raise no_server(node, service)
             builder = factory.client_builder().initial_max_slice_len(max(slice_len, 1))
-            with guard(f"create a {service} client (are there more than 16 clients?)"):
+            with channel_errors(f"create a {service} client (are there more than 16 clients?)"):
                 self._client: Any = node.keep(builder.allocation_strategy(growth).create())
 
     def close(self) -> None:

@@ -155,7 +155,6 @@ class Program:
 
     @property
     def pid(self) -> int:
-        """Its process id."""
         return self._process.pid
 
     def exit_code(self) -> int | None:
@@ -170,7 +169,7 @@ class Program:
         return _cleaned(self._output.read().decode(errors="replace"))
 
     def stop(self) -> None:
-        """Stops it and waits for its end. Again is fine; in a forked child it does nothing."""
+        """Stops it and waits for its end, if it still runs; does nothing in a forked child."""
         if os.getpid() != self._owner or self._output.closed:
             return
         _programs.discard(self)

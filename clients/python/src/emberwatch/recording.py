@@ -71,12 +71,8 @@ def read(
     for learners.
 
     Args:
-        path: The file.
         world: Only this world; None: all.
         strict: Raise an error where there would be a warning.
-
-    Yields:
-        Each record, as copies of your own.
 
     Raises:
         EmberwatchError: With code `"recording"` if the file is none, naming the byte.

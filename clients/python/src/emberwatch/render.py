@@ -89,7 +89,6 @@ def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8
     scale and whether there is a truth, on nothing else; it is even both ways, for video codecs.
 
     Args:
-        picture: What to draw.
         scale: Side of a cell in pixels, at least 1; the default makes panels about 512 long.
 
     Returns:
@@ -142,7 +141,7 @@ class Screen:
 
     A window needs pygame and a display (``DISPLAY``, ``WAYLAND_DISPLAY`` or ``SDL_VIDEODRIVER``);
     pygame has one per process. Without it, the standard output must be a terminal. Without either,
-    a warning is logged once and nothing is shown. Closing the window ends only the show.
+    a warning is logged once and nothing is shown. Closable the window ends only the show.
     """
 
     def __init__(self, *, title: str = "Emberwatch", fps: float = 0.0) -> None:
@@ -180,7 +179,7 @@ class Screen:
 
     def _show_in_window(self, image: NDArray[np.uint8]) -> None:
         pygame, (height, width, _) = self._pygame, image.shape
-        if self._window is None or self._pygame.display.get_surface() is not self._window:
+        if pygame.display.get_surface() is not self._window:
             self._window = None
         if self._window is None or self._window.get_size() != (width, height):
             self._window = pygame.display.set_mode((width, height))

@@ -76,7 +76,6 @@ class Session:
 
     @property
     def instance(self) -> str:
-        """The instance's name, once open."""
         return self._opened().client.instance
 
     @property
@@ -143,7 +142,7 @@ class Session:
         return self._program.wait_for(lambda: Client(instance, timeout=self.settings.timeout))
 
     def close(self) -> None:
-        """Gives the worlds back; a private server stops. Again is fine, and so is a new reset."""
+        """Gives the worlds back; a private server stops. A new reset opens it again."""
         lease, self._lease = self._lease, None
         client, self._client = self._client, None
         program, self._program = self._program, None

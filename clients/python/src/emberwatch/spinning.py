@@ -28,7 +28,6 @@ class Spinning:
         self._n_failed = 0
 
     def begin(self, now: float) -> None:
-        """A wait begins."""
         self._spins = now >= self._not_before
         self._end = now + SPIN
         self._last = now

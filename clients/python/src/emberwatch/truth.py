@@ -34,7 +34,6 @@ class HiddenStates:
 
         Args:
             moments: Seed, episode and step of each world.
-            timeout: How long to wait for them, seconds.
             first: The first of these worlds, counted from 0.
         """
         wanted, last = list(moments), first + len(moments)
@@ -57,7 +56,6 @@ class HiddenStates:
         return self._states[first:last].copy()
 
     def close(self) -> None:
-        """Stops reading. Again is fine."""
         self._reader.close()
 
     def _take(self, truth: Truth) -> None:

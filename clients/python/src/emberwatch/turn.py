@@ -18,7 +18,7 @@ from typing import Final
 
 from emberwatch.errors import EmberwatchError
 
-#: How long to wait for others, each of which takes milliseconds, seconds.
+#: How long to wait for the turns of others, which take milliseconds each; seconds.
 _LONGEST_WAIT: Final = 10.0
 
 #: How long to wait before asking whether the process that has the turn is stopped, seconds.
@@ -68,7 +68,7 @@ def process_state(pid: int) -> str | None:
         return None
 
 
-def unusable(path: Path, error: OSError) -> EmberwatchError:
+def cannot_create(path: Path, error: OSError) -> EmberwatchError:
     """The error of a file or folder that the system does not let be used."""
     remedy = (
         ": channels need a /dev/shm that can be written to; as root, "
@@ -104,7 +104,7 @@ def _wait(path: Path) -> int | None:
                 if lock not in _locks:
                     os.close(lock)
     except OSError as error:
-        raise unusable(path, error) from None
+        raise cannot_create(path, error) from None
 
 
 def _holder(lock: int) -> int | None:

@@ -151,7 +151,6 @@ class WildfireVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], N
         return tuple(self._draw(index) for index in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Gives the worlds back; a private server stops."""
         self._session.close()
         for view in self._views:
             view.close()

@@ -15,7 +15,7 @@ from emberwatch.settings import WorldSpec
 #: The render modes of every environment here.
 RENDER_MODES: Final = ("human", "rgb_array", "ansi")
 
-#: Pictures a second of a film, or of a window that is not driven faster.
+#: Pictures a second of a film, and at most in a window.
 RENDER_FPS: Final = 10
 
 #: Row and column that each move adds.
@@ -54,7 +54,6 @@ class View:
         return None
 
     def close(self) -> None:
-        """Closes the window, if there is one. Again is fine."""
         if self._screen is not None:
             self._screen.close()
             self._screen = None

@@ -175,7 +175,6 @@ class StepAnswer:
     __slots__ = ("_payload", "first_world", "frames", "simulation_nanos")
 
     def __init__(self, reply: StepReply, payload: bytearray, n_observations: int) -> None:
-        """Takes a payload apart."""
         n_worlds, height, width = reply.n_worlds, reply.height, reply.width
         if not n_worlds * height * width:
             raise bad_answer(
@@ -192,7 +191,6 @@ class StepAnswer:
         self.frames = frames.reshape(n_worlds, height, width)
 
     def __repr__(self) -> str:
-        """The first result, and the shape of the frames."""
         others = len(self.frames) - 1
         more = f", and {others} more" if others else ""
         return (
@@ -206,7 +204,6 @@ class StepAnswer:
         return np.frombuffer(self._payload, RESULT_DTYPE, count=len(self.frames))
 
     def result(self, index: int = 0) -> StepResult:
-        """The result of one world."""
         return StepResult(*RESULT.unpack_from(self._payload, index * RESULT.size))
 
 

@@ -100,7 +100,6 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins a new episode; observes the prior."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._step = int(info.get("step", 0))
         self._filter = Filter(self._model, prior=self._prior)
@@ -108,7 +107,6 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
         return self._observe(observation), info
 
     def step(self, action: ActType) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Steps the world; observes the posterior."""
         belief = self.filter
         observation, reward, terminated, truncated, info = self.env.step(action)
         before, self._step = self._step, int(info.get("step", self._step + 1))

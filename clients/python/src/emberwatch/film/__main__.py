@@ -167,7 +167,7 @@ def _model(path: str | None, server: ServerInfo) -> Model | None:
 
 
 def _begin(prior: str, model: Model, server: ServerInfo, k: int) -> Filter:
-    """The filter before the frame of a step that nothing is known before of."""
+    """The filter before the frame of step k, the first that is known."""
     grid = {"height": server.height, "width": server.width}
     if prior == "simulated":
         burn_in = min(server.burn_in + k, _MOST_SIMULATED)

@@ -86,11 +86,9 @@ class Page:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of every picture, pixels."""
         return self._base.size
 
     def draw(self, scene: Scene) -> Image.Image:
-        """The picture of a scene."""
         image, result = self._base.copy(), scene.step.frame.result
         middle, right = _MARGIN + 8, image.width - _MARGIN
         step = f"step k = {scene.k}"
@@ -171,7 +169,7 @@ def _write(
     font: ImageFont.FreeTypeFont = _TEXT,
     ink: Color = _INK,
 ) -> None:
-    """Writes large and shrinks that, which keeps letters' distances; `at`: left edge, middle."""
+    """Draws large and reduces, which keeps letters apart; `at`: left edge, middle."""
     mask = Image.new("L", (_FINE * (_length(text, font) + 2), 2 * int(font.size)))
     draw, bold = ImageDraw.Draw(mask), 1 if font is _TITLE else 0
     draw.text((0, mask.height / 2), text, 255, font, "lm", stroke_width=bold)

@@ -26,7 +26,6 @@ class Selection:
     every: int
 
     def shows(self, step: Step) -> bool:
-        """Whether a step is shown."""
         k = step.frame.result.step
         return self.first <= k <= self.last and (k - self.first) % self.every == 0
 
