@@ -49,7 +49,10 @@ def test_a_missing_model_file_is_named(tmp_path: Path) -> None:
         WildfireEnv(model=tmp_path / "none.toml", **SMALL).reset(seed=1)
 
 
-def test_a_bad_model_file_is_named(tmp_path: Path) -> None:
+def test_a_bad_model_file_is_named_in_the_server_s_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RUST_LOG", "off")
     path = tmp_path / "bad.toml"
     path.write_text("name = 5\n")
     with pytest.raises(errors.InvalidArgumentError, match=r"bad\.toml: .*line 1, column 8"):

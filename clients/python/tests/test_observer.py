@@ -1,4 +1,4 @@
-"""Observers and truth readers: what is published, to whom, and what they miss."""
+"""Observers and truth readers: what is published, who gets it, and what they miss."""
 
 import subprocess
 from collections.abc import Callable

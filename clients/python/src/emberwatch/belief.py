@@ -92,8 +92,8 @@ class Transition:
     over ``m`` (eq. 3).
 
     It keeps work space: share none between threads. The belief lies in rows with a margin of
-    zeros, end to end, so that a neighbour is a shifted slice. Taps that weigh alike for all next
-    states are added up before they are multiplied, and those without weight are left out.
+    zeros, end to end, so that a neighbour is a shifted slice. Taps with the same
+    weights are added up before they are multiplied, and those without weight are left out.
     """
 
     def __init__(self, model: Model, *, height: int, width: int) -> None:
@@ -103,7 +103,7 @@ class Transition:
         self._length = (height - 1) * self._stride + width
         # A common factor, which eq. 3 cancels.
         largest = max(model.kernel.max(), model.bias.max()) or 1.0
-        self._groups = [_taps_that_weigh_alike(w / largest) for w in model.kernel.swapaxes(0, 1)]
+        self._groups = [_grouped_taps(w / largest) for w in model.kernel.swapaxes(0, 1)]
         self._bias = (model.bias / largest)[:, None]
         top, left = kernel_height // 2, kernel_width // 2
         self._planes = np.zeros((n_states, height + kernel_height - 1, self._stride))
@@ -158,7 +158,7 @@ def entropy(belief: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(0.0, 0.0 - (belief * logarithm).sum(axis=0))
 
 
-def _taps_that_weigh_alike(
+def _grouped_taps(
     kernel: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], list[list[tuple[int, int]]]]:
     """Weights (S, groups) of a kernel (S, KH, KW), and the taps (row, col) that share each."""

@@ -56,7 +56,7 @@ class Client(ServerConnection):
         cell and the last frame. To start again, `lease.reset()`.
 
         Args:
-            takeover: Take them from whoever holds them.
+            takeover: Take them from their holder.
             ttl: The lease ends this long after its last use, seconds; None: the server's default.
 
         Raises:

@@ -1,4 +1,4 @@
-"""An agent that serves decisions: it estimates and plans, its client says what for.
+"""An agent that serves decisions: it estimates and plans, its client chooses the objective.
 
 PROTOCOL.md section 13. `WildfireObjectiveEnv` makes an environment of it.
 """

@@ -100,7 +100,7 @@ class WildfireEnv(WorldEnv):
     def __init__(
         self, *, observation: Parts = ("frame", "robot"), **world: Unpack[WorldArguments]
     ) -> None:
-        """See the class. Nothing is started before the first reset."""
+        """See the class. No server of its own runs before the first reset."""
         settings = Settings.of(WildfireEnv, world)
         super().__init__(settings, reveals=settings.truth)
         self._observations = Observations(observation, self._spec)

@@ -83,7 +83,7 @@ class WildfireMovesEnv(WorldEnv):
         reward: Literal["path", "move"] = "path",
         **world: Unpack[WorldArguments],
     ) -> None:
-        """See the class. Nothing is started before the first reset."""
+        """See the class. No server of its own runs before the first reset."""
         if reward not in ("path", "move"):
             raise InvalidArgumentError(f"reward: expected 'path' or 'move', got {reward!r}")
         reveals = world.get("truth", False)
@@ -117,7 +117,6 @@ class WildfireMovesEnv(WorldEnv):
         """Flies one move; the T-th completes the path and moves the world.
 
         Raises:
-            InvalidArgumentError: If it is not an integer in 0 to 3. Nothing is done.
             EmberwatchError: As `WildfireEnv.step`.
         """
         moves = [*self._moves, as_choice(action, wire.N_MOVES)]
@@ -163,7 +162,7 @@ class WildfireMovesEnv(WorldEnv):
         row, col = self._robot
         if self.render_mode == "human":
             self._draw()
-        # Copies: the frame is handed out again with each move of a path.
+        # Copies: each move of a path returns the frame again.
         observation = self._observations.one(
             answer.frames[0].copy(),
             row,

@@ -53,8 +53,8 @@ class WildfireObjectiveEnv(WorldEnv):
     ## Observation Space
 
     `Box(0, 1, (18 (S + 1) + 2,), float32)`: a summary of the belief that the next plan will use,
-    in place of the paper's h_k. It is as long for every grid; PROTOCOL.md section 13 says what
-    each number is, and `summary_names` names them.
+    in place of the paper's h_k. Its length is the same for every grid; PROTOCOL.md section 13
+    explains the numbers, and `summary_names` names them.
 
     ## Starting State
 
@@ -86,7 +86,7 @@ class WildfireObjectiveEnv(WorldEnv):
         agent: Literal["own", "running"] = "own",
         **world: Unpack[WorldArguments],
     ) -> None:
-        """See the class. Nothing is started before the first reset."""
+        """See the class. No server of its own runs before the first reset."""
         for name, value, choices in (
             ("planner", planner, ("beam", "shooting")),
             ("prior", prior, ("simulated", "initial", "uniform")),
@@ -154,10 +154,7 @@ class WildfireObjectiveEnv(WorldEnv):
         """Plans and flies a path for an objective.
 
         Raises:
-            InvalidArgumentError: If it is not an integer in 0 to S. Nothing is sent.
-            LeaseLostError: If another client took the world over.
-            ServerGoneError: If agent or server have ended, with the agent's words.
-            RequestTimeoutError: If there is no answer; the world may have moved: reset or resume.
+            EmberwatchError: As `WildfireEnv.step`, in the agent's words if it has ended.
         """
         objective = as_choice(action, len(self._opened().info.objectives))
         if self._is_lost:
@@ -245,7 +242,7 @@ class WildfireObjectiveEnv(WorldEnv):
             decisions = self._connect(instance)
             if decisions.info.pid == agent.pid:
                 return decisions
-            # Another agent serves the world: ours will end with an error that says so.
+            # Another agent serves the world; the own one will end with an error about it.
             decisions.close()
             raise NoServerError(f"world {settings.world} has another agent")
 

@@ -65,7 +65,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Outlook:
-    """What an agent believes of a world and wants there, copied."""
+    """What an agent believes about a world and plans there, copied."""
 
     world: int
     #: Resets of the world since the server started.

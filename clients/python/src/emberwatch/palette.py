@@ -1,7 +1,6 @@
 """The colours of pictures: the model's own, and marks that stand out from them.
 
-Lightness tells marks from cells, so that they can be told apart in grey and under every colour
-blindness.
+Lightness distinguishes marks from cells, also in grey and under every colour blindness.
 """
 
 from __future__ import annotations
@@ -25,7 +24,9 @@ LIGHT: Final[Color] = (0xFF, 0xFF, 0xFF)
 # The wildfire model's three, then from Okabe and Ito (2008), with a brown for their orange.
 _COLORS = ("3B6EA5", "E3B23C", "C8371B", "009E73", "CC79A7", "56B4E9", "8C510A", "F0E442")
 _GREYS = (0x30, 0x60, 0x98, 0xE2)  # for what was not observed
-_APART = 3 * 60 * 60  # squared distance at which colours are told apart, as in the Rust figures
+_APART = (
+    3 * 60 * 60
+)  # squared distance at which colours can be distinguished, as in the Rust figures
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

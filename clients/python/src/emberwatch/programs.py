@@ -81,6 +81,7 @@ def _run(name: str, arguments: Sequence[str], timeout: float) -> subprocess.Comp
     try:
         return subprocess.run(
             command,
+            env=os.environ | {"RUST_LOG": "warn"},
             capture_output=True,
             text=True,
             errors="replace",

@@ -14,7 +14,7 @@ _Record = TypeVar("_Record")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerInfo:
-    """What a server says of itself (PROTOCOL.md section 6, `hello`)."""
+    """How a server describes itself (PROTOCOL.md section 6, `hello`)."""
 
     protocol: int
     build: str
@@ -106,7 +106,7 @@ class LeftBelief(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DecisionsInfo:
-    """What an agent that serves decisions says of itself."""
+    """How an agent that serves decisions describes itself."""
 
     protocol: int
     build: str

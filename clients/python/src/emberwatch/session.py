@@ -34,7 +34,7 @@ from emberwatch.truth import HiddenStates
 from emberwatch.wire import StepAnswer
 
 # Seconds after its last use that a lease ends: learners may think long, and a dead holder is
-# noticed at once anyway. Of a private server nobody else wants the worlds.
+# noticed at once anyway. No other client uses the worlds of a private server.
 _LEASE: Final = 3600.0
 _PRIVATE_LEASE: Final = 86400.0
 

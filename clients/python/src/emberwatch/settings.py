@@ -73,7 +73,7 @@ class Settings:
         """The settings from what is left of an environment's keywords.
 
         Raises:
-            TypeError: If a keyword is unknown: naming the one most alike, and all there are.
+            TypeError: If a keyword is unknown; names the most similar one, and all.
         """
         parameters = signature(environment.__init__).parameters.values()
         known = {each.name for each in parameters if each.kind is each.KEYWORD_ONLY}

@@ -1,4 +1,4 @@
-"""When a wait spins, from what came of it before (PROTOCOL.md section 8). It knows no clock."""
+"""Decides when a wait spins, from how earlier waits ended (PROTOCOL.md section 8). Pure."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class WildfireVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], N
         observation: Parts = ("frame", "robot"),
         **world: Unpack[WorldArguments],
     ) -> None:
-        """See the class. Nothing is started before the first reset."""
+        """See the class. No server of its own runs before the first reset."""
         self.closed = True  # until it is made: Gymnasium 1.2 closes what failed to be made, too
         if max_episode_steps == -1:  # no limit in Gymnasium's own `make`
             max_episode_steps = None
@@ -118,11 +118,8 @@ class WildfireVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], N
         """Flies one path in each world.
 
         Raises:
-            InvalidArgumentError: If it is not `(num_envs, T)` integers in 0 to 3. Nothing is sent.
             gymnasium.error.ResetNeeded: In mode `DISABLED`, if an episode is over.
-            LeaseLostError: If another client took a world over.
-            ServerGoneError: If the server has ended; the next reset starts or finds another.
-            RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
+            EmberwatchError: As `WildfireEnv.step`.
         """
         moves = as_moves(actions, self.num_envs, self._spec.n_moves)
         moves = moves.reshape(self.num_envs, -1)

@@ -49,8 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         begin = None if model is None else partial(_begin, flags.prior, model, server)
         page = Page(server, model, world=flags.world, scale=flags.scale, has_truth=has_truth)
         with warnings.catch_warnings(action="ignore"):  # in the survey already
-            told = steps(recording.read(flags.recording, world=flags.world))
-            _write(flags, page, n_scenes, scenes(told, selection, begin))
+            recorded = steps(recording.read(flags.recording, world=flags.world))
+            _write(flags, page, n_scenes, scenes(recorded, selection, begin))
     except (EmberwatchError, OSError) as error:
         parser.exit(1, f"{_NAME}: {error}\n")
 

@@ -25,7 +25,7 @@ _LEAST_ROOM = 150  # of a panel, for its title and legend
 _LONG_SIDE, _MOST_SCALE = 200, 20  # of a panel, and of a cell, unless a scale is given
 _MOST_SIDE, _MOST_AREA = 65_535, 1 << 26  # of a picture; the side is what a GIF can tell
 _INK, _WARNING, _EDGE = (0x33, 0x33, 0x33), (0xD5, 0x5E, 0x00), (0x66, 0x66, 0x66)
-_SHADES = 24  # of a probability: more make larger files and are hardly told apart
+_SHADES = 24  # of a probability: more make larger files and can hardly be distinguished
 # ColorBrewer's YlGnBu (Apache-2.0): its lightness falls evenly.
 _RAMP = "ffffd9 edf8b1 c7e9b4 7fcdbb 41b6c4 1d91c0 225ea8 253494 081d58".split()
 
