@@ -12,6 +12,7 @@ import stat
 import time
 import tomllib
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -80,11 +81,9 @@ class ChannelFiles:
             if path.stem.removeprefix(self._prefix) not in hashes:
                 _remove(path)
                 continue
-            try:
+            with suppress(OSError, ValueError, KeyError, TypeError):  # It is in the making.
                 identity = tomllib.loads(path.read_text())["unique_service_id"]
                 yield identity["unique_value"] << 64 | identity["payload_value"]
-            except (OSError, ValueError, KeyError, TypeError):  # It is in the making.
-                continue
 
     def _used(self, living: set[int]) -> tuple[set[int], set[str]]:
         """Ids of the ports, and hashes of the services' names, that living nodes use."""
@@ -133,23 +132,19 @@ def _is_in_the_making(identity: int) -> bool:
 
 def _is_writable(path: Path) -> bool:
     """A tag, or a node's details, can be written to until it is finished."""
-    try:
+    with suppress(FileNotFoundError):
         return bool(path.lstat().st_mode & stat.S_IWUSR)
-    except FileNotFoundError:
-        return False
+    return False
 
 
 def _is_unfinished(path: Path) -> bool:
     """A segment can be read only when it is finished."""
-    try:
+    with suppress(FileNotFoundError):
         found = path.lstat()
-    except FileNotFoundError:
-        return False
-    return found.st_size == 0 or not found.st_mode & stat.S_IRUSR
+        return found.st_size == 0 or not found.st_mode & stat.S_IRUSR
+    return False
 
 
 def _remove(path: Path) -> None:
-    try:
+    with suppress(OSError):  # What stays is removed by the next program.
         shutil.rmtree(path) if path.is_dir() else path.unlink()
-    except OSError:  # What stays is removed by the next program.
-        pass

@@ -14,12 +14,12 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from emberwatch.arguments import as_moves, as_seed
-from emberwatch.base import NOTHING_TO_DRAW, REPORTED, wants_to_resume
+from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, wants_to_resume
 from emberwatch.errors import InvalidArgumentError
 from emberwatch.observations import Observations, Parts
 from emberwatch.session import Session, SessionOwner
 from emberwatch.settings import Settings, WorldArguments, draw_seed
-from emberwatch.view import RENDER_FPS, RENDER_MODES, View, fly
+from emberwatch.view import View, fly
 from emberwatch.wire import RESULT_DTYPE, StepAnswer
 
 
@@ -63,11 +63,7 @@ class WildfireVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], N
         self._observations = Observations(observation, spec, num_envs)
         self._views = [View(settings.render_mode, spec) for _ in range(num_envs)]
         self._max_steps = max_episode_steps
-        self.metadata = {
-            "render_modes": list(RENDER_MODES),
-            "render_fps": RENDER_FPS,
-            "autoreset_mode": self._mode,
-        }
+        self.metadata = {**WorldEnv.metadata, "autoreset_mode": self._mode}
         self.num_envs = num_envs
         self.render_mode = settings.render_mode
         self.single_observation_space = self._observations.space
