@@ -400,7 +400,10 @@ fn snapshots_of_other_instances_alone_are_told_of() {
     let words = format!("this instance, {name}-<12 digits>.snapshot, got others, such as other-0");
     second.program.wait_for_words(&words, PATIENCE);
     let log = second.program.stderr();
-    assert!(log.contains("WARN") && log.contains("begin anew"), "{log}");
+    assert!(
+        log.contains("WARN") && log.contains("new worlds start"),
+        "{log}"
+    );
 }
 
 #[test]

@@ -14,7 +14,7 @@ use std::path::Path;
 use thiserror::Error;
 
 /// Most worlds of one server.
-pub const MAX_WORLDS: u32 = 1024;
+const MAX_WORLDS: u32 = 1024;
 
 /// The name of the default model.
 const WILDFIRE: &str = "wildfire";

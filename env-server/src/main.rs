@@ -72,11 +72,8 @@ fn run(cli: &Cli) -> Result<()> {
             if cli.check {
                 return commands::print(&toml::to_string(&checked.config)?);
             }
-            Ok(serve(
-                checked,
-                &stop_on_signals().context("handle signals")?,
-                cli.exit_with,
-            )?)
+            let stop = stop_on_signals().context("handle signals")?;
+            serve(checked, &stop, cli.exit_with)
         }
     }
 }

@@ -50,7 +50,7 @@ impl ReplayCommand {
             at_once: self.no_wait,
             strict: self.strict,
         };
-        Ok(replay(&options, &stop)?)
+        replay(&options, &stop)
     }
 }
 

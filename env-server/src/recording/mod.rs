@@ -5,5 +5,5 @@ mod recorder;
 mod replay;
 mod replies;
 
-pub use recorder::{RecordError, RecordOptions, RecordSummary, record};
-pub use replay::{ReplayError, ReplayOptions, replay};
+pub use recorder::{RecordOptions, RecordSummary, record};
+pub use replay::{ReplayOptions, replay};

@@ -3,6 +3,7 @@
 //! One thread reads, so that it returns to the channels at once; another compresses and writes. Lost samples are
 //! counted by sequence numbers, in each record and in the end record.
 
+use anyhow::{Context, Result};
 use protocol::Connection;
 use protocol::channels::{ChannelError, Instance};
 use protocol::connection::ConnectionError;
@@ -12,7 +13,7 @@ use protocol::observer::{Observer, Sample};
 use protocol::recording::{Event, Record, RecordingError, Totals, Writer};
 use std::collections::HashMap;
 use std::fs::{File, OpenOptions};
-use std::io::BufWriter;
+use std::io::{BufWriter, Error, ErrorKind};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -20,7 +21,6 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use thiserror::Error;
 
 /// Longest wait for a frame before the recorder checks whether to stop.
 const TICK: Duration = Duration::from_millis(50);
@@ -69,40 +69,20 @@ pub struct RecordSummary {
     pub n_unknown: u64,
 }
 
-/// Why recording failed.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum RecordError {
-    /// The file exists.
-    #[error("--out {}: expected a new file, got one that exists; --force writes over it", .0.display())]
-    Exists(PathBuf),
-    /// The file could not be written.
-    #[error("--out {}: {problem}", path.display())]
-    File {
-        path: PathBuf,
-        problem: RecordingError,
-    },
-    /// The instance could not be observed.
-    #[error(transparent)]
-    Channel(#[from] ChannelError),
-}
-
 /// Records until `stop` is set or the steps are recorded.
 ///
 /// # Errors
 /// If the file cannot be written, or the instance not be observed; earlier records stay in the file.
-pub fn record(options: &RecordOptions, stop: &AtomicBool) -> Result<RecordSummary, RecordError> {
+pub fn record(options: &RecordOptions, stop: &AtomicBool) -> Result<RecordSummary> {
     // First, as the answer takes longer than a fast agent takes to fill an observer's buffer.
     let first_server = Connection::open(&options.instance, NAME, HELLO_TIMEOUT);
     // In this order: every frame that is recorded has its hidden states.
     let truths = options.truth.then(|| Observer::truth(&options.instance));
     let truths = truths.transpose()?;
     let frames = Observer::frames(&options.instance)?.eager();
-    let failed = |problem| RecordError::File {
-        path: options.out.clone(),
-        problem,
-    };
-    let writing = Writing::start(create(&options.out, options.overwrite)?).map_err(failed)?;
+    let file = || format!("--out {}", options.out.display());
+    let created = create(&options.out, options.overwrite).with_context(file)?;
+    let writing = Writing::start(created).with_context(file)?;
     let mut recorder = Recorder {
         options,
         writing,
@@ -126,7 +106,7 @@ pub fn record(options: &RecordOptions, stop: &AtomicBool) -> Result<RecordSummar
     while !stop.load(Ordering::Relaxed) && !recorder.is_done() && recorder.writing.is_running() {
         recorder.run_once(&frames, truths.as_ref())?;
     }
-    recorder.finish().map_err(failed)
+    recorder.finish().with_context(file)
 }
 
 struct Recorder<'a> {
@@ -161,7 +141,7 @@ impl Recorder<'_> {
         &mut self,
         frames: &Observer<FrameHeader>,
         truths: Option<&Observer<TruthHeader>>,
-    ) -> Result<(), RecordError> {
+    ) -> Result<()> {
         let frame = frames.receive(TICK)?;
         if let Some(truths) = truths {
             while let Some(sample) = truths.try_receive()? {
@@ -356,7 +336,7 @@ impl Writing {
         drop(self.queue);
         self.thread
             .join()
-            .unwrap_or_else(|_| Err(std::io::Error::other("the writing thread panicked").into()))
+            .unwrap_or_else(|_| Err(Error::other("the writing thread panicked").into()))
     }
 }
 
@@ -394,7 +374,7 @@ fn bytes_of(record: &Record) -> usize {
 }
 
 /// A file that no other user can read: it may hold hidden states.
-fn create(path: &Path, overwrite: bool) -> Result<File, RecordError> {
+fn create(path: &Path, overwrite: bool) -> std::io::Result<File> {
     let mut file_options = OpenOptions::new();
     file_options.write(true).mode(0o600);
     let found = path.metadata().ok().filter(|_| overwrite);
@@ -408,10 +388,9 @@ fn create(path: &Path, overwrite: bool) -> Result<File, RecordError> {
         None => file_options.create_new(true).open(path),
     };
     file.map_err(|error| match error.kind() {
-        std::io::ErrorKind::AlreadyExists => RecordError::Exists(path.into()),
-        _ => RecordError::File {
-            path: path.into(),
-            problem: error.into(),
-        },
+        ErrorKind::AlreadyExists => {
+            Error::other("expected a new file, got one that exists; --force writes over it")
+        }
+        _ => error,
     })
 }

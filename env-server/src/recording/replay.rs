@@ -4,8 +4,9 @@
 
 use super::pace::Pace;
 use super::replies::{ConnectionCounts, Next, ReplayState};
-use crate::server::{Cleaner, PortConfig, PortError, Ports};
-use protocol::channels::{ChannelError, Instance, ipc_error};
+use crate::server::{Cleaner, PortConfig, Ports};
+use anyhow::{Context, Error, Result, bail};
+use protocol::channels::{Instance, ipc_error};
 use protocol::control::{Reply, ServerInfo};
 use protocol::message::{Status, StepReply, VERSION};
 use protocol::recording::{Event, Reader, Record, RecordingError, Totals};
@@ -16,7 +17,6 @@ use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-use thiserror::Error;
 
 /// How often a replay that waits checks for observers and for the end.
 const TICK: Duration = Duration::from_millis(50);
@@ -42,34 +42,13 @@ pub struct ReplayOptions {
     pub strict: bool,
 }
 
-/// Why a replay failed.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum ReplayError {
-    /// The file cannot be replayed.
-    #[error("recording {}: {problem}", path.display())]
-    File {
-        path: PathBuf,
-        problem: RecordingError,
-    },
-    /// There is nothing to publish.
-    #[error("recording {}: expected samples from {from:?} on, got none", path.display())]
-    Empty { path: PathBuf, from: Duration },
-    /// The server's channels could not be made.
-    #[error(transparent)]
-    Port(#[from] PortError),
-    /// A channel failed.
-    #[error(transparent)]
-    Channel(#[from] ChannelError),
-}
-
 /// Replays until the end, `stop`, or a client's `shutdown`.
 ///
 /// A recording that is damaged or cut short is replayed up to there, with a warning.
 ///
 /// # Errors
 /// If the file holds nothing to replay, or the channels fail.
-pub fn replay(options: &ReplayOptions, stop: &AtomicBool) -> Result<(), ReplayError> {
+pub fn replay(options: &ReplayOptions, stop: &AtomicBool) -> Result<()> {
     let summary = RecordingSummary::of(options)?;
     let ports = Ports::open_with(&summary.config)?;
     let instance = options.instance.name();
@@ -114,7 +93,7 @@ struct Replay<'a> {
 }
 
 impl RecordingSummary {
-    fn of(options: &ReplayOptions) -> Result<Self, ReplayError> {
+    fn of(options: &ReplayOptions) -> Result<Self> {
         let mut config = PortConfig {
             instance: options.instance.clone(),
             n_cells: 0,
@@ -156,16 +135,17 @@ impl RecordingSummary {
                 })
             }
             (_, Some(problem)) => Err(file_error(&options.file, problem)),
-            _ => Err(ReplayError::Empty {
-                path: options.file.clone(),
-                from: options.from,
-            }),
+            _ => bail!(
+                "{}: expected samples from {:?} on, got none",
+                in_file(&options.file),
+                options.from
+            ),
         }
     }
 }
 
 impl Replay<'_> {
-    fn run(&mut self) -> Result<(), ReplayError> {
+    fn run(&mut self) -> Result<()> {
         if !self.options.at_once {
             tracing::info!("waiting for an observer");
             while !self.ends() && self.ports.observers() == (0, 0) {
@@ -184,7 +164,7 @@ impl Replay<'_> {
     }
 
     /// Publishes the recording once.
-    fn publish_all(&mut self) -> Result<(), ReplayError> {
+    fn publish_all(&mut self) -> Result<()> {
         self.pace.begin_round(Instant::now());
         for record in open(&self.options.file)? {
             let record = match record {
@@ -207,7 +187,7 @@ impl Replay<'_> {
     }
 
     /// Waits until a moment of the recording, and until observers can follow.
-    fn wait_until_due(&mut self, time: Duration) -> Result<(), ReplayError> {
+    fn wait_until_due(&mut self, time: Duration) -> Result<()> {
         let due = self.pace.due(time);
         let mut now = Instant::now();
         while !self.ends() && due.is_none_or(|due| now < due) {
@@ -238,7 +218,7 @@ impl Replay<'_> {
     }
 
     /// Answers requests until a moment, or the end.
-    fn serve_until(&mut self, until: Instant) -> Result<(), ReplayError> {
+    fn serve_until(&mut self, until: Instant) -> Result<()> {
         loop {
             self.ports.connect_observers();
             while let Some(request) = self.ports.receive_step() {
@@ -299,14 +279,15 @@ impl Replay<'_> {
     }
 }
 
-fn open(path: &Path) -> Result<Reader<BufReader<File>>, ReplayError> {
-    let file = File::open(path).map_err(|error| file_error(path, error.into()))?;
-    Reader::new(BufReader::new(file)).map_err(|problem| file_error(path, problem))
+fn open(path: &Path) -> Result<Reader<BufReader<File>>> {
+    let open = || Reader::new(BufReader::new(File::open(path)?));
+    open().with_context(|| in_file(path))
 }
 
-fn file_error(path: &Path, problem: RecordingError) -> ReplayError {
-    ReplayError::File {
-        path: path.into(),
-        problem,
-    }
+fn file_error(path: &Path, problem: RecordingError) -> Error {
+    Error::new(problem).context(in_file(path))
+}
+
+fn in_file(path: &Path) -> String {
+    format!("recording {}", path.display())
 }

@@ -11,7 +11,7 @@ use thiserror::Error;
 
 /// What a server, all clients and all observers take, and some more: 40 alone, 10 for each of 16 clients, up to 8 more where
 /// its requests grow, 1 for each of 16 observers and 4 readers (measured).
-pub const NEEDED: u64 = 512;
+const NEEDED: u64 = 512;
 
 /// What a new client takes.
 const PER_CLIENT: usize = 10;

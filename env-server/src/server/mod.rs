@@ -13,6 +13,5 @@ mod serve;
 mod state;
 
 pub use liveness::Cleaner;
-pub use ports::{PortConfig, PortError, Ports};
+pub use ports::{PortConfig, Ports};
 pub use serve::serve;
-pub use state::ServeError;

@@ -1,8 +1,9 @@
 //! The server's ends of the channels.
 
-use super::descriptors::{DescriptorWarning, TooFewDescriptors, raise_limit};
+use super::descriptors::{DescriptorWarning, raise_limit};
 use crate::config::Checked;
 use crate::throttle::Throttle;
+use anyhow::{Result, anyhow, bail, ensure};
 use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::publisher::Publisher;
@@ -29,7 +30,6 @@ use std::collections::HashSet;
 use std::os::fd::BorrowedFd;
 use std::path::PathBuf;
 use std::time::Instant;
-use thiserror::Error;
 
 /// A request on `step` that waits for its answer.
 pub type ActiveStep = Active<StepRequest, StepReply>;
@@ -39,41 +39,6 @@ const MESSAGE_OVERHEAD: usize = 512;
 
 /// Shared memory for everything of fixed size: control messages, events, tables.
 const FIXED_BYTES: u64 = 8 << 20;
-
-/// Why the server cannot serve its instance.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum PortError {
-    /// Another server serves the instance.
-    #[error("instance {instance:?} is already running, as pid {pid}")]
-    AlreadyRunning {
-        instance: String,
-        /// The other server's process.
-        pid: i32,
-    },
-    /// Too little shared memory: writing to it would end in a bus error.
-    #[error(
-        "shared memory: expected {needed} MiB free in {SHARED_MEMORY}, got {free} MiB; free some, give the \
-         container more (docker: --shm-size), or serve fewer worlds or a smaller grid"
-    )]
-    SharedMemory {
-        /// MiB.
-        needed: u64,
-        /// MiB.
-        free: u64,
-    },
-    /// The server's files were removed: clients do not find it any more.
-    #[error(
-        "{path} was removed while the server was running: keep cleaners of old files away from {SHARED_MEMORY}"
-    )]
-    Removed { path: String },
-    /// Too few file descriptors for all clients.
-    #[error(transparent)]
-    Descriptors(#[from] TooFewDescriptors),
-    /// A channel could not be made.
-    #[error(transparent)]
-    Channel(#[from] ChannelError),
-}
 
 /// The instance, and the sizes of its messages.
 #[derive(Debug, Clone)]
@@ -121,7 +86,7 @@ impl Ports {
     ///
     /// # Errors
     /// If another server has them, or the system has too little memory or descriptors.
-    pub fn open(checked: &Checked) -> Result<Self, PortError> {
+    pub fn open(checked: &Checked) -> Result<Self> {
         let n_cells = checked.shape.n_cells();
         Self::open_with(&PortConfig {
             instance: checked.instance.clone(),
@@ -136,7 +101,7 @@ impl Ports {
     ///
     /// # Errors
     /// If another server has them, or the system has too little memory or descriptors.
-    pub fn open_with(config: &PortConfig) -> Result<Self, PortError> {
+    pub fn open_with(config: &PortConfig) -> Result<Self> {
         check_shared_memory(config)?;
         raise_limit()?;
         let _turn = Turn::take()?;
@@ -204,13 +169,14 @@ impl Ports {
     ///
     /// # Errors
     /// If the server's files were removed.
-    pub fn check_entries(&self) -> Result<(), PortError> {
-        match self.entries.iter().find(|path| !path.exists()) {
-            None => Ok(()),
-            Some(path) => Err(PortError::Removed {
-                path: path.display().to_string(),
-            }),
+    pub fn check_entries(&self) -> Result<()> {
+        if let Some(path) = self.entries.iter().find(|path| !path.exists()) {
+            bail!(
+                "{} was removed while the server was running: keep cleaners of old files away from {SHARED_MEMORY}",
+                path.display()
+            );
         }
+        Ok(())
     }
 
     /// Closes the ports, unless their files were removed: those of the same names are another server's then.
@@ -353,18 +319,16 @@ fn taken<Q: Header, R: Header>(
     config: &PortConfig,
     service: &RequestResponse<Q, R>,
     error: ServerCreateError,
-) -> PortError {
+) -> anyhow::Error {
+    let instance = config.instance.name();
     match port_owner(service, &error) {
-        Some(pid) => PortError::AlreadyRunning {
-            instance: config.instance.name().into(),
-            pid,
-        },
+        Some(pid) => anyhow!("instance {instance:?} is already running, as pid {pid}"),
         None => ipc_error("create a server")(error).into(),
     }
 }
 
 /// Checks that `/dev/shm` has enough room: a write to a full one ends the process with SIGBUS.
-fn check_shared_memory(config: &PortConfig) -> Result<(), PortError> {
+fn check_shared_memory(config: &PortConfig) -> Result<()> {
     let bytes =
         |n_messages: usize, length: usize| (n_messages * (length + MESSAGE_OVERHEAD)) as u64;
     // Chunks as iceoryx2 counts them: 2 requests in flight x (buffered + borrowed + loaned).
@@ -379,12 +343,12 @@ fn check_shared_memory(config: &PortConfig) -> Result<(), PortError> {
         return Ok(());
     };
     let free = status.f_bavail * status.f_frsize;
-    let mebibytes = |bytes: u64| bytes.div_ceil(1 << 20);
-    if needed <= free {
-        return Ok(());
-    }
-    Err(PortError::SharedMemory {
-        needed: mebibytes(needed),
-        free: free >> 20,
-    })
+    ensure!(
+        needed <= free,
+        "shared memory: expected {} MiB free in {SHARED_MEMORY}, got {} MiB; free some, give the container more \
+         (docker: --shm-size), or serve fewer worlds or a smaller grid",
+        needed.div_ceil(1 << 20),
+        free >> 20
+    );
+    Ok(())
 }

@@ -1,9 +1,10 @@
 //! The loop: receive, check the lease, step, answer, publish.
 
 use super::ports::ActiveStep;
-use super::state::{ServeError, Server};
+use super::state::Server;
 use crate::config::Checked;
 use crate::simulator::{Outcome, ServerStats};
+use anyhow::Result;
 use protocol::channels::ipc_error;
 use protocol::control::Reply;
 use protocol::message::Operation;
@@ -32,11 +33,7 @@ const NEW_OBSERVER_TICK: Duration = Duration::from_millis(5);
 ///
 /// # Errors
 /// If the server cannot start, its channels fail, or the last snapshot cannot be written.
-pub fn serve(
-    checked: Checked,
-    stop: &Arc<AtomicBool>,
-    exit_with: Option<i32>,
-) -> Result<(), ServeError> {
+pub fn serve(checked: Checked, stop: &Arc<AtomicBool>, exit_with: Option<i32>) -> Result<()> {
     let mut server = Server::start(checked, exit_with)?;
     let mut outcome = Ok(());
     while outcome.is_ok() && !stop.load(Ordering::Relaxed) && !server.is_over {
@@ -59,7 +56,7 @@ enum Found {
 
 impl Server {
     /// Waits for something and handles it.
-    fn run_once(&mut self) -> Result<(), ServeError> {
+    fn run_once(&mut self) -> Result<()> {
         let woken = Cell::new(false);
         let tick = if self.publications.has_new_observers() {
             NEW_OBSERVER_TICK
@@ -79,7 +76,7 @@ impl Server {
             || Ok(self.poll(&woken)),
             |limit| {
                 woken.set(self.sleep(limit)?);
-                Ok::<_, ServeError>(())
+                Ok::<_, anyhow::Error>(())
             },
         )?;
         let now = Instant::now();
@@ -105,7 +102,7 @@ impl Server {
     }
 
     /// Sleeps until a wake-up, a signal, a death or a finished reset; returns whether there was one.
-    fn sleep(&self, limit: Duration) -> Result<bool, ServeError> {
+    fn sleep(&self, limit: Duration) -> Result<bool> {
         let own = [
             self.ports.descriptor(),
             self.resets.descriptor(),
@@ -174,7 +171,7 @@ impl Server {
     }
 
     /// What no request asks for: ended clients, finished work, expired leases, new observers.
-    fn check_everything(&mut self, now: Instant) -> Result<(), ServeError> {
+    fn check_everything(&mut self, now: Instant) -> Result<()> {
         self.last_tick = now;
         self.cancel_abandoned(now);
         self.forget_ended_clients();
@@ -193,7 +190,7 @@ impl Server {
         self.publications
             .publish_to_new(&self.ports, &self.simulator);
         self.rate.update(now, self.simulator.n_steps());
-        Ok(self.ports.check_entries()?)
+        self.ports.check_entries()
     }
 
     fn forget_ended_clients(&mut self) {

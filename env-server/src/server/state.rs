@@ -3,18 +3,16 @@
 use super::autosave::{Autosave, FirstWorlds, first_worlds};
 use super::files::Files;
 use super::liveness::{Cleaner, Clients};
-use super::ports::{PortError, Ports};
+use super::ports::Ports;
 use super::publications::Publications;
 use super::resets::Resets;
 use crate::config::Checked;
 use crate::simulator::{PendingFile, PendingReply, Simulator};
-use crate::snapshot::FileError;
 use crate::throttle::Throttle;
-use protocol::channels::ChannelError;
+use anyhow::{Context, Result};
 use protocol::control::Reply;
 use protocol::message::Status;
-use protocol::model::ModelError;
-use protocol::program::{NotRunning, WatchedProcess};
+use protocol::program::WatchedProcess;
 use protocol::responder::ActiveControl;
 use protocol::wait::Waiter;
 use rand_chacha::ChaCha8Rng;
@@ -25,37 +23,12 @@ use std::collections::hash_map::RandomState;
 use std::hash::BuildHasher;
 use std::ops::Range;
 use std::time::{Duration, Instant};
-use thiserror::Error;
 
 /// How long a server that ends waits for its files.
 const LAST_FILES: Duration = Duration::from_secs(10);
 
 /// Over how long the step rate is measured.
 const RATE_WINDOW: Duration = Duration::from_secs(1);
-
-/// Why the server could not start or had to end.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum ServeError {
-    /// Its channels could not be made.
-    #[error(transparent)]
-    Port(#[from] PortError),
-    /// A channel failed.
-    #[error(transparent)]
-    Channel(#[from] ChannelError),
-    /// The model does not fit the grid.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// The process to end with is not there.
-    #[error(transparent)]
-    WatchedProcess(#[from] NotRunning),
-    /// A snapshot to start with is refused, or none could be written.
-    #[error(transparent)]
-    File(#[from] FileError),
-    /// Threads could not be started.
-    #[error("start {n_threads} threads: {problem}")]
-    Threads { n_threads: usize, problem: String },
-}
 
 pub(super) struct Server {
     pub(super) simulator: Simulator,
@@ -88,7 +61,7 @@ pub(super) struct Rate {
 }
 
 impl Server {
-    pub(super) fn start(checked: Checked, exit_with: Option<i32>) -> Result<Self, ServeError> {
+    pub(super) fn start(checked: Checked, exit_with: Option<i32>) -> Result<Self> {
         let exit_with = exit_with.map(WatchedProcess::watch).transpose()?;
         let ports = Ports::open(&checked)?;
         let (instance, config) = (checked.instance.name().to_owned(), &checked.config);
@@ -118,11 +91,10 @@ impl Server {
                 .filter_map(|(world, restored)| simulator.start_with(world, restored))
                 .collect();
         }
-        let not_started = |problem: String| ServeError::Threads { n_threads, problem };
-        let files = Files::start(simulator.spec().clone())
-            .map_err(|error| not_started(error.to_string()))?;
-        let resets = Resets::new(threads(n_threads)?, simulator.spec().rules.clone());
-        let resets = resets.map_err(|errno| not_started(errno.to_string()))?;
+        let spec = simulator.spec().clone();
+        let resets = Resets::new(threads(n_threads)?, spec.rules.clone());
+        let resets = resets.context("start the threads for resets")?;
+        let files = Files::start(spec).context("start the thread for files")?;
         resets.start(resets_due);
         let now = Instant::now();
         Ok(Self {
@@ -195,7 +167,7 @@ impl Server {
     ///
     /// # Errors
     /// If the last snapshot could not be written.
-    pub(super) fn end(mut self) -> Result<(), ServeError> {
+    pub(super) fn end(mut self) -> Result<()> {
         self.save(true);
         let (finished, is_late) = match self.files.finish(LAST_FILES) {
             Ok(finished) => (finished, false),
@@ -229,12 +201,9 @@ impl Rate {
     }
 }
 
-fn threads(n_threads: usize) -> Result<ThreadPool, ServeError> {
+fn threads(n_threads: usize) -> Result<ThreadPool> {
     let pool = ThreadPoolBuilder::new().num_threads(n_threads).build();
-    pool.map_err(|error| ServeError::Threads {
-        n_threads,
-        problem: error.to_string(),
-    })
+    pool.with_context(|| format!("start {n_threads} threads"))
 }
 
 /// Lease tokens that nobody can guess, below 2^53 so that every JSON reader holds them; never 0.

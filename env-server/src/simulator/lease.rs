@@ -1,7 +1,7 @@
 //! Which client may act on which worlds, and until when. Pure: time and tokens are arguments.
 //!
 //! A lease covers consecutive worlds. It ends by release, by expiry, with its client's connection or
-//! process, or by a takeover; a world taken from a lease is lost to that lease for good, also when it
+//! process, or by a takeover; a world taken from a lease stays lost to that lease, also when it
 //! is free again.
 
 use protocol::message::Status;

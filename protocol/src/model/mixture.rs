@@ -3,7 +3,7 @@
 
 use super::parameters::Model;
 
-/// Mark of a cell to be drawn again, and of what lies off the grid: who draws it as its parent is
+/// Mark of a cell to be drawn again, and of what lies off the grid: a cell with such a parent is
 /// rejected. Odd, and its high bit is set, as in no state.
 pub(crate) const REJECTED: u8 = 255;
 
@@ -44,7 +44,7 @@ pub(crate) struct Draw {
     mask: u8,
 }
 
-/// A tap, and the outcome for whatever parent it meets.
+/// A tap, and the outcome for each state of its parent.
 #[derive(Debug, Clone, Copy, Default)]
 struct Rule {
     /// Where the tap reads, relative to a cell's home.

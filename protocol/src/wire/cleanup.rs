@@ -93,7 +93,7 @@ impl ChannelFiles {
         n_removed + self.remove_ports(ports, &used)
     }
 
-    /// Segments that nobody will finish: to open one could take for ever.
+    /// Unfinished segments of dead processes: to open one could take without end.
     fn remove_unfinished(&self, used: &Used) -> usize {
         let is_left = |path: &PathBuf| {
             let ids = self.ids(path);

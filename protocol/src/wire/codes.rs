@@ -55,7 +55,7 @@ pub enum Status {
     /// The lease does not cover these worlds, or was never given; detail: the first such world.
     NoLease = 8,
     /// The lease was taken over, expired or released; detail: pid of who took it over or holds the
-    /// world since, 0 if nobody.
+    /// world since, 0 if no client does.
     LeaseLost = 9,
     /// Another client holds a world; detail: its pid.
     Busy = 10,
@@ -69,7 +69,7 @@ pub enum Status {
     UnknownFlags = 14,
     /// Not an objective of the agent's; detail: number of objectives.
     BadObjective = 15,
-    /// The agent that was asked ends: it was told to, or cannot go on; detail: 0.
+    /// The agent that was asked ends: it was asked to, or it failed; detail: 0.
     AgentEnds = 16,
     /// A file that cannot be read or written, or is refused; detail: 0.
     BadFile = 17,

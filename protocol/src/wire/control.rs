@@ -13,14 +13,14 @@ pub const MAX_BELIEF_PART: usize = 1 << 19;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "op", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {
-    /// Who are you, and do we speak the same protocol?
+    /// Handshake: which server is this, and which protocol version does it speak?
     Hello {
         /// The client's protocol version.
         protocol: u32,
         /// The client's name and version, for the server's log.
         client: String,
     },
-    /// Give me the right to act on consecutive worlds.
+    /// Acquire the right to act on consecutive worlds.
     Acquire {
         /// First world.
         first_world: u32,

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "op", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Request {
-    /// Who are you, and do we speak the same protocol?
+    /// Handshake: which agent is this, and which protocol version does it speak?
     Hello {
         /// The learner's protocol version.
         protocol: u32,
@@ -21,7 +21,7 @@ pub enum Request {
         #[serde(default)]
         seed: Option<u64>,
     },
-    /// Plan for an objective, fly the path, take in what was seen.
+    /// Plan for an objective, fly the path, correct the belief with the frame.
     Decide {
         /// Its position among [`AgentInfo::objectives`].
         objective: u64,

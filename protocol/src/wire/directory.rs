@@ -103,7 +103,7 @@ fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
             "expected a directory that belongs to this user and that others cannot write to".into(),
         ));
     }
-    // Whatever umask it was made under.
+    // Its mode depends on the umask it was made under.
     match found.mode() & 0o777 {
         0o700 => Ok(()),
         _ => std::fs::set_permissions(path, Permissions::from_mode(0o700))

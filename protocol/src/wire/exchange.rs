@@ -31,7 +31,7 @@ pub enum ConnectionError {
         /// Name of the instance.
         instance: String,
     },
-    /// No answer in time. A step may have been made all the same: observe before stepping again.
+    /// No answer in time. A step may have been made nevertheless: observe before the next one.
     #[error("no answer to {what} from instance {instance:?} within {timeout:?}")]
     Timeout {
         /// Kind of the request.
@@ -144,7 +144,7 @@ impl Exchange {
     }
 }
 
-/// Checks that a status is `Ok`; `message` are the words of the refusal, if it has any.
+/// Checks that a status is `Ok`; `message` is the message of the refusal, if it has one.
 pub(super) fn check_status(
     what: &'static str,
     code: u32,

@@ -35,7 +35,7 @@ pub struct StepRequest {
     pub n_moves: u32,
     /// [`FLAG_FULL_COVERAGE`] or 0.
     pub flags: u32,
-    /// Low half of the id of the client's listener on `wake-client`; both halves 0: wake nobody.
+    /// Low half of the id of the client's listener on `wake-client`; both halves 0: no wake-up.
     pub listener_low: u64,
     /// High half of that id.
     pub listener_high: u64,
@@ -115,7 +115,7 @@ pub struct ControlRequest {
     pub reserved: u32,
     /// Chosen by the client, returned in the answer.
     pub sequence: u64,
-    /// Low half of the id of the client's listener on `wake-client`; both halves 0: wake nobody.
+    /// Low half of the id of the client's listener on `wake-client`; both halves 0: no wake-up.
     pub listener_low: u64,
     /// High half of that id.
     pub listener_high: u64,

@@ -13,7 +13,7 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use std::cell::Cell;
 use std::time::{Duration, Instant};
 
-/// How long an observer sleeps between two polls while it is busy: publishing wakes nobody, so that observers cost
+/// How long an observer sleeps between two polls while it is busy: publishing wakes no observer, so that observers cost
 /// the server no system call. Nor do they spin, which would take processor time from it. At 128,000 frames a second
 /// this fills [`FRAME_BUFFER`].
 const BUSY_INTERVAL: Duration = Duration::from_micros(500);

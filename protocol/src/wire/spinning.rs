@@ -2,7 +2,7 @@
 //!
 //! Where both processes have a core, spinning answers in about 1 us and blocking in about 50 us, most of it the
 //! wake-up of an idle core. Where others keep the cores busy it is the other way round: who spins uses up its time
-//! slice; who blocks is woken ahead of the busy ones. Nobody yields: beside a busy process each `sched_yield`
+//! slice; who blocks is woken ahead of the busy ones. No wait yields: beside a busy process each `sched_yield`
 //! costs a time slice, milliseconds.
 
 use std::time::{Duration, Instant};

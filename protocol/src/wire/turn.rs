@@ -23,7 +23,7 @@ const STOPPED_WAIT: Duration = Duration::from_millis(50);
 const INTERVAL: Duration = Duration::from_micros(500);
 
 /// The file in the channel directory that is locked.
-pub(crate) const LOCK: &str = "lock";
+const LOCK: &str = "lock";
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Held {
@@ -116,13 +116,13 @@ fn is_file(file: &OwnedFd, path: &Path) -> bool {
     }
 }
 
-/// The process that has the lock, as the kernel says.
+/// The process that has the lock, by `/proc/locks`.
 fn holder(file: &OwnedFd) -> Option<i32> {
     let found = fstat(file).ok()?;
     let (major, minor) = (major(found.st_dev), minor(found.st_dev));
     let inode = format!("{major:02x}:{minor:02x}:{}", found.st_ino);
     let locks = std::fs::read_to_string("/proc/locks").ok()?;
-    // "1: FLOCK  ADVISORY  WRITE 4711 00:1a:5678 0 EOF"; who waits has an arrow in front.
+    // "1: FLOCK  ADVISORY  WRITE 4711 00:1a:5678 0 EOF"; waiting processes have an arrow in front.
     locks.lines().find_map(|line| {
         let words: Vec<&str> = line.split_whitespace().collect();
         match words[..] {

@@ -74,7 +74,7 @@ pub struct Record {
     pub event: Event,
 }
 
-/// What a record tells.
+/// What a record holds.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Event {
     /// The samples from here on are from this server.
@@ -107,19 +107,9 @@ pub enum RecordingError {
     /// The system refused.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// Some other file.
-    #[error(
-        "not a recording: expected it to begin with {:?}, got {:?}",
-        MAGIC.escape_ascii().to_string(),
-        .0.escape_ascii().to_string()
-    )]
-    Foreign(Vec<u8>),
-    /// A format of another release, or of a host of the other byte order.
-    #[error("recording version: expected {VERSION}, got {0}")]
-    Version(u32),
-    /// A reserved field with a meaning that this release does not know.
-    #[error("recording: expected 0 in byte 12 to 15, got {0}")]
-    Reserved(u32),
+    /// Another kind of file, or a format of another release or byte order.
+    #[error("{0}")]
+    Foreign(String),
     /// The file has no end record: its recorder was killed, or bytes are missing. Everything before is whole.
     #[error(
         "the recording was cut short: expected a whole record at byte {offset}, got {got} bytes; good before it: \

@@ -13,5 +13,5 @@ pub use format::{
     Event, FileHeader, Kind, MAGIC, MAX_BODY_BYTES, MAX_STORED_BYTES, Record, RecordHeader,
     RecordingError, Totals, VERSION,
 };
-pub use reader::{Position, Reader};
+pub use reader::Reader;
 pub use writer::Writer;

@@ -10,7 +10,7 @@ use std::collections::HashMap;
 
 /// What the records so far hold. Writer and reader both keep it, so that neither accepts a record that the other
 /// would refuse.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Default)]
 pub(super) struct Progress {
     pub(super) nanos: u64,
     server: Option<Limits>,

@@ -9,7 +9,7 @@ use crate::wire::observer::Sample;
 use bytemuck::{Pod, Zeroable};
 use flate2::bufread::DeflateDecoder;
 use serde::de::DeserializeOwned;
-use std::io::{Read, Seek, SeekFrom};
+use std::io::Read;
 
 /// Reads a recording: an iterator of records that ends after the first error.
 ///
@@ -18,16 +18,10 @@ use std::io::{Read, Seek, SeekFrom};
 #[derive(Debug)]
 pub struct Reader<R> {
     input: R,
-    at: Position,
-    stored: Vec<u8>,
-    is_over: bool,
-}
-
-/// A position between two records, to come back to.
-#[derive(Debug, Clone)]
-pub struct Position {
     offset: u64,
     progress: Progress,
+    stored: Vec<u8>,
+    is_over: bool,
 }
 
 impl<R: Read> Reader<R> {
@@ -40,7 +34,11 @@ impl<R: Read> Reader<R> {
         let n_read = fill(&mut input, &mut header)?;
         let n_magic = n_read.min(MAGIC.len());
         if header.magic[..n_magic] != MAGIC[..n_magic] {
-            return Err(RecordingError::Foreign(header.magic[..n_magic].to_vec()));
+            return Err(RecordingError::Foreign(format!(
+                "not a recording: expected it to begin with \"{}\", got \"{}\"",
+                MAGIC.escape_ascii(),
+                header.magic[..n_magic].escape_ascii()
+            )));
         }
         if n_read < size_of::<FileHeader>() {
             return Err(RecordingError::Cut {
@@ -50,18 +48,19 @@ impl<R: Read> Reader<R> {
             });
         }
         if header.version != VERSION {
-            return Err(RecordingError::Version(header.version));
+            let got = header.version;
+            let problem = format!("recording version: expected {VERSION}, got {got}");
+            return Err(RecordingError::Foreign(problem));
         }
         if header.reserved != 0 {
-            return Err(RecordingError::Reserved(header.reserved));
+            let got = header.reserved;
+            let problem = format!("recording: expected 0 in byte 12 to 15, got {got}");
+            return Err(RecordingError::Foreign(problem));
         }
-        let at = Position {
-            offset: n_read as u64,
-            progress: Progress::default(),
-        };
         Ok(Self {
             input,
-            at,
+            offset: n_read as u64,
+            progress: Progress::default(),
             stored: Vec::new(),
             is_over: false,
         })
@@ -69,17 +68,12 @@ impl<R: Read> Reader<R> {
 
     /// What has been read so far.
     pub fn totals(&self) -> Totals {
-        self.at.progress.totals
-    }
-
-    /// The position before the next record.
-    pub fn position(&self) -> Position {
-        self.at.clone()
+        self.progress.totals
     }
 
     /// The next record; `None` at the end.
     fn read(&mut self) -> Result<Option<Record>, RecordingError> {
-        let (offset, n_steps) = (self.at.offset, self.at.progress.n_steps);
+        let (offset, n_steps) = (self.offset, self.progress.n_steps);
         let mut header = RecordHeader::zeroed();
         let n_read = fill(&mut self.input, &mut header)?;
         let cut = |got: usize| RecordingError::Cut {
@@ -115,7 +109,7 @@ impl<R: Read> Reader<R> {
             )));
         }
         let body = inflated(&self.stored).map_err(damaged)?;
-        self.at.offset += (n_read + length) as u64;
+        self.offset += (n_read + length) as u64;
         if header.kind == Kind::End as u32 {
             return self.check_end(&body).map_err(damaged).map(|()| None);
         }
@@ -124,7 +118,7 @@ impl<R: Read> Reader<R> {
             n_lost: header.n_lost,
             event: event(header.kind, &body).map_err(damaged)?,
         };
-        self.at.progress.accept(&record).map_err(damaged)?;
+        self.progress.accept(&record).map_err(damaged)?;
         Ok(Some(record))
     }
 
@@ -138,19 +132,6 @@ impl<R: Read> Reader<R> {
             Ok(_) => Err("expected nothing behind the end, got more bytes".into()),
             Err(error) => Err(error.to_string()),
         }
-    }
-}
-
-impl<R: Read + Seek> Reader<R> {
-    /// Goes to a position in the same recording.
-    ///
-    /// # Errors
-    /// If the system refuses.
-    pub fn go_to(&mut self, position: &Position) -> Result<(), RecordingError> {
-        self.input.seek(SeekFrom::Start(position.offset))?;
-        self.at = position.clone();
-        self.is_over = false;
-        Ok(())
     }
 }
 
