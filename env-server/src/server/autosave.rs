@@ -169,8 +169,8 @@ fn log_why_none(folder: &Folder, path: &Path) {
     match &folder.snapshots()[..] {
         [] => tracing::info!(folder = %path, "nothing to restore: new worlds start"),
         [first, ..] => tracing::warn!(
-            "--restore {path}: expected snapshots of this instance, {expected}, got others, such as {first}: the \
-             worlds begin anew; to restore one of these, name its file, or its instance with --instance"
+            "--restore {path}: expected snapshots of this instance, {expected}, got others, such as {first}: \
+             new worlds start; to restore one of these, name its file, or its instance with --instance"
         ),
     }
 }

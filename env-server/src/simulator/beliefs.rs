@@ -10,18 +10,18 @@ const BYTES_PER_CELL: u64 = 64;
 #[derive(Debug)]
 pub struct Beliefs {
     n_cells: usize,
-    left: Vec<Option<Left>>,
+    left: Vec<Option<StoredBelief>>,
 }
 
 #[derive(Debug)]
-struct Left {
+struct StoredBelief {
     info: BeliefInfo,
     bytes: Vec<u8>,
 }
 
 /// A part of a belief that an agent leaves.
 #[derive(Debug)]
-pub struct Part<'a> {
+pub struct BeliefPart<'a> {
     /// Tells other agents what the bytes are.
     pub kind: &'a str,
     /// Where the part begins.
@@ -43,7 +43,12 @@ impl Beliefs {
     ///
     /// # Errors
     /// If it is too long or does not follow the part before; the error says what was expected.
-    pub fn add(&mut self, world: usize, at: &StepResult, part: &Part<'_>) -> Result<(), String> {
+    pub fn add(
+        &mut self,
+        world: usize,
+        at: &StepResult,
+        part: &BeliefPart<'_>,
+    ) -> Result<(), String> {
         let longest = BYTES_PER_CELL * self.n_cells as u64;
         if part.length > longest {
             let got = part.length;
@@ -78,7 +83,7 @@ impl Beliefs {
         }
         if part.offset == 0 {
             let bytes = Vec::with_capacity(part.length as usize);
-            *left = Some(Left { info, bytes });
+            *left = Some(StoredBelief { info, bytes });
         }
         if let Some(left) = left {
             left.bytes.extend_from_slice(part.bytes);
@@ -88,7 +93,7 @@ impl Beliefs {
 
     /// The whole belief about a world at the step of a result.
     pub fn of(&self, world: usize, at: &StepResult) -> Option<(&BeliefInfo, &[u8])> {
-        let Left { info, bytes } = self.left[world].as_ref()?;
+        let StoredBelief { info, bytes } = self.left[world].as_ref()?;
         let is_there = (info.seed, info.episode, info.step) == (at.seed, at.episode, at.step);
         let is_whole = bytes.len() as u64 == info.length;
         (is_there && is_whole).then_some((info, bytes))

@@ -1,6 +1,6 @@
 //! Control requests about worlds as a whole: snapshot, restore, fork, and beliefs that are left.
 
-use super::beliefs::Part;
+use super::beliefs::BeliefPart;
 use super::lease::ClientId;
 use super::outcome::{Outcome, PendingFile, malformed, refusal};
 use super::state::{ResetJob, Simulator, Slot};
@@ -192,7 +192,7 @@ impl Simulator {
         let bytes = BASE64.decode(&left.data);
         let bytes =
             bytes.map_err(|error| malformed(&format!("data: expected base64, got {error}")))?;
-        let part = Part {
+        let part = BeliefPart {
             kind: &left.kind,
             offset: left.offset,
             length: left.length,
