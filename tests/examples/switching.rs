@@ -7,7 +7,7 @@ use agent::action::{ActionSet, Region};
 use agent::belief::Belief;
 use agent::estimator::{Filter, Prior};
 use agent::planner::BeamSearch;
-use env_server::episode::{Episode, Rules, Start};
+use env_server::world::{Episode, Rules, Start};
 use protocol::{Cell, Coverage, Model, Shape};
 use std::io::Write;
 

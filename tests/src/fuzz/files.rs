@@ -1,6 +1,6 @@
 //! What the programs read from files: models, checkpoints.
 
-use super::Seed;
+use super::target::Seed;
 use agent::checkpoint::{Contents, Problem, encode};
 use agent::estimator::learned_filter::Dimensions;
 use agent::learned::Learned;
