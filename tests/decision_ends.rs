@@ -1,10 +1,11 @@
 //! How agents that serve decisions begin, keep their world and end; and learners that are killed.
 
 use crate::harness::{PATIENCE, Program, SMALL, Server, eventually, takeover};
-use crate::learning::learner::{Learner, refusal, reply_to, start_agent, start_with_learner};
+use crate::learner::{Learner, refusal, reply_to, start_agent, start_with_learner};
 use crate::wire::control_header;
 use agent::acting::decider::{Assignment, Decider};
-use agent::acting::run::{RunError, prepare};
+use agent::acting::error::RunError;
+use agent::acting::run::prepare;
 use agent::config::AgentConfig;
 use agent::planning::policy::PlannerKind;
 use agent::server::client::{Claim, Client, shape_of};

@@ -1,7 +1,7 @@
 //! Agents that take decisions from a learner outside: same worlds, same plans, clear refusals.
 
 use crate::harness::{PATIENCE, SMALL, Server, frames_until, new_instance, run};
-use crate::learning::learner::{Learner, decision, refusal, start_agent, start_with_learner};
+use crate::learner::{Learner, decision, refusal, start_agent, start_with_learner};
 use crate::wire::control_header;
 use protocol::channels::ChannelError;
 use protocol::decisions::{Decision, Reply, Request};

@@ -2,8 +2,8 @@
 
 use agent::server::client::{Claim, Client, Observation};
 use env_server::config::ServerConfig;
-use env_server::episode::{Episode, Rules};
-use env_server::snapshot::{Settings, WorldToWrite, encode};
+use env_server::snapshot::{SnapshotWorld, WorldSpec, encode};
+use env_server::world::Episode;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::{Reply, Request, ServerInfo, ServerStatus, WorldSeed};
@@ -198,10 +198,13 @@ impl Server {
 
     /// Starts a server of two worlds as [`SMALL`] ones at k = 0, whose every reset goes on for ever.
     pub fn start_with_endless_resets(flags: &str) -> Self {
-        let (settings, mut rules) = small_settings(ENDLESS);
+        let WorldSpec {
+            settings,
+            mut rules,
+        } = small_spec(ENDLESS);
         rules.burn_in = 0;
         let episodes = [0, 1].map(|seed| Episode::new(&rules, seed));
-        let worlds = episodes.each_ref().map(WorldToWrite::Ready);
+        let worlds = episodes.each_ref().map(SnapshotWorld::Ready);
         let folder = TempDir::new().expect("a folder for the worlds");
         let file = folder.path().join("worlds.snapshot");
         std::fs::write(&file, encode(&settings, &worlds).expect("small")).expect("write");
@@ -296,7 +299,7 @@ pub fn eventually(limit: Duration, mut holds: impl FnMut() -> bool) -> bool {
 }
 
 /// What snapshots of a server as a [`SMALL`] one say of it, and the rules of its worlds.
-pub fn small_settings(burn_in: u64) -> (Settings, Rules) {
+pub fn small_spec(burn_in: u64) -> WorldSpec {
     let config = ServerConfig {
         height: 5,
         width: 7,
@@ -305,16 +308,7 @@ pub fn small_settings(burn_in: u64) -> (Settings, Rules) {
         ..ServerConfig::default()
     };
     let checked = config.check().expect("valid settings");
-    let rules = Rules::new(
-        &checked.model,
-        checked.shape,
-        burn_in,
-        0,
-        checked.config.start,
-    );
-    let mut rules = rules.expect("a valid model");
-    (rules.history, rules.n_moves) = (checked.config.history as usize, 6);
-    (Settings::of(&checked), rules)
+    WorldSpec::of(&checked).expect("a valid model")
 }
 
 /// The server's status, over a connection of its own.

@@ -6,6 +6,7 @@
 //! instance, a folder and a deadline of its own. `cargo test -p tests -- --ignored` adds the long run of the
 //! hostile clients, and what needs Python (`scripts/test` installs it).
 
+mod agent_beliefs;
 mod attacker;
 mod autoencoder;
 mod commands;
@@ -24,7 +25,6 @@ mod hostile;
 mod kills;
 mod learner;
 mod lease;
-mod outlooks;
 mod places;
 mod python;
 mod recording;

@@ -2,12 +2,11 @@
 
 use crate::harness::{
     ENDLESS, Ended, PATIENCE, Paths, SMALL, Server, eventually, fly, frames_until, new_instance,
-    reset, run, small_settings, takeover,
+    reset, run, small_spec, takeover,
 };
 use crate::wire::{RawClient, Wire, control_header};
 use agent::server::client::{Client, Observation};
-use env_server::snapshot::folder::{Folder, Outlives};
-use env_server::snapshot::{RestoredWorld, WorldToWrite, decode, encode};
+use env_server::snapshot::{Durability, Folder, SnapshotWorld, decode, encode};
 use protocol::channels::Instance;
 use protocol::control::{Reply, Request};
 use protocol::message::Status;
@@ -333,9 +332,9 @@ fn the_last_few_are_kept_and_one_that_is_spared() {
             .save(b"EMBRSNAP", outlives, 2, spared)
             .expect("written")
     };
-    let safe = save(Outlives::PowerLoss, None);
+    let safe = save(Durability::PowerLoss, None);
     for number in 2..6 {
-        let path = save(Outlives::Kills, Some(&safe));
+        let path = save(Durability::Kill, Some(&safe));
         let kept: Vec<PathBuf> = files
             .files()
             .expect("a list")
@@ -346,7 +345,7 @@ fn the_last_few_are_kept_and_one_that_is_spared() {
         assert_eq!(kept.last(), Some(&path));
         assert_eq!(kept.len(), number.min(3));
     }
-    save(Outlives::Kills, None);
+    save(Durability::Kill, None);
     assert!(!safe.exists(), "no longer spared");
 }
 
@@ -401,7 +400,10 @@ fn snapshots_of_other_instances_alone_are_told_of() {
     let words = format!("this instance, {name}-<12 digits>.snapshot, got others, such as other-0");
     second.program.wait_for_words(&words, PATIENCE);
     let log = second.program.stderr();
-    assert!(log.contains("WARN") && log.contains("begin anew"), "{log}");
+    assert!(
+        log.contains("WARN") && log.contains("new worlds start"),
+        "{log}"
+    );
 }
 
 #[test]
@@ -458,16 +460,16 @@ fn a_world_in_its_burn_in_begins_anew_after_a_restart() {
 /// A copy of a snapshot of a server with endless resets, as if that had been a [`SMALL`] one.
 fn with_short_burn_in(file: &Path) -> PathBuf {
     let bytes = std::fs::read(file).expect("the snapshot");
-    let (settings, rules) = small_settings(ENDLESS);
+    let spec = small_spec(ENDLESS);
     let snapshot = decode(&bytes).expect("a snapshot");
-    let restored = snapshot.restore(&settings, &rules).expect("of that server");
+    let restored = snapshot.restore(&spec).expect("of that server");
     let worlds = restored.iter().map(|world| match world {
-        RestoredWorld::Ready(episode) => WorldToWrite::Ready(episode),
-        RestoredWorld::Beginning(beginning) => WorldToWrite::Beginning(*beginning),
+        SnapshotWorld::Ready(episode) => SnapshotWorld::Ready(&**episode),
+        SnapshotWorld::New(new) => SnapshotWorld::New(*new),
     });
     let worlds: Vec<_> = worlds.collect();
     let copy = file.with_extension("copy");
-    let bytes = encode(&small_settings(20).0, &worlds).expect("small");
+    let bytes = encode(&small_spec(20).settings, &worlds).expect("small");
     std::fs::write(&copy, bytes).expect("write");
     copy
 }

@@ -6,8 +6,7 @@
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use env_server::config::ServerConfig;
-use env_server::lease::ClientId;
-use env_server::simulator::{Outcome, Simulator, Surroundings};
+use env_server::simulator::{ClientId, Outcome, ServerStats, Simulator};
 use env_server::snapshot::decode;
 use protocol::control::{Reply, Request};
 use protocol::message::{Operation, Status, StepRequest, VERSION};
@@ -38,11 +37,11 @@ impl Session {
         let checked = config.check().expect("bench settings");
         let threads = ThreadPoolBuilder::new().num_threads(1).build();
         let threads = threads.expect("bench threads");
-        let (mut simulator, orders) =
+        let (mut simulator, jobs) =
             Simulator::new(checked, threads, Box::new(|| 1)).expect("bench model");
-        for order in orders {
-            let (world, episode) = order.carry_out(simulator.rules());
-            simulator.finish_reset(world, episode);
+        for job in jobs {
+            let (world, episode) = job.run(&simulator.spec().rules);
+            simulator.put(world, episode);
         }
         let request = StepRequest {
             version: VERSION,
@@ -85,12 +84,12 @@ fn acquire(simulator: &mut Simulator, n_worlds: u32) -> u64 {
     };
     let text = serde_json::to_vec(&request).expect("requests serialise");
     let now = Instant::now();
-    let Outcome::Later(_, awaited) =
-        simulator.control(now, CLIENT, VERSION, &text, &Surroundings::default())
+    let Outcome::Pending(_, pending) =
+        simulator.control(now, CLIENT, VERSION, &text, &ServerStats::default())
     else {
         panic!("no lease");
     };
-    match simulator.answer_awaited(now, &awaited) {
+    match simulator.pending_reply(now, &pending) {
         Some(Reply::Lease(lease)) => lease.lease,
         _ => panic!("no lease"),
     }
@@ -119,11 +118,11 @@ fn snapshot(criterion: &mut Criterion) {
     group.bench_function("to bytes", |bencher| {
         bencher.iter(|| simulator.snapshot(0..1));
     });
-    let place = simulator.place();
+    let spec = simulator.spec();
     group.bench_function("from bytes", |bencher| {
         bencher.iter(|| {
             let snapshot = decode(&bytes).expect("a snapshot");
-            snapshot.restore(&place.settings, &place.rules)
+            snapshot.restore(spec)
         });
     });
     group.finish();

@@ -1,18 +1,20 @@
-//! The server's settings: defaults, then a TOML file, then flags.
+//! The server's settings and their checks.
 
-use crate::episode::Start;
-use clap::{Args, ValueEnum};
-use protocol::channels::Instance;
+use crate::world::Start;
+use protocol::channels::{ChannelError, Instance};
 use protocol::control::CoverageRule;
+use protocol::grid::ShapeError;
+use protocol::model::ModelError;
 use protocol::path::MAX_MOVES;
 use protocol::program::read_text;
-use protocol::{Cell, Model, Shape};
+use protocol::{Model, Shape};
 use serde::{Deserialize, Serialize};
-use std::path::{Path, PathBuf};
+use std::fmt::Display;
+use std::path::Path;
 use thiserror::Error;
 
 /// Most worlds of one server.
-pub const MAX_WORLDS: u32 = 1024;
+const MAX_WORLDS: u32 = 1024;
 
 /// The name of the default model.
 const WILDFIRE: &str = "wildfire";
@@ -51,107 +53,24 @@ pub struct ServerConfig {
     pub lease_millis: u64,
     /// Threads that simulate; 0: one per core.
     pub threads: usize,
-    /// Steps of each world whose frames are kept for agents that come later, 1 to 1,000,000.
+    /// Steps of each world whose frames are kept for later agents, 1 to 1,000,000.
     pub history: u32,
-    /// Begin with the worlds of this snapshot file, or of the last in this folder; empty: anew.
+    /// Start with the worlds of this snapshot file, or of the last in this folder; empty: with new ones.
     pub restore: String,
-    /// Write a snapshot each so many steps of all worlds together, times their number; 0: never.
+    /// Steps of each world between two snapshots; 0: none are written.
     pub snapshot_every: u64,
     /// The folder for these snapshots.
     pub snapshot_dir: String,
-    /// How many of them to keep, at least 1; the last that outlives a loss of power is kept besides.
+    /// How many of them to keep, at least 1; the last that survives a loss of power is kept too.
     pub snapshot_keep: u32,
-}
-
-/// The same settings as flags; each overrides the file.
-#[derive(Debug, Default, Args)]
-pub struct ServerFlags {
-    /// Read settings from this TOML file
-    #[arg(long, value_name = "FILE")]
-    pub config: Option<PathBuf>,
-    /// Name under which clients find this server [default: default]
-    #[arg(long)]
-    pub instance: Option<String>,
-    /// Number of independent worlds [default: 1]
-    #[arg(long)]
-    pub worlds: Option<u32>,
-    /// `wildfire`, `wildfire-sparse`, `wildfire-latent` or the path of a model file [default: wildfire]
-    #[arg(long)]
-    pub model: Option<String>,
-    /// Grid height in cells [default: 64]
-    #[arg(long)]
-    pub height: Option<usize>,
-    /// Grid width in cells [default: 64]
-    #[arg(long)]
-    pub width: Option<usize>,
-    /// Moves in a path [default: 64]
-    #[arg(long)]
-    pub moves: Option<usize>,
-    /// Seed of world 0; world i starts from this plus i [default: 0]
-    #[arg(long)]
-    pub seed: Option<u64>,
-    /// Steps simulated before k = 0 [default: 10000]
-    #[arg(long)]
-    pub burn_in: Option<u64>,
-    /// Episode length in steps, 0 for no end [default: 0]
-    #[arg(long)]
-    pub max_steps: Option<u64>,
-    /// What a step observes [default: path]
-    #[arg(long)]
-    pub coverage: Option<CoverageFlag>,
-    /// The robot's first cell: corner, centre, random or ROW,COL [default: corner]
-    #[arg(long, value_parser = parse_start)]
-    pub start: Option<Start>,
-    /// Publish the hidden states, for evaluation and pictures
-    #[arg(long, num_args = 0..=1, default_missing_value = "true", value_name = "BOOL")]
-    pub publish_truth: Option<bool>,
-    /// Tell clients the model [default: true]
-    #[arg(long, num_args = 0..=1, default_missing_value = "true", value_name = "BOOL")]
-    pub reveal_model: Option<bool>,
-    /// A lease ends this long after its last use, in milliseconds [default: 30000]
-    #[arg(long)]
-    pub lease_millis: Option<u64>,
-    /// Threads that simulate, 0 for one per core [default: 0]
-    #[arg(long)]
-    pub threads: Option<usize>,
-    /// Steps of each world whose frames are kept for agents that come later [default: 256]
-    #[arg(long)]
-    pub history: Option<u32>,
-    /// Begin with the worlds of this snapshot file, or of the last in this folder, if there is one
-    #[arg(long, value_name = "FILE|FOLDER")]
-    pub restore: Option<String>,
-    /// Write a snapshot each so many steps of all worlds, and one at the end [default: 0, never]
-    #[arg(long, value_name = "STEPS")]
-    pub snapshot_every: Option<u64>,
-    /// The folder for these snapshots
-    #[arg(long, value_name = "FOLDER")]
-    pub snapshot_dir: Option<String>,
-    /// How many of these snapshots to keep, and the last that the disk has for sure [default: 3]
-    #[arg(long)]
-    pub snapshot_keep: Option<u32>,
-}
-
-/// [`CoverageRule`] as a flag.
-#[derive(Debug, Clone, Copy, ValueEnum)]
-pub enum CoverageFlag {
-    /// The cells on the path
-    Path,
-    /// Every cell
-    Full,
-    /// The cells on the path, or every cell when a step asks for it
-    Client,
 }
 
 /// Settings that were checked, and what they name.
 #[derive(Debug, Clone)]
 pub struct Checked {
-    /// The settings.
     pub config: ServerConfig,
-    /// The instance.
     pub instance: Instance,
-    /// The model.
     pub model: Model,
-    /// The grid.
     pub shape: Shape,
 }
 
@@ -159,35 +78,26 @@ pub struct Checked {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ConfigError {
-    /// A file that cannot be read.
+    /// `what` is `config file` or `model file`.
     #[error("{what} {path}: {problem}")]
     File {
-        /// `config file` or `model file`.
         what: &'static str,
-        /// Its path.
         path: String,
-        /// What is wrong.
         problem: String,
     },
     /// A setting out of its range.
     #[error("{setting}: expected {expected}, got {got}")]
     Range {
-        /// Which setting.
         setting: &'static str,
-        /// What it must be.
         expected: String,
-        /// What it is.
         got: String,
     },
-    /// A name, a shape or a model that its own check refused.
     #[error(transparent)]
-    Channel(#[from] protocol::channels::ChannelError),
-    /// See [`protocol::grid::ShapeError`].
+    Channel(#[from] ChannelError),
     #[error(transparent)]
-    Shape(#[from] protocol::grid::ShapeError),
-    /// See [`protocol::model::ModelError`].
+    Shape(#[from] ShapeError),
     #[error(transparent)]
-    Model(#[from] protocol::model::ModelError),
+    Model(#[from] ModelError),
 }
 
 impl Default for ServerConfig {
@@ -217,51 +127,11 @@ impl Default for ServerConfig {
     }
 }
 
-impl ServerFlags {
-    /// The effective settings.
-    ///
-    /// # Errors
-    /// [`ConfigError::File`] for a file that is not there or not of the form.
-    pub fn effective(&self) -> Result<ServerConfig, ConfigError> {
-        let mut config = match &self.config {
-            None => ServerConfig::default(),
-            Some(path) => toml::from_str(&read("config file", path)?)
-                .map_err(|error| file_error("config file", path, error))?,
-        };
-        fn set<T: Clone>(setting: &mut T, flag: &Option<T>) {
-            if let Some(value) = flag {
-                *setting = value.clone();
-            }
-        }
-        set(&mut config.instance, &self.instance);
-        set(&mut config.worlds, &self.worlds);
-        set(&mut config.model, &self.model);
-        set(&mut config.height, &self.height);
-        set(&mut config.width, &self.width);
-        set(&mut config.moves, &self.moves);
-        set(&mut config.seed, &self.seed);
-        set(&mut config.burn_in, &self.burn_in);
-        set(&mut config.max_steps, &self.max_steps);
-        set(&mut config.coverage, &self.coverage.map(CoverageRule::from));
-        set(&mut config.start, &self.start);
-        set(&mut config.publish_truth, &self.publish_truth);
-        set(&mut config.reveal_model, &self.reveal_model);
-        set(&mut config.lease_millis, &self.lease_millis);
-        set(&mut config.threads, &self.threads);
-        set(&mut config.history, &self.history);
-        set(&mut config.restore, &self.restore);
-        set(&mut config.snapshot_every, &self.snapshot_every);
-        set(&mut config.snapshot_dir, &self.snapshot_dir);
-        set(&mut config.snapshot_keep, &self.snapshot_keep);
-        Ok(config)
-    }
-}
-
 impl ServerConfig {
     /// Checks every setting.
     ///
     /// # Errors
-    /// [`ConfigError`] names the first setting that is wrong, what it must be and what it is.
+    /// If a setting is wrong; the error names the first, what it must be and what it is.
     pub fn check(self) -> Result<Checked, ConfigError> {
         let instance = Instance::new(&self.instance)?;
         let shape = Shape::new(self.height, self.width)?;
@@ -300,6 +170,16 @@ impl ServerConfig {
         })
     }
 
+    /// The settings of a TOML file.
+    ///
+    /// # Errors
+    /// If it cannot be read or is malformed.
+    pub fn read(path: &Path) -> Result<Self, ConfigError> {
+        let wrong = |error: &dyn Display| file_error("config file", path, error);
+        let text = read_text(path).map_err(|error| wrong(&error))?;
+        toml::from_str(&text).map_err(|error| wrong(&error))
+    }
+
     fn read_model(&self) -> Result<Model, ConfigError> {
         if let Some(model) = Model::built_in(&self.model) {
             return Ok(model);
@@ -314,11 +194,7 @@ impl ServerConfig {
     }
 }
 
-fn read(what: &'static str, path: &Path) -> Result<String, ConfigError> {
-    read_text(path).map_err(|error| file_error(what, path, error))
-}
-
-fn file_error(what: &'static str, path: &Path, problem: impl ToString) -> ConfigError {
+fn file_error(what: &'static str, path: &Path, problem: impl Display) -> ConfigError {
     ConfigError::File {
         what,
         path: path.display().to_string(),
@@ -337,34 +213,10 @@ fn in_range(setting: &'static str, got: u64, least: u64, most: u64) -> Result<()
     })
 }
 
-fn parse_start(text: &str) -> Result<Start, String> {
-    match text {
-        "corner" => Ok(Start::Corner),
-        "centre" => Ok(Start::Centre),
-        "random" => Ok(Start::Random),
-        cell => {
-            let parsed = cell
-                .split_once(',')
-                .and_then(|(row, col)| Some((row.trim().parse().ok()?, col.trim().parse().ok()?)));
-            let (row, col) = parsed.ok_or("expected corner, centre, random or ROW,COL")?;
-            Ok(Start::At(Cell { row, col }))
-        }
-    }
-}
-
-impl From<CoverageFlag> for CoverageRule {
-    fn from(flag: CoverageFlag) -> Self {
-        match flag {
-            CoverageFlag::Path => Self::Path,
-            CoverageFlag::Full => Self::Full,
-            CoverageFlag::Client => Self::Client,
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use protocol::Cell;
 
     #[test]
     fn the_documented_file_holds_the_defaults() {
@@ -381,29 +233,6 @@ mod tests {
             n_settings,
             "a setting is not listed"
         );
-    }
-
-    #[test]
-    fn flags_override_the_file_and_the_file_the_defaults() {
-        let path =
-            std::env::temp_dir().join(format!("emberwatch-config-{}.toml", std::process::id()));
-        std::fs::write(
-            &path,
-            "worlds = 3\nmoves = 5\nstart = { row = 1, col = 2 }\n",
-        )
-        .expect("write");
-        let flags = ServerFlags {
-            config: Some(path.clone()),
-            moves: Some(7),
-            ..ServerFlags::default()
-        };
-        let config = flags.effective().expect("valid");
-        assert_eq!((config.worlds, config.moves, config.height), (3, 7, 64));
-        assert_eq!(config.start, Start::At(Cell { row: 1, col: 2 }));
-        std::fs::write(&path, "wrolds = 3\n").expect("write");
-        let error = flags.effective().expect_err("unknown key").to_string();
-        assert!(error.contains("wrolds"), "{error}");
-        std::fs::remove_file(&path).expect("clean up");
     }
 
     fn check(change: impl FnOnce(&mut ServerConfig), expected: &str) {

@@ -4,7 +4,7 @@ mod commands;
 
 use anyhow::{Context, Result};
 use clap::{Parser, Subcommand};
-use env_server::config::ServerFlags;
+use env_server::flags::ServerFlags;
 use env_server::server::serve;
 use protocol::program::{start_logging, stop_on_signals};
 use std::process::ExitCode;
@@ -31,15 +31,15 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Ask a running server what is going on
+    /// Print the state of a running server
     Status(commands::StatusCommand),
     /// Stop a running server
     Stop(commands::StopCommand),
     /// Write worlds of a running server to a file
     Snapshot(commands::SnapshotCommand),
-    /// Put the worlds of a file in the place of a running server's
+    /// Replace worlds of a running server by those of a file
     Restore(commands::RestoreCommand),
-    /// Put a copy of one world of a running server in the place of another
+    /// Replace a world of a running server by a copy of another
     Fork(commands::ForkCommand),
     /// Observe an instance and write what is published to a file
     Record(commands::RecordCommand),
@@ -72,11 +72,8 @@ fn run(cli: &Cli) -> Result<()> {
             if cli.check {
                 return commands::print(&toml::to_string(&checked.config)?);
             }
-            Ok(serve(
-                checked,
-                &stop_on_signals().context("handle signals")?,
-                cli.exit_with,
-            )?)
+            let stop = stop_on_signals().context("handle signals")?;
+            serve(checked, &stop, cli.exit_with)
         }
     }
 }

@@ -1,11 +1,11 @@
-//! Says one of many like warnings, and then how many there were. Pure: time comes in as an argument.
+//! Logs one of many like warnings, and then how many there were. Pure: time is an argument.
 
 use std::time::{Duration, Instant};
 
 /// Least time between two warnings of one kind.
 const INTERVAL: Duration = Duration::from_secs(10);
 
-/// Decides which warnings of one kind are said.
+/// Decides which warnings of one kind are logged.
 #[derive(Debug, Default)]
 pub struct Throttle {
     last: Option<Instant>,
@@ -13,7 +13,7 @@ pub struct Throttle {
 }
 
 impl Throttle {
-    /// Takes note of a warning; returns whether to say it, and how many were not said before it.
+    /// Counts a warning; if it is to be logged, returns how many before it were not.
     pub fn pass(&mut self, now: Instant) -> Option<u64> {
         if self.last.is_some_and(|last| now < last + INTERVAL) {
             self.n_unsaid += 1;

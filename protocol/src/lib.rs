@@ -1,42 +1,26 @@
-//! What the server and its clients agree on: the model and what it does, paths and frames, and the
-//! wire.
+//! What the server and its clients agree on, in two folders: [`model`], the mathematics of the paper, and [`wire`], the
+//! messages and channels. `wire` depends on `model`, never the other way.
 //!
-//! Read [`grid`], [`model`], [`dynamics`] (the world) and [`transition`] (beliefs) for the model of
-//! the paper; [`path`] and [`frame`] for what a robot does and sees; [`message`], [`control`] and
-//! [`decisions`] for what travels; [`channels`], [`connection`], [`responder`], [`observer`] and
-//! [`wait`] for how, and [`recording`] for keeping it in a file. PROTOCOL.md says
-//! the same for other languages. Words: a *world* is the hidden state of one grid; a *step* `k` flies
-//! one path and moves the world once; a *frame* is what was seen; a *lease* is the right to act.
+//! PROTOCOL.md describes the wire for other languages. Words: a *world* is the hidden state of one grid; a *step* `k`
+//! flies one path and moves the world once; a *frame* holds the observations of a step; a *lease* is the right to act.
 
-pub mod channels;
-pub mod cleanup;
-pub mod connection;
-pub mod control;
-pub mod decisions;
-pub mod dynamics;
-pub mod frame;
-pub mod grid;
-mod lanes;
-pub mod message;
-mod mixture;
 pub mod model;
-mod node;
-pub mod observer;
-pub mod outlook;
-pub mod path;
 pub mod program;
-pub mod randomness;
-pub mod recording;
-pub mod responder;
-mod spinning;
-pub mod transition;
-pub mod turn;
-pub mod wait;
+pub mod wire;
 
-pub use connection::Connection;
-pub use dynamics::Dynamics;
-pub use frame::{Coverage, Frame, UNOBSERVED};
-pub use grid::{Cell, Grid, Probabilities, Shape};
-pub use model::Model;
-pub use path::Move;
-pub use transition::Transition;
+pub use model::dynamics::{self, Dynamics};
+pub use model::frame::{self, Coverage, Frame, UNOBSERVED};
+pub use model::grid::{self, Cell, Grid, Probabilities, Shape};
+pub use model::path::{self, Move};
+pub use model::transition::{self, Transition};
+pub use model::{Model, randomness};
+pub use wire::connection::{self, Connection};
+pub use wire::{
+    agent_belief, channels, cleanup, control, decisions, message, observer, recording, responder,
+    turn, wait,
+};
+
+/// The names that `agent` uses for [`agent_belief`].
+pub mod outlook {
+    pub use crate::wire::agent_belief::{BeliefPublisher as Showcase, Intent};
+}

@@ -8,7 +8,7 @@ use protocol::observer::Sample;
 use protocol::recording::{
     Event, Kind, MAX_STORED_BYTES, Reader, Record, RecordHeader, RecordingError, Totals, Writer,
 };
-use std::io::{Cursor, Write};
+use std::io::Write;
 
 fn server(height: usize, width: usize, n_moves: usize) -> Event {
     Event::Server(Box::new(ServerInfo {
@@ -312,22 +312,6 @@ fn a_writer_refuses_what_a_reader_would() {
     sample.header.version = 9;
     check(2, Event::Truth(sample), "version: expected 1, got 9");
     check(2, frame(0, (2, 3), vec![0; 10]), "");
-}
-
-#[test]
-fn a_reader_goes_back_to_a_position() {
-    let bytes = written(&example());
-    let mut reader = Reader::new(Cursor::new(bytes)).expect("begin");
-    let mut positions = vec![reader.position()];
-    while let Some(record) = reader.next() {
-        record.expect("whole");
-        positions.push(reader.position());
-    }
-    for (skipped, position) in positions.iter().enumerate().take(7).rev() {
-        reader.go_to(position).expect("seek");
-        let rest: Result<Vec<Record>, _> = reader.by_ref().collect();
-        assert_eq!(rest.expect("whole"), example()[skipped..]);
-    }
 }
 
 #[test]

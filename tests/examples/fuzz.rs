@@ -7,7 +7,7 @@
 use anyhow::{Context, Result, bail};
 use std::io::{Write, stdout};
 use tests::fuzz::campaign::Campaign;
-use tests::fuzz::{Kind, TARGETS, Target};
+use tests::fuzz::{Kind, TARGETS, Target, named};
 
 /// What to run.
 struct Plan {
@@ -42,7 +42,7 @@ fn main() -> Result<()> {
             "--files" => plan.files = number()?,
             "--seed" => plan.seed = number()?,
             "--target" => {
-                let target = Target::named(&value);
+                let target = named(&value);
                 plan.target = Some(target.with_context(|| format!("no target {value:?}"))?);
             }
             _ => bail!("expected --messages, --files, --seed, --target or --seeds, got {flag}"),

@@ -7,7 +7,7 @@ use agent::estimation::belief::Belief;
 use agent::estimation::{BayesFilter, Prior};
 use agent::planning::BeamSearch;
 use agent::planning::action::{ActionSet, Region};
-use env_server::episode::{Episode, Rules, Start};
+use env_server::world::{Episode, Rules, Start};
 use protocol::{Cell, Coverage, Model, Shape};
 use std::io::Write;
 

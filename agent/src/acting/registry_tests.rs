@@ -1,11 +1,12 @@
 //! Which belief an agent plans on, and what its decisions go by.
 
+use super::*;
 use crate::estimation::dqn_input::DqnInput;
-use crate::estimation::{AutoencoderEstimator, Estimator};
-use crate::planning::BasisKind;
-use crate::rollout::agent::*;
+use crate::planning::PlanningProblem;
+use crate::rollout::agent::Aim;
 use ::network::{Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, NetworkShape};
 use protocol::randomness::split_mix;
+use protocol::{Frame, Grid};
 
 const N_MOVES: usize = 6;
 const ROBOT: Cell = Cell { row: 4, col: 4 };

@@ -21,15 +21,15 @@ pub const RANDOM_MOVES: &str = "random moves";
 /// A policy at work on one world.
 pub struct Agent {
     policy: Policy,
-    objective: Objective,
+    pub(crate) objective: Objective,
     estimator: Box<dyn Estimator>,
-    basis: PlanBasis,
+    pub(crate) basis: PlanBasis,
     planner: Box<dyn Planner + Send>,
     decider: Option<Box<dyn Decider>>,
     /// The state that pays most, where that is learned.
     target: Option<usize>,
     /// What the last path was for.
-    aim: Aim,
+    pub(crate) aim: Aim,
     /// Names of the belief's states.
     state_names: Vec<String>,
     n_moves: usize,
@@ -37,7 +37,7 @@ pub struct Agent {
 }
 
 /// What a path was for.
-enum Aim {
+pub(crate) enum Aim {
     Nothing,
     Walk,
     Objective(Target),

@@ -1,9 +1,9 @@
 //! The last few thousand steps of each world, joined from what arrives on three channels. Pure.
 
+use protocol::agent_belief::{AgentBelief, Intent};
 use protocol::frame::UNOBSERVED;
 use protocol::message::{AgentHeader, FrameHeader, StepResult, TruthHeader};
 use protocol::observer::Sample;
-use protocol::outlook::{Intent, Outlook};
 use protocol::path::path_from_bytes;
 use protocol::{Cell, Move, Shape};
 use std::collections::{BTreeMap, VecDeque};
@@ -175,7 +175,7 @@ impl Album {
 
     /// Adds what an agent believed of a step; `false` if that step is not there, yet or any more. `states` are
     /// the model's.
-    pub fn add_belief(&mut self, outlook: &Outlook, states: Option<&States>) -> bool {
+    pub fn add_belief(&mut self, published: &AgentBelief, states: Option<&States>) -> bool {
         let AgentHeader {
             seed,
             episode,
@@ -183,7 +183,7 @@ impl Album {
             world,
             pid,
             ..
-        } = outlook.header;
+        } = published.header;
         let Some(entry) = self.entry(
             world,
             Key {
@@ -194,19 +194,19 @@ impl Album {
         ) else {
             return false;
         };
-        let (_, height, width) = outlook.belief.dim();
+        let (_, height, width) = published.belief.dim();
         if (height, width) != entry.shape.dim() {
             return true; // It makes no sense, now or later.
         }
-        let states = states.filter(|states| states.names == outlook.intent.states);
+        let states = states.filter(|states| states.names == published.intent.states);
         let truth = entry.truth.as_deref();
         let score = truth.zip(states);
         let belief = Belief {
-            levels: outlook.belief.iter().map(|&p| level(p)).collect(),
-            entropy: entropy(outlook),
-            intent: outlook.intent.clone(),
+            levels: published.belief.iter().map(|&p| level(p)).collect(),
+            entropy: entropy(published),
+            intent: published.intent.clone(),
             pid,
-            score: score.and_then(|(truth, states)| score_of(outlook, truth, states.target)),
+            score: score.and_then(|(truth, states)| score_of(published, truth, states.target)),
         };
         let n_bytes = belief.n_bytes();
         let replaced = entry.belief.replace(belief);
@@ -364,10 +364,10 @@ fn level(share: f32) -> u8 {
 }
 
 /// Entropy of each cell as a share of the greatest, `ln S`.
-fn entropy(outlook: &Outlook) -> Box<[u8]> {
-    let (n_states, height, width) = outlook.belief.dim();
+fn entropy(published: &AgentBelief) -> Box<[u8]> {
+    let (n_states, height, width) = published.belief.dim();
     let mut sums = vec![0f32; height * width];
-    for plane in outlook.belief.outer_iter() {
+    for plane in published.belief.outer_iter() {
         for (sum, &p) in sums.iter_mut().zip(plane) {
             *sum -= if p > 0.0 { p * p.ln() } else { 0.0 };
         }
@@ -377,9 +377,9 @@ fn entropy(outlook: &Outlook) -> Box<[u8]> {
 }
 
 /// `None` if the hidden states are not among the belief's.
-fn score_of(outlook: &Outlook, truth: &[u8], target: usize) -> Option<Score> {
+fn score_of(published: &AgentBelief, truth: &[u8], target: usize) -> Option<Score> {
     let n_cells = truth.len();
-    let numbers = outlook.belief.as_slice()?;
+    let numbers = published.belief.as_slice()?;
     let (mut log_loss, mut brier) = (0.0, 0.0);
     for (cell, &state) in truth.iter().enumerate() {
         let p = f64::from(*numbers.get(usize::from(state) * n_cells + cell)?);

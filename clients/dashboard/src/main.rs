@@ -5,7 +5,7 @@ use clap::Parser;
 use dashboard::scene::{Scene, Stage};
 use dashboard::{player, server, watcher};
 use protocol::channels::Instance;
-use protocol::program::{Keeper, start_logging, stop_on_signals};
+use protocol::program::{WatchedProcess, start_logging, stop_on_signals};
 use std::io::Write;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -61,7 +61,7 @@ fn run(cli: &Cli) -> Result<()> {
     if let Err(error) = rustix::process::nice(NICENESS) {
         tracing::warn!("priority not lowered: {error}");
     }
-    let keeper = cli.exit_with.map(Keeper::watch).transpose()?;
+    let keeper = cli.exit_with.map(WatchedProcess::watch).transpose()?;
     let stop = stop_on_signals().context("handle signals")?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -78,7 +78,9 @@ fn run(cli: &Cli) -> Result<()> {
     let (stage, threads) = start(cli, &stop)?;
     announce(address, cli.open)?;
     let end = async {
-        while !stop.load(Ordering::Relaxed) && !keeper.as_ref().is_some_and(Keeper::has_ended) {
+        while !stop.load(Ordering::Relaxed)
+            && !keeper.as_ref().is_some_and(WatchedProcess::has_ended)
+        {
             tokio::time::sleep(TICK).await;
         }
         Ok(())

@@ -3,12 +3,12 @@
 //! One thread reads what is published, which needs no server; another asks the server now and then how it is.
 
 use crate::scene::{Info, Stage};
+use protocol::agent_belief::AgentBelief;
 use protocol::channels::{AGENT_BUFFER, ChannelError, FRAME_BUFFER, Instance};
 use protocol::connection::{Connection, ConnectionError, unexpected};
 use protocol::control::{Reply, Request, ServerStatus};
 use protocol::message::{AgentHeader, FrameHeader, Header, TruthHeader};
 use protocol::observer::{Observer, Sample};
-use protocol::outlook::Outlook;
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -144,7 +144,7 @@ struct Reader {
     truth: Option<Observer<TruthHeader>>,
     agents: Option<Observer<AgentHeader>>,
     /// Beliefs that came before their frames, and when.
-    early: Vec<(Outlook, Instant)>,
+    early: Vec<(AgentBelief, Instant)>,
     frame_gaps: Gaps,
     truth_gaps: Gaps,
     agent_gaps: HashMap<u32, Gaps>,
@@ -234,14 +234,14 @@ impl Reader {
                 let gaps = self.agent_gaps.entry(pid).or_default();
                 let lost = gaps.before(Some(pid), sequence);
                 scene.lost.agent = scene.lost.agent.saturating_add(lost);
-                match Outlook::try_from(belief) {
-                    Ok(outlook) => self.early.push((outlook, now)),
+                match AgentBelief::try_from(belief) {
+                    Ok(published) => self.early.push((published, now)),
                     Err(error) => tracing::warn!("{error}"),
                 }
             }
             let states = scene.states();
-            self.early.retain(|(outlook, came)| {
-                let is_there = scene.album.add_belief(outlook, states.as_ref());
+            self.early.retain(|(published, came)| {
+                let is_there = scene.album.add_belief(published, states.as_ref());
                 !is_there && now.duration_since(*came) < EARLY
             });
         });

@@ -4,9 +4,9 @@ use dashboard::album::{Album, MAX_ENTRIES, States};
 use dashboard::picture::{Ask, picture};
 use dashboard::scene::Scene;
 use protocol::Probabilities;
+use protocol::agent_belief::{AgentBelief, Intent};
 use protocol::message::{AgentHeader, FrameHeader, StepResult, TruthHeader};
 use protocol::observer::Sample;
-use protocol::outlook::{Intent, Outlook};
 use serde_json::Value;
 use std::time::Instant;
 
@@ -43,13 +43,13 @@ fn truth(step: u64, states: [u8; 6]) -> Sample<TruthHeader> {
 }
 
 /// Certain of state 1 in the left column, of nothing elsewhere.
-fn outlook(step: u64) -> Outlook {
+fn agent_belief(step: u64) -> AgentBelief {
     let p = |(state, _, col): (usize, usize, usize)| match (col, state) {
         (0, 1) => 1.0,
         (0, _) => 0.0,
         _ => 0.5,
     };
-    Outlook {
+    AgentBelief {
         header: AgentHeader {
             step,
             seed: u64::MAX,
@@ -124,7 +124,7 @@ fn a_picture_joins_frame_truth_and_belief_of_a_step() {
     album.add_frame(&frame(1, [255, 0, 1, 255, 255, 255]), now);
     album.add_frame(&frame(2, [255, 1, 0, 255, 255, 255]), now);
     album.add_truth(&truth(2, [1, 1, 0, 1, 0, 0]));
-    album.add_belief(&outlook(2), Some(&states()));
+    album.add_belief(&agent_belief(2), Some(&states()));
     let (header, array) = read(album, None);
     assert_eq!(header["shown"]["step"], 2);
     assert_eq!(header["shown"]["seed"], u64::MAX.to_string());
@@ -184,9 +184,9 @@ fn a_memory_says_how_far_it_reaches() {
 #[test]
 fn a_belief_without_its_frame_is_not_taken() {
     let mut album = Album::default();
-    assert!(!album.add_belief(&outlook(1), None));
+    assert!(!album.add_belief(&agent_belief(1), None));
     album.add_frame(&frame(1, [255; 6]), Instant::now());
-    assert!(album.add_belief(&outlook(1), None));
+    assert!(album.add_belief(&agent_belief(1), None));
 }
 
 #[test]
@@ -222,7 +222,7 @@ fn a_step_with_a_belief_is_shown_rather_than_a_slightly_newer_one() {
     let mut album = Album::default();
     let now = Instant::now();
     album.add_frame(&frame(1, [255; 6]), now);
-    album.add_belief(&outlook(1), None);
+    album.add_belief(&agent_belief(1), None);
     album.add_frame(&frame(2, [255; 6]), now);
     let (header, _) = read(album, None);
     assert_eq!(header["shown"]["step"], 1);
@@ -251,7 +251,7 @@ fn what_makes_no_sense_is_left_out() {
     }
     assert!(album.strip(0).is_none());
     album.add_truth(&truth(2, [0; 6])); // of a frame that never comes
-    album.add_belief(&outlook(1), None);
+    album.add_belief(&agent_belief(1), None);
     album.add_frame(&good, Instant::now());
     let mut short = truth(1, [0; 6]);
     short.payload.pop();
@@ -272,7 +272,7 @@ fn a_step_without_a_belief_has_the_one_before_of_its_episode() {
         for step in 1..=4 {
             album.add_frame(&frame(step, [255; 6]), now);
             if step == 2 {
-                album.add_belief(&outlook(step), Some(&states()));
+                album.add_belief(&agent_belief(step), Some(&states()));
             }
         }
         let mut next_episode = frame(1, [255; 6]);

@@ -108,7 +108,7 @@ def envpool_row(n_envs: int) -> Row | None:
 
 
 def race(makers: list[Callable[[int], Row | None]], n_envs: int, n_steps: int, rounds: int) -> None:
-    """Lets rows of the same size take turns."""
+    """Runs rows of the same size in turns."""
     rows = [row for row in (maker(n_envs) for maker in makers) if row is not None]
     for row in rows:
         row.go(n_steps // 10)

@@ -23,8 +23,10 @@ def main() -> None:
     parser.add_argument("--instance", default="default")
     parser.add_argument("--world", type=int, default=0)
     parser.add_argument("--private", action="store_true", help="start a server and an agent")
-    parser.add_argument("--frames", type=int, default=0, help="end after so many frames; 0: never")
-    parser.add_argument("--every", type=int, default=20, help="draw each so manieth frame")
+    parser.add_argument(
+        "--frames", type=int, default=0, help="end after this many frames; 0: never"
+    )
+    parser.add_argument("--every", type=int, default=20, help="draw every n-th frame")
     parser.add_argument("--out", help="write the last picture here instead of showing a window")
     args = parser.parse_args()
     if args.out:

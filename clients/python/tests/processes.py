@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 
 from emberwatch.client import Client
-from emberwatch.errors import ChannelError, EmberwatchError
+from emberwatch.errors import EmberwatchError
 from emberwatch.programs import Program
 from emberwatch.replies import ServerStatus
 
@@ -161,10 +161,12 @@ def in_time() -> Iterator[None]:
 
 def connects(server: Server) -> bool:
     """Opens one more connection, if there is a place for it."""
-    with suppress(ChannelError):
+    try:
         server.connect()
-        return True
-    return False
+    except EmberwatchError as error:
+        assert error.code == "channel"
+        return False
+    return True
 
 
 def is_running(pid: int) -> bool:

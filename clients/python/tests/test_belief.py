@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from failures import fails
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -14,12 +15,12 @@ from emberwatch.belief import (
     UNOBSERVED,
     Filter,
     Transition,
-    ZeroEvidenceError,
     entropy,
     initial_prior,
     uniform_prior,
 )
-from emberwatch.model import Model, ModelError
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.model import Model
 
 REPOSITORY = Path(__file__).parents[3]
 WILDFIRE = Model.wildfire()
@@ -210,11 +211,12 @@ def test_an_impossible_frame_is_refused_whole() -> None:
     prior = one_hot(np.array([[2, 2], [0, 2]]))
     filter = Filter(observed_through(matrix), prior=prior)
     # Cell (0, 0) could be corrected; cell (1, 0) is normal, which never looks like fire.
-    with pytest.raises(ZeroEvidenceError, match=r"cell \(1, 0\): .* got 2") as caught:
+    words = r"cell \(1, 0\): .* belief \[1\.0, 0\.0, 0\.0\] allows, got 2"
+    with fails("impossible_frame", match=words) as caught:
         filter.correct(np.array([[1, 255], [2, 2]], np.uint8))
     assert (filter.belief == prior).all()
-    for error in (caught.value, pickle.loads(pickle.dumps(caught.value))):
-        assert (error.cell, error.observed, error.belief) == ((1, 0), 2, (1.0, 0.0, 0.0))
+    copy = pickle.loads(pickle.dumps(caught.value))
+    assert (str(copy), copy.code) == (str(caught.value), "impossible_frame")
 
 
 @pytest.mark.parametrize(
@@ -278,5 +280,6 @@ def test_a_model_of_biases_only_forgets() -> None:
 
 def test_a_model_that_can_vanish_is_refused() -> None:
     model = model_of(kernel=np.zeros((2, 2, 1, 1)), bias=np.zeros(2), matrix=np.ones((2, 1)))
-    with pytest.raises(ModelError, match=r"cell \(0, 0\)"):
-        Filter(model, prior=uniform_prior(model, height=2, width=2))
+    filter = Filter(model, prior=uniform_prior(model, height=2, width=2))
+    with pytest.raises(InvalidArgumentError, match=r"cell \(0, 0\): expected a positive sum"):
+        filter.predict()

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from failures import fails
 from processes import LONG, PATIENCE, Script, Server, eventually, in_time
 
 from emberwatch import errors
@@ -82,17 +83,17 @@ def test_closing_again_is_fine_and_a_closed_client_says_so(server: Start) -> Non
     for _ in range(3):
         client.close()
     for call in (client.status, client.observe, client.acquire, lambda: lease.step([3] * 6)):
-        with pytest.raises(errors.ClosedError, match="closed"):
+        with fails("closed", match="closed"):
             call()
     for call in (lease.observe, lease.reset, lease.renew, lease.release):
-        with pytest.raises(errors.ClosedError, match="closed"):
+        with fails("closed", match="closed"):
             call()
 
 
 FORK = """
 import multiprocessing, os, sys, threading
 from emberwatch.client import Client
-from emberwatch.errors import ForkedError
+from emberwatch.errors import EmberwatchError
 from emberwatch.observer import observe
 from emberwatch.programs import Program, unused_instance
 
@@ -108,8 +109,8 @@ def child():
                  lambda: observer.receive(0)):
         try:
             call()
-        except ForkedError as error:
-            assert "fork" in str(error) and "open a new one" in str(error)
+        except EmberwatchError as error:
+            assert error.code == "forked" and "open a new one" in str(error)
         else:
             os._exit(9)
     client.close()

@@ -1,10 +1,11 @@
-"""Observers and truth readers: what is published, to whom, and what they miss."""
+"""Observers and truth readers: what is published, who gets it, and what they miss."""
 
 import subprocess
 from collections.abc import Callable
 
 import numpy as np
 import pytest
+from failures import fails
 from processes import PATIENCE, Server, eventually
 
 from emberwatch import errors, wire
@@ -194,7 +195,7 @@ def test_iterating_ends_when_no_frame_comes_in_time(server: Start) -> None:
     started = server()
     frames: list[Frame] = []
     with observe(started.instance, timeout=0.2) as observer:
-        # A server may take its time to greet.
+        # A server may publish the first frames late.
         assert eventually(lambda: bool(frames.extend(observer) or frames))
     assert all(frame.result.step == 0 for frame in frames)
     assert list(observe(unused_instance(), timeout=0)) == []
@@ -229,7 +230,7 @@ def test_closing_again_is_fine_and_a_closed_observer_says_so(make: Callable[...,
     observer = make(unused_instance())
     for _ in range(3):
         observer.close()
-    with pytest.raises(errors.ClosedError, match="closed"):
+    with fails("closed", match="closed"):
         observer.receive(0)
 
 
@@ -264,7 +265,7 @@ def test_an_agent_s_beliefs_are_read(server: Start) -> None:
 def test_a_belief_that_makes_no_sense_is_refused() -> None:
     header = wire.AgentHeader(n_states=2, height=1, width=1)
     for payload in [b"", bytes(8), bytes(8) + b"[]", bytes(8) + b'{"policy": "p"}']:
-        with pytest.raises(errors.GarbledAnswerError, match="sample: expected"):
+        with fails("bad_answer", match="sample: expected"):
             outlook_from_sample(header, bytearray(payload), 0)
 
 
@@ -281,7 +282,7 @@ def test_one_too_many_is_told_the_limit_and_others_go_on(
 ) -> None:
     started = server(publish_truth="true")
     readers = [make(started.instance) for _ in range(limit)]
-    with pytest.raises(errors.ChannelError, match=f"more than {limit} readers"):
+    with fails("channel", match=f"more than {limit} readers"):
         make(started.instance)
     started.connect().acquire().step(paths(0))
     for reader in readers:
@@ -292,10 +293,10 @@ def test_one_too_many_is_told_the_limit_and_others_go_on(
 
 @pytest.mark.parametrize("timeout", [-1, -0.001, float("nan")])
 def test_an_impossible_timeout_is_refused(timeout: float) -> None:
-    with pytest.raises(errors.SettingError, match="timeout: expected seconds"):
+    with pytest.raises(errors.InvalidArgumentError, match="timeout: expected seconds"):
         observe(timeout=timeout)
 
 
 def test_a_bad_instance_name_is_refused() -> None:
-    with pytest.raises(errors.SettingError, match="instance"):
+    with pytest.raises(errors.InvalidArgumentError, match="instance"):
         observe("a/b")

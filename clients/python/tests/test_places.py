@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from failures import fails
 from processes import PATIENCE, Server, connects, eventually
 
 from emberwatch import channels, errors
@@ -23,7 +24,7 @@ US = os.getpid()
 def test_a_seventeenth_client_is_told_the_limit_and_others_go_on(server: Start) -> None:
     started = server()
     clients = [started.connect() for _ in range(15)]
-    with pytest.raises(errors.ChannelError, match="more than 16 clients"):
+    with fails("channel", match="more than 16 clients"):
         started.connect()
     assert clients[-1].acquire().step([3] * 6).result().step == 1
     clients[0].close()
@@ -53,7 +54,7 @@ def test_a_server_that_is_started_later_is_waited_for(
 
 @pytest.mark.parametrize("name", ["", "a/b", "a b", ".", "ä", "x" * 65, "a\n", "a\0"])
 def test_a_bad_instance_name_is_refused(name: str) -> None:
-    with pytest.raises(errors.SettingError, match="instance: expected 1 to 64 characters"):
+    with pytest.raises(errors.InvalidArgumentError, match="instance: expected 1 to 64 characters"):
         connect(name)
 
 
@@ -114,7 +115,7 @@ def test_shared_memory_of_our_prefix_is_ours_and_closed_to_others(
     assert (tmp_path / "emberwatch_10_a").stat().st_mode & 0o777 == 0o666
     owner = tmp_path.stat().st_uid
     monkeypatch.setattr(os, "getuid", lambda: owner + 1)
-    with pytest.raises(errors.ChannelError, match=f"something of user {owner}"):
+    with fails("channel", match=f"something of user {owner}"):
         channels._own_segments(tmp_path, "emberwatch_1_")
 
 
@@ -168,6 +169,6 @@ def test_a_stopped_process_in_its_turn_keeps_nobody_waiting() -> None:
 
 def _refuses(place: Path, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(channels, "directory", lambda: place)
-    with pytest.raises(errors.ChannelError, match=words) as raised:
+    with fails("channel", match=words) as raised:
         connect("default")
     assert str(place) in str(raised.value)

@@ -12,18 +12,18 @@ from pathlib import Path
 import document
 import numpy as np
 import pytest
+from failures import fails
 from hypothesis import given
 from hypothesis import strategies as st
 from processes import PATIENCE, Server, eventually
 
 import emberwatch
-from emberwatch import errors, programs, recording, wire
+from emberwatch import programs, recording, wire
 from emberwatch.observer import Frame, Truth
 from emberwatch.recording import (
     Record,
     RecordingCutWarning,
     RecordingDamagedWarning,
-    RecordingError,
 )
 
 INFO = document.examples()[1]
@@ -62,7 +62,7 @@ def read(path: Path, content: bytes, *, strict: bool = False) -> list[Record]:
 
 
 def refused(path: Path, content: bytes, words: str) -> None:
-    with pytest.raises(RecordingError, match=re.escape(words)):
+    with fails("recording", match=re.escape(words)):
         read(path, content, strict=True)
 
 
@@ -120,7 +120,7 @@ def test_a_changed_byte_anywhere_is_noticed(path: Path) -> None:
     for position in range(len(GOOD)):
         content = bytearray(GOOD)
         content[position] ^= 0x10
-        with pytest.raises(RecordingError):
+        with fails("recording"):
             read(path, bytes(content), strict=True)
 
 
@@ -170,7 +170,7 @@ def test_random_bytes_are_never_read_whole(
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "noise.recording"
     content = FILE_HEADER + (packed(kind, deflated(noise)) if packs else noise)
-    with pytest.raises(RecordingError):
+    with fails("recording"):
         read(path, content, strict=True)
 
 
@@ -217,9 +217,9 @@ def test_a_replay_is_observed_like_a_server_and_refuses_to_act(path: Path) -> No
             seen = [frame.n_lost for frame, _ in zip(observer, range(4), strict=False)]
             with emberwatch.connect(instance) as client:
                 assert client.info.pid == replay.pid
-                with pytest.raises(errors.NotPermittedError, match="a recording is replayed"):
+                with fails("not_permitted", match="a recording is replayed"):
                     client.acquire()
-                with pytest.raises(errors.NotPermittedError, match="takes no steps"):
+                with fails("not_permitted", match="takes no steps"):
                     client.observe()
                 client.shutdown()
         assert replay.wait(PATIENCE) == 0

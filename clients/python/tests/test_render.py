@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from emberwatch.model import Model
-from emberwatch.render import Palette, Screen, ansi, rgb_array
+from emberwatch.render import Palette, Picture, Screen, ansi, rgb_array
 
 WILDFIRE = Palette.of(Model.wildfire())
 NORMAL, LATENT, FIRE = WILDFIRE.observations
@@ -27,13 +27,15 @@ def pixel(image: NDArray[np.uint8], row: int, col: int) -> tuple[int, ...]:
 
 
 def draw(**changes: Any) -> NDArray[np.uint8]:
-    usual = {"frame": FRAME, "robot": (1, 1), "palette": WILDFIRE, "path": PATH, "scale": 40}
-    return rgb_array(**{**usual, **changes})
+    usual = {"frame": FRAME, "robot": (1, 1), "palette": WILDFIRE, "path": PATH}
+    scale = changes.pop("scale", 40)
+    return rgb_array(Picture(**{**usual, **changes}), scale=scale)
 
 
 def text(**changes: Any) -> str:
-    usual = {"frame": FRAME, "robot": (1, 1), "palette": WILDFIRE, "path": PATH, "color": False}
-    return ansi(**{**usual, **changes})
+    usual = {"frame": FRAME, "robot": (1, 1), "palette": WILDFIRE, "path": PATH}
+    color = changes.pop("color", False)
+    return ansi(Picture(**{**usual, **changes}), color=color)
 
 
 def test_cells_are_squares_of_their_colour() -> None:
@@ -50,7 +52,7 @@ def test_the_path_is_a_line_and_ends_in_the_robot() -> None:
     assert pixel(image, 40, 20) == DARK  # between the first two cells
     assert pixel(image, 20, 20) == WHITE  # where it begins
     assert pixel(image, 60, 60) == DARK  # the robot's dot
-    assert {DARK, WHITE} <= {pixel(image, 60, col) for col in range(45, 60)}  # and its ring
+    assert {DARK, WHITE} <= {pixel(image, 60, col) for col in range(45, 60)}  # and its circle
     without = draw(path=None)
     assert pixel(without, 40, 20) == FIRE and pixel(without, 20, 20) == NORMAL
 
@@ -228,13 +230,13 @@ def test_a_window_shows_the_picture(headless: None, monkeypatch: pytest.MonkeyPa
     screen = Screen(title="test")
     assert screen.kind == "window"
     for parts in (PARTS, PARTS | {"truth": TRUTH}):
-        screen.show(**parts)
+        screen.show(Picture(**parts))
         shown = pygame.surfarray.array3d(pygame.display.get_surface()).transpose(1, 0, 2)
-        assert (shown == rgb_array(**parts)).all()
+        assert (shown == rgb_array(Picture(**parts))).all()
     pygame.event.post(pygame.event.Event(pygame.QUIT))
-    screen.show(**PARTS)
+    screen.show(Picture(**PARTS))
     assert screen.kind == "nothing" and not pygame.display.get_init()
-    screen.show(**PARTS)
+    screen.show(Picture(**PARTS))
     screen.close()
     screen.close()
 
@@ -246,9 +248,9 @@ def test_two_screens_take_turns_in_the_one_window(
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     one, other = Screen(), Screen()
     for screen in (one, other, one):
-        screen.show(**PARTS)
+        screen.show(Picture(**PARTS))
     other.close()
-    one.show(**PARTS)
+    one.show(Picture(**PARTS))
     one.close()
 
 
@@ -258,11 +260,11 @@ def test_a_terminal_shows_the_text_in_place(
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     screen = Screen()
     assert screen.kind == "terminal"
-    screen.show(**PARTS)
-    screen.show(**PARTS, truth=TRUTH)
+    screen.show(Picture(**PARTS))
+    screen.show(Picture(**PARTS, truth=TRUTH))
     screen.close()
-    screen.show(**PARTS)
-    first, second = ansi(**PARTS), ansi(**PARTS, truth=TRUTH)
+    screen.show(Picture(**PARTS))
+    first, second = ansi(Picture(**PARTS)), ansi(Picture(**PARTS, truth=TRUTH))
     shown = f"\x1b[2J\x1b[H{first}\x1b[K\n\x1b[J\x1b[H{second}\x1b[K\n\x1b[J"
     assert capsys.readouterr().out == shown
 
@@ -272,8 +274,8 @@ def test_nowhere_to_show_is_said_once(
 ) -> None:
     with caplog.at_level(logging.WARNING):
         screen = Screen(fps=0.001)
-        screen.show(**PARTS)
-        screen.show(**PARTS)
+        screen.show(Picture(**PARTS))
+        screen.show(Picture(**PARTS))
         screen.close()
     assert screen.kind == "nothing" and capsys.readouterr().out == ""
     assert [record.message for record in caplog.records] == [
@@ -289,5 +291,5 @@ def test_pictures_keep_their_pace(headless: None, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("time.monotonic", lambda: 50.0)
     screen = Screen(fps=4.0)
     for _ in range(3):
-        screen.show(**PARTS)
+        screen.show(Picture(**PARTS))
     assert waits == [0.0, 0.25, 0.5]

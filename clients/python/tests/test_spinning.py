@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from emberwatch.spinning import PAUSE, VAIN_SPINS, Spinning
+from emberwatch.spinning import FAILED_SPINS, PAUSE, Spinning
 
 MICRO = 1e-6
 
 
-def blocks_at(spinning: Spinning, begin: float, looks: list[int]) -> int | None:
-    """A wait with looks so many microseconds after its beginning, in vain: at which it blocks."""
+def blocks_at(spinning: Spinning, begin: float, polls: list[int]) -> int | None:
+    """A wait that polls at these microseconds and finds nothing: when it blocks."""
     spinning.begin(begin)
-    return next((at for at in looks if not spinning.goes_on(begin + at * MICRO)), None)
+    return next((at for at in polls if not spinning.goes_on(begin + at * MICRO)), None)
 
 
 def test_a_wait_spins_for_a_while_then_blocks() -> None:
@@ -19,9 +19,9 @@ def test_a_wait_spins_for_a_while_then_blocks() -> None:
     assert not spinning.goes_on(5.0 + 102 * MICRO)
 
 
-def test_after_three_spins_in_vain_waits_block_at_once_until_one_tries_again() -> None:
+def test_after_three_failed_spins_waits_block_at_once_until_one_tries_again() -> None:
     spinning = Spinning()
-    for _ in range(VAIN_SPINS):
+    for _ in range(FAILED_SPINS):
         assert blocks_at(spinning, 5.0, [0, 101]) == 101
     assert blocks_at(spinning, 5.0 + 102 * MICRO, [0]) == 0
     assert blocks_at(spinning, 5.0 + PAUSE, [0]) == 0
@@ -30,10 +30,10 @@ def test_after_three_spins_in_vain_waits_block_at_once_until_one_tries_again() -
     assert blocks_at(spinning, again + 102 * MICRO, [0]) == 0
 
 
-def test_what_arrives_while_spinning_makes_up_for_spins_in_vain() -> None:
+def test_what_arrives_while_spinning_makes_up_for_failed_spins() -> None:
     spinning = Spinning()
     for _ in range(10):
-        for _ in range(1, VAIN_SPINS):
+        for _ in range(1, FAILED_SPINS):
             assert blocks_at(spinning, 5.0, [0, 101]) == 101
         assert blocks_at(spinning, 5.0, [0, 99]) is None
         spinning.arrived()
@@ -41,7 +41,7 @@ def test_what_arrives_while_spinning_makes_up_for_spins_in_vain() -> None:
 
 def test_what_arrives_after_blocking_does_not() -> None:
     spinning = Spinning()
-    for _ in range(VAIN_SPINS):
+    for _ in range(FAILED_SPINS):
         assert blocks_at(spinning, 5.0, [0, 101]) == 101
         spinning.arrived()
     assert blocks_at(spinning, 5.0 + 102 * MICRO, [0]) == 0

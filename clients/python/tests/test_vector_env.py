@@ -22,17 +22,16 @@ from environments import (
     no_warnings,
     serving,
 )
+from failures import fails
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from processes import eventually, is_running, stopped
 
 import emberwatch
 from emberwatch.errors import (
-    BusyError,
-    InvalidActionError,
+    InvalidArgumentError,
     LeaseLostError,
     RequestTimeoutError,
     ServerGoneError,
-    SettingError,
 )
 
 PARTS = ("frame", "robot", "age")
@@ -103,7 +102,7 @@ def test_episodes_end_and_begin_anew_as_in_single_environments(
 ) -> None:
     ours, theirs = pair(4, mode, observation=PARTS, truth=truth, max_episode_steps=3)
     assert_same_flight(ours, theirs, 2, seed=0)
-    # Some begin anew in between, so that episodes end at different times.
+    # Some are reset in between, so that episodes end at different times.
     for mask in ([True, False, True, False], [False, False, True, False]):
         for env_seed in (5, [7, None, 8, None], None):
             left = ours.reset(seed=env_seed, options={"reset_mask": np.array(mask)})
@@ -203,7 +202,7 @@ def test_many_worlds_take_staggered_ends() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"reset_mask": [True, False]}, r"expected an array \(2,\) of bool, got <class 'list'>"),
+        ({"reset_mask": [True, False]}, r"expected an array \(2,\) of bool .* got <class 'list'>"),
         ({"reset_mask": np.array([1, 0])}, r"expected an array \(2,\) of bool .* got int64 \(2,\)"),
         ({"reset_mask": np.array([True])}, r"expected an array \(2,\) of bool .* got bool \(1,\)"),
         ({"reset_mask": np.zeros(2, bool)}, "with at least one True"),
@@ -214,7 +213,7 @@ def test_many_worlds_take_staggered_ends() -> None:
 def test_a_wrong_reset_mask_is_named(options: dict[str, Any], message: str) -> None:
     env = make_vec(2)
     env.reset(seed=1)
-    with pytest.raises(SettingError, match=message):
+    with pytest.raises(InvalidArgumentError, match=message):
         env.reset(options=options)
     env.close()
 
@@ -240,7 +239,9 @@ def test_the_first_reset_is_of_all_worlds() -> None:
 @pytest.mark.parametrize("seed", [[1], [1, 2, 3], []], ids=str)
 def test_a_wrong_number_of_seeds_is_named(seed: list[int]) -> None:
     env = make_vec(2)
-    with pytest.raises(SettingError, match="seed: expected an integer, None or 2 of them, got"):
+    with pytest.raises(
+        InvalidArgumentError, match="seed: expected an integer, None or 2 of them, got"
+    ):
         env.reset(seed=seed)
     env.close()
 
@@ -280,7 +281,7 @@ def test_resume_goes_on_where_the_worlds_stand() -> None:
 def test_wrong_actions_are_named_and_not_sent(action: Any, message: str) -> None:
     env = make_vec(2)
     env.reset(seed=1)
-    with pytest.raises(InvalidActionError, match=message):
+    with pytest.raises(InvalidArgumentError, match=message):
         env.step(action)
     assert env.step(np.zeros((2, 4), int))[4]["step"].tolist() == [1, 1]
     env.close()
@@ -333,8 +334,8 @@ def _spoil(value: Any) -> None:
     [
         ({"max_episode_steps": 0}, "max_episode_steps: expected at least 1 or None, got 0"),
         ({"autoreset_mode": "sometimes"}, "sometimes"),
-        ({"n_worlds": 0}, "num_envs: expected an integer within 1 to 1024, got 0"),
-        ({"n_worlds": 1025}, "num_envs: .* got 1025"),
+        ({"n_worlds": 0}, "worlds: expected 1 to 1024, got 0"),
+        ({"n_worlds": 1025}, "worlds: .* got 1025"),
         ({"n_worlds": 129, "truth": True}, "truth: expected at most 128 worlds, got 129"),
         ({"observation": "smoke"}, "observation: .* got 'smoke'"),
         ({"world": 2}, "expected instance=..., .* got world 2"),
@@ -349,11 +350,11 @@ def test_impossible_keywords_are_named(keywords: dict[str, Any], message: str) -
 
 def test_worlds_that_a_server_does_not_have_are_named() -> None:
     with serving(worlds=3) as instance:
-        with pytest.raises(SettingError, match="expected worlds within 0 to 2, got 1 to 3"):
+        with pytest.raises(InvalidArgumentError, match="expected worlds within 0 to 2, got 1 to 3"):
             make_vec(3, instance=instance, world=1)
         one, other = make_vec(2, instance=instance), make_vec(2, instance=instance, world=1)
         one.reset(seed=1)
-        with pytest.raises(BusyError, match=f"pid {os.getpid()}"):
+        with fails("busy", match=f"pid {os.getpid()}"):
             other.reset(seed=1)
         one.close()
         other.reset(seed=1)
@@ -568,7 +569,7 @@ def test_live_worlds_are_not_copied(flying: Vector) -> None:
 
 
 def test_an_unknown_keyword_is_named() -> None:
-    with pytest.raises(SettingError, match="got 'burnin' .did you mean 'burn_in'"):
+    with pytest.raises(TypeError, match="keyword 'burnin' .did you mean 'burn_in'"):
         make_vec(2, burnin=3)
     gc.collect()
 
@@ -577,7 +578,7 @@ def test_a_stopped_server_times_out_and_resume_goes_on(flying: Vector) -> None:
     pid = private_pid(flying)
     with stopped(pid), impatient(flying), pytest.raises(RequestTimeoutError):
         flying.step(np.zeros((2, 4), int))
-    with pytest.raises(emberwatch.errors.ClosedError, match="timed out"):
+    with fails("closed", match="timed out"):
         flying.step(np.zeros((2, 4), int))
     infos = flying.reset(options={"resume": True})[1]
     after = flying.step(np.zeros((2, 4), int))[4]

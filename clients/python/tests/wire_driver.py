@@ -10,7 +10,7 @@ import sys
 
 from emberwatch import wire
 from emberwatch.channels import Node
-from emberwatch.ports import Bell, RequestPort
+from emberwatch.ports import Peer, RequestPort
 
 HEADERS = {
     "step": (wire.StepRequest, wire.StepReply),
@@ -19,9 +19,9 @@ HEADERS = {
 
 
 def main() -> None:
-    bell = Bell(Node(sys.argv[1]))
+    peer = Peer(Node(sys.argv[1]))
     ports = {
-        service: RequestPort(bell, service, headers, slice_len=4096, grows=True)
+        service: RequestPort(peer, service, headers, slice_len=4096, grows=True)
         for service, headers in HEADERS.items()
     }
     for line in sys.stdin:

@@ -2,7 +2,7 @@
 
 use anyhow::{Context, Result};
 use clap::Args;
-use env_server::recorder::{Order, Summary, record};
+use env_server::recording::{RecordOptions, RecordSummary, record};
 use protocol::channels::Instance;
 use protocol::program::stop_on_signals;
 use std::path::PathBuf;
@@ -16,7 +16,7 @@ pub struct RecordCommand {
     /// The file to write
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Write over a file that exists
+    /// Overwrite an existing file
     #[arg(long)]
     force: bool,
     /// Record hidden states too, where the server publishes them (`--publish-truth`)
@@ -34,7 +34,7 @@ impl RecordCommand {
     /// Records until stopped, or until the steps are recorded.
     pub fn run(&self) -> Result<()> {
         let stop = stop_on_signals().context("handle signals")?;
-        let order = Order {
+        let options = RecordOptions {
             instance: Instance::new(&self.instance)?,
             out: self.out.clone(),
             overwrite: self.force,
@@ -42,12 +42,12 @@ impl RecordCommand {
             n_steps: self.steps,
             worlds: self.worlds.clone(),
         };
-        report(&record(&order, &stop)?);
+        report(&record(&options, &stop)?);
         Ok(())
     }
 }
 
-fn report(summary: &Summary) {
+fn report(summary: &RecordSummary) {
     let totals = &summary.totals;
     tracing::info!(
         records = totals.n_servers + totals.n_frames + totals.n_truths,

@@ -2,7 +2,7 @@
 
 use anyhow::{Context, Result};
 use clap::Args;
-use env_server::replay::{Order, replay};
+use env_server::recording::{ReplayOptions, replay};
 use protocol::channels::Instance;
 use protocol::program::stop_on_signals;
 use std::path::PathBuf;
@@ -22,13 +22,13 @@ pub struct ReplayCommand {
     /// Leave out this much of the beginning, seconds
     #[arg(long, default_value = "0", value_parser = parse_seconds, value_name = "SECONDS")]
     from: Duration,
-    /// Begin anew at the end, until stopped
+    /// Start again at the end, until stopped
     #[arg(long = "loop")]
     repeat: bool,
-    /// Begin at once, rather than when there is an observer
+    /// Start at once, rather than with the first observer
     #[arg(long)]
     no_wait: bool,
-    /// Refuse a recording that is damaged or cut short, rather than replay what of it is good
+    /// Refuse a recording that is damaged or cut short, rather than replay its whole records
     #[arg(long)]
     strict: bool,
 }
@@ -41,7 +41,7 @@ impl ReplayCommand {
     /// Replays until the end, or until stopped.
     pub fn run(&self) -> Result<()> {
         let stop = stop_on_signals().context("handle signals")?;
-        let order = Order {
+        let options = ReplayOptions {
             file: self.file.clone(),
             instance: Instance::new(&self.instance)?,
             speed: self.speed.0,
@@ -50,7 +50,7 @@ impl ReplayCommand {
             at_once: self.no_wait,
             strict: self.strict,
         };
-        Ok(replay(&order, &stop)?)
+        replay(&options, &stop)
     }
 }
 

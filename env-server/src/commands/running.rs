@@ -1,6 +1,6 @@
 //! `status` and `stop`: questions to a running server.
 
-use super::print;
+use super::print::print;
 use anyhow::Result;
 use clap::Args;
 use protocol::Connection;
@@ -11,7 +11,7 @@ use std::time::Duration;
 /// How long to wait for the server.
 const TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Ask a running server what is going on.
+/// Print the state of a running server.
 #[derive(Args)]
 pub struct StatusCommand {
     #[command(flatten)]

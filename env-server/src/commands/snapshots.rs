@@ -2,7 +2,7 @@
 
 use anyhow::{Result, bail};
 use clap::Args;
-use env_server::snapshot::folder::read;
+use env_server::snapshot::read;
 use protocol::Connection;
 use protocol::channels::Instance;
 use protocol::control::{Reply, Request, WorldInfo};
@@ -12,7 +12,7 @@ use std::time::Duration;
 /// How long to wait: files may be large, and worlds in their burn-in.
 const TIMEOUT: Duration = Duration::from_secs(120);
 
-/// Write worlds to a file; needs no lease and disturbs nobody.
+/// Write worlds to a file; needs no lease.
 #[derive(Args)]
 pub struct SnapshotCommand {
     /// The file to write
@@ -28,7 +28,7 @@ pub struct SnapshotCommand {
     worlds: Option<u32>,
 }
 
-/// Put the worlds of a file in the place of a server's.
+/// Replace worlds of a server by those of a file.
 #[derive(Args)]
 pub struct RestoreCommand {
     /// The file to read
@@ -50,7 +50,7 @@ pub struct RestoreCommand {
     takeover: bool,
 }
 
-/// Put a copy of one world in the place of another.
+/// Replace a world by a copy of another.
 #[derive(Args)]
 pub struct ForkCommand {
     /// The world to copy
@@ -93,7 +93,7 @@ impl SnapshotCommand {
 impl RestoreCommand {
     /// Acquires the worlds, has them replaced, and releases them.
     pub fn run(&self) -> Result<()> {
-        // Says what is wrong with the file before any world is taken from anybody.
+        // A wrong file is refused before any lease is taken over.
         let in_file = read(&self.file)?.worlds.len() as u32;
         let Some(rest) = in_file.checked_sub(self.from).filter(|rest| *rest > 0) else {
             bail!(

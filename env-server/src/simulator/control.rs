@@ -1,16 +1,15 @@
 //! Control requests: parse, check, answer now or when worlds are ready.
 
-use super::{FileOrder, ResetOrder, Simulator, Slot};
-use crate::files::Job;
-use crate::lease::{Claim, ClientId, Refusal};
+use super::lease::{Claim, ClientId};
+use super::outcome::{Outcome, PendingReply, ServerStats, malformed, refusal};
+use super::state::{ResetJob, Simulator, Slot};
 use protocol::channels::MAX_CLIENTS;
 use protocol::control::{
-    LeaseInfo, Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldSeed, WorldStatus, parse,
+    LeaseInfo, Reply, Request, ServerInfo, ServerStatus, WorldSeed, WorldStatus, parse,
 };
 use protocol::message::{Status, StepResult, VERSION};
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
-use std::ops::Range;
 use std::time::{Duration, Instant};
 
 /// Longest lease a client may ask for: a day.
@@ -18,42 +17,6 @@ const LONGEST_LEASE: Duration = Duration::from_secs(86_400);
 
 /// Shortest lease a client may ask for.
 const SHORTEST_LEASE: Duration = Duration::from_millis(100);
-
-/// What a control request leads to.
-pub enum Outcome {
-    /// An answer now.
-    Answer(Reply),
-    /// Resets to carry out, and an answer when the worlds it names are ready.
-    Later(Vec<ResetOrder>, Awaited),
-    /// Worlds to publish, and an answer now.
-    Changed(Range<usize>, Reply),
-    /// Work on a file, and an answer when it is done.
-    File(Job, FileOrder),
-    /// An answer now, then the end of the server.
-    Shutdown,
-}
-
-/// An answer that waits until worlds have been reset.
-pub struct Awaited {
-    worlds: Vec<usize>,
-    lease: u64,
-    client: ClientId,
-    /// Whether to tell of the lease, or of the worlds alone.
-    tells_lease: bool,
-}
-
-/// What the server itself knows and a status answer tells.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Surroundings {
-    /// Time since the server started.
-    pub uptime: Duration,
-    /// World steps a second, lately.
-    pub steps_per_second: f64,
-    /// Clients on the step channel.
-    pub n_clients: usize,
-    /// Observers of frames.
-    pub n_observers: usize,
-}
 
 impl Simulator {
     /// Handles a control request.
@@ -63,9 +26,9 @@ impl Simulator {
         client: ClientId,
         version: u32,
         text: &[u8],
-        surroundings: &Surroundings,
+        stats: &ServerStats,
     ) -> Outcome {
-        let outcome = self.try_control(now, client, version, text, surroundings);
+        let outcome = self.try_control(now, client, version, text, stats);
         outcome.unwrap_or_else(|reply| {
             self.n_refused += 1;
             Outcome::Answer(reply)
@@ -73,28 +36,28 @@ impl Simulator {
     }
 
     /// The answer to a request that had to wait, once its worlds are ready.
-    pub fn answer_awaited(&mut self, now: Instant, awaited: &Awaited) -> Option<Reply> {
-        if awaited
+    pub fn pending_reply(&mut self, now: Instant, pending: &PendingReply) -> Option<Reply> {
+        if pending
             .worlds
             .iter()
             .any(|&world| self.episode(world).is_none())
         {
             return None;
         }
-        let worlds = awaited
+        let worlds = pending
             .worlds
             .iter()
             .map(|&world| self.world_info(world))
             .collect();
-        // Waiting is use: a burn-in longer than the lease must not end it.
-        self.leases.end_wait(now, awaited.lease);
-        if !awaited.tells_lease {
+        // A burn-in longer than the lease must not end it.
+        self.leases.end_wait(now, pending.lease);
+        if !pending.tells_lease {
             return Some(Reply::Reset { worlds });
         }
         Some(
-            match self.leases.renew(now, awaited.lease, awaited.client) {
+            match self.leases.renew(now, pending.lease, pending.client) {
                 Ok(lease) => Reply::Lease(LeaseInfo {
-                    lease: awaited.lease,
+                    lease: pending.lease,
                     ttl_millis: lease.time_to_live.as_millis() as u64,
                     worlds,
                 }),
@@ -103,9 +66,9 @@ impl Simulator {
         )
     }
 
-    /// Takes note that nobody waits for an answer any more.
-    pub fn forget_awaited(&mut self, now: Instant, awaited: &Awaited) {
-        self.leases.end_wait(now, awaited.lease);
+    /// Cancels the wait for a reply that no client waits for any more.
+    pub fn cancel_reply(&mut self, now: Instant, pending: &PendingReply) {
+        self.leases.end_wait(now, pending.lease);
     }
 
     fn try_control(
@@ -114,61 +77,63 @@ impl Simulator {
         client: ClientId,
         version: u32,
         text: &[u8],
-        surroundings: &Surroundings,
+        stats: &ServerStats,
     ) -> Result<Outcome, Reply> {
         if version != VERSION {
-            return Err(mismatch(version));
+            return Err(Reply::version_mismatch(version));
         }
-        Ok(match parse(text).map_err(malformed)? {
-            Request::Hello { protocol, .. } if protocol != VERSION => {
-                return Err(mismatch(protocol));
-            }
-            Request::Hello { .. } => Outcome::Answer(Reply::Hello(Box::new(self.info()))),
-            Request::Acquire {
-                first_world,
-                n_worlds,
-                takeover,
-                ttl_millis,
-            } => {
-                let worlds = self.range(first_world, n_worlds).map_err(refusal)?;
-                let time_to_live = self.time_to_live(ttl_millis);
-                self.acquire(
-                    now,
-                    Claim {
-                        client,
-                        worlds,
-                        takeover,
-                        time_to_live,
-                    },
-                )?
-            }
-            Request::Renew { lease } => {
-                self.leases.renew(now, lease, client).map_err(refusal)?;
-                self.tell_lease(lease, client)
-            }
-            Request::Release { lease } => {
-                self.leases.release(now, lease, client).map_err(refusal)?;
-                Outcome::Answer(Reply::Done)
-            }
-            Request::Reset { lease, worlds } => self.order_resets(now, client, lease, &worlds)?,
-            Request::Snapshot {
-                first_world,
-                n_worlds,
-                path,
-            } => self.order_snapshot(first_world, n_worlds, path)?,
-            Request::Restore {
-                lease,
-                first_world,
-                n_worlds,
-                from,
-                path,
-            } => self.order_restore(now, client, lease, (first_world, n_worlds, from), path)?,
-            Request::Fork { lease, from, to } => self.fork(now, client, lease, (from, to))?,
-            Request::LeaveBelief(part) => self.leave_belief(now, client, &part)?,
-            Request::Belief { world, offset } => self.belief(world, offset)?,
-            Request::Status {} => Outcome::Answer(Reply::Status(self.status(surroundings))),
-            Request::Shutdown {} => Outcome::Shutdown,
-        })
+        Ok(
+            match parse(text).map_err(|message| Reply::error(Status::Malformed, 0, message))? {
+                Request::Hello { protocol, .. } if protocol != VERSION => {
+                    return Err(Reply::version_mismatch(protocol));
+                }
+                Request::Hello { .. } => Outcome::Answer(Reply::Hello(Box::new(self.info()))),
+                Request::Acquire {
+                    first_world,
+                    n_worlds,
+                    takeover,
+                    ttl_millis,
+                } => {
+                    let worlds = self.range(first_world, n_worlds).map_err(refusal)?;
+                    let time_to_live = self.time_to_live(ttl_millis);
+                    self.acquire(
+                        now,
+                        Claim {
+                            client,
+                            worlds,
+                            takeover,
+                            time_to_live,
+                        },
+                    )?
+                }
+                Request::Renew { lease } => {
+                    self.leases.renew(now, lease, client).map_err(refusal)?;
+                    self.tell_lease(lease, client)
+                }
+                Request::Release { lease } => {
+                    self.leases.release(now, lease, client).map_err(refusal)?;
+                    Outcome::Answer(Reply::Done)
+                }
+                Request::Reset { lease, worlds } => self.reset(now, client, lease, &worlds)?,
+                Request::Snapshot {
+                    first_world,
+                    n_worlds,
+                    path,
+                } => self.snapshot_job(first_world, n_worlds, path)?,
+                Request::Restore {
+                    lease,
+                    first_world,
+                    n_worlds,
+                    from,
+                    path,
+                } => self.restore_job(now, client, lease, (first_world, n_worlds, from), path)?,
+                Request::Fork { lease, from, to } => self.fork(now, client, lease, (from, to))?,
+                Request::LeaveBelief(part) => self.leave_belief(now, client, &part)?,
+                Request::Belief { world, offset } => self.belief(world, offset)?,
+                Request::Status {} => Outcome::Answer(Reply::Status(self.status(stats))),
+                Request::Shutdown {} => Outcome::Shutdown,
+            },
+        )
     }
 
     fn time_to_live(&self, ttl_millis: Option<u64>) -> Duration {
@@ -183,23 +148,23 @@ impl Simulator {
     }
 
     /// An answer when its worlds are ready; the lease lives until then.
-    fn later(&mut self, orders: Vec<ResetOrder>, awaited: Awaited) -> Outcome {
-        self.leases.begin_wait(awaited.lease);
-        Outcome::Later(orders, awaited)
+    fn pending(&mut self, jobs: Vec<ResetJob>, pending: PendingReply) -> Outcome {
+        self.leases.begin_wait(pending.lease);
+        Outcome::Pending(jobs, pending)
     }
 
     /// The worlds of a lease, once they are ready.
     fn tell_lease(&mut self, lease: u64, client: ClientId) -> Outcome {
-        let awaited = Awaited {
+        let pending = PendingReply {
             worlds: self.leases.worlds_held(lease),
             lease,
             client,
             tells_lease: true,
         };
-        self.later(Vec::new(), awaited)
+        self.pending(Vec::new(), pending)
     }
 
-    fn order_resets(
+    fn reset(
         &mut self,
         now: Instant,
         client: ClientId,
@@ -221,30 +186,28 @@ impl Simulator {
                 .iter()
                 .any(|earlier| earlier.world == *world)
             {
-                return Err(malformed(format!(
-                    "{}: reset: expected each world once, got world {world} twice",
-                    Status::Malformed.explain(0)
-                )));
+                let problem = format!("reset: expected each world once, got world {world} twice");
+                return Err(malformed(&problem));
             }
         }
-        let orders = worlds
+        let jobs = worlds
             .iter()
-            .filter_map(|order| self.take_for_reset(order))
+            .filter_map(|world| self.take_for_reset(world))
             .collect();
-        let worlds = worlds.iter().map(|order| order.world as usize).collect();
-        let awaited = Awaited {
+        let worlds = worlds.iter().map(|world| world.world as usize).collect();
+        let pending = PendingReply {
             worlds,
             lease,
             client,
             tells_lease: false,
         };
-        Ok(self.later(orders, awaited))
+        Ok(self.pending(jobs, pending))
     }
 
-    fn take_for_reset(&mut self, order: &WorldSeed) -> Option<ResetOrder> {
-        let world = order.world as usize;
+    fn take_for_reset(&mut self, to: &WorldSeed) -> Option<ResetJob> {
+        let world = to.world as usize;
         let last = *self.episode(world)?.result();
-        let seed = order.seed.unwrap_or_else(|| next_seed(&last));
+        let seed = to.seed.unwrap_or_else(|| next_seed(&last));
         let episode = last.episode.wrapping_add(1);
         let slot = Slot::Resetting {
             last,
@@ -252,35 +215,13 @@ impl Simulator {
             episode,
         };
         match std::mem::replace(&mut self.slots[world], slot) {
-            Slot::Ready(before) => Some(ResetOrder {
+            Slot::Ready(before) => Some(ResetJob {
                 world,
                 before: Some(before),
                 episode,
                 seed,
             }),
             Slot::Resetting { .. } => None,
-        }
-    }
-
-    pub(super) fn world_info(&self, world: usize) -> WorldInfo {
-        let result = match &self.slots[world] {
-            Slot::Ready(episode) => episode.result(),
-            Slot::Resetting { last, .. } => last,
-        };
-        let StepResult {
-            step,
-            seed,
-            episode,
-            row,
-            col,
-            ..
-        } = *result;
-        WorldInfo {
-            world: world as u32,
-            step,
-            seed,
-            episode,
-            robot: [row, col],
         }
     }
 
@@ -312,7 +253,7 @@ impl Simulator {
         }
     }
 
-    fn status(&self, surroundings: &Surroundings) -> ServerStatus {
+    fn status(&self, stats: &ServerStats) -> ServerStatus {
         let world_status = |world| WorldStatus {
             info: self.world_info(world),
             holder_pid: self.leases.holder(world).map(|lease| lease.client.pid),
@@ -320,38 +261,15 @@ impl Simulator {
         };
         ServerStatus {
             pid: std::process::id(),
-            uptime_millis: surroundings.uptime.as_millis() as u64,
+            uptime_millis: stats.uptime.as_millis() as u64,
             n_steps: self.n_steps,
-            steps_per_second: surroundings.steps_per_second,
+            steps_per_second: stats.steps_per_second,
             n_refused: self.n_refused,
-            n_clients: surroundings.n_clients,
-            n_observers: surroundings.n_observers,
+            n_clients: stats.n_clients,
+            n_observers: stats.n_observers,
             worlds: (0..self.slots.len()).map(world_status).collect(),
         }
     }
-}
-
-/// The refusal of a client that speaks another version.
-fn mismatch(client: u32) -> Reply {
-    let (status, detail) = (Status::VersionMismatch, u64::from(VERSION));
-    let message = Status::version_mismatch(client, detail);
-    Reply::Error {
-        status,
-        detail,
-        message,
-    }
-}
-
-pub(super) fn malformed(message: String) -> Reply {
-    Reply::Error {
-        status: Status::Malformed,
-        detail: 0,
-        message,
-    }
-}
-
-pub(super) fn refusal(refusal: Refusal) -> Reply {
-    Reply::refusal(refusal.status, refusal.detail)
 }
 
 /// The seed after an episode whose reset names none; below 2^53, which every JSON reader holds.

@@ -1,10 +1,13 @@
 //! What waits for worlds that are being reset, and what leases do meanwhile.
 
-use super::*;
+use super::lease::ClientId;
+use super::outcome::{Outcome, PendingReply, ServerStats};
+use super::state::{ResetJob, Simulator};
 use crate::config::ServerConfig;
 use protocol::control::{Reply, Request, WorldSeed};
+use protocol::message::{Operation, Status, StepRequest, VERSION};
 use rayon::ThreadPoolBuilder;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 const US: ClientId = ClientId { node: 1, pid: 7 };
 
@@ -12,7 +15,7 @@ const US: ClientId = ClientId { node: 1, pid: 7 };
 const LEASE: Duration = Duration::from_secs(20);
 
 /// Two worlds in their first burn-in, and what ends it.
-fn start() -> (Simulator, Vec<ResetOrder>) {
+fn start() -> (Simulator, Vec<ResetJob>) {
     let config = ServerConfig {
         worlds: 2,
         height: 3,
@@ -32,35 +35,39 @@ fn start() -> (Simulator, Vec<ResetOrder>) {
     Simulator::new(checked, threads.expect("a thread"), next_token).expect("a valid model")
 }
 
-fn finish(simulator: &mut Simulator, orders: Vec<ResetOrder>) {
-    for order in orders {
-        let (world, episode) = order.carry_out(simulator.rules());
-        simulator.finish_reset(world, episode);
+fn finish(simulator: &mut Simulator, jobs: Vec<ResetJob>) {
+    for job in jobs {
+        let (world, episode) = job.run(&simulator.spec().rules);
+        simulator.put(world, episode);
     }
 }
 
 fn ask(simulator: &mut Simulator, now: Instant, request: &Request) -> Outcome {
     let text = serde_json::to_vec(request).expect("requests serialise");
-    simulator.control(now, US, VERSION, &text, &Surroundings::default())
+    simulator.control(now, US, VERSION, &text, &ServerStats::default())
 }
 
 /// Asks for what is answered later.
-fn later(simulator: &mut Simulator, now: Instant, request: &Request) -> (Vec<ResetOrder>, Awaited) {
+fn ask_pending(
+    simulator: &mut Simulator,
+    now: Instant,
+    request: &Request,
+) -> (Vec<ResetJob>, PendingReply) {
     match ask(simulator, now, request) {
-        Outcome::Later(orders, awaited) => (orders, awaited),
+        Outcome::Pending(jobs, pending) => (jobs, pending),
         _ => panic!("{request:?} is not answered later"),
     }
 }
 
 /// Asks for both worlds; the first token is 1.
-fn acquire(simulator: &mut Simulator, now: Instant) -> Awaited {
+fn acquire(simulator: &mut Simulator, now: Instant) -> PendingReply {
     let request = Request::Acquire {
         first_world: 0,
         n_worlds: 2,
         takeover: false,
         ttl_millis: None,
     };
-    later(simulator, now, &request).1
+    ask_pending(simulator, now, &request).1
 }
 
 /// Resets world 0 to a seed.
@@ -88,24 +95,24 @@ fn step(simulator: &mut Simulator, now: Instant) -> Status {
 
 #[test]
 fn a_world_in_burn_in_takes_no_step_and_requests_for_it_wait() {
-    let ((mut simulator, orders), now) = (start(), Instant::now());
+    let ((mut simulator, jobs), now) = (start(), Instant::now());
     let acquired = acquire(&mut simulator, now);
-    assert_eq!(simulator.answer_awaited(now, &acquired), None);
+    assert_eq!(simulator.pending_reply(now, &acquired), None);
     assert_eq!(step(&mut simulator, now), Status::Resetting);
-    finish(&mut simulator, orders);
-    let told = simulator.answer_awaited(now, &acquired);
+    finish(&mut simulator, jobs);
+    let told = simulator.pending_reply(now, &acquired);
     assert!(matches!(told, Some(Reply::Lease(_))), "{told:?}");
     assert_eq!(step(&mut simulator, now), Status::Ok);
 
-    let (orders, awaited) = later(&mut simulator, now, &reset(77));
-    assert_eq!(simulator.answer_awaited(now, &awaited), None);
+    let (jobs, pending) = ask_pending(&mut simulator, now, &reset(77));
+    assert_eq!(simulator.pending_reply(now, &pending), None);
     assert_eq!(step(&mut simulator, now), Status::Resetting);
     let twice = ask(&mut simulator, now, &reset(78));
     let is_refused =
         matches!(&twice, Outcome::Answer(reply) if reply.status() == Status::Resetting);
     assert!(is_refused, "one reset of a world at a time");
-    finish(&mut simulator, orders);
-    let Some(Reply::Reset { worlds }) = simulator.answer_awaited(now, &awaited) else {
+    finish(&mut simulator, jobs);
+    let Some(Reply::Reset { worlds }) = simulator.pending_reply(now, &pending) else {
         panic!("expected a reset");
     };
     let begun = (worlds[0].seed, worlds[0].step, worlds[0].episode);
@@ -115,16 +122,16 @@ fn a_world_in_burn_in_takes_no_step_and_requests_for_it_wait() {
 
 #[test]
 fn a_lease_lasts_from_its_last_use_or_renewal() {
-    let ((mut simulator, orders), now) = (start(), Instant::now());
+    let ((mut simulator, jobs), now) = (start(), Instant::now());
     let acquired = acquire(&mut simulator, now);
-    finish(&mut simulator, orders);
-    simulator.answer_awaited(now, &acquired).expect("ready");
+    finish(&mut simulator, jobs);
+    simulator.pending_reply(now, &acquired).expect("ready");
     let almost = LEASE - Duration::from_millis(1);
     let now = now + almost;
     assert_eq!(step(&mut simulator, now), Status::Ok);
     let now = now + almost;
-    let (_, awaited) = later(&mut simulator, now, &Request::Renew { lease: 1 });
-    simulator.answer_awaited(now, &awaited).expect("ready");
+    let (_, pending) = ask_pending(&mut simulator, now, &Request::Renew { lease: 1 });
+    simulator.pending_reply(now, &pending).expect("ready");
     assert!(simulator.expire(now + almost).is_empty());
     assert_eq!(step(&mut simulator, now + LEASE), Status::LeaseLost);
     assert_eq!(simulator.expire(now + LEASE), [US.pid]);
@@ -132,24 +139,24 @@ fn a_lease_lasts_from_its_last_use_or_renewal() {
 
 #[test]
 fn a_lease_outlives_the_burn_ins_that_its_client_waits_for() {
-    let ((mut simulator, orders), now) = (start(), Instant::now());
+    let ((mut simulator, jobs), now) = (start(), Instant::now());
     let acquired = acquire(&mut simulator, now);
     let now = now + 9 * LEASE;
     assert!(simulator.expire(now).is_empty(), "the first");
-    finish(&mut simulator, orders);
-    let told = simulator.answer_awaited(now, &acquired);
+    finish(&mut simulator, jobs);
+    let told = simulator.pending_reply(now, &acquired);
     assert!(matches!(told, Some(Reply::Lease(_))), "{told:?}");
 
-    let (orders, awaited) = later(&mut simulator, now, &reset(77));
+    let (jobs, pending) = ask_pending(&mut simulator, now, &reset(77));
     let now = now + 9 * LEASE;
     assert!(simulator.expire(now).is_empty(), "that of a reset");
-    finish(&mut simulator, orders);
-    let told = simulator.answer_awaited(now, &awaited);
+    finish(&mut simulator, jobs);
+    let told = simulator.pending_reply(now, &pending);
     assert!(matches!(told, Some(Reply::Reset { .. })), "{told:?}");
 
-    let (_, awaited) = later(&mut simulator, now, &reset(78));
+    let (_, pending) = ask_pending(&mut simulator, now, &reset(78));
     let now = now + 9 * LEASE;
-    simulator.forget_awaited(now, &awaited);
+    simulator.cancel_reply(now, &pending);
     let almost = now + LEASE - Duration::from_millis(1);
     assert!(simulator.expire(almost).is_empty());
     assert_eq!(

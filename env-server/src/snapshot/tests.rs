@@ -1,27 +1,28 @@
 //! Snapshots that are whole, damaged and forged.
 
-use super::*;
+use super::error::SnapshotError;
+use super::format::{HEADER_BYTES, MAGIC, NewEpisode, SnapshotWorld, VERSION, decode, encode};
+use super::settings::{Settings, WorldSpec};
 use crate::config::ServerConfig;
+use crate::world::{Episode, Rules, SavedWorld};
 use protocol::{Coverage, Move};
 
-const BEGINNING: Beginning = Beginning {
+const NEW: NewEpisode = NewEpisode {
     seed: 7,
     episode: 3,
 };
 
-fn settings() -> (Settings, Rules) {
+fn spec() -> WorldSpec {
     let config = ServerConfig {
         height: 3,
         width: 5,
         moves: 2,
         burn_in: 300,
+        history: 4,
         ..ServerConfig::default()
     };
     let checked = config.check().expect("valid settings");
-    let mut rules = Rules::new(&checked.model, checked.shape, 300, 0, checked.config.start)
-        .expect("valid model");
-    (rules.history, rules.n_moves) = (4, 2);
-    (Settings::of(&checked), rules)
+    WorldSpec::of(&checked).expect("a valid model")
 }
 
 fn episodes(rules: &Rules) -> Vec<Episode> {
@@ -34,25 +35,25 @@ fn episodes(rules: &Rules) -> Vec<Episode> {
 }
 
 fn bytes(settings: &Settings, episodes: &[Episode]) -> Vec<u8> {
-    let mut worlds: Vec<_> = episodes.iter().map(WorldToWrite::Ready).collect();
-    worlds.push(WorldToWrite::Beginning(BEGINNING));
+    let mut worlds: Vec<_> = episodes.iter().map(SnapshotWorld::Ready).collect();
+    worlds.push(SnapshotWorld::New(NEW));
     encode(settings, &worlds).expect("small")
 }
 
 #[test]
 fn what_is_read_is_what_was_written() {
-    let (settings, rules) = settings();
-    let written = bytes(&settings, &episodes(&rules));
+    let spec = spec();
+    let written = bytes(&spec.settings, &episodes(&spec.rules));
     let snapshot = decode(&written).expect("a snapshot");
-    let mut restored = snapshot.restore(&settings, &rules).expect("a fit");
+    let mut restored = snapshot.restore(&spec).expect("a fit");
     let last = restored.pop().expect("three worlds");
-    assert!(matches!(last, RestoredWorld::Beginning(BEGINNING)));
+    assert!(matches!(last, SnapshotWorld::New(NEW)));
     let episodes = restored.into_iter().map(|world| match world {
-        RestoredWorld::Ready(episode) => *episode,
-        RestoredWorld::Beginning(_) => panic!("expected a world at a step"),
+        SnapshotWorld::Ready(episode) => *episode,
+        SnapshotWorld::New(_) => panic!("expected a world at a step"),
     });
     let episodes: Vec<Episode> = episodes.collect();
-    assert_eq!(bytes(&settings, &episodes), written);
+    assert_eq!(bytes(&spec.settings, &episodes), written);
 }
 
 /// As a hostile author would write it: any body, with a header that fits.
@@ -67,8 +68,8 @@ fn sealed(body: &[u8]) -> Vec<u8> {
 
 #[test]
 fn a_changed_body_with_a_checksum_that_fits_is_refused_or_a_world_that_can_be() {
-    let (settings, rules) = settings();
-    let whole = bytes(&settings, &episodes(&rules));
+    let spec = spec();
+    let whole = bytes(&spec.settings, &episodes(&spec.rules));
     let body = &whole[HEADER_BYTES..];
     let mut n_restored = 0;
     for at in 0..body.len() {
@@ -76,12 +77,12 @@ fn a_changed_body_with_a_checksum_that_fits_is_refused_or_a_world_that_can_be() 
             let mut changed = body.to_vec();
             changed[at] = byte;
             let snapshot = decode(&sealed(&changed));
-            let restored = snapshot.and_then(|snapshot| snapshot.restore(&settings, &rules));
+            let restored = snapshot.and_then(|snapshot| snapshot.restore(&spec));
             for world in restored.into_iter().flatten() {
-                if let RestoredWorld::Ready(mut episode) = world {
+                if let SnapshotWorld::Ready(mut episode) = world {
                     n_restored += 1;
-                    episode.step(&rules, &[Move::Left, Move::Up], Coverage::Path);
-                    episode.reset(&rules, 5);
+                    episode.step(&spec.rules, &[Move::Left, Move::Up], Coverage::Path);
+                    episode.reset(&spec.rules, 5);
                 }
             }
         }
@@ -90,16 +91,14 @@ fn a_changed_body_with_a_checksum_that_fits_is_refused_or_a_world_that_can_be() 
     // A length that no memory holds.
     let mut claims = body.to_vec();
     claims[..8].copy_from_slice(&u64::MAX.to_ne_bytes());
-    assert!(matches!(
-        decode(&sealed(&claims)),
-        Err(SnapshotError::Malformed(_))
-    ));
+    let refusal = decode(&sealed(&claims)).expect_err("a false length");
+    assert!(refusal.to_string().starts_with("malformed: "), "{refusal}");
 }
 
 #[test]
 fn every_cut_and_every_flipped_bit_is_noticed() {
-    let (settings, rules) = settings();
-    let bytes = bytes(&settings, &episodes(&rules));
+    let spec = spec();
+    let bytes = bytes(&spec.settings, &episodes(&spec.rules));
     for length in 0..bytes.len() {
         assert!(decode(&bytes[..length]).is_err(), "cut to {length}");
     }
@@ -110,19 +109,22 @@ fn every_cut_and_every_flipped_bit_is_noticed() {
     }
     let mut longer = bytes.clone();
     longer.push(0);
-    assert!(matches!(decode(&longer), Err(SnapshotError::Length { .. })));
+    let refusal = decode(&longer).expect_err("one byte too many");
+    let (expected, got) = (bytes.len() - HEADER_BYTES, longer.len() - HEADER_BYTES);
+    let problem = format!("damaged: expected {expected} bytes, got {got}");
+    assert_eq!(refusal, SnapshotError::Damaged(problem));
 }
 
 /// A change to the world of an otherwise good file.
-fn misfit(change: impl FnOnce(&mut WorldSnapshot), words: &str) {
-    let (settings, rules) = settings();
-    let bytes = bytes(&settings, &episodes(&rules));
+fn misfit(change: impl FnOnce(&mut SavedWorld), words: &str) {
+    let spec = spec();
+    let bytes = bytes(&spec.settings, &episodes(&spec.rules));
     let mut snapshot = decode(&bytes).expect("a snapshot");
-    let StoredWorld::Ready(world) = &mut snapshot.worlds[1] else {
+    let SnapshotWorld::Ready(world) = &mut snapshot.worlds[1] else {
         panic!("expected a world at a step");
     };
     change(world);
-    let error = snapshot.restore(&settings, &rules).err();
+    let error = snapshot.restore(&spec).err();
     let error = error.expect("a misfit").to_string();
     assert!(error.starts_with("world 1 of the file"), "{error}");
     assert!(error.contains(words), "{words:?}: {error}");
@@ -135,7 +137,7 @@ fn a_world_that_cannot_be_is_refused() {
         "states: expected states below 3, got 3",
     );
     misfit(
-        |world| world.beginning.truncate(14),
+        |world| world.first_states.truncate(14),
         "first states: expected 15, got 14",
     );
     misfit(
@@ -190,7 +192,7 @@ fn a_world_that_cannot_be_is_refused() {
 
 #[test]
 fn the_first_other_setting_is_named() {
-    let (ours, _) = settings();
+    let ours = spec().settings;
     let mut theirs = ours.clone();
     theirs.others[3].1 = "9".into();
     let error = theirs.check(&ours).expect_err("another burn-in");

@@ -1,7 +1,8 @@
 //! The checks that turn a [`ModelFile`] into arrays; the first that fails names its entry.
 
-use super::file::{KernelEntry, ModelError, ModelFile, StateEntry, parse_color};
-use super::{MAX_KERNEL_SIDE, MAX_VALUES};
+use super::file::{
+    KernelEntry, MAX_KERNEL_SIDE, MAX_VALUES, ModelError, ModelFile, StateEntry, parse_color,
+};
 use ndarray::{Array1, Array2, Array4};
 use std::ops::RangeInclusive;
 

@@ -1,11 +1,20 @@
-//! A model as people write it: the TOML form, and what can be wrong with it.
+//! The model file in TOML, and the errors in one.
 
-use super::{LEAST_SHARE, MAX_VALUES};
-use crate::grid::{Cell, Shape};
+use super::grid::{Cell, Shape};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// A model as written in TOML; [`Model::new`] checks it.
+/// Most states, and most observations, of a model: 64.
+pub const MAX_VALUES: usize = 64;
+
+/// Largest kernel side: 15 cells.
+pub const MAX_KERNEL_SIDE: usize = 15;
+
+/// The least that the weights of a cell may sum to, as a share of the largest weight: the smallest
+/// normal `f32` is 1e-38, so that sums from 1e-30 on keep their precision in beliefs.
+pub(super) const LEAST_SHARE: f64 = 1e-30;
+
+/// A model as written in TOML; [`super::Model::new`] checks it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelFile {

@@ -2,11 +2,11 @@
 
 use crate::harness::{Paths, Server};
 use crate::{range, say};
+use protocol::agent_belief::{BeliefPublisher, Intent};
 use protocol::channels::Instance;
 use protocol::control::{Reply, Request};
 use protocol::message::{AgentHeader, Operation, StepRequest};
 use protocol::observer::Observer;
-use protocol::outlook::{Intent, Showcase};
 use protocol::path::path_to_bytes;
 use protocol::{Connection, Probabilities};
 use rustix::process::{Pid, Signal, kill_process};
@@ -69,8 +69,8 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
     let (mut connection, request) = acquire(&server);
     let info = connection.info().clone();
     let belief = Probabilities::from_elem((3, info.height, info.width), 1.0 / 3.0);
-    let mut showcase =
-        Showcase::open(&server.instance, 4 * belief.len() + 1024).expect("the agent channel");
+    let mut showcase = BeliefPublisher::open(&server.instance, 4 * belief.len() + 1024)
+        .expect("the agent channel");
     let mut paths = Paths::new(0);
     let (mut work, mut trips) = (Vec::new(), Vec::new());
     let mut last = Instant::now();

@@ -2,8 +2,8 @@
 //!
 //! Input `i` of a seed is the same on every run, so that the same command meets the same failure.
 
-use super::Target;
 use super::mutation::mutated;
+use super::target::Target;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rustix::time::{ClockId, clock_gettime};

@@ -1,6 +1,6 @@
 //! What the programs read from files: models, checkpoints.
 
-use super::Seed;
+use super::target::Seed;
 use agent::estimation::parameters::Dimensions;
 use agent::learning::checkpoint::{Contents, Problem, encode};
 use agent::learning::learned::Learned;

@@ -1,7 +1,8 @@
 //! What a client, an observer or a learner reads: answers, frames, replies.
 
-use super::Seed;
+use super::target::Seed;
 use bytemuck::{Pod, bytes_of};
+use protocol::agent_belief::{AgentBelief, Intent};
 use protocol::control::{LeaseInfo, Reply, ServerStatus, WorldInfo, WorldStatus, parse};
 use protocol::decisions;
 use protocol::message::{
@@ -9,7 +10,6 @@ use protocol::message::{
     split_step_payload,
 };
 use protocol::observer::Sample;
-use protocol::outlook::{Intent, Outlook};
 use protocol::path::{fly, path_from_bytes, path_to_bytes};
 use protocol::{Cell, Coverage, Frame, Shape, UNOBSERVED};
 use serde::Serialize;
@@ -102,7 +102,7 @@ pub fn outlook(bytes: &[u8]) -> bool {
         return false;
     };
     let payload = payload.to_vec();
-    let Ok(outlook) = Outlook::try_from(&Sample { header, payload }) else {
+    let Ok(outlook) = AgentBelief::try_from(&Sample { header, payload }) else {
         return false;
     };
     let dimensions = [header.n_states, header.height, header.width].map(|n| n as usize);

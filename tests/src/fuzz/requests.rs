@@ -3,12 +3,11 @@
 //! A simulator is kept from one input to the next, so that leases, resets and episodes come to every
 //! state, and begins anew after some inputs, so that a failure comes of few of them.
 
-use super::Seed;
 use super::messages::{split_header, survives};
+use super::target::Seed;
 use bytemuck::bytes_of;
 use env_server::config::ServerConfig;
-use env_server::lease::ClientId;
-use env_server::simulator::{Awaited, Outcome, ResetOrder, Simulator, Surroundings};
+use env_server::simulator::{ClientId, Outcome, PendingReply, ResetJob, ServerStats, Simulator};
 use protocol::control::{CoverageRule, Reply, Request, WorldStatus, parse};
 use protocol::message::{
     FLAG_FULL_COVERAGE, Operation, RESULT_BYTES, Status, StepReply, StepRequest, StepResult,
@@ -50,8 +49,8 @@ const LEASE: &str = "LEASE";
 struct Siege {
     simulator: Simulator,
     now: Instant,
-    orders: Vec<ResetOrder>,
-    awaited: Vec<(ClientId, Awaited)>,
+    jobs: Vec<ResetJob>,
+    pending: Vec<(ClientId, PendingReply)>,
     /// The victim's lease, then the attackers' last.
     leases: [u64; 3],
     n_inputs: usize,
@@ -107,14 +106,14 @@ impl Siege {
             token
         });
         let checked = config.check().expect("valid settings");
-        let (simulator, orders) =
+        let (simulator, jobs) =
             Simulator::new(checked, threads, next_token).expect("valid settings");
-        let (now, awaited) = (Instant::now(), Vec::new());
+        let (now, pending) = (Instant::now(), Vec::new());
         let mut siege = Self {
             simulator,
             now,
-            orders,
-            awaited,
+            jobs,
+            pending,
             leases: [0; 3],
             n_inputs: 0,
         };
@@ -124,17 +123,17 @@ impl Siege {
             let text = format!(
                 r#"{{"op":"acquire","first_world":{first_world},"n_worlds":{n_worlds},"ttl_millis":86400000}}"#
             );
-            let Outcome::Later(_, awaited) = siege.ask(client, VERSION, text.as_bytes()) else {
+            let Outcome::Pending(_, pending) = siege.ask(client, VERSION, text.as_bytes()) else {
                 panic!("the worlds are free");
             };
-            siege.answer(who, &awaited);
+            siege.answer(who, &pending);
         }
         siege
     }
 
     fn ask(&mut self, client: ClientId, version: u32, text: &[u8]) -> Outcome {
         self.simulator
-            .control(self.now, client, version, text, &Surroundings::default())
+            .control(self.now, client, version, text, &ServerStats::default())
     }
 
     fn step(&mut self, request: &StepRequest, paths: &[u8]) -> bool {
@@ -202,9 +201,9 @@ impl Siege {
         }
         let known = self.status();
         match self.ask(ATTACKERS[who], version, &text) {
-            Outcome::Later(orders, awaited) => {
-                self.orders.extend(orders);
-                self.wait_for(who, awaited);
+            Outcome::Pending(jobs, pending) => {
+                self.jobs.extend(jobs);
+                self.wait_for(who, pending);
                 true
             }
             Outcome::Answer(reply) => {
@@ -223,8 +222,8 @@ impl Siege {
                 true
             }
             // No file is written or read: as if the disk had failed.
-            Outcome::File(_, order) => {
-                self.simulator.forget_file(self.now, &order);
+            Outcome::File(_, pending) => {
+                self.simulator.cancel_file(self.now, &pending);
                 true
             }
             Outcome::Shutdown => {
@@ -235,32 +234,32 @@ impl Siege {
     }
 
     /// Keeps what a client waits for in place of what it waited for before: one request at a time.
-    fn wait_for(&mut self, who: usize, awaited: Awaited) {
+    fn wait_for(&mut self, who: usize, pending: PendingReply) {
         let client = ATTACKERS[who];
         let given_up = self
-            .awaited
+            .pending
             .iter()
             .position(|(waiting, _)| *waiting == client);
         if let Some(index) = given_up {
-            let (_, given_up) = self.awaited.swap_remove(index);
-            self.simulator.forget_awaited(self.now, &given_up);
+            let (_, given_up) = self.pending.swap_remove(index);
+            self.simulator.cancel_reply(self.now, &given_up);
         }
-        self.awaited.push((client, awaited));
+        self.pending.push((client, pending));
     }
 
-    /// Carries out what was ordered, and answers who waited for it.
+    /// Runs the resets, and answers the clients that waited for them.
     fn finish_resets(&mut self) {
-        for order in std::mem::take(&mut self.orders) {
-            let (world, episode) = order.carry_out(self.simulator.rules());
-            self.simulator.finish_reset(world, episode);
+        for job in std::mem::take(&mut self.jobs) {
+            let (world, episode) = job.run(&self.simulator.spec().rules);
+            self.simulator.put(world, episode);
         }
-        for (client, awaited) in std::mem::take(&mut self.awaited) {
-            self.answer(usize::from(client == ATTACKERS[1]) + 1, &awaited);
+        for (client, pending) in std::mem::take(&mut self.pending) {
+            self.answer(usize::from(client == ATTACKERS[1]) + 1, &pending);
         }
     }
 
-    fn answer(&mut self, who: usize, awaited: &Awaited) {
-        let reply = self.simulator.answer_awaited(self.now, awaited);
+    fn answer(&mut self, who: usize, pending: &PendingReply) {
+        let reply = self.simulator.pending_reply(self.now, pending);
         if let Reply::Lease(lease) = reply.expect("all worlds are ready") {
             self.leases[who] = lease.lease;
         }

@@ -1,9 +1,9 @@
 //! Files of worlds: snapshots and recordings.
 
-use super::Seed;
-use env_server::config::{Checked, ServerConfig};
-use env_server::episode::{Episode, Rules};
-use env_server::snapshot::{Beginning, RestoredWorld, Settings, WorldToWrite, decode, encode};
+use super::target::Seed;
+use env_server::config::ServerConfig;
+use env_server::snapshot::{NewEpisode, SnapshotWorld, WorldSpec, decode, encode};
+use env_server::world::Episode;
 use protocol::control::ServerInfo;
 use protocol::message::{FrameHeader, VERSION};
 use protocol::observer::Sample;
@@ -18,28 +18,19 @@ const HEADER_BYTES: usize = 24;
 const RECORDING_HEADER: usize = 16;
 const RECORD_HEADER: usize = 24;
 
-struct Place {
-    settings: Settings,
-    rules: Rules,
-}
-
-fn place() -> &'static Place {
-    static PLACE: OnceLock<Place> = OnceLock::new();
-    PLACE.get_or_init(|| {
+fn spec() -> &'static WorldSpec {
+    static SPEC: OnceLock<WorldSpec> = OnceLock::new();
+    SPEC.get_or_init(|| {
         let config = ServerConfig {
             height: 2,
             width: 3,
             moves: 2,
             burn_in: 5,
+            history: 3,
             ..ServerConfig::default()
         };
-        let checked: Checked = config.check().expect("valid settings");
-        let start = checked.config.start;
-        let rules = Rules::new(&checked.model, checked.shape, 5, 0, start);
-        let mut rules = rules.expect("valid model");
-        (rules.history, rules.n_moves) = (3, 2);
-        let settings = Settings::of(&checked);
-        Place { settings, rules }
+        let checked = config.check().expect("valid settings");
+        WorldSpec::of(&checked).expect("a valid model")
     })
 }
 
@@ -52,12 +43,12 @@ pub fn snapshot(bytes: &[u8]) -> bool {
         header[12..16].copy_from_slice(&crc32fast::hash(body).to_ne_bytes());
         header[16..24].copy_from_slice(&(body.len() as u64).to_ne_bytes());
     }
-    let Place { settings, rules } = place();
-    let restored = decode(&bytes).and_then(|snapshot| snapshot.restore(settings, rules));
+    let WorldSpec { settings, rules } = spec();
+    let restored = decode(&bytes).and_then(|snapshot| snapshot.restore(spec()));
     let Ok(worlds) = restored else { return false };
     for world in worlds {
-        if let RestoredWorld::Ready(mut episode) = world {
-            let again = encode(settings, &[WorldToWrite::Ready(&episode)]).expect("small");
+        if let SnapshotWorld::Ready(mut episode) = world {
+            let again = encode(settings, &[SnapshotWorld::Ready(&episode)]).expect("small");
             assert!(decode(&again).is_ok());
             if !episode.is_over() {
                 episode.step(rules, &[Move::Left, Move::Down], Coverage::Path);
@@ -104,7 +95,7 @@ fn mend(bytes: &mut [u8]) {
 }
 
 pub fn snapshot_seeds() -> Vec<Seed> {
-    let Place { settings, rules } = place();
+    let WorldSpec { settings, rules } = spec();
     let mut flown = Episode::new(rules, 3);
     for coverage in [
         Coverage::Path,
@@ -114,20 +105,20 @@ pub fn snapshot_seeds() -> Vec<Seed> {
     ] {
         flown.step(rules, &[Move::Right, Move::Down], coverage);
     }
-    let beginning = WorldToWrite::Beginning(Beginning {
+    let in_burn_in = SnapshotWorld::New(NewEpisode {
         seed: 1,
         episode: 2,
     });
     let new = Episode::new(rules, 4);
-    let written = |worlds: &[WorldToWrite<'_>]| encode(settings, worlds).expect("small");
+    let written = |worlds: &[SnapshotWorld<&Episode>]| encode(settings, worlds).expect("small");
     vec![
-        ("flown", written(&[WorldToWrite::Ready(&flown)])),
+        ("flown", written(&[SnapshotWorld::Ready(&flown)])),
         (
             "three",
             written(&[
-                WorldToWrite::Ready(&new),
-                beginning,
-                WorldToWrite::Ready(&flown),
+                SnapshotWorld::Ready(&new),
+                in_burn_in,
+                SnapshotWorld::Ready(&flown),
             ]),
         ),
         ("none", written(&[])),

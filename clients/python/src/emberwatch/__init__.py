@@ -14,6 +14,7 @@ from emberwatch import recording
 from emberwatch.client import Client, connect
 from emberwatch.decisions import Decisions
 from emberwatch.env import WildfireEnv
+from emberwatch.errors import EmberwatchError
 from emberwatch.lease import Lease
 from emberwatch.moves_env import WildfireMovesEnv
 from emberwatch.objective_env import WildfireObjectiveEnv
@@ -28,6 +29,7 @@ __all__ = [
     "Decision",
     "Decisions",
     "DecisionsInfo",
+    "EmberwatchError",
     "Frame",
     "Lease",
     "Observer",

@@ -8,58 +8,48 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
-from emberwatch.errors import InvalidActionError, SettingError
+from emberwatch.errors import InvalidArgumentError
 
 
 def as_seed(seed: object) -> int:
-    """Checks a world's seed.
-
-    Raises:
-        SettingError: If it is not an integer that fits into the wire's 64 bits.
-    """
+    """Checks a world's seed."""
     if isinstance(seed, int | np.integer):
         number = int(cast("int", seed))
         if 0 <= number < 2**64:
             return number
-    raise SettingError(f"seed: expected an integer within 0 to 2**64 - 1, got {seed!r}")
+    raise InvalidArgumentError(f"seed: expected an integer within 0 to 2**64 - 1, got {seed!r}")
 
 
 def as_choice(action: object, n_choices: int) -> int:
-    """Checks an action that is one integer below `n_choices`.
-
-    Raises:
-        InvalidActionError: Naming what was expected and what was got.
-    """
+    """Checks an action that is one integer below `n_choices`."""
     try:
         given = np.asarray(action)
     except (ValueError, OverflowError):
         given = np.empty(0)
     if given.size == 1 and given.dtype.kind in "iu" and 0 <= int(given.item()) < n_choices:
         return int(given.item())
-    raise InvalidActionError(f"action: expected one integer, 0 to {n_choices - 1}, got {action!r}")
+    raise InvalidArgumentError(
+        f"action: expected one integer, 0 to {n_choices - 1}, got {action!r}"
+    )
 
 
 def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]:
-    """Checks paths, `(n_worlds, T)` or for one world `(T,)`, and makes them bytes.
-
-    Raises:
-        InvalidActionError: Naming what was expected and what was got.
-    """
+    """Checks paths, `(n_worlds, T)` or for one world `(T,)`, and makes them bytes."""
     try:
         given = np.asarray(paths)
     except (ValueError, OverflowError) as error:
-        raise InvalidActionError(f"action: expected an array of moves, got {error}") from None
+        raise InvalidArgumentError(f"action: expected an array of moves, got {error}") from None
     if given.shape != (n_worlds, n_moves) and (n_worlds != 1 or given.shape != (n_moves,)):
         one = f" or ({n_moves},)" if n_worlds == 1 else ""
-        raise InvalidActionError(
+        raise InvalidArgumentError(
             f"action: expected shape ({n_worlds}, {n_moves}){one}, got {given.shape}"
         )
     if given.dtype.kind not in "iu":
-        raise InvalidActionError(f"action: expected integers, got {given.dtype}")
+        raise InvalidArgumentError(f"action: expected integers, got {given.dtype}")
     # One shift leaves something of each value below 0 or above 3.
     if (given >> 2).any():
         where = tuple(int(i) for i in np.argwhere((given < 0) | (given >= wire.N_MOVES))[0])
-        raise InvalidActionError(
+        raise InvalidArgumentError(
             f"action: expected moves 0 to {wire.N_MOVES - 1}, got {given[where]} at {where}"
         )
     return given.astype(np.uint8)

@@ -8,10 +8,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import SettingError
-from emberwatch.model import Model
+from emberwatch.errors import InvalidArgumentError
 from emberwatch.replies import Decision
-from emberwatch.session import Session, state_to_copy
+from emberwatch.session import Session, SessionOwner
 from emberwatch.settings import Settings, draw_seed
 from emberwatch.view import RENDER_FPS, RENDER_MODES, View
 from emberwatch.wire import StepAnswer, StepResult
@@ -20,8 +19,11 @@ NOTHING_TO_DRAW: Final = (
     "render: nothing to draw; give a render_mode to gymnasium.make and reset first"
 )
 
+#: Fields of a result that become `info`: not the seed, which gives the hidden states away.
+REPORTED: Final = ("step", "n_target_cells", "n_visited", "n_hits")
 
-class WorldEnv(gymnasium.Env[Any, Any]):
+
+class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
     """One world of a private or a running server."""
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -29,30 +31,15 @@ class WorldEnv(gymnasium.Env[Any, Any]):
         "render_fps": RENDER_FPS,
     }
 
-    def __init__(self, settings: Settings, render_mode: str | None, *, reveals: bool) -> None:
-        """Checks the settings; `reveals` puts the hidden states into infos and pictures."""
-        self._session: Final = Session(settings)
-        self._shape: Final = self._session.shape
-        self._view = View(render_mode, self._shape, self._session.model)
-        self.render_mode = render_mode
+    def __init__(self, settings: Settings, *, reveals: bool) -> None:
+        """`reveals` puts the hidden states into infos and pictures."""
+        self._session = Session(settings)
+        self._spec: Final = self._session.spec
+        self._view = View(settings.render_mode, self._spec)
+        self.render_mode = settings.render_mode
         self._reveals = reveals
         self._truth: NDArray[np.uint8] | None = None
         self._path: NDArray[np.intp] | None = None
-
-    @property
-    def model(self) -> Model | None:
-        """The model behind the world; None if a running server hides it."""
-        return self._session.model
-
-    @property
-    def burn_in(self) -> int:
-        """Steps that the world is simulated before k = 0."""
-        return self._session.burn_in
-
-    @property
-    def instance(self) -> str:
-        """The server's instance name, once the environment has been reset."""
-        return self._session.instance
 
     def render(self) -> Any:
         """Draws the last frame, path and robot, beside the truth when that is revealed."""
@@ -62,17 +49,8 @@ class WorldEnv(gymnasium.Env[Any, Any]):
         return None if self.render_mode == "human" else self._draw()
 
     def close(self) -> None:
-        """Gives the world back; a private server stops. Again is fine."""
         self._session.close()
         self._view.close()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """For copies, which only a closed environment has."""
-        return state_to_copy(self, self._is_open())
-
-    def _is_open(self) -> bool:
-        """Whether there has been a reset since it was made or closed."""
-        return self._session.is_open
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None) -> StepAnswer:
         """Begins an episode, or goes on from where the world stands."""
@@ -86,7 +64,6 @@ class WorldEnv(gymnasium.Env[Any, Any]):
         return answer
 
     def _describe(self, answer: StepAnswer, result: StepResult) -> dict[str, Any]:
-        """The `info` of an answer: what is for reports, without the seed."""
         info = reported(result)
         if self._reveals:
             self._truth = truth = self._session.truth(answer)[0]
@@ -98,27 +75,20 @@ class WorldEnv(gymnasium.Env[Any, Any]):
 
 
 def reported(result: StepResult | Decision) -> dict[str, Any]:
-    """What of a result is for reports: without the seed."""
-    return {
-        "step": result.step,
-        "n_target_cells": result.n_target_cells,
-        "n_visited": result.n_visited,
-        "n_hits": result.n_hits,
-    }
+    """The `info` of a result."""
+    return {name: getattr(result, name) for name in REPORTED}
 
 
 def wants_to_resume(options: dict[str, Any] | None, seed: object) -> bool:
-    """Reads the options of a reset.
-
-    Raises:
-        SettingError: If one is unknown, or a seed is given to go on from.
-    """
+    """Reads the options of a reset."""
     for key in options or {}:
         if key != "resume":
-            raise SettingError(f"options: expected 'resume', got {key!r}")
+            raise InvalidArgumentError(f"options: expected 'resume', got {key!r}")
     resume = (options or {}).get("resume", False)
     if not isinstance(resume, bool):
-        raise SettingError(f"options: expected resume True or False, got {resume!r}")
+        raise InvalidArgumentError(f"options: expected resume True or False, got {resume!r}")
     if resume and seed is not None:
-        raise SettingError("options: expected no seed with resume=True, which begins no episode")
+        raise InvalidArgumentError(
+            "options: expected no seed with resume=True, which begins no episode"
+        )
     return resume

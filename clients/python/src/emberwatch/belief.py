@@ -2,7 +2,7 @@
 
 A frame turns the predictor ``u_k`` into the posterior ``p_k`` (eq. 5); the transition turns that
 into the next predictor ``u_{k+1} = Phi(p_k)`` (eq. 6). Cells are treated as independent given the
-frames, so this is an approximation even with the true model. `emberwatch.wrappers.Belief` runs it
+frames, so this is an approximation even with the true model. `wrappers.BeliefObservation` runs it
 beside an environment.
 
 Beliefs have shape (S, H, W): one probability per state and cell, a distribution in each cell.
@@ -13,47 +13,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch.errors import EmberwatchError, InvalidArgumentError
 from emberwatch.model import Model
-
-UNOBSERVED = 255
-"""Value of a frame's cell where nothing was observed."""
+from emberwatch.wire import UNOBSERVED
 
 _SUM_TOLERANCE = 5e-5  # of a cell's probabilities, as the Rust agent's: 400 float32 roundings
-
-
-class ZeroEvidenceError(ValueError):
-    """A frame that the belief holds impossible."""
-
-    def __init__(self, *, cell: tuple[int, int], observed: int, belief: tuple[float, ...]) -> None:
-        """Names the first such cell (row, column), the value seen and the belief before it."""
-        super().__init__(
-            f"frame: cell {cell}: expected an observation that the belief {list(belief)} allows, "
-            f"got {observed}"
-        )
-        self.cell = cell
-        self.observed = observed
-        self.belief = belief
-
-    def __reduce__(self) -> tuple[object, ...]:
-        """For pickle, which repeats positional arguments only."""
-        return (_zero_evidence, (self.cell, self.observed, self.belief))
 
 
 class Filter:
     """Filter of one world: `correct` with each frame, and `predict` for each step of the world."""
 
     def __init__(self, model: Model, *, prior: NDArray[np.floating]) -> None:
-        """A filter that believes the prior.
-
-        Args:
-            model: The world's model.
-            prior: Predictor ``u_0``, shape (S, H, W); each cell sums to one within 5e-5, and is
-                divided by its sum.
-
-        Raises:
-            ValueError: The prior is of another shape, or a cell is no distribution.
-            ModelError: On the prior's grid the transition could divide by zero.
-        """
+        """Begins with the prior: predictor ``u_0``, shape (S, H, W), each cell a distribution."""
         self._belief = _distribution(prior, n_states=model.n_states)
         _, height, width = self._belief.shape
         self._transition = Transition(model, height=height, width=width)
@@ -68,18 +39,16 @@ class Filter:
         """Bayes' rule on the observed cells (eq. 5); the others keep their belief.
 
         ``p = B(y) u / (b(y)' u)`` with ``b(y)`` the column of the observation matrix for ``y``, and
-        ``B(y)`` the diagonal matrix of it.
+        ``B(y)`` the diagonal matrix of it. An impossible frame leaves the belief as it was.
 
         Args:
             frame: Observed values below O, 255 where nothing was observed; shape (H, W).
-
-        Raises:
-            ZeroEvidenceError: Where ``b(y)' u = 0``; the belief is then as it was.
-            ValueError: The frame is of another grid or type, or holds a value that is neither.
         """
         if frame.shape != self._belief.shape[1:] or frame.dtype != np.uint8:
             expected = f"shape {self._belief.shape[1:]} and type uint8"
-            raise ValueError(f"frame: expected {expected}, got {frame.shape} and {frame.dtype}")
+            raise InvalidArgumentError(
+                f"frame: expected {expected}, got {frame.shape} and {frame.dtype}"
+            )
         values = frame.ravel()
         cells = np.flatnonzero(values != UNOBSERVED)
         observed = values[cells]
@@ -87,7 +56,7 @@ class Filter:
         if (observed >= n_observations).any():
             index = int(cells[np.argmax(observed >= n_observations)])
             expected = f"a value below {n_observations}, or {UNOBSERVED}"
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"frame: cell {self._cell(index)}: expected {expected}, got {values[index]}"
             )
         belief = self._belief.reshape(len(self._belief), -1)
@@ -96,10 +65,10 @@ class Filter:
         evidence = joint.sum(axis=0)
         if not evidence.all():
             first = int(np.argmin(evidence))
-            raise ZeroEvidenceError(
-                cell=self._cell(int(cells[first])),
-                observed=int(observed[first]),
-                belief=tuple(prior[:, first].tolist()),
+            raise EmberwatchError(
+                f"frame: cell {self._cell(int(cells[first]))}: expected an observation that the "
+                f"belief {prior[:, first].tolist()} allows, got {observed[first]}",
+                "impossible_frame",
             )
         belief[:, cells] = joint / evidence
 
@@ -123,23 +92,18 @@ class Transition:
     over ``m`` (eq. 3).
 
     It keeps work space: share none between threads. The belief lies in rows with a margin of
-    zeros, end to end, so that a neighbour is a shifted slice. Taps that weigh alike for all next
-    states are added up before they are multiplied, and those without weight are left out.
+    zeros, end to end, so that a neighbour is a shifted slice. Taps with the same
+    weights are added up before they are multiplied, and those without weight are left out.
     """
 
     def __init__(self, model: Model, *, height: int, width: int) -> None:
-        """Lays out a model's operator for a grid, both sides in cells and at least 1.
-
-        Raises:
-            ModelError: On this grid eq. 3 could divide by zero.
-        """
-        model.check_on(height=height, width=width)
         n_states, _, kernel_height, kernel_width = model.kernel.shape
         self._shape = (n_states, height, width)
         self._stride = width + kernel_width - 1
         self._length = (height - 1) * self._stride + width
-        largest = max(model.kernel.max(), model.bias.max())  # a common factor, which eq. 3 cancels
-        self._groups = [_taps_that_weigh_alike(w / largest) for w in model.kernel.swapaxes(0, 1)]
+        # A common factor, which eq. 3 cancels.
+        largest = max(model.kernel.max(), model.bias.max()) or 1.0
+        self._groups = [_grouped_taps(w / largest) for w in model.kernel.swapaxes(0, 1)]
         self._bias = (model.bias / largest)[:, None]
         top, left = kernel_height // 2, kernel_width // 2
         self._planes = np.zeros((n_states, height + kernel_height - 1, self._stride))
@@ -147,13 +111,9 @@ class Transition:
         self._sums = np.empty((max(len(taps) for _, taps in self._groups), self._length))
 
     def apply(self, belief: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``Phi(belief)``, a new array; both of shape (S, H, W), each cell's sum is one.
-
-        Raises:
-            ValueError: The belief is of another shape.
-        """
+        """``Phi(belief)``, a new array; both of shape (S, H, W), each cell's sum is one."""
         if belief.shape != self._shape:
-            raise ValueError(f"belief: expected shape {self._shape}, got {belief.shape}")
+            raise InvalidArgumentError(f"belief: expected shape {self._shape}, got {belief.shape}")
         n_states, height, width = self._shape
         self._inside[:] = belief
         out = np.empty((n_states, height * self._stride))
@@ -164,7 +124,13 @@ class Transition:
                 self._add_up(plane.ravel(), group, total)
             weights += columns @ self._sums[: len(groups)]
         on_grid = out.reshape(n_states, height, self._stride)[:, :, :width]
-        return np.divide(on_grid, on_grid.sum(axis=0), out=np.empty(self._shape))
+        totals = on_grid.sum(axis=0)
+        if not totals.all():
+            row, col = (int(at) for at in np.argwhere(totals == 0.0)[0])
+            raise InvalidArgumentError(
+                f"model: transition weights of cell ({row}, {col}): expected a positive sum"
+            )
+        return np.divide(on_grid, totals, out=np.empty(self._shape))
 
     def _add_up(
         self, plane: NDArray[np.float64], taps: list[tuple[int, int]], total: NDArray[np.float64]
@@ -187,26 +153,15 @@ def uniform_prior(model: Model, *, height: int, width: int) -> NDArray[np.float6
 
 
 def entropy(belief: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shannon entropy of each cell in nats (eq. 14), with ``0 log 0 = 0``.
-
-    Args:
-        belief: Shape (S, H, W), each cell a distribution.
-
-    Returns:
-        Shape (H, W), 0 to log S.
-    """
+    """Shannon entropy of each cell in nats (eq. 14), with ``0 log 0 = 0``; shape (H, W)."""
     logarithm = np.log(belief, out=np.zeros_like(belief), where=belief > 0.0)
     return np.maximum(0.0, 0.0 - (belief * logarithm).sum(axis=0))
 
 
-def _taps_that_weigh_alike(
+def _grouped_taps(
     kernel: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], list[list[tuple[int, int]]]]:
-    """Taps (row, col) of one state by the weights they share, and those weights (S, groups).
-
-    Args:
-        kernel: Weights of this state for each next one, shape (S, KH, KW).
-    """
+    """Weights (S, groups) of a kernel (S, KH, KW), and the taps (row, col) that share each."""
     groups: dict[tuple[float, ...], list[tuple[int, int]]] = {}
     for row, col in np.ndindex(*kernel.shape[1:]):
         column = tuple(kernel[:, row, col].tolist())
@@ -220,20 +175,14 @@ def _distribution(prior: NDArray[np.floating], *, n_states: int) -> NDArray[np.f
     """A copy of the prior, each cell's sum exactly one."""
     belief = np.array(prior, dtype=np.float64, order="C")
     if belief.ndim != 3 or belief.shape[0] != n_states or not belief.size:
-        raise ValueError(f"prior: expected shape ({n_states}, H, W), got {belief.shape}")
+        raise InvalidArgumentError(f"prior: expected shape ({n_states}, H, W), got {belief.shape}")
     total = belief.sum(axis=0)
     fine = (np.abs(total - 1.0) <= _SUM_TOLERANCE) & (belief >= 0.0).all(axis=0)
     if not fine.all():
         row, col = (int(i) for i in np.argwhere(~fine)[0])
         got = belief[:, row, col].tolist()
-        raise ValueError(
+        raise InvalidArgumentError(
             f"prior: cell ({row}, {col}): expected probabilities >= 0 with sum 1, got {got}"
         )
     belief /= total
     return belief
-
-
-def _zero_evidence(
-    cell: tuple[int, int], observed: int, belief: tuple[float, ...]
-) -> ZeroEvidenceError:
-    return ZeroEvidenceError(cell=cell, observed=observed, belief=belief)

@@ -12,14 +12,14 @@ import os
 import re
 import stat
 import weakref
+from collections.abc import Generator
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Self
 
 from emberwatch import wire
-from emberwatch.cleanup import Places
-from emberwatch.errors import ChannelError, ClosedError, ForkedError, SettingError
-from emberwatch.turn import turn, unusable
+from emberwatch.cleanup import ChannelFiles
+from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.turn import cannot_create, turn
 
 _INSTANCE: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -38,18 +38,12 @@ class Node:
     """One connection's place in shared memory: a node, and everything made from it.
 
     iceoryx2 does not survive `fork`: there, everything of the parent is left alone for good, and
-    using it raises `ForkedError`.
+    using it raises an error with code `"forked"`.
     """
 
     def __init__(self, instance: str) -> None:
-        """Joins the channels of an instance.
-
-        Raises:
-            SettingError: If the instance's name is not 1 to 64 of `A-Z a-z 0-9 - _`.
-            ChannelError: If the directory of the channels is not safe, or iceoryx2 fails.
-        """
         if not _INSTANCE.fullmatch(instance):
-            raise SettingError(
+            raise InvalidArgumentError(
                 f"instance: expected 1 to 64 characters out of A-Z a-z 0-9 - _, got {instance!r}"
             )
         self.instance: Final = instance
@@ -58,7 +52,7 @@ class Node:
         self._forked = False
         builder = iox2.NodeBuilder.new().signal_handling_mode(iox2.SignalHandlingMode.Disabled)
         config = _config()
-        with in_turn() as is_alone, guard("create a node"):
+        with in_turn() as is_alone, channel_errors("create a node"):
             _own_segments(_SHARED_MEMORY, _prefix())
             _remove_leftovers(is_alone)
             self.node: Any = builder.config(config).create(iox2.ServiceType.Ipc)
@@ -77,20 +71,21 @@ class Node:
         if self._usable:
             return
         if self._forked:
-            raise ForkedError(
+            raise EmberwatchError(
                 f"the connection to instance {self.instance!r} belongs to the process that forked "
-                "this one; open a new one here (for environments: make them in the child)"
+                "this one; open a new one here (for environments: make them in the child)",
+                "forked",
             )
-        raise ClosedError(f"the connection to instance {self.instance!r} is closed")
+        raise EmberwatchError(f"the connection to instance {self.instance!r} is closed", "closed")
 
     def close(self) -> None:
-        """Leaves the channels. Again is fine; in a forked child it does nothing."""
+        """Leaves the channels; in a forked child it does nothing. May be called again."""
         if not self._usable:
             return
         self._usable = False
         _nodes.discard(self)
         with contextlib.ExitStack() as stack:
-            with contextlib.suppress(ChannelError):
+            with contextlib.suppress(EmberwatchError):
                 stack.enter_context(in_turn())
             # The youngest first: ports before the node that they were made from.
             while self._held:
@@ -100,11 +95,7 @@ class Node:
     def open_request_response(
         self, service: str, request: type[wire.Header], reply: type[wire.Header]
     ) -> Any:
-        """Opens a service that its server has made; `None` if there is none.
-
-        Raises:
-            ChannelError: If it exists but does not fit.
-        """
+        """Opens a service that its server has made; `None` if there is none."""
         builder = self.node.service_builder(self._name(service)).request_response(_BYTES, _BYTES)
         builder = builder.request_header(request).response_header(reply)
         try:
@@ -112,51 +103,43 @@ class Node:
         except iox2.RequestResponseOpenError as error:
             if "DoesNotExist" in str(error):
                 return None
-            raise ChannelError(f"open {service} on instance {self.instance!r}: {error}") from None
+            problem = f"open {service} on instance {self.instance!r}: {error}"
+            raise EmberwatchError(problem, "channel") from None
 
     def other_version(self, service: str) -> int | None:
         """The protocol version of a server on the instance that speaks another one, if any."""
         # Of the files themselves: iceoryx2 opens each service, and may wait for one without end.
         pattern = re.compile(rf'service_name = "emberwatch/v(\d+)/{self.instance}/{service}"')
-        texts = map(_text, (directory() / "services").glob(f"{_prefix()}*.service"))
-        versions = {int(match[1]) for text in texts for match in pattern.finditer(text)}
+        versions: set[int] = set()
+        for path in (directory() / "services").glob(f"{_prefix()}*.service"):
+            with contextlib.suppress(OSError):  # a service that has ended
+                found = pattern.finditer(path.read_text(errors="replace"))
+                versions |= {int(match[1]) for match in found}
         return max(versions - {wire.VERSION}, default=None)
 
     def open_publications(
-        self,
-        service: str,
-        header: type[wire.Header],
-        readers: int,
-        buffer: int,
-        *,
-        publishers: int = 1,
+        self, service: str, header: type[wire.Header], readers: int, buffer: int, publishers: int
     ) -> Any:
-        """Opens or creates `frames`, `truth` or `agent`.
-
-        Raises:
-            ChannelError: If iceoryx2 fails.
-        """
         builder = self.node.service_builder(self._name(service)).publish_subscribe(_BYTES)
         builder = builder.user_header(header).max_publishers(publishers)
         builder = builder.max_subscribers(readers).max_nodes(wire.MAX_NODES).history_size(1)
         builder = builder.subscriber_max_buffer_size(buffer).subscriber_max_borrowed_samples(1)
-        with in_turn(), guard(f"open {service} on instance {self.instance!r}"):
+        with in_turn(), channel_errors(f"open {service} on instance {self.instance!r}"):
             return self.keep(builder.enable_safe_overflow(True).open_or_create())
 
     def open_wake(self, service: str) -> Any:
-        """Opens or creates an event service.
-
-        Raises:
-            ChannelError: If iceoryx2 fails.
-        """
         builder = self.node.service_builder(self._name(service)).event()
         builder = builder.max_listeners(wire.MAX_NODES).max_notifiers(wire.MAX_NODES)
-        with in_turn(), guard(f"open {service} on instance {self.instance!r}"):
+        with in_turn(), channel_errors(f"open {service} on instance {self.instance!r}"):
             return self.keep(builder.max_nodes(wire.MAX_NODES).open_or_create())
 
     def clean_up(self) -> None:
-        """Removes what dead processes left behind, if others let us."""
-        with contextlib.suppress(ChannelError), in_turn() as is_alone, guard("clean up"):
+        """Removes what dead processes left behind, unless another process has the turn."""
+        with (
+            contextlib.suppress(EmberwatchError),
+            in_turn() as is_alone,
+            channel_errors("clean up"),
+        ):
             if is_alone:
                 _remove_leftovers(is_alone)
 
@@ -170,43 +153,29 @@ class Node:
         return iox2.ServiceName.new(f"emberwatch/v{wire.VERSION}/{self.instance}/{service}")
 
 
-class Closing:
+class Closable:
     """What `with` closes."""
 
     def close(self) -> None:
-        """Closes it. Again is fine."""
+        """Closes it; may be called again."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:
-        """Returns itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Closes it."""
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
-class guard:
-    """Turns iceoryx2's errors into a `ChannelError` that says what was attempted."""
-
-    def __init__(self, what: str) -> None:
-        """Names the attempt."""
-        self._what = what
-
-    def __enter__(self) -> None:
-        """Begins the attempt."""
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        """Ends it."""
-        if error is not None and isinstance(error, Exception):
-            if isinstance(error, ChannelError):
-                return
-            raise ChannelError(f"{self._what}: {error}") from None
+@contextlib.contextmanager
+def channel_errors(what: str) -> Generator[None]:
+    """Turns iceoryx2's errors into one that says what was attempted."""
+    try:
+        yield
+    except EmberwatchError:
+        raise
+    except Exception as error:
+        raise EmberwatchError(f"{what}: {error}", "channel") from None
 
 
 def directory() -> Path:
@@ -215,31 +184,23 @@ def directory() -> Path:
 
 
 def in_turn() -> contextlib.AbstractContextManager[bool]:
-    """A turn of making and removing; yields whether nobody else has it."""
+    """A turn of making and removing; yields whether no other process has it."""
     return turn(_own_directory(directory()))
 
 
 def _remove_leftovers(is_alone: bool) -> None:
-    places = Places(directory(), _SHARED_MEMORY, _prefix())
+    places = ChannelFiles(directory(), _SHARED_MEMORY, _prefix())
     if is_alone:
         places.remove_leftovers(_config())
         return
     for segment in places.unfinished():
-        raise ChannelError(
-            f"{segment}: a stopped process is in the middle of making it: continue that, or kill it"
-        )
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(errors="replace")
-    except OSError:
-        return ""
+        problem = "a stopped process is in the middle of making it: continue that, or kill it"
+        raise EmberwatchError(f"{segment}: {problem}", "channel")
 
 
 def _config() -> Any:
     config = iox2.config.default()
-    # Not whenever it likes, but in turn.
+    # Only in turn.
     config.global_cfg.node.cleanup_dead_nodes_on_creation = False
     config.global_cfg.node.cleanup_dead_nodes_on_destruction = False
     config.global_cfg.service.cleanup_dead_nodes_on_open = False
@@ -258,10 +219,8 @@ def _own_segments(folder: Path, prefix: str) -> None:
         try:
             found = path.lstat()
             if not stat.S_ISREG(found.st_mode) or found.st_uid != os.getuid():
-                raise ChannelError(
-                    f"{path}: expected shared memory of this user, got something of user "
-                    f"{found.st_uid}"
-                )
+                problem = f"shared memory of this user, got something of user {found.st_uid}"
+                raise EmberwatchError(f"{path}: expected {problem}", "channel")
             if found.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
                 path.chmod(0o600)
         except FileNotFoundError:  # It belonged to a process that ended.
@@ -275,16 +234,17 @@ def _own_directory(path: Path) -> Path:
     except FileExistsError:
         pass
     except OSError as error:
-        raise unusable(path, error) from None
+        raise cannot_create(path, error) from None
     found = path.lstat()
     if (
         not stat.S_ISDIR(found.st_mode)
         or found.st_uid != os.getuid()
         or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
     ):
-        raise ChannelError(
+        raise EmberwatchError(
             f"{path}: expected a directory that belongs to this user and that others cannot "
-            f"write to, got mode {stat.filemode(found.st_mode)} of user {found.st_uid}"
+            f"write to, got mode {stat.filemode(found.st_mode)} of user {found.st_uid}",
+            "channel",
         )
     return path
 

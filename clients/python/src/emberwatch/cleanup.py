@@ -12,6 +12,7 @@ import stat
 import time
 import tomllib
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,15 +20,14 @@ from emberwatch.turn import process_state
 
 _iox2: Final[Any] = importlib.import_module("iceoryx2")
 
-#: What is younger, seconds, and of a living process may be in the making: not all take turns.
+#: What a living process made less than this ago may be unfinished, as not all take turns; seconds.
 _MAKING: Final = 1.0
 
 
-class Places:
+class ChannelFiles:
     """Where channels' files are, and what their names begin with."""
 
     def __init__(self, root: Path, shared: Path, prefix: str) -> None:
-        """Names them."""
         self._root, self._shared, self._prefix = root, shared, prefix
 
     def unfinished(self) -> list[Path]:
@@ -35,21 +35,13 @@ class Places:
         return [path for path in self._shared.glob(f"{self._prefix}*") if _is_unfinished(path)]
 
     def remove_leftovers(self, config: Any) -> None:
-        """Removes what dead processes left; to be called in a turn that is ours alone."""
-        # Files before nodes and tags: what others make meanwhile, without turns, is not among them.
+        """Removes what dead processes left; call it in a turn that no other process shares."""
+        # Files before nodes and tags, to leave out what others make meanwhile without turns.
         node_files = list((self._root / "nodes").glob("*"))
         service_files = list((self._root / "services").glob(f"{self._prefix}*.service"))
         folders = (self._shared, self._root)
         port_files = [path for folder in folders for path in folder.glob(f"{self._prefix}*")]
-        living: set[int] = set()
-        dead: list[Any] = []
-        for node in _iox2.Node.list(_iox2.ServiceType.Ipc, config):
-            if isinstance(node, _iox2.NodeState.Dead):
-                dead.append(node._0)
-            elif isinstance(node, _iox2.NodeState.Alive):
-                living.add(int(node._0.id.value))
-            elif isinstance(node, _iox2.NodeState.Inaccessible):
-                living.add(int(node._0.value))
+        living, dead = _nodes(config)
         ports, services = self._used(living)
         for path in self.unfinished():
             ids = self._ids(path)
@@ -59,10 +51,10 @@ class Places:
                 _remove(path)
         for node in dead:
             identity = int(node.id.value)
-            # Unfinished tags were for nothing yet, but iceoryx2 could not remove the folder.
+            # iceoryx2 cannot remove a folder with unfinished tags, which mean nothing yet.
             for path in filter(_is_writable, self._folder(identity).glob("*")):
                 _remove(path)
-            # Else nothing of it is in memory that others use; the details go last.
+            # Else none of its memory is used by others; the details go last.
             if node.details is not None and services & self._tags(identity, ".service_tag"):
                 try:
                     node.try_remove_stale_resources()
@@ -89,11 +81,9 @@ class Places:
             if path.stem.removeprefix(self._prefix) not in hashes:
                 _remove(path)
                 continue
-            try:
+            with suppress(OSError, ValueError, KeyError, TypeError):  # It is in the making.
                 identity = tomllib.loads(path.read_text())["unique_service_id"]
                 yield identity["unique_value"] << 64 | identity["payload_value"]
-            except (OSError, ValueError, KeyError, TypeError):  # It is in the making.
-                continue
 
     def _used(self, living: set[int]) -> tuple[set[int], set[str]]:
         """Ids of the ports, and hashes of the services' names, that living nodes use."""
@@ -119,6 +109,20 @@ class Places:
         return {int(word) for word in words if word.isdecimal() and 10 < len(word) < 40}
 
 
+def _nodes(config: Any) -> tuple[set[int], list[Any]]:
+    """The ids of living nodes, and the dead ones."""
+    living: set[int] = set()
+    dead: list[Any] = []
+    for node in _iox2.Node.list(_iox2.ServiceType.Ipc, config):
+        if isinstance(node, _iox2.NodeState.Dead):
+            dead.append(node._0)
+        elif isinstance(node, _iox2.NodeState.Alive):
+            living.add(int(node._0.id.value))
+        elif isinstance(node, _iox2.NodeState.Inaccessible):
+            living.add(int(node._0.value))
+    return living, dead
+
+
 def _is_in_the_making(identity: int) -> bool:
     """Whether an id was begun just now, by a process that lives."""
     seconds, nanos, pid = (identity >> shift & 0xFFFFFFFF for shift in (0, 32, 64))
@@ -128,23 +132,19 @@ def _is_in_the_making(identity: int) -> bool:
 
 def _is_writable(path: Path) -> bool:
     """A tag, or a node's details, can be written to until it is finished."""
-    try:
+    with suppress(FileNotFoundError):
         return bool(path.lstat().st_mode & stat.S_IWUSR)
-    except FileNotFoundError:
-        return False
+    return False
 
 
 def _is_unfinished(path: Path) -> bool:
     """A segment can be read only when it is finished."""
-    try:
+    with suppress(FileNotFoundError):
         found = path.lstat()
-    except FileNotFoundError:
-        return False
-    return found.st_size == 0 or not found.st_mode & stat.S_IRUSR
+        return found.st_size == 0 or not found.st_mode & stat.S_IRUSR
+    return False
 
 
 def _remove(path: Path) -> None:
-    try:
+    with suppress(OSError):  # What stays is removed by the next program.
         shutil.rmtree(path) if path.is_dir() else path.unlink()
-    except OSError:  # What stays is removed by the next program.
-        pass

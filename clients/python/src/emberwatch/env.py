@@ -57,7 +57,7 @@ class WildfireEnv(WorldEnv):
     The world after `burn_in` steps from the model's initial distribution, a pure function of the
     seed: `reset(seed=s)` begins the same episode here, in the vector environment and in Rust. A
     reset without a seed draws the next one from `np_random`. The robot is at `start`, and nothing
-    has been observed. `reset(options={"resume": True})` does not begin anew but goes on from
+    has been observed. `reset(options={"resume": True})` begins nothing but goes on from
     where the world stands, such as after another agent.
 
     ## Episode End
@@ -78,7 +78,7 @@ class WildfireEnv(WorldEnv):
     * `observation`: parts of the observation; `("frame", "robot")` by default.
     * `instance`: attach to this running server; None: a private one.
     * `world`: which of its worlds (0).
-    * `takeover`: take the world from whoever holds it (False).
+    * `takeover`: take the world from its holder (False).
     * `model`: `"wildfire"` (the default), `"wildfire-sparse"`, `"wildfire-latent"` or the path of
       a model file; `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `start`
       (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the private server. With `instance`
@@ -98,36 +98,22 @@ class WildfireEnv(WorldEnv):
     """
 
     def __init__(
-        self,
-        *,
-        observation: Parts = ("frame", "robot"),
-        render_mode: str | None = None,
-        **world: Unpack[WorldArguments],
+        self, *, observation: Parts = ("frame", "robot"), **world: Unpack[WorldArguments]
     ) -> None:
-        """Checks the arguments; see the class. Nothing is started before the first reset.
-
-        Raises:
-            SettingError: If an argument is impossible or contradicts the running server.
-            NoServerError: If nobody serves `instance`.
-        """
+        """See the class. No server of its own runs before the first reset."""
         settings = Settings.of(WildfireEnv, world)
-        super().__init__(settings, render_mode, reveals=settings.truth)
-        self._observations = Observations(observation, self._shape)
+        super().__init__(settings, reveals=settings.truth)
+        self._observations = Observations(observation, self._spec)
         self.observation_space = self._observations.space
-        self.action_space = spaces.MultiDiscrete([4] * self._shape.n_moves)
+        self.action_space = spaces.MultiDiscrete([4] * self._spec.n_moves)
         self._answer: StepAnswer | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode; see the class, *Starting State*.
-
-        Raises:
-            BusyError: If another client holds the world of a running server.
-            SettingError: If an option is unknown.
-        """
+        """Begins an episode; see the class, *Starting State*."""
         self._answer = answer = self._begin(seed, options)
-        self._observations.began([0], answer.frames)
+        self._observations.reset([0], answer.frames)
         return self._seen(answer, answer.result())
 
     def step(
@@ -136,19 +122,19 @@ class WildfireEnv(WorldEnv):
         """Flies a path of T moves.
 
         Raises:
-            InvalidActionError: If it is not `(T,)` integers in 0 to 3. Nothing is sent.
+            InvalidArgumentError: If it is not `(T,)` integers in 0 to 3. Nothing is sent.
             LeaseLostError: If another client took the world over.
             ServerGoneError: If the server has ended; the next reset starts or finds another.
             RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
         """
-        moves = as_moves(action, 1, self._shape.n_moves)
+        moves = as_moves(action, 1, self._spec.n_moves)
         before, answer = self._answer, self._session.step(moves)
         self._answer = answer
-        self._observations.note(answer, 0)
+        self._observations.update(answer)
         result = answer.result()
         if self.render_mode is not None and before is not None:
             start = before.result()
-            self._path = fly((start.row, start.col), moves.reshape(-1), self._shape)
+            self._path = fly((start.row, start.col), moves.reshape(-1), self._spec)
         observation, info = self._seen(answer, result)
         return observation, result.reward, bool(result.terminated), bool(result.truncated), info
 
@@ -156,7 +142,7 @@ class WildfireEnv(WorldEnv):
         info = self._describe(answer, result)
         frame = answer.frames[0]
         if self.render_mode is not None:
-            # Pictures come from the frame that the learner, who may write to his, does not have.
+            # The learner may write to its frame: pictures come from another.
             frame = frame.copy()
         if self.render_mode == "human":
             self._draw()

@@ -5,21 +5,18 @@ from __future__ import annotations
 import os
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
-from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
 from emberwatch.arguments import as_moves, as_seed
-from emberwatch.errors import InvalidActionError, SettingError
+from emberwatch.connection import ServerConnection
+from emberwatch.errors import InvalidArgumentError
 from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
 from emberwatch.replies import Grant, WorldInfo, records
 from emberwatch.wire import StepAnswer, StepResult
-
-if TYPE_CHECKING:
-    from emberwatch.client import Client
 
 #: Most bytes of a belief in one message.
 _BELIEF_PART: Final = 1 << 19
@@ -29,13 +26,12 @@ class Lease:
     """The right to act on consecutive worlds. Ends by `release`, or leaving its `with`."""
 
     def __init__(
-        self, client: Client, grant: Grant, start: tuple[WorldInfo, ...], worlds: range
+        self, client: ServerConnection, grant: Grant, start: tuple[WorldInfo, ...], worlds: range
     ) -> None:
-        """Made by `Client.acquire`."""
         self.client: Final = client
         #: The server's number for it.
         self.number: Final = grant.lease
-        #: It ends so many seconds after its last use.
+        #: It ends this many seconds after its last use.
         self.ttl: Final = grant.ttl_millis / 1000
         #: The worlds it covers.
         self.worlds: Final = worlds
@@ -58,12 +54,13 @@ class Lease:
                 one world.
             worlds: Only these, consecutive; None: all of the lease.
             full: Observe every cell; needs a server with coverage "client" or "full".
-            timeout: How long to wait for the answer, seconds.
 
         Raises:
-            InvalidActionError: If the paths are not of that shape, type and range; nothing is sent.
+            InvalidArgumentError: If the paths are not of that shape, type and range.
             LeaseLostError: If the lease ended or a world was taken over.
-            EpisodeOverError: If a world's episode was truncated: reset it.
+            RequestTimeoutError: If no answer comes; `observe` tells whether the step was made.
+            ServerGoneError: If the server ended.
+            EmberwatchError: With code `"episode_over"`: reset that world.
         """
         chosen = self.worlds if worlds is None else self._part(worlds)
         moves = as_moves(paths, len(chosen), self.client.info.n_moves)
@@ -99,24 +96,19 @@ class Lease:
         Args:
             seeds: One per world; None: the server derives the next from the world's last.
             worlds: Only these worlds; None: all of the lease.
-            timeout: How long to wait for the burn-ins, seconds.
 
         Returns:
             Where the worlds stand, in the order asked.
-
-        Raises:
-            LeaseLostError: If the lease ended or a world was taken over.
         """
         chosen = list(self.worlds if worlds is None else worlds)
         given = [None] * len(chosen) if seeds is None else list(seeds)
         if len(given) != len(chosen):
-            raise InvalidActionError(f"seeds: expected {len(chosen)}, got {len(given)}")
+            raise InvalidArgumentError(f"seeds: expected {len(chosen)}, got {len(given)}")
         pairs = [
             {"world": world, "seed": None if seed is None else as_seed(seed)}
             for world, seed in zip(chosen, given, strict=True)
         ]
-        request = {"op": "reset", "lease": self.number, "worlds": pairs}
-        return records(WorldInfo, self.client.control(request, timeout=timeout))
+        return records(WorldInfo, self._ask("reset", timeout, worlds=pairs))
 
     def restore(
         self,
@@ -126,34 +118,23 @@ class Lease:
         first: int = 0,
         timeout: float = RESET_TIMEOUT,
     ) -> tuple[WorldInfo, ...]:
-        """Puts the worlds of a snapshot file in the place of its own: they go on bit for bit.
+        """Replaces its worlds with those of a snapshot file, which go on as they would have.
 
         Args:
             path: The file, written by `Client.snapshot` or `emberwatch-server snapshot`.
             worlds: Only these worlds, consecutive; None: all of the lease.
             first: The first of the file's worlds that is read.
-            timeout: How long to wait for the answer, seconds.
-
-        Raises:
-            BadFileError: If the file is damaged, too short, or of a server with other settings.
         """
         chosen = self.worlds if worlds is None else self._part(worlds)
-        request = {
-            "op": "restore",
-            "lease": self.number,
-            "first_world": chosen.start,
-            "n_worlds": len(chosen),
-            "from": first,
-            "path": os.path.abspath(path),
-        }
-        return records(WorldInfo, self.client.control(request, timeout=timeout))
+        place = {"first_world": chosen.start, "n_worlds": len(chosen), "from": first}
+        reply = self._ask("restore", timeout, **place, path=os.path.abspath(path))
+        return records(WorldInfo, reply)
 
     def fork(
         self, source: int, target: int, *, timeout: float = STEP_TIMEOUT
     ) -> tuple[WorldInfo, ...]:
         """Puts a copy of any world in the place of one of its own: both have the same future."""
-        request = {"op": "fork", "lease": self.number, "from": source, "to": target}
-        return records(WorldInfo, self.client.control(request, timeout=timeout))
+        return records(WorldInfo, self._ask("fork", timeout, **{"from": source, "to": target}))
 
     def leave_belief(
         self,
@@ -164,64 +145,55 @@ class Lease:
         world: int | None = None,
         timeout: float = STEP_TIMEOUT,
     ) -> None:
-        """Leaves bytes about a world as it stands to whoever acts on it next (`Client.belief`).
+        """Leaves bytes about the present step of a world to its next client (`Client.belief`).
 
         Args:
             result: The world's last result; another step is refused.
             kind: Says to other agents what the bytes are, in at most 256 bytes.
             data: At most 64 bytes per cell.
             world: Which world; None: the first of the lease.
-            timeout: How long to wait for each answer, seconds.
         """
         for offset in range(0, max(len(data), 1), _BELIEF_PART):
-            part = data[offset : offset + _BELIEF_PART]
-            request = {
-                "op": "leave_belief",
-                "lease": self.number,
-                "world": self.worlds.start if world is None else world,
-                "episode": result.episode,
-                "step": result.step,
-                "kind": kind,
-                "offset": offset,
-                "length": len(data),
-                "data": b64encode(part).decode(),
-            }
-            self.client.control(request, timeout=timeout)
+            self._ask(
+                "leave_belief",
+                timeout,
+                world=self.worlds.start if world is None else world,
+                episode=result.episode,
+                step=result.step,
+                kind=kind,
+                offset=offset,
+                length=len(data),
+                data=b64encode(data[offset : offset + _BELIEF_PART]).decode(),
+            )
+
+    def renew(self, *, timeout: float = RESET_TIMEOUT) -> None:
+        """Starts the lease's clock again without acting."""
+        self._ask("renew", timeout)
+
+    def release(self, *, timeout: float = STEP_TIMEOUT) -> None:
+        """Gives the worlds back. May be called again."""
+        if not self._is_over:
+            self._is_over = True
+            self._ask("release", timeout)
+
+    def _ask(self, operation: str, timeout: float, **keys: Any) -> dict[str, Any]:
+        request = {"op": operation, "lease": self.number, **keys}
+        return self.client.control(request, timeout=timeout)
 
     def _part(self, worlds: range) -> range:
-        """Checks worlds to step: consecutive, of this lease."""
         is_part = isinstance(worlds, range) and worlds.step == 1 and len(worlds) > 0  # pyright: ignore[reportUnnecessaryIsInstance]
         if not is_part or worlds.start < self.worlds.start or worlds.stop > self.worlds.stop:
-            raise SettingError(
+            raise InvalidArgumentError(
                 f"worlds: expected a range of consecutive worlds within {self.worlds}, got {worlds}"
             )
         return worlds
 
-    def renew(self, *, timeout: float = RESET_TIMEOUT) -> None:
-        """Starts the lease's clock again without acting."""
-        self.client.control({"op": "renew", "lease": self.number}, timeout=timeout)
-
-    def release(self, *, timeout: float = STEP_TIMEOUT) -> None:
-        """Gives the worlds back. Again is fine."""
-        if not self._is_over:
-            self._is_over = True
-            self.client.control({"op": "release", "lease": self.number}, timeout=timeout)
-
     def __enter__(self) -> Self:
-        """Returns itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Releases it; after an error, without a second one."""
-        if kind is None:
-            self.release()
-            return
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             self.release()
         except Exception:
-            pass  # the first error says more
+            if kind is None:  # else the first error says more
+                raise

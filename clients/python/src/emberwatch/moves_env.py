@@ -12,16 +12,14 @@ from numpy.typing import NDArray
 from emberwatch import wire
 from emberwatch.arguments import as_choice
 from emberwatch.base import WorldEnv
-from emberwatch.errors import ClosedError, SettingError
-from emberwatch.observations import Observations, assemble, check_parts
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.observations import Observations, image_space
+from emberwatch.session import not_reset
 from emberwatch.settings import Settings, WorldArguments
 from emberwatch.view import fly
 from emberwatch.wire import StepAnswer
 
-#: The parts of an observation that there are.
 MovesPart: TypeAlias = Literal["frame", "robot", "age", "visited", "move"]
-
-_PARTS: tuple[MovesPart, ...] = ("frame", "robot", "age", "visited", "move")
 
 
 class WildfireMovesEnv(WorldEnv):
@@ -58,19 +56,15 @@ class WildfireMovesEnv(WorldEnv):
     comparable. The environment needs the `truth` channel for it: a private server publishes it,
     a running one must.
 
-    ## Starting State
-
-    As `WildfireEnv`.
-
     ## Episode End
 
     Never `terminated`. `truncated` after `max_episode_steps` moves (64,000, thus 1,000 paths of
     the default length, unless `gymnasium.make` is told otherwise), or after the running server's
     own `--max-steps`.
 
-    ## Information
+    ## Starting State, Information
 
-    As `WildfireEnv`, about the last complete path.
+    As `WildfireEnv`; the information is about the last complete path.
 
     ## Arguments
 
@@ -87,53 +81,35 @@ class WildfireMovesEnv(WorldEnv):
         *,
         observation: MovesPart | Sequence[MovesPart] = ("frame", "visited", "robot", "move"),
         reward: Literal["path", "move"] = "path",
-        render_mode: str | None = None,
         **world: Unpack[WorldArguments],
     ) -> None:
-        """Checks the arguments; see the class. Nothing is started before the first reset.
-
-        Raises:
-            SettingError: If an argument is impossible or contradicts the running server.
-            NoServerError: If nobody serves `instance`.
-        """
+        """See the class. No server of its own runs before the first reset."""
         if reward not in ("path", "move"):
-            raise SettingError(f"reward: expected 'path' or 'move', got {reward!r}")
+            raise InvalidArgumentError(f"reward: expected 'path' or 'move', got {reward!r}")
         reveals = world.get("truth", False)
         self._pays_moves = reward == "move"
         world["truth"] = reveals or self._pays_moves
-        super().__init__(Settings.of(WildfireMovesEnv, world), render_mode, reveals=reveals)
+        super().__init__(Settings.of(WildfireMovesEnv, world), reveals=reveals)
         if self._pays_moves and self.model is None:
-            raise SettingError("reward='move': expected a server that reveals its model")
-        self._names, self._is_plain = check_parts(observation, _PARTS)
-        shape = self._shape
-        # Frames and ages change with each path only.
-        self._observations = Observations(("frame", "robot", "age"), shape)
-        image = self._observations.spaces["frame"]
-        known: dict[str, spaces.Space[Any]] = {
-            **self._observations.spaces,
-            "visited": image,
-            "move": spaces.Discrete(shape.n_moves),
-        }
-        self.observation_space = assemble(self._names, known, self._is_plain)
+            raise InvalidArgumentError("reward='move': expected a server that reveals its model")
+        spec = self._spec
+        extra = {"visited": image_space(spec), "move": spaces.Discrete(spec.n_moves)}
+        self._observations = Observations(observation, spec, extra=extra)
+        self.observation_space = self._observations.space
         self.action_space = spaces.Discrete(wire.N_MOVES)
         self._answer: StepAnswer | None = None
         self._states: NDArray[np.uint8] | None = None
         self._start = self._robot = (0, 0)
         self._moves: list[int] = []
-        self._visited = np.zeros((shape.height, shape.width), np.uint8)
+        self._visited = np.zeros((spec.height, spec.width), np.uint8)
         self._paid = 0.0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode; see `WildfireEnv`.
-
-        Raises:
-            BusyError: If another client holds the world of a running server.
-            SettingError: If an option is unknown.
-        """
+        """Begins an episode; see `WildfireEnv`."""
         answer = self._begin(seed, options)
-        self._observations.began([0], answer.frames)
+        self._observations.reset([0], answer.frames)
         self._begin_path(answer)
         return self._seen(answer)
 
@@ -141,15 +117,12 @@ class WildfireMovesEnv(WorldEnv):
         """Flies one move; the T-th completes the path and moves the world.
 
         Raises:
-            InvalidActionError: If it is not an integer in 0 to 3. Nothing is done.
-            LeaseLostError: If another client took the world over.
-            ServerGoneError: If the server has ended; the next reset starts or finds another.
-            RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
+            EmberwatchError: As `WildfireEnv.step`.
         """
         moves = [*self._moves, as_choice(action, wire.N_MOVES)]
-        if self._answer is None or not self._session.is_open:
-            raise ClosedError("the environment has no episode: reset it first")
-        if len(moves) < self._shape.n_moves:
+        if self._answer is None or not self._is_open():
+            raise not_reset()
+        if len(moves) < self._spec.n_moves:
             reward = self._visit(moves[-1])
             self._paid += reward
             self._moves = moves
@@ -158,8 +131,8 @@ class WildfireMovesEnv(WorldEnv):
         answer = self._session.step(np.array(moves, np.uint8))
         result = answer.result()
         reward = result.reward - self._paid
-        self._path = fly(self._start, moves, self._shape)
-        self._observations.note(answer, 0)
+        self._path = fly(self._start, moves, self._spec)
+        self._observations.update(answer)
         self._begin_path(answer)
         observation, info = self._seen(answer)
         return observation, reward, bool(result.terminated), bool(result.truncated), info
@@ -176,7 +149,7 @@ class WildfireMovesEnv(WorldEnv):
 
     def _visit(self, move: int) -> float:
         """Moves the robot; returns what its cell pays at once."""
-        row, col = fly(self._robot, (move,), self._shape)[0].tolist()
+        row, col = fly(self._robot, (move,), self._spec)[0].tolist()
         self._robot = (row, col)
         is_new = not self._visited[row, col]
         self._visited[row, col] = 255
@@ -187,18 +160,20 @@ class WildfireMovesEnv(WorldEnv):
     def _seen(self, answer: StepAnswer) -> tuple[Any, dict[str, Any]]:
         info = self._describe(answer, answer.result())
         row, col = self._robot
-        # Copies: the frame is handed out again with each move of a path.
-        parts = self._observations.one(answer.frames[0].copy(), row, col)
-        parts["visited"] = self._visited[:, :, np.newaxis].copy()
-        parts["move"] = np.int64(len(self._moves))
         if self.render_mode == "human":
             self._draw()
-        if self._is_plain:
-            return parts[self._names[0]], info
-        return {name: parts[name] for name in self._names}, info
+        # Copies: each move of a path returns the frame again.
+        observation = self._observations.one(
+            answer.frames[0].copy(),
+            row,
+            col,
+            visited=self._visited[:, :, np.newaxis].copy(),
+            move=np.int64(len(self._moves)),
+        )
+        return observation, info
 
     def _draw(self) -> Any:
         if self._answer is None:
             return None
-        flown = fly(self._start, self._moves, self._shape) if self._moves else self._path
+        flown = fly(self._start, self._moves, self._spec) if self._moves else self._path
         return self._view.draw(self._answer.frames[0], self._robot, flown, self._truth)

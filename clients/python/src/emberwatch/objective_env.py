@@ -14,21 +14,20 @@ from numpy.typing import NDArray
 
 from emberwatch.arguments import as_choice, as_seed
 from emberwatch.base import WorldEnv, reported, wants_to_resume
-from emberwatch.client import connect, when_served
+from emberwatch.client import connect, connect_with_retry
 from emberwatch.decisions import Decisions
 from emberwatch.errors import (
-    AgentEndsError,
-    ClosedError,
+    InvalidArgumentError,
     LeaseLostError,
     NoServerError,
     RequestTimeoutError,
     ServerGoneError,
-    SettingError,
 )
 from emberwatch.observer import Frame, Observer
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program
 from emberwatch.replies import Decision
+from emberwatch.session import not_reset, timed_out_before
 from emberwatch.settings import Settings, WorldArguments, draw_seed
 from emberwatch.truth import HiddenStates
 from emberwatch.view import fly
@@ -54,22 +53,14 @@ class WildfireObjectiveEnv(WorldEnv):
     ## Observation Space
 
     `Box(0, 1, (18 (S + 1) + 2,), float32)`: a summary of the belief that the next plan will use,
-    in place of the paper's h_k. It is as long for every grid; PROTOCOL.md section 13 says what
-    each number is, and `summary_names` names them.
-
-    ## Rewards
-
-    As `WildfireEnv`.
+    in place of the paper's h_k. Its length is the same for every grid; PROTOCOL.md section 13
+    explains the numbers, and `summary_names` names them.
 
     ## Starting State
 
     As `WildfireEnv`, with the belief that the world's burn-in leaves one with (`prior`).
 
-    ## Episode End
-
-    As `WildfireEnv`.
-
-    ## Information
+    ## Rewards, Episode End, Information
 
     As `WildfireEnv`.
 
@@ -93,24 +84,23 @@ class WildfireObjectiveEnv(WorldEnv):
         planner: Literal["beam", "shooting"] = "beam",
         prior: Literal["simulated", "initial", "uniform"] = "simulated",
         agent: Literal["own", "running"] = "own",
-        render_mode: str | None = None,
         **world: Unpack[WorldArguments],
     ) -> None:
-        """Checks the arguments; see the class. Nothing is started before the first reset.
-
-        Raises:
-            SettingError: If an argument is impossible or contradicts the running server.
-            NoServerError: If nobody serves `instance`.
-        """
-        _check_choice("planner", planner, ("beam", "shooting"))
-        _check_choice("prior", prior, ("simulated", "initial", "uniform"))
-        _check_choice("agent", agent, ("own", "running"))
+        """See the class. No server of its own runs before the first reset."""
+        for name, value, choices in (
+            ("planner", planner, ("beam", "shooting")),
+            ("prior", prior, ("simulated", "initial", "uniform")),
+            ("agent", agent, ("own", "running")),
+        ):
+            if value not in choices:
+                expected = f"one of {', '.join(choices)}"
+                raise InvalidArgumentError(f"{name}: expected {expected}, got {value!r}")
         settings = Settings.of(WildfireObjectiveEnv, world)
         if agent == "running" and settings.instance is None:
-            raise SettingError("agent='running': expected instance=..., where it runs")
-        super().__init__(settings, render_mode, reveals=settings.truth)
+            raise InvalidArgumentError("agent='running': expected instance=..., where it runs")
+        super().__init__(settings, reveals=settings.truth)
         if self.model is None:
-            raise SettingError("model: expected one, as the server does not reveal its own")
+            raise InvalidArgumentError("model: expected one, as the server does not reveal its own")
         self._arguments = {"planner": planner, "prior": prior}
         self._agent: Program | None = None
         self._owns_agent = agent == "own"
@@ -118,7 +108,7 @@ class WildfireObjectiveEnv(WorldEnv):
         self._frames: Observer | None = None
         self._truths: HiddenStates | None = None
         self._frame: Frame | None = None
-        #: Whether a decision has timed out, so that the world may stand elsewhere than thought.
+        #: Whether a decision has timed out, so that the world may stand elsewhere than expected.
         self._is_lost = False
         n_objectives = self.model.n_states + 1
         self.action_space = spaces.Discrete(n_objectives)
@@ -142,24 +132,18 @@ class WildfireObjectiveEnv(WorldEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begins an episode; see `WildfireEnv`.
-
-        Raises:
-            LaunchError: If the agent does not start, in its own words, such as that another client
-                holds the world of a running server.
-            SettingError: If an option is unknown.
-        """
+        """Begins an episode; see `WildfireEnv`. An agent that does not start says why."""
         super(WorldEnv, self).reset(seed=seed)
         resume = wants_to_resume(options, seed)
         world_seed = draw_seed(self.np_random) if seed is None and not resume else seed
         world_seed = None if world_seed is None else as_seed(world_seed)
         may_move = self._is_open() and not resume
         try:
-            decision = self._begin_with(world_seed, resume)
-        except (AgentEndsError, ServerGoneError):
+            decision = self._begin_at(world_seed, resume)
+        except ServerGoneError:
             if not may_move:
                 raise
-            decision = self._begin_with(world_seed, resume)
+            decision = self._begin_at(world_seed, resume)
         self._is_lost = False
         self._path = None
         return self._seen(decision)
@@ -170,44 +154,38 @@ class WildfireObjectiveEnv(WorldEnv):
         """Plans and flies a path for an objective.
 
         Raises:
-            InvalidActionError: If it is not an integer in 0 to S. Nothing is sent.
-            LeaseLostError: If another client took the world over.
-            ServerGoneError: If agent or server have ended, with the agent's words.
-            RequestTimeoutError: If there is no answer; the world may have moved: reset or resume.
+            EmberwatchError: As `WildfireEnv.step`, in the agent's words if it has ended.
         """
         objective = as_choice(action, len(self._opened().info.objectives))
         if self._is_lost:
-            raise ClosedError(
-                "an earlier decision timed out, and the world may have moved: reset, or go on from "
-                "where it stands with reset(options={'resume': True})"
-            )
-        with self._closing_when_lost():
+            raise timed_out_before()
+        with self._closed_when_lost():
             decision = self._opened().decide(objective, timeout=self._session.settings.timeout)
         observation, info = self._seen(decision)
         return observation, decision.reward, decision.terminated, decision.truncated, info
 
     def close(self) -> None:
-        """Ends the agent and the private server, if they are its own. Again is fine."""
-        readers, self._frames, self._truths = (self._frames, self._truths), None, None
-        for part in (*readers, self._decisions):
+        """Ends the agent and the private server, if they are its own. May be called again."""
+        for part in (self._frames, self._truths, self._decisions):
             if part is not None:
                 part.close()
-        self._decisions = None
+        self._frames = self._truths = self._decisions = None
         agent, self._agent = self._agent, None
         if agent is not None:
             agent.stop()
         super().close()
 
     @contextlib.contextmanager
-    def _closing_when_lost(self) -> Generator[None]:
-        """What is gone is given up, in the agent's own words, so that a reset opens anew."""
+    def _closed_when_lost(self) -> Generator[None]:
+        """Closes what is gone, with an error in the agent's own words; a reset opens it again."""
         try:
             yield
         except RequestTimeoutError:
             self._is_lost = True
             raise
-        except (LeaseLostError, AgentEndsError, ServerGoneError) as error:
-            code, words = (None, "") if self._agent is None else self._agent.ended()
+        except (LeaseLostError, ServerGoneError) as error:
+            code = None if self._agent is None else self._agent.exit_code()
+            words = "" if self._agent is None or code is None else self._agent.output()
             self.close()
             if isinstance(error, LeaseLostError) or code is None:
                 raise
@@ -217,10 +195,10 @@ class WildfireObjectiveEnv(WorldEnv):
     def _is_open(self) -> bool:
         return self._decisions is not None
 
-    def _begin_with(self, seed: int | None, resume: bool) -> Decision:
+    def _begin_at(self, seed: int | None, resume: bool) -> Decision:
         """Where an episode begins, or goes on."""
         decisions = self._open(seed)
-        with self._closing_when_lost():
+        with self._closed_when_lost():
             return decisions.last() if resume else decisions.reset(seed)
 
     def _open(self, seed: int | None) -> Decisions:
@@ -238,7 +216,8 @@ class WildfireObjectiveEnv(WorldEnv):
             if self.render_mode is not None:
                 self._frames = Observer(instance, world=settings.world)
             if self._reveals:
-                self._truths = HiddenStates(instance, settings, 1, self._shape)
+                shape = (1, self._spec.height, self._spec.width)
+                self._truths = HiddenStates(instance, settings.world, shape)
             self._decisions = self._start_agent(instance)
         except BaseException:
             self.close()
@@ -247,35 +226,35 @@ class WildfireObjectiveEnv(WorldEnv):
 
     def _start_agent(self, instance: str) -> Decisions:
         settings = self._session.settings
-
-        def connect_to_any() -> Decisions:
-            return Decisions(instance, settings.world, timeout=settings.timeout)
+        if not self._owns_agent:
+            return connect_with_retry(settings.timeout, lambda: self._connect(instance))
+        flags = {"instance": instance, "world": settings.world, "wait": 0, **self._arguments}
+        if settings.instance is not None and settings.model is not None:
+            flags["model"] = str(settings.model)
+        command = ["serve-decisions", *(f"--{flag}={value}" for flag, value in flags.items())]
+        self._agent = agent = Program(
+            "emberwatch-agent", command + ["--takeover"] * settings.takeover
+        )
+        # For environments that nobody closes. Does nothing where it has been stopped before.
+        weakref.finalize(self, agent.stop)
 
         def connect_to_own() -> Decisions:
-            decisions = connect_to_any()
-            if self._agent is not None and decisions.info.pid == self._agent.pid:
+            decisions = self._connect(instance)
+            if decisions.info.pid == agent.pid:
                 return decisions
-            # Another agent serves the world: ours is about to end, and to say so.
+            # Another agent serves the world; the own one will end with an error about it.
             decisions.close()
             raise NoServerError(f"world {settings.world} has another agent")
 
-        if not self._owns_agent:
-            return when_served(settings.timeout, connect_to_any)
-        flags = {"instance": instance, "world": str(settings.world), "wait": "0"}
-        flags |= self._arguments
-        command = ["serve-decisions", *(f"--{flag}={value}" for flag, value in flags.items())]
-        if settings.takeover:
-            command.append("--takeover")
-        if settings.instance is not None and settings.model is not None:
-            command.append(f"--model={settings.model_argument}")
-        self._agent = Program("emberwatch-agent", command)
-        # For environments that nobody closes. Does nothing where it has been stopped before.
-        weakref.finalize(self, self._agent.stop)
-        return self._agent.wait_for(connect_to_own, RESET_TIMEOUT)
+        return agent.wait_for(connect_to_own, RESET_TIMEOUT)
+
+    def _connect(self, instance: str) -> Decisions:
+        settings = self._session.settings
+        return Decisions(instance, settings.world, timeout=settings.timeout)
 
     def _opened(self) -> Decisions:
         if self._decisions is None:
-            raise ClosedError("the environment is closed: reset it first")
+            raise not_reset()
         return self._decisions
 
     def _seen(self, decision: Decision) -> tuple[NDArray[np.float32], dict[str, Any]]:
@@ -287,7 +266,7 @@ class WildfireObjectiveEnv(WorldEnv):
             info["truth"] = truth.copy()
         if self._frames is not None:
             self._frame = frame = self._await_frame(self._frames, moment)
-            self._path = fly(frame.start, frame.path, self._shape) if len(frame.path) else None
+            self._path = fly(frame.start, frame.path, self._spec) if len(frame.path) else None
         if self.render_mode == "human":
             self._draw()
         return np.array(decision.summary, np.float32), info
@@ -307,8 +286,3 @@ class WildfireObjectiveEnv(WorldEnv):
             return None
         robot = (self._frame.result.row, self._frame.result.col)
         return self._view.draw(self._frame.frame, robot, self._path, self._truth)
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise SettingError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")

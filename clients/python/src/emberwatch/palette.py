@@ -1,7 +1,6 @@
 """The colours of pictures: the model's own, and marks that stand out from them.
 
-Lightness tells marks from cells, so that they can be told apart in grey and under every colour
-blindness.
+Lightness distinguishes marks from cells, also in grey and under every colour blindness.
 """
 
 from __future__ import annotations
@@ -12,8 +11,9 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.belief import UNOBSERVED
-from emberwatch.model import MAX_VALUES, Color, Model
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.model import MAX_VALUES, Color, Model, color_from_hex
+from emberwatch.wire import UNOBSERVED
 
 DARK: Final[Color] = (0x14, 0x14, 0x14)
 """Marks on light cells."""
@@ -24,7 +24,9 @@ LIGHT: Final[Color] = (0xFF, 0xFF, 0xFF)
 # The wildfire model's three, then from Okabe and Ito (2008), with a brown for their orange.
 _COLORS = ("3B6EA5", "E3B23C", "C8371B", "009E73", "CC79A7", "56B4E9", "8C510A", "F0E442")
 _GREYS = (0x30, 0x60, 0x98, 0xE2)  # for what was not observed
-_APART = 3 * 60 * 60  # squared distance at which colours are told apart, as in the Rust figures
+_APART = (
+    3 * 60 * 60
+)  # squared distance at which colours can be distinguished, as in the Rust figures
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,16 +44,16 @@ class Palette:
 
     @classmethod
     def of(cls, source: Model | int, *, on_paper: bool = False) -> Self:
-        """The model's colours, or eight others in turn for a hidden model.
+        """The model's colours, or of a number of observations eight colours in turn.
 
-        Args:
-            source: The model, or its number of observations, 1 to 64.
-            on_paper: Whether what was not observed is light if it can be, as the page around it.
+        `on_paper` makes what was not observed light if it can be, as the page around it.
         """
         if isinstance(source, Model):
             states, observations = source.state_colors, source.observation_colors
         else:
-            states = tuple(_color(i) for i in range(MAX_VALUES))  # however many there may be
+            states = tuple(
+                color_from_hex(_COLORS[i % len(_COLORS)]) for i in range(MAX_VALUES)
+            )  # however many there may be
             observations = states[:source]
         return cls(
             states=states,
@@ -61,19 +63,11 @@ class Palette:
         )
 
     def paint_frame(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Colours (H, W, 3) of a frame (H, W).
-
-        Raises:
-            ValueError: A value is neither an observation nor 255.
-        """
+        """Colours (H, W, 3) of a frame (H, W)."""
         return _paint(frame, {**dict(enumerate(self.observations)), UNOBSERVED: self.unobserved})
 
     def paint_truth(self, truth: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Colours (H, W, 3) of hidden states (H, W).
-
-        Raises:
-            ValueError: A value is no state.
-        """
+        """Colours (H, W, 3) of hidden states (H, W)."""
         return _paint(truth, dict(enumerate(self.states)))
 
 
@@ -98,13 +92,8 @@ def _paint(values: NDArray[np.uint8], colors: dict[int, Color]) -> NDArray[np.ui
     unknown = np.isin(values, list(colors), invert=True)
     if unknown.any():
         got = int(values[unknown][0])
-        raise ValueError(f"picture: expected values out of {sorted(colors)}, got {got}")
+        raise InvalidArgumentError(f"picture: expected values out of {sorted(colors)}, got {got}")
     return table[values]
-
-
-def _color(index: int) -> Color:
-    red, green, blue = bytes.fromhex(_COLORS[index % len(_COLORS)])
-    return red, green, blue
 
 
 def _grey_unlike(colors: tuple[Color, ...], greys: tuple[int, ...]) -> Color:

@@ -1,4 +1,4 @@
-"""The programs that come with the package, and private ones started from Python."""
+"""The programs that come with the package: found, run, and started as private ones."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import atexit
 import contextlib
 import itertools
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -13,14 +14,15 @@ import sys
 import sysconfig
 import tempfile
 import time
+import tomllib
 import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import IO, Final, TypeVar
+from typing import IO, Any, Final, TypeVar
 
 from emberwatch.errors import (
     EmberwatchError,
-    LaunchError,
+    InvalidArgumentError,
     NoServerError,
     RequestTimeoutError,
     ServerGoneError,
@@ -28,35 +30,27 @@ from emberwatch.errors import (
 
 _Connection = TypeVar("_Connection")
 
-#: How long a program may take until it answers, seconds.
+# Seconds that a program may take to answer, to stop before it is killed, and to end after it has
+# said that it ends.
 _START_TIMEOUT: Final = 20.0
-
-#: How long it may take to stop before it is killed, seconds.
 _STOP_TIMEOUT: Final = 3.0
-
-#: How long a program that says farewell may take to end, seconds.
-_FAREWELL: Final = 3.0
+_EXIT_TIMEOUT: Final = 3.0
 
 _numbers = itertools.count()
 
 
 def find(name: str) -> Path:
-    """The path of `emberwatch-server` or `emberwatch-agent`.
-
-    Looked for where pip installed this package's programs, then on the `PATH`.
-
-    Raises:
-        LaunchError: If it is nowhere.
-    """
+    """The path of a program: where pip installed this package's programs, or on the `PATH`."""
     places = [Path(sysconfig.get_path("scripts")), Path(sys.executable).parent]
     for place in places:
         if (place / name).is_file():
             return place / name
     on_path = shutil.which(name)
     if on_path is None:
-        raise LaunchError(
+        raise EmberwatchError(
             f"{name}: expected it in {places[0]} or on the PATH; install the package with pip "
-            "(`pip install ./clients/python`), or attach to a running server with instance=..."
+            "(`pip install ./clients/python`), or attach to a running server with instance=...",
+            "program",
         )
     return Path(on_path)
 
@@ -66,62 +60,94 @@ def unused_instance() -> str:
     return f"python-{os.getpid()}-{next(_numbers)}"
 
 
+def check_settings(flags: Sequence[str]) -> dict[str, Any]:
+    """What a server would run with, given these flags; a refusal is in the server's words."""
+    done = _run("emberwatch-server", ["--check", *flags], _START_TIMEOUT)
+    if done.returncode != 0:
+        raise InvalidArgumentError(_cleaned(done.stderr))
+    return tomllib.loads(done.stdout)
+
+
+def run(name: str, arguments: Sequence[str], timeout: float) -> None:
+    """Runs a program to its end; a failure is an error in its own words."""
+    done = _run(name, arguments, timeout)
+    if done.returncode != 0:
+        words = _cleaned(done.stderr[-1000:])
+        raise EmberwatchError(f"{name} ended with code {done.returncode}: {words}", "program")
+
+
+def _run(name: str, arguments: Sequence[str], timeout: float) -> subprocess.CompletedProcess[str]:
+    command = [str(find(name)), *arguments]
+    try:
+        return subprocess.run(
+            command,
+            env=os.environ | {"RUST_LOG": "warn"},
+            capture_output=True,
+            text=True,
+            errors="replace",
+            stdin=subprocess.DEVNULL,
+            timeout=timeout,
+        )
+    except OSError as error:
+        raise _not_started(command, error) from None
+    except subprocess.TimeoutExpired:
+        raise EmberwatchError(f"{name} did not end within {timeout} s", "program") from None
+
+
+def _not_started(command: Sequence[str], error: OSError) -> EmberwatchError:
+    return EmberwatchError(f"start {command[0]}: {error.strerror}", "program")
+
+
+def _cleaned(text: str) -> str:
+    """A program's messages without times, levels and the hint at its flags."""
+    text = re.sub(r"(?m)^\S+Z +[A-Z]+ |^error: ", "", text)
+    return text.partition("\n\nFor more information")[0].strip()
+
+
 class Program:
     """A program of our own. It ends with `stop`, or with this process, however that ends."""
 
     def __init__(self, name: str, arguments: Sequence[str]) -> None:
-        """Starts it with the arguments and `--exit-with` this process.
-
-        Raises:
-            LaunchError: If it cannot be started.
-        """
         command = [str(find(name)), *arguments, "--exit-with", str(os.getpid())]
-        environment = {"RUST_LOG": "warn"} | os.environ
         self._name = name
         self._owner = os.getpid()
-        # Its own words, for the error if it ends at once. A file never fills up and blocks it.
-        self._words: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
+        # For the error if it ends at once. A file, unlike a pipe, never fills up and blocks it.
+        self._output: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
         try:
             # A process group of its own: Ctrl-C is for Python, which then stops it. Not a session:
             # each has its own share of the cores, and between shares a wake-up waits longer.
             self._process = subprocess.Popen(
                 command,
-                env=environment,
+                env={"RUST_LOG": "warn"} | os.environ,
                 stdin=subprocess.DEVNULL,
-                stdout=self._words,
-                stderr=self._words,
+                stdout=self._output,
+                stderr=self._output,
                 process_group=0,
             )
         except OSError as error:
-            self._words.close()
-            raise LaunchError(f"start {command[0]}: {error.strerror}") from None
+            self._output.close()
+            raise _not_started(command, error) from None
         _programs.add(self)
 
     def wait_for(
         self, connect: Callable[[], _Connection], timeout: float | None = None
     ) -> _Connection:
-        """Connects to it, again and again until it answers, for 20 s unless told otherwise.
-
-        Raises:
-            LaunchError: If it ends first, with its own words, or does not answer in time.
-        """
+        """Tries to connect until it answers, for 20 s unless `timeout` says otherwise."""
         timeout = _START_TIMEOUT if timeout is None else timeout
         deadline, pause = time.monotonic() + timeout, 0.002
         while True:
             try:
                 return connect()
             except (NoServerError, ServerGoneError, RequestTimeoutError) as error:
+                problem = None
                 if self._process.poll() is not None:
-                    code, words = self._process.returncode, self.words()
+                    code = self._process.returncode
+                    problem = f"ended with code {code} before it answered: {self.output()}"
+                elif time.monotonic() > deadline:
+                    problem = f"did not answer within {timeout} s: {error}"
+                if problem is not None:
                     self.stop()
-                    raise LaunchError(
-                        f"{self._name} ended with code {code} before it answered: {words}"
-                    ) from None
-                if time.monotonic() > deadline:
-                    self.stop()
-                    raise LaunchError(
-                        f"{self._name} did not answer within {timeout} s: {error}"
-                    ) from None
+                    raise EmberwatchError(f"{self._name} {problem}", "program") from None
                 time.sleep(pause)
                 pause = min(2 * pause, 0.03)
             except EmberwatchError:
@@ -130,24 +156,22 @@ class Program:
 
     @property
     def pid(self) -> int:
-        """Its process id."""
         return self._process.pid
 
-    def ended(self) -> tuple[int | None, str]:
-        """Its exit code, waited for a moment, and its words; `None` if it runs still."""
+    def exit_code(self) -> int | None:
+        """Its exit code, waited for a moment; `None` if it still runs."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_FAREWELL)
-        code = self._process.returncode
-        return (None, "") if code is None else (code, self.words())
+            self._process.wait(_EXIT_TIMEOUT)
+        return self._process.returncode
 
-    def words(self) -> str:
+    def output(self) -> str:
         """What it wrote, such as warnings and errors."""
-        self._words.seek(0)
-        return self._words.read().decode(errors="replace").strip()
+        self._output.seek(0)
+        return _cleaned(self._output.read().decode(errors="replace"))
 
     def stop(self) -> None:
-        """Stops it and waits for its end. Again is fine; in a forked child it does nothing."""
-        if os.getpid() != self._owner or self._words.closed:
+        """Stops it and waits for its end, if it still runs; does nothing in a forked child."""
+        if os.getpid() != self._owner or self._output.closed:
             return
         _programs.discard(self)
         self._process.send_signal(signal.SIGTERM)
@@ -156,7 +180,7 @@ class Program:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._words.close()
+        self._output.close()
 
 
 _programs: weakref.WeakSet[Program] = weakref.WeakSet()

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final, NoReturn
 
 from emberwatch import wire
-from emberwatch.errors import EmberwatchError, GarbledAnswerError
+from emberwatch.errors import EmberwatchError
 from emberwatch.observer import Frame, Truth, frame_from_sample, truth_from_sample
 from emberwatch.replies import ServerInfo
 from emberwatch.replies import record as record_from_reply
@@ -42,10 +42,6 @@ TRUTH: Final = 3
 END: Final = 4
 
 
-class RecordingError(EmberwatchError):
-    """A file is no recording of this version, or is damaged: the message names the byte."""
-
-
 class RecordingCutWarning(UserWarning):
     """A recording ends without an end. Every record before is whole."""
 
@@ -54,27 +50,15 @@ class RecordingDamagedWarning(UserWarning):
     """A recording has bytes that no recorder wrote. Every record before is whole."""
 
 
-class _EarlyEndError(RecordingError):
-    """What is wrong with a recording whose records up to here are whole."""
-
-    def __init__(self, message: str, warning: type[UserWarning]) -> None:
-        super().__init__(message)
-        self.warning = warning
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Record:
-    """A record, checked.
+    """A record, checked."""
 
-    Attributes:
-        seconds: Time since the recording began.
-        server: The server that it is of.
-        sample: A frame or hidden states; its `n_lost` counts the samples of that channel that the
-            recorder missed right before it, of all worlds.
-    """
-
+    #: Time since the recording began.
     seconds: float
     server: ServerInfo
+    #: Its `n_lost` counts the samples of that channel, of all worlds, that the recorder missed
+    #: right before it.
     sample: Frame | Truth
 
 
@@ -87,15 +71,11 @@ def read(
     for learners.
 
     Args:
-        path: The file.
         world: Only this world; None: all.
         strict: Raise an error where there would be a warning.
 
-    Yields:
-        Each record, as copies of your own.
-
     Raises:
-        RecordingError: If the file is no recording.
+        EmberwatchError: With code `"recording"` if the file is none, naming the byte.
         OSError: If it cannot be read.
 
     Warns:
@@ -108,10 +88,10 @@ def read(
             for record in reader.records():
                 if world is None or record.sample.world == world:
                     yield record
-        except _EarlyEndError as error:
-            if strict:
+        except EmberwatchError as error:
+            if strict or reader.warning is None:
                 raise
-            warnings.warn(str(error), error.warning, stacklevel=2)
+            warnings.warn(str(error), reader.warning, stacklevel=2)
 
 
 class _Reader:
@@ -123,6 +103,8 @@ class _Reader:
         self._offset = 0
         self._nanos = 0
         self._server: ServerInfo | None = None
+        #: What is wrong, if every record up to there is whole.
+        self.warning: type[UserWarning] | None = None
         #: World steps, and episode and step of each world's last frame.
         self._n_steps = 0
         self._last: dict[int, tuple[int, int]] = {}
@@ -134,18 +116,14 @@ class _Reader:
         head = self._file.read(FILE_HEADER.size)
         if not (head.startswith(MAGIC) or MAGIC.startswith(head)):
             start = head[: len(MAGIC)]
-            raise RecordingError(
-                f"{self._name}: not a recording: expected it to begin with {MAGIC}, got {start}"
-            )
+            raise self._error(f"not a recording: expected it to begin with {MAGIC}, got {start}")
         if len(head) < FILE_HEADER.size:
             self._cut(len(head))
         _, version, reserved = FILE_HEADER.unpack(head)
         if version != VERSION:
-            raise RecordingError(
-                f"{self._name}: recording version: expected {VERSION}, got {version}"
-            )
+            raise self._error(f"recording version: expected {VERSION}, got {version}")
         if reserved != 0:
-            raise RecordingError(f"{self._name}: expected 0 in byte 12 to 15, got {reserved}")
+            raise self._error(f"expected 0 in byte 12 to 15, got {reserved}")
         self._offset = len(head)
         while True:
             head = self._file.read(RECORD_HEADER.size)
@@ -173,7 +151,9 @@ class _Reader:
                 yield Record(seconds=nanos / 1e9, server=self._server, sample=sample)
 
     def _take(self, kind: int, body: bytearray, n_lost: int) -> Frame | Truth | None:
-        """The sample in a body; `None` for a server, of which it takes note."""
+        """The sample in a body; `None` for a server, which it keeps."""
+        if kind not in (SERVER, FRAME, TRUTH):
+            self._damaged(f"kind: expected 1 to 4, got {kind}")
         try:
             if kind == SERVER:
                 self._totals["n_servers"] += 1
@@ -183,12 +163,10 @@ class _Reader:
             if kind == FRAME:
                 header = wire.FrameHeader.from_buffer_copy(body)
                 sample = frame_from_sample(header, body[ctypes.sizeof(header) :], n_lost)
-            elif kind == TRUTH:
+            else:
                 header = wire.TruthHeader.from_buffer_copy(body)
                 sample = truth_from_sample(header, body[ctypes.sizeof(header) :], n_lost)
-            else:
-                self._damaged(f"kind: expected 1 to 4, got {kind}")
-        except (ValueError, RecursionError, GarbledAnswerError) as error:
+        except (ValueError, RecursionError, EmberwatchError) as error:
             self._damaged(str(error))
         self._check_sample(header)
         name = "frames" if kind == FRAME else "truths"
@@ -246,6 +224,8 @@ class _Reader:
         self._end(f"is damaged at byte {self._offset}: {problem}", RecordingDamagedWarning)
 
     def _end(self, problem: str, warning: type[UserWarning]) -> NoReturn:
-        raise _EarlyEndError(
-            f"{self._name}: the recording {problem}; good before it: {self._n_steps} steps", warning
-        )
+        self.warning = warning
+        raise self._error(f"the recording {problem}; good before it: {self._n_steps} steps")
+
+    def _error(self, problem: str) -> EmberwatchError:
+        return EmberwatchError(f"{self._name}: {problem}", "recording")

@@ -2,7 +2,7 @@
 
 `rgb_array` and `ansi` are pure: arrays in, a picture or a text out. `Screen` shows either to
 people, for ``render_mode="human"``. The path is dark or light, whichever is further from the
-colours below it, and the robot a ring of both.
+colours below it, and the robot a circle of both.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.belief import UNOBSERVED
+from emberwatch.errors import InvalidArgumentError
 from emberwatch.palette import DARK, LIGHT, mark_on
 from emberwatch.palette import Palette as Palette
+from emberwatch.wire import UNOBSERVED
 
 _EDGE = (0xB4, 0xB4, 0xB4)
 _LONG_SIDE = 512  # pixels of a panel, about, unless a scale is given
@@ -41,82 +42,94 @@ Cells = NDArray[np.integer] | Sequence[tuple[int, int]]
 """Visited cells (row, column) in order, shape (n, 2); each a neighbour of the last, or the same."""
 
 
-def rgb_array(
-    *,
-    frame: NDArray[np.uint8],
-    robot: tuple[int, int] | None,
-    palette: Palette,
-    path: Cells | None = None,
-    truth: NDArray[np.uint8] | None = None,
-    scale: int | None = None,
-) -> NDArray[np.uint8]:
+class Picture:
+    """What to draw, checked."""
+
+    def __init__(
+        self,
+        frame: NDArray[np.uint8],
+        robot: tuple[int, int] | None,
+        palette: Palette,
+        path: Cells | None = None,
+        truth: NDArray[np.uint8] | None = None,
+    ) -> None:
+        """Takes what is known of a world.
+
+        Args:
+            frame: Observed values, 255 where nothing was observed; shape (H, W).
+            robot: The robot's cell (row, column); None leaves it out.
+            palette: The colours.
+            path: Visited cells in order.
+            truth: Hidden states, shape (H, W).
+        """
+        if frame.ndim != 2 or not frame.size:
+            raise InvalidArgumentError(f"frame: expected shape (H, W), got {frame.shape}")
+        if truth is not None and truth.shape != frame.shape:
+            raise InvalidArgumentError(f"truth: expected shape {frame.shape}, got {truth.shape}")
+        self.frame, self.robot, self.palette, self.truth = frame, robot, palette, truth
+        self.path = np.asarray([] if path is None else path, dtype=np.intp).reshape(-1, 2)
+        for what, places in (("robot", np.asarray([robot or (0, 0)])), ("path", self.path)):
+            off = ((places < 0) | (places >= frame.shape)).any(axis=1)
+            if off.any():
+                got = tuple(places[np.argmax(off)].tolist())
+                raise InvalidArgumentError(
+                    f"{what}: expected cells of a {frame.shape} grid, got {got}"
+                )
+        jumps = np.abs(np.diff(self.path, axis=0)).sum(axis=1) > 1
+        if jumps.any():
+            at = int(np.argmax(jumps))
+            got = [tuple(cell) for cell in self.path[at : at + 2].tolist()]
+            raise InvalidArgumentError(f"path: expected neighbours one after the other, got {got}")
+
+
+def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8]:
     """Draws a frame with path and robot, and the truth beside it (below it on wide grids).
 
-    The picture's size depends on the grid, the scale and whether there is a truth, on nothing else;
-    it is even both ways, for video codecs.
+    The path is a line, or a tint where cells are below 3 pixels. The size depends on the grid, the
+    scale and whether there is a truth, on nothing else; it is even both ways, for video codecs.
 
     Args:
-        frame: Observed values, 255 where nothing was observed; shape (H, W).
-        robot: The robot's cell (row, column); None leaves it out.
-        palette: The colours.
-        path: Visited cells in order; a line, or a tint where cells are below 3 pixels.
-        truth: Hidden states, shape (H, W).
         scale: Side of a cell in pixels, at least 1; the default makes panels about 512 long.
 
     Returns:
         Shape (height, width, 3), red, green, blue.
-
-    Raises:
-        ValueError: An argument is of another shape, leaves the grid or the palette.
     """
-    cells = _check(frame, robot, path, truth)
-    height, width = frame.shape
+    palette, cells = picture.palette, picture.path
+    height, width = picture.frame.shape
     if scale is None:  # even, where cells can be
         scale = max(1, 2 * round(_LONG_SIDE / max(height, width) / 2))
     if scale < 1:
-        raise ValueError(f"scale: expected at least 1 pixel, got {scale}")
-    colors = palette.paint_frame(frame)
+        raise InvalidArgumentError(f"scale: expected at least 1 pixel, got {scale}")
+    colors = palette.paint_frame(picture.frame)
     if scale < LEAST_LINE_SCALE:
         panels = [_enlarge(_tinted(colors, cells), scale)]
     else:
-        seen = (frame != UNOBSERVED)[:, :, None]
+        seen = (picture.frame != UNOBSERVED)[:, :, None]
         line = np.where(seen, palette.path, mark_on(palette.unobserved)).astype(np.uint8)
         panels = [_enlarge(colors, scale)]
         _draw_path(panels[0], cells, line, scale)
-    if truth is not None:
-        panels.append(_enlarge(palette.paint_truth(truth), scale))
-    if robot is not None:
+    if picture.truth is not None:
+        panels.append(_enlarge(palette.paint_truth(picture.truth), scale))
+    if picture.robot is not None:
         for panel in panels:
-            _draw_robot(panel, robot, scale)
+            _draw_robot(panel, picture.robot, scale)
     return _join(panels, axis=0 if width >= 2 * height else 1)
 
 
-def ansi(
-    *,
-    frame: NDArray[np.uint8],
-    robot: tuple[int, int],
-    palette: Palette,
-    path: Cells | None = None,
-    truth: NDArray[np.uint8] | None = None,
-    color: bool = True,
-) -> str:
+def ansi(picture: Picture, *, color: bool = True) -> str:
     """Draws the same for a terminal, the truth at the right, without a line break at the end.
 
     In colour (24 bits), a cell is two characters, or on grids of more than 32 rows half of one,
     which tints the path. Without colour it is two ASCII characters: the value as ``0-9A-Za-z+/``,
     or ``.`` where nothing was observed, then ``@`` for the robot, ``*`` for the path or a space.
-    The other arguments are those of `rgb_array`.
-
-    Raises:
-        ValueError: An argument is of another shape, leaves the grid or the palette.
     """
-    cells = _check(frame, robot, path, truth)
-    grids = [(frame, palette.paint_frame(frame), cells)]
-    if truth is not None:
-        grids.append((truth, palette.paint_truth(truth), cells[:0]))
+    palette, cells, robot = picture.palette, picture.path, picture.robot
+    grids = [(picture.frame, palette.paint_frame(picture.frame), cells)]
+    if picture.truth is not None:
+        grids.append((picture.truth, palette.paint_truth(picture.truth), cells[:0]))
     if not color:
         panels = [_ascii_lines(values, _marks(values, at, robot)) for values, _, at in grids]
-    elif len(frame) <= _MOST_WIDE_ROWS:
+    elif len(picture.frame) <= _MOST_WIDE_ROWS:
         panels = [_wide_lines(colors, _marks(values, at, robot)) for values, colors, at in grids]
     else:
         panels = [_half_lines(_tinted(colors, at), robot) for _, colors, at in grids]
@@ -128,56 +141,32 @@ class Screen:
 
     A window needs pygame and a display (``DISPLAY``, ``WAYLAND_DISPLAY`` or ``SDL_VIDEODRIVER``);
     pygame has one per process. Without it, the standard output must be a terminal. Without either,
-    a warning is logged once and nothing is shown. Closing the window ends only the show.
+    a warning is logged once and nothing is shown. Closable the window ends only the show.
     """
 
     def __init__(self, *, title: str = "Emberwatch", fps: float = 0.0) -> None:
-        """Finds out where to show; opens nothing yet.
-
-        Args:
-            title: The window's.
-            fps: Most pictures a second, by waiting; 0 does not wait.
-        """
+        """Opens nothing yet; `fps`: most pictures a second, by waiting; 0 does not wait."""
         self._title, self._fps = title, fps
         self._next: float | None = None
         self._window: Any = None
         self._pygame = _pygame_with_display()
-        self._kind: Literal["window", "terminal", "nothing"] = "window"
+        #: Where pictures go.
+        self.kind: Literal["window", "terminal", "nothing"] = "window"
         if self._pygame is None:
-            self._kind = "terminal" if sys.stdout.isatty() else "nothing"
-        if self._kind == "nothing":
+            self.kind = "terminal" if sys.stdout.isatty() else "nothing"
+        if self.kind == "nothing":
             _LOG.warning(
                 "render_mode 'human' shows nothing: there is no display with pygame installed, and "
                 "the output is no terminal; use 'rgb_array' or 'ansi' to get pictures"
             )
 
-    @property
-    def kind(self) -> Literal["window", "terminal", "nothing"]:
-        """Where pictures go."""
-        return self._kind
-
-    def show(
-        self,
-        *,
-        frame: NDArray[np.uint8],
-        robot: tuple[int, int],
-        palette: Palette,
-        path: Cells | None = None,
-        truth: NDArray[np.uint8] | None = None,
-    ) -> None:
-        """Draws what `rgb_array` or `ansi` draws from the same, in place of the last picture.
-
-        Raises:
-            ValueError: An argument is of another shape, leaves the grid or the palette.
-        """
-        if self._kind == "window":
-            self._show_in_window(
-                rgb_array(frame=frame, robot=robot, palette=palette, path=path, truth=truth)
-            )
-        elif self._kind == "terminal":
-            picture = ansi(frame=frame, robot=robot, palette=palette, path=path, truth=truth)
+    def show(self, picture: Picture) -> None:
+        """Draws in place of the last picture."""
+        if self.kind == "window":
+            self._show_in_window(rgb_array(picture))
+        elif self.kind == "terminal":
             clear = "\x1b[2J" if self._next is None else ""
-            sys.stdout.write(f"{clear}\x1b[H{picture}\x1b[K\n\x1b[J")
+            sys.stdout.write(f"{clear}\x1b[H{ansi(picture)}\x1b[K\n\x1b[J")
             sys.stdout.flush()
         self._pace()
 
@@ -186,11 +175,11 @@ class Screen:
         # Another screen of this process may have taken the window over.
         if self._window is not None and self._pygame.display.get_surface() is self._window:
             self._pygame.display.quit()
-        self._window, self._kind = None, "nothing"
+        self._window, self.kind = None, "nothing"
 
     def _show_in_window(self, image: NDArray[np.uint8]) -> None:
         pygame, (height, width, _) = self._pygame, image.shape
-        if self._window is None or self._pygame.display.get_surface() is not self._window:
+        if pygame.display.get_surface() is not self._window:
             self._window = None
         if self._window is None or self._window.get_size() != (width, height):
             self._window = pygame.display.set_mode((width, height))
@@ -204,34 +193,9 @@ class Screen:
     def _pace(self) -> None:
         now = time.monotonic()
         at = now if self._next is None else max(now, self._next)
-        if self._kind != "nothing":
+        if self.kind != "nothing":
             time.sleep(at - now)
             self._next = at + (1.0 / self._fps if self._fps > 0.0 else 0.0)
-
-
-def _check(
-    frame: NDArray[np.uint8],
-    robot: tuple[int, int] | None,
-    path: Cells | None,
-    truth: NDArray[np.uint8] | None,
-) -> NDArray[np.intp]:
-    """The path as cells (n, 2), all arguments checked."""
-    if frame.ndim != 2 or not frame.size:
-        raise ValueError(f"frame: expected shape (H, W), got {frame.shape}")
-    if truth is not None and truth.shape != frame.shape:
-        raise ValueError(f"truth: expected shape {frame.shape}, got {truth.shape}")
-    cells = np.asarray([] if path is None else path, dtype=np.intp).reshape(-1, 2)
-    for what, places in (("robot", np.asarray([robot or (0, 0)])), ("path", cells)):
-        off = ((places < 0) | (places >= frame.shape)).any(axis=1)
-        if off.any():
-            got = tuple(places[np.argmax(off)].tolist())
-            raise ValueError(f"{what}: expected cells of a {frame.shape} grid, got {got}")
-    jumps = np.abs(np.diff(cells, axis=0)).sum(axis=1) > 1
-    if jumps.any():
-        at = int(np.argmax(jumps))
-        got = [tuple(cell) for cell in cells[at : at + 2].tolist()]
-        raise ValueError(f"path: expected neighbours one after the other, got {got}")
-    return cells
 
 
 def _tinted(colors: NDArray[np.uint8], cells: NDArray[np.intp]) -> NDArray[np.uint8]:
@@ -271,7 +235,7 @@ def _draw_path(
 
 
 def _draw_robot(image: NDArray[np.uint8], robot: tuple[int, int], scale: int) -> None:
-    """A ring around a dot, at least as large as can be seen."""
+    """A circle around a dot, at least as large as can be seen."""
     row, col = ((2 * at + 1) * scale / 2 - 0.5 for at in robot)
     radius = min(_MOST_RADIUS, max(_LEAST_RADIUS, 0.46 * scale))
     top, left = max(0, int(row - radius)), max(0, int(col - radius))
@@ -293,11 +257,12 @@ def _join(panels: list[NDArray[np.uint8]], *, axis: int) -> NDArray[np.uint8]:
 
 
 def _marks(
-    values: NDArray[np.uint8], cells: NDArray[np.intp], robot: tuple[int, int]
+    values: NDArray[np.uint8], cells: NDArray[np.intp], robot: tuple[int, int] | None
 ) -> NDArray[np.str_]:
     marks = np.full(values.shape, " ")
     marks[tuple(cells.T)] = "*"
-    marks[tuple(robot)] = "@"
+    if robot is not None:
+        marks[robot] = "@"
     return marks
 
 
@@ -319,10 +284,11 @@ def _wide_lines(colors: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator[
         yield _styled(cells)
 
 
-def _half_lines(colors: NDArray[np.uint8], robot: tuple[int, int]) -> Iterator[str]:
+def _half_lines(colors: NDArray[np.uint8], robot: tuple[int, int] | None) -> Iterator[str]:
     """Lines of cells half a character high: the upper one in front, the lower one behind it."""
     colors = colors.copy()
-    colors[tuple(robot)] = LIGHT
+    if robot is not None:
+        colors[robot] = LIGHT
     for row in range(0, len(colors), 2):
         cells: list[tuple[str, str]] = []
         for col, (red, green, blue) in enumerate(colors[row].tolist()):
@@ -345,7 +311,7 @@ def _pygame_with_display() -> Any:
     if not any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")):
         return None
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # it greets
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints its version
             pygame = importlib.import_module("pygame")
     except ImportError:
         return None

@@ -1,23 +1,20 @@
-"""JSON requests and what comes back (PROTOCOL.md sections 6 and 13)."""
+"""What comes back on JSON requests (PROTOCOL.md sections 6 and 13)."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple, TypeVar, cast, get_origin, get_type_hints
 
-from emberwatch import wire
-from emberwatch.errors import GarbledAnswerError, refusal
-from emberwatch.ports import Bell, RequestPort
+from emberwatch.errors import EmberwatchError
 
 _Record = TypeVar("_Record")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerInfo:
-    """What a server says of itself (PROTOCOL.md section 6, `hello`)."""
+    """How a server describes itself (PROTOCOL.md section 6, `hello`)."""
 
     protocol: int
     build: str
@@ -52,14 +49,9 @@ class WorldInfo:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WorldStatus:
+class WorldStatus(WorldInfo):
     """One world in a `ServerStatus`."""
 
-    world: int
-    step: int
-    seed: int
-    episode: int
-    robot: tuple[int, int]
     #: The process that holds it, if any.
     holder_pid: int | None
     #: Whether it is in its burn-in.
@@ -102,24 +94,19 @@ class LeftBeliefInfo:
 
 
 class LeftBelief(NamedTuple):
-    """What an agent left about a world to the next.
+    """What an agent left about a world to the next."""
 
-    Attributes:
-        kind: Says what the bytes are.
-        episode: The episode it is about.
-        step: The step k at which it was left: the present one.
-        data: The bytes.
-    """
-
+    #: Says what the bytes are.
     kind: str
     episode: int
+    #: The step k at which it was left: the present one.
     step: int
     data: bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DecisionsInfo:
-    """What an agent that serves decisions says of itself."""
+    """How an agent that serves decisions describes itself."""
 
     protocol: int
     build: str
@@ -161,72 +148,32 @@ class Decision:
     summary: tuple[float, ...]
 
 
-def ask(
-    port: RequestPort[wire.ControlReply],
-    bell: Bell,
-    sequence: int,
-    request: Mapping[str, Any],
-    timeout: float,
-) -> dict[str, Any]:
-    """One JSON request and its reply, on `control` or a channel like it.
-
-    Raises:
-        RefusedError: One of its subclasses, if it is refused.
-        RequestTimeoutError, ServerGoneError, GarbledAnswerError: If there is no good answer.
-    """
-    what = f"{request['op']!r}"
-    header = wire.CONTROL_REQUEST.pack(
-        wire.VERSION, 0, sequence, bell.listener_low, bell.listener_high
-    )
-    head, payload = port.exchange(header, json.dumps(request).encode(), what, timeout)
-    try:
-        reply = json.loads(payload)
-    except (ValueError, RecursionError) as error:
-        raise GarbledAnswerError(f"answer to {what}: expected JSON, got {error}") from None
-    if not isinstance(reply, dict):
-        raise GarbledAnswerError(f"answer to {what}: expected an object, got {reply!r}")
-    keys = cast("dict[str, Any]", reply)
-    if head.status != 0:
-        detail, message = keys.get("detail"), keys.get("message")
-        raise refusal(
-            head.status,
-            detail if isinstance(detail, int) else 0,
-            message if isinstance(message, str) else None,
-        )
-    wire.check_answer(f"answer to {what}", head, sequence)
-    return keys
-
-
 def records(kind: type[_Record], reply: Mapping[str, Any]) -> tuple[_Record, ...]:
-    """The records of a reply's worlds.
-
-    Raises:
-        GarbledAnswerError: If one is missing or of another type.
-    """
+    """The records of a reply's worlds."""
     worlds = reply.get("worlds")
     if not isinstance(worlds, list):
-        raise GarbledAnswerError(f"reply: expected a list 'worlds', got {worlds!r}")
+        raise _wrong(f"a list 'worlds', got {worlds!r}")
     return tuple(record(kind, world) for world in cast("list[Any]", worlds))
 
 
 def record(kind: type[_Record], keys: Any) -> _Record:
-    """A record from a reply; keys that this release does not know are ignored.
-
-    Raises:
-        GarbledAnswerError: Naming what is missing or of another type.
-    """
+    """A record from a reply; keys that this release does not know are ignored."""
     if not isinstance(keys, Mapping):
-        raise GarbledAnswerError(f"reply: expected an object, got {keys!r}")
+        raise _wrong(f"an object, got {keys!r}")
     given = cast("Mapping[str, Any]", keys)
     values: dict[str, Any] = {}
     for name, types in _types(kind).items():
         if name not in given:
-            raise GarbledAnswerError(f"reply: expected a key {name!r}, got {sorted(given)}")
+            raise _wrong(f"a key {name!r}, got {sorted(given)}")
         value = tuple(given[name]) if isinstance(given[name], list) else given[name]
         if not isinstance(value, types):
-            raise GarbledAnswerError(f"reply: expected another {name!r}, got {value!r}")
+            raise _wrong(f"another {name!r}, got {value!r}")
         values[name] = value
     return kind(**values)
+
+
+def _wrong(problem: str) -> EmberwatchError:
+    return EmberwatchError(f"reply: expected {problem}", "bad_answer")
 
 
 @cache

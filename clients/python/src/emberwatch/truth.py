@@ -9,27 +9,23 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import GarbledAnswerError, RequestTimeoutError
+from emberwatch import wire
+from emberwatch.errors import RequestTimeoutError
 from emberwatch.observer import Truth, TruthReader
-from emberwatch.settings import Settings, Shape
 
-#: How long to wait for hidden states before they are asked for anew the first time, seconds.
-_PATIENCE: Final = 0.02
+#: How long to wait for hidden states before they are first asked for again, seconds.
+_RETRY: Final = 0.02
 
 
 class HiddenStates:
     """The newest hidden states of consecutive worlds."""
 
-    def __init__(self, instance: str, settings: Settings, n_worlds: int, shape: Shape) -> None:
-        """Reads the instance's truth, from world `settings.world` on.
-
-        Raises:
-            ChannelError: If iceoryx2 fails, also when there are more than 4 readers.
-        """
+    def __init__(self, instance: str, first_world: int, shape: tuple[int, int, int]) -> None:
+        """`shape` is `(n_worlds, H, W)`."""
         self._reader = TruthReader(instance)
-        self._first = settings.world
-        self._moments: list[tuple[int, int, int]] = [(-1, -1, -1)] * n_worlds
-        self._states = np.zeros((n_worlds, shape.height, shape.width), np.uint8)
+        self._first = first_world
+        self._moments: list[tuple[int, int, int]] = [(-1, -1, -1)] * shape[0]
+        self._states = np.zeros(shape, np.uint8)
 
     def at(
         self, moments: Sequence[tuple[int, int, int]], timeout: float, first: int = 0
@@ -38,11 +34,7 @@ class HiddenStates:
 
         Args:
             moments: Seed, episode and step of each world.
-            timeout: How long to wait for them, seconds.
             first: The first of these worlds, counted from 0.
-
-        Raises:
-            RequestTimeoutError: If they are not published in time.
         """
         wanted, last = list(moments), first + len(moments)
         begin = asked = time.perf_counter()
@@ -51,26 +43,25 @@ class HiddenStates:
             now = time.perf_counter()
             if now - begin > timeout:
                 raise RequestTimeoutError(f"no hidden states within {timeout} s")
-            # Others' worlds may have crowded ours out: a new reader is shown all anew. Where it
-            # missed nothing, they may just take longer.
-            if now - asked > (_PATIENCE if n_lost else _PATIENCE * 2**n_asked):
+            # The samples of other worlds may have displaced these: a new reader gets all again.
+            # Where it missed nothing, they may just take longer.
+            if now - asked > (_RETRY if n_lost else _RETRY * 2**n_asked):
                 self._reader.close()
                 self._reader = TruthReader(self._reader.instance)
                 asked, n_asked, n_lost = now, n_asked + 1, 0
-            truth = self._reader.receive(min(timeout, _PATIENCE))
+            truth = self._reader.receive(min(timeout, _RETRY))
             if truth is not None:
                 n_lost += truth.n_lost
                 self._take(truth)
         return self._states[first:last].copy()
 
     def close(self) -> None:
-        """Stops reading. Again is fine."""
         self._reader.close()
 
     def _take(self, truth: Truth) -> None:
         index = truth.world - self._first
         if 0 <= index < len(self._moments):
             if truth.states.shape != self._states.shape[1:]:
-                raise GarbledAnswerError(f"truth: got a grid of {truth.states.shape}")
+                raise wire.bad_answer(f"truth: got a grid of {truth.states.shape}")
             self._moments[index] = (truth.seed, truth.episode, truth.step)
             self._states[index] = truth.states

@@ -16,9 +16,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from emberwatch.errors import ChannelError
+from emberwatch.errors import EmberwatchError
 
-#: How long to wait for others, each of which takes milliseconds, seconds.
+#: How long to wait for the turns of others, which take milliseconds each; seconds.
 _LONGEST_WAIT: Final = 10.0
 
 #: How long to wait before asking whether the process that has the turn is stopped, seconds.
@@ -39,12 +39,9 @@ _locks: Final[set[int]] = set()
 
 @contextmanager
 def turn(directory: Path) -> Generator[bool]:
-    """A turn, which may be within another of the same thread; yields whether nobody else has it.
+    """Takes a turn; turns of one thread may nest. Yields whether no other process has it.
 
-    A stopped process that has it is not waited for.
-
-    Raises:
-        ChannelError: If it does not come in time, or the directory cannot be written to.
+    It does not wait for a stopped process.
     """
     if _held.alone is not None:
         yield _held.alone
@@ -71,15 +68,14 @@ def process_state(pid: int) -> str | None:
         return None
 
 
-def unusable(path: Path, error: OSError) -> ChannelError:
+def cannot_create(path: Path, error: OSError) -> EmberwatchError:
     """The error of a file or folder that the system does not let be used."""
     remedy = (
         ": channels need a /dev/shm that can be written to; as root, "
         "`mount -o remount,rw /dev/shm`, or mount a tmpfs there"
     )
-    return ChannelError(
-        f"create {path}: {error.strerror}{remedy if error.errno == errno.EROFS else ''}"
-    )
+    remedy = remedy if error.errno == errno.EROFS else ""
+    return EmberwatchError(f"create {path}: {error.strerror}{remedy}", "channel")
 
 
 def _wait(path: Path) -> int | None:
@@ -98,23 +94,24 @@ def _wait(path: Path) -> int | None:
                 if holder is not None and process_state(holder) == "T":
                     return None
                 if waited > _LONGEST_WAIT:
-                    raise ChannelError(
+                    raise EmberwatchError(
                         f"{path}: expected the lock within {_LONGEST_WAIT} s, got it held by "
-                        f"pid {holder}"
+                        f"pid {holder}",
+                        "channel",
                     ) from None
                 time.sleep(_INTERVAL)
             finally:
                 if lock not in _locks:
                     os.close(lock)
     except OSError as error:
-        raise unusable(path, error) from None
+        raise cannot_create(path, error) from None
 
 
 def _holder(lock: int) -> int | None:
     """The process that has the lock, as the kernel says."""
     found = os.fstat(lock)
     inode = f"{os.major(found.st_dev):02x}:{os.minor(found.st_dev):02x}:{found.st_ino}"
-    # "1: FLOCK  ADVISORY  WRITE 4711 00:1a:5678 0 EOF"; who waits has an arrow in front.
+    # "1: FLOCK  ADVISORY  WRITE 4711 00:1a:5678 0 EOF"; a process that waits has an arrow in front.
     for line in Path("/proc/locks").read_text().splitlines():
         words = line.split()
         if words[1] == "FLOCK" and words[3] == "WRITE" and words[5] == inode:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, Final, Unpack, cast
+from collections.abc import Sequence
+from typing import Any, Unpack
 
 import gymnasium
 import numpy as np
@@ -14,23 +14,16 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from emberwatch.arguments import as_moves, as_seed
-from emberwatch.base import NOTHING_TO_DRAW, wants_to_resume
-from emberwatch.errors import SettingError
-from emberwatch.model import Model
+from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, wants_to_resume
+from emberwatch.errors import InvalidArgumentError
 from emberwatch.observations import Observations, Parts
-from emberwatch.session import Session, state_to_copy
-from emberwatch.settings import Settings, WorldArguments, check_count, draw_seed
-from emberwatch.view import RENDER_FPS, RENDER_MODES, View, fly
+from emberwatch.session import Session, SessionOwner
+from emberwatch.settings import Settings, WorldArguments, draw_seed
+from emberwatch.view import View, fly
 from emberwatch.wire import RESULT_DTYPE, StepAnswer
 
-#: Most worlds of any server.
-_MAX_WORLDS: Final = 1024
 
-#: Fields of a result that become `info`, as in the single environment.
-_REPORTED: Final = ("step", "n_target_cells", "n_visited", "n_hits")
-
-
-class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
+class WildfireVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
     """Many worlds of `WildfireEnv`, stepped together.
 
     Observations, rewards, ends and infos are those of Gymnasium's `SyncVectorEnv` over the single
@@ -53,63 +46,38 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         observation: Parts = ("frame", "robot"),
-        render_mode: str | None = None,
         **world: Unpack[WorldArguments],
     ) -> None:
-        """Checks the arguments. Nothing is started before the first reset.
-
-        Raises:
-            SettingError: If an argument is impossible or contradicts the running server.
-            NoServerError: If nobody serves `instance`.
-        """
+        """See the class. No server of its own runs before the first reset."""
         self.closed = True  # until it is made: Gymnasium 1.2 closes what failed to be made, too
-        if max_episode_steps == -1:  # what Gymnasium's own `make` takes for no limit
+        if max_episode_steps == -1:  # no limit in Gymnasium's own `make`
             max_episode_steps = None
         if max_episode_steps is not None and max_episode_steps < 1:
-            raise SettingError(
+            raise InvalidArgumentError(
                 f"max_episode_steps: expected at least 1 or None, got {max_episode_steps}"
             )
-        check_count("num_envs", num_envs, 1, _MAX_WORLDS)
         self._mode = AutoresetMode(autoreset_mode)
-        self._session = Session(Settings.of(WildfireVectorEnv, world), num_envs)
-        shape = self._session.shape
-        self._observations = Observations(observation, shape, num_envs)
-        self._views = [View(render_mode, shape, self._session.model) for _ in range(num_envs)]
+        settings = Settings.of(WildfireVectorEnv, world)
+        self._session = Session(settings, num_envs)
+        self._spec = spec = self._session.spec
+        self._observations = Observations(observation, spec, num_envs)
+        self._views = [View(settings.render_mode, spec) for _ in range(num_envs)]
         self._max_steps = max_episode_steps
-        self.metadata = {
-            "render_modes": list(RENDER_MODES),
-            "render_fps": RENDER_FPS,
-            "autoreset_mode": self._mode,
-        }
+        self.metadata = {**WorldEnv.metadata, "autoreset_mode": self._mode}
         self.num_envs = num_envs
-        self.render_mode = render_mode
+        self.render_mode = settings.render_mode
         self.single_observation_space = self._observations.space
         self.observation_space = batch_space(self._observations.space, num_envs)
-        self.single_action_space = spaces.MultiDiscrete([4] * shape.n_moves)
+        self.single_action_space = spaces.MultiDiscrete([4] * spec.n_moves)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._generators: list[np.random.Generator | None] = [None] * num_envs
-        self._frames = np.zeros((num_envs, shape.height, shape.width), np.uint8)
+        self._frames = np.zeros((num_envs, spec.height, spec.width), np.uint8)
         self._results = np.zeros(num_envs, RESULT_DTYPE)
         self._elapsed = np.zeros(num_envs, np.int64)
         self._over = np.zeros(num_envs, np.bool_)
         self._truths: NDArray[np.uint8] | None = None
         self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
         self.closed = False
-
-    @property
-    def model(self) -> Model | None:
-        """The model behind the worlds; None if a running server hides it."""
-        return self._session.model
-
-    @property
-    def burn_in(self) -> int:
-        """Steps that the worlds are simulated before k = 0."""
-        return self._session.burn_in
-
-    @property
-    def instance(self) -> str:
-        """The server's instance name, once the environment has been reset."""
-        return self._session.instance
 
     def reset(
         self,
@@ -124,11 +92,6 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
                 generator goes on.
             options: `reset_mask`, `(num_envs,)` booleans, at least one true; or `resume`, see
                 `WildfireEnv`.
-
-        Raises:
-            SettingError: If an option or the number of seeds is wrong.
-            gymnasium.error.ResetNeeded: If only some worlds are reset before all were.
-            BusyError: If another client holds a world of a running server.
         """
         rest = dict(options or {})
         mask = self._check_mask(rest.pop("reset_mask", None))
@@ -137,10 +100,10 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         if not mask.all() and not self._session.is_open:
             raise gymnasium.error.ResetNeeded("reset_mask: expected a reset of all worlds before")
         self.closed = False
-        chosen = [int(index) for index in np.flatnonzero(mask)]
+        chosen = np.flatnonzero(mask).tolist()
         if resumes:
-            self._take(self._session.resume(), range(self.num_envs))
-            self._began(chosen)
+            self._take(self._session.resume())
+            self._reset_episodes(chosen)
         else:
             self._restart(chosen, seeds)
         return self._seen(), self._infos(mask)
@@ -151,13 +114,10 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         """Flies one path in each world.
 
         Raises:
-            InvalidActionError: If it is not `(num_envs, T)` integers in 0 to 3. Nothing is sent.
             gymnasium.error.ResetNeeded: In mode `DISABLED`, if an episode is over.
-            LeaseLostError: If another client took a world over.
-            ServerGoneError: If the server has ended; the next reset starts or finds another.
-            RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
+            EmberwatchError: As `WildfireEnv.step`.
         """
-        moves = as_moves(actions, self.num_envs, self._session.shape.n_moves)
+        moves = as_moves(actions, self.num_envs, self._spec.n_moves)
         moves = moves.reshape(self.num_envs, -1)
         over = self._over
         if not over.any():
@@ -165,7 +125,7 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         elif self._mode is AutoresetMode.NEXT_STEP:
             for run in _runs(~over):
                 self._fly(moves, run)
-            self._restart([int(index) for index in np.flatnonzero(over)], [None] * self.num_envs)
+            self._restart(np.flatnonzero(over).tolist(), [None] * self.num_envs)
         else:
             raise gymnasium.error.ResetNeeded(
                 f"worlds {np.flatnonzero(over).tolist()}: the episode is over; reset with "
@@ -184,26 +144,22 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         return tuple(self._draw(index) for index in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Gives the worlds back; a private server stops."""
         self._session.close()
         for view in self._views:
             view.close()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """For copies, which only a closed environment has."""
-        return state_to_copy(self, self._session.is_open)
 
     def _fly(self, moves: NDArray[np.uint8], run: range) -> None:
         """Steps consecutive worlds."""
         before = self._results
         answer = self._session.step(moves[run.start : run.stop], run)
-        self._take(answer, run)
-        self._observations.note(answer, run.start)
+        if len(run) == self.num_envs:  # else the reset of the others brings all results again
+            self._take(answer)
+        self._observations.update(answer, run.start)
         self._elapsed[run.start : run.stop] += 1
         if self.render_mode is not None:
             for index in run:
                 start = (int(before["row"][index]), int(before["col"][index]))
-                self._paths[index] = fly(start, moves[index], self._session.shape)
+                self._paths[index] = fly(start, moves[index], self._spec)
 
     def _restart(self, indices: list[int], seeds: Sequence[int | None]) -> None:
         """Begins episodes in some worlds."""
@@ -214,38 +170,26 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
                 generator, _ = seeding.np_random(seed)
                 self._generators[index] = generator
             chosen.append(draw_seed(generator) if seed is None else seed)
-        self._take(self._session.reset(indices, chosen), range(self.num_envs))
-        self._began(indices)
+        self._take(self._session.reset(indices, chosen))
+        self._reset_episodes(indices)
 
-    def _began(self, indices: Sequence[int]) -> None:
-        chosen = list(indices)
+    def _reset_episodes(self, chosen: list[int]) -> None:
         self._elapsed[chosen] = 0
         self._over = self._over.copy()
         self._over[chosen] = False
-        self._observations.began(chosen, self._frames)
+        self._observations.reset(chosen, self._frames)
         for index in chosen:
             self._paths[index] = None
 
-    def _take(self, answer: StepAnswer, run: range) -> None:
-        """Takes over an answer. What was handed out before is never written to."""
-        if len(run) == self.num_envs:
-            self._frames, self._results = answer.frames, answer.results
-        else:
-            self._frames, self._results = self._frames.copy(), self._results.copy()
-            self._frames[run.start : run.stop] = answer.frames
-            self._results[run.start : run.stop] = answer.results
+    def _take(self, answer: StepAnswer) -> None:
+        self._frames, self._results = answer.frames, answer.results
         if self._session.settings.truth:
-            truths = self._session.truth(answer)
-            if self._truths is None or len(run) == self.num_envs:
-                self._truths = truths
-            else:
-                self._truths = self._truths.copy()
-                self._truths[run.start : run.stop] = truths
+            self._truths = self._session.truth(answer)
 
     def _outcome(
         self, flown: NDArray[np.bool_]
     ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """What `step` returns; worlds that began anew in this step earned nothing."""
+        """What `step` returns; worlds that began an episode in this step earned nothing."""
         rewards = np.where(flown, self._results["reward"], 0.0)
         terminations = flown & (self._results["terminated"] != 0)
         truncations = flown & (self._results["truncated"] != 0)
@@ -255,7 +199,7 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         infos: dict[str, Any] = {}
         if self._mode is AutoresetMode.SAME_STEP and over.any():
             infos = self._final(over)
-            self._restart([int(index) for index in np.flatnonzero(over)], [None] * self.num_envs)
+            self._restart(np.flatnonzero(over).tolist(), [None] * self.num_envs)
         else:
             self._over = over
         infos |= self._infos(np.ones(self.num_envs, np.bool_))
@@ -278,7 +222,7 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
     def _infos(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
         """The infos of some worlds, zero for the others, as Gymnasium stacks them."""
         infos: dict[str, Any] = {}
-        for name in _REPORTED:
+        for name in REPORTED:
             infos[name] = np.where(mask, self._results[name], 0).astype(np.int64)
             infos[f"_{name}"] = mask.copy()
         if self._truths is not None:
@@ -290,7 +234,7 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         robots = np.stack((self._results["row"], self._results["col"]), axis=1).astype(np.int64)
         if self.render_mode == "human":
             self._draw(0)
-        # Pictures come from the frames that the learner, who may write to his, does not have.
+        # The learner may write to its frames: pictures come from others.
         frames = self._frames if self.render_mode is None else self._frames.copy()
         return self._observations.all(frames, robots)
 
@@ -305,33 +249,25 @@ class WildfireVectorEnv(VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
         if isinstance(seed, int | np.integer):
             return [int(seed) + index for index in range(self.num_envs)]
         if not hasattr(seed, "__len__") or len(seed) != self.num_envs:
-            raise SettingError(
+            raise InvalidArgumentError(
                 f"seed: expected an integer, None or {self.num_envs} of them, got {seed!r}"
             )
         # Checked before any world's generator is replaced.
         return [None if one is None else as_seed(one) for one in seed]
 
-    def _check_mask(self, mask: object) -> NDArray[np.bool_]:
-        if mask is None:
-            return np.ones(self.num_envs, np.bool_)
+    def _check_mask(self, mask: Any) -> NDArray[np.bool_]:
         shape = (self.num_envs,)
-        if not isinstance(mask, np.ndarray):
-            raise SettingError(f"reset_mask: expected an array {shape} of bool, got {type(mask)}")
-        array = cast("NDArray[Any]", mask)
-        if array.dtype != np.bool_ or array.shape != shape or not array.any():
-            raise SettingError(
-                f"reset_mask: expected an array {shape} of bool with at least one True, "
-                f"got {array.dtype} {array.shape}"
+        if mask is None:
+            return np.ones(shape, np.bool_)
+        got = f"{mask.dtype} {mask.shape}" if hasattr(mask, "dtype") else repr(mask.__class__)
+        if got != f"bool {shape}" or not mask.any():
+            raise InvalidArgumentError(
+                f"reset_mask: expected an array {shape} of bool with at least one True, got {got}"
             )
-        return array
+        return mask
 
 
-def _runs(mask: NDArray[np.bool_]) -> Iterator[range]:
+def _runs(mask: NDArray[np.bool_]) -> list[range]:
     """The runs of consecutive true entries."""
-    start = None
-    for index, is_true in enumerate([*mask.tolist(), False]):
-        if is_true and start is None:
-            start = index
-        elif not is_true and start is not None:
-            yield range(start, index)
-            start = None
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False]))))
+    return [range(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]

@@ -7,16 +7,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emberwatch.errors import SettingError
-from emberwatch.model import Model
-from emberwatch.render import Palette, Screen, ansi, rgb_array
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.render import Palette, Picture, Screen, ansi, rgb_array
 from emberwatch.replies import ServerInfo
-from emberwatch.settings import Shape
+from emberwatch.settings import WorldSpec
 
 #: The render modes of every environment here.
 RENDER_MODES: Final = ("human", "rgb_array", "ansi")
 
-#: Pictures a second of a film, or of a window that is not driven faster.
+#: Pictures a second of a film, and at most in a window.
 RENDER_FPS: Final = 10
 
 #: Row and column that each move adds.
@@ -26,20 +25,14 @@ _DIRECTIONS: Final[tuple[tuple[int, int], ...]] = ((-1, 0), (1, 0), (0, -1), (0,
 class View:
     """Draws one world: the frame, the path flown, the robot, and the truth where it is known."""
 
-    def __init__(self, render_mode: str | None, shape: Shape, model: Model | None) -> None:
-        """Chooses the mode.
-
-        Raises:
-            SettingError: If there is no such mode.
-        """
+    def __init__(self, render_mode: str | None, spec: WorldSpec) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
-            raise SettingError(
+            raise InvalidArgumentError(
                 f"render_mode: expected None or one of {', '.join(RENDER_MODES)}, "
                 f"got {render_mode!r}"
             )
         self.mode: Final = render_mode
-        self._shape = shape
-        self._palette = Palette.of(shape.n_observations if model is None else model)
+        self._palette = Palette.of(spec.n_observations if spec.model is None else spec.model)
         self._screen: Screen | None = None
 
     def draw(
@@ -50,36 +43,29 @@ class View:
         truth: NDArray[np.uint8] | None,
     ) -> Any:
         """An image, a text, or `None` after showing it to a human, as the mode has it."""
-        parts: dict[str, Any] = {
-            "frame": frame,
-            "path": path,
-            "robot": robot,
-            "truth": truth,
-            "palette": self._palette,
-        }
+        picture = Picture(frame, robot, self._palette, path, truth)
         if self.mode == "rgb_array":
-            return rgb_array(**parts)
+            return rgb_array(picture)
         if self.mode == "ansi":
-            return ansi(**parts)
+            return ansi(picture)
         if self._screen is None:
             self._screen = Screen(fps=RENDER_FPS)
-        self._screen.show(**parts)
+        self._screen.show(picture)
         return None
 
     def close(self) -> None:
-        """Closes the window, if there is one. Again is fine."""
         if self._screen is not None:
             self._screen.close()
             self._screen = None
 
 
-def fly(start: tuple[int, int], moves: ArrayLike, shape: Shape | ServerInfo) -> NDArray[np.intp]:
+def fly(start: tuple[int, int], moves: ArrayLike, grid: WorldSpec | ServerInfo) -> NDArray[np.intp]:
     """The cells of a path after each move, `(n_moves, 2)`: a move off the grid stays in place."""
     row, col = start
     cells: list[tuple[int, int]] = []
     for move in np.asarray(moves).tolist():
         down, right = _DIRECTIONS[int(move)]
-        row = min(max(row + down, 0), shape.height - 1)
-        col = min(max(col + right, 0), shape.width - 1)
+        row = min(max(row + down, 0), grid.height - 1)
+        col = min(max(col + right, 0), grid.width - 1)
         cells.append((row, col))
     return np.array(cells, np.intp).reshape(-1, 2)

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import GarbledAnswerError
+from emberwatch.errors import EmberwatchError
 
 #: The protocol version that this package speaks.
 VERSION: Final = 1
@@ -42,7 +42,12 @@ TRUTH_BUFFER: Final = 128
 AGENT_BUFFER: Final = 4
 MAX_NODES: Final = 64
 
-_U16, _U32, _U64, _F64 = ctypes.c_uint16, ctypes.c_uint32, ctypes.c_uint64, ctypes.c_double
+_STEP_REQUEST: Final = "IIQQIIIIQQQ"
+_CONTROL_REQUEST: Final = "IIQQQ"
+
+#: The two request headers as bytes, field by field.
+STEP_REQUEST: Final = struct.Struct("=" + _STEP_REQUEST)
+CONTROL_REQUEST: Final = struct.Struct("=" + _CONTROL_REQUEST)
 
 
 class Header(ctypes.Structure):
@@ -54,72 +59,54 @@ class Header(ctypes.Structure):
         return f"emberwatch.v1.{cls.__name__}"
 
 
+def _fields(format: str, names: str) -> list[tuple[str, Any]]:
+    """Fields by `struct`'s letters."""
+    kinds = {"I": ctypes.c_uint32, "Q": ctypes.c_uint64}
+    return [(name, kinds[letter]) for name, letter in zip(names.split(), format, strict=True)]
+
+
 class StepRequest(Header):
     """In front of the paths: `n_worlds * n_moves` bytes."""
 
-    _fields_ = [
-        ("version", _U32),
-        ("operation", _U32),
-        ("lease", _U64),
-        ("sequence", _U64),
-        ("first_world", _U32),
-        ("n_worlds", _U32),
-        ("n_moves", _U32),
-        ("flags", _U32),
-        ("listener_low", _U64),
-        ("listener_high", _U64),
-        ("step", _U64),
-    ]
+    _fields_ = _fields(
+        _STEP_REQUEST,
+        "version operation lease sequence first_world n_worlds n_moves flags listener_low "
+        "listener_high step",
+    )
 
 
 class StepReply(Header):
     """In front of `n_worlds` results and as many frames."""
 
     _fields_ = [
-        ("version", _U32),
-        ("status", _U32),
-        ("sequence", _U64),
-        ("first_world", _U32),
-        ("n_worlds", _U32),
-        ("height", _U32),
-        ("width", _U32),
-        ("simulation_nanos", _U64),
-        ("detail", _U64),
-        ("reserved", _U64 * 2),
+        *_fields(
+            "IIQIIIIQQ",
+            "version status sequence first_world n_worlds height width simulation_nanos detail",
+        ),
+        ("reserved", ctypes.c_uint64 * 2),
     ]
 
 
 class ControlRequest(Header):
     """In front of one JSON object."""
 
-    _fields_ = [
-        ("version", _U32),
-        ("reserved", _U32),
-        ("sequence", _U64),
-        ("listener_low", _U64),
-        ("listener_high", _U64),
-    ]
+    _fields_ = _fields(_CONTROL_REQUEST, "version reserved sequence listener_low listener_high")
 
 
 class ControlReply(Header):
     """In front of one JSON object."""
 
-    _fields_ = [("version", _U32), ("status", _U32), ("sequence", _U64)]
+    _fields_ = _fields("IIQ", "version status sequence")
 
 
 class FrameHeader(Header):
     """In front of a published frame and its path."""
 
     _fields_ = [
-        ("version", _U32),
-        ("world", _U32),
-        ("sequence", _U64),
-        ("height", _U32),
-        ("width", _U32),
-        ("n_moves", _U32),
-        ("start_row", _U32),
-        ("start_col", _U32),
-        ("reserved", _U32),
+        *_fields(
+            "IIQIIIIII",
+            "version world sequence height width n_moves start_row start_col reserved",
+        ),
         ("result", ctypes.c_ubyte * 64),
     ]
 
@@ -127,69 +114,42 @@ class FrameHeader(Header):
 class TruthHeader(Header):
     """In front of published hidden states."""
 
-    _fields_ = [
-        ("version", _U32),
-        ("world", _U32),
-        ("sequence", _U64),
-        ("episode", _U64),
-        ("step", _U64),
-        ("seed", _U64),
-        ("height", _U32),
-        ("width", _U32),
-    ]
+    _fields_ = _fields("IIQQQQII", "version world sequence episode step seed height width")
 
 
 class AgentHeader(Header):
     """In front of an agent's belief and what it wants."""
 
-    _fields_ = [
-        ("version", _U32),
-        ("world", _U32),
-        ("sequence", _U64),
-        ("episode", _U64),
-        ("step", _U64),
-        ("seed", _U64),
-        ("height", _U32),
-        ("width", _U32),
-        ("n_states", _U32),
-        ("pid", _U32),
-    ]
-
-
-#: The two request headers as bytes, field by field.
-STEP_REQUEST: Final = struct.Struct("=IIQQIIIIQQQ")
-CONTROL_REQUEST: Final = struct.Struct("=IIQQQ")
+    _fields_ = _fields(
+        "IIQQQQIIII", "version world sequence episode step seed height width n_states pid"
+    )
 
 
 class StepResult(NamedTuple):
-    """How one world stands after a step or a reset (PROTOCOL.md, `StepResult`).
+    """How one world stands after a step or a reset (PROTOCOL.md, `StepResult`)."""
 
-    Attributes:
-        step: k, the number of steps since the last reset.
-        seed: Seed of the episode. With the model it gives the hidden state away: not for learners.
-        episode: Resets of this world since the server started.
-        reward: Sum of the model's rewards over the distinct cells visited.
-        n_target_cells: Cells of the whole grid in the state that pays most (fire): for reports.
-        n_visited: Distinct cells visited.
-        n_hits: Distinct cells visited in the state that pays most.
-        row: The robot's row.
-        col: The robot's column.
-        coverage: What the frame shows: 0 nothing, 1 the path, 2 every cell.
-        terminated: 1 if the episode ended by itself.
-        truncated: 1 if the server's `max_steps` ended it.
-    """
-
+    #: k, the number of steps since the last reset.
     step: int
+    #: Seed of the episode. With the model it gives the hidden state away: not for learners.
     seed: int
+    #: Resets of this world since the server started.
     episode: int
+    #: Sum of the model's rewards over the distinct cells visited.
     reward: float
+    #: Cells of the whole grid in the state that pays most (fire): for reports.
     n_target_cells: int
+    #: Distinct cells visited.
     n_visited: int
+    #: Distinct cells visited in the state that pays most.
     n_hits: int
+    #: The robot's place.
     row: int
     col: int
+    #: What the frame shows: 0 nothing, 1 the path, 2 every cell.
     coverage: int
+    #: 1 if the episode ended by itself.
     terminated: int
+    #: 1 if the server's `max_steps` ended it.
     truncated: int
 
 
@@ -198,14 +158,7 @@ RESULT: Final = struct.Struct("=QQQdIIIIIIHH4x")
 
 #: The same for many at once.
 RESULT_DTYPE: Final = np.dtype(
-    [
-        *zip(
-            StepResult._fields,
-            ["u8", "u8", "u8", "f8", "u4", "u4", "u4", "u4", "u4", "u4", "u2", "u2"],
-            strict=True,
-        ),
-        ("reserved", "u4"),
-    ]
+    [*zip(StepResult._fields, "QQQdIIIIIIHH", strict=True), ("reserved", "I")]
 )
 
 
@@ -222,21 +175,14 @@ class StepAnswer:
     __slots__ = ("_payload", "first_world", "frames", "simulation_nanos")
 
     def __init__(self, reply: StepReply, payload: bytearray, n_observations: int) -> None:
-        """Takes a payload apart.
-
-        Raises:
-            GarbledAnswerError: If its length or a value of a frame is impossible.
-        """
         n_worlds, height, width = reply.n_worlds, reply.height, reply.width
         if not n_worlds * height * width:
-            raise GarbledAnswerError(
+            raise bad_answer(
                 f"answer to step: expected worlds, got {n_worlds} of {height} x {width} cells"
             )
         expected = n_worlds * (RESULT.size + height * width)
         if len(payload) != expected:
-            raise GarbledAnswerError(
-                f"answer to step: expected {expected} bytes, got {len(payload)}"
-            )
+            raise bad_answer(f"answer to step: expected {expected} bytes, got {len(payload)}")
         self._payload = payload
         self.first_world: int = reply.first_world
         self.simulation_nanos: int = reply.simulation_nanos
@@ -245,7 +191,6 @@ class StepAnswer:
         self.frames = frames.reshape(n_worlds, height, width)
 
     def __repr__(self) -> str:
-        """The first result, and the shape of the frames."""
         others = len(self.frames) - 1
         more = f", and {others} more" if others else ""
         return (
@@ -259,46 +204,36 @@ class StepAnswer:
         return np.frombuffer(self._payload, RESULT_DTYPE, count=len(self.frames))
 
     def result(self, index: int = 0) -> StepResult:
-        """The result of one world."""
         return StepResult(*RESULT.unpack_from(self._payload, index * RESULT.size))
 
 
-def check_frame(values: NDArray[np.uint8], n_observations: int) -> None:
-    """Refuses frames whole that hold anything but observations and 255.
+def bad_answer(message: str) -> EmberwatchError:
+    """The error of an answer that makes no sense."""
+    return EmberwatchError(message, "bad_answer")
 
-    Raises:
-        GarbledAnswerError: Naming the value.
-    """
+
+def check_frame(values: NDArray[np.uint8], n_observations: int) -> None:
+    """Refuses frames whole that hold anything but observations and 255."""
     # 255 wraps to 0, observation o becomes o + 1: one addition and one maximum check all.
     highest = int((values + np.uint8(1)).max(initial=0))
     if highest > n_observations:
-        raise GarbledAnswerError(
+        raise bad_answer(
             f"frame: expected observations below {n_observations} or 255, got {highest - 1}"
         )
 
 
 def check_worlds(reply: StepReply, expected: tuple[int, int, int, int]) -> None:
-    """Refuses an answer about other worlds, or of another size: first, number, height, width.
-
-    Raises:
-        GarbledAnswerError: Naming both.
-    """
+    """Refuses an answer about other worlds, or of another size: first, number, height, width."""
     got = (reply.first_world, reply.n_worlds, reply.height, reply.width)
     if got != expected:
-        raise GarbledAnswerError(
+        raise bad_answer(
             f"answer to step: expected first world, worlds, height, width {expected}, got {got}"
         )
 
 
 def check_answer(what: str, reply: Any, sequence: int) -> None:
-    """Refuses an answer of another version or to another request.
-
-    Raises:
-        GarbledAnswerError: Naming both.
-    """
+    """Refuses an answer of another version or to another request."""
     if reply.version != VERSION:
-        raise GarbledAnswerError(f"{what}: expected version {VERSION}, got {reply.version}")
+        raise bad_answer(f"{what}: expected version {VERSION}, got {reply.version}")
     if reply.sequence != sequence:
-        raise GarbledAnswerError(
-            f"{what}: expected sequence number {sequence}, got {reply.sequence}"
-        )
+        raise bad_answer(f"{what}: expected sequence number {sequence}, got {reply.sequence}")

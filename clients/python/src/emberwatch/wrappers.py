@@ -1,4 +1,4 @@
-"""`Belief`: what the known-model filter makes of the frames, as the observation.
+"""`BeliefObservation`: what the known-model filter makes of the frames, as the observation.
 
 A frame shows a path; the belief is what all frames so far say about every cell. For learning
 without memory, the belief is the better observation. Also `simulated_prior`, what can be known
@@ -8,11 +8,9 @@ about a world before its first frame.
 from __future__ import annotations
 
 import functools
-import subprocess
 import tempfile
-from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, SupportsFloat, cast
+from typing import Any, Final, Literal, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -21,20 +19,19 @@ from gymnasium.core import ActType
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from emberwatch import programs
 from emberwatch.belief import Filter, initial_prior, uniform_prior
+from emberwatch.errors import EmberwatchError, InvalidArgumentError
 from emberwatch.model import Model
 
 PriorKind = Literal["simulated", "initial", "uniform"]
-"""A prior by name, see `Belief`."""
+"""A prior by name, see `BeliefObservation`."""
 
-_SIMULATION_TIMEOUT_SECONDS = 1800.0  # 64 worlds of 512 x 512 cells take minutes
-
-
-class PriorError(RuntimeError):
-    """The program that simulates priors failed, or wrote something else."""
+#: 64 worlds of 512 x 512 cells take minutes.
+_SIMULATION_TIMEOUT: Final = 1800.0
 
 
-class Belief(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArgs):
+class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArgs):
     """Runs the known-model filter beside an environment and observes its belief.
 
     For single environments: wrap those of a vector one by one. `terminated` and `truncated` pass
@@ -64,8 +61,10 @@ class Belief(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArg
     - An array of shape (S, H, W), each cell's sum one.
     - ``None``: ``"simulated"`` if the environment has a burn-in, else ``"initial"``.
 
-    ## Version history
-    - v1: first version.
+    ## Arguments
+    `env` observes the frame, a `Box` of shape (H, W, 1) and type uint8, or a `Dict` with
+    ``"frame"``. `model`, a `Model`, its name or the path of its file, is for servers that do not
+    reveal theirs; else it is ``env.unwrapped.model``.
     """
 
     def __init__(
@@ -75,31 +74,15 @@ class Belief(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArg
         keep: bool = False,
         dtype: Literal["float32", "uint8"] = "float32",
         prior: PriorKind | NDArray[np.floating] | None = None,
-        model: Model | str | PathLike[str] | None = None,
+        model: Model | str | Path | None = None,
     ) -> None:
-        """Wraps an environment.
-
-        Args:
-            env: Observes the frame, a `Box` of shape (H, W, 1) and type uint8, or a `Dict` with
-                ``"frame"``. ``env.unwrapped`` has ``model``, a `Model` or None, and ``burn_in``.
-            keep: Whether the original observations stay beside the belief.
-            dtype: Type and layout of the belief.
-            prior: The belief about ``X_0``.
-            model: The world's model, its name, or the path of its file, for servers that do not
-                reveal it.
-
-        Raises:
-            ValueError: No model is known, or an argument or the environment is of another form.
-            ModelError: The model cannot run on the environment's grid.
-            PriorError: The prior could not be simulated.
-        """
         RecordConstructorArgs.__init__(self, keep=keep, dtype=dtype, prior=prior, model=model)
         gymnasium.Wrapper.__init__(self, env)  # pyright: ignore[reportUnknownMemberType]
         if dtype not in ("float32", "uint8"):
-            raise ValueError(f"dtype: expected 'float32' or 'uint8', got {dtype!r}")
+            raise InvalidArgumentError(f"dtype: expected 'float32' or 'uint8', got {dtype!r}")
         self._keep, self._dtype = keep, dtype
         self._model = _model_of(env, model)
-        original = _spaces_of(env.observation_space)
+        original = _parts_of(env.observation_space, spaces.Dict)
         height, width = _grid_of(original)
         self._prior = _prior_of(env, prior, self._model, height=height, width=width)
         Filter(self._model, prior=self._prior)  # refuses what does not fit, now
@@ -109,19 +92,14 @@ class Belief(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArg
 
     @property
     def filter(self) -> Filter:
-        """The filter of the current episode, for its entropy or its belief in double precision.
-
-        Raises:
-            ResetNeeded: There is no episode yet.
-        """
+        """The filter of the current episode, for its entropy or its belief in double precision."""
         if self._filter is None:
-            raise gymnasium.error.ResetNeeded("Belief: call reset before anything else")
+            raise gymnasium.error.ResetNeeded("BeliefObservation: call reset before anything else")
         return self._filter
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins a new episode; observes the prior."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._step = int(info.get("step", 0))
         self._filter = Filter(self._model, prior=self._prior)
@@ -129,11 +107,6 @@ class Belief(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArg
         return self._observe(observation), info
 
     def step(self, action: ActType) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Steps the world; observes the posterior.
-
-        Raises:
-            ZeroEvidenceError: The frame cannot be, given the model and the prior.
-        """
         belief = self.filter
         observation, reward, terminated, truncated, info = self.env.step(action)
         before, self._step = self._step, int(info.get("step", self._step + 1))
@@ -150,109 +123,64 @@ class Belief(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArg
             belief = np.ascontiguousarray(image.transpose(1, 2, 0))
         else:
             belief = belief.astype(np.float32)
-        if not self._keep:
-            return belief
-        return {**_parts_of(observation), "belief": belief}
+        return {**_parts_of(observation), "belief": belief} if self._keep else belief
 
     def _space(
         self, original: dict[str, spaces.Space[Any]], height: int, width: int
     ) -> spaces.Space[Any]:
+        n_states = self._model.n_states
         if self._dtype == "uint8":
-            image = (height, width, self._model.n_states)
-            belief = spaces.Box(0, 255, image, np.uint8)
+            belief = spaces.Box(0, 255, (height, width, n_states), np.uint8)
         else:
-            planes = (self._model.n_states, height, width)
-            belief = spaces.Box(0.0, 1.0, planes, np.float32)
-        if not self._keep:
-            return belief
-        return spaces.Dict({**original, "belief": belief})
+            belief = spaces.Box(0.0, 1.0, (n_states, height, width), np.float32)
+        return spaces.Dict({**original, "belief": belief}) if self._keep else belief
 
 
 @functools.lru_cache(maxsize=8)
 def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> NDArray[np.floating]:
     """How often each cell of 64 simulated worlds is in each state after the burn-in.
 
-    Runs ``emberwatch-agent prior``, whose worlds do not depend on any environment's seed. The same
-    array again for the same arguments, so it cannot be written to.
-
-    Args:
-        model: The worlds' model.
-        height: Grid height, cells.
-        width: Grid width, cells.
-        burn_in: Steps from the initial distribution, at least 0.
-
-    Returns:
-        Shape (S, H, W), each cell's sum one, read-only.
-
-    Raises:
-        PriorError: The program failed, or wrote something else.
+    Runs ``emberwatch-agent prior``, whose worlds do not depend on any environment's seed. Shape
+    (S, H, W); the same array again for the same arguments, so it cannot be written to.
     """
-    from emberwatch.programs import find
-
+    name = "emberwatch-agent"
     with tempfile.TemporaryDirectory(prefix="emberwatch-prior-") as directory:
         file, out = Path(directory, "model.toml"), Path(directory, "prior.npy")
         file.write_text(model.toml, "utf-8")
-        command = [str(find("emberwatch-agent")), "prior", "--model", str(file)]
-        command += ["--height", str(height), "--width", str(width)]
-        command += ["--burn-in", str(burn_in), "--out", str(out)]
-        _run(command)
+        flags = {"model": file, "height": height, "width": width, "burn-in": burn_in, "out": out}
+        arguments = ["prior", *(f"--{flag}={value}" for flag, value in flags.items())]
+        programs.run(name, arguments, _SIMULATION_TIMEOUT)
         try:
             with out.open("rb") as stream:
                 prior: NDArray[np.floating] = np.lib.format.read_array(stream)
         except (OSError, ValueError) as error:
-            raise PriorError(f"emberwatch-agent prior: expected an .npy file: {error}") from error
+            problem = f"{name} prior: expected an .npy file: {error}"
+            raise EmberwatchError(problem, "program") from error
     expected = (model.n_states, height, width)
     if prior.shape != expected:
-        raise PriorError(f"emberwatch-agent prior: expected shape {expected}, got {prior.shape}")
+        problem = f"{name} prior: expected shape {expected}, got {prior.shape}"
+        raise EmberwatchError(problem, "program")
     prior.flags.writeable = False
     return prior
 
 
-def _run(command: list[str]) -> None:
-    try:
-        done = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            stdin=subprocess.DEVNULL,
-            timeout=_SIMULATION_TIMEOUT_SECONDS,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise PriorError(f"emberwatch-agent prior: expected an end, got {error}") from error
-    if done.returncode != 0:
-        raise PriorError(
-            f"emberwatch-agent prior: expected success, got exit code {done.returncode}: "
-            f"{done.stderr.strip()[-1000:]}"
-        )
-
-
-def _model_of(env: gymnasium.Env[Any, Any], model: Model | str | PathLike[str] | None) -> Model:
+def _model_of(env: gymnasium.Env[Any, Any], model: Model | str | Path | None) -> Model:
     if isinstance(model, Model):
         return model
     if model is not None:
         return Model.named(model)
     revealed = getattr(env.unwrapped, "model", None)
     if not isinstance(revealed, Model):
-        raise ValueError(
-            "Belief: expected the world's model, got none: the server does not reveal it "
-            "(--reveal-model false); pass model=, a Model, its name or the path of its file"
+        raise InvalidArgumentError(
+            "BeliefObservation: expected the world's model, got none: the server does not reveal "
+            "it (--reveal-model false); pass model=, a Model, its name or the path of its file"
         )
     return revealed
 
 
-def _spaces_of(space: spaces.Space[Any]) -> dict[str, spaces.Space[Any]]:
-    """The observation's parts: those of a `Dict`, or a lone frame."""
-    if isinstance(space, spaces.Dict):
-        parts = cast("spaces.Dict", space).spaces  # pyright: ignore[reportUnknownMemberType]
-        return dict(parts)
-    return {"frame": space}
-
-
-def _parts_of(observation: Any) -> dict[str, Any]:
-    if isinstance(observation, dict):
-        return cast("dict[str, Any]", observation)
-    return {"frame": observation}
+def _parts_of(whole: Any, kind: type[Any] = dict) -> dict[str, Any]:
+    """The parts of an observation, or of its space: those of a dictionary, or a lone frame."""
+    return dict(whole) if isinstance(whole, kind) else {"frame": whole}
 
 
 def _grid_of(parts: dict[str, spaces.Space[Any]]) -> tuple[int, int]:
@@ -262,7 +190,9 @@ def _grid_of(parts: dict[str, spaces.Space[Any]]) -> tuple[int, int]:
             return height, width
         case _:
             expected = "a frame of shape (H, W, 1) and type uint8, alone or as 'frame' of a Dict"
-            raise ValueError(f"Belief: expected observations of {expected}, got {parts}")
+            raise InvalidArgumentError(
+                f"BeliefObservation: expected observations of {expected}, got {parts}"
+            )
 
 
 def _prior_of(
@@ -277,20 +207,17 @@ def _prior_of(
     if prior is None:
         prior = "simulated" if burn_in > 0 else "initial"
     if not isinstance(prior, str):
-        if prior.shape != (model.n_states, height, width):
-            expected = (model.n_states, height, width)
-            raise ValueError(f"prior: expected shape {expected}, got {prior.shape}")
+        expected = (model.n_states, height, width)
+        if prior.shape != expected:
+            raise InvalidArgumentError(f"prior: expected shape {expected}, got {prior.shape}")
         return prior
-    match prior:
-        case "simulated":
-            return simulated_prior(model, height=height, width=width, burn_in=burn_in)
-        case "initial":
-            return initial_prior(model, height=height, width=width)
-        case "uniform":
-            return uniform_prior(model, height=height, width=width)
-        case _:
-            expected = "'simulated', 'initial', 'uniform' or an array"
-            raise ValueError(f"prior: expected {expected}, got {prior!r}")
+    if prior == "simulated":
+        return simulated_prior(model, height=height, width=width, burn_in=burn_in)
+    simple = {"initial": initial_prior, "uniform": uniform_prior}
+    if prior not in simple:
+        expected = "'simulated', 'initial', 'uniform' or an array"
+        raise InvalidArgumentError(f"prior: expected {expected}, got {prior!r}")
+    return simple[prior](model, height=height, width=width)
 
 
 def _frame_of(observation: Any) -> NDArray[np.uint8]:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from emberwatch import recording
 from emberwatch.belief import Filter, initial_prior, uniform_prior
-from emberwatch.errors import EmberwatchError
-from emberwatch.film.scenes import FilmError, Scene, Selection, scenes
+from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.film.scenes import Scene, Selection, scenes
 from emberwatch.film.steps import steps
 from emberwatch.model import Model
 from emberwatch.observer import Frame
@@ -48,10 +48,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         model = _model(flags.model, server)
         begin = None if model is None else partial(_begin, flags.prior, model, server)
         page = Page(server, model, world=flags.world, scale=flags.scale, has_truth=has_truth)
-        with warnings.catch_warnings(action="ignore"):  # said by the survey
-            told = steps(recording.read(flags.recording, world=flags.world))
-            _write(flags, page, n_scenes, scenes(told, selection, begin))
-    except (EmberwatchError, OSError, RuntimeError, ValueError) as error:
+        with warnings.catch_warnings(action="ignore"):  # in the survey already
+            recorded = steps(recording.read(flags.recording, world=flags.world))
+            _write(flags, page, n_scenes, scenes(recorded, selection, begin))
+    except (EmberwatchError, OSError) as error:
         parser.exit(1, f"{_NAME}: {error}\n")
 
 
@@ -129,15 +129,15 @@ def _survey(flags: argparse.Namespace, selection: Selection) -> tuple[ServerInfo
                 has_truth |= step.truth is not None
                 episodes.add(step.frame.result.episode)
     if server is None and not worlds and caught:
-        raise FilmError(str(caught[-1].message))
+        raise EmberwatchError(str(caught[-1].message), "recording")
     if server is None:
-        raise FilmError(
+        raise InvalidArgumentError(
             f"--world: expected one of those recorded, {sorted(worlds)}, got {flags.world}"
         )
     if n_steps == 0:
         known = ", ".join(f"{first} to {last}" for first, last in runs[:_MOST_NAMED])
         more = ", ..." if len(runs) > _MOST_NAMED else ""
-        raise FilmError(
+        raise InvalidArgumentError(
             f"--step, --from, --to: expected some of the recorded steps {known}{more}, "
             f"got {selection.first} to {selection.last}"
         )
@@ -157,9 +157,9 @@ def _model(path: str | None, server: ServerInfo) -> Model | None:
     """The model that the server revealed, or else that of the file."""
     if server.model is not None:
         return Model.from_toml(server.model)
-    model = None if path is None else Model.read(path)
+    model = None if path is None else Model.named(path)
     if model is not None and model.n_observations != server.n_observations:
-        raise FilmError(
+        raise InvalidArgumentError(
             f"--model: expected one with {server.n_observations} observations, as recorded, "
             f"got {model.n_observations}"
         )
@@ -167,7 +167,7 @@ def _model(path: str | None, server: ServerInfo) -> Model | None:
 
 
 def _begin(prior: str, model: Model, server: ServerInfo, k: int) -> Filter:
-    """The filter before the frame of a step that nothing is known before of."""
+    """The filter before the frame of step k, the first that is known."""
     grid = {"height": server.height, "width": server.width}
     if prior == "simulated":
         burn_in = min(server.burn_in + k, _MOST_SIMULATED)
@@ -182,7 +182,7 @@ def _write(flags: argparse.Namespace, page: Page, n_scenes: int, scenes: Iterato
     (width, height), out = page.size, flags.out
     if n_scenes * width * height > _MOST_PIXELS:
         most = _MOST_PIXELS // (width * height)
-        raise FilmError(
+        raise InvalidArgumentError(
             f"--every, --scale: expected at most {most} pictures of this size, got {n_scenes}"
         )
     out.parent.mkdir(parents=True, exist_ok=True)

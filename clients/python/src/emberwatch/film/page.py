@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from emberwatch.belief import entropy
-from emberwatch.film.scenes import FilmError, Scene
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.film.scenes import Scene
 from emberwatch.model import Color, Model
 from emberwatch.palette import DARK, LIGHT, Palette
-from emberwatch.render import LEAST_LINE_SCALE, rgb_array
+from emberwatch.render import LEAST_LINE_SCALE, Picture, rgb_array
 from emberwatch.replies import ServerInfo
 
 _MARGIN, _GAP, _LINE, _SWATCH = 14, 16, 20, 11  # pixels
@@ -24,11 +25,11 @@ _LEAST_ROOM = 150  # of a panel, for its title and legend
 _LONG_SIDE, _MOST_SCALE = 200, 20  # of a panel, and of a cell, unless a scale is given
 _MOST_SIDE, _MOST_AREA = 65_535, 1 << 26  # of a picture; the side is what a GIF can tell
 _INK, _WARNING, _EDGE = (0x33, 0x33, 0x33), (0xD5, 0x5E, 0x00), (0x66, 0x66, 0x66)
-_SHADES = 24  # of a probability: more make larger files and are hardly told apart
+_SHADES = 24  # of a probability: more make larger files and can hardly be distinguished
 # ColorBrewer's YlGnBu (Apache-2.0): its lightness falls evenly.
 _RAMP = "ffffd9 edf8b1 c7e9b4 7fcdbb 41b6c4 1d91c0 225ea8 253494 081d58".split()
 
-_FINE = 4  # texts are written so many times larger
+_FINE = 4  # texts are drawn this many times larger, then reduced
 _TEXT = cast("ImageFont.FreeTypeFont", ImageFont.load_default(13 * _FINE))
 _TITLE = cast("ImageFont.FreeTypeFont", ImageFont.load_default(16 * _FINE))
 
@@ -57,11 +58,7 @@ class Page:
         scale: int | None,
         has_truth: bool,
     ) -> None:
-        """Lays out and draws what all pictures of a world share; no model leaves the belief out.
-
-        Raises:
-            FilmError: The pictures are too large.
-        """
+        """Lays out and draws what all pictures of a world share; no model leaves the belief out."""
         height, width = server.height, server.width
         self._name = f"{model.name if model else 'hidden model'}, world {world}"
         self._scale = scale or min(max(_LONG_SIDE // max(height, width), 1), _MOST_SCALE)
@@ -78,7 +75,9 @@ class Page:
         size = 2 * _MARGIN + n_panels * (self._room + _GAP) - _GAP, self._foot + _LINE
         if max(size) > _MOST_SIDE or size[0] * size[1] > _MOST_AREA:
             most = f"at most {_MOST_SIDE} pixels a side and {_MOST_AREA} in all"
-            raise FilmError(f"--scale: expected pictures of {most}, got {size[0]} x {size[1]}")
+            raise InvalidArgumentError(
+                f"--scale: expected pictures of {most}, got {size[0]} x {size[1]}"
+            )
         self._base = Image.new("RGB", size, LIGHT)
         for left, panel, legend in zip(self._lefts(), self._panels, legends, strict=True):
             _write(self._base, (left, _TOP - 13), _fit(panel.title, self._room))
@@ -87,11 +86,9 @@ class Page:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of every picture, pixels."""
         return self._base.size
 
     def draw(self, scene: Scene) -> Image.Image:
-        """The picture of a scene."""
         image, result = self._base.copy(), scene.step.frame.result
         middle, right = _MARGIN + 8, image.width - _MARGIN
         step = f"step k = {scene.k}"
@@ -106,8 +103,8 @@ class Page:
         _write(image, (left, middle), _fit(place, right - _GAP - left))
         for left, panel in zip(self._lefts(), self._panels, strict=True):
             self._draw_panel(image, left, panel, scene)
-        note, color = _small_print(scene)
-        _write(image, (_MARGIN, self._foot), _fit(note, image.width - 2 * _MARGIN), ink=color)
+        text, color = _small_print(scene)
+        _write(image, (_MARGIN, self._foot), _fit(text, image.width - 2 * _MARGIN), ink=color)
         return image
 
     def indexed(self, image: Image.Image) -> Image.Image:
@@ -122,17 +119,15 @@ class Page:
         draw.rectangle((left - 1, _TOP - 1, left + width, _TOP + height), LIGHT, _EDGE)
         cells = panel.cells(scene)
         if cells is None:
-            note = _fit("not recorded", width)
-            at = left + (width - _length(note)) // 2, _TOP + height // 2
-            _write(image, at, note, ink=_WARNING)
+            text = _fit("not recorded", width)
+            at = left + (width - _length(text)) // 2, _TOP + height // 2
+            _write(image, at, text, ink=_WARNING)
             return
         robot: tuple[int, int] | None = None
         if scene.path is not None:
             robot = (int(scene.path[-1, 0]), int(scene.path[-1, 1]))
         path = scene.path if panel.has_path and self._scale >= LEAST_LINE_SCALE else None
-        pixels = rgb_array(
-            frame=cells, robot=robot, palette=panel.palette, path=path, scale=self._scale
-        )
+        pixels = rgb_array(Picture(cells, robot, panel.palette, path), scale=self._scale)
         image.paste(Image.fromarray(pixels[:height, :width]), (left, _TOP))
 
     def _placed(self, marks: list[tuple[_Mark, str]]) -> list[tuple[_Mark, str, tuple[int, int]]]:
@@ -154,7 +149,7 @@ class Page:
         if mark == "robot":
             blank = Palette(states=(), observations=(LIGHT,), unobserved=LIGHT, path=DARK)
             frame = np.zeros((1, 1), np.uint8)
-            robot = rgb_array(frame=frame, robot=(0, 0), palette=blank, scale=_SWATCH + 1)
+            robot = rgb_array(Picture(frame, (0, 0), blank), scale=_SWATCH + 1)
             self._base.paste(Image.fromarray(robot), (x, top))
         elif mark == "scale":
             _write(self._base, (x, y), "0")
@@ -174,7 +169,7 @@ def _write(
     font: ImageFont.FreeTypeFont = _TEXT,
     ink: Color = _INK,
 ) -> None:
-    """Writes large and shrinks that, which keeps letters' distances; `at`: left edge, middle."""
+    """Draws large and reduces, which keeps letters apart; `at`: left edge, middle."""
     mask = Image.new("L", (_FINE * (_length(text, font) + 2), 2 * int(font.size)))
     draw, bold = ImageDraw.Draw(mask), 1 if font is _TITLE else 0
     draw.text((0, mask.height / 2), text, 255, font, "lm", stroke_width=bold)
@@ -196,7 +191,7 @@ def _fit(text: str, room: float) -> str:
 
 
 def _film_palette(palette: Palette) -> Image.Image:
-    """Whatever cells, marks and letters can look like, of as few colours as a GIF can have."""
+    """All colours of cells, marks and letters, few enough for a GIF."""
     cells = np.array([*palette.observations, palette.unobserved])
     inks = np.linspace(LIGHT, [_INK, _WARNING], 8).reshape(-1, 3)
     marks = np.array([DARK, LIGHT, _EDGE, *palette.states, *_ramp(_SHADES)])
@@ -275,5 +270,5 @@ def _small_print(scene: Scene) -> tuple[str, Color]:
         return f"{lost} not recorded{predicted}", _WARNING
     begins = f"the belief begins at step {scene.since}"
     lost = f"{scene.n_lost} steps before this one are not recorded"
-    notes = [begins] * (scene.since > 0) + [lost] * (scene.n_lost > 0)
-    return "; ".join(notes), _INK
+    texts = [begins] * (scene.since > 0) + [lost] * (scene.n_lost > 0)
+    return "; ".join(texts), _INK

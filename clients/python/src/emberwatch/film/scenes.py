@@ -8,29 +8,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.belief import Filter, ZeroEvidenceError
+from emberwatch.belief import Filter
 from emberwatch.errors import EmberwatchError
 from emberwatch.film.steps import Step
 from emberwatch.view import fly
 
-# Behind a longer gap the belief begins again: a fire forgets itself within about 5,500 steps.
+# After a longer gap the belief begins again: a fire depends on the last 5,500 steps or so.
 _MOST_LOST = 10_000
-
-
-class FilmError(EmberwatchError):
-    """A film that cannot be made."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """Which steps k to show: every so many of them, from the first to the last."""
+    """Which steps k to show: every n-th from the first to the last."""
 
     first: int
     last: float
     every: int
 
     def shows(self, step: Step) -> bool:
-        """Whether a step is shown."""
         k = step.frame.result.step
         return self.first <= k <= self.last and (k - self.first) % self.every == 0
 
@@ -74,9 +69,6 @@ def scenes(
         steps: Every step there is, also those that are not shown.
         selection: Which to show.
         begin: The filter before the frame of a step k; None where no model is known.
-
-    Raises:
-        FilmError: A frame cannot be, given the model and the first belief.
     """
     known: Filter | None = None
     since = n_lost = n_rewards = 0
@@ -98,8 +90,8 @@ def scenes(
         try:
             if known is not None:
                 known.correct(step.frame.frame)
-        except ZeroEvidenceError as error:
-            raise FilmError(f"step {k}: {error}") from error
+        except EmberwatchError as error:
+            raise EmberwatchError(f"step {k}: {error}", error.code) from error
         if step.frame.path.size:
             n_rewards, total = n_rewards + 1, total + step.frame.result.reward
         if selection.shows(step):

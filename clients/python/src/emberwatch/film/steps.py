@@ -64,5 +64,5 @@ def steps(records: Iterable[Record]) -> Iterator[Step]:
 
 
 def _kind(server: ServerInfo) -> tuple[object, ...]:
-    """What must be alike for one filter to follow two servers' worlds."""
+    """What must be equal for one filter to follow two servers' worlds."""
     return server.height, server.width, server.n_observations, server.model

@@ -1,0 +1,154 @@
+"""A connection to a process that answers: handshake, JSON requests, steps."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from typing import Any, Final, TypeVar, cast
+
+from emberwatch import wire
+from emberwatch.channels import Closable, Node
+from emberwatch.errors import refusal
+from emberwatch.ports import STEP_TIMEOUT, Peer, RequestPort
+from emberwatch.release import VERSION
+from emberwatch.replies import ServerInfo, record
+from emberwatch.wire import StepAnswer
+
+_Record = TypeVar("_Record")
+
+
+class Connection(Closable):
+    """A channel of JSON messages. Threads may share it: they take turns."""
+
+    def __init__(self, instance: str, service: str, wake: str, who: str) -> None:
+        self._node = Node(instance)
+        self._lock = threading.Lock()
+        self._sequence = 0
+        self._parts: list[Peer | RequestPort[Any]] = []
+        with self._closed_on_error():
+            self._peer = Peer(self._node, wake, who)
+            self._parts.append(self._peer)
+            headers = (wire.ControlRequest, wire.ControlReply)
+            self._control = RequestPort(self._peer, service, headers, slice_len=4096, grows=True)
+            self._parts.insert(0, self._control)
+
+    @property
+    def instance(self) -> str:
+        return self._node.instance
+
+    def close(self) -> None:
+        """Closes the connection; its leases end. May be called again."""
+        for part in self._parts:
+            part.close()
+        self._node.close()
+
+    def control(self, request: Mapping[str, Any], *, timeout: float) -> dict[str, Any]:
+        """Sends one JSON request (PROTOCOL.md section 6) and returns the reply's keys."""
+        self._node.check()
+        with self._lock:
+            self._sequence = sequence = self._sequence + 1
+            header = wire.CONTROL_REQUEST.pack(
+                wire.VERSION, 0, sequence, self._peer.listener_low, self._peer.listener_high
+            )
+            what = f"{request['op']!r}"
+            payload = json.dumps(request).encode()
+            head, answer = self._control.exchange(header, payload, what, timeout)
+        reply = _decoded(what, answer)
+        if head.status != 0:
+            detail, message = reply.get("detail"), reply.get("message")
+            raise refusal(
+                head.status,
+                detail if isinstance(detail, int) else 0,
+                message if isinstance(message, str) else None,
+            )
+        wire.check_answer(f"answer to {what}", head, sequence)
+        return reply
+
+    def _shake_hands(self, kind: type[_Record], timeout: float) -> _Record:
+        """The process's description of itself; from now on its end is noticed."""
+        client = f"emberwatch-python {VERSION}"
+        hello = {"op": "hello", "protocol": wire.VERSION, "client": client}
+        reply = self.control(hello, timeout=timeout)
+        info = record(kind, reply)
+        self._peer.watch(reply["pid"])
+        return info
+
+    @contextmanager
+    def _closed_on_error(self) -> Generator[None]:
+        try:
+            yield
+        except BaseException:
+            self.close()
+            raise
+
+
+class ServerConnection(Connection):
+    """A connection to a server, which also steps worlds."""
+
+    def __init__(self, instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> None:
+        super().__init__(instance, "control", "wake-server", "server")
+        with self._closed_on_error():
+            self.info: Final = self._shake_hands(ServerInfo, timeout)
+            self._step = RequestPort(
+                self._peer,
+                "step",
+                (wire.StepRequest, wire.StepReply),
+                slice_len=self.info.n_worlds * self.info.n_moves,
+                grows=False,
+            )
+            self._parts.insert(0, self._step)
+
+    def observe(
+        self, first_world: int = 0, n_worlds: int = 1, *, timeout: float = STEP_TIMEOUT
+    ) -> StepAnswer:
+        """The last results and frames again. Needs no lease and changes nothing."""
+        return self.exchange(wire.OBSERVE, 0, first_world, n_worlds, 0, b"", timeout=timeout)
+
+    def exchange(
+        self,
+        operation: int,
+        lease: int,
+        first_world: int,
+        n_worlds: int,
+        flags: int,
+        paths: bytes,
+        *,
+        step: int = 0,
+        timeout: float,
+    ) -> StepAnswer:
+        """Sends one request on `step` as it is; `Lease.step` and `observe` are easier."""
+        self._node.check()
+        with self._lock:
+            self._sequence = sequence = self._sequence + 1
+            header = wire.STEP_REQUEST.pack(
+                wire.VERSION,
+                operation,
+                lease,
+                sequence,
+                first_world,
+                n_worlds,
+                self.info.n_moves if operation == wire.STEP else 0,
+                flags,
+                self._peer.listener_low,
+                self._peer.listener_high,
+                step,
+            )
+            reply, payload = self._step.exchange(header, paths, "a step", timeout)
+        if reply.status != 0:
+            raise refusal(reply.status, reply.detail)
+        wire.check_answer("answer to step", reply, sequence)
+        wire.check_worlds(reply, (first_world, n_worlds, self.info.height, self.info.width))
+        return StepAnswer(reply, payload, self.info.n_observations)
+
+
+def _decoded(what: str, answer: bytearray) -> dict[str, Any]:
+    try:
+        reply = json.loads(answer)
+    except (ValueError, RecursionError) as error:
+        problem = f"answer to {what}: expected JSON, got {error}"
+        raise wire.bad_answer(problem) from None
+    if not isinstance(reply, dict):
+        raise wire.bad_answer(f"answer to {what}: expected an object, got {reply!r}")
+    return cast("dict[str, Any]", reply)

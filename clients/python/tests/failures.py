@@ -1,0 +1,10 @@
+"""What the tests expect to fail, by the error's code."""
+
+import pytest
+
+from emberwatch.errors import EmberwatchError
+
+
+def fails(code: str, match: str | None = None) -> pytest.RaisesExc[EmberwatchError]:
+    """A context that expects an error with this code."""
+    return pytest.raises(EmberwatchError, match=match, check=lambda error: error.code == code)

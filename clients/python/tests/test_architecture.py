@@ -1,0 +1,43 @@
+"""Which module imports which: no circles, and iceoryx2 in few of them."""
+
+import ast
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import emberwatch
+
+PACKAGE = Path(emberwatch.__file__).parent
+
+
+def modules() -> dict[str, Path]:
+    """The package's modules by name."""
+    names = {}
+    for path in PACKAGE.rglob("*.py"):
+        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        names[".".join(parts).removesuffix(".__init__")] = path
+    return names
+
+
+def imports(path: Path) -> set[str]:
+    """The modules that a file names in imports, wherever in it they stand."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: a relative import"
+            inner = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= inner & modules().keys() or {str(node.module)}
+    return found
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    graph = {name: imports(path) & modules().keys() for name, path in modules().items()}
+    assert len(graph) > 30 and "emberwatch.wire" in graph["emberwatch.ports"]
+    order = list(TopologicalSorter(graph).static_order())
+    assert order.index("emberwatch.errors") < order.index("emberwatch.env")
+
+
+def test_iceoryx2_is_known_to_the_modules_of_channels_alone() -> None:
+    users = {name for name, path in modules().items() if '"iceoryx2"' in path.read_text()}
+    assert users == {"emberwatch.channels", "emberwatch.cleanup"}

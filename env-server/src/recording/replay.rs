@@ -1,0 +1,293 @@
+//! Publishes a recording again, as its server did: the same headers and bytes, in the recorded order.
+//!
+//! The file is read twice: once to check all of it before anybody sees anything, once to publish it.
+
+use super::pace::Pace;
+use super::replies::{ConnectionCounts, Next, ReplayState};
+use crate::server::{Cleaner, PortConfig, Ports};
+use anyhow::{Context, Error, Result, bail};
+use protocol::channels::{Instance, ipc_error};
+use protocol::control::{Reply, ServerInfo};
+use protocol::message::{Status, StepReply, VERSION};
+use protocol::recording::{Event, Reader, Record, RecordingError, Totals};
+use protocol::responder::{ActiveControl, listener_id, wait_until_taken};
+use protocol::wait::sleep_until_event;
+use std::fs::File;
+use std::io::BufReader;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// How often a replay that waits checks for observers and for the end.
+const TICK: Duration = Duration::from_millis(50);
+
+/// How long observers may take to read the last samples, unless they leave before.
+const LAST_SAMPLES_TIMEOUT: Duration = Duration::from_secs(3);
+
+/// What to replay, and how.
+#[derive(Debug)]
+pub struct ReplayOptions {
+    pub file: PathBuf,
+    /// The instance to publish on.
+    pub instance: Instance,
+    /// How many times as fast as it was recorded; `None`: as fast as observers can follow.
+    pub speed: Option<f64>,
+    /// What to leave out at the beginning.
+    pub from: Duration,
+    /// Whether to start again at the end, until stopped.
+    pub repeat: bool,
+    /// Whether to begin without an observer.
+    pub at_once: bool,
+    /// Whether to refuse a file that is damaged or cut short.
+    pub strict: bool,
+}
+
+/// Replays until the end, `stop`, or a client's `shutdown`.
+///
+/// A recording that is damaged or cut short is replayed up to there, with a warning.
+///
+/// # Errors
+/// If the file holds nothing to replay, or the channels fail.
+pub fn replay(options: &ReplayOptions, stop: &AtomicBool) -> Result<()> {
+    let summary = RecordingSummary::of(options)?;
+    let ports = Ports::open_with(&summary.config)?;
+    let instance = options.instance.name();
+    tracing::info!(
+        instance,
+        frames = summary.totals.n_frames,
+        truths = summary.totals.n_truths,
+        lost = summary.totals.n_lost_frames + summary.totals.n_lost_truths,
+        "replaying"
+    );
+    let mut replay = Replay {
+        options,
+        stop,
+        ports,
+        state: ReplayState::new(summary.info, summary.totals.n_truths > 0),
+        pace: Pace::new(options.speed, Instant::now()),
+        is_over: false,
+        _cleaner: Cleaner::start(),
+    };
+    let outcome = replay.run();
+    tracing::info!(steps = replay.state.n_steps(), "replayed");
+    replay.ports.close();
+    outcome
+}
+
+/// What the whole file holds.
+struct RecordingSummary {
+    config: PortConfig,
+    /// The first server.
+    info: ServerInfo,
+    totals: Totals,
+}
+
+struct Replay<'a> {
+    options: &'a ReplayOptions,
+    stop: &'a AtomicBool,
+    ports: Ports,
+    state: ReplayState,
+    pace: Pace,
+    is_over: bool,
+    _cleaner: Cleaner,
+}
+
+impl RecordingSummary {
+    fn of(options: &ReplayOptions) -> Result<Self> {
+        let mut config = PortConfig {
+            instance: options.instance.clone(),
+            n_cells: 0,
+            n_moves: 0,
+            answer_bytes: 0,
+            publish_truth: false,
+        };
+        let (mut first, mut is_empty, mut end) = (None, true, None);
+        let mut reader = open(&options.file)?;
+        for record in reader.by_ref() {
+            let record = match record {
+                Ok(record) => record,
+                Err(problem) if !options.strict && problem.leaves_good_records() => {
+                    end = Some(problem);
+                    break;
+                }
+                Err(problem) => return Err(file_error(&options.file, problem)),
+            };
+            match record.event {
+                Event::Server(info) => {
+                    config.n_cells = config.n_cells.max(info.height * info.width);
+                    config.n_moves = config.n_moves.max(info.n_moves);
+                    first.get_or_insert(*info);
+                }
+                _ => is_empty &= Duration::from_nanos(record.nanos) < options.from,
+            }
+        }
+        let totals = reader.totals();
+        config.publish_truth = totals.n_truths > 0;
+        match (first, end) {
+            (Some(info), end) if !is_empty => {
+                if let Some(problem) = end {
+                    tracing::warn!(file = %options.file.display(), "{problem}; replaying these");
+                }
+                Ok(Self {
+                    config,
+                    info,
+                    totals,
+                })
+            }
+            (_, Some(problem)) => Err(file_error(&options.file, problem)),
+            _ => bail!(
+                "{}: expected samples from {:?} on, got none",
+                in_file(&options.file),
+                options.from
+            ),
+        }
+    }
+}
+
+impl Replay<'_> {
+    fn run(&mut self) -> Result<()> {
+        if !self.options.at_once {
+            tracing::info!("waiting for an observer");
+            while !self.ends() && self.ports.observers() == (0, 0) {
+                self.serve_until(Instant::now() + TICK)?;
+            }
+        }
+        self.publish_all()?;
+        while self.options.repeat && !self.ends() {
+            self.publish_all()?;
+        }
+        let deadline = Instant::now() + LAST_SAMPLES_TIMEOUT;
+        while !self.ends() && self.ports.observers() != (0, 0) && Instant::now() < deadline {
+            self.serve_until(Instant::now() + TICK)?;
+        }
+        Ok(())
+    }
+
+    /// Publishes the recording once.
+    fn publish_all(&mut self) -> Result<()> {
+        self.pace.begin_round(Instant::now());
+        for record in open(&self.options.file)? {
+            let record = match record {
+                Ok(record) => record,
+                Err(problem) if problem.leaves_good_records() => break,
+                Err(problem) => return Err(file_error(&self.options.file, problem)),
+            };
+            let time = Duration::from_nanos(record.nanos);
+            if let Event::Server(_) = record.event {
+                self.state.record(&record.event);
+            } else if time >= self.options.from {
+                self.wait_until_due(time - self.options.from)?;
+                if self.ends() {
+                    break;
+                }
+                self.publish(record);
+            }
+        }
+        Ok(())
+    }
+
+    /// Waits until a moment of the recording, and until observers can follow.
+    fn wait_until_due(&mut self, time: Duration) -> Result<()> {
+        let due = self.pace.due(time);
+        let mut now = Instant::now();
+        while !self.ends() && due.is_none_or(|due| now < due) {
+            let tick = now + TICK;
+            self.serve_until(due.map_or(tick, |due| due.min(tick)))?;
+            now = Instant::now();
+        }
+        if let Some(pause) = self.pace.pause() {
+            self.serve_until(pause)?;
+        }
+        Ok(())
+    }
+
+    fn publish(&mut self, record: Record) {
+        self.pace.publish(Instant::now());
+        self.state.record(&record.event);
+        match record.event {
+            Event::Frame(sample) => self
+                .ports
+                .publish_frame(sample.header, &sample.payload, &[]),
+            Event::Truth(sample) => self.ports.publish_truth(sample.header, &sample.payload),
+            Event::Server(_) => {}
+        }
+    }
+
+    fn ends(&self) -> bool {
+        self.is_over || self.stop.load(Ordering::Relaxed)
+    }
+
+    /// Answers requests until a moment, or the end.
+    fn serve_until(&mut self, until: Instant) -> Result<()> {
+        loop {
+            self.ports.connect_observers();
+            while let Some(request) = self.ports.receive_step() {
+                let asked = *request.user_header();
+                let reply = StepReply {
+                    version: VERSION,
+                    status: self.state.refuse_step(asked.version) as u32,
+                    sequence: asked.sequence,
+                    first_world: asked.first_world,
+                    detail: if asked.version == VERSION {
+                        0
+                    } else {
+                        VERSION.into()
+                    },
+                    ..StepReply::default()
+                };
+                let listener = listener_id(asked.listener_low, asked.listener_high);
+                self.ports.answers().send(&request, reply, &[], listener);
+            }
+            while let Some(request) = self.ports.receive_control() {
+                self.answer(request);
+            }
+            self.ports.check_entries()?;
+            let now = Instant::now();
+            self.ports.warn_of_descriptors(now);
+            let left = until.saturating_duration_since(now);
+            if left.is_zero() || self.ends() {
+                return Ok(());
+            }
+            if !self.ports.drain()? {
+                sleep_until_event(&[self.ports.descriptor()], left).map_err(ipc_error("sleep"))?;
+            }
+        }
+    }
+
+    fn answer(&mut self, request: ActiveControl) {
+        let counts = ConnectionCounts {
+            n_clients: self.ports.n_clients(),
+            n_observers: self.ports.observers().0,
+        };
+        let version = request.user_header().version;
+        let (reply, next) = self.state.answer(version, request.payload(), &counts);
+        self.send(&request, &reply);
+        if next == Next::End {
+            wait_until_taken(&[request]);
+            tracing::info!("a client asked to shut down");
+            self.is_over = true;
+        }
+    }
+
+    fn send(&mut self, request: &ActiveControl, reply: &Reply) {
+        if reply.status() != Status::Ok {
+            tracing::debug!(status = ?reply.status(), "refused a control request");
+        }
+        self.ports
+            .answers()
+            .send_json(request, reply.status(), reply);
+    }
+}
+
+fn open(path: &Path) -> Result<Reader<BufReader<File>>> {
+    let open = || Reader::new(BufReader::new(File::open(path)?));
+    open().with_context(|| in_file(path))
+}
+
+fn file_error(path: &Path, problem: RecordingError) -> Error {
+    Error::new(problem).context(in_file(path))
+}
+
+fn in_file(path: &Path) -> String {
+    format!("recording {}", path.display())
+}

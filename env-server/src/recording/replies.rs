@@ -1,0 +1,133 @@
+//! Replies to the clients of a replay: what the recorded server answered to `hello`, and its worlds at present.
+
+use protocol::control::{Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldStatus, parse};
+use protocol::message::{Status, VERSION};
+use protocol::recording::Event;
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+const REFUSAL: &str = "a recording is replayed on this instance: it can be observed, not acted on";
+
+/// What a replay has published so far.
+pub struct ReplayState {
+    info: ServerInfo,
+    has_truth: bool,
+    worlds: BTreeMap<u32, WorldInfo>,
+    began: Instant,
+    n_steps: u64,
+    n_refused: u64,
+}
+
+/// The connected clients and observers.
+pub struct ConnectionCounts {
+    /// Clients on the step channel.
+    pub n_clients: usize,
+    /// Observers of frames.
+    pub n_observers: usize,
+}
+
+/// What to do after an answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Next {
+    Continue,
+    End,
+}
+
+impl ReplayState {
+    /// A replay of this server before its first sample.
+    pub fn new(info: ServerInfo, has_truth: bool) -> Self {
+        Self {
+            info,
+            has_truth,
+            worlds: BTreeMap::new(),
+            began: Instant::now(),
+            n_steps: 0,
+            n_refused: 0,
+        }
+    }
+
+    /// World steps published.
+    pub fn n_steps(&self) -> u64 {
+        self.n_steps
+    }
+
+    /// Keeps what is published.
+    pub fn record(&mut self, event: &Event) {
+        match event {
+            Event::Server(info) => {
+                self.info = ServerInfo::clone(info);
+                self.worlds.clear();
+            }
+            Event::Frame(sample) => {
+                let (header, result) = (&sample.header, &sample.header.result);
+                self.n_steps += u64::from(header.n_moves > 0);
+                let info = WorldInfo {
+                    world: header.world,
+                    step: result.step,
+                    seed: result.seed,
+                    episode: result.episode,
+                    robot: [result.row, result.col],
+                };
+                self.worlds.insert(header.world, info);
+            }
+            Event::Truth(_) => {}
+        }
+    }
+
+    /// The status of every step request.
+    pub fn refuse_step(&mut self, version: u32) -> Status {
+        self.n_refused += 1;
+        if version == VERSION {
+            Status::NotPermitted
+        } else {
+            Status::VersionMismatch
+        }
+    }
+
+    /// The answer to a control request.
+    pub fn answer(
+        &mut self,
+        version: u32,
+        text: &[u8],
+        counts: &ConnectionCounts,
+    ) -> (Reply, Next) {
+        let reply = match parse::<Request>(text) {
+            _ if version != VERSION => Reply::version_mismatch(version),
+            Err(message) => Reply::error(Status::Malformed, 0, message),
+            Ok(Request::Hello { protocol, .. }) if protocol != VERSION => {
+                Reply::version_mismatch(protocol)
+            }
+            Ok(Request::Hello { .. }) => Reply::Hello(Box::new(ServerInfo {
+                pid: std::process::id(),
+                publish_truth: self.has_truth,
+                ..self.info.clone()
+            })),
+            Ok(Request::Status {}) => Reply::Status(self.status(counts)),
+            Ok(Request::Shutdown {}) => return (Reply::Done, Next::End),
+            Ok(_) => Reply::error(Status::NotPermitted, 0, REFUSAL.into()),
+        };
+        self.n_refused += u64::from(reply.status() != Status::Ok);
+        (reply, Next::Continue)
+    }
+
+    fn status(&self, counts: &ConnectionCounts) -> ServerStatus {
+        let uptime = self.began.elapsed();
+        let shown = self.worlds.values().cloned();
+        ServerStatus {
+            pid: std::process::id(),
+            uptime_millis: uptime.as_millis() as u64,
+            n_steps: self.n_steps,
+            steps_per_second: self.n_steps as f64 / uptime.as_secs_f64().max(1e-9),
+            n_refused: self.n_refused,
+            n_clients: counts.n_clients,
+            n_observers: counts.n_observers,
+            worlds: shown
+                .map(|info| WorldStatus {
+                    info,
+                    holder_pid: None,
+                    resetting: false,
+                })
+                .collect(),
+        }
+    }
+}

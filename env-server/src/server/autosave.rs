@@ -1,0 +1,190 @@
+//! Snapshots that a server writes regularly, and starts with.
+
+use super::files::Files;
+use crate::config::Checked;
+use crate::snapshot::{
+    Done, Durability, FileError, Folder, Job, SnapshotError, SnapshotWorld, WorldSpec, load,
+    refused,
+};
+use crate::throttle::Throttle;
+use crate::world::Episode;
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// Least time between two snapshots that survive a loss of power: to wait for the disk each time would slow the steps
+/// down.
+const SYNC_INTERVAL: Duration = Duration::from_secs(5);
+
+/// When to write the next one, and where.
+pub struct Autosave {
+    folder: Folder,
+    keep: usize,
+    /// World steps between two.
+    every: u64,
+    /// World steps at which the next is due.
+    due: u64,
+    /// The job that writes one now.
+    writing: Option<(u64, Durability)>,
+    /// The last that survives a loss of power, and when it was written.
+    safe: Option<(Instant, PathBuf)>,
+    failures: Throttle,
+}
+
+impl Autosave {
+    /// By the settings; `None` if they want none.
+    ///
+    /// # Errors
+    /// If the folder cannot be written to, or has another run's files.
+    pub fn new(checked: &Checked) -> Result<Option<Self>, FileError> {
+        let config = &checked.config;
+        if config.snapshot_every == 0 {
+            return Ok(None);
+        }
+        let folder = Folder::new(Path::new(&config.snapshot_dir), &checked.instance);
+        folder.prepare()?;
+        let n_files = folder.files()?.len();
+        if n_files > 0 && config.restore.is_empty() {
+            return Err(folder.not_empty(n_files));
+        }
+        let every = config.snapshot_every.saturating_mul(config.worlds.into());
+        Ok(Some(Self {
+            folder,
+            keep: config.snapshot_keep as usize,
+            every,
+            due: every,
+            writing: None,
+            safe: None,
+            failures: Throttle::default(),
+        }))
+    }
+
+    /// Whether one is to be written after so many world steps. Never two at once: a disk that is too
+    /// slow gets fewer.
+    pub fn is_due(&self, n_steps: u64) -> bool {
+        n_steps >= self.due && self.writing.is_none()
+    }
+
+    /// Leaves one out.
+    pub fn skip(&mut self, n_steps: u64) {
+        self.due = n_steps.saturating_add(self.every);
+    }
+
+    /// Starts one; the last of a run always survives a loss of power.
+    pub fn start(&mut self, n_steps: u64, bytes: Vec<u8>, is_last: bool, files: &mut Files) {
+        self.skip(n_steps);
+        let safe = self.safe.as_ref();
+        let durability = durability(safe.map(|(at, _)| at.elapsed()), is_last);
+        let job = files.add(Job::Autosave {
+            folder: self.folder.clone(),
+            durability,
+            keep: self.keep,
+            also_keep: safe.map(|(_, path)| path.clone()),
+            bytes,
+        });
+        self.writing = Some((job, durability));
+    }
+
+    /// Handles the result of a job; returns whether it was one of these.
+    pub fn finish(&mut self, job: u64, outcome: &Result<Done, FileError>) -> bool {
+        let Some((_, durability)) = self.writing.take_if(|(own, _)| *own == job) else {
+            return false;
+        };
+        match outcome {
+            Ok(Done::Saved { path, .. }) if durability == Durability::PowerLoss => {
+                self.safe = Some((Instant::now(), path.clone()));
+            }
+            Ok(_) => {}
+            Err(error) => self.warn(error),
+        }
+        true
+    }
+
+    /// Warns, at most every ten seconds, that one was not written.
+    pub fn warn(&mut self, error: &dyn Display) {
+        if let Some(n_unsaid) = self.failures.pass(Instant::now()) {
+            tracing::warn!(n_unsaid, "not saved: {error}");
+        }
+    }
+}
+
+/// What the next snapshot must survive; `age`: time since the last that survives a loss of power, if there is one.
+fn durability(age: Option<Duration>, is_last: bool) -> Durability {
+    match age {
+        Some(age) if age < SYNC_INTERVAL && !is_last => Durability::Kill,
+        _ => Durability::PowerLoss,
+    }
+}
+
+/// Worlds that a server starts with.
+pub struct FirstWorlds {
+    /// Their file.
+    pub path: PathBuf,
+    pub worlds: Vec<SnapshotWorld<Box<Episode>>>,
+}
+
+/// The worlds that the settings want a server to start with; `None`: new ones. Damaged files of a folder are skipped.
+///
+/// # Errors
+/// If no file is whole, or the last whole one does not fit.
+pub fn first_worlds(checked: &Checked, spec: &WorldSpec) -> Result<Option<FirstWorlds>, FileError> {
+    if checked.config.restore.is_empty() {
+        return Ok(None);
+    }
+    let path = Path::new(&checked.config.restore);
+    let files = if path.is_dir() {
+        let folder = Folder::new(path, &checked.instance);
+        let files = folder.files()?;
+        if files.is_empty() {
+            log_why_none(&folder, path);
+        }
+        files.into_iter().rev().map(|(_, path)| path).collect()
+    } else {
+        vec![path.to_owned()]
+    };
+    let mut damaged = None;
+    for path in files {
+        match load(spec, &path, None) {
+            Ok(worlds) if worlds.len() == checked.config.worlds as usize => {
+                return Ok(Some(FirstWorlds { path, worlds }));
+            }
+            Ok(worlds) => {
+                let error = SnapshotError::n_worlds(checked.config.worlds, worlds.len());
+                return Err(refused(&path, error));
+            }
+            Err(error) if error.is_damaged => {
+                tracing::warn!("{error}");
+                damaged.get_or_insert(error);
+            }
+            Err(error) => return Err(error),
+        }
+    }
+    damaged.map_or(Ok(None), Err)
+}
+
+/// Logs why nothing of a folder is restored. An empty folder is that of a first start. One with other instances' files
+/// may be too, but the user may also have meant those.
+fn log_why_none(folder: &Folder, path: &Path) {
+    let (path, expected) = (path.display(), folder.pattern());
+    match &folder.snapshots()[..] {
+        [] => tracing::info!(folder = %path, "nothing to restore: new worlds start"),
+        [first, ..] => tracing::warn!(
+            "--restore {path}: expected snapshots of this instance, {expected}, got others, such as {first}: \
+             new worlds start; to restore one of these, name its file, or its instance with --instance"
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_the_last_and_one_every_five_seconds_survive_a_loss_of_power() {
+        let (soon, late) = (SYNC_INTERVAL / 2, SYNC_INTERVAL);
+        assert_eq!(durability(None, false), Durability::PowerLoss);
+        assert_eq!(durability(Some(soon), false), Durability::Kill);
+        assert_eq!(durability(Some(late), false), Durability::PowerLoss);
+        assert_eq!(durability(Some(soon), true), Durability::PowerLoss);
+    }
+}

@@ -1,0 +1,64 @@
+//! Results of work on other threads, and a descriptor that wakes the server's loop for them.
+
+use rustix::event::{EventfdFlags, eventfd};
+use rustix::io::Errno;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender, channel};
+
+/// Results that have arrived.
+pub struct Completions<T> {
+    pub results: Receiver<T>,
+    /// Readable while `results` may hold something.
+    signal: Arc<OwnedFd>,
+}
+
+/// Sends results from another thread.
+pub struct CompletionSender<T> {
+    results: Sender<T>,
+    signal: Arc<OwnedFd>,
+}
+
+/// Both ends.
+///
+/// # Errors
+/// If the system has no event descriptor left.
+pub fn completions<T>() -> Result<(CompletionSender<T>, Completions<T>), Errno> {
+    let signal = Arc::new(eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?);
+    let (sender, results) = channel();
+    let sender = CompletionSender {
+        results: sender,
+        signal: signal.clone(),
+    };
+    Ok((sender, Completions { results, signal }))
+}
+
+impl<T> CompletionSender<T> {
+    /// Sends a result, unless the server has ended meanwhile.
+    pub fn send(&self, result: T) {
+        let _ = self.results.send(result);
+        let _ = rustix::io::write(&*self.signal, &1u64.to_ne_bytes());
+    }
+}
+
+impl<T> Clone for CompletionSender<T> {
+    fn clone(&self) -> Self {
+        Self {
+            results: self.results.clone(),
+            signal: self.signal.clone(),
+        }
+    }
+}
+
+impl<T> Completions<T> {
+    /// The results since the last call.
+    pub fn take(&self) -> Vec<T> {
+        let _ = rustix::io::read(&*self.signal, &mut [0u8; 8]);
+        self.results.try_iter().collect()
+    }
+
+    /// Readable while there are results.
+    pub fn descriptor(&self) -> BorrowedFd<'_> {
+        self.signal.as_fd()
+    }
+}

@@ -1,0 +1,97 @@
+//! File descriptors. iceoryx2 takes some for each client and observer; without them, a new one gets no answer at all.
+//! So there must be enough for all before a server starts.
+
+use crate::throttle::Throttle;
+use rustix::event::{EventfdFlags, eventfd};
+use rustix::io::Errno;
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use std::os::fd::OwnedFd;
+use std::time::Instant;
+use thiserror::Error;
+
+/// What a server, all clients and all observers take, and some more: 40 alone, 10 for each of 16 clients, up to 8 more where
+/// its requests grow, 1 for each of 16 observers and 4 readers (measured).
+const NEEDED: u64 = 512;
+
+/// What a new client takes.
+const PER_CLIENT: usize = 10;
+
+/// A limit that is too low for all clients and observers.
+#[derive(Debug, Error, PartialEq, Eq)]
+#[error(
+    "file descriptors: expected a limit of at least {NEEDED}, got {got}; raise it (`ulimit -Hn`; docker: --ulimit \
+     nofile)"
+)]
+pub struct TooFewDescriptors {
+    got: u64,
+}
+
+/// Raises the soft limit if it is too low.
+///
+/// # Errors
+/// If the hard limit is too low.
+pub fn raise_limit() -> Result<(), TooFewDescriptors> {
+    let Some(raised) = enough(getrlimit(Resource::Nofile))? else {
+        return Ok(());
+    };
+    let got = raised.maximum.unwrap_or(0);
+    setrlimit(Resource::Nofile, raised).map_err(|_| TooFewDescriptors { got })
+}
+
+/// The limits to set; `None` if these are enough.
+fn enough(limits: Rlimit) -> Result<Option<Rlimit>, TooFewDescriptors> {
+    let is_enough = |limit: Option<u64>| limit.is_none_or(|limit| limit >= NEEDED);
+    match limits.maximum {
+        _ if is_enough(limits.current) => Ok(None),
+        maximum if is_enough(maximum) => Ok(Some(Rlimit {
+            current: Some(NEEDED),
+            maximum,
+        })),
+        maximum => Err(TooFewDescriptors {
+            got: maximum.unwrap_or(0),
+        }),
+    }
+}
+
+/// Warns, at most every ten seconds, that there are too few: limits may change, and the system has one too.
+#[derive(Debug, Default)]
+pub struct DescriptorWarning(Throttle);
+
+impl DescriptorWarning {
+    /// Warns if connections could not be opened for this reason; another reason is the death of their clients.
+    pub fn warn(&mut self, now: Instant, n_connections: u64) {
+        if n_connections == 0 {
+            return;
+        }
+        let free: Result<Vec<OwnedFd>, Errno> = (0..PER_CLIENT)
+            .map(|_| eventfd(0, EventfdFlags::CLOEXEC))
+            .collect();
+        let Err(problem) = free else { return };
+        if let Some(n_unsaid) = self.0.pass(now) {
+            let limit = getrlimit(Resource::Nofile).current;
+            tracing::warn!(
+                limit,
+                n_unsaid,
+                "no file descriptors for a client or an observer, which gets no answer: {problem}"
+            );
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_low_limit_is_raised_as_far_as_needed_and_allowed() {
+        let limits = |current, maximum| Rlimit { current, maximum };
+        assert_eq!(enough(limits(None, None)), Ok(None));
+        assert_eq!(enough(limits(Some(NEEDED), Some(4 * NEEDED))), Ok(None));
+        for maximum in [Some(NEEDED), None] {
+            let raised = limits(Some(NEEDED), maximum);
+            assert_eq!(enough(limits(Some(64), maximum)), Ok(Some(raised)));
+        }
+        let refused = enough(limits(Some(64), Some(100))).expect_err("too few");
+        assert!(refused.to_string().contains("got 100"), "{refused}");
+    }
+}

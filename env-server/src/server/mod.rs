@@ -1,0 +1,17 @@
+//! The server on its channels: the loop, its ports, and the threads that keep slow work off it.
+
+mod autosave;
+mod completions;
+mod descriptors;
+mod files;
+mod liveness;
+mod pending;
+mod ports;
+mod publications;
+mod resets;
+mod serve;
+mod state;
+
+pub use liveness::Cleaner;
+pub use ports::{PortConfig, Ports};
+pub use serve::serve;

@@ -1,0 +1,108 @@
+//! What is answered later: requests that wait for resets and files.
+
+use super::state::Server;
+use crate::simulator::PendingFile;
+use crate::snapshot::{Done, FileError, Job};
+use protocol::control::Reply;
+use protocol::message::Status;
+use protocol::responder::ActiveControl;
+use std::time::Instant;
+
+impl Server {
+    pub(super) fn answer_pending(&mut self, now: Instant) {
+        for (request, pending) in std::mem::take(&mut self.pending_replies) {
+            match self.simulator.pending_reply(now, &pending) {
+                Some(reply) => self.send_reply(&request, &reply),
+                None => self.pending_replies.push((request, pending)),
+            }
+        }
+    }
+
+    /// Has a file read or written for a request that is answered afterwards.
+    pub(super) fn start_file(
+        &mut self,
+        now: Instant,
+        request: ActiveControl,
+        job: Job,
+        pending: PendingFile,
+    ) {
+        if self.files.has_room() {
+            let number = self.files.add(job);
+            self.pending_files.insert(number, (request, pending));
+            return;
+        }
+        self.simulator.cancel_file(now, &pending);
+        let message = "too many files at a time: try again later".into();
+        self.send_reply(&request, &bad_file(message));
+    }
+
+    pub(super) fn take_resets(&mut self, now: Instant) {
+        let finished = self.resets.finished();
+        if finished.is_empty() {
+            return;
+        }
+        for (world, episode) in finished {
+            self.simulator.put(world, episode);
+            self.publish(world..world + 1);
+        }
+        self.answer_pending(now);
+    }
+
+    pub(super) fn take_files(&mut self, now: Instant) {
+        for (number, outcome) in self.files.finished() {
+            if let Some(autosave) = &mut self.autosave
+                && autosave.finish(number, &outcome)
+            {
+                self.save_if_due(); // More steps may have been made meanwhile.
+                continue;
+            }
+            let Some((request, pending)) = self.pending_files.remove(&number) else {
+                continue; // Its client gave up.
+            };
+            let reply = self.file_reply(now, &pending, outcome);
+            self.send_reply(&request, &reply);
+            if let (PendingFile::Restored { worlds, .. }, Status::Ok) = (pending, reply.status()) {
+                self.publish(worlds);
+            }
+        }
+    }
+
+    fn file_reply(
+        &mut self,
+        now: Instant,
+        pending: &PendingFile,
+        outcome: Result<Done, FileError>,
+    ) -> Reply {
+        match outcome {
+            Ok(Done::Loaded(episodes)) => self.simulator.finish_restore(now, pending, episodes),
+            Ok(Done::Saved { path, n_bytes }) => self.simulator.saved(pending, &path, n_bytes),
+            Err(error) => {
+                self.simulator.cancel_file(now, pending);
+                bad_file(error.to_string())
+            }
+        }
+    }
+
+    /// Drops requests whose clients no longer wait: until then, iceoryx2 delivers none of the same client's next ones.
+    pub(super) fn cancel_abandoned(&mut self, now: Instant) {
+        let simulator = &mut self.simulator;
+        self.pending_replies.retain(|(request, pending)| {
+            let is_awaited = request.is_connected();
+            if !is_awaited {
+                simulator.cancel_reply(now, pending);
+            }
+            is_awaited
+        });
+        self.pending_files.retain(|_, (request, pending)| {
+            let is_awaited = request.is_connected();
+            if !is_awaited {
+                simulator.cancel_file(now, pending);
+            }
+            is_awaited
+        });
+    }
+}
+
+fn bad_file(message: String) -> Reply {
+    Reply::error(Status::BadFile, 0, message)
+}

@@ -1,0 +1,354 @@
+//! The server's ends of the channels.
+
+use super::descriptors::{DescriptorWarning, raise_limit};
+use crate::config::Checked;
+use crate::throttle::Throttle;
+use anyhow::{Result, anyhow, bail, ensure};
+use iceoryx2::node::Node;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::server::Server;
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::prelude::{CallbackProgression, PortFactory};
+use iceoryx2::service::dynamic_config::publish_subscribe::SubscriberDetails;
+use iceoryx2::service::dynamic_config::request_response::ClientDetails;
+use iceoryx2::service::port_factory::server::ServerCreateError;
+use protocol::channels::{
+    Channel, ChannelError, ControlService, FRAME_BUFFER, FrameService, Instance, Ipc, MAX_CLIENTS,
+    MAX_OBSERVERS, MAX_TRUTH_READERS, RequestResponse, SHARED_MEMORY, Services, StepService,
+    TRUTH_BUFFER, TruthService, create_node, entries_of, ipc_error,
+};
+use protocol::message::{FrameHeader, Header, RESULT_BYTES, StepReply, StepRequest, TruthHeader};
+use protocol::responder::{
+    Active, ActiveControl, Answers, ControlServer, FailedConnections, control_server, port_owner,
+    received,
+};
+use protocol::turn::Turn;
+use protocol::wait::{descriptor, drain};
+use std::cell::RefCell;
+use std::collections::HashSet;
+use std::os::fd::BorrowedFd;
+use std::path::PathBuf;
+use std::time::Instant;
+
+/// A request on `step` that waits for its answer.
+pub type ActiveStep = Active<StepRequest, StepReply>;
+
+/// Bytes that iceoryx2 adds to each message, at most.
+const MESSAGE_OVERHEAD: usize = 512;
+
+/// Shared memory for everything of fixed size: control messages, events, tables.
+const FIXED_BYTES: u64 = 8 << 20;
+
+/// The instance, and the sizes of its messages.
+#[derive(Debug, Clone)]
+pub struct PortConfig {
+    pub instance: Instance,
+    /// Most cells of a frame, or of hidden states.
+    pub n_cells: usize,
+    /// Most moves in a path.
+    pub n_moves: usize,
+    /// Longest answer on `step`, bytes.
+    pub answer_bytes: usize,
+    /// Whether to publish hidden states.
+    pub publish_truth: bool,
+}
+
+/// All ports of a server.
+pub struct Ports {
+    step: Server<Ipc, [u8], StepRequest, [u8], StepReply>,
+    control: ControlServer,
+    frames: Publisher<Ipc, [u8], FrameHeader>,
+    truth: Option<Publisher<Ipc, [u8], TruthHeader>>,
+    listener: Listener<Ipc>,
+    answers: Answers,
+    failed_connections: FailedConnections,
+    descriptor_warning: DescriptorWarning,
+    unpublished: RefCell<Throttle>,
+    control_service: ControlService,
+    step_service: StepService,
+    frame_service: FrameService,
+    truth_service: Option<TruthService>,
+    entries: Vec<PathBuf>,
+    _node: Node<Ipc>,
+    /// Last, so that all else is dropped within it.
+    end: Option<Turn>,
+}
+
+impl Drop for Ports {
+    fn drop(&mut self) {
+        self.end = Turn::take().ok();
+    }
+}
+
+impl Ports {
+    /// Opens the ports of a simulator.
+    ///
+    /// # Errors
+    /// If another server has them, or the system has too little memory or descriptors.
+    pub fn open(checked: &Checked) -> Result<Self> {
+        let n_cells = checked.shape.n_cells();
+        Self::open_with(&PortConfig {
+            instance: checked.instance.clone(),
+            n_cells,
+            n_moves: checked.config.moves,
+            answer_bytes: checked.config.worlds as usize * (RESULT_BYTES + n_cells),
+            publish_truth: checked.config.publish_truth,
+        })
+    }
+
+    /// Opens ports for messages of these sizes.
+    ///
+    /// # Errors
+    /// If another server has them, or the system has too little memory or descriptors.
+    pub fn open_with(config: &PortConfig) -> Result<Self> {
+        check_shared_memory(config)?;
+        raise_limit()?;
+        let _turn = Turn::take()?;
+        let node = create_node()?;
+        let services = Services {
+            node: &node,
+            instance: &config.instance,
+        };
+        let (control_service, step_service) = (services.create_control()?, services.create_step()?);
+        let failed_connections = FailedConnections::default();
+        let control = control_server(&control_service, &failed_connections);
+        let control = control.map_err(|error| taken(config, &control_service, error))?;
+        let step = step_service
+            .server_builder()
+            .initial_max_slice_len(config.answer_bytes.max(1))
+            .set_request_degradation_handler(failed_connections.counter())
+            .set_response_degradation_handler(failed_connections.counter());
+        let step = step.max_loaned_responses_per_request(1).create();
+        let step = step.map_err(|error| taken(config, &step_service, error))?;
+        let frame_service = services.frames()?;
+        let frames = frame_service
+            .publisher_builder()
+            .initial_max_slice_len(config.n_cells + config.n_moves)
+            .set_degradation_handler(failed_connections.counter())
+            .max_loaned_samples(1);
+        let frames = frames.create().map_err(ipc_error("publish frames"))?;
+        let truth_service = if config.publish_truth {
+            Some(services.truth()?)
+        } else {
+            None
+        };
+        let truth = truth_service.as_ref().map(|service| {
+            let publisher = service
+                .publisher_builder()
+                .set_degradation_handler(failed_connections.counter())
+                .initial_max_slice_len(config.n_cells);
+            publisher
+                .max_loaned_samples(1)
+                .create()
+                .map_err(ipc_error("publish the truth"))
+        });
+        let services_made = [control_service.service_hash(), step_service.service_hash()];
+        let entries = entries_of(&node, &services_made);
+        Ok(Self {
+            step,
+            control,
+            frames,
+            truth: truth.transpose()?,
+            listener: services.listener(Channel::WakeServer)?,
+            answers: Answers::new(&services)?,
+            failed_connections,
+            descriptor_warning: DescriptorWarning::default(),
+            unpublished: RefCell::default(),
+            control_service,
+            step_service,
+            frame_service,
+            truth_service,
+            entries,
+            _node: node,
+            end: None,
+        })
+    }
+
+    /// Checks that clients can still find the server.
+    ///
+    /// # Errors
+    /// If the server's files were removed.
+    pub fn check_entries(&self) -> Result<()> {
+        if let Some(path) = self.entries.iter().find(|path| !path.exists()) {
+            bail!(
+                "{} was removed while the server was running: keep cleaners of old files away from {SHARED_MEMORY}",
+                path.display()
+            );
+        }
+        Ok(())
+    }
+
+    /// Closes the ports, unless their files were removed: those of the same names are another server's then.
+    pub fn close(self) {
+        if self.check_entries().is_err() {
+            std::mem::forget(self);
+        }
+    }
+
+    /// The next step request.
+    pub fn receive_step(&self) -> Option<ActiveStep> {
+        received(self.step.receive(), &self.failed_connections)
+    }
+
+    /// The next control request.
+    pub fn receive_control(&self) -> Option<ActiveControl> {
+        received(self.control.receive(), &self.failed_connections)
+    }
+
+    /// Sends answers to requests of both kinds.
+    pub fn answers(&mut self) -> &mut Answers {
+        &mut self.answers
+    }
+
+    /// Publishes a frame and the path that was flown, if anybody observes.
+    pub fn publish_frame(&self, header: FrameHeader, frame: &[u8], path: &[u8]) {
+        let bytes = [frame, path].concat();
+        let sent = self
+            .frames
+            .loan_slice_uninit(bytes.len())
+            .map_err(|error| format!("{error:?}"))
+            .and_then(|mut sample| {
+                *sample.user_header_mut() = header;
+                sample
+                    .write_from_slice(&bytes)
+                    .send()
+                    .map_err(|error| format!("{error:?}"))
+            });
+        self.warn_of(sent, "a frame was not published");
+    }
+
+    /// Publishes hidden states, if the server does so at all.
+    pub fn publish_truth(&self, header: TruthHeader, states: &[u8]) {
+        let Some(truth) = &self.truth else { return };
+        let sent = truth
+            .loan_slice_uninit(states.len())
+            .map_err(|error| format!("{error:?}"))
+            .and_then(|mut sample| {
+                *sample.user_header_mut() = header;
+                sample
+                    .write_from_slice(states)
+                    .send()
+                    .map_err(|error| format!("{error:?}"))
+            });
+        self.warn_of(sent, "hidden states were not published");
+    }
+
+    /// Warns, at most every ten seconds, of what was not published.
+    fn warn_of(&self, sent: Result<usize, String>, what: &str) {
+        if let Err(problem) = sent
+            && let Some(n_unsaid) = self.unpublished.borrow_mut().pass(Instant::now())
+        {
+            tracing::warn!(problem, n_unsaid, "{what}");
+        }
+    }
+
+    /// Warns, at most every ten seconds, of clients and observers that cannot connect.
+    pub fn warn_of_descriptors(&mut self, now: Instant) {
+        self.descriptor_warning
+            .warn(now, self.failed_connections.take());
+    }
+
+    /// The number of observers of frames and of readers of the truth.
+    pub fn observers(&self) -> (usize, usize) {
+        let n_frames = self.frame_service.dynamic_config().number_of_subscribers();
+        let n_truth = self.truth_service.as_ref().map_or(0, |service| {
+            service.dynamic_config().number_of_subscribers()
+        });
+        (n_frames, n_truth)
+    }
+
+    /// Who observes frames or reads the truth.
+    pub fn observer_ids(&self) -> Vec<u128> {
+        let mut ids = Vec::new();
+        let mut add = |subscriber: &SubscriberDetails| {
+            ids.push(subscriber.subscriber_id.value());
+            CallbackProgression::Continue
+        };
+        self.frame_service
+            .dynamic_config()
+            .list_subscribers(&mut add);
+        if let Some(service) = &self.truth_service {
+            service.dynamic_config().list_subscribers(&mut add);
+        }
+        ids
+    }
+
+    /// Connects to new observers.
+    pub fn connect_observers(&self) {
+        // An observer that cannot be connected to gets nothing; others are not affected.
+        let _ = self.frames.update_connections();
+        let _ = self
+            .truth
+            .as_ref()
+            .map(UpdateConnections::update_connections);
+    }
+
+    /// Clients connected to `step`.
+    pub fn n_clients(&self) -> usize {
+        self.step_service.dynamic_config().number_of_clients()
+    }
+
+    /// The nodes with an open connection.
+    pub fn client_nodes(&self) -> HashSet<u128> {
+        let mut nodes = HashSet::new();
+        let mut add = |client: &ClientDetails| {
+            nodes.insert(client.node_id.value());
+            CallbackProgression::Continue
+        };
+        self.control_service.dynamic_config().list_clients(&mut add);
+        self.step_service.dynamic_config().list_clients(&mut add);
+        nodes
+    }
+
+    /// Drops wake-ups; returns whether there were any.
+    ///
+    /// # Errors
+    /// If iceoryx2 cannot read them.
+    pub fn drain(&self) -> Result<bool, ChannelError> {
+        drain(&self.listener)
+    }
+
+    /// Readable while there are wake-ups.
+    pub fn descriptor(&self) -> BorrowedFd<'_> {
+        descriptor(&self.listener)
+    }
+}
+
+fn taken<Q: Header, R: Header>(
+    config: &PortConfig,
+    service: &RequestResponse<Q, R>,
+    error: ServerCreateError,
+) -> anyhow::Error {
+    let instance = config.instance.name();
+    match port_owner(service, &error) {
+        Some(pid) => anyhow!("instance {instance:?} is already running, as pid {pid}"),
+        None => ipc_error("create a server")(error).into(),
+    }
+}
+
+/// Checks that `/dev/shm` has enough room: a write to a full one ends the process with SIGBUS.
+fn check_shared_memory(config: &PortConfig) -> Result<()> {
+    let bytes =
+        |n_messages: usize, length: usize| (n_messages * (length + MESSAGE_OVERHEAD)) as u64;
+    // Chunks as iceoryx2 counts them: 2 requests in flight x (buffered + borrowed + loaned).
+    let answers = bytes(MAX_CLIENTS * 2 * 3, config.answer_bytes);
+    let frames = bytes(
+        MAX_OBSERVERS * (FRAME_BUFFER + 1) + 2,
+        config.n_cells + config.n_moves,
+    );
+    let truth = bytes(MAX_TRUTH_READERS * (TRUTH_BUFFER + 1) + 2, config.n_cells);
+    let needed = FIXED_BYTES + answers + frames + if config.publish_truth { truth } else { 0 };
+    let Ok(status) = rustix::fs::statvfs(SHARED_MEMORY) else {
+        return Ok(());
+    };
+    let free = status.f_bavail * status.f_frsize;
+    ensure!(
+        needed <= free,
+        "shared memory: expected {} MiB free in {SHARED_MEMORY}, got {} MiB; free some, give the container more \
+         (docker: --shm-size), or serve fewer worlds or a smaller grid",
+        needed.div_ceil(1 << 20),
+        free >> 20
+    );
+    Ok(())
+}

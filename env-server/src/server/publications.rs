@@ -1,0 +1,102 @@
+//! What observers get: every world after its step, and all worlds when they connect.
+
+use super::ports::Ports;
+use crate::simulator::Simulator;
+use crate::world::Episode;
+use protocol::channels::FRAME_BUFFER;
+use protocol::message::{FrameHeader, TruthHeader, VERSION};
+use protocol::path::path_to_bytes;
+use std::ops::Range;
+
+/// What has been published, and to whom.
+#[derive(Default)]
+pub struct Publications {
+    observers: Vec<u128>,
+    /// Worlds that are yet to be published for new observers.
+    for_new: Range<usize>,
+    n_frames: u64,
+    n_truths: u64,
+}
+
+impl Publications {
+    /// Whether worlds are yet to be published for new observers.
+    pub fn has_new_observers(&self) -> bool {
+        !self.for_new.is_empty()
+    }
+
+    /// Publishes every world, part by part, for new observers.
+    pub fn publish_to_new(&mut self, ports: &Ports, simulator: &Simulator) {
+        let observers = ports.observer_ids();
+        let has_new = observers.iter().any(|id| !self.observers.contains(id));
+        if observers != self.observers {
+            // Also disconnects those that have left.
+            ports.connect_observers();
+        }
+        self.observers = observers;
+        if has_new {
+            self.for_new = simulator.worlds();
+        }
+        // In parts: more at once would overflow the buffers of new observers.
+        let part = self.for_new.start..self.for_new.end.min(self.for_new.start + FRAME_BUFFER);
+        self.for_new.start = part.end;
+        self.publish(ports, simulator, part);
+    }
+
+    /// Publishes worlds as they are now; costs nothing without observers.
+    pub fn publish(&mut self, ports: &Ports, simulator: &Simulator, worlds: Range<usize>) {
+        let (n_observers, n_readers) = ports.observers();
+        if n_observers == 0 && n_readers == 0 {
+            return;
+        }
+        for world in worlds {
+            let Some(episode) = simulator.episode(world) else {
+                continue;
+            };
+            if n_readers > 0 {
+                self.publish_truth(ports, world, episode);
+            }
+            if n_observers > 0 {
+                self.publish_frame(ports, world, episode);
+            }
+        }
+    }
+
+    fn publish_frame(&mut self, ports: &Ports, world: usize, episode: &Episode) {
+        let (height, width) = episode.states().dim();
+        let (start, path) = episode.path();
+        let header = FrameHeader {
+            version: VERSION,
+            world: world as u32,
+            sequence: self.n_frames,
+            height: height as u32,
+            width: width as u32,
+            n_moves: path.len() as u32,
+            start_row: start.row as u32,
+            start_col: start.col as u32,
+            reserved: 0,
+            result: *episode.result(),
+        };
+        ports.publish_frame(header, episode.frame().as_bytes(), &path_to_bytes(path));
+        self.n_frames += 1;
+    }
+
+    fn publish_truth(&mut self, ports: &Ports, world: usize, episode: &Episode) {
+        let (states, result) = (episode.states(), episode.result());
+        let (height, width) = states.dim();
+        let header = TruthHeader {
+            version: VERSION,
+            world: world as u32,
+            sequence: self.n_truths,
+            episode: result.episode,
+            step: result.step,
+            seed: result.seed,
+            height: height as u32,
+            width: width as u32,
+        };
+        ports.publish_truth(
+            header,
+            states.as_slice().expect("invariant: states are row-major"),
+        );
+        self.n_truths += 1;
+    }
+}

@@ -1,0 +1,51 @@
+//! Resets run here, on threads of their own, so that one client's burn-in never delays another's
+//! step.
+
+use super::completions::{CompletionSender, Completions, completions};
+use crate::simulator::ResetJob;
+use crate::world::{Episode, Rules};
+use rayon::ThreadPool;
+use rustix::io::Errno;
+use std::os::fd::BorrowedFd;
+use std::sync::Arc;
+
+/// The threads that reset worlds.
+pub struct Resets {
+    threads: ThreadPool,
+    rules: Arc<Rules>,
+    finished: Completions<(usize, Box<Episode>)>,
+    sender: CompletionSender<(usize, Box<Episode>)>,
+}
+
+impl Resets {
+    /// Threads without work yet.
+    ///
+    /// # Errors
+    /// If the system has no event descriptor left.
+    pub fn new(threads: ThreadPool, rules: Rules) -> Result<Self, Errno> {
+        let (sender, finished) = completions()?;
+        Ok(Self {
+            threads,
+            rules: Arc::new(rules),
+            finished,
+            sender,
+        })
+    }
+
+    pub fn start(&self, jobs: Vec<ResetJob>) {
+        for job in jobs {
+            let (rules, sender) = (self.rules.clone(), self.sender.clone());
+            self.threads.spawn(move || sender.send(job.run(&rules)));
+        }
+    }
+
+    /// The worlds that have been reset since the last call.
+    pub fn finished(&self) -> Vec<(usize, Box<Episode>)> {
+        self.finished.take()
+    }
+
+    /// Readable while a reset has finished.
+    pub fn descriptor(&self) -> BorrowedFd<'_> {
+        self.finished.descriptor()
+    }
+}

@@ -1,0 +1,209 @@
+//! The loop: receive, check the lease, step, answer, publish.
+
+use super::ports::ActiveStep;
+use super::state::Server;
+use crate::config::Checked;
+use crate::simulator::{Outcome, ServerStats};
+use anyhow::Result;
+use protocol::channels::ipc_error;
+use protocol::control::Reply;
+use protocol::message::Operation;
+use protocol::program::WatchedProcess;
+use protocol::responder::{ActiveControl, listener_id, wait_until_taken};
+use protocol::wait::sleep_until_event;
+use std::cell::Cell;
+use std::os::fd::BorrowedFd;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// How often an idle server checks for expired leases and new observers.
+const IDLE_TICK: Duration = Duration::from_millis(250);
+
+/// How often a busy server does: bounds the delay until it notices a client's death.
+const BUSY_TICK: Duration = Duration::from_millis(50);
+
+/// One round in this many takes a control request before a step.
+const CONTROL_FIRST: u64 = 64;
+
+/// How often a server publishes the next worlds for new observers.
+const NEW_OBSERVER_TICK: Duration = Duration::from_millis(5);
+
+/// Serves until `stop` is set, a client asks to shut down, or the process `exit_with` ends.
+///
+/// # Errors
+/// If the server cannot start, its channels fail, or the last snapshot cannot be written.
+pub fn serve(checked: Checked, stop: &Arc<AtomicBool>, exit_with: Option<i32>) -> Result<()> {
+    let mut server = Server::start(checked, exit_with)?;
+    let mut outcome = Ok(());
+    while outcome.is_ok() && !stop.load(Ordering::Relaxed) && !server.is_over {
+        outcome = server.run_once();
+    }
+    let n_steps = server.simulator.n_steps();
+    server.end()?;
+    outcome?;
+    tracing::info!(n_steps, "stopped");
+    Ok(())
+}
+
+/// What a round of the loop found.
+enum Found {
+    Step(ActiveStep),
+    Control(ActiveControl),
+    /// A wake-up without a request, a death or a finished reset.
+    Event,
+}
+
+impl Server {
+    /// Waits for something and handles it.
+    fn run_once(&mut self) -> Result<()> {
+        let woken = Cell::new(false);
+        let tick = if self.publications.has_new_observers() {
+            NEW_OBSERVER_TICK
+        } else {
+            IDLE_TICK
+        };
+        // Sometimes control comes first, so that endless steps cannot block it.
+        self.n_rounds = self.n_rounds.wrapping_add(1);
+        if self.n_rounds.is_multiple_of(CONTROL_FIRST)
+            && let Some(request) = self.ports.receive_control()
+        {
+            self.answer_control(Instant::now(), request);
+            return Ok(());
+        }
+        let found = self.waiter.wait(
+            tick,
+            || Ok(self.poll(&woken)),
+            |limit| {
+                woken.set(self.sleep(limit)?);
+                Ok::<_, anyhow::Error>(())
+            },
+        )?;
+        let now = Instant::now();
+        match found {
+            Some(Found::Step(request)) => self.answer_step(now, &request),
+            Some(Found::Control(request)) => self.answer_control(now, request),
+            Some(Found::Event) | None => self.check_everything(now)?,
+        }
+        if now - self.last_tick > BUSY_TICK {
+            self.check_everything(now)?;
+        }
+        Ok(())
+    }
+
+    fn poll(&self, woken: &Cell<bool>) -> Option<Found> {
+        if let Some(request) = self.ports.receive_step() {
+            return Some(Found::Step(request));
+        }
+        if let Some(request) = self.ports.receive_control() {
+            return Some(Found::Control(request));
+        }
+        woken.get().then_some(Found::Event)
+    }
+
+    /// Sleeps until a wake-up, a signal, a death or a finished reset; returns whether there was one.
+    fn sleep(&self, limit: Duration) -> Result<bool> {
+        let own = [
+            self.ports.descriptor(),
+            self.resets.descriptor(),
+            self.files.descriptor(),
+        ];
+        let exit_with = self.exit_with.iter().map(WatchedProcess::descriptor);
+        let others = exit_with.chain(self.clients.descriptors());
+        let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(others).collect();
+        let woken = sleep_until_event(&descriptors, limit).map_err(ipc_error("sleep"))?;
+        // Now, as wake-ups that are left end the next sleep at once.
+        self.ports.drain()?;
+        Ok(woken)
+    }
+
+    fn answer_step(&mut self, now: Instant, request: &ActiveStep) {
+        let client = self.clients.identify(request.header());
+        let header = *request.user_header();
+        let mut reply =
+            self.simulator
+                .step(now, client, &header, request.payload(), &mut self.payload);
+        reply.simulation_nanos = now.elapsed().as_nanos() as u64;
+        let listener = listener_id(header.listener_low, header.listener_high);
+        self.ports
+            .answers()
+            .send(request, reply, &self.payload, listener);
+        if header.operation == Operation::Step as u32 {
+            let worlds = self.simulator.worlds_of(&reply);
+            self.publish(worlds);
+            self.save_if_due();
+        }
+    }
+
+    fn answer_control(&mut self, now: Instant, request: ActiveControl) {
+        // The worlds of a holder that died a moment ago must be free.
+        self.forget_ended_clients();
+        let client = self.clients.identify(request.header());
+        let stats = ServerStats {
+            uptime: self.started.elapsed(),
+            steps_per_second: self.rate.per_second,
+            n_clients: self.ports.n_clients(),
+            n_observers: self.ports.observers().0,
+        };
+        let version = request.user_header().version;
+        match self
+            .simulator
+            .control(now, client, version, request.payload(), &stats)
+        {
+            Outcome::Answer(reply) => self.send_reply(&request, &reply),
+            Outcome::Pending(jobs, pending) => {
+                self.resets.start(jobs);
+                self.pending_replies.push((request, pending));
+                self.answer_pending(now);
+            }
+            Outcome::Changed(worlds, reply) => {
+                self.send_reply(&request, &reply);
+                self.publish(worlds);
+            }
+            Outcome::File(job, pending) => self.start_file(now, request, job, pending),
+            Outcome::Shutdown => {
+                self.send_reply(&request, &Reply::Done);
+                wait_until_taken(&[request]);
+                tracing::info!(client = client.pid, "a client asked to shut down");
+                self.is_over = true;
+            }
+        }
+    }
+
+    /// What no request asks for: ended clients, finished work, expired leases, new observers.
+    fn check_everything(&mut self, now: Instant) -> Result<()> {
+        self.last_tick = now;
+        self.cancel_abandoned(now);
+        self.forget_ended_clients();
+        self.take_resets(now);
+        self.take_files(now);
+        self.is_over |= self
+            .exit_with
+            .as_ref()
+            .is_some_and(WatchedProcess::has_ended);
+        for pid in self.simulator.expire(now) {
+            if let Some(n_unsaid) = self.expired_leases.pass(now) {
+                tracing::warn!(pid, n_unsaid, "a lease expired");
+            }
+        }
+        self.ports.warn_of_descriptors(now);
+        self.publications
+            .publish_to_new(&self.ports, &self.simulator);
+        self.rate.update(now, self.simulator.n_steps());
+        self.ports.check_entries()
+    }
+
+    fn forget_ended_clients(&mut self) {
+        for pid in self.clients.take_dead() {
+            let n_leases = self.simulator.end_of_process(pid);
+            tracing::info!(pid, n_leases, "a client ended");
+            self.cleaner.request();
+        }
+        let n_leases = self
+            .simulator
+            .end_of_connections(&self.ports.client_nodes());
+        if n_leases > 0 {
+            tracing::info!(n_leases, "a connection was closed without a release");
+        }
+    }
+}

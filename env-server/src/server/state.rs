@@ -1,0 +1,218 @@
+//! The state of a running server: how it starts, and how it ends.
+
+use super::autosave::{Autosave, FirstWorlds, first_worlds};
+use super::files::Files;
+use super::liveness::{Cleaner, Clients};
+use super::ports::Ports;
+use super::publications::Publications;
+use super::resets::Resets;
+use crate::config::Checked;
+use crate::simulator::{PendingFile, PendingReply, Simulator};
+use crate::throttle::Throttle;
+use anyhow::{Context, Result};
+use protocol::control::Reply;
+use protocol::message::Status;
+use protocol::program::WatchedProcess;
+use protocol::responder::ActiveControl;
+use protocol::wait::Waiter;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+use rayon::{ThreadPool, ThreadPoolBuilder};
+use std::collections::HashMap;
+use std::collections::hash_map::RandomState;
+use std::hash::BuildHasher;
+use std::ops::Range;
+use std::time::{Duration, Instant};
+
+/// How long a server that ends waits for its files.
+const LAST_FILES: Duration = Duration::from_secs(10);
+
+/// Over how long the step rate is measured.
+const RATE_WINDOW: Duration = Duration::from_secs(1);
+
+pub(super) struct Server {
+    pub(super) simulator: Simulator,
+    pub(super) ports: Ports,
+    pub(super) waiter: Waiter,
+    pub(super) clients: Clients,
+    pub(super) exit_with: Option<WatchedProcess>,
+    pub(super) cleaner: Cleaner,
+    pub(super) resets: Resets,
+    pub(super) pending_replies: Vec<(ActiveControl, PendingReply)>,
+    pub(super) files: Files,
+    /// Requests that wait for a file, by the number of its job.
+    pub(super) pending_files: HashMap<u64, (ActiveControl, PendingFile)>,
+    pub(super) autosave: Option<Autosave>,
+    pub(super) payload: Vec<u8>,
+    pub(super) publications: Publications,
+    pub(super) expired_leases: Throttle,
+    pub(super) rate: Rate,
+    pub(super) started: Instant,
+    pub(super) last_tick: Instant,
+    pub(super) n_rounds: u64,
+    pub(super) is_over: bool,
+}
+
+/// World steps a second over the last window.
+pub(super) struct Rate {
+    since: Instant,
+    n_steps: u64,
+    pub(super) per_second: f64,
+}
+
+impl Server {
+    pub(super) fn start(checked: Checked, exit_with: Option<i32>) -> Result<Self> {
+        let exit_with = exit_with.map(WatchedProcess::watch).transpose()?;
+        let ports = Ports::open(&checked)?;
+        let (instance, config) = (checked.instance.name().to_owned(), &checked.config);
+        tracing::info!(
+            instance,
+            pid = std::process::id(),
+            worlds = config.worlds,
+            seed = config.seed,
+            "serving"
+        );
+        if checked.model.reward().iter().all(|&reward| reward == 0.0) {
+            let model = checked.model.name();
+            tracing::warn!(
+                model,
+                "no state pays: every reward will be 0; give a state a `reward` in the model file"
+            );
+        }
+        let n_threads = config.threads;
+        let autosave = Autosave::new(&checked)?;
+        let settings = checked.clone();
+        let (mut simulator, mut resets_due) =
+            Simulator::new(checked, threads(n_threads)?, token_source())?;
+        if let Some(FirstWorlds { path, worlds }) = first_worlds(&settings, simulator.spec())? {
+            tracing::info!(file = %path.display(), "restored");
+            let worlds = worlds.into_iter().enumerate();
+            resets_due = worlds
+                .filter_map(|(world, restored)| simulator.start_with(world, restored))
+                .collect();
+        }
+        let spec = simulator.spec().clone();
+        let resets = Resets::new(threads(n_threads)?, spec.rules.clone());
+        let resets = resets.context("start the threads for resets")?;
+        let files = Files::start(spec).context("start the thread for files")?;
+        resets.start(resets_due);
+        let now = Instant::now();
+        Ok(Self {
+            simulator,
+            ports,
+            waiter: Waiter::default(),
+            clients: Clients::default(),
+            exit_with,
+            cleaner: Cleaner::start(),
+            resets,
+            pending_replies: Vec::new(),
+            files,
+            pending_files: HashMap::new(),
+            autosave,
+            payload: Vec::new(),
+            publications: Publications::default(),
+            expired_leases: Throttle::default(),
+            rate: Rate {
+                since: now,
+                n_steps: 0,
+                per_second: 0.0,
+            },
+            started: now,
+            last_tick: now,
+            n_rounds: 0,
+            is_over: false,
+        })
+    }
+
+    pub(super) fn send_reply(&mut self, request: &ActiveControl, reply: &Reply) {
+        if reply.status() != Status::Ok {
+            tracing::debug!(status = ?reply.status(), "refused a control request");
+        }
+        self.ports
+            .answers()
+            .send_json(request, reply.status(), reply);
+    }
+
+    pub(super) fn publish(&mut self, worlds: Range<usize>) {
+        self.publications
+            .publish(&self.ports, &self.simulator, worlds);
+    }
+
+    pub(super) fn save_if_due(&mut self) {
+        let n_steps = self.simulator.n_steps();
+        if self
+            .autosave
+            .as_ref()
+            .is_some_and(|autosave| autosave.is_due(n_steps))
+        {
+            self.save(false);
+        }
+    }
+
+    fn save(&mut self, is_last: bool) {
+        let Some(autosave) = &mut self.autosave else {
+            return;
+        };
+        let n_steps = self.simulator.n_steps();
+        match self.simulator.snapshot(self.simulator.worlds()) {
+            Ok(bytes) => autosave.start(n_steps, bytes, is_last, &mut self.files),
+            Err(error) => {
+                autosave.skip(n_steps);
+                autosave.warn(&error);
+            }
+        }
+    }
+
+    /// Writes a last snapshot and closes the channels; then others may take the instance.
+    ///
+    /// # Errors
+    /// If the last snapshot could not be written.
+    pub(super) fn end(mut self) -> Result<()> {
+        self.save(true);
+        let (finished, is_late) = match self.files.finish(LAST_FILES) {
+            Ok(finished) => (finished, false),
+            Err(finished) => (finished, true),
+        };
+        if is_late {
+            tracing::warn!("files were not written within {LAST_FILES:?}");
+        }
+        self.ports.close();
+        let failed = finished
+            .into_iter()
+            .filter_map(|(_, outcome)| outcome.err());
+        match failed.last() {
+            Some(error) if self.autosave.is_some() => Err(error.into()),
+            _ => Ok(()),
+        }
+    }
+}
+
+impl Rate {
+    pub(super) fn update(&mut self, now: Instant, n_steps: u64) {
+        let elapsed = now - self.since;
+        if elapsed >= RATE_WINDOW {
+            let per_second = (n_steps - self.n_steps) as f64 / elapsed.as_secs_f64();
+            *self = Self {
+                since: now,
+                n_steps,
+                per_second,
+            };
+        }
+    }
+}
+
+fn threads(n_threads: usize) -> Result<ThreadPool> {
+    let pool = ThreadPoolBuilder::new().num_threads(n_threads).build();
+    pool.with_context(|| format!("start {n_threads} threads"))
+}
+
+/// Lease tokens that nobody can guess, below 2^53 so that every JSON reader holds them; never 0.
+fn token_source() -> Box<dyn FnMut() -> u64> {
+    let entropy = RandomState::new();
+    let mut key = [0; 32];
+    for (index, bytes) in key.chunks_mut(8).enumerate() {
+        bytes.copy_from_slice(&entropy.hash_one(index).to_le_bytes());
+    }
+    let mut rng = ChaCha8Rng::from_seed(key);
+    Box::new(move || (rng.next_u64() >> 11).max(1))
+}

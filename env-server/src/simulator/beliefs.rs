@@ -1,0 +1,106 @@
+//! Beliefs that agents leave for the next agents: bytes that the server does not interpret.
+
+use protocol::control::{BeliefInfo, MAX_BELIEF_PART};
+use protocol::message::StepResult;
+
+/// Most bytes of a belief per cell of the grid: sixteen 32-bit numbers.
+const BYTES_PER_CELL: u64 = 64;
+
+/// The beliefs left, one per world at most.
+#[derive(Debug)]
+pub struct Beliefs {
+    n_cells: usize,
+    left: Vec<Option<StoredBelief>>,
+}
+
+#[derive(Debug)]
+struct StoredBelief {
+    info: BeliefInfo,
+    bytes: Vec<u8>,
+}
+
+/// A part of a belief that an agent leaves.
+#[derive(Debug)]
+pub struct BeliefPart<'a> {
+    /// Tells other agents what the bytes are.
+    pub kind: &'a str,
+    /// Where the part begins.
+    pub offset: u64,
+    /// Length of the whole.
+    pub length: u64,
+    pub bytes: &'a [u8],
+}
+
+impl Beliefs {
+    pub fn new(n_worlds: usize, n_cells: usize) -> Self {
+        Self {
+            n_cells,
+            left: (0..n_worlds).map(|_| None).collect(),
+        }
+    }
+
+    /// Adds the next part of a belief about a world at the step of a result; the first starts a new one.
+    ///
+    /// # Errors
+    /// If it is too long or does not follow the part before; the error says what was expected.
+    pub fn add(
+        &mut self,
+        world: usize,
+        at: &StepResult,
+        part: &BeliefPart<'_>,
+    ) -> Result<(), String> {
+        let longest = BYTES_PER_CELL * self.n_cells as u64;
+        if part.length > longest {
+            let got = part.length;
+            return Err(format!(
+                "length: expected at most {longest} bytes, got {got}"
+            ));
+        }
+        if part.bytes.len() > MAX_BELIEF_PART {
+            let got = part.bytes.len();
+            return Err(format!(
+                "data: expected at most {MAX_BELIEF_PART} bytes, got {got}"
+            ));
+        }
+        let info = BeliefInfo {
+            kind: part.kind.into(),
+            seed: at.seed,
+            episode: at.episode,
+            step: at.step,
+            length: part.length,
+        };
+        let left = &mut self.left[world];
+        let so_far = left
+            .as_ref()
+            .filter(|left| left.info == info && part.offset > 0);
+        let expected = so_far.map_or(0, |left| left.bytes.len() as u64);
+        let end = part.offset.saturating_add(part.bytes.len() as u64);
+        if part.offset != expected || end > part.length {
+            let (offset, length) = (part.offset, part.length);
+            return Err(format!(
+                "offset: expected the next bytes, from {expected}, within {length}, got {offset} to {end}"
+            ));
+        }
+        if part.offset == 0 {
+            let bytes = Vec::with_capacity(part.length as usize);
+            *left = Some(StoredBelief { info, bytes });
+        }
+        if let Some(left) = left {
+            left.bytes.extend_from_slice(part.bytes);
+        }
+        Ok(())
+    }
+
+    /// The whole belief about a world at the step of a result.
+    pub fn of(&self, world: usize, at: &StepResult) -> Option<(&BeliefInfo, &[u8])> {
+        let StoredBelief { info, bytes } = self.left[world].as_ref()?;
+        let is_there = (info.seed, info.episode, info.step) == (at.seed, at.episode, at.step);
+        let is_whole = bytes.len() as u64 == info.length;
+        (is_there && is_whole).then_some((info, bytes))
+    }
+
+    /// Drops the belief about a world that was replaced.
+    pub fn forget(&mut self, world: usize) {
+        self.left[world] = None;
+    }
+}

@@ -1,0 +1,212 @@
+//! Leases that are given, kept and lost.
+
+use super::lease::{Claim, ClientId, Leases, Refusal};
+use protocol::message::Status;
+use std::collections::HashSet;
+use std::ops::Range;
+use std::time::{Duration, Instant};
+
+const TTL: Duration = Duration::from_secs(10);
+
+fn client(pid: u32) -> ClientId {
+    ClientId {
+        node: u128::from(pid),
+        pid,
+    }
+}
+
+fn claim(pid: u32, worlds: Range<usize>, takeover: bool) -> Claim {
+    Claim {
+        client: client(pid),
+        worlds,
+        takeover,
+        time_to_live: TTL,
+    }
+}
+
+#[test]
+fn a_world_has_one_holder() {
+    let (mut leases, now) = (Leases::new(4), Instant::now());
+    leases
+        .acquire(now, claim(1, 0..2, false), 11)
+        .expect("free");
+    let refused = leases
+        .acquire(now, claim(2, 1..3, false), 12)
+        .expect_err("held");
+    assert_eq!(refused, Refusal::new(Status::Busy, 1));
+    assert!(leases.holder(2).is_none(), "a refused claim takes nothing");
+    leases
+        .acquire(now, claim(2, 2..4, false), 13)
+        .expect("free");
+    assert_eq!(leases.use_lease(now, 11, client(1), &(0..2)), Ok(()));
+    assert_eq!(
+        leases.use_lease(now, 13, client(2), &(1..3)),
+        Err(Refusal::new(Status::NoLease, 1))
+    );
+}
+
+#[test]
+fn a_takeover_costs_the_holder_the_worlds_taken() {
+    let (mut leases, now) = (Leases::new(2), Instant::now());
+    leases
+        .acquire(now, claim(1, 0..2, false), 11)
+        .expect("free");
+    leases
+        .acquire(now, claim(2, 1..2, true), 12)
+        .expect("takeover");
+    assert_eq!(leases.use_lease(now, 11, client(1), &(0..1)), Ok(()));
+    assert_eq!(
+        leases.use_lease(now, 11, client(1), &(0..2)),
+        Err(Refusal::new(Status::LeaseLost, 2))
+    );
+    leases
+        .acquire(now, claim(3, 0..1, true), 13)
+        .expect("takeover of the rest");
+    assert_eq!(
+        leases.renew(now, 11, client(1)).map(|_| ()),
+        Err(Refusal::new(Status::LeaseLost, 3))
+    );
+}
+
+#[test]
+fn use_extends_a_lease_and_idleness_ends_it() {
+    let (mut leases, now) = (Leases::new(1), Instant::now());
+    leases
+        .acquire(now, claim(1, 0..1, false), 11)
+        .expect("free");
+    let almost = now + TTL - Duration::from_millis(1);
+    assert_eq!(leases.use_lease(almost, 11, client(1), &(0..1)), Ok(()));
+    assert!(leases.expire(now + TTL).is_empty());
+    let late = almost + TTL;
+    assert_eq!(
+        leases.use_lease(late, 11, client(1), &(0..1)),
+        Err(Refusal::new(Status::LeaseLost, 0))
+    );
+    assert_eq!(leases.expire(late).len(), 1);
+    assert_eq!(
+        leases.use_lease(late, 11, client(1), &(0..1)),
+        Err(Refusal::new(Status::LeaseLost, 0))
+    );
+    leases
+        .acquire(late, claim(2, 0..1, false), 12)
+        .expect("free again");
+}
+
+#[test]
+fn a_lease_does_not_expire_while_its_client_waits() {
+    let (mut leases, now) = (Leases::new(1), Instant::now());
+    leases
+        .acquire(now, claim(1, 0..1, false), 11)
+        .expect("free");
+    leases.begin_wait(11);
+    let late = now + 9 * TTL;
+    assert!(leases.expire(late).is_empty());
+    leases.end_wait(late, 11);
+    assert_eq!(leases.use_lease(late, 11, client(1), &(0..1)), Ok(()));
+    assert_eq!(leases.expire(late + TTL).len(), 1);
+}
+
+#[test]
+fn a_lost_lease_names_who_holds_its_own_worlds_now() {
+    let (mut leases, now) = (Leases::new(2), Instant::now());
+    leases
+        .acquire(now, claim(1, 0..1, false), 11)
+        .expect("free");
+    leases
+        .acquire(now, claim(2, 1..2, false), 12)
+        .expect("free");
+    leases
+        .acquire(now, claim(3, 1..2, true), 13)
+        .expect("takeover");
+    assert_eq!(
+        leases.renew(now, 12, client(2)).map(|_| ()),
+        Err(Refusal::new(Status::LeaseLost, 3))
+    );
+}
+
+#[test]
+fn a_lost_lease_names_who_took_it_over_also_when_that_client_has_left() {
+    let (mut leases, now) = (Leases::new(3), Instant::now());
+    let lost = |leases: &mut Leases, worlds: Range<usize>| {
+        let refusal = leases.use_lease(now, 11, client(1), &worlds);
+        refusal.expect_err("lost").detail
+    };
+    leases
+        .acquire(now, claim(1, 0..3, false), 11)
+        .expect("free");
+    leases
+        .acquire(now, claim(2, 0..1, true), 12)
+        .expect("takeover");
+    leases.release(now, 12, client(2)).expect("held");
+    assert_eq!(lost(&mut leases, 0..1), 2);
+    assert_eq!(leases.use_lease(now, 11, client(1), &(1..3)), Ok(()));
+    leases
+        .acquire(now, claim(3, 1..3, true), 13)
+        .expect("takeover of the rest");
+    leases.release(now, 13, client(3)).expect("held");
+    assert_eq!(lost(&mut leases, 1..2), 3);
+    leases
+        .acquire(now, claim(4, 1..2, false), 14)
+        .expect("free");
+    assert_eq!(lost(&mut leases, 1..2), 3, "not who came later");
+}
+
+#[test]
+fn a_stolen_token_is_worth_nothing() {
+    let (mut leases, now) = (Leases::new(1), Instant::now());
+    leases
+        .acquire(now, claim(1, 0..1, false), 11)
+        .expect("free");
+    assert_eq!(
+        leases.use_lease(now, 11, client(2), &(0..1)),
+        Err(Refusal::new(Status::NoLease, 0))
+    );
+    assert_eq!(
+        leases.release(now, 11, client(2)),
+        Err(Refusal::new(Status::NoLease, 0))
+    );
+    assert_eq!(leases.release(now, 11, client(1)), Ok(()));
+    assert!(leases.holder(0).is_none());
+}
+
+#[test]
+fn a_closed_connection_holds_nothing() {
+    let (mut leases, now) = (Leases::new(2), Instant::now());
+    leases
+        .acquire(now, claim(1, 0..1, false), 11)
+        .expect("free");
+    leases
+        .acquire(now, claim(2, 1..2, false), 12)
+        .expect("free");
+    let open = HashSet::from([2]);
+    assert_eq!(leases.end_of_nodes_except(&open).len(), 1);
+    assert!(leases.holder(0).is_none() && leases.holder(1).is_some());
+}
+
+#[test]
+fn a_dead_process_holds_nothing() {
+    let (mut leases, now) = (Leases::new(2), Instant::now());
+    leases
+        .acquire(now, claim(1, 0..1, false), 11)
+        .expect("free");
+    leases
+        .acquire(now, claim(2, 1..2, false), 12)
+        .expect("free");
+    assert_eq!(leases.end_of_process(1).len(), 1);
+    assert!(leases.holder(0).is_none() && leases.holder(1).is_some());
+}
+
+#[test]
+fn worlds_outside_the_server_are_refused() {
+    let (mut leases, now) = (Leases::new(2), Instant::now());
+    #[expect(
+        clippy::reversed_empty_ranges,
+        reason = "what a hostile client may send"
+    )]
+    for worlds in [0..3, 2..2, 5..7, 1..0] {
+        let refused = leases
+            .acquire(now, claim(1, worlds, true), 11)
+            .expect_err("no such world");
+        assert_eq!(refused, Refusal::new(Status::NoSuchWorld, 2));
+    }
+}

@@ -1,0 +1,86 @@
+//! Work on snapshot files, for a thread that may wait for a disk.
+
+use super::error::SnapshotError;
+use super::file::{Durability, FileError, read, refused, write};
+use super::folder::Folder;
+use super::format::SnapshotWorld;
+use super::settings::WorldSpec;
+use crate::world::Episode;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+/// What to do with a file.
+#[derive(Debug)]
+pub enum Job {
+    /// Write a snapshot.
+    Save { path: PathBuf, bytes: Vec<u8> },
+    /// Write the next of the server's own snapshots.
+    Autosave {
+        folder: Folder,
+        durability: Durability,
+        /// How many files to keep.
+        keep: usize,
+        /// Another one to keep.
+        also_keep: Option<PathBuf>,
+        bytes: Vec<u8>,
+    },
+    /// Read worlds of a snapshot.
+    Load { path: PathBuf, worlds: Range<usize> },
+}
+
+/// What came of a job.
+pub enum Done {
+    /// A file was written.
+    Saved { path: PathBuf, n_bytes: usize },
+    /// Worlds were read.
+    Loaded(Vec<SnapshotWorld<Box<Episode>>>),
+}
+
+impl Job {
+    /// Reads or writes the file.
+    ///
+    /// # Errors
+    /// If the system refuses, or the file does not fit.
+    pub fn run(self, spec: &WorldSpec) -> Result<Done, FileError> {
+        match self {
+            Self::Save { path, bytes } => {
+                write(&path, &bytes, Durability::PowerLoss)?;
+                let n_bytes = bytes.len();
+                Ok(Done::Saved { path, n_bytes })
+            }
+            Self::Autosave {
+                folder,
+                durability,
+                keep,
+                also_keep,
+                bytes,
+            } => {
+                let path = folder.save(&bytes, durability, keep, also_keep.as_deref())?;
+                let n_bytes = bytes.len();
+                Ok(Done::Saved { path, n_bytes })
+            }
+            Self::Load { path, worlds } => Ok(Done::Loaded(load(spec, &path, Some(worlds))?)),
+        }
+    }
+}
+
+/// Worlds of a file; `None`: all.
+///
+/// # Errors
+/// If the file cannot be read, has too few worlds, or does not fit.
+pub fn load(
+    spec: &WorldSpec,
+    path: &Path,
+    worlds: Option<Range<usize>>,
+) -> Result<Vec<SnapshotWorld<Box<Episode>>>, FileError> {
+    let mut snapshot = read(path)?;
+    if let Some(worlds) = worlds {
+        let got = snapshot.worlds.len();
+        if worlds.end > got {
+            let expected = format!("at least {}", worlds.end);
+            return Err(refused(path, SnapshotError::n_worlds(expected, got)));
+        }
+        snapshot.worlds = snapshot.worlds.drain(worlds).collect();
+    }
+    snapshot.restore(spec).map_err(|error| refused(path, error))
+}

@@ -1,0 +1,100 @@
+//! The settings that a server's worlds depend on: a snapshot fits a server with the same ones.
+
+use super::error::SnapshotError;
+use crate::config::Checked;
+use crate::world::Rules;
+use bincode::{Decode, Encode};
+use protocol::model::ModelError;
+use std::fmt::Display;
+
+/// The settings of a server that its worlds depend on.
+#[derive(Debug, Clone, PartialEq, Eq, Encode, Decode)]
+pub struct Settings {
+    /// The model file as TOML.
+    pub model: String,
+    /// Every other setting by name.
+    pub others: Vec<(String, String)>,
+}
+
+/// What the worlds of a server must fit.
+#[derive(Debug, Clone)]
+pub struct WorldSpec {
+    pub settings: Settings,
+    pub rules: Rules,
+}
+
+impl WorldSpec {
+    /// Those of a server.
+    ///
+    /// # Errors
+    /// If the model does not fit the grid.
+    pub fn of(checked: &Checked) -> Result<Self, ModelError> {
+        let Checked {
+            config,
+            model,
+            shape,
+            ..
+        } = checked;
+        let mut rules = Rules::new(
+            model,
+            *shape,
+            config.burn_in,
+            config.max_steps,
+            config.start,
+        )?;
+        (rules.history, rules.n_moves) = (config.history as usize, config.moves);
+        let settings = Settings::of(checked);
+        Ok(Self { settings, rules })
+    }
+}
+
+impl Settings {
+    /// The settings of a server.
+    pub fn of(checked: &Checked) -> Self {
+        let config = &checked.config;
+        let model = toml::to_string(checked.model.file());
+        let text = |value: &dyn Display| value.to_string();
+        let others: [(&str, String); 7] = [
+            ("height", text(&checked.shape.height())),
+            ("width", text(&checked.shape.width())),
+            ("moves", text(&config.moves)),
+            ("burn_in", text(&config.burn_in)),
+            ("max_steps", text(&config.max_steps)),
+            ("coverage", format!("{:?}", config.coverage).to_lowercase()),
+            ("start", format!("{:?}", config.start).to_lowercase()),
+        ];
+        Self {
+            model: model.expect("invariant: a model was read from TOML"),
+            others: others.map(|(name, value)| (name.into(), value)).to_vec(),
+        }
+    }
+
+    /// Checks that these, of a file, are a server's own.
+    ///
+    /// # Errors
+    /// If one differs; the error names the first that does.
+    pub fn check(&self, server: &Self) -> Result<(), SnapshotError> {
+        let other = |setting: &str, expected: &str, got: &str| {
+            let problem = format!("{setting}: expected {expected} as this server's, got {got}");
+            SnapshotError::Unfit(problem)
+        };
+        if self.model != server.model {
+            let pairs = server.model.lines().zip(self.model.lines());
+            let line = pairs.into_iter().find(|(expected, got)| expected != got);
+            let (expected, got) = line.unwrap_or(("its model", "a longer or shorter one"));
+            return Err(other(
+                "model",
+                &format!("{expected:?}"),
+                &format!("{got:?}"),
+            ));
+        }
+        for (index, (setting, expected)) in server.others.iter().enumerate() {
+            let got = self.others.get(index).filter(|(name, _)| name == setting);
+            let got = got.map_or("nothing", |(_, value)| value);
+            if got != expected {
+                return Err(other(setting, expected, got));
+            }
+        }
+        Ok(())
+    }
+}

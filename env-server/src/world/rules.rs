@@ -1,0 +1,88 @@
+//! What all episodes of a server share: the model, the grid, and the settings that decide a world's future.
+
+use super::sensor::Sensor;
+use protocol::model::ModelError;
+use protocol::randomness::{Purpose, stream};
+use protocol::{Cell, Dynamics, Model, Shape};
+use rand::RngExt;
+use serde::{Deserialize, Serialize};
+
+/// Where the robot stands after a reset.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Start {
+    /// The upper left cell, (0, 0).
+    Corner,
+    /// The middle.
+    Centre,
+    /// A cell drawn from the seed.
+    Random,
+    /// This cell.
+    #[serde(untagged)]
+    At(Cell),
+}
+
+/// What all episodes of a server share.
+#[derive(Debug, Clone)]
+pub struct Rules {
+    pub shape: Shape,
+    /// Reward for each distinct visited cell, by state.
+    pub reward: Vec<f64>,
+    /// The state that pays most.
+    pub target_state: u8,
+    /// Number of states S.
+    pub n_states: usize,
+    /// Number of observations O.
+    pub n_observations: usize,
+    /// Steps simulated before k = 0.
+    pub burn_in: u64,
+    /// Episode length; 0: never truncated.
+    pub max_steps: u64,
+    pub start: Start,
+    /// Steps whose frames are kept.
+    pub history: usize,
+    /// Moves in a path.
+    pub n_moves: usize,
+    pub(super) sensor: Sensor,
+    pub(super) dynamics: Dynamics,
+}
+
+impl Rules {
+    /// The rules under a model; `history` and `n_moves` are 0.
+    ///
+    /// # Errors
+    /// If the model does not fit the grid.
+    pub fn new(
+        model: &Model,
+        shape: Shape,
+        burn_in: u64,
+        max_steps: u64,
+        start: Start,
+    ) -> Result<Self, ModelError> {
+        Ok(Self {
+            shape,
+            reward: model.reward().to_vec(),
+            target_state: model.target_state() as u8,
+            n_states: model.n_states(),
+            n_observations: model.n_observations(),
+            burn_in,
+            max_steps,
+            start,
+            history: 0,
+            n_moves: 0,
+            sensor: Sensor::new(model),
+            dynamics: Dynamics::new(model, shape)?,
+        })
+    }
+
+    pub(super) fn start_cell(&self, seed: u64) -> Cell {
+        match self.start {
+            Start::Corner => Cell { row: 0, col: 0 },
+            Start::Centre => self.shape.centre(),
+            Start::Random => self
+                .shape
+                .cell(stream(seed, Purpose::Start, 0).random_range(0..self.shape.n_cells())),
+            Start::At(cell) => cell,
+        }
+    }
+}

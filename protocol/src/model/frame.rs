@@ -1,0 +1,169 @@
+//! A [`Frame`]: what a robot saw in one step, the masked observation `y ⊙ m` of paper eq. 11.
+
+use super::grid::{Grid, Shape};
+use ndarray::ArrayView2;
+use thiserror::Error;
+
+/// The value of a cell that was not observed.
+pub const UNOBSERVED: u8 = 255;
+
+/// What part of the grid a frame claims to show.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[repr(u32)]
+pub enum Coverage {
+    /// Nothing: the frame after a reset.
+    Empty = 0,
+    /// The cells on the robot's path (paper section III.C).
+    Path = 1,
+    /// Every cell (paper sections III.A and III.B).
+    Full = 2,
+}
+
+/// One observed value per cell, [`UNOBSERVED`] where the robot did not look.
+///
+/// Values are below the model's number of observations; decoding checks it, so that a `Frame` may
+/// index a likelihood table.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Frame {
+    values: Grid<u8>,
+}
+
+/// Bytes that are no frame of the expected grid.
+#[derive(Debug, Error, PartialEq, Eq)]
+pub enum FrameError {
+    /// Wrong number of bytes.
+    #[error("frame: expected {expected} bytes for a {shape} grid, got {got}")]
+    Length {
+        /// Bytes the grid needs.
+        expected: usize,
+        /// Bytes received.
+        got: usize,
+        /// The grid.
+        shape: Shape,
+    },
+    /// A value that is neither an observation nor [`UNOBSERVED`].
+    #[error(
+        "frame: cell {index}: expected an observation below {n_observations} or 255, got {value}"
+    )]
+    Value {
+        /// Row-major cell index.
+        index: usize,
+        /// The byte found there.
+        value: u8,
+        /// Number of observations O of the model.
+        n_observations: usize,
+    },
+}
+
+impl Frame {
+    /// A frame in which nothing was observed.
+    pub fn empty(shape: Shape) -> Self {
+        Self {
+            values: Grid::from_elem(shape.dim(), UNOBSERVED),
+        }
+    }
+
+    /// Decodes `H * W` row-major bytes, whole or not at all.
+    ///
+    /// # Errors
+    /// [`FrameError`] for a wrong length or a value that is no observation.
+    pub fn from_bytes(
+        shape: Shape,
+        n_observations: usize,
+        bytes: &[u8],
+    ) -> Result<Self, FrameError> {
+        if bytes.len() != shape.n_cells() {
+            let (expected, got) = (shape.n_cells(), bytes.len());
+            return Err(FrameError::Length {
+                expected,
+                got,
+                shape,
+            });
+        }
+        let wrong = |&value: &u8| value != UNOBSERVED && usize::from(value) >= n_observations;
+        if bytes.iter().any(wrong) {
+            let index = bytes
+                .iter()
+                .position(wrong)
+                .expect("invariant: any() found one");
+            return Err(FrameError::Value {
+                index,
+                value: bytes[index],
+                n_observations,
+            });
+        }
+        let values = Grid::from_shape_vec(shape.dim(), bytes.to_vec());
+        Ok(Self {
+            values: values.expect("invariant: length checked above"),
+        })
+    }
+
+    /// The values, shape `[H, W]`.
+    pub fn values(&self) -> ArrayView2<'_, u8> {
+        self.values.view()
+    }
+
+    /// The values as `H * W` row-major bytes.
+    pub fn as_bytes(&self) -> &[u8] {
+        self.values
+            .as_slice()
+            .expect("invariant: frames are row-major")
+    }
+
+    /// Observed cells in row-major order: `(cell index, value)`.
+    pub fn observed(&self) -> impl Iterator<Item = (usize, u8)> + '_ {
+        let cells = self.as_bytes().iter().copied().enumerate();
+        cells.filter(|&(_, value)| value != UNOBSERVED)
+    }
+
+    /// Forgets every observation.
+    pub fn clear(&mut self) {
+        self.values.fill(UNOBSERVED);
+    }
+
+    /// Records one observation; `value` must be below the model's number of observations.
+    pub fn observe(&mut self, index: usize, value: u8) {
+        debug_assert_ne!(value, UNOBSERVED);
+        self.values
+            .as_slice_mut()
+            .expect("invariant: frames are row-major")[index] = value;
+    }
+}
+
+impl TryFrom<u32> for Coverage {
+    type Error = u32;
+
+    fn try_from(value: u32) -> Result<Self, u32> {
+        match value {
+            0 => Ok(Self::Empty),
+            1 => Ok(Self::Path),
+            2 => Ok(Self::Full),
+            other => Err(other),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_frame_is_accepted_whole_or_rejected_whole() {
+        let shape = Shape::new(2, 2).expect("test shape");
+        let frame = Frame::from_bytes(shape, 3, &[0, 255, 2, 255]).expect("valid");
+        assert_eq!(frame.observed().collect::<Vec<_>>(), [(0, 0), (2, 2)]);
+        assert_eq!(
+            Frame::from_bytes(shape, 3, &[0, 3, 2, 255]),
+            Err(FrameError::Value {
+                index: 1,
+                value: 3,
+                n_observations: 3
+            })
+        );
+        assert!(matches!(
+            Frame::from_bytes(shape, 3, &[0; 3]),
+            Err(FrameError::Length { .. })
+        ));
+    }
+}

@@ -1,0 +1,97 @@
+//! The vectorised part of [`super::dynamics`]: work on [`LANES`] cells at once.
+//!
+//! Plain loops over arrays, inlined so that LLVM compiles them for their caller's vectors.
+
+use super::mixture::ESCAPED;
+use super::randomness::split_mix;
+
+/// Cells decided at once by the first byte, and searched at once for undecided ones.
+pub(crate) const LANES: usize = 64;
+
+/// The byte values that stand for one tap.
+#[derive(Debug)]
+pub(crate) struct FastTap {
+    offset: usize,
+    /// The last of them (the first follows on the tap before), in every lane.
+    last: [u8; LANES],
+}
+
+/// The taps that bytes stand for, with the last byte value of each.
+pub(crate) fn fast_taps(counts: &[usize], offsets: &[usize]) -> Vec<FastTap> {
+    let mut end = 0;
+    let mut taps = Vec::new();
+    for (&count, &offset) in counts.iter().zip(offsets) {
+        end += count;
+        if count > 0 {
+            let last = u8::try_from(end - 1).expect("invariant: fast probabilities sum to <= 1");
+            taps.push(FastTap {
+                offset,
+                last: [last; LANES],
+            });
+        }
+    }
+    taps
+}
+
+/// Words `first..` of the SplitMix64 generator of a key; `bytes` are whole words.
+#[inline(always)]
+pub(crate) fn fill(bytes: &mut [u8], key: u64, first: usize) {
+    let (words, _) = bytes.as_chunks_mut();
+    for (index, word) in (first..).zip(words) {
+        *word = split_mix(key, index as u64).to_le_bytes();
+    }
+}
+
+/// Replaces each byte by the parent under the tap that it stands for, or by [`ESCAPED`].
+#[inline(always)]
+pub(crate) fn blend(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
+    let mut states = [ESCAPED; LANES];
+    // From the last tap back, so that each overwrites the lanes of the taps after it.
+    for tap in fast.iter().rev() {
+        let parent: &[u8; LANES] = parents[tap.offset..]
+            .first_chunk()
+            .expect("invariant: a whole chunk of places is under every tap");
+        for lane in 0..LANES {
+            // Arithmetic where an `if` would do: LLVM vectorises this one.
+            let chosen = u8::from(lanes[lane] <= tap.last[lane]).wrapping_neg();
+            states[lane] ^= (states[lane] ^ parent[lane]) & chosen;
+        }
+    }
+    *lanes = states;
+}
+
+/// The high bit of every lane, that of lane `8 w + b` at position `8 b + w`: an order that takes one
+/// shift a word, with no multiplication to gather its bits.
+#[inline]
+pub(crate) fn high_bits(lanes: &[u8; LANES]) -> u64 {
+    let (words, _) = lanes.as_chunks();
+    let high = |word| u64::from_le_bytes(word) >> 7 & 0x0101_0101_0101_0101;
+    let bits = words
+        .iter()
+        .enumerate()
+        .map(|(index, word)| high(*word) << index);
+    bits.fold(0, |all, bits| all | bits)
+}
+
+/// The lane of a bit's position in [`high_bits`], and the position of a lane's bit.
+#[inline]
+pub(crate) fn transposed(at: u32) -> u32 {
+    at % 8 * 8 + at / 8
+}
+
+/// Writes `first` plus the lane of each bit of [`high_bits`] that is set; what follows in `to` is lost.
+///
+/// Eight at a time, needed or not, as in simdjson's `flatten_bits`: a loop over the bits alone would
+/// mispredict its end in most chunks.
+#[inline]
+pub(crate) fn list_lanes(mut bits: u64, first: u32, to: &mut [u32; LANES]) {
+    for eight in to.as_chunks_mut::<8>().0 {
+        for lane in eight {
+            *lane = first + transposed(bits.trailing_zeros() % 64);
+            bits &= bits.wrapping_sub(1);
+        }
+        if bits == 0 {
+            return;
+        }
+    }
+}

@@ -1,0 +1,22 @@
+//! The hidden Markov model of the paper: its parameters, its mathematics, and what a robot does and sees.
+//!
+//! Nothing here knows the wire. [`grid`] is what every other file indexes; [`dynamics`] draws hidden states,
+//! [`transition`] applies the same operator to beliefs; [`path`] and [`frame`] are a robot's moves and observations.
+
+mod check;
+pub mod dynamics;
+pub mod file;
+pub mod frame;
+pub mod grid;
+mod lanes;
+mod mixture;
+mod parameters;
+pub mod path;
+pub mod randomness;
+pub mod transition;
+
+pub use file::{
+    KernelEntry, MAX_KERNEL_SIDE, MAX_VALUES, ModelError, ModelFile, ObservationEntry, StateEntry,
+    parse_color,
+};
+pub use parameters::Model;

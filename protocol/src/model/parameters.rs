@@ -1,0 +1,372 @@
+//! The parameters of the hidden Markov model on a grid, for simulators and filters.
+//!
+//! Paper section II: states with the transition kernel `w` and bias `b` of eq. 2, and the observation
+//! matrix `O` of eq. 1. [`super::file`] is the file format. [`super::transition`] applies the parameters to
+//! beliefs, [`super::dynamics`] to realised states.
+
+use super::check::Checker;
+use super::file::{LEAST_SHARE, ModelError, ModelFile};
+use super::grid::{Cell, Shape};
+use ndarray::{Array1, Array2, Array4, Axis};
+
+/// The built-in models by name.
+const BUILT_IN: [(&str, &str); 3] = [
+    (
+        "wildfire",
+        include_str!("../../../config/models/wildfire.toml"),
+    ),
+    (
+        "wildfire-sparse",
+        include_str!("../../../config/models/wildfire-sparse.toml"),
+    ),
+    (
+        "wildfire-latent",
+        include_str!("../../../config/models/wildfire-latent.toml"),
+    ),
+];
+
+/// A checked model: every model that exists can be simulated and filtered.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Model {
+    file: ModelFile,
+    kernel: Array4<f64>,
+    bias: Array1<f64>,
+    likelihood: Array2<f64>,
+    initial: Array1<f64>,
+    reward: Array1<f64>,
+}
+
+impl Model {
+    /// The built-in wildfire model (`config/models/wildfire.toml`).
+    pub fn wildfire() -> Self {
+        Self::built_in("wildfire").expect("invariant: the wildfire is built in")
+    }
+
+    /// The built-in model of a name: `wildfire`, `wildfire-sparse` or `wildfire-latent`
+    /// (`config/models`).
+    pub fn built_in(name: &str) -> Option<Self> {
+        let (_, text) = BUILT_IN.iter().find(|(known, _)| *known == name)?;
+        let model = Self::from_toml(text);
+        Some(model.expect("invariant: built-in models are valid, as a test shows"))
+    }
+
+    /// The names of the built-in models.
+    pub fn built_in_names() -> impl Iterator<Item = &'static str> {
+        BUILT_IN.iter().map(|(name, _)| *name)
+    }
+
+    /// Reads and checks a model file's text.
+    ///
+    /// # Errors
+    /// If an entry is wrong; the error names it, what it must be and what it is.
+    pub fn from_toml(text: &str) -> Result<Self, ModelError> {
+        let file = toml::from_str(text).map_err(|error| ModelError::Toml(error.to_string()))?;
+        Self::new(file)
+    }
+
+    /// Checks a model file and lays out its arrays.
+    ///
+    /// # Errors
+    /// If an entry is wrong; the error names it, what it must be and what it is.
+    pub fn new(file: ModelFile) -> Result<Self, ModelError> {
+        let check = Checker { model: &file.name };
+        check.counts_and_names(&file)?;
+        let kernel = check.kernel(&file)?;
+        let bias = check.per_state(&file, "bias", |state| state.bias, 0.0)?;
+        let reward = check.per_state(&file, "reward", |state| state.reward, f64::NEG_INFINITY)?;
+        let initial = check.per_state(&file, "initial", |state| state.initial, 0.0)?;
+        check.distribution("initial", initial.as_slice().unwrap_or_default())?;
+        let likelihood = check.likelihood(&file)?;
+        let initial = &initial / initial.sum();
+        Ok(Self {
+            file,
+            kernel,
+            bias,
+            likelihood,
+            initial,
+            reward,
+        })
+    }
+
+    /// Checks that eq. 3 never divides by zero or nearly zero on a grid, whatever the states.
+    ///
+    /// # Errors
+    /// If it can; the error names the first such cell.
+    pub fn check_on(&self, shape: Shape) -> Result<(), ModelError> {
+        let column_sums = self.kernel.sum_axis(Axis(0));
+        let least = column_sums.fold_axis(Axis(0), f64::INFINITY, |a, b| a.min(*b));
+        let (kernel_height, kernel_width) = least.dim();
+        let largest = self.kernel.iter().chain(&self.bias).copied();
+        let largest = largest.fold(f64::MIN_POSITIVE, f64::max);
+        // Cells further than a kernel from the edges are all alike: look at one of them.
+        let distinct = |side: usize, kernel: usize| {
+            (0..side).filter(move |&at| at <= kernel || at + kernel >= side)
+        };
+        for row in distinct(shape.height(), kernel_height) {
+            for col in distinct(shape.width(), kernel_width) {
+                let on_grid = least.indexed_iter().filter(|&((i, j), _)| {
+                    let (i, j) = (row + i, col + j);
+                    let (up, left) = (kernel_height / 2, kernel_width / 2);
+                    (up..shape.height() + up).contains(&i)
+                        && (left..shape.width() + left).contains(&j)
+                });
+                let sum = self.bias.sum() + on_grid.map(|(_, weight)| weight).sum::<f64>();
+                self.check_share(sum / largest, shape, Cell { row, col })?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks the least share of the largest weight that a cell's weights can sum to.
+    fn check_share(&self, share: f64, shape: Shape, cell: Cell) -> Result<(), ModelError> {
+        let model = || self.name().into();
+        if share <= 0.0 {
+            let model = model();
+            return Err(ModelError::ZeroWeight { model, shape, cell });
+        }
+        if share < LEAST_SHARE {
+            return Err(ModelError::FaintWeight {
+                model: model(),
+                shape,
+                cell,
+                share,
+            });
+        }
+        Ok(())
+    }
+
+    /// The model's name.
+    pub fn name(&self) -> &str {
+        &self.file.name
+    }
+
+    /// The file that the model was made from; serialises to a model file again.
+    pub fn file(&self) -> &ModelFile {
+        &self.file
+    }
+
+    /// Number of states S.
+    pub fn n_states(&self) -> usize {
+        self.file.states.len()
+    }
+
+    /// Number of observations O.
+    pub fn n_observations(&self) -> usize {
+        self.file.observations.len()
+    }
+
+    /// Transition weights `w[to, from, row, col]`, shape `[S, S, KH, KW]`, all `>= 0` (eq. 2).
+    pub fn kernel(&self) -> &Array4<f64> {
+        &self.kernel
+    }
+
+    /// Transition bias `b[to]`, shape `[S]`, all `>= 0` (eq. 2).
+    pub fn bias(&self) -> &Array1<f64> {
+        &self.bias
+    }
+
+    /// `P(y | x)`, shape `[S, O]`; each row sums to one (eq. 1).
+    pub fn likelihood(&self) -> &Array2<f64> {
+        &self.likelihood
+    }
+
+    /// Distribution of each cell at the start of burn-in, shape `[S]`.
+    pub fn initial(&self) -> &Array1<f64> {
+        &self.initial
+    }
+
+    /// Reward for each distinct visited cell by its state, shape `[S]`.
+    pub fn reward(&self) -> &Array1<f64> {
+        &self.reward
+    }
+
+    /// Names of the states.
+    pub fn state_names(&self) -> Vec<String> {
+        let states = self.file.states.iter();
+        states.map(|state| state.name.clone()).collect()
+    }
+
+    /// The state that pays most (the first of them): fire in the wildfire model.
+    pub fn target_state(&self) -> usize {
+        let better = |best, state| {
+            if self.reward[state] > self.reward[best] {
+                state
+            } else {
+                best
+            }
+        };
+        (0..self.n_states()).fold(0, better)
+    }
+
+    /// The state of a name.
+    pub fn state_named(&self, name: &str) -> Option<usize> {
+        self.file.states.iter().position(|state| state.name == name)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn built_in_models_have_their_names_and_fit_the_grid() {
+        let shape = Shape::new(64, 64).expect("test shape");
+        let mut n_models = 0;
+        for name in Model::built_in_names() {
+            let model = Model::built_in(name).expect(name);
+            assert_eq!(model.name(), name);
+            assert_eq!(model.check_on(shape), Ok(()), "{name}");
+            n_models += 1;
+        }
+        assert_eq!(n_models, 3);
+        assert_eq!(Model::built_in("wildfire-dense"), None);
+    }
+
+    #[test]
+    fn the_built_in_model_has_the_published_parameters() {
+        // DESIGN: g = 0.1, a0 = 0.9999, a1 = 0.99992, a2 = 0.999; the authors' kernel.
+        let model = Model::wildfire();
+        let around = [[0.1, 0.1, 0.1], [0.1, 1.0, 0.1], [0.1, 0.1, 0.1]];
+        let drift = [[0.12, 0.12, 0.12], [0.1, 1.0, 0.1], [0.08, 0.08, 0.08]];
+        let blocks = [
+            (0, 0, 0.9999, around),
+            (0, 2, 1.0 - 0.9999, around),
+            (1, 1, 0.99992, around),
+            (1, 0, 1.0 - 0.99992, around),
+            (2, 1, 1.0 - 0.999, around),
+            (2, 2, 0.999, drift),
+        ];
+        let mut expected = Array4::<f64>::zeros((3, 3, 3, 3));
+        for (to, from, scale, block) in blocks {
+            for (row, values) in block.iter().enumerate() {
+                for (col, value) in values.iter().enumerate() {
+                    expected[[to, from, row, col]] = scale * value;
+                }
+            }
+        }
+        assert!((&expected - model.kernel()).iter().all(|d| d.abs() < 1e-12));
+        assert_eq!(model.likelihood().row(1).to_vec(), [0.80, 0.15, 0.05]);
+        assert_eq!(model.initial().to_vec(), [0.99, 0.01, 0.0]);
+        assert_eq!(model.target_state(), 2);
+    }
+
+    fn check(change: impl FnOnce(&mut ModelFile), expected: &str) {
+        let mut file = Model::wildfire().file;
+        change(&mut file);
+        let error = Model::new(file)
+            .expect_err("the change must be rejected")
+            .to_string();
+        assert!(
+            error.contains(expected),
+            "{error:?} does not say {expected:?}"
+        );
+    }
+
+    #[test]
+    fn wrong_entries_are_rejected_by_name() {
+        check(|f| f.states.truncate(1), "expected 2 to 64 states, got 1");
+        check(
+            |f| f.states[1].name = "normal".into(),
+            "state name \"normal\" stands twice",
+        );
+        check(
+            |f| f.kernel[0].weights[0][1] = -0.1,
+            "kernel from \"normal\" to \"normal\": expected finite weights >= 0, got -0.",
+        );
+        check(
+            |f| f.states[0].name = "explore".into(),
+            "state name: expected letters, digits, '-' and '_', and none of",
+        );
+        check(|f| f.kernel[0].scale = f64::NAN, "got NaN");
+        check(|f| f.kernel[0].to = "ash".into(), "names state \"ash\"");
+        check(
+            |f| f.kernel_size = [2, 3],
+            "two odd numbers up to 15, got [2, 3]",
+        );
+        check(
+            |f| f.states[2].observed_as = vec![0.5, 0.4, 0.0],
+            "observed_as: expected a sum of 1, got 0.9",
+        );
+        check(
+            |f| f.states[2].observed_as = vec![1.0],
+            "expected 3 probabilities",
+        );
+        check(
+            |f| f.states[0].initial = 0.5,
+            "initial: expected a sum of 1, got 0.51",
+        );
+        check(|f| f.states[0].bias = -1.0, "state \"normal\": bias");
+        check(
+            |f| f.states[0].color = "red".into(),
+            "expected #rrggbb, got red",
+        );
+        check(|f| f.states[0].color = "#+1+2+3".into(), "got #+1+2+3");
+        check(
+            |f| f.kernel.push(f.kernel[0].clone()),
+            "expected one entry for each pair of states, got two",
+        );
+    }
+
+    #[test]
+    fn numbers_too_large_or_too_small_to_compute_with_are_rejected() {
+        let around = "0, or a size of 1e-100 to 1e100";
+        for (number, shown) in [(1e101, "e101"), (1e-320, "e-320")] {
+            check(|f| f.states[0].bias = number, around);
+            check(|f| f.states[2].reward = -number, shown);
+            check(|f| f.kernel[0].weights[1][1] = number, around);
+        }
+        // Each factor is in range, their product vanishes.
+        check(
+            |f| {
+                f.kernel[0].scale = 1e-99;
+                f.kernel[0].weights = vec![vec![1e-99; 3]; 3];
+            },
+            "kernel from \"normal\" to \"normal\": expected 0, or a size of",
+        );
+    }
+
+    #[test]
+    fn weights_that_can_vanish_beside_the_largest_are_rejected() {
+        let mut file = Model::wildfire().file;
+        for entry in file.kernel.iter_mut().filter(|e| e.from == "latent") {
+            entry.scale *= 1e-31;
+        }
+        let shape = Shape::new(4, 4).expect("test shape");
+        let error = Model::new(file.clone()).expect("valid until a grid is named");
+        let error = error.check_on(shape).expect_err("a cell among latent ones");
+        assert!(
+            matches!(error, ModelError::FaintWeight { share, .. } if share > 0.0),
+            "{error}"
+        );
+        file.states[0].bias = 1e-6;
+        let rescued = Model::new(file).expect("valid");
+        assert_eq!(rescued.check_on(shape), Ok(()));
+    }
+
+    #[test]
+    fn weights_that_can_sum_to_zero_are_rejected_on_the_grid_where_they_can() {
+        let mut file = Model::wildfire().file;
+        for entry in &mut file.kernel {
+            entry.weights[1][1] = 0.0;
+        }
+        let model = Model::new(file).expect("valid until a grid is named");
+        let shape = |height, width| Shape::new(height, width).expect("test shape");
+        assert_eq!(model.check_on(shape(5, 9)), Ok(()));
+        let error = model
+            .check_on(shape(1, 1))
+            .expect_err("a cell without neighbours");
+        assert!(error.to_string().contains("cell (0, 0)"), "{error}");
+        assert_eq!(Model::wildfire().check_on(shape(1, 1)), Ok(()));
+    }
+
+    #[test]
+    fn a_model_file_survives_toml() {
+        let model = Model::wildfire();
+        let text = toml::to_string(model.file()).expect("models serialise");
+        assert_eq!(Model::from_toml(&text), Ok(model));
+        assert!(matches!(
+            Model::from_toml("name = 3"),
+            Err(ModelError::Toml(_))
+        ));
+    }
+}

@@ -1,0 +1,203 @@
+//! The channel `agent`: the beliefs that agents publish, for displays.
+//!
+//! An agent has a [`BeliefPublisher`], which costs next to nothing without readers. A reader gets an [`AgentBelief`]
+//! from each sample.
+
+use super::channels::{
+    AgentService, ChannelError, Instance, Ipc, Services, create_node, ipc_error,
+};
+use super::message::{AgentHeader, VERSION};
+use super::observer::Sample;
+use super::turn::Turn;
+use crate::model::grid::{Probabilities, Shape};
+use iceoryx2::node::Node;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::prelude::{AllocationStrategy, PortFactory};
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// Most states of a published belief.
+pub const MAX_STATES: u32 = 256;
+
+/// Longest [`Intent`] in JSON, bytes.
+pub const MAX_INTENT_BYTES: usize = 65_536;
+
+/// What an agent's last path was planned for.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Intent {
+    /// Name of the agent's policy.
+    pub policy: String,
+    /// The estimator that made the belief.
+    pub belief_from: String,
+    /// The objective of the path that was just flown.
+    pub objective: String,
+    /// Names of the belief's states.
+    pub states: Vec<String>,
+    /// Time that the path's plan took, milliseconds.
+    pub plan_millis: f64,
+}
+
+/// One sample of `agent`, checked.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AgentBelief {
+    /// World, episode, step, process.
+    pub header: AgentHeader,
+    /// The belief about the state at that step, the posterior; shape `[S, H, W]`, each in 0..=1.
+    pub belief: Probabilities,
+    /// What the path was planned for.
+    pub intent: Intent,
+}
+
+/// A malformed sample.
+#[derive(Debug, Error, PartialEq, Eq)]
+#[error("sample of an agent: {problem}")]
+pub struct BeliefError {
+    problem: String,
+}
+
+/// An agent's side of the channel.
+#[derive(Debug)]
+pub struct BeliefPublisher {
+    service: AgentService,
+    publisher: Publisher<Ipc, [u8], AgentHeader>,
+    sequence: u64,
+    _node: Node<Ipc>,
+    /// Last, so that all else is dropped within it.
+    end: Option<Turn>,
+}
+
+impl Drop for BeliefPublisher {
+    fn drop(&mut self) {
+        self.end = Turn::take().ok();
+    }
+}
+
+impl BeliefPublisher {
+    /// Opens the channel; `n_bytes` is the length of a sample, which may grow.
+    ///
+    /// # Errors
+    /// If the channel cannot be opened, or has too many agents.
+    pub fn open(instance: &Instance, n_bytes: usize) -> Result<Self, ChannelError> {
+        let _turn = Turn::take()?;
+        let node = create_node()?;
+        let service = Services {
+            node: &node,
+            instance,
+        }
+        .agent()?;
+        let publisher = service
+            .publisher_builder()
+            .initial_max_slice_len(n_bytes)
+            .allocation_strategy(AllocationStrategy::PowerOfTwo)
+            .max_loaned_samples(1)
+            .create()
+            .map_err(ipc_error(
+                "publish beliefs (are there more than 16 agents?)",
+            ))?;
+        Ok(Self {
+            service,
+            publisher,
+            sequence: 0,
+            _node: node,
+            end: None,
+        })
+    }
+
+    /// Whether there are readers.
+    pub fn is_watched(&self) -> bool {
+        self.service.dynamic_config().number_of_subscribers() > 0
+    }
+
+    /// Publishes a belief of shape `[S, H, W]`; the header needs world, episode, step and seed.
+    ///
+    /// # Errors
+    /// If iceoryx2 cannot publish it.
+    pub fn show(
+        &mut self,
+        about: AgentHeader,
+        belief: &Probabilities,
+        intent: &Intent,
+    ) -> Result<(), ChannelError> {
+        let (n_states, height, width) = belief.dim();
+        let text = serde_json::to_vec(intent).expect("invariant: an intent serialises");
+        let n_bytes = belief.len() * size_of::<f32>() + text.len();
+        let mut sample = self
+            .publisher
+            .loan_slice(n_bytes)
+            .map_err(ipc_error("loan a sample"))?;
+        *sample.user_header_mut() = AgentHeader {
+            version: VERSION,
+            sequence: self.sequence,
+            height: height as u32,
+            width: width as u32,
+            n_states: n_states as u32,
+            pid: std::process::id(),
+            ..about
+        };
+        let (numbers, words) = sample.payload_mut().split_at_mut(n_bytes - text.len());
+        for (bytes, number) in numbers.chunks_exact_mut(size_of::<f32>()).zip(belief) {
+            bytes.copy_from_slice(&number.to_ne_bytes());
+        }
+        words.copy_from_slice(&text);
+        sample.send().map_err(ipc_error("publish a belief"))?;
+        self.sequence += 1;
+        Ok(())
+    }
+}
+
+impl TryFrom<&Sample<AgentHeader>> for AgentBelief {
+    type Error = BeliefError;
+
+    fn try_from(sample: &Sample<AgentHeader>) -> Result<Self, BeliefError> {
+        let garbled = |problem: String| BeliefError { problem };
+        let header = sample.header;
+        if header.version != VERSION {
+            let got = header.version;
+            return Err(garbled(format!("version: expected {VERSION}, got {got}")));
+        }
+        let shape = Shape::new(header.height as usize, header.width as usize)
+            .map_err(|error| garbled(error.to_string()))?;
+        if !(1..=MAX_STATES).contains(&header.n_states) {
+            let got = header.n_states;
+            return Err(garbled(format!(
+                "states: expected 1 to {MAX_STATES}, got {got}"
+            )));
+        }
+        let n_numbers = header.n_states as usize * shape.n_cells();
+        let (numbers, text) = sample
+            .payload
+            .split_at_checked(n_numbers * size_of::<f32>())
+            .ok_or_else(|| {
+                let got = sample.payload.len();
+                garbled(format!(
+                    "belief: expected {n_numbers} numbers, got {got} bytes"
+                ))
+            })?;
+        if text.len() > MAX_INTENT_BYTES {
+            let got = text.len();
+            return Err(garbled(format!(
+                "intent: expected at most {MAX_INTENT_BYTES} bytes, got {got}"
+            )));
+        }
+        let numbers: Vec<f32> = numbers
+            .chunks_exact(size_of::<f32>())
+            .map(bytemuck::pod_read_unaligned)
+            .collect();
+        if let Some(got) = numbers.iter().find(|p| !(0.0..=1.0).contains(*p)) {
+            return Err(garbled(format!(
+                "belief: expected probabilities, got {got}"
+            )));
+        }
+        let (height, width) = shape.dim();
+        Ok(Self {
+            header,
+            belief: Probabilities::from_shape_vec(
+                (header.n_states as usize, height, width),
+                numbers,
+            )
+            .expect("invariant: counted above"),
+            intent: serde_json::from_slice(text)
+                .map_err(|error| garbled(format!("intent: {error}")))?,
+        })
+    }
+}

@@ -1,0 +1,370 @@
+//! The channels of one instance: names, services and their limits.
+//!
+//! All channels of an instance live under `emberwatch/v1/<instance>/`, in a directory and under a
+//! prefix of the user's own, so that users never meet and no stray configuration file is read.
+
+use super::message::{
+    AgentHeader, ControlReply, ControlRequest, FrameHeader, Header, StepReply, StepRequest,
+    TruthHeader,
+};
+use iceoryx2::node::Node;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::prelude::{CallbackProgression, ServiceName};
+use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenOrCreateError;
+use iceoryx2::service::builder::request_response as request_response_builder;
+use iceoryx2::service::builder::request_response::RequestResponseOpenError;
+use iceoryx2::service::port_factory::{PortFactory, event, publish_subscribe, request_response};
+use std::sync::{Mutex, PoisonError};
+
+pub use super::directory::{SHARED_MEMORY, channel_directory, entries_of, node_config};
+pub use super::error::{ChannelError, Ipc, ipc_error};
+pub use super::node::create_node;
+
+/// Most clients at a time on each of `step` and `control`.
+pub const MAX_CLIENTS: usize = 16;
+
+/// Most observers of `frames` at a time.
+pub const MAX_OBSERVERS: usize = 16;
+
+/// Most readers of `truth` at a time.
+pub const MAX_TRUTH_READERS: usize = 4;
+
+/// Frames that an observer may fall behind before it loses the oldest.
+pub const FRAME_BUFFER: usize = 64;
+
+/// Hidden states that a reader may fall behind: a batch of this many worlds is never lost.
+pub const TRUTH_BUFFER: usize = 128;
+
+/// Most readers of `agent` at a time.
+pub const MAX_AGENT_READERS: usize = 4;
+
+/// Beliefs that a reader may fall behind before it loses the oldest: pictures want the newest only.
+pub const AGENT_BUFFER: usize = 4;
+
+/// Most processes attached to an instance at a time.
+pub const MAX_NODES: usize = 64;
+
+/// A request-response service of bytes behind headers `Q` and `R`.
+pub type RequestResponse<Q, R> = request_response::PortFactory<Ipc, [u8], Q, [u8], R>;
+
+/// The `step` service.
+pub type StepService = RequestResponse<StepRequest, StepReply>;
+
+/// A service of JSON messages: `control`, or the decisions of a world.
+pub type ControlService = RequestResponse<ControlRequest, ControlReply>;
+
+/// The `frames` service.
+pub type FrameService = publish_subscribe::PortFactory<Ipc, [u8], FrameHeader>;
+
+/// The `truth` service.
+pub type TruthService = publish_subscribe::PortFactory<Ipc, [u8], TruthHeader>;
+
+/// The `agent` service.
+pub type AgentService = publish_subscribe::PortFactory<Ipc, [u8], AgentHeader>;
+
+/// A wake service.
+pub type WakeService = event::PortFactory<Ipc>;
+
+/// The name of one running server.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Instance(String);
+
+/// A channel of an instance.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Channel {
+    /// Steps, request-response.
+    Step,
+    /// Everything rare, request-response.
+    Control,
+    /// What robots saw, publish-subscribe.
+    Frames,
+    /// Hidden states, publish-subscribe.
+    Truth,
+    /// What agents believe, publish-subscribe.
+    Agent,
+    /// Wakes the server, event.
+    WakeServer,
+    /// Wakes clients, event.
+    WakeClient,
+    /// Decisions for a world, answered by its agent, request-response.
+    Decisions(u32),
+    /// Wakes the agent that answers a world's decisions, event.
+    WakeAgent(u32),
+}
+
+impl Instance {
+    /// Checks a name.
+    ///
+    /// # Errors
+    /// If it is not 1 to 64 letters, digits, `-` or `_`.
+    pub fn new(name: &str) -> Result<Self, ChannelError> {
+        let allowed = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+        if (1..=64).contains(&name.len()) && name.chars().all(allowed) {
+            Ok(Self(name.into()))
+        } else {
+            Err(ChannelError::InstanceName(name.into()))
+        }
+    }
+
+    /// As users write it.
+    pub fn name(&self) -> &str {
+        &self.0
+    }
+
+    /// The service name of a channel.
+    pub fn service_name(&self, channel: Channel) -> ServiceName {
+        let name = format!("emberwatch/v1/{}/{}", self.0, channel.name());
+        ServiceName::new(&name).expect("invariant: instance names are short and plain")
+    }
+
+    /// The error for an instance without a server.
+    pub fn no_server(&self) -> ChannelError {
+        ChannelError::NoServer {
+            instance: self.0.clone(),
+        }
+    }
+
+    /// The error for a channel without a server port.
+    fn no_server_of(&self, channel: Channel) -> ChannelError {
+        match channel {
+            Channel::Decisions(world) => ChannelError::NoAgent {
+                instance: self.0.clone(),
+                world,
+            },
+            _ => self.no_server(),
+        }
+    }
+}
+
+impl Channel {
+    fn name(self) -> String {
+        match self {
+            Self::Step => "step".into(),
+            Self::Control => "control".into(),
+            Self::Frames => "frames".into(),
+            Self::Truth => "truth".into(),
+            Self::Agent => "agent".into(),
+            Self::WakeServer => "wake-server".into(),
+            Self::WakeClient => "wake-client".into(),
+            Self::Decisions(world) => format!("decisions-{world}"),
+            Self::WakeAgent(world) => format!("wake-agent-{world}"),
+        }
+    }
+}
+
+/// Opens, or creates with its limits, each service of an instance.
+pub struct Services<'a> {
+    /// The process's node.
+    pub node: &'a Node<Ipc>,
+    /// The instance.
+    pub instance: &'a Instance,
+}
+
+impl Services<'_> {
+    /// The `step` service, created if need be; for the server.
+    ///
+    /// # Errors
+    /// If iceoryx2 cannot make it, also because old clients hold a service of other limits.
+    pub fn create_step(&self) -> Result<StepService, ChannelError> {
+        self.create(Channel::Step)
+    }
+
+    /// The `control` service, created if need be; for the server.
+    ///
+    /// # Errors
+    /// As [`Self::create_step`].
+    pub fn create_control(&self) -> Result<ControlService, ChannelError> {
+        self.create(Channel::Control)
+    }
+
+    /// The `step` service of a running server.
+    ///
+    /// # Errors
+    /// If there is none.
+    pub fn open_step(&self) -> Result<StepService, ChannelError> {
+        self.open(Channel::Step)
+    }
+
+    /// The `control` service of a running server.
+    ///
+    /// # Errors
+    /// If there is none.
+    pub fn open_control(&self) -> Result<ControlService, ChannelError> {
+        self.open(Channel::Control)
+    }
+
+    /// The service of a world's decisions, created if need be; for the agent.
+    ///
+    /// # Errors
+    /// As [`Self::create_step`].
+    pub fn create_decisions(&self, world: u32) -> Result<ControlService, ChannelError> {
+        self.create(Channel::Decisions(world))
+    }
+
+    /// The service of a world's decisions, which a running agent answers.
+    ///
+    /// # Errors
+    /// If there is none.
+    pub fn open_decisions(&self, world: u32) -> Result<ControlService, ChannelError> {
+        self.open(Channel::Decisions(world))
+    }
+
+    /// The `frames` service; observers may create it before the server starts.
+    ///
+    /// # Errors
+    /// If iceoryx2 can neither open nor make it.
+    pub fn frames(&self) -> Result<FrameService, ChannelError> {
+        self.publications(Channel::Frames, 1, MAX_OBSERVERS, FRAME_BUFFER)
+            .map_err(ipc_error("open the frames channel"))
+    }
+
+    /// The `truth` service; for evaluation and pictures, never for learners.
+    ///
+    /// # Errors
+    /// If iceoryx2 can neither open nor make it.
+    pub fn truth(&self) -> Result<TruthService, ChannelError> {
+        self.publications(Channel::Truth, 1, MAX_TRUTH_READERS, TRUTH_BUFFER)
+            .map_err(ipc_error("open the truth channel"))
+    }
+
+    /// The `agent` service, which agents and readers create alike.
+    ///
+    /// # Errors
+    /// If iceoryx2 can neither open nor make it.
+    pub fn agent(&self) -> Result<AgentService, ChannelError> {
+        self.publications(Channel::Agent, MAX_CLIENTS, MAX_AGENT_READERS, AGENT_BUFFER)
+            .map_err(ipc_error("open the agent channel"))
+    }
+
+    /// A wake service.
+    ///
+    /// # Errors
+    /// If iceoryx2 can neither open nor make it.
+    pub fn wake(&self, channel: Channel) -> Result<WakeService, ChannelError> {
+        let builder = self
+            .node
+            .service_builder(&self.instance.service_name(channel))
+            .event();
+        let builder = builder
+            .max_listeners(MAX_NODES)
+            .max_notifiers(MAX_NODES)
+            .max_nodes(MAX_NODES);
+        builder
+            .open_or_create()
+            .map_err(ipc_error("open a wake channel"))
+    }
+
+    /// A listener on a wake service.
+    ///
+    /// # Errors
+    /// If iceoryx2 can neither open nor make it.
+    pub fn listener(&self, channel: Channel) -> Result<Listener<Ipc>, ChannelError> {
+        // iceoryx2 0.10 changes the umask of the process while it binds a listener's socket: of two
+        // threads at once, the second would put back what the first had changed it to, for good.
+        static BINDING: Mutex<()> = Mutex::new(());
+        let wake = self.wake(channel)?;
+        let _alone = BINDING.lock().unwrap_or_else(PoisonError::into_inner);
+        wake.listener_builder()
+            .create()
+            .map_err(ipc_error("create a listener"))
+    }
+
+    fn publications<H: Header>(
+        &self,
+        channel: Channel,
+        n_publishers: usize,
+        n_readers: usize,
+        buffer: usize,
+    ) -> Result<publish_subscribe::PortFactory<Ipc, [u8], H>, PublishSubscribeOpenOrCreateError>
+    {
+        let name = self.instance.service_name(channel);
+        let builder = self.node.service_builder(&name);
+        let builder = builder.publish_subscribe::<[u8]>().user_header::<H>();
+        let builder = builder
+            .max_publishers(n_publishers)
+            .max_subscribers(n_readers)
+            .max_nodes(MAX_NODES);
+        let builder = builder.history_size(1).subscriber_max_buffer_size(buffer);
+        let builder = builder
+            .subscriber_max_borrowed_samples(1)
+            .enable_safe_overflow(true);
+        builder.open_or_create()
+    }
+
+    fn create<Q: Header, R: Header>(
+        &self,
+        channel: Channel,
+    ) -> Result<RequestResponse<Q, R>, ChannelError> {
+        let builder = self
+            .builder::<Q, R>(channel)
+            .max_servers(1)
+            .max_clients(MAX_CLIENTS)
+            .max_nodes(MAX_NODES);
+        let builder = builder
+            .max_active_requests_per_client(1)
+            .max_loaned_requests(1);
+        let builder = builder
+            .max_response_buffer_size(1)
+            .max_borrowed_responses_per_pending_response(1);
+        let builder = builder.enable_fire_and_forget_requests(false);
+        builder
+            .open_or_create()
+            .map_err(ipc_error("create a request channel"))
+    }
+
+    fn open<Q: Header, R: Header>(
+        &self,
+        channel: Channel,
+    ) -> Result<RequestResponse<Q, R>, ChannelError> {
+        let service = self
+            .builder::<Q, R>(channel)
+            .open()
+            .map_err(|error| match error {
+                RequestResponseOpenError::DoesNotExist => self.instance.no_server_of(channel),
+                other => ipc_error("open a request channel")(other),
+            })?;
+        if service.dynamic_config().number_of_servers() > 0 {
+            Ok(service)
+        } else {
+            Err(self.instance.no_server_of(channel))
+        }
+    }
+
+    fn builder<Q: Header, R: Header>(
+        &self,
+        channel: Channel,
+    ) -> request_response_builder::Builder<[u8], Q, [u8], R, Ipc> {
+        let builder = self
+            .node
+            .service_builder(&self.instance.service_name(channel));
+        let builder = builder.request_response::<[u8], [u8]>();
+        builder
+            .request_user_header::<Q>()
+            .response_user_header::<R>()
+    }
+}
+
+/// The process id of the service's server, running or dead.
+pub fn server_pid<Q: Header, R: Header>(service: &RequestResponse<Q, R>) -> Option<i32> {
+    let mut pid = None;
+    service.dynamic_config().list_servers(|server| {
+        pid = server.node_id.pid::<Ipc>().ok().map(|id| id.value());
+        CallbackProgression::Stop
+    });
+    pid
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn instance_names_are_plain() {
+        for good in ["default", "a-b_3", &"x".repeat(64)] {
+            assert_eq!(Instance::new(good).expect("good name").name(), good);
+        }
+        for bad in ["", "a b", "../x", "é", &"x".repeat(65)] {
+            assert!(Instance::new(bad).is_err(), "{bad:?}");
+        }
+    }
+}

@@ -1,0 +1,206 @@
+//! The numbers of the binary messages: version, operations, flags, status codes.
+
+use thiserror::Error;
+
+/// Version of the protocol.
+pub const VERSION: u32 = 1;
+
+/// Set in [`super::message::StepRequest::flags`]: observe every cell, not only the path (needs a server whose
+/// coverage is `client` or `full`).
+pub const FLAG_FULL_COVERAGE: u32 = 1;
+
+/// What a step request asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u32)]
+pub enum Operation {
+    /// Fly one path in each of the worlds and move them from k to k + 1; needs a lease.
+    Step = 1,
+    /// Return the last results and frames again, changing nothing; needs no lease.
+    Observe = 2,
+    /// Return the results and frames of an earlier step k; needs no lease.
+    Recall = 3,
+}
+
+/// A number that is no [`Status`] or no [`Operation`].
+#[derive(Debug, Error, PartialEq, Eq)]
+#[error("{what}: {value} is not a known code")]
+pub struct UnknownCode {
+    /// `status` or `operation`.
+    pub what: &'static str,
+    /// The number received.
+    pub value: u32,
+}
+
+/// Answer to a request; every rejection has its own code and changes nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[repr(u32)]
+pub enum Status {
+    /// Done.
+    Ok = 0,
+    /// The request's version is not the server's; detail: the server's version.
+    VersionMismatch = 1,
+    /// No such operation; detail: the operation received.
+    UnknownOperation = 2,
+    /// Not a well-formed control message.
+    Malformed = 3,
+    /// A world outside the server's; detail: number of worlds.
+    NoSuchWorld = 4,
+    /// The payload is not `n_worlds * n_moves` bytes; detail: bytes expected.
+    WrongLength = 5,
+    /// Not the server's number of moves in a path; detail: moves expected.
+    WrongPathLength = 6,
+    /// A byte that is no move; detail: its position in the payload.
+    BadMove = 7,
+    /// The lease does not cover these worlds, or was never given; detail: the first such world.
+    NoLease = 8,
+    /// The lease was taken over, expired or released; detail: pid of who took it over or holds the
+    /// world since, 0 if no client does.
+    LeaseLost = 9,
+    /// Another client holds a world; detail: its pid.
+    Busy = 10,
+    /// A world is being reset; detail: the world.
+    Resetting = 11,
+    /// A world was truncated and must be reset first; detail: the world.
+    EpisodeOver = 12,
+    /// Full frames were asked of a server that gives none, or acting of a replay; detail: 0.
+    NotPermitted = 13,
+    /// A flag that the server does not know; detail: the flags received.
+    UnknownFlags = 14,
+    /// Not an objective of the agent's; detail: number of objectives.
+    BadObjective = 15,
+    /// The agent that was asked ends: it was asked to, or it failed; detail: 0.
+    AgentEnds = 16,
+    /// A file that cannot be read or written, or is refused; detail: 0.
+    BadFile = 17,
+    /// A frame or a belief that the server does not keep; detail: the nearest step kept, or the present one.
+    NotKept = 18,
+}
+
+impl Status {
+    /// Every status, in the order of its code.
+    pub const ALL: [Self; 19] = [
+        Self::Ok,
+        Self::VersionMismatch,
+        Self::UnknownOperation,
+        Self::Malformed,
+        Self::NoSuchWorld,
+        Self::WrongLength,
+        Self::WrongPathLength,
+        Self::BadMove,
+        Self::NoLease,
+        Self::LeaseLost,
+        Self::Busy,
+        Self::Resetting,
+        Self::EpisodeOver,
+        Self::NotPermitted,
+        Self::UnknownFlags,
+        Self::BadObjective,
+        Self::AgentEnds,
+        Self::BadFile,
+        Self::NotKept,
+    ];
+
+    /// What to tell a client of another version.
+    pub fn version_mismatch(client: u32, server: u64) -> String {
+        format!(
+            "protocol version mismatch: the client speaks {client}, the server {server}; \
+             use a client and a server of one release"
+        )
+    }
+
+    /// One sentence for people: what the status with this detail says and what to do.
+    pub fn explain(self, detail: u64) -> String {
+        match self {
+            Self::Ok => "ok".into(),
+            Self::VersionMismatch => Self::version_mismatch(VERSION, detail),
+            Self::UnknownOperation => {
+                format!("operation: expected 1 (step), 2 (observe) or 3 (recall), got {detail}")
+            }
+            Self::Malformed => "malformed control message".into(),
+            Self::NoSuchWorld => format!(
+                "no such world: the server has worlds 0 to {}",
+                detail.saturating_sub(1)
+            ),
+            Self::WrongLength => format!("wrong payload length: expected {detail} bytes"),
+            Self::WrongPathLength => {
+                format!("wrong path length: the server flies {detail} moves a step")
+            }
+            Self::BadMove => format!("byte {detail} of the paths: expected a move in 0..=3"),
+            Self::NoLease => format!("no lease on world {detail}: acquire it first"),
+            Self::LeaseLost if detail == 0 => {
+                "lease lost: it expired or was released; acquire the worlds again".into()
+            }
+            Self::LeaseLost => format!(
+                "lease lost to pid {detail}, which took the world over or acquired it since"
+            ),
+            Self::Busy => format!(
+                "busy: held by pid {detail}; wait for its release, or acquire with \"takeover\": true"
+            ),
+            Self::Resetting => {
+                format!("world {detail} is being reset; wait for the answer to the reset")
+            }
+            Self::EpisodeOver => format!("world {detail} was truncated: reset it first"),
+            Self::NotPermitted => {
+                "not permitted: full frames need a server with coverage \"client\" or \"full\", and a \
+                 replay takes no steps"
+                    .into()
+            }
+            Self::UnknownFlags => {
+                format!("flags: expected 0 or {FLAG_FULL_COVERAGE} (full coverage), got {detail}")
+            }
+            Self::BadObjective => format!("objective: expected 0 to {}", detail.saturating_sub(1)),
+            Self::AgentEnds => "the agent ends".into(),
+            Self::BadFile => "the file cannot be used".into(),
+            Self::NotKept => format!("not kept: the nearest step that is kept is {detail}"),
+        }
+    }
+}
+
+impl TryFrom<u32> for Status {
+    type Error = UnknownCode;
+
+    fn try_from(value: u32) -> Result<Self, UnknownCode> {
+        let known = Self::ALL.get(value as usize).copied();
+        known.ok_or(UnknownCode {
+            what: "status",
+            value,
+        })
+    }
+}
+
+impl TryFrom<u32> for Operation {
+    type Error = UnknownCode;
+
+    fn try_from(value: u32) -> Result<Self, UnknownCode> {
+        match value {
+            1 => Ok(Self::Step),
+            2 => Ok(Self::Observe),
+            3 => Ok(Self::Recall),
+            _ => Err(UnknownCode {
+                what: "operation",
+                value,
+            }),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn status_codes_survive_the_wire() {
+        for (code, status) in Status::ALL.into_iter().enumerate() {
+            assert_eq!(status as usize, code);
+            assert_eq!(Status::try_from(code as u32), Ok(status));
+        }
+        assert_eq!(
+            Status::try_from(19),
+            Err(UnknownCode {
+                what: "status",
+                value: 19
+            })
+        );
+    }
+}

@@ -1,0 +1,267 @@
+//! A client's side of `step` and `control`: one request at a time, each with a deadline.
+//!
+//! Nothing returned points into shared memory.
+
+use super::channels::{Channel, Instance, Ipc, Services, create_node, ipc_error, server_pid};
+use super::control::{Reply, Request, ServerInfo};
+use super::exchange::{Exchange, check_answer, check_status};
+use super::message::{
+    ControlReply, ControlRequest, StepReply, StepRequest, StepResult, VERSION, split_step_payload,
+};
+use super::process::WatchedProcess;
+use super::turn::Turn;
+use super::wait::Waiter;
+use iceoryx2::port::client::Client;
+use iceoryx2::prelude::AllocationStrategy;
+use std::os::fd::BorrowedFd;
+use std::time::Duration;
+
+pub use super::exchange::ConnectionError;
+
+/// Length that control requests may have before their segment grows, bytes.
+const CONTROL_SLICE: usize = 4096;
+
+/// The answer to a step: results and frames of consecutive worlds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StepAnswer {
+    /// The binary header.
+    pub reply: StepReply,
+    /// One result per world.
+    pub results: Vec<StepResult>,
+    /// The frames, `H * W` bytes per world.
+    pub frames: Vec<u8>,
+}
+
+/// A connection to a running server.
+pub struct Connection {
+    step: Client<Ipc, [u8], StepRequest, [u8], StepReply>,
+    control: Client<Ipc, [u8], ControlRequest, [u8], ControlReply>,
+    exchange: Exchange,
+    info: ServerInfo,
+    sequence: u64,
+    /// Last, so that the ports are dropped within it.
+    end: Option<Turn>,
+}
+
+impl Drop for Connection {
+    fn drop(&mut self) {
+        self.end = Turn::take().ok();
+    }
+}
+
+impl Connection {
+    /// Connects to the instance's server and shakes hands; `client` names this program in its log.
+    ///
+    /// # Errors
+    /// If no server runs on the instance, it speaks another version, or it does not answer in time.
+    pub fn open(
+        instance: &Instance,
+        client: &str,
+        timeout: Duration,
+    ) -> Result<Self, ConnectionError> {
+        let mut turn = Some(Turn::take()?); // declared first: what fails below is dropped within it
+        let node = create_node()?;
+        let services = Services {
+            node: &node,
+            instance,
+        };
+        let control_service = services.open_control()?;
+        let step_service = services.open_step()?;
+        let server_process = server_pid(&control_service)
+            .and_then(|pid| WatchedProcess::open(pid).ok())
+            .filter(|server| !server.has_ended())
+            .ok_or_else(|| instance.no_server())?;
+        let server = services
+            .wake(Channel::WakeServer)?
+            .notifier_builder()
+            .create()
+            .map_err(ipc_error("create a notifier"))?;
+        let listener = services.listener(Channel::WakeClient)?;
+        let control = control_service
+            .client_builder()
+            .initial_max_slice_len(CONTROL_SLICE);
+        let control = control
+            .allocation_strategy(AllocationStrategy::PowerOfTwo)
+            .create();
+        let control = control.map_err(ipc_error(
+            "create a control client (are there more than 16 clients?)",
+        ))?;
+        let exchange = Exchange {
+            instance: instance.clone(),
+            server,
+            listener,
+            server_process,
+            waiter: Waiter::default(),
+            _node: node,
+        };
+        drop(turn.take());
+        let info = shake_hands(&control, &exchange, client, timeout);
+        turn = Some(Turn::take()?);
+        let info = info?;
+        let longest = info.n_worlds as usize * info.n_moves;
+        let step = step_service
+            .client_builder()
+            .initial_max_slice_len(longest.max(1))
+            .create();
+        let step = step.map_err(ipc_error(
+            "create a step client (are there more than 16 clients?)",
+        ))?;
+        drop(turn);
+        Ok(Self {
+            step,
+            control,
+            exchange,
+            info,
+            sequence: 1,
+            end: None,
+        })
+    }
+
+    /// What the server said of itself.
+    pub fn info(&self) -> &ServerInfo {
+        &self.info
+    }
+
+    /// The server's process: readable when it has ended.
+    pub fn server_process(&self) -> BorrowedFd<'_> {
+        self.exchange.server_process.descriptor()
+    }
+
+    /// Checks that the server's process runs, without asking it.
+    ///
+    /// # Errors
+    /// If it has ended.
+    pub fn check_server(&self) -> Result<(), ConnectionError> {
+        match self.exchange.server_process.has_ended() {
+            true => Err(self.exchange.server_gone()),
+            false => Ok(()),
+        }
+    }
+
+    /// Asks on the control channel.
+    ///
+    /// # Errors
+    /// If the server refuses, has ended, or gives no good answer in time.
+    pub fn control(
+        &mut self,
+        request: &Request,
+        timeout: Duration,
+    ) -> Result<Reply, ConnectionError> {
+        self.sequence += 1;
+        ask(
+            &self.control,
+            &self.exchange,
+            self.sequence,
+            request,
+            timeout,
+        )
+    }
+
+    /// Asks on the step channel; version, sequence and listener are filled in here.
+    ///
+    /// # Errors
+    /// If the server refuses, has ended, or gives no good answer in time.
+    pub fn step(
+        &mut self,
+        request: StepRequest,
+        paths: &[u8],
+        timeout: Duration,
+    ) -> Result<StepAnswer, ConnectionError> {
+        const WHAT: &str = "step";
+        self.sequence += 1;
+        let (listener_low, listener_high) = self.exchange.listener_id();
+        let header = StepRequest {
+            version: VERSION,
+            sequence: self.sequence,
+            listener_low,
+            listener_high,
+            ..request
+        };
+        let (reply, answer) = self.exchange.request(
+            &self.step,
+            header,
+            paths,
+            WHAT,
+            timeout,
+            |reply, payload| {
+                let parts = split_step_payload(reply, payload);
+                (
+                    *reply,
+                    parts.map(|(results, frames)| (results, frames.to_vec())),
+                )
+            },
+        )?;
+        check_status(WHAT, reply.status, reply.detail, None)?;
+        check_answer(WHAT, reply.version, (reply.sequence, self.sequence))?;
+        let (results, frames) = answer.map_err(|expected| ConnectionError::Garbled {
+            what: WHAT,
+            problem: format!("expected a payload of {expected} bytes"),
+        })?;
+        Ok(StepAnswer {
+            reply,
+            results,
+            frames,
+        })
+    }
+}
+
+fn shake_hands(
+    control: &Client<Ipc, [u8], ControlRequest, [u8], ControlReply>,
+    exchange: &Exchange,
+    client: &str,
+    timeout: Duration,
+) -> Result<ServerInfo, ConnectionError> {
+    let hello = Request::Hello {
+        protocol: VERSION,
+        client: client.into(),
+    };
+    match ask(control, exchange, 1, &hello, timeout)? {
+        Reply::Hello(info) => Ok(*info),
+        other => Err(unexpected("hello", &other)),
+    }
+}
+
+fn ask(
+    client: &Client<Ipc, [u8], ControlRequest, [u8], ControlReply>,
+    exchange: &Exchange,
+    sequence: u64,
+    request: &Request,
+    timeout: Duration,
+) -> Result<Reply, ConnectionError> {
+    const WHAT: &str = "a control request";
+    let text = serde_json::to_vec(request).expect("invariant: requests serialise");
+    let (listener_low, listener_high) = exchange.listener_id();
+    let header = ControlRequest {
+        version: VERSION,
+        reserved: 0,
+        sequence,
+        listener_low,
+        listener_high,
+    };
+    let (reply, payload) =
+        exchange.request(client, header, &text, WHAT, timeout, |reply, payload| {
+            (*reply, payload.to_vec())
+        })?;
+    check_answer(WHAT, reply.version, (reply.sequence, sequence))?;
+    let parsed = serde_json::from_slice(&payload);
+    let message = match &parsed {
+        Ok(Reply::Error {
+            message, detail, ..
+        }) => Some((*detail, message.clone())),
+        _ => None,
+    };
+    let detail = message.as_ref().map_or(0, |(detail, _)| *detail);
+    check_status(WHAT, reply.status, detail, message.map(|(_, text)| text))?;
+    parsed.map_err(|error| ConnectionError::Garbled {
+        what: WHAT,
+        problem: error.to_string(),
+    })
+}
+
+/// The error for a reply that answers another question.
+pub fn unexpected(what: &'static str, reply: &Reply) -> ConnectionError {
+    ConnectionError::Garbled {
+        what,
+        problem: format!("got the reply to something else: {reply:?}"),
+    }
+}

@@ -1,0 +1,134 @@
+//! The messages of a world's decisions: an external learner decides the objective of the next path, the agent
+//! estimates, plans and steps. JSON text both ways, behind the headers of `control`.
+
+use super::message::Status;
+use serde::{Deserialize, Serialize};
+
+/// What a learner asks an agent.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "op", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Request {
+    /// Handshake: which agent is this, and which protocol version does it speak?
+    Hello {
+        /// The learner's protocol version.
+        protocol: u32,
+        /// The learner's name and version, for the agent's log.
+        client: String,
+    },
+    /// Start a new episode with a new belief; answered when burn-in is done.
+    Reset {
+        /// The world's seed; `None` lets the server derive one from the world's last.
+        #[serde(default)]
+        seed: Option<u64>,
+    },
+    /// Plan for an objective, fly the path, correct the belief with the frame.
+    Decide {
+        /// Its position among [`AgentInfo::objectives`].
+        objective: u64,
+    },
+    /// What did the last decision give? Changes nothing.
+    // Braces, so that unknown keys are refused here too.
+    Last {},
+    /// Release the world and end the agent.
+    Shutdown {},
+}
+
+/// What the agent answers.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "reply", rename_all = "snake_case")]
+pub enum Reply {
+    /// To `hello`.
+    Decisions(Box<AgentInfo>),
+    /// To `reset`, `decide` and `last`.
+    Decision(Decision),
+    /// To `shutdown`.
+    Done,
+    /// To anything that was refused.
+    Error {
+        /// Reason for programs.
+        status: Status,
+        /// See [`Status`].
+        detail: u64,
+        /// Reason for people.
+        message: String,
+    },
+}
+
+/// The handshake: everything a learner needs to know to decide.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AgentInfo {
+    /// The agent's protocol version.
+    pub protocol: u32,
+    /// The agent's release.
+    pub build: String,
+    /// The agent's process.
+    pub pid: u32,
+    /// The instance of its server.
+    pub instance: String,
+    /// The world it acts on.
+    pub world: u32,
+    /// Grid height H.
+    pub height: usize,
+    /// Grid width W.
+    pub width: usize,
+    /// Moves in a path.
+    pub n_moves: usize,
+    /// Episode length; 0: never truncated.
+    pub max_steps: u64,
+    /// Names of the states.
+    pub states: Vec<String>,
+    /// Names of the objectives: each state's probability, then `entropy`.
+    pub objectives: Vec<String>,
+    /// The planner: `beam` or `shooting`.
+    pub planner: String,
+    /// Names of the numbers in [`Decision::summary`].
+    pub summary: Vec<String>,
+}
+
+/// The world and the agent's belief after a decision or a reset.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Decision {
+    /// Step index k; 0 after a reset.
+    pub step: u64,
+    /// Sum of rewards over the distinct visited cells.
+    pub reward: f64,
+    /// Cells of the whole grid in the state that pays most; for reports, not for learners.
+    pub n_target_cells: u32,
+    /// Distinct cells visited by the path.
+    pub n_visited: u32,
+    /// Distinct visited cells in the state that pays most.
+    pub n_hits: u32,
+    /// The robot's `[row, col]`.
+    pub robot: [u32; 2],
+    /// Whether the episode ended by itself.
+    pub terminated: bool,
+    /// Whether the episode reached the server's `max_steps`: reset before the next decision.
+    pub truncated: bool,
+    /// Seed of the episode; with the model it gives the hidden state away: not for learners.
+    pub seed: u64,
+    /// Resets of this world since the server started.
+    pub episode: u64,
+    /// The objective decided for; `None` after a reset, and before this agent's first decision.
+    pub objective: Option<u64>,
+    /// The belief that the next plan uses, in a few numbers from 0 to 1; see [`AgentInfo::summary`].
+    pub summary: Vec<f32>,
+}
+
+impl Reply {
+    /// A refusal with its standard sentence.
+    pub fn refusal(status: Status, detail: u64) -> Self {
+        Self::Error {
+            status,
+            detail,
+            message: status.explain(detail),
+        }
+    }
+
+    /// The status for the binary header.
+    pub fn status(&self) -> Status {
+        match self {
+            Self::Error { status, .. } => *status,
+            _ => Status::Ok,
+        }
+    }
+}

@@ -1,0 +1,130 @@
+//! The user's own directory and prefix for channel files, and iceoryx2's configuration for them.
+
+use super::error::{ChannelError, Ipc, ipc_error};
+use iceoryx2::node::Node;
+use iceoryx2::prelude::{Config, FileName, Path, SemanticString};
+use iceoryx2::service::service_hash::ServiceHash;
+use std::fs::{DirBuilder, Permissions};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
+use std::path::PathBuf;
+
+/// Where iceoryx2 keeps shared memory: a folder that every user may write to.
+pub const SHARED_MEMORY: &str = "/dev/shm";
+
+/// The directory of this user's channel files: `/dev/shm/emberwatch-<uid>/`.
+///
+/// Beside the shared memory, so that both are there or neither: no cleaner of old files comes here, and it is the
+/// same for every process of the user, of a session or not.
+pub fn channel_directory() -> PathBuf {
+    PathBuf::from(format!(
+        "{SHARED_MEMORY}/emberwatch-{}/",
+        rustix::process::getuid().as_raw()
+    ))
+}
+
+/// The files by which others find a node and services: without them it is cut off.
+pub fn entries_of(node: &Node<Ipc>, services: &[&ServiceHash]) -> Vec<PathBuf> {
+    let (directory, prefix) = (channel_directory(), prefix());
+    let monitor = format!("nodes/{prefix}{}.node_monitor", node.id().value());
+    let services = services
+        .iter()
+        .map(|hash| format!("services/{prefix}{hash}.service"));
+    let names = services.chain([monitor]);
+    names.map(|name| directory.join(name)).collect()
+}
+
+/// The channel directory, made if it is missing, and checked.
+pub(crate) fn own_channel_directory() -> Result<PathBuf, ChannelError> {
+    let directory = channel_directory();
+    own_directory(&directory)?;
+    Ok(directory)
+}
+
+/// iceoryx2's configuration: its defaults, the user's own directory and prefix.
+///
+/// # Errors
+/// If the directory cannot be made or belongs to another user.
+pub fn node_config() -> Result<Config, ChannelError> {
+    let directory = own_channel_directory()?;
+    let path = Path::new(directory.as_os_str().as_encoded_bytes())
+        .map_err(ipc_error("set the root path"))?;
+    let prefix = FileName::new(prefix().as_bytes()).map_err(ipc_error("set the prefix"))?;
+    let mut config = Config::default();
+    config.global.set_root_path(&path);
+    config.global.prefix = prefix;
+    // Cleaning up needs a turn, which iceoryx2 does not take.
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
+    Ok(config)
+}
+
+/// What names of this user's shared memory begin with.
+pub(crate) fn prefix() -> String {
+    format!("emberwatch-{}_", rustix::process::getuid().as_raw())
+}
+
+/// The error of a file or folder that the system does not let be used.
+pub(crate) fn not_usable(path: &std::path::Path, error: std::io::Error) -> ChannelError {
+    directory_error(
+        path,
+        match error.kind() {
+            std::io::ErrorKind::ReadOnlyFilesystem => format!(
+                "{error}: channels need a {SHARED_MEMORY} that can be written to; as root, \
+                 `mount -o remount,rw {SHARED_MEMORY}`, or mount a tmpfs there"
+            ),
+            _ => error.to_string(),
+        },
+    )
+}
+
+/// The error of a file or folder.
+pub(crate) fn directory_error(path: &std::path::Path, problem: String) -> ChannelError {
+    ChannelError::Directory {
+        path: path.display().to_string(),
+        problem,
+    }
+}
+
+/// Makes the directory, for this user alone, or checks that it belongs to this user.
+fn own_directory(path: &std::path::Path) -> Result<(), ChannelError> {
+    let wrong = |problem: String| directory_error(path, problem);
+    match DirBuilder::new().mode(0o700).create(path) {
+        Err(error) if error.kind() != std::io::ErrorKind::AlreadyExists => {
+            return Err(not_usable(path, error));
+        }
+        _ => {}
+    }
+    let bare = path.components().as_path(); // without the trailing slash, so that a link is seen
+    let found = std::fs::symlink_metadata(bare).map_err(|error| wrong(error.to_string()))?;
+    let mine = found.is_dir() && found.uid() == rustix::process::getuid().as_raw();
+    if !mine || found.mode() & 0o022 != 0 {
+        return Err(wrong(
+            "expected a directory that belongs to this user and that others cannot write to".into(),
+        ));
+    }
+    // Its mode depends on the umask it was made under.
+    match found.mode() & 0o777 {
+        0o700 => Ok(()),
+        _ => std::fs::set_permissions(path, Permissions::from_mode(0o700))
+            .map_err(|error| wrong(error.to_string())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_directory_that_others_may_write_to_is_refused() {
+        let path = std::env::temp_dir().join(format!("emberwatch-test-{}", std::process::id()));
+        own_directory(&path).expect("a new directory");
+        own_directory(&path).expect("the same again");
+        std::fs::set_permissions(&path, Permissions::from_mode(0o600)).expect("chmod");
+        own_directory(&path).expect("what a umask took is given back");
+        assert_eq!(path.metadata().expect("there").mode() & 0o777, 0o700);
+        std::fs::set_permissions(&path, Permissions::from_mode(0o777)).expect("chmod");
+        assert!(own_directory(&path).is_err());
+        std::fs::remove_dir(&path).expect("clean up");
+    }
+}

@@ -1,0 +1,60 @@
+//! Why a channel could not be opened or used.
+
+use iceoryx2::prelude::ipc;
+use std::fmt::Debug;
+use thiserror::Error;
+
+/// iceoryx2's inter-process flavour.
+pub type Ipc = ipc::Service;
+
+/// Why a channel could not be opened or used.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ChannelError {
+    /// A name that cannot be an instance's.
+    #[error("instance name: expected 1 to 64 letters, digits, '-' or '_', got {0:?}")]
+    InstanceName(String),
+    /// The directory for the channels' files cannot be used.
+    #[error("channel directory {path}: {problem}")]
+    Directory {
+        /// The directory, or the file in it.
+        path: String,
+        /// What was expected, and what is there.
+        problem: String,
+    },
+    /// No server runs on the instance.
+    #[error(
+        "no server on instance {instance:?}: start one with `emberwatch-server --instance {instance}`"
+    )]
+    NoServer {
+        /// Name of the instance.
+        instance: String,
+    },
+    /// No agent takes decisions for the world.
+    #[error(
+        "no agent serves decisions of world {world} on instance {instance:?}: start one with \
+         `emberwatch-agent serve-decisions --instance {instance} --world {world}`"
+    )]
+    NoAgent {
+        /// Name of the instance.
+        instance: String,
+        /// The world that has no agent.
+        world: u32,
+    },
+    /// iceoryx2 refused.
+    #[error("{what}: iceoryx2 says {problem}")]
+    Ipc {
+        /// What was attempted.
+        what: &'static str,
+        /// iceoryx2's reason.
+        problem: String,
+    },
+}
+
+/// Adds context to an error of iceoryx2.
+pub fn ipc_error<E: Debug>(what: &'static str) -> impl Fn(E) -> ChannelError {
+    move |error| ChannelError::Ipc {
+        what,
+        problem: format!("{error:?}"),
+    }
+}

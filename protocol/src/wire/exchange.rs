@@ -1,0 +1,191 @@
+//! One request and its answer: send, wait, copy the answer out of shared memory.
+//!
+//! A wait ends at once when the server answers or dies: a pidfd of the server is in the poll set.
+
+use super::channels::{ChannelError, Instance, Ipc, ipc_error};
+use super::cleanup::remove_leftovers;
+use super::message::{Header, Status, VERSION};
+use super::process::WatchedProcess;
+use super::wait::{Waiter, descriptor, drain, sleep_until_readable};
+use iceoryx2::node::Node;
+use iceoryx2::pending_response::PendingResponse;
+use iceoryx2::port::client::Client;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+use std::time::Duration;
+use thiserror::Error;
+
+/// Longest sleep between two looks at the answer: bounds what a lost wake-up can cost.
+const LONGEST_SLEEP: Duration = Duration::from_millis(50);
+
+/// Why a request got no good answer.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ConnectionError {
+    /// The channel could not be used.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+    /// The server ended while, or before, it was asked.
+    #[error("the server on instance {instance:?} is gone")]
+    ServerGone {
+        /// Name of the instance.
+        instance: String,
+    },
+    /// No answer in time. A step may have been made nevertheless: observe before the next one.
+    #[error("no answer to {what} from instance {instance:?} within {timeout:?}")]
+    Timeout {
+        /// Kind of the request.
+        what: &'static str,
+        /// Name of the instance.
+        instance: String,
+        /// How long the client waited.
+        timeout: Duration,
+    },
+    /// The server refused, and changed nothing.
+    #[error("{message}")]
+    Refused {
+        /// Reason for programs.
+        status: Status,
+        /// See [`Status`].
+        detail: u64,
+        /// Reason for people.
+        message: String,
+    },
+    /// The answer makes no sense: client and server are not of one release.
+    #[error("answer to {what}: {problem}")]
+    Garbled {
+        /// Kind of the request.
+        what: &'static str,
+        /// What is wrong with the answer.
+        problem: String,
+    },
+}
+
+/// What a request and its answer need: both ends of waking, and the server's process.
+pub(super) struct Exchange {
+    pub(super) instance: Instance,
+    pub(super) server: Notifier<Ipc>,
+    pub(super) listener: Listener<Ipc>,
+    pub(super) server_process: WatchedProcess,
+    pub(super) waiter: Waiter,
+    pub(super) _node: Node<Ipc>,
+}
+
+impl Exchange {
+    pub(super) fn listener_id(&self) -> (u64, u64) {
+        let id = self.listener.id().value();
+        (id as u64, (id >> 64) as u64)
+    }
+
+    /// Sends one request and waits for its answer, which `read` copies out of shared memory.
+    pub(super) fn request<Q: Header, R: Header, T>(
+        &self,
+        client: &Client<Ipc, [u8], Q, [u8], R>,
+        header: Q,
+        payload: &[u8],
+        what: &'static str,
+        timeout: Duration,
+        read: impl Fn(&R, &[u8]) -> T,
+    ) -> Result<T, ConnectionError> {
+        let mut request = client
+            .loan_slice_uninit(payload.len())
+            .map_err(ipc_error("send a request"))?;
+        *request.user_header_mut() = header;
+        let pending = request
+            .write_from_slice(payload)
+            .send()
+            .map_err(ipc_error("send a request"))?;
+        if pending.number_of_server_connections() == 0 {
+            return Err(self.server_gone());
+        }
+        self.server.notify().map_err(ipc_error("wake the server"))?;
+        self.answer(&pending, timeout, read)?
+            .ok_or_else(|| ConnectionError::Timeout {
+                what,
+                instance: self.instance.name().into(),
+                timeout,
+            })
+    }
+
+    fn answer<Q: Header, R: Header, T>(
+        &self,
+        pending: &PendingResponse<Ipc, [u8], Q, [u8], R>,
+        timeout: Duration,
+        read: impl Fn(&R, &[u8]) -> T,
+    ) -> Result<Option<T>, ConnectionError> {
+        let has_ended = std::cell::Cell::new(false);
+        let poll = || match pending.receive().map_err(ipc_error("receive an answer"))? {
+            Some(response) => Ok(Some(read(response.user_header(), response.payload()))),
+            None if has_ended.get() => Err(self.server_gone()),
+            None => Ok(None),
+        };
+        self.waiter.wait(timeout, poll, |remaining| {
+            has_ended.set(self.sleep(remaining.min(LONGEST_SLEEP))? || !pending.is_connected());
+            Ok(())
+        })
+    }
+
+    /// Sleeps until woken; returns whether the server has ended.
+    fn sleep(&self, timeout: Duration) -> Result<bool, ChannelError> {
+        let descriptors = [descriptor(&self.listener), self.server_process.descriptor()];
+        let readable = sleep_until_readable(&descriptors, timeout)
+            .map_err(ipc_error("wait for the server"))?;
+        // Now, as wake-ups that are left end the next sleep at once.
+        drain(&self.listener)?;
+        Ok(readable[1])
+    }
+
+    /// The error of a server that has ended; removes the files it left.
+    pub(super) fn server_gone(&self) -> ConnectionError {
+        let _ = remove_leftovers(); // Else the next program removes them.
+        ConnectionError::ServerGone {
+            instance: self.instance.name().into(),
+        }
+    }
+}
+
+/// Checks that a status is `Ok`; `message` is the message of the refusal, if it has one.
+pub(super) fn check_status(
+    what: &'static str,
+    code: u32,
+    detail: u64,
+    message: Option<String>,
+) -> Result<(), ConnectionError> {
+    match Status::try_from(code) {
+        Ok(Status::Ok) => Ok(()),
+        Ok(status) => {
+            let message = match status {
+                // In the words of the commands that connect this way.
+                Status::Busy => format!(
+                    "busy: held by pid {detail}; wait for its release, or take over with --takeover"
+                ),
+                _ => message.unwrap_or_else(|| status.explain(detail)),
+            };
+            Err(ConnectionError::Refused {
+                status,
+                detail,
+                message,
+            })
+        }
+        Err(unknown) => Err(ConnectionError::Garbled {
+            what,
+            problem: unknown.to_string(),
+        }),
+    }
+}
+
+/// Checks that an answer is of our version and to our request: `(got, expected)` sequence numbers.
+pub(super) fn check_answer(
+    what: &'static str,
+    version: u32,
+    (got, expected): (u64, u64),
+) -> Result<(), ConnectionError> {
+    let problem = if version != VERSION {
+        format!("expected version {VERSION}, got {version}")
+    } else if got != expected {
+        format!("expected sequence number {expected}, got {got}")
+    } else {
+        return Ok(());
+    };
+    Err(ConnectionError::Garbled { what, problem })
+}

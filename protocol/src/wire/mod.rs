@@ -1,0 +1,27 @@
+//! The wire: what travels between processes, and how.
+//!
+//! [`message`], [`control`] and [`decisions`] are the messages; [`channels`] the services that carry them;
+//! [`connection`] a client's side, [`responder`] the answering side, [`observer`] a reader's side. [`node`], [`turn`]
+//! and [`cleanup`] create and remove channels; [`wait`] is the bounded wait. [`recording`] keeps samples in a file.
+
+pub mod agent_belief;
+pub mod channels;
+pub mod cleanup;
+mod codes;
+pub mod connection;
+pub mod control;
+pub mod decisions;
+mod directory;
+mod error;
+mod exchange;
+mod json;
+pub mod message;
+mod node;
+pub mod observer;
+mod poll;
+pub(crate) mod process;
+pub mod recording;
+pub mod responder;
+mod spinning;
+pub mod turn;
+pub mod wait;

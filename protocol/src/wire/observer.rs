@@ -1,0 +1,241 @@
+//! An observer's side of `frames`, `truth` and `agent`: it reads, never acts, and never slows the server.
+
+use super::channels::{
+    AGENT_BUFFER, Channel, ChannelError, FRAME_BUFFER, Instance, Ipc, Services, TRUTH_BUFFER,
+    create_node, ipc_error,
+};
+use super::message::{AgentHeader, FrameHeader, Header, TruthHeader};
+use super::turn::Turn;
+use iceoryx2::node::Node;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::prelude::PayloadHeader;
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use std::cell::Cell;
+use std::time::{Duration, Instant};
+
+/// How long an observer sleeps between two polls while it is busy: publishing wakes no observer, so that observers cost
+/// the server no system call. Nor do they spin, which would take processor time from it. At 128,000 frames a second
+/// this fills [`FRAME_BUFFER`].
+const BUSY_INTERVAL: Duration = Duration::from_micros(500);
+
+/// The same while it is not: each poll wakes a process, on a core that the server may need.
+const IDLE_INTERVAL: Duration = Duration::from_millis(4);
+
+/// How long an observer stays busy after it began, and after it found a quarter of its buffer full.
+const BUSY: Duration = Duration::from_secs(1);
+
+/// A sample copied out of shared memory.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sample<H> {
+    /// The binary header.
+    pub header: H,
+    /// The bytes behind it.
+    pub payload: Vec<u8>,
+}
+
+/// Reads one channel of an instance, whether a server runs or not.
+pub struct Observer<H: Header> {
+    subscriber: Subscriber<Ipc, [u8], H>,
+    publisher: Cell<Option<u32>>,
+    polling: Polling,
+    node: Node<Ipc>,
+    /// Last, so that all else is dropped within it.
+    end: Option<Turn>,
+}
+
+impl<H: Header> Drop for Observer<H> {
+    fn drop(&mut self) {
+        self.end = Turn::take().ok();
+    }
+}
+
+/// How often to poll.
+#[derive(Debug)]
+struct Polling {
+    buffer: usize,
+    is_eager: bool,
+    /// Samples since the last sleep.
+    n_found: Cell<usize>,
+    /// When the observer was last found busy.
+    busy: Cell<Instant>,
+}
+
+impl Observer<FrameHeader> {
+    /// Reads the frames of an instance; the server publishes every world's current one at once.
+    ///
+    /// # Errors
+    /// If the channel cannot be opened, or has too many observers.
+    pub fn frames(instance: &Instance) -> Result<Self, ChannelError> {
+        let refusal = "observe frames (are there more than 16 observers?)";
+        let observer = Self::new(
+            instance,
+            |services| services.frames(),
+            FRAME_BUFFER,
+            refusal,
+        )?;
+        wake_server(&observer.node, instance)?;
+        Ok(observer)
+    }
+}
+
+impl Observer<TruthHeader> {
+    /// Reads the hidden states of an instance, if its server publishes them.
+    ///
+    /// # Errors
+    /// If the channel cannot be opened, or has too many readers.
+    pub fn truth(instance: &Instance) -> Result<Self, ChannelError> {
+        let refusal = "read the truth (are there more than 4 readers?)";
+        let observer = Self::new(instance, |services| services.truth(), TRUTH_BUFFER, refusal)?;
+        wake_server(&observer.node, instance)?;
+        Ok(observer)
+    }
+}
+
+impl Observer<AgentHeader> {
+    /// Reads what the agents of an instance believe; [`super::agent_belief::AgentBelief`] checks each sample.
+    ///
+    /// # Errors
+    /// If the channel cannot be opened, or has too many readers.
+    pub fn agents(instance: &Instance) -> Result<Self, ChannelError> {
+        let refusal = "read the agents' beliefs (are there more than 4 readers?)";
+        Self::new(instance, |services| services.agent(), AGENT_BUFFER, refusal)
+    }
+}
+
+impl<H: Header> Observer<H> {
+    fn new(
+        instance: &Instance,
+        service: impl FnOnce(&Services<'_>) -> Result<PortFactory<Ipc, [u8], H>, ChannelError>,
+        buffer: usize,
+        refusal: &'static str,
+    ) -> Result<Self, ChannelError> {
+        let _turn = Turn::take()?;
+        let node = create_node()?;
+        let service = service(&Services {
+            node: &node,
+            instance,
+        })?;
+        let subscriber = service.subscriber_builder().buffer_size(buffer).create();
+        Ok(Self {
+            subscriber: subscriber.map_err(ipc_error(refusal))?,
+            publisher: Cell::new(None),
+            polling: Polling {
+                buffer,
+                is_eager: false,
+                n_found: Cell::new(0),
+                busy: Cell::new(Instant::now()),
+            },
+            node,
+            end: None,
+        })
+    }
+
+    /// Polls each 500 us at any time: for observers that must not miss the first samples after a pause, when the
+    /// server may publish more than a buffer holds within the 4 ms that others sleep then.
+    #[must_use]
+    pub fn eager(mut self) -> Self {
+        self.polling.is_eager = true;
+        self
+    }
+
+    /// The next sample; `None` if none came in time. Gaps in the headers' sequence numbers are
+    /// samples that this observer lost, as it was too slow.
+    ///
+    /// # Errors
+    /// If iceoryx2 cannot read the channel.
+    pub fn receive(&self, timeout: Duration) -> Result<Option<Sample<H>>, ChannelError> {
+        let start = Instant::now();
+        loop {
+            let sample = self.try_receive()?;
+            let remaining = timeout.saturating_sub(start.elapsed());
+            if sample.is_some() || remaining.is_zero() {
+                return Ok(sample);
+            }
+            std::thread::sleep(remaining.min(self.polling.interval(Instant::now())));
+        }
+    }
+
+    /// The next sample, if there is one already.
+    ///
+    /// # Errors
+    /// If iceoryx2 cannot read the channel.
+    pub fn try_receive(&self) -> Result<Option<Sample<H>>, ChannelError> {
+        let sample = self
+            .subscriber
+            .receive()
+            .map_err(ipc_error("receive a sample"))?;
+        let n_found = &self.polling.n_found;
+        Ok(sample.map(|sample| {
+            n_found.set(n_found.get() + 1);
+            let pid = sample.header().node_id().pid::<Ipc>();
+            self.publisher.set(pid.ok().map(|id| id.value() as u32));
+            Sample {
+                header: *sample.user_header(),
+                payload: sample.payload().to_vec(),
+            }
+        }))
+    }
+
+    /// The process that published the sample received last: the server's, or an agent's.
+    pub fn publisher(&self) -> Option<u32> {
+        self.publisher.get()
+    }
+}
+
+impl Polling {
+    /// How long to sleep, now that the buffer is empty.
+    fn interval(&self, now: Instant) -> Duration {
+        if self.n_found.replace(0) > self.buffer / 4 {
+            self.busy.set(now);
+        }
+        match self.is_eager || now.duration_since(self.busy.get()) < BUSY {
+            true => BUSY_INTERVAL,
+            false => IDLE_INTERVAL,
+        }
+    }
+}
+
+/// Wakes a sleeping server, so that it notices the new observer now.
+fn wake_server(node: &Node<Ipc>, instance: &Instance) -> Result<(), ChannelError> {
+    let _turn = Turn::take()?;
+    let services = Services { node, instance };
+    let notifier = services
+        .wake(Channel::WakeServer)?
+        .notifier_builder()
+        .create();
+    notifier
+        .map_err(ipc_error("create a notifier"))?
+        .notify()
+        .map_err(ipc_error("wake the server"))?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_observer_polls_often_while_busy_and_for_a_second_after() {
+        let began = Instant::now();
+        let mut polling = Polling {
+            buffer: 64,
+            is_eager: false,
+            n_found: Cell::new(0),
+            busy: Cell::new(began),
+        };
+        let later = |seconds: f64| began + Duration::from_secs_f64(seconds);
+        assert_eq!(
+            polling.interval(later(0.9)),
+            BUSY_INTERVAL,
+            "it has just begun"
+        );
+        polling.n_found.set(16);
+        assert_eq!(polling.interval(later(1.1)), IDLE_INTERVAL);
+        polling.n_found.set(17);
+        assert_eq!(polling.interval(later(2.0)), BUSY_INTERVAL);
+        assert_eq!(polling.interval(later(2.9)), BUSY_INTERVAL);
+        assert_eq!(polling.interval(later(3.1)), IDLE_INTERVAL);
+        polling.is_eager = true;
+        assert_eq!(polling.interval(later(9.0)), BUSY_INTERVAL);
+    }
+}

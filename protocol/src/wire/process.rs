@@ -1,0 +1,55 @@
+//! Other processes: whether they run, and a descriptor that tells when they end.
+
+use super::poll::is_readable;
+use rustix::io::Errno;
+use rustix::process::{Pid, PidfdFlags, pidfd_open};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use thiserror::Error;
+
+/// A process that is watched until it ends.
+#[derive(Debug)]
+pub struct WatchedProcess(OwnedFd);
+
+/// The process to end with does not run.
+#[derive(Debug, Error, PartialEq, Eq)]
+#[error("--exit-with {pid}: expected a running process, got {errno}")]
+pub struct NotRunning {
+    pid: i32,
+    errno: Errno,
+}
+
+impl WatchedProcess {
+    /// Watches a process.
+    ///
+    /// # Errors
+    /// `ESRCH` if there is no such process, or the system's error if it has no descriptor left.
+    pub fn open(pid: i32) -> Result<Self, Errno> {
+        let process = (pid > 0).then(|| Pid::from_raw(pid)).flatten();
+        pidfd_open(process.ok_or(Errno::SRCH)?, PidfdFlags::empty()).map(Self)
+    }
+
+    /// Watches the process that `--exit-with` names.
+    ///
+    /// # Errors
+    /// If it does not run.
+    pub fn watch(pid: i32) -> Result<Self, NotRunning> {
+        Self::open(pid).map_err(|errno| NotRunning { pid, errno })
+    }
+
+    /// Readable when it has ended.
+    pub fn descriptor(&self) -> BorrowedFd<'_> {
+        self.0.as_fd()
+    }
+
+    /// Whether it has ended.
+    pub fn has_ended(&self) -> bool {
+        is_readable(self.descriptor())
+    }
+}
+
+/// A process's state, such as `R` or `Z`, as `/proc` says; `None` if there is no such process.
+pub(crate) fn process_state(pid: i32) -> Option<char> {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    // After its name, which may hold anything, in brackets.
+    stat.rsplit_once(") ")?.1.chars().next()
+}

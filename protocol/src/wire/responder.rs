@@ -1,0 +1,308 @@
+//! The answering side of a request channel: take a request, send its answer, wake its client.
+//!
+//! The server uses [`Answers`] on each of its channels; an agent uses a [`Responder`] for the decisions of a world.
+
+use super::channels::{
+    Channel, ChannelError, ControlService, Instance, Ipc, RequestResponse, Services, create_node,
+    ipc_error, server_pid,
+};
+use super::message::{ControlReply, ControlRequest, Header, Status, VERSION};
+use super::turn::Turn;
+use super::wait::{descriptor, drain};
+use iceoryx2::active_request::ActiveRequest;
+use iceoryx2::node::Node;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::{ListenerKey, Notifier};
+use iceoryx2::port::server::Server;
+use iceoryx2::port::{
+    DegradationAction, DegradationCause, DegradationFn, DegradationInfo, ReceiveError,
+};
+use iceoryx2::prelude::{AllocationStrategy, CallbackProgression};
+use iceoryx2::service::port_factory::server::ServerCreateError;
+use serde::Serialize;
+use std::collections::HashMap;
+use std::os::fd::BorrowedFd;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+use thiserror::Error;
+
+/// Length that answers in JSON may have before their segment grows, bytes.
+const JSON_SLICE: usize = 16_384;
+
+/// Listeners remembered before the table is emptied.
+const MAX_KNOWN_LISTENERS: usize = 1024;
+
+/// How long clients may take to read an answer before its sender ends.
+const LAST_ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
+
+/// A request that waits for its answer.
+pub type Active<Q, R> = ActiveRequest<Ipc, [u8], Q, [u8], R>;
+
+/// A request in JSON that waits for its answer.
+pub type ActiveControl = Active<ControlRequest, ControlReply>;
+
+/// The answering port of a service of JSON messages.
+pub type ControlServer = Server<Ipc, [u8], ControlRequest, [u8], ControlReply>;
+
+/// Sends answers and wakes the clients that wait for them.
+#[derive(Debug)]
+pub struct Answers {
+    notifier: Notifier<Ipc>,
+    listeners: HashMap<u128, ListenerKey>,
+}
+
+/// Counts connections that could not be opened, for example as no file descriptors are left: their clients get no
+/// answer.
+#[derive(Debug, Clone, Default)]
+pub struct FailedConnections(Arc<AtomicU64>);
+
+/// The answering port for the decisions of a world.
+#[derive(Debug)]
+pub struct Responder {
+    server: ControlServer,
+    answers: Answers,
+    failed_connections: FailedConnections,
+    listener: Listener<Ipc>,
+    _node: Node<Ipc>,
+    /// Last, so that all else is dropped within it.
+    end: Option<Turn>,
+}
+
+impl Drop for Responder {
+    fn drop(&mut self) {
+        self.end = Turn::take().ok();
+    }
+}
+
+/// Why decisions cannot be answered.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ResponderError {
+    /// Another agent answers them.
+    #[error(
+        "decisions of world {world} on instance {instance:?} are served already, by pid {pid}: \
+         shut it down first"
+    )]
+    Taken {
+        /// Name of the instance.
+        instance: String,
+        /// The world whose decisions it answers.
+        world: u32,
+        /// The other agent's process.
+        pid: i32,
+    },
+    /// A channel could not be made.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+}
+
+impl FailedConnections {
+    /// A handler that counts, for a port.
+    pub fn counter(&self) -> impl DegradationFn + 'static {
+        let count = self.0.clone();
+        move |_: DegradationCause, _: &DegradationInfo| {
+            count.fetch_add(1, Ordering::Relaxed);
+            DegradationAction::Ignore
+        }
+    }
+
+    /// The count since the last call.
+    pub fn take(&self) -> u64 {
+        self.0.swap(0, Ordering::Relaxed)
+    }
+}
+
+impl Answers {
+    /// Sends answers to clients of an instance.
+    ///
+    /// # Errors
+    /// If the wake service cannot be opened.
+    pub fn new(services: &Services<'_>) -> Result<Self, ChannelError> {
+        let wake = services.wake(Channel::WakeClient)?;
+        let notifier = wake.notifier_builder().create();
+        Ok(Self {
+            notifier: notifier.map_err(ipc_error("create a notifier"))?,
+            listeners: HashMap::new(),
+        })
+    }
+
+    /// Sends an answer and wakes its client. A client that has ended, or that does not read its answers, loses
+    /// this one.
+    pub fn send<Q: Header, R: Header>(
+        &mut self,
+        request: &Active<Q, R>,
+        header: R,
+        payload: &[u8],
+        listener: u128,
+    ) {
+        let sent = request
+            .loan_slice_uninit(payload.len())
+            .map_err(|error| format!("{error:?}"))
+            .and_then(|mut response| {
+                *response.user_header_mut() = header;
+                response
+                    .write_from_slice(payload)
+                    .send()
+                    .map_err(|error| format!("{error:?}"))
+            });
+        match sent {
+            Ok(()) => self.wake(listener),
+            Err(problem) => tracing::debug!(problem, "an answer was not taken"),
+        }
+    }
+
+    /// Sends an answer in JSON and wakes its client.
+    pub fn send_json(&mut self, request: &ActiveControl, status: Status, reply: &impl Serialize) {
+        let asked = request.user_header();
+        let header = ControlReply {
+            version: VERSION,
+            status: status as u32,
+            sequence: asked.sequence,
+        };
+        let listener = listener_id(asked.listener_low, asked.listener_high);
+        let text = serde_json::to_vec(reply).expect("invariant: replies serialise");
+        self.send(request, header, &text, listener);
+    }
+
+    fn wake(&mut self, listener: u128) {
+        let known = self
+            .listeners
+            .get(&listener)
+            .is_some_and(|key| self.notifier.notify_single_listener(key).is_ok());
+        if listener == 0 || known {
+            return;
+        }
+        if self.listeners.len() == MAX_KNOWN_LISTENERS {
+            self.listeners.clear();
+        }
+        self.listeners.remove(&listener);
+        let listeners = &mut self.listeners;
+        self.notifier.for_each_listener(|one, details| {
+            if details.listener_id.value() != listener {
+                return CallbackProgression::Continue;
+            }
+            listeners.insert(listener, one.listener_key());
+            let _ = one.notify();
+            CallbackProgression::Stop
+        });
+    }
+}
+
+impl Responder {
+    /// Opens the answering port of a world's decisions.
+    ///
+    /// # Errors
+    /// If another agent has it, or it cannot be made.
+    pub fn open(instance: &Instance, world: u32) -> Result<Self, ResponderError> {
+        let _turn = Turn::take()?;
+        let node = create_node()?;
+        let services = Services {
+            node: &node,
+            instance,
+        };
+        let service = services.create_decisions(world)?;
+        let failed_connections = FailedConnections::default();
+        let server =
+            control_server(&service, &failed_connections).map_err(|error| {
+                match port_owner(&service, &error) {
+                    Some(pid) => ResponderError::Taken {
+                        instance: instance.name().into(),
+                        world,
+                        pid,
+                    },
+                    None => ipc_error("create a server")(error).into(),
+                }
+            })?;
+        let listener = services.listener(Channel::WakeAgent(world))?;
+        Ok(Self {
+            server,
+            answers: Answers::new(&services)?,
+            failed_connections,
+            listener,
+            _node: node,
+            end: None,
+        })
+    }
+
+    /// The next request.
+    pub fn receive(&self) -> Option<ActiveControl> {
+        let request = received(self.server.receive(), &self.failed_connections);
+        if self.failed_connections.take() > 0 {
+            tracing::warn!("a connection could not be opened: are no file descriptors left?");
+        }
+        request
+    }
+
+    /// Answers a request.
+    pub fn answer(&mut self, request: &ActiveControl, status: Status, reply: &impl Serialize) {
+        self.answers.send_json(request, status, reply);
+    }
+
+    /// Drops wake-ups; returns whether there were any.
+    ///
+    /// # Errors
+    /// If iceoryx2 cannot read them.
+    pub fn drain(&self) -> Result<bool, ChannelError> {
+        drain(&self.listener)
+    }
+
+    /// Readable while there are wake-ups.
+    pub fn descriptor(&self) -> BorrowedFd<'_> {
+        descriptor(&self.listener)
+    }
+}
+
+/// The request that was received, if any. A failure is due to the client, such as one whose memory is gone: it must not
+/// end the server.
+pub fn received<T>(
+    result: Result<Option<T>, ReceiveError>,
+    failed_connections: &FailedConnections,
+) -> Option<T> {
+    result.unwrap_or_else(|error| {
+        if matches!(error, ReceiveError::ConnectionFailure(_)) {
+            failed_connections.0.fetch_add(1, Ordering::Relaxed);
+        }
+        tracing::debug!(?error, "a request was not received");
+        None
+    })
+}
+
+/// The answering port of a service of JSON messages, for answers of any length.
+///
+/// # Errors
+/// If iceoryx2 cannot make it; [`port_owner`] tells whether another process has the port.
+pub fn control_server(
+    service: &ControlService,
+    failed_connections: &FailedConnections,
+) -> Result<ControlServer, ServerCreateError> {
+    let builder = service.server_builder().initial_max_slice_len(JSON_SLICE);
+    builder
+        .set_request_degradation_handler(failed_connections.counter())
+        .set_response_degradation_handler(failed_connections.counter())
+        .allocation_strategy(AllocationStrategy::PowerOfTwo)
+        .create()
+}
+
+/// The process that has a service's one answering port, if this is why another could not be created.
+pub fn port_owner<Q: Header, R: Header>(
+    service: &RequestResponse<Q, R>,
+    error: &ServerCreateError,
+) -> Option<i32> {
+    (*error == ServerCreateError::ExceedsMaxSupportedServers)
+        .then(|| server_pid(service))
+        .flatten()
+}
+
+/// A listener's id from the two halves in a request's header.
+pub fn listener_id(low: u64, high: u64) -> u128 {
+    u128::from(low) | u128::from(high) << 64
+}
+
+/// Waits, for half a second at most, until clients have read their answers and dropped their requests.
+pub fn wait_until_taken<Q: Header, R: Header>(requests: &[Active<Q, R>]) {
+    let deadline = Instant::now() + LAST_ANSWER_TIMEOUT;
+    while requests.iter().any(Active::is_connected) && Instant::now() < deadline {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}

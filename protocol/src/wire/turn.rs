@@ -1,0 +1,157 @@
+//! A lock between processes: one that makes or removes nodes, services or ports takes a turn (PROTOCOL.md section 1).
+//!
+//! During its turn no other process makes anything: what is unfinished was left by a dead one. The lock is a `flock`,
+//! which ends with its process.
+
+use super::directory::{directory_error, not_usable, own_channel_directory};
+use super::error::ChannelError;
+use super::process::process_state;
+use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, major, minor, open, stat};
+use rustix::io::Errno;
+use std::cell::Cell;
+use std::os::fd::OwnedFd;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+/// How long to wait for others, each of which takes milliseconds.
+const LONGEST_WAIT: Duration = Duration::from_secs(10);
+
+/// How long to wait before asking whether the process that has the turn is stopped.
+const STOPPED_WAIT: Duration = Duration::from_millis(50);
+
+/// How often to try.
+const INTERVAL: Duration = Duration::from_micros(500);
+
+/// The file in the channel directory that is locked.
+const LOCK: &str = "lock";
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Held {
+    No,
+    /// By this thread; no other process makes or removes anything.
+    Alone,
+    /// By a stopped process, which is not waited for.
+    Unlocked,
+}
+
+thread_local! {
+    static HELD: Cell<Held> = const { Cell::new(Held::No) };
+}
+
+/// A turn; it ends when it is dropped. One within another of the same thread is part of that.
+#[derive(Debug)]
+pub struct Turn {
+    is_outermost: bool,
+    _lock: Option<OwnedFd>,
+}
+
+impl Turn {
+    /// Waits for a turn. A stopped process that has it is not waited for.
+    ///
+    /// # Errors
+    /// If others hold it for too long, or the directory cannot be written to.
+    pub fn take() -> Result<Self, ChannelError> {
+        let is_outermost = HELD.get() == Held::No;
+        let lock = match is_outermost {
+            true => wait(&own_channel_directory()?.join(LOCK), LONGEST_WAIT)?,
+            false => None,
+        };
+        if is_outermost {
+            HELD.set(if lock.is_some() {
+                Held::Alone
+            } else {
+                Held::Unlocked
+            });
+        }
+        Ok(Self {
+            is_outermost,
+            _lock: lock,
+        })
+    }
+
+    /// Whether no other process has it.
+    pub fn is_alone(&self) -> bool {
+        HELD.get() == Held::Alone
+    }
+}
+
+impl Drop for Turn {
+    fn drop(&mut self) {
+        if self.is_outermost {
+            HELD.set(Held::No);
+        }
+    }
+}
+
+/// The lock; `None` if a stopped process has it.
+fn wait(path: &Path, limit: Duration) -> Result<Option<OwnedFd>, ChannelError> {
+    let start = Instant::now();
+    let flags = OFlags::RDWR | OFlags::CREATE | OFlags::CLOEXEC;
+    let wrong = |errno: Errno| not_usable(path, errno.into());
+    loop {
+        let file = open(path, flags, Mode::RUSR | Mode::WUSR).map_err(wrong)?;
+        match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) if is_file(&file, path) => return Ok(Some(file)),
+            Ok(()) => continue, // It was removed meanwhile: others lock another file now.
+            Err(Errno::WOULDBLOCK | Errno::INTR) => {}
+            Err(errno) => return Err(wrong(errno)),
+        }
+        let elapsed = start.elapsed();
+        if elapsed > STOPPED_WAIT && holder(&file).is_some_and(is_stopped) {
+            return Ok(None);
+        }
+        if elapsed > limit {
+            let pid = holder(&file).map_or("a process".into(), |pid| format!("pid {pid}"));
+            let problem = format!("expected the lock within {limit:?}, got it held by {pid}");
+            return Err(directory_error(path, problem));
+        }
+        std::thread::sleep(INTERVAL);
+    }
+}
+
+fn is_file(file: &OwnedFd, path: &Path) -> bool {
+    match (fstat(file), stat(path)) {
+        (Ok(ours), Ok(there)) => (ours.st_dev, ours.st_ino) == (there.st_dev, there.st_ino),
+        _ => false,
+    }
+}
+
+/// The process that has the lock, by `/proc/locks`.
+fn holder(file: &OwnedFd) -> Option<i32> {
+    let found = fstat(file).ok()?;
+    let (major, minor) = (major(found.st_dev), minor(found.st_dev));
+    let inode = format!("{major:02x}:{minor:02x}:{}", found.st_ino);
+    let locks = std::fs::read_to_string("/proc/locks").ok()?;
+    // "1: FLOCK  ADVISORY  WRITE 4711 00:1a:5678 0 EOF"; waiting processes have an arrow in front.
+    locks.lines().find_map(|line| {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        match words[..] {
+            [_, "FLOCK", _, "WRITE", pid, found, ..] if found == inode => pid.parse().ok(),
+            _ => None,
+        }
+    })
+}
+
+fn is_stopped(pid: i32) -> bool {
+    process_state(pid) == Some('T')
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_turn_is_waited_for_and_its_holder_named() {
+        let path = std::env::temp_dir().join(format!("emberwatch-turn-{}", std::process::id()));
+        let first = wait(&path, Duration::ZERO).expect("nobody has it");
+        let refusal = wait(&path, Duration::from_millis(1)).expect_err("it is taken");
+        let pid = format!("held by pid {}", std::process::id());
+        assert!(refusal.to_string().contains(&pid), "{refusal}");
+        std::fs::remove_file(&path).expect("remove it");
+        let second = wait(&path, Duration::ZERO).expect("another file of that name");
+        assert!(first.is_some() && second.is_some());
+        drop(second);
+        assert!(wait(&path, Duration::ZERO).expect("free again").is_some());
+        std::fs::remove_file(&path).expect("clean up");
+    }
+}

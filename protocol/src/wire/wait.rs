@@ -1,0 +1,110 @@
+//! The bounded wait that both sides use: spin while that pays, then block, never past a deadline.
+
+use super::error::{ChannelError, Ipc, ipc_error};
+use super::spinning::Spinning;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::prelude::FileDescriptorBased;
+use std::cell::Cell;
+use std::os::fd::BorrowedFd;
+use std::time::{Duration, Instant};
+
+pub use super::poll::{is_readable, sleep_until_event, sleep_until_readable};
+
+/// Waits, and remembers whether spinning pays.
+#[derive(Debug, Default)]
+pub struct Waiter {
+    spinning: Cell<Spinning>,
+}
+
+impl Waiter {
+    /// Polls until something arrives or the timeout has passed, then returns `None`.
+    ///
+    /// `block` may sleep for at most the duration it is given; it is called again and again until the
+    /// timeout, so it may return early for any reason.
+    ///
+    /// # Errors
+    /// The first error of `poll` or `block`.
+    pub fn wait<T, E>(
+        &self,
+        timeout: Duration,
+        mut poll: impl FnMut() -> Result<Option<T>, E>,
+        mut block: impl FnMut(Duration) -> Result<(), E>,
+    ) -> Result<Option<T>, E> {
+        let start = Instant::now();
+        let mut spinning = self.spinning.get();
+        spinning.begin(start);
+        let arrived = loop {
+            let arrived = poll()?;
+            if arrived.is_some() {
+                spinning.arrived();
+                break arrived;
+            }
+            let now = Instant::now();
+            let waited = now - start;
+            if spinning.goes_on(now) {
+                std::hint::spin_loop();
+            } else if waited < timeout {
+                block(timeout - waited)?;
+            } else {
+                break None;
+            }
+        };
+        self.spinning.set(spinning);
+        Ok(arrived)
+    }
+}
+
+/// The descriptor that is readable while a listener has notifications to drain.
+#[expect(unsafe_code, reason = "iceoryx2 hands out the raw descriptor only")]
+pub fn descriptor(listener: &Listener<Ipc>) -> BorrowedFd<'_> {
+    // SAFETY: the descriptor stays open as long as its listener, which the result borrows.
+    unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) }
+}
+
+/// Drops a listener's wake-ups; returns whether there were any.
+///
+/// # Errors
+/// If iceoryx2 cannot read them.
+pub fn drain(listener: &Listener<Ipc>) -> Result<bool, ChannelError> {
+    let drained = listener.try_wait(|_| {});
+    drained
+        .map(|n_drained| n_drained > 0)
+        .map_err(ipc_error("drain wake-ups"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_wait_blocks_no_longer_than_its_timeout() {
+        let mut longest = Duration::ZERO;
+        let timeout = Duration::from_millis(5);
+        let block = |limit: Duration| {
+            longest = longest.max(limit);
+            std::thread::sleep(limit);
+            Ok::<_, ()>(())
+        };
+        let waited = Waiter::default().wait(timeout, || Ok(None::<u8>), block);
+        assert_eq!(waited, Ok(None));
+        assert!(longest <= timeout);
+    }
+
+    #[test]
+    fn what_arrives_is_returned_and_errors_end_the_wait() {
+        let mut calls = 0;
+        let third = || {
+            calls += 1;
+            Ok::<_, &str>((calls == 3).then_some(calls))
+        };
+        assert_eq!(
+            Waiter::default().wait(Duration::from_secs(9), third, |_| Ok(())),
+            Ok(Some(3))
+        );
+        let failing = || Err::<Option<u8>, _>("gone");
+        assert_eq!(
+            Waiter::default().wait(Duration::from_secs(9), failing, |_| Ok(())),
+            Err("gone")
+        );
+    }
+}

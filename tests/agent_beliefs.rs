@@ -1,0 +1,156 @@
+//! What agents show of their beliefs, to whoever looks.
+
+use crate::harness::{PATIENCE, Program, Server, eventually};
+use protocol::agent_belief::AgentBelief;
+use protocol::message::AgentHeader;
+use protocol::observer::Observer;
+use std::collections::BTreeSet;
+use std::time::{Duration, Instant};
+
+fn run(server: &Server, flags: &[&str]) -> Program {
+    let common = ["run", "--instance", server.instance.name()];
+    Program::start("emberwatch-agent", &[&common[..], flags].concat())
+}
+
+/// Reads until one is as wanted.
+fn until(
+    observer: &Observer<AgentHeader>,
+    mut wanted: impl FnMut(&AgentBelief) -> bool,
+) -> Vec<AgentBelief> {
+    let (mut all, start) = (Vec::<AgentBelief>::new(), Instant::now());
+    while !all.last().is_some_and(&mut wanted) {
+        let remaining = PATIENCE.saturating_sub(start.elapsed());
+        let shown = next(observer, remaining);
+        all.push(shown.expect("an agent that shows its belief"));
+    }
+    all
+}
+
+fn next(observer: &Observer<AgentHeader>, limit: Duration) -> Option<AgentBelief> {
+    let sample = observer.receive(limit).expect("receive")?;
+    Some(AgentBelief::try_from(&sample).expect("a belief"))
+}
+
+#[test]
+fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
+    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 2000");
+    let observer = Observer::agents(&server.instance).expect("observe");
+    let mut agent = run(&server, &["--steps", "500", "--policy", "beam_explore"]);
+    let mut shown = Vec::new();
+    let has_ended = eventually(4 * PATIENCE, || {
+        shown.extend(next(&observer, Duration::ZERO));
+        agent.has_ended()
+    });
+    assert!(has_ended, "{}", agent.stderr());
+    assert_eq!(agent.wait(PATIENCE).code, Some(0));
+    shown.extend(std::iter::from_fn(|| next(&observer, Duration::ZERO)));
+    // Who meets an agent sees its last belief; who is paused until it is gone meets none.
+    let Some(last) = shown.last() else { return };
+    assert_eq!(last.header.step, 500);
+    for AgentBelief {
+        header,
+        belief,
+        intent,
+    } in &shown
+    {
+        assert_eq!(belief.dim(), (3, 16, 24));
+        let sums = belief.sum_axis(ndarray::Axis(0));
+        assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-4));
+        assert_eq!(intent.policy, "beam_explore");
+        assert_eq!(intent.states, ["normal", "latent", "fire"]);
+        assert!(
+            header.step == 0 || intent.objective == "entropy",
+            "{intent:?}"
+        );
+    }
+    // The posterior is sure of what was seen on the last path: 98 of 100 fires look like one.
+    let surest = last.belief.iter().copied().fold(0.0, f32::max);
+    assert!(surest > 0.9, "{surest}");
+}
+
+#[test]
+fn beliefs_that_nobody_looks_at_are_not_shown() {
+    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 200");
+    let agent = run(&server, &[]);
+    let acts = || server.observe(0).0.step > 500;
+    assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
+    let observer = Observer::agents(&server.instance).expect("observe");
+    let shown = until(&observer, |_| true);
+    assert!(shown[0].header.step > 500, "a belief of before");
+    assert_eq!(shown[0].header.pid, agent.pid());
+}
+
+#[test]
+fn a_comparison_that_is_watched_shows_the_beliefs_of_all_its_worlds() {
+    let flags = "--worlds 8 --publish-truth --height 8 --width 9 --moves 6 --burn-in 50";
+    let server = Server::start(flags);
+    let observer = Observer::agents(&server.instance).expect("observe");
+    let compare = |n_steps: u64| {
+        let words = format!(
+            "compare --policies beam_exploit --baseline beam_exploit --seeds 0..8 --steps {n_steps} \
+             --watch 127.0.0.1:0 --instance {}",
+            server.instance.name()
+        );
+        Program::start("emberwatch-agent", &words.split(' ').collect::<Vec<_>>())
+    };
+    let comparison = compare(1_000_000);
+    let mut missing: BTreeSet<u32> = (0..8).collect();
+    let start = Instant::now();
+    while !missing.is_empty() {
+        let remaining = PATIENCE.saturating_sub(start.elapsed());
+        let sample = observer.receive(remaining).expect("receive");
+        let sample = sample.unwrap_or_else(|| panic!("no belief about worlds {missing:?}"));
+        missing.remove(&sample.header.world);
+        std::thread::sleep(Duration::from_millis(2)); // as a dashboard looks
+    }
+    comparison.wait_for_words("watch at http://127.0.0.1:", PATIENCE);
+    drop((comparison, observer));
+    let held = || {
+        server
+            .status()
+            .worlds
+            .iter()
+            .any(|world| world.holder_pid.is_some())
+    };
+    assert!(eventually(PATIENCE, || !held()));
+    let ended = compare(5).wait(PATIENCE);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+}
+
+#[test]
+fn a_training_shows_what_it_believes_of_all_its_worlds() {
+    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 500 --worlds 3");
+    let observer = Observer::agents(&server.instance).expect("observe");
+    let folder = tempfile::TempDir::new().expect("a folder");
+    let out = folder.path().join("out");
+    let config = folder.path().join("agent.toml");
+    std::fs::write(&config, "[learning]\nexplore_steps = 1000000\n").expect("write");
+    let flags = [
+        "--config",
+        config.to_str().expect("a path"),
+        "--out",
+        out.to_str().expect("a path"),
+        "--world",
+        "1",
+        "--worlds",
+        "2",
+    ];
+    let common = ["train", "--instance", server.instance.name()];
+    let training = Program::start("emberwatch-agent", &[&common[..], &flags].concat());
+    let mut worlds = BTreeSet::new();
+    let shown = until(&observer, |shown| {
+        worlds.insert(shown.header.world);
+        worlds.len() == 2 && shown.header.step > 5
+    });
+    drop(training);
+    assert_eq!(worlds, BTreeSet::from([1, 2]));
+    for AgentBelief { belief, intent, .. } in &shown {
+        assert_eq!(belief.dim(), (3, 16, 24));
+        let sums = belief.sum_axis(ndarray::Axis(0));
+        assert!(sums.iter().all(|sum| (sum - 1.0).abs() < 1e-4));
+        assert_eq!(intent.policy, "train learned_filter");
+        assert_eq!(intent.belief_from, "learned_filter");
+        assert_eq!(intent.states, ["state 0", "state 1", "state 2"]);
+        assert_eq!(intent.objective, "random moves");
+    }
+}

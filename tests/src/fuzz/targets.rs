@@ -1,0 +1,105 @@
+//! Every decoder.
+
+use super::target::{Kind, Seed, Target};
+use super::{files, messages, requests, worlds};
+
+/// All of them.
+pub const TARGETS: [Target; 11] = [
+    message("step_request", requests::step, requests::step_seeds),
+    message(
+        "control_request",
+        requests::control,
+        requests::control_seeds,
+    ),
+    message(
+        "step_answer",
+        messages::step_answer,
+        messages::step_answer_seeds,
+    ),
+    message("frame", messages::frame, messages::frame_seeds),
+    message("outlook", messages::outlook, messages::outlook_seeds),
+    message(
+        "control_reply",
+        messages::control_reply,
+        messages::control_reply_seeds,
+    ),
+    message("decision", messages::decision, messages::decision_seeds),
+    file("model", files::model, files::model_seeds),
+    file("checkpoint", files::checkpoint, files::checkpoint_seeds),
+    file("snapshot", worlds::snapshot, worlds::snapshot_seeds),
+    file("recording", worlds::recording, worlds::recording_seeds),
+];
+
+type Body = fn(&[u8]) -> bool;
+type Seeds = fn() -> Vec<Seed>;
+
+const fn message(name: &'static str, body: Body, seeds: Seeds) -> Target {
+    Target {
+        name,
+        kind: Kind::Message,
+        body,
+        seeds,
+    }
+}
+
+const fn file(name: &'static str, body: Body, seeds: Seeds) -> Target {
+    Target {
+        name,
+        kind: Kind::File,
+        body,
+        seeds,
+    }
+}
+
+/// The target of a name.
+pub fn named(name: &str) -> Option<&'static Target> {
+    TARGETS.iter().find(|target| target.name == name)
+}
+
+/// Decodes bytes as a target of a name does.
+///
+/// # Panics
+/// If something is wrong with its decoder, or there is no such target.
+pub fn decode(name: &str, bytes: &[u8]) -> bool {
+    let target = named(name).expect("a target of this name");
+    (target.body)(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    #[test]
+    fn the_corpus_holds_the_seeds_of_this_release() {
+        for target in TARGETS {
+            for (name, bytes) in (target.seeds)() {
+                let path = target.folder().join(name);
+                let kept = std::fs::read(&path).unwrap_or_default();
+                assert!(
+                    sorted(kept) == sorted(bytes),
+                    "{} is not what it was made of: run `cargo run -p tests --example fuzz -- --seeds`",
+                    path.display()
+                );
+            }
+        }
+    }
+
+    /// Whatever the order: safetensors writes texts in any.
+    fn sorted(mut bytes: Vec<u8>) -> Vec<u8> {
+        bytes.sort_unstable();
+        bytes
+    }
+
+    #[test]
+    fn every_target_has_a_program_and_every_program_a_target() {
+        let programs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/fuzz_targets");
+        for target in TARGETS {
+            let program = std::fs::read_to_string(programs.join(format!("{}.rs", target.name)));
+            let program = program.expect("a program of libFuzzer");
+            assert!(program.contains(&format!("{:?}", target.name)), "{program}");
+        }
+        let n_programs = std::fs::read_dir(programs).expect("the programs").count();
+        assert_eq!(n_programs, TARGETS.len());
+    }
+}
