@@ -1,11 +1,12 @@
-//! ARCHITECTURE.md names every source file and no other; no file of a crate depends on itself by way of others.
+//! ARCHITECTURE.md names every room and file rightly; rooms use only those below them; no file depends on itself by
+//! way of others.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
-/// Directories all of whose Rust, Python or JavaScript files are listed.
+/// Folders of sources: each folder in them that has any is a room.
 const SOURCES: [&str; 9] = [
     "protocol/src",
     "env-server/src",
@@ -18,10 +19,12 @@ const SOURCES: [&str; 9] = [
     "clients/python/src/emberwatch",
 ];
 
-/// The crates' folders; `agent` and `agent/figures` are not among them yet.
-const CRATES: [&str; 5] = [
+const CRATES: [&str; 8] = [
     "protocol",
     "env-server",
+    "agent",
+    "agent/figures",
+    "agent/network",
     "clients/dashboard",
     "clients/python",
     "tests",
@@ -37,30 +40,19 @@ fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// The files of the list: a line without indent begins a directory, the others name a file in it.
-fn listed() -> BTreeSet<String> {
-    let (_, list) = ARCHITECTURE.split_once("```text\n").expect("a list");
-    let (list, _) = list.split_once("\n```").expect("its end");
-    let mut directory = "";
-    let mut files = BTreeSet::new();
-    for line in list.lines() {
-        let (name, says) = line.trim().split_once(' ').expect("a name and its role");
-        assert!(!says.trim().is_empty(), "{name} has no role");
-        if line.starts_with(' ') {
-            assert!(files.insert(format!("{directory}{name}")), "{name} twice");
-        } else {
-            directory = name;
-        }
-    }
-    files
+/// The rooms of the table, in its order.
+fn rooms() -> Vec<&'static str> {
+    let rows = ARCHITECTURE.lines().filter(|line| line.starts_with("| `"));
+    let room = |row: &'static str| row.split('`').nth(1).expect("a room");
+    rows.map(room).collect()
 }
 
-/// The source files below a directory, relative to the root.
-fn source_files(directory: &str) -> Vec<String> {
-    let entries = std::fs::read_dir(root().join(directory)).expect("a source directory");
+/// The source files below a folder, relative to the root.
+fn source_files(folder: &str) -> Vec<String> {
+    let entries = std::fs::read_dir(root().join(folder)).expect("a source folder");
     let below = |entry: std::io::Result<std::fs::DirEntry>| {
-        let entry = entry.expect("a readable directory");
-        let path = format!("{directory}/{}", entry.file_name().display());
+        let entry = entry.expect("a readable folder");
+        let path = format!("{folder}/{}", entry.file_name().display());
         match entry.file_type().expect("a file type").is_dir() {
             true => source_files(&path),
             false => vec![path],
@@ -74,31 +66,72 @@ fn is_source(name: &str) -> bool {
     [".rs", ".py", ".js"].iter().any(|end| name.ends_with(end))
 }
 
+/// The room of a source file: the topmost folder below the sources, or these themselves.
+fn room_of(path: &str) -> String {
+    let of = |source: &&&str| path.starts_with(&format!("{source}/"));
+    let source = SOURCES.iter().filter(of).max_by_key(|source| source.len());
+    let source = source.expect("a folder of sources");
+    match path[source.len() + 1..].split_once('/') {
+        Some((folder, _)) => format!("{source}/{folder}"),
+        None => (*source).to_owned(),
+    }
+}
+
 #[test]
-fn every_source_file_is_listed() {
-    let listed = listed();
-    let all: Vec<String> = SOURCES.into_iter().flat_map(source_files).collect();
-    let missing: Vec<&String> = all.iter().filter(|path| !listed.contains(*path)).collect();
-    assert!(
-        all.len() > 80 && missing.is_empty(),
-        "not listed: {missing:?}"
-    );
+fn every_room_is_listed_and_exists() {
+    let rooms: BTreeSet<&str> = rooms().into_iter().collect();
+    let files: Vec<String> = SOURCES.into_iter().flat_map(source_files).collect();
+    let found: BTreeSet<String> = files.iter().map(|path| room_of(path)).collect();
+    // What only has thin roots beside folders, and folders of a room's own, need no line.
+    let has_rooms = |room: &str| found.iter().any(|other| other.starts_with(&format!("{room}/")));
+    let inner = ["agent/network/src/ops", "agent/network/src/dqn", "tests/src/fuzz"];
+    let missing: Vec<&String> = found
+        .iter()
+        .filter(|room| !rooms.contains(room.as_str()) && !has_rooms(room))
+        .filter(|room| !inner.contains(&room.as_str()))
+        .collect();
+    assert!(files.len() > 80 && missing.is_empty(), "not listed: {missing:?}");
+    let gone: Vec<&&str> = rooms.iter().filter(|room| !root().join(room).exists()).collect();
+    assert!(gone.is_empty(), "not there: {gone:?}");
 }
 
 #[test]
 fn every_file_named_exists() {
-    let listed = listed();
-    let gone: Vec<&String> = listed
-        .iter()
-        .filter(|path| !root().join(path).is_file())
-        .collect();
-    assert!(gone.is_empty(), "not there: {gone:?}");
-    // In the text, a file goes by the end of its path.
+    let files: Vec<String> = SOURCES.into_iter().flat_map(source_files).collect();
     let quoted = ARCHITECTURE.split('`').skip(1).step_by(2);
     for name in quoted.filter(|name| is_source(name)) {
         let end = format!("/{name}");
         let is_end = |path: &String| path == name || path.ends_with(&end);
-        assert!(listed.iter().any(is_end), "{name} is not in the list");
+        let exists = files.iter().any(is_end) || root().join(name).is_file();
+        assert!(exists, "{name} does not exist");
+    }
+}
+
+#[test]
+fn rooms_use_only_those_below_them() {
+    let rooms = rooms();
+    for name in ["agent", "env-server", "protocol"] {
+        let source = root().join(name).join("src");
+        let graph = graph(&source.join("lib.rs"), |path| {
+            std::fs::read_to_string(path).ok()
+        });
+        let place = |file: &PathBuf| {
+            let path = file.strip_prefix(root()).expect("below the root");
+            let room = room_of(path.to_str().expect("a name"));
+            let stem = path.with_extension("");
+            let stem = stem.to_str().expect("a name");
+            rooms.iter().position(|name| *name == room || *name == stem)
+        };
+        let edges = graph
+            .iter()
+            .flat_map(|(file, used)| used.iter().map(move |used| (file, used)));
+        let upward: Vec<_> = edges
+            .filter(|(file, used)| match (place(file), place(used)) {
+                (Some(from), Some(to)) => to < from,
+                _ => false,
+            })
+            .collect();
+        assert!(upward.is_empty(), "{upward:#?}");
     }
 }
 
