@@ -35,9 +35,9 @@ impl<R: Read> Reader<R> {
         let n_magic = n_read.min(MAGIC.len());
         if header.magic[..n_magic] != MAGIC[..n_magic] {
             return Err(RecordingError::Foreign(format!(
-                "not a recording: expected it to begin with \"{}\", got \"{}\"",
-                MAGIC.escape_ascii(),
-                header.magic[..n_magic].escape_ascii()
+                "not a recording: expected it to begin with {:?}, got {:?}",
+                MAGIC.escape_ascii().to_string(),
+                header.magic[..n_magic].escape_ascii().to_string()
             )));
         }
         if n_read < size_of::<FileHeader>() {
