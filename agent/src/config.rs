@@ -1,10 +1,12 @@
 //! The agent's settings: defaults or the paper's preset, then a TOML file, then flags.
 
 mod decisions;
+mod error;
 mod learning;
 mod networks;
 
 pub use decisions::DecisionsConfig;
+pub use error::ConfigError;
 pub use learning::LearningConfig;
 pub use networks::{AutoencoderConfig, DqnConfig, StepSize};
 
@@ -20,7 +22,6 @@ use clap::{Args, ValueEnum};
 use protocol::program::read_text;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
-use thiserror::Error;
 
 /// Settings of planners and estimators; `config/agent.toml` lists them with their defaults.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -123,50 +124,6 @@ pub struct AgentFlags {
     /// Seed of planners, of the prior's worlds and of learners [default: 0]
     #[arg(long)]
     pub agent_seed: Option<u64>,
-}
-
-/// Why settings were refused.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum ConfigError {
-    /// A file that cannot be read or is not of the form.
-    #[error("config file {path}: {problem}")]
-    File {
-        /// Its path.
-        path: String,
-        /// What is wrong.
-        problem: String,
-    },
-    /// A bonus that is no number of a sensible size.
-    #[error("objective.{setting}: expected 0 to 1000, got {got}")]
-    Bonus {
-        /// Which setting.
-        setting: &'static str,
-        /// What it is.
-        got: f32,
-    },
-    /// A setting that is no number of a sensible size.
-    #[error("{setting}: expected 0 to {most}, got {got}")]
-    Number {
-        /// Which setting.
-        setting: &'static str,
-        /// Greatest value allowed.
-        most: f64,
-        /// What it is.
-        got: f64,
-    },
-    /// A setting out of its range.
-    #[error("{setting}: expected {least} to {most}, got {got}")]
-    Range {
-        /// Which setting.
-        setting: &'static str,
-        /// Least value allowed.
-        least: usize,
-        /// Greatest value allowed.
-        most: usize,
-        /// What it is.
-        got: usize,
-    },
 }
 
 impl Default for AgentConfig {

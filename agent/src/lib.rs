@@ -3,14 +3,16 @@
 //! Rooms, each using only those below it:
 //!
 //! - `commands` (of the program): flags in, words out
-//! - [`benchmark`]: policies on the same worlds, scored
-//! - [`acting`]: one world of a running server, for a policy or for a learner outside
-//! - [`learning`]: models that are learned while acting, and their checkpoints
-//! - [`rollout`]: an agent, and the one step that all of these take
-//! - [`server`]: the ends of the wire
-//! - [`config`]: settings
-//! - [`planning`]: from a belief to a path
-//! - [`estimation`]: from frames to a belief
+//! - [`benchmark`] -- policies on the same worlds, scored
+//! - [`acting`] -- one world of a running server, for a policy or for a learner outside
+//! - [`learning`] -- models that are learned while acting, and their checkpoints
+//! - [`rollout`] -- an agent, and the one step that all of these take
+//! - [`server`] -- the ends of the wire
+//! - [`config`] -- settings
+//! - [`planning`] -- from a belief to a path
+//! - [`estimation`] -- from frames to a belief
+
+#![allow(missing_docs, reason = "a program: what names say is not said again")]
 
 pub mod acting;
 pub mod benchmark;

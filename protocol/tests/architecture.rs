@@ -83,15 +83,29 @@ fn every_room_is_listed_and_exists() {
     let files: Vec<String> = SOURCES.into_iter().flat_map(source_files).collect();
     let found: BTreeSet<String> = files.iter().map(|path| room_of(path)).collect();
     // What only has thin roots beside folders, and folders of a room's own, need no line.
-    let has_rooms = |room: &str| found.iter().any(|other| other.starts_with(&format!("{room}/")));
-    let inner = ["agent/network/src/ops", "agent/network/src/dqn", "tests/src/fuzz"];
+    let has_rooms = |room: &str| {
+        found
+            .iter()
+            .any(|other| other.starts_with(&format!("{room}/")))
+    };
+    let inner = [
+        "agent/network/src/ops",
+        "agent/network/src/dqn",
+        "tests/src/fuzz",
+    ];
     let missing: Vec<&String> = found
         .iter()
         .filter(|room| !rooms.contains(room.as_str()) && !has_rooms(room))
         .filter(|room| !inner.contains(&room.as_str()))
         .collect();
-    assert!(files.len() > 80 && missing.is_empty(), "not listed: {missing:?}");
-    let gone: Vec<&&str> = rooms.iter().filter(|room| !root().join(room).exists()).collect();
+    assert!(
+        files.len() > 80 && missing.is_empty(),
+        "not listed: {missing:?}"
+    );
+    let gone: Vec<&&str> = rooms
+        .iter()
+        .filter(|room| !root().join(room).exists())
+        .collect();
     assert!(gone.is_empty(), "not there: {gone:?}");
 }
 

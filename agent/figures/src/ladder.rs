@@ -2,9 +2,8 @@
 
 use crate::axis::{Axis, is_drawable};
 use crate::palette::{Color, GRID, INK, PAPER, blend};
-use crate::svg::{Align, Svg};
+use crate::svg::{Align, MARGIN, Svg, WIDTH};
 use crate::text::TextStyle;
-use crate::{MARGIN, WIDTH};
 use std::collections::BTreeSet;
 
 const ROW: f64 = 44.0;

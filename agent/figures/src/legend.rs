@@ -1,10 +1,17 @@
 //! What the colours and marks of a snapshot mean, and how the marks look.
 
 use crate::palette::{Color, INK, MUTED, PAPER};
-use crate::snapshot::Named;
-use crate::svg::{Align, Point, Svg};
+use crate::svg::{Align, MARGIN, Point, Svg, WIDTH};
 use crate::text::TextStyle;
-use crate::{MARGIN, WIDTH};
+
+/// A state or an observation.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Named {
+    /// Its name.
+    pub name: String,
+    /// Its colour.
+    pub color: Color,
+}
 
 /// Height of a line of the legend.
 const LINE: f64 = 26.0;

@@ -15,13 +15,8 @@ mod svg;
 mod text;
 
 pub use ladder::{Bar, Ladder};
+pub use legend::Named;
 pub use lines::{Curve, Lines, MOST_CURVES, Panel, Scale, Shade};
 pub use palette::Color;
 pub use raster::{Heat, PngError, heat, png};
-pub use snapshot::{Misfit, Named, Snapshot};
-
-/// Width of every page in points.
-const WIDTH: f64 = 1200.0;
-
-/// Empty rim of every page in points.
-const MARGIN: f64 = 32.0;
+pub use snapshot::{Misfit, Snapshot};

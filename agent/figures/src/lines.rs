@@ -2,9 +2,8 @@
 
 use crate::axis::{Axis, is_drawable, spread};
 use crate::palette::{Color, GRID, INK, LINES, MUTED, SHADE, blend};
-use crate::svg::{Align, Point, Svg};
+use crate::svg::{Align, MARGIN, Point, Svg, WIDTH};
 use crate::text::TextStyle;
-use crate::{MARGIN, WIDTH};
 
 /// Most curves of a panel: there are no more colours.
 pub const MOST_CURVES: usize = LINES.len();

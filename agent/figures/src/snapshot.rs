@@ -1,12 +1,11 @@
 //! One step as the paper draws it: the hidden truth, what could be seen, what was seen along the
 //! path, and the belief in each state.
 
-use crate::legend::{Legend, draw_path, draw_robot, draw_start};
+use crate::legend::{Legend, Named, draw_path, draw_robot, draw_start};
 use crate::palette::{Color, MUTED, sequential, unlike};
 use crate::panels::{Layout, TITLE_ROOM};
-use crate::svg::{Align, Point, Svg};
+use crate::svg::{Align, MARGIN, Point, Svg, WIDTH};
 use crate::text::TextStyle;
-use crate::{MARGIN, WIDTH};
 use ndarray::{ArrayView2, ArrayView3};
 use thiserror::Error;
 
@@ -19,15 +18,6 @@ const FOOT: f64 = 84.0;
 const COLOR_BAR: f64 = 260.0;
 /// Side in points of a cell that shows its colour beside a path with a white rim.
 const WIDE_CELL: f64 = 12.0;
-
-/// A state or an observation.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Named {
-    /// Its name.
-    pub name: String,
-    /// Its colour.
-    pub color: Color,
-}
 
 /// One step of one world, with hindsight.
 #[derive(Debug, Clone)]

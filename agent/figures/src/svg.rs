@@ -2,8 +2,13 @@
 
 use crate::palette::{Color, PAPER};
 use crate::text::{CAP_HEIGHT, FAMILY, TextStyle};
-use crate::{MARGIN, WIDTH};
 use std::fmt::Write;
+
+/// Width of every page in points.
+pub const WIDTH: f64 = 1200.0;
+
+/// Empty rim of every page in points.
+pub const MARGIN: f64 = 32.0;
 
 /// A position in points: right of the left edge, below the upper edge.
 pub type Point = (f64, f64);
@@ -147,23 +152,11 @@ impl Svg {
         self.letters((start, at.1), style, &length, text);
     }
 
-    /// The same from the left edge, as wide as it is.
-    pub fn measured(&mut self, style: TextStyle, text: &str) {
-        self.letters((0.0, 0.0), style, "", text);
-    }
-
     fn letters(&mut self, (x, middle): Point, style: TextStyle, more: &str, text: &str) {
-        let (size, color) = (style.size, style.color);
-        let weight = if style.is_bold {
-            " font-weight=\"bold\""
-        } else {
-            ""
-        };
-        let (x, baseline) = (short(x), short(middle + size * CAP_HEIGHT / 2.0));
-        let text = escaped(text);
-        self.add(format_args!(
-            "<text x=\"{x}\" y=\"{baseline}\" font-size=\"{size}\"{weight}{more} fill=\"{color}\">{text}</text>"
-        ));
+        let baseline = short(middle + style.size * CAP_HEIGHT / 2.0);
+        let at = format!("x=\"{}\" y=\"{baseline}\"", short(x));
+        let element = style.element(&at, more, text);
+        self.add(format_args!("{element}"));
     }
 
     fn add(&mut self, element: std::fmt::Arguments<'_>) {
@@ -191,22 +184,6 @@ fn short(number: f64) -> f64 {
 /// A PNG has two pixels a point.
 fn on_pixel(number: f64) -> f64 {
     short((number * 2.0).round() / 2.0)
-}
-
-/// Text as XML allows it: other characters are left out.
-fn escaped(text: &str) -> String {
-    let mut escaped = String::new();
-    for letter in text.chars() {
-        match letter {
-            '&' => escaped += "&amp;",
-            '<' => escaped += "&lt;",
-            '>' => escaped += "&gt;",
-            '\u{fffe}' | '\u{ffff}' => {}
-            letter if letter.is_control() => escaped.push(' '),
-            letter => escaped.push(letter),
-        }
-    }
-    escaped
 }
 
 #[cfg(test)]

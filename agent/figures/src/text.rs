@@ -2,7 +2,6 @@
 //! License 1.1.
 
 use crate::palette::{Color, INK, MUTED};
-use crate::svg::Svg;
 use resvg::usvg::{Node, Options, Tree, fontdb};
 use std::sync::{Arc, LazyLock};
 
@@ -62,11 +61,26 @@ impl TextStyle {
         Self { color, ..self }
     }
 
+    /// The text as an SVG element at a place.
+    pub fn element(self, at: &str, more: &str, text: &str) -> String {
+        let (size, color) = (self.size, self.color);
+        let weight = match self.is_bold {
+            true => " font-weight=\"bold\"",
+            false => "",
+        };
+        let text = escaped(text);
+        format!("<text {at} font-size=\"{size}\"{weight}{more} fill=\"{color}\">{text}</text>")
+    }
+
     /// Width of a text in points.
     pub fn width(self, text: &str) -> f64 {
-        let mut page = Svg::new(1.0, 1.0);
-        page.measured(self, text);
-        let tree = Tree::from_str(&page.finish(), &OPTIONS);
+        // A space at the beginning of a text counts in its width.
+        let page = format!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" font-family=\"{FAMILY}\" \
+             xml:space=\"preserve\">{}</svg>",
+            self.element("", "", text)
+        );
+        let tree = Tree::from_str(&page, &OPTIONS);
         let tree = tree.expect("invariant: pages are SVG");
         let width = |node: &Node| match node {
             Node::Text(text) => Some(f64::from(text.bounding_box().width())),
@@ -87,6 +101,22 @@ impl TextStyle {
         n.checked_sub(1)
             .map_or(String::new(), |last| short(ends[last]))
     }
+}
+
+/// Text as XML allows it: other characters are left out.
+fn escaped(text: &str) -> String {
+    let mut escaped = String::new();
+    for letter in text.chars() {
+        match letter {
+            '&' => escaped += "&amp;",
+            '<' => escaped += "&lt;",
+            '>' => escaped += "&gt;",
+            '\u{fffe}' | '\u{ffff}' => {}
+            letter if letter.is_control() => escaped.push(' '),
+            letter => escaped.push(letter),
+        }
+    }
+    escaped
 }
 
 #[cfg(test)]

@@ -6,6 +6,7 @@ use crate::gru::Gru;
 use crate::observation::Observation;
 use crate::pass::Pass;
 use crate::shape::NetworkShape;
+use crate::variables::count_numbers;
 use candle_core::{DType, Result, Tensor};
 use candle_nn::VarBuilder;
 use candle_nn::ops::softmax;
@@ -92,5 +93,36 @@ impl Network {
     /// The observation matrix `O`, `[observations, states]`; each column sums to one.
     pub fn observation_matrix(&self) -> Result<Tensor> {
         self.observation.matrix()
+    }
+}
+
+impl NetworkShape {
+    /// How many numbers the network's parameters and statistics have; none of them is made.
+    pub fn n_numbers(&self) -> usize {
+        count_numbers(|vb| Network::new(&vb, self, Default::default()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::Shape;
+
+    #[test]
+    fn numbers_are_counted_before_they_are_made() {
+        // Convolutions 6,176 + 8,208 + 1,160, linear 516, GRU 120, decoder 8,192 + 131,072 + 32,768 + 8,192
+        // + 768, observation matrix 9; four numbers per channel for each of the seven normalisations.
+        assert_eq!(shape(64).n_numbers(), 197_181 + 4 * 296);
+        assert!(shape(4096).n_numbers() > 40_000_000);
+    }
+
+    fn shape(side: usize) -> NetworkShape {
+        NetworkShape {
+            grid: Shape::new(side, side).expect("test shape"),
+            n_states: 3,
+            n_observations: 3,
+            encoding: 4,
+            hidden: 4,
+        }
     }
 }

@@ -7,8 +7,6 @@
 //! - The encoder sees a grid of that padded size, unseen beyond the edge, and no kernel is larger than
 //!   its input.
 
-use crate::model::Network;
-use crate::variables::count_numbers;
 use protocol::grid::Shape;
 
 /// Channels after each convolution of the encoder.
@@ -91,11 +89,6 @@ impl NetworkShape {
         let [.., last] = self.convolutions();
         last.channels_out * last.output[0] * last.output[1]
     }
-
-    /// How many numbers the network's parameters and statistics have; none of them is made.
-    pub fn n_numbers(&self) -> usize {
-        count_numbers(|vb| Network::new(&vb, self, Default::default()))
-    }
 }
 
 #[cfg(test)]
@@ -132,13 +125,5 @@ mod tests {
         assert_eq!(sizes(48, 80), ([48, 80], [3, 3], [2, 6]));
         assert_eq!(sizes(6, 6), ([16, 16], [1, 1], [1, 1]));
         assert_eq!(sizes(20, 33), ([32, 48], [2, 3], [1, 2]));
-    }
-
-    #[test]
-    fn numbers_are_counted_before_they_are_made() {
-        // Convolutions 6,176 + 8,208 + 1,160, linear 516, GRU 120, decoder 8,192 + 131,072 + 32,768 + 8,192
-        // + 768, observation matrix 9; four numbers per channel for each of the seven normalisations.
-        assert_eq!(shape(64, 64).n_numbers(), 197_181 + 4 * 296);
-        assert!(shape(4096, 4096).n_numbers() > 40_000_000);
     }
 }

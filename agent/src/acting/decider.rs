@@ -32,7 +32,6 @@ const RENEW_AFTER: u32 = 3;
 pub struct Assignment {
     /// The server.
     pub instance: Instance,
-    /// The world.
     pub world: u32,
     /// Take the world from its holder.
     pub takeover: bool,
@@ -188,9 +187,6 @@ impl Decider {
     }
 
     /// Gives the world back.
-    ///
-    /// # Errors
-    /// [`RunError::Connection`].
     pub fn release(mut self) -> Result<(), RunError> {
         leave(&mut self.client, &self.robot)?;
         Ok(self.client.release()?)

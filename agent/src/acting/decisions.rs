@@ -37,7 +37,6 @@ pub enum DecisionsError {
     /// The place of the one that answers could not be taken.
     #[error(transparent)]
     Responder(#[from] ResponderError),
-    /// A channel failed.
     #[error(transparent)]
     Channel(#[from] ChannelError),
 }

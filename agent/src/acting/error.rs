@@ -15,13 +15,10 @@ pub enum RunError {
     /// The server refused, or cannot be reached in the first place.
     #[error(transparent)]
     Connection(#[from] ConnectionError),
-    /// The agent failed.
     #[error(transparent)]
     Agent(#[from] AgentError),
-    /// The policy's name.
     #[error(transparent)]
     Policy(#[from] UnknownPolicy),
-    /// The model.
     #[error(transparent)]
     Model(#[from] ModelError),
     /// The hidden states that an oracle needs.
@@ -29,34 +26,18 @@ pub enum RunError {
     Truth(#[from] TruthError),
     /// The server hides its model and none was given.
     #[error("instance {instance:?} does not reveal its model: expected --model FILE")]
-    NoModel {
-        /// The instance.
-        instance: String,
-    },
+    NoModel { instance: String },
     /// A model of other observations than the server's.
     #[error("model: expected the server's {expected} observations, got {got}")]
-    OtherModel {
-        /// The server's number of observations.
-        expected: usize,
-        /// The model's.
-        got: usize,
-    },
+    OtherModel { expected: usize, got: usize },
     /// A model that contradicts the one that the server reveals.
     #[error(
         "model: expected the server's own, {expected:?}, as it reveals it, got another, {got:?}"
     )]
-    RevealedModel {
-        /// The server's.
-        expected: String,
-        /// The one given.
-        got: String,
-    },
+    RevealedModel { expected: String, got: String },
     /// A policy that only `compare` can feed.
     #[error("policy {policy:?} needs worlds that run one step ahead: only `compare` has them")]
-    Clairvoyant {
-        /// The policy.
-        policy: String,
-    },
+    Clairvoyant { policy: String },
 }
 
 /// Whether the server is away and may come back.

@@ -14,9 +14,6 @@ const RENEW_AFTER: u64 = 500;
 
 /// Gives a robot's agent what is known of its world before the present frame; returns whether that frame is in
 /// it already, and the belief about X_{k+1}.
-///
-/// # Errors
-/// [`RunError`].
 pub fn resume(client: &mut Client, robot: &mut Robot) -> Result<bool, RunError> {
     if take_over_left(client, robot)? {
         return Ok(true);
@@ -47,9 +44,6 @@ pub fn resume(client: &mut Client, robot: &mut Robot) -> Result<bool, RunError> 
 
 /// Gives an agent the belief that was left for it, if there is one; whatever it believed before is
 /// forgotten.
-///
-/// # Errors
-/// [`ConnectionError`].
 pub fn take_over_left(client: &mut Client, robot: &mut Robot) -> Result<bool, ConnectionError> {
     let step = robot.observation().result.step;
     let agent = &mut robot.agent;
@@ -65,9 +59,6 @@ pub fn take_over_left(client: &mut Client, robot: &mut Robot) -> Result<bool, Co
 }
 
 /// Leaves an agent's belief about X_{k+1}, after its last observation, to the next one.
-///
-/// # Errors
-/// [`ConnectionError`].
 pub fn leave(client: &mut Client, robot: &Robot) -> Result<(), ConnectionError> {
     let (agent, present) = (&robot.agent, robot.observation());
     let Some(kind) = agent.estimator().kind() else {

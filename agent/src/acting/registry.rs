@@ -179,5 +179,4 @@ fn same_observations(task: &Task<'_>, got: usize) -> Result<(), AgentError> {
 }
 
 #[cfg(test)]
-#[path = "registry_tests.rs"]
 mod tests;

@@ -33,7 +33,6 @@ const REPORT_INTERVAL: Duration = Duration::from_secs(2);
 pub struct Mission {
     /// The server.
     pub instance: Instance,
-    /// The world.
     pub world: u32,
     /// The policy's name.
     pub policy: String,
@@ -302,9 +301,6 @@ impl Report {
 }
 
 /// What a server says of itself, and its model, or the one given; checks that it has the world.
-///
-/// # Errors
-/// [`RunError`].
 pub fn prepare(
     instance: &Instance,
     world: u32,

@@ -40,7 +40,6 @@ pub enum ArenaError {
     /// The server or the way to it.
     #[error(transparent)]
     Connection(#[from] ConnectionError),
-    /// The hidden states.
     #[error(transparent)]
     Truth(#[from] TruthError),
     /// The model that the server reveals.
@@ -49,7 +48,6 @@ pub enum ArenaError {
     /// The server is not set up for a comparison.
     #[error("instance {instance:?}: comparing needs {needs}")]
     Unfit {
-        /// The instance.
         instance: String,
         /// What is missing, and the flag that gives it.
         needs: String,
@@ -116,7 +114,6 @@ impl Arena {
         self.main.clone()
     }
 
-    /// The model.
     pub fn model(&self) -> &Model {
         &self.model
     }
@@ -138,9 +135,6 @@ impl Arena {
 
     /// Starts the main worlds (and scouts) with these seeds; returns observations and hidden states
     /// at k = 0.
-    ///
-    /// # Errors
-    /// [`ArenaError`].
     pub fn reset(&mut self, seeds: &[u64]) -> Result<Vec<Seen>, ArenaError> {
         let orders = |first: u32| {
             seeds.iter().zip(first..).map(|(&seed, world)| WorldSeed {
@@ -160,9 +154,6 @@ impl Arena {
     }
 
     /// Flies a path in each main world; returns observations and hidden states at `step`.
-    ///
-    /// # Errors
-    /// [`ArenaError`].
     pub fn step(
         &mut self,
         seeds: &[u64],
@@ -176,9 +167,6 @@ impl Arena {
     }
 
     /// The hidden states at `step` before the main worlds get there, from the scouts.
-    ///
-    /// # Errors
-    /// [`ArenaError`].
     pub fn foresee(&mut self, seeds: &[u64], step: u64) -> Result<Vec<Grid<u8>>, ArenaError> {
         let worlds = self.range(&self.scouts, seeds);
         let paths = vec![self.any_path(); worlds.len()];
@@ -188,9 +176,6 @@ impl Arena {
 
     /// What a robot that sees every cell would have seen of a seed's world at a step, at least 1;
     /// `None` if the server has no spare world or gives no full frames.
-    ///
-    /// # Errors
-    /// [`ArenaError`].
     pub fn full_observation(
         &mut self,
         seed: u64,

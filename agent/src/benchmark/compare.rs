@@ -69,18 +69,10 @@ pub struct Moment {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum CompareError {
-    /// The worlds.
     #[error(transparent)]
     Arena(#[from] ArenaError),
-    /// An agent.
     #[error("policy {policy:?}: {problem}")]
-    Agent {
-        /// The policy.
-        policy: String,
-        /// What is wrong.
-        problem: AgentError,
-    },
-    /// The model.
+    Agent { policy: String, problem: AgentError },
     #[error(transparent)]
     Model(#[from] ModelError),
 }
@@ -107,9 +99,6 @@ struct Tally {
 }
 
 /// Runs every policy on every world; `progress` is told of each policy and of each world step.
-///
-/// # Errors
-/// [`CompareError`].
 pub fn compare(
     arena: &mut Arena,
     comparison: &Comparison,

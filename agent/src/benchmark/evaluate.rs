@@ -50,24 +50,17 @@ pub struct Marks {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ExaminationError {
-    /// The worlds.
     #[error(transparent)]
     Arena(#[from] ArenaError),
-    /// An agent.
     #[error(transparent)]
     Agent(#[from] AgentError),
-    /// The guide.
     #[error(transparent)]
     Policy(#[from] UnknownPolicy),
-    /// The model.
     #[error(transparent)]
     Model(#[from] ModelError),
 }
 
 /// Flies the guide's paths and scores each estimator's prediction of every frame.
-///
-/// # Errors
-/// [`ExaminationError`].
 pub fn examine(
     arena: &mut Arena,
     examination: &Examination<'_>,

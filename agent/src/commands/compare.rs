@@ -1,7 +1,7 @@
 //! `compare`: the benchmark.
 
+use super::shared::{make_folder, make_folder_of, write};
 use super::worlds::WorldFlags;
-use super::{make_folder, make_folder_of, write};
 use agent::benchmark::arena::Arena;
 use agent::benchmark::compare::{Comparison, Moment, Results, compare};
 use agent::benchmark::report::{

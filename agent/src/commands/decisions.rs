@@ -1,6 +1,6 @@
 //! `serve-decisions`: a learner outside decides, this program estimates, plans and steps.
 
-use super::{WaitFlag, model_named};
+use super::shared::{WaitFlag, model_named};
 use agent::acting::decider::Assignment;
 use agent::acting::decisions::serve_decisions;
 use agent::config::AgentFlags;

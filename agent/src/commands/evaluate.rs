@@ -1,8 +1,8 @@
 //! `evaluate`: what a checkpoint is worth beside the known model, with its parameters fixed.
 
 use super::compare::run_comparison;
+use super::shared::{make_folder_of, write};
 use super::worlds::WorldFlags;
-use super::{make_folder_of, write};
 use agent::benchmark::arena::Arena;
 use agent::benchmark::compare::Comparison;
 use agent::benchmark::evaluate::{Examination, Marks, examine, score_of_frequencies};

@@ -1,6 +1,6 @@
 //! `prior`: a filter's first belief as a file, for filters in other languages.
 
-use super::model_named;
+use super::shared::model_named;
 use agent::Belief;
 use agent::estimation::Prior;
 use agent::estimation::first_belief::first_belief;

@@ -1,7 +1,7 @@
 //! `train`: learns a model while acting.
 
+use super::shared::{WaitFlag, make_folder, parse_seconds};
 use super::worlds::GridFlags;
-use super::{WaitFlag, make_folder, parse_seconds};
 use agent::benchmark::report::training::draw_training;
 use agent::config::{AgentFlags, LearnerKind, Preset};
 use agent::learning::train::{Training, train};

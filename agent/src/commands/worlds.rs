@@ -1,6 +1,6 @@
 //! The worlds that policies meet: a running server's, or a private one's.
 
-use super::{WaitFlag, model_named};
+use super::shared::{WaitFlag, model_named};
 use agent::benchmark::arena::{Arena, MAX_BATCH};
 use agent::server::launch::OwnServer;
 use anyhow::{Result, ensure};

@@ -1,6 +1,6 @@
 //! Settings of what learns to choose among actions: the section `[decisions]` of `config/agent.toml`.
 
-use crate::config::ConfigError;
+use crate::config::error::ConfigError;
 use ::network::{AdamSettings, DqnSettings};
 use serde::{Deserialize, Serialize};
 

@@ -1,6 +1,6 @@
 //! Settings of what learns the model: the section `[learning]` of `config/agent.toml`.
 
-use crate::config::ConfigError;
+use crate::config::error::ConfigError;
 use serde::{Deserialize, Serialize};
 
 /// How the learned filter learns.

@@ -1,6 +1,6 @@
 //! Settings of the paper's networks: the sections `[autoencoder]` and `[dqn]` of `config/agent.toml`.
 
-use crate::config::ConfigError;
+use crate::config::error::ConfigError;
 use crate::estimation::dqn_input::DqnInput;
 use ::network::{AdamSettings, AutoencoderSettings, DqnSettings};
 use serde::{Deserialize, Serialize};

@@ -39,20 +39,12 @@ pub enum BeliefError {
     Shape(#[from] ShapeError),
     /// A cell whose numbers are no distribution.
     #[error("belief of cell {cell}: expected probabilities >= 0 with sum 1, got {got:?}")]
-    Simplex {
-        /// The first such cell.
-        cell: Cell,
-        /// Its numbers, one per state.
-        got: Vec<f32>,
-    },
+    Simplex { cell: Cell, got: Vec<f32> },
     /// A state that the model lacks.
     #[error("belief from states: cell {cell}: expected a state below {n_states}, got {got}")]
     State {
-        /// The first such cell.
         cell: Cell,
-        /// Number of states S.
         n_states: usize,
-        /// The value found there.
         got: u8,
     },
 }

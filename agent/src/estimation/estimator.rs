@@ -74,7 +74,6 @@ pub enum EstimatorError {
     /// A network whose numbers are too large to be worked with, or whose device fails.
     #[error("checkpoint: {0}")]
     Network(#[from] NetworkError),
-    /// Hidden states of another model.
     #[error("hidden states: {0}")]
     Belief(#[from] BeliefError),
     /// An upper bound that is not told the hidden states.

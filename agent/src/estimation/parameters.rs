@@ -27,7 +27,6 @@ const OWN_OBSERVATION: f32 = 2.5;
 /// their own must not start alike.
 const NOISE: f32 = 0.1;
 
-/// How many of what.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Dimensions {
     /// Number of states S.
@@ -71,9 +70,6 @@ pub struct DimensionsError {
 
 impl Dimensions {
     /// Checks them against the limits of a model.
-    ///
-    /// # Errors
-    /// [`DimensionsError`].
     pub fn check(self) -> Result<Self, DimensionsError> {
         let values = 2..=MAX_VALUES;
         let side = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;

@@ -180,7 +180,6 @@ impl ActionSet {
             .collect()
     }
 
-    /// The action of a name.
     pub fn named(&self, name: &str) -> Option<&Action> {
         self.actions.iter().find(|action| action.name == name)
     }

@@ -44,7 +44,6 @@ impl Window {
         self.gains.extend(cells.iter().map(gains));
     }
 
-    /// Number of cells.
     pub fn n_cells(&self) -> usize {
         self.rows * self.cols
     }

@@ -83,39 +83,20 @@ pub enum AgentError {
     Model(#[from] ModelError),
     /// A policy that needs a learned model was not given it.
     #[error("policy {policy:?} needs what `train` learned: expected --checkpoint FILE of {kind}")]
-    NeedsCheckpoint {
-        /// The policy.
-        policy: String,
-        /// Whose checkpoint.
-        kind: &'static str,
-    },
-    /// A network of another grid.
+    NeedsCheckpoint { policy: String, kind: &'static str },
     #[error(
         "checkpoint: expected a network for {expected} cells as the world's, got one for {got}"
     )]
-    OtherGrid {
-        /// The world's.
-        expected: String,
-        /// The network's.
-        got: String,
-    },
+    OtherGrid { expected: String, got: String },
     /// A checkpoint that does not fit the model.
     #[error("checkpoint: {0}")]
     Checkpoint(String),
     /// A learned model of other observations.
     #[error("checkpoint: expected {expected} observations as the world's, got {got}")]
-    OtherObservations {
-        /// The world's.
-        expected: usize,
-        /// The learned model's.
-        got: usize,
-    },
+    OtherObservations { expected: usize, got: usize },
     /// A policy that needs the hidden state was not given it.
     #[error("policy {policy:?} needs the truth channel: start the server with --publish-truth")]
-    NeedsTruth {
-        /// The policy.
-        policy: String,
-    },
+    NeedsTruth { policy: String },
 }
 
 impl Agent {
@@ -298,7 +279,6 @@ impl Agent {
         }
     }
 
-    /// The policy.
     pub fn policy(&self) -> &Policy {
         &self.policy
     }

@@ -47,7 +47,6 @@ pub struct Client {
 /// Which worlds to act on, and how to get them.
 #[derive(Debug, Clone)]
 pub struct Claim {
-    /// The worlds.
     pub worlds: Range<u32>,
     /// Take them from their holder.
     pub takeover: bool,
@@ -138,9 +137,6 @@ impl Client {
     }
 
     /// The worlds as they are, changing nothing.
-    ///
-    /// # Errors
-    /// [`ConnectionError`].
     pub fn observe(&mut self, worlds: Range<u32>) -> Result<Vec<Observation>, ConnectionError> {
         let request = self.request(Operation::Observe, &worlds);
         let answer = self.connection.step(request, &[], STEP_TIMEOUT)?;
@@ -165,9 +161,6 @@ impl Client {
     }
 
     /// Leaves a belief about the first world, as it stands after a result, to whoever acts on it next.
-    ///
-    /// # Errors
-    /// [`ConnectionError`].
     pub fn leave_belief(
         &mut self,
         at: &StepResult,
@@ -191,9 +184,6 @@ impl Client {
     }
 
     /// The belief that was left about the first world as it stands, if it is of a kind.
-    ///
-    /// # Errors
-    /// [`ConnectionError`].
     pub fn belief(&mut self, kind: &str) -> Result<Option<Vec<u8>>, ConnectionError> {
         let world = self.worlds.start;
         let (mut first, mut bytes) = (None, Vec::new());
@@ -221,9 +211,6 @@ impl Client {
     }
 
     /// Starts new episodes with the given seeds; returns when burn-in is done.
-    ///
-    /// # Errors
-    /// [`ConnectionError`].
     pub fn reset(&mut self, seeds: &[WorldSeed]) -> Result<Vec<WorldInfo>, ConnectionError> {
         let request = Request::Reset {
             lease: self.lease,
@@ -236,9 +223,6 @@ impl Client {
     }
 
     /// Extends the lease without acting.
-    ///
-    /// # Errors
-    /// [`ConnectionError`].
     pub fn renew(&mut self) -> Result<(), ConnectionError> {
         let request = Request::Renew { lease: self.lease };
         self.connection.control(&request, STEP_TIMEOUT).map(|_| ())
@@ -250,17 +234,11 @@ impl Client {
     }
 
     /// Looks whether the server lives, without asking it.
-    ///
-    /// # Errors
-    /// [`ConnectionError::ServerGone`].
     pub fn check_server(&self) -> Result<(), ConnectionError> {
         self.connection.check_server()
     }
 
     /// Gives the worlds back.
-    ///
-    /// # Errors
-    /// [`ConnectionError`].
     pub fn release(mut self) -> Result<(), ConnectionError> {
         let request = Request::Release { lease: self.lease };
         self.connection.control(&request, STEP_TIMEOUT).map(|_| ())
@@ -319,9 +297,6 @@ fn garbled(problem: &dyn std::fmt::Display) -> ConnectionError {
 }
 
 /// What a server says of itself, from a connection of its own.
-///
-/// # Errors
-/// [`ConnectionError`].
 pub fn server_info(instance: &Instance) -> Result<ServerInfo, ConnectionError> {
     let connection = Connection::open(instance, CLIENT_NAME, STEP_TIMEOUT)?;
     Ok(connection.info().clone())
@@ -365,9 +340,6 @@ pub fn is_away(error: &ConnectionError) -> bool {
 }
 
 /// Whether a belief of a kind was left about a world as it stands; needs no lease.
-///
-/// # Errors
-/// [`ConnectionError`].
 pub fn is_belief_left(
     instance: &Instance,
     world: u32,

@@ -30,7 +30,6 @@ struct Turns {
 
 /// One world's belief, the posterior after the frame of `result`.
 pub struct View<'a> {
-    /// The world.
     pub world: u32,
     /// Where it stands.
     pub result: &'a StepResult,

@@ -20,26 +20,13 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(3);
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum LaunchError {
-    /// The program cannot be started.
     #[error("start {program}: {problem}")]
-    Start {
-        /// The program.
-        program: String,
-        /// The system's reason.
-        problem: String,
-    },
+    Start { program: String, problem: String },
     /// It ended at once; its own words stand above.
     #[error("the {what} ended with {status} before it served")]
-    Ended {
-        /// Server or dashboard.
-        what: &'static str,
-        /// Its exit status.
-        status: String,
-    },
-    /// It does not answer.
+    Ended { what: &'static str, status: String },
     #[error(transparent)]
     Connection(#[from] ConnectionError),
-    /// The instance's name.
     #[error(transparent)]
     Channel(#[from] ChannelError),
 }
@@ -62,9 +49,6 @@ struct OwnProgram(Child);
 impl OwnServer {
     /// Starts `emberwatch-server` with the given arguments on an instance of its own, and waits until
     /// it answers. It ends with this process, however that ends.
-    ///
-    /// # Errors
-    /// [`LaunchError`].
     pub fn start(program: Option<PathBuf>, arguments: &[String]) -> Result<Self, LaunchError> {
         let instance = Instance::new(&format!("private-{}", std::process::id()))?;
         let mut command = private(program.unwrap_or_else(|| beside_this("emberwatch-server")));
@@ -77,7 +61,6 @@ impl OwnServer {
         Ok(server)
     }
 
-    /// Its instance.
     pub fn instance(&self) -> &Instance {
         &self.instance
     }

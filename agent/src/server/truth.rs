@@ -15,25 +15,14 @@ const TIMEOUT: Duration = Duration::from_secs(5);
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum TruthError {
-    /// The channel failed.
     #[error(transparent)]
     Channel(#[from] ChannelError),
-    /// A state did not come.
     #[error("truth of world {world} at step {step}: not published within {TIMEOUT:?}")]
-    Missing {
-        /// The world.
-        world: u32,
-        /// The step.
-        step: u64,
-    },
-    /// A state of another grid.
+    Missing { world: u32, step: u64 },
     #[error("truth of world {world}: expected {expected} bytes, got {got}")]
     Length {
-        /// The world.
         world: u32,
-        /// Bytes of the grid.
         expected: usize,
-        /// Bytes received.
         got: usize,
     },
 }
@@ -46,9 +35,6 @@ pub struct TruthFeed {
 
 impl TruthFeed {
     /// Attaches to the truth channel.
-    ///
-    /// # Errors
-    /// [`TruthError::Channel`].
     pub fn open(instance: &Instance, shape: Shape) -> Result<Self, TruthError> {
         Ok(Self {
             observer: Observer::truth(instance)?,

@@ -7,9 +7,6 @@ use std::path::Path;
 
 /// Writes the reward of each step, mean and standard error over worlds, into a folder of each policy's
 /// own; steps are counted from 1.
-///
-/// # Errors
-/// [`EventsError`].
 pub fn write_events(folder: &Path, runs: &[PolicyRun]) -> Result<(), EventsError> {
     let groups = groups(runs);
     for group in &groups {

@@ -8,24 +8,16 @@ use thiserror::Error;
 #[derive(Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum ReportError {
-    /// Nothing to report on.
     #[error("{what}: expected at least one policy run, got none")]
-    Empty {
-        /// The report.
-        what: &'static str,
-    },
+    Empty { what: &'static str },
     /// A number that cannot be drawn.
     #[error(
         "policy {policy:?} on world seed {world_seed}: {what}: expected a finite number, got {got}"
     )]
     NotFinite {
-        /// The policy.
         policy: String,
-        /// The world.
         world_seed: u64,
-        /// Which number.
         what: &'static str,
-        /// The number.
         got: f64,
     },
     /// Parts of a snapshot that do not belong together.
@@ -34,7 +26,6 @@ pub enum ReportError {
     /// A file that could not be written.
     #[error("cannot write {}: {reason}", path.display())]
     Write {
-        /// The file.
         path: PathBuf,
         /// What the system or the encoder said.
         reason: String,

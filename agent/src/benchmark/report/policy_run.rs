@@ -9,7 +9,6 @@ pub struct PolicyRun {
     pub policy: String,
     /// Where the belief came from: `none`, `known_model`, `truth`, `next_truth` or a learned one.
     pub estimator: String,
-    /// Seed of the world.
     pub world_seed: u64,
     /// Number of scored steps.
     pub steps: u64,

@@ -8,7 +8,6 @@ use std::collections::BTreeMap;
 /// A mean over worlds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
-    /// The mean.
     pub mean: f64,
     /// Standard error of the mean; one world has none.
     pub standard_error: Option<f64>,

@@ -18,18 +18,13 @@ const POINTS: usize = 200;
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum TrainingFigureError {
-    /// Metrics that cannot be read.
     #[error(transparent)]
     Metrics(#[from] MetricsError),
-    /// The figure.
     #[error(transparent)]
     Report(#[from] ReportError),
 }
 
 /// Draws a training's metrics into its folder.
-///
-/// # Errors
-/// [`TrainingFigureError`].
 pub fn draw_training(folder: &Path) -> Result<(), TrainingFigureError> {
     let rows = Rows::read(folder)?;
     let curve = |column: &str, name: &str| averages(&rows, column, name);

@@ -162,7 +162,7 @@ impl Wide for f32 {
 #[cfg(target_arch = "x86_64")]
 #[expect(unsafe_code, reason = "each instruction is there where these run")]
 mod x86 {
-    use super::{LANES, Lanes};
+    use crate::learning::filter::vector::{LANES, Lanes};
     use std::arch::x86_64::*;
 
     /// One register of 16.

@@ -1,0 +1,70 @@
+//! `run`: act on one world of a running server.
+
+use super::shared::{WaitFlag, model_named};
+use agent::acting::run::{Mission, run};
+use agent::config::AgentFlags;
+use agent::learning::learned::Learned;
+use anyhow::{Context, Result};
+use clap::Args;
+use network::DeviceKind;
+use protocol::channels::Instance;
+use protocol::program::stop_on_signals;
+use std::path::PathBuf;
+
+/// Act on one world of a running server.
+#[derive(Args)]
+pub struct RunCommand {
+    /// The server's instance name
+    #[arg(long, default_value = "default")]
+    instance: String,
+    #[command(flatten)]
+    wait: WaitFlag,
+    /// The world to act on
+    #[arg(long, default_value_t = 0)]
+    world: u32,
+    /// The policy
+    #[arg(long, default_value = "beam_exploit")]
+    policy: String,
+    /// Steps to act for; 0: until stopped
+    #[arg(long, default_value_t = 0)]
+    steps: u64,
+    /// Take the world from its holder
+    #[arg(long)]
+    takeover: bool,
+    /// A built-in model or a model file, where the server does not reveal its model
+    #[arg(long, value_name = "MODEL")]
+    model: Option<String>,
+    /// What `train` learned, for policies `learned_*`, `autoencoder_*` and `dqn_beam`
+    #[arg(long, value_name = "FILE")]
+    checkpoint: Option<PathBuf>,
+    /// Where networks compute: cpu, cuda or metal
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    device: DeviceKind,
+    #[command(flatten)]
+    settings: AgentFlags,
+}
+
+impl RunCommand {
+    /// Runs the mission.
+    pub fn run(&self) -> Result<()> {
+        let model = self.model.as_deref().map(model_named).transpose()?;
+        let mission = Mission {
+            instance: Instance::new(&self.instance)?,
+            world: self.world,
+            policy: self.policy.clone(),
+            steps: self.steps,
+            takeover: self.takeover,
+            model,
+            config: self.settings.effective()?,
+            learned: Learned::read(self.checkpoint.as_deref(), &self.device.open()?)?,
+        };
+        let stop = stop_on_signals().context("handle signals")?;
+        if !self.wait.for_server(&mission.instance, &stop)? {
+            return Ok(());
+        }
+        let summary = run(&mission, &stop)?;
+        let mean_reward = summary.reward / summary.steps.max(1) as f64;
+        tracing::info!(steps = summary.steps, mean_reward, "done");
+        Ok(())
+    }
+}

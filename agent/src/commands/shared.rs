@@ -1,0 +1,69 @@
+//! What several subcommands need: a server that may come, models by name, files and output.
+
+use agent::server::client::wait_for_server;
+use anyhow::{Context, Result, ensure};
+use clap::Args;
+use protocol::Model;
+use protocol::channels::Instance;
+use protocol::program::read_text;
+use std::io::Write;
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
+
+/// How long to wait for a server.
+#[derive(Debug, Args)]
+pub struct WaitFlag {
+    /// Seconds to wait until the instance has a server; 0: not at all
+    #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = parse_seconds)]
+    wait: Duration,
+}
+
+impl WaitFlag {
+    /// Waits for the instance's server; returns whether to go on: not if `stop` was set meanwhile.
+    pub fn for_server(&self, instance: &Instance, stop: &AtomicBool) -> Result<bool> {
+        Ok(wait_for_server(instance, self.wait, stop)?)
+    }
+}
+
+pub fn parse_seconds(text: &str) -> Result<Duration, String> {
+    let seconds: f64 = text.parse().map_err(|_| "expected seconds, such as 60")?;
+    let limit = Duration::try_from_secs_f64(seconds);
+    limit.map_err(|error| format!("expected seconds, such as 60: {error}"))
+}
+
+/// A built-in model, or that of a file.
+pub fn model_named(name: &str) -> Result<Model> {
+    if let Some(model) = Model::built_in(name) {
+        return Ok(model);
+    }
+    let path = Path::new(name);
+    ensure!(
+        path.exists(),
+        "model file {name}: No such file: expected one, or {}",
+        Model::built_in_names().collect::<Vec<_>>().join(", ")
+    );
+    read_model(path)
+}
+
+pub fn read_model(path: &Path) -> Result<Model> {
+    let text = read_text(path).with_context(|| format!("model file {}", path.display()))?;
+    Model::from_toml(&text).with_context(|| format!("model file {}", path.display()))
+}
+
+/// Makes the folder of a file to come.
+pub fn make_folder_of(path: &Path) -> Result<()> {
+    let parent = path.parent().filter(|parent| *parent != Path::new(""));
+    parent.map_or(Ok(()), make_folder)
+}
+
+pub fn make_folder(path: &Path) -> Result<()> {
+    std::fs::create_dir_all(path).with_context(|| format!("create {}", path.display()))
+}
+
+pub fn write(text: &str) -> Result<()> {
+    let mut out = std::io::stdout();
+    out.write_all(text.as_bytes())
+        .and_then(|()| out.write_all(b"\n"))
+        .context("write to standard output")
+}
