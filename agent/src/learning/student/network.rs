@@ -7,7 +7,7 @@
 
 mod progress;
 
-pub use self::progress::{LearnedNetwork, Progress};
+pub use self::progress::{LearnedNetwork, Progress, SavedNetwork};
 
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
