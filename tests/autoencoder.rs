@@ -116,6 +116,7 @@ fn the_same_seed_gives_the_same_losses_bit_for_bit() {
 fn a_training_that_stopped_goes_on_as_if_it_had_not() {
     goes_on_as_if_it_had_not_stopped(SETTINGS);
     goes_on_as_if_it_had_not_stopped(&printed());
+    goes_on_as_if_it_had_not_stopped(&SETTINGS.replace("[dqn]", "[dqn]\nn_step = 3"));
 }
 
 fn goes_on_as_if_it_had_not_stopped(settings: &str) {

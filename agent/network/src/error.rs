@@ -18,7 +18,7 @@ pub enum NetworkError {
     /// The numbers.
     #[error(transparent)]
     NotFinite(#[from] NotFinite),
-    /// A remembered transition of another DQN.
+    /// A saved transition of another DQN.
     #[error("dqn.transitions: {at}: expected {expected}, got {got}")]
     Transition {
         /// Which one, the oldest first.

@@ -386,7 +386,7 @@ mod tests {
             decode(&[kind], &bytes).expect_err(to).to_string()
         };
         let words = "expected a checkpoint of others, got one of tests";
-        assert_eq!(refused("others", "", ""), words);
+        assert_eq!(refused("others", "kernel", "kernel"), words);
         for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"1""#, "none")] {
             let words = format!("emberwatch.format: expected 1, got {got}");
             assert_eq!(refused("tests", r#"format":"1""#, to), words);

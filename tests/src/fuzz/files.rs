@@ -219,6 +219,7 @@ fn autoencoder(side: usize, length: usize) -> Contents {
         n_observations: 3,
         counters: [0, 0],
         dqn: decisions().dqn.saved(),
+        track: decisions().dqn.track(),
         follower: Follower::at(vec![0.0; length], Belief::uniform(3, cell)),
         estimate: None,
         frames: Vec::new(),

@@ -1,7 +1,7 @@
 //! What a resumed run needs of the DQN: tensors by name and a [`SavedDqn`] out, and in again.
 
 use super::memory::{Memory, Row};
-use super::{Dqn, Perceptron, Transition, on_cpu};
+use super::{Dqn, Perceptron, Track, Transition, on_cpu};
 use crate::error::NetworkError;
 use crate::tensors::{NamedTensor, named, restored};
 use candle_core::Tensor;
@@ -61,6 +61,21 @@ impl Dqn {
         self.adam.restore(moments, saved.n_updates);
         self.n_updates = saved.n_updates;
         Ok(())
+    }
+
+    /// A world's saved track to go on with; without steps if its transitions were of other lengths or discounts.
+    ///
+    /// # Errors
+    /// For a step of another DQN.
+    pub fn resume_track(&self, saved: Track) -> Result<Track, NetworkError> {
+        let track = self.track();
+        let length = saved.open.len();
+        if (saved.n_step, saved.gamma) != (track.n_step, track.gamma) || length >= saved.n_step {
+            return Ok(track);
+        }
+        let mut steps = saved.open.iter().enumerate();
+        steps.try_for_each(|(at, step)| self.check_transition(at, step))?;
+        Ok(saved)
     }
 
     fn check_transition(&self, at: usize, transition: &Transition) -> Result<(), NetworkError> {

@@ -21,7 +21,7 @@ use crate::planning::policy::Policy;
 use crate::rollout::agent::{Agent, Setup, numbered_states};
 use crate::rollout::{self, Robot};
 use crate::server::client::Observation;
-use ::network::{Track, Transition, Window};
+use ::network::{Transition, Window};
 use protocol::path;
 use std::time::{Duration, Instant};
 
@@ -39,7 +39,6 @@ pub struct NetworkStudent {
     /// Its world's, once it is attached.
     robot: Option<Robot>,
     decision: Option<Decision>,
-    track: Track,
     is_frozen: bool,
     times: [(&'static str, Duration); 3],
 }
@@ -56,7 +55,6 @@ impl NetworkStudent {
     pub fn new(progress: Progress, site: Site, config: &AgentConfig) -> Self {
         Self {
             choices: Policy::network_choices(progress.autoencoder.shape().n_states),
-            track: progress.dqn.track(),
             progress,
             site,
             config: config.clone(),
@@ -110,7 +108,7 @@ impl NetworkStudent {
             reward: robot.observation().result.reward as f32,
             next: self.input(robot),
         };
-        if let Some(transition) = self.track.add(step) {
+        if let Some(transition) = self.progress.track.add(step) {
             self.progress.dqn.remember(transition);
         }
     }
@@ -218,7 +216,7 @@ impl Student for NetworkStudent {
     }
 
     fn begin(&mut self, _: u32, observation: Observation) -> Result<(), StudentError> {
-        self.track = self.progress.dqn.track();
+        self.progress.track = self.progress.dqn.track();
         self.progress.replay.begin();
         self.progress.replay.push(observation.frame.clone());
         let follower = Follower::new(&self.progress.autoencoder)?;

@@ -12,7 +12,7 @@ use crate::learning::student::Site;
 use crate::planning::BasisKind;
 use crate::planning::policy::Policy;
 use crate::server::client::Place;
-use ::network::{Autoencoder, Device, Dqn, NetworkError, NetworkShape, Replay, SavedDqn};
+use ::network::{Autoencoder, Device, Dqn, NetworkError, NetworkShape, Replay, SavedDqn, Track};
 use protocol::model::MAX_VALUES;
 use protocol::{Frame, Shape};
 use serde::{Deserialize, Serialize};
@@ -27,6 +27,8 @@ pub struct Progress {
     pub dqn: Dqn,
     /// What that sees.
     pub input: DqnInput,
+    /// The world's latest steps, for its replay.
+    pub track: Track,
     /// The estimate where paths are planned on it, as a checkpoint left it.
     pub estimate: Option<Belief>,
     /// What paths are planned on.
@@ -52,6 +54,8 @@ pub struct SavedNetwork {
     pub counters: [u64; 2],
     /// The DQN.
     pub dqn: SavedDqn,
+    /// The world's latest steps.
+    pub track: Track,
     /// What the network knows of the world.
     pub follower: Follower,
     /// The estimate where paths are planned on it.
@@ -95,9 +99,11 @@ impl Progress {
         let n_actions = Policy::network_choices(n_states).len();
         let input = config.dqn.input;
         let n_inputs = input.length(settings.hidden, n_states);
+        let dqn = Dqn::new(config.dqn.settings(), n_inputs, n_actions, config.seed);
         Ok(Self {
             follower: Follower::new(&autoencoder)?,
-            dqn: Dqn::new(config.dqn.settings(), n_inputs, n_actions, config.seed),
+            track: dqn.track(),
+            dqn,
             input,
             estimate: None,
             basis: config.objective.belief,
@@ -147,6 +153,7 @@ impl Progress {
             n_observations,
             counters: self.autoencoder.counters(),
             dqn: self.dqn.saved(),
+            track: self.track.clone(),
             follower: follower.clone(),
             estimate: estimate.cloned(),
             frames: frames.map(|frame| frame.as_bytes().to_vec()).collect(),
@@ -214,6 +221,7 @@ impl Progress {
         let find = |name: &str, shape: &[usize]| contents.tensor(name, shape);
         self.autoencoder.load(find, saved.counters)?;
         self.dqn.load(find, &saved.dqn)?;
+        self.track = self.dqn.resume_track(saved.track.clone())?;
         let follower = &saved.follower;
         check_numbers("hidden", follower.hidden(), self.follower.hidden().len())?;
         check_belief("prediction", follower.prediction(), n_states, grid)?;
