@@ -160,7 +160,7 @@ fn settings_of_sizes_and_of_plans_reach_the_training() {
     // Only shown in part, as paths are flown.
     let [stored, planned] = [stored, planned].map(|contents| state(&contents));
     assert_ne!(stored.frames, planned.frames);
-    assert!(stored.estimate.is_none() && planned.estimate.is_some());
+    assert!(stored.position.estimate.is_none() && planned.position.estimate.is_some());
 }
 
 #[test]
@@ -176,7 +176,7 @@ fn actions_go_by_what_the_settings_say_and_a_checkpoint_by_its_own() {
             assert_eq!(pair[0].next, pair[1].input, "{input}");
         }
         if input == "after_frame" {
-            assert_eq!(transitions[14].next, stored.follower.hidden());
+            assert_eq!(transitions[14].next, stored.position.follower.hidden());
         }
         let checkpoint = place.checkpoint("out");
         let checkpoint = checkpoint.display();
@@ -277,7 +277,10 @@ fn full_observation_tells_which_state_pays() {
         .iter()
         .filter_map(|row| row[4].parse::<f64>().ok())
         .sum();
-    let estimate = state(&contents(&place.checkpoint("out"))).reward.rewards;
+    let estimate = state(&contents(&place.checkpoint("out")))
+        .position
+        .reward
+        .rewards;
     assert_eq!(rewards > 0.0, estimate.iter().sum::<f64>() > 0.0);
 }
 

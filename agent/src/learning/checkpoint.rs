@@ -94,13 +94,8 @@ impl Contents {
         };
         let (state, length) =
             decoded.map_err(|error| Problem::value(STATE, "that of its learner", error))?;
-        let n_bytes = self.state.len();
-        check(
-            length == n_bytes,
-            STATE,
-            format_args!("{length} bytes"),
-            n_bytes,
-        )?;
+        let got = self.state.len();
+        check(length == got, STATE, format!("{length} bytes"), got)?;
         Ok(state)
     }
 
@@ -139,13 +134,13 @@ impl Contents {
     /// # Errors
     /// For none, or others than an agent's.
     pub fn settings(&self) -> Result<AgentConfig, Problem> {
-        const EXPECTED: &str = "those of an agent";
-        check(!self.settings.is_empty(), SETTINGS, EXPECTED, "none")?;
-        let config = toml::from_str::<AgentConfig>(&self.settings);
-        let config = config.map_err(|error| Problem::value(SETTINGS, EXPECTED, error))?;
-        config
-            .check()
-            .map_err(|error| Problem::value(SETTINGS, EXPECTED, error))
+        let wrong = |got: String| Problem::value(SETTINGS, "those of an agent", got);
+        if self.settings.is_empty() {
+            return Err(wrong("none".into()));
+        }
+        let config: Result<AgentConfig, _> = toml::from_str(&self.settings);
+        let config = config.map_err(|error| wrong(error.to_string()))?;
+        config.check().map_err(|error| wrong(error.to_string()))
     }
 
     /// Against damage, not malice.
@@ -153,9 +148,7 @@ impl Contents {
         let mut digest = crc32fast::Hasher::new();
         for (name, Tensor { shape, numbers }) in &self.tensors {
             digest.update(format!("{name} {shape:?} ").as_bytes());
-            numbers
-                .iter()
-                .for_each(|number| digest.update(&number.to_le_bytes()));
+            digest.update(&little_endian(numbers));
         }
         digest.update(&self.state);
         digest.update(self.settings.as_bytes());
@@ -215,23 +208,16 @@ pub fn read(
 /// # Errors
 /// For one that is too large.
 pub fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>, Problem> {
-    let little_endian = |(name, tensor): (&String, &Tensor)| {
-        let numbers = tensor
-            .numbers
-            .iter()
-            .flat_map(|number| number.to_le_bytes());
-        (
-            name.clone(),
-            Dtype::F32,
-            tensor.shape.clone(),
-            numbers.collect(),
-        )
+    let tensors = contents.tensors.iter();
+    let tensor = |(name, tensor): (&String, &Tensor)| {
+        let bytes = little_endian(&tensor.numbers);
+        (name.clone(), Dtype::F32, tensor.shape.clone(), bytes)
     };
-    let mut all: Vec<(String, Dtype, Vec<usize>, Vec<u8>)> =
-        contents.tensors.iter().map(little_endian).collect();
+    let mut all: Vec<_> = tensors.map(tensor).collect();
     let state = contents.state.clone();
     all.push((STATE.into(), Dtype::U8, vec![state.len()], state));
-    let views = all.iter().map(|(name, kind, shape, bytes)| {
+    let views = all.iter();
+    let views = views.map(|(name, kind, shape, bytes)| {
         Ok((name, TensorView::new(*kind, shape.clone(), bytes)?))
     });
     let views = views.collect::<Result<Vec<_>, _>>().map_err(damaged)?;
@@ -267,7 +253,17 @@ pub fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Con
     let mut contents = Contents::new([], &());
     contents.settings = texts.remove(SETTINGS).unwrap_or_default();
     for (name, view) in file.iter() {
-        contents.insert(name, &view)?;
+        match (name, view.dtype()) {
+            (STATE, Dtype::U8) => contents.state = view.data().to_vec(),
+            (_, Dtype::F32) => {
+                let (numbers, _) = view.data().as_chunks();
+                let numbers = numbers.iter().map(|&number| f32::from_le_bytes(number));
+                let (shape, numbers) = (view.shape().to_vec(), numbers.collect());
+                let tensor = Tensor { shape, numbers };
+                contents.tensors.insert(name.into(), tensor);
+            }
+            (_, other) => return Err(Problem::value(name, "F32", other)),
+        }
     }
     let (expected, got) = (texts.remove(DIGEST).unwrap_or_default(), contents.digest());
     match got == expected {
@@ -276,31 +272,14 @@ pub fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Con
     }
 }
 
-impl Contents {
-    fn insert(&mut self, name: &str, view: &TensorView<'_>) -> Result<(), Problem> {
-        let (shape, bytes) = (view.shape().to_vec(), view.data());
-        match (name, view.dtype()) {
-            (STATE, Dtype::U8) => self.state = bytes.to_vec(),
-            (_, Dtype::F32) => {
-                let (numbers, _) = bytes.as_chunks();
-                let numbers = numbers.iter().map(|&number| f32::from_le_bytes(number));
-                let numbers = numbers.collect();
-                self.tensors.insert(name.into(), Tensor { shape, numbers });
-            }
-            (_, other) => return Err(Problem::value(name, "F32", format_args!("{other:?}"))),
-        }
-        Ok(())
-    }
+fn little_endian(numbers: &[f32]) -> Vec<u8> {
+    let numbers = numbers.iter();
+    numbers.flat_map(|number| number.to_le_bytes()).collect()
 }
 
 fn check_size(n_bytes: u64) -> Result<(), Problem> {
-    match n_bytes {
-        ..=MAX_BYTES => Ok(()),
-        _ => Err(Problem::whole(
-            format_args!("at most {MAX_BYTES} bytes"),
-            n_bytes,
-        )),
-    }
+    let expected = format!("at most {MAX_BYTES} bytes");
+    check(n_bytes <= MAX_BYTES, "file", expected, n_bytes)
 }
 
 fn damaged(error: SafeTensorError) -> Problem {

@@ -5,8 +5,9 @@
 //! before it renews. Frames of a block that is not full yet are not replayed. The oldest blocks go
 //! when there is no room.
 
+use crate::estimation::belief::Belief;
 use crate::learning::checkpoint::{Problem, check, check_counts, check_numbers};
-use protocol::{Frame, Shape};
+use protocol::{Frame, Probabilities, Shape};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -199,27 +200,16 @@ impl Block {
             None => Ok(()),
             // Still to be given.
             Some([]) if self.frames.is_empty() => Ok(()),
-            Some(start) => check_beliefs("replay.start", start, n_states, shape),
+            Some(start) => {
+                let dim = (n_states, shape.height(), shape.width());
+                check_numbers("replay.start", start, n_states * shape.n_cells())?;
+                let start = Probabilities::from_shape_vec(dim, start.to_vec());
+                let start = start.expect("invariant: as many numbers");
+                let wrong = |error| Problem::value("replay.start", "a belief", error);
+                Belief::from_probabilities(start).map(drop).map_err(wrong)
+            }
         }
     }
-}
-
-/// Refuses numbers that are no distribution over the states in each cell, but for what roundings add up to.
-pub fn check_beliefs(
-    name: &str,
-    numbers: &[f32],
-    n_states: usize,
-    shape: Shape,
-) -> Result<(), Problem> {
-    let n_cells = shape.n_cells();
-    check_numbers(name, numbers, n_states * n_cells)?;
-    for cell in 0..n_cells {
-        let distribution = || numbers[cell..].iter().step_by(n_cells);
-        let sum: f32 = distribution().sum();
-        let fits = (sum - 1.0).abs() < 1e-3 && distribution().all(|&p| p >= 0.0);
-        check(fits, name, "probabilities with sum 1 in each cell", sum)?;
-    }
-    Ok(())
 }
 
 #[cfg(test)]
@@ -368,15 +358,16 @@ mod tests {
             |replay| replay.n_opened = u64::MAX,
             "replay.n_opened: expected at most 9007199254740992, got 18446744073709551615",
         );
-        let lengths = "replay.start: expected 6 numbers, got 0";
+        let lengths = "replay.start: expected 6 finite numbers, got 0";
         check(|replay| full(replay).start = Some(Vec::new()), lengths);
         check(
             |replay| full(replay).start = Some(vec![f32::NAN; 6]),
-            "replay.start: expected finite numbers, got NaN",
+            "replay.start: expected 6 finite numbers, got NaN",
         );
         check(
             |replay| full(replay).start = Some(vec![0.25; 6]),
-            "replay.start: expected probabilities with sum 1 in each cell, got 0.5",
+            "replay.start: expected a belief, got belief of cell (0, 0): expected probabilities >= 0 \
+             with sum 1, got [0.25, 0.25]",
         );
     }
 }

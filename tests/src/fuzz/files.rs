@@ -11,7 +11,7 @@ use agent::learning::learner::{self, Learner, Progress};
 use agent::learning::reward::RewardEstimate;
 use agent::learning::student::decisions::{self, Decisions};
 use agent::learning::student::filter::{FilterStudent, SavedFilter};
-use agent::learning::student::network::{self, SavedNetwork};
+use agent::learning::student::network::{self, Position, SavedNetwork};
 use agent::learning::student::{Site, Student};
 use ndarray::{Array3, Axis};
 use protocol::model::ModelFile;
@@ -219,14 +219,16 @@ fn autoencoder(side: usize, length: usize) -> Contents {
         n_observations: 3,
         counters: [0, 0],
         dqn: decisions().dqn.saved(),
-        track: decisions().dqn.track(),
-        follower: Follower::at(vec![0.0; length], Belief::uniform(3, cell)),
-        estimate: None,
         frames: Vec::new(),
         tracks: Vec::new(),
-        reward: RewardEstimate::new(3),
-        iterations: 0,
-        place: [0; 5],
+        position: Position {
+            follower: Follower::at(vec![0.0; length], Belief::uniform(3, cell)),
+            estimate: None,
+            track: decisions().dqn.track(),
+            reward: RewardEstimate::new(3),
+            iterations: 0,
+            place: None,
+        },
     };
     let settings = format!("[autoencoder]\nencoding = {length}\nhidden = {length}\n");
     Contents {

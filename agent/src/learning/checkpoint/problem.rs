@@ -27,14 +27,6 @@ pub enum Problem {
     /// The system refused.
     #[error("{0}")]
     Io(#[from] std::io::Error),
-    /// Not a checkpoint of the kind that was asked for, as this program writes it.
-    #[error("expected {expected}, got {got}")]
-    Whole {
-        /// What the file must be.
-        expected: String,
-        /// What it is.
-        got: String,
-    },
     /// The form is right and the numbers are not those that were written.
     #[error("expected contents with digest {expected}, got {got}: the file is damaged")]
     Digest {
@@ -46,16 +38,9 @@ pub enum Problem {
     /// The networks in it.
     #[error(transparent)]
     Network(#[from] ::network::NetworkError),
-    /// A tensor or a field of the state that the program cannot work with.
-    #[error("{name}: expected {expected}, got {got}")]
-    Value {
-        /// The tensor or field.
-        name: String,
-        /// What it must be.
-        expected: String,
-        /// What it is.
-        got: String,
-    },
+    /// Contents that the program cannot work with: what, expected and got.
+    #[error("{0}")]
+    Unfit(String),
 }
 
 impl Problem {
@@ -68,17 +53,12 @@ impl Problem {
 
     /// What is wrong with the file as a whole.
     pub fn whole(expected: impl Display, got: impl Display) -> Self {
-        let (expected, got) = (expected.to_string(), got.to_string());
-        Self::Whole { expected, got }
+        Self::Unfit(format!("expected {expected}, got {got}"))
     }
 
-    /// What is wrong with a tensor or field.
+    /// What is wrong with a tensor or a field of the state.
     pub fn value(name: &str, expected: impl Display, got: impl Display) -> Self {
-        Self::Value {
-            name: name.into(),
-            expected: expected.to_string(),
-            got: got.to_string(),
-        }
+        Self::Unfit(format!("{name}: expected {expected}, got {got}"))
     }
 }
 
@@ -108,19 +88,11 @@ pub fn check_numbers<T: Copy + Into<f64>>(
     numbers: &[T],
     length: usize,
 ) -> Result<(), Problem> {
-    check(
-        numbers.len() == length,
-        name,
-        format_args!("{length} numbers"),
-        numbers.len(),
-    )?;
-    let wrong = numbers
-        .iter()
-        .map(|&number| number.into())
-        .find(|number| !number.is_finite());
-    wrong.map_or(Ok(()), |got| {
-        Err(Problem::value(name, "finite numbers", got))
-    })
+    let mut floats = numbers.iter().map(|&number| number.into());
+    let wrong = floats.find(|number: &f64| !number.is_finite());
+    let got = wrong.unwrap_or(numbers.len() as f64);
+    let fits = wrong.is_none() && numbers.len() == length;
+    check(fits, name, format!("{length} finite numbers"), got)
 }
 
 /// Refuses a belief about other states or on another grid.

@@ -260,7 +260,7 @@ mod tests {
         );
         forged(
             |_, saved| saved.reward.rewards[1] = f64::NAN,
-            "reward.rewards: expected finite numbers, got NaN",
+            "reward.rewards: expected 3 finite numbers, got NaN",
         );
         forged(
             |_, saved| saved.n_updates = u64::MAX,

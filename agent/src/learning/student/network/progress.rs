@@ -11,6 +11,7 @@ use crate::learning::reward::RewardEstimate;
 use crate::learning::student::Site;
 use crate::planning::BasisKind;
 use crate::planning::policy::Policy;
+use crate::rollout::Robot;
 use crate::server::client::Place;
 use ::network::{Autoencoder, Device, Dqn, NetworkError, NetworkShape, Replay, SavedDqn, Track};
 use protocol::model::MAX_VALUES;
@@ -21,20 +22,27 @@ use serde::{Deserialize, Serialize};
 pub struct Progress {
     /// The model.
     pub autoencoder: Autoencoder,
-    /// What it knows of the world.
-    pub follower: Follower,
     /// The choice of objectives.
     pub dqn: Dqn,
     /// What that sees.
     pub input: DqnInput,
-    /// The world's latest steps, for its replay.
-    pub track: Track,
-    /// The estimate where paths are planned on it, as a checkpoint left it.
-    pub estimate: Option<Belief>,
     /// What paths are planned on.
     pub basis: BasisKind,
     /// The frames that are learned from.
     pub replay: Replay,
+    /// Where learning stands beside.
+    pub position: Position,
+}
+
+/// Where Algorithm 1 stands in its world.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Position {
+    /// What the network knows of the world.
+    pub follower: Follower,
+    /// The estimate where paths are planned on it, as a checkpoint left it.
+    pub estimate: Option<Belief>,
+    /// The world's latest steps, for the DQN's replay.
+    pub track: Track,
     /// Which state pays.
     pub reward: RewardEstimate,
     /// Iterations of Algorithm 1.
@@ -54,22 +62,12 @@ pub struct SavedNetwork {
     pub counters: [u64; 2],
     /// The DQN.
     pub dqn: SavedDqn,
-    /// The world's latest steps.
-    pub track: Track,
-    /// What the network knows of the world.
-    pub follower: Follower,
-    /// The estimate where paths are planned on it.
-    pub estimate: Option<Belief>,
     /// The replay, the oldest frame first.
     pub frames: Vec<Vec<u8>>,
     /// The places of frames with which tracks begin.
     pub tracks: Vec<u64>,
-    /// Which state pays.
-    pub reward: RewardEstimate,
-    /// Iterations of Algorithm 1.
-    pub iterations: u64,
-    /// Where the world stands.
-    pub place: Place,
+    /// Where learning stands beside.
+    pub position: Position,
 }
 
 /// What Algorithm 1 learned, with its parameters fixed.
@@ -100,25 +98,28 @@ impl Progress {
         let input = config.dqn.input;
         let n_inputs = input.length(settings.hidden, n_states);
         let dqn = Dqn::new(config.dqn.settings(), n_inputs, n_actions, config.seed);
-        Ok(Self {
+        let position = Position {
             follower: Follower::new(&autoencoder)?,
-            track: dqn.track(),
-            dqn,
-            input,
             estimate: None,
-            basis: config.objective.belief,
-            autoencoder,
-            replay: Replay::new(settings.replay),
+            track: dqn.track(),
             reward: RewardEstimate::new(n_states),
             iterations: 0,
             place: None,
+        };
+        Ok(Self {
+            autoencoder,
+            dqn,
+            input,
+            basis: config.objective.belief,
+            replay: Replay::new(settings.replay),
+            position,
         })
     }
 
     /// The state that pays most, as far as rewards tell by now.
     pub(super) fn target(&self) -> usize {
-        let target = self.reward.target();
-        target.unwrap_or(self.reward.rewards.len() - 1)
+        let reward = &self.position.reward;
+        reward.target().unwrap_or(reward.rewards.len() - 1)
     }
 
     /// What is known by then.
@@ -132,35 +133,26 @@ impl Progress {
         }
     }
 
-    /// As a checkpoint, without the settings: the world stands at `place`.
+    /// As a checkpoint, without the settings: a robot stands in the world.
     ///
     /// # Errors
     /// As the network's device.
-    pub fn to_contents(
-        &self,
-        place: Place,
-        follower: &Follower,
-        estimate: Option<&Belief>,
-    ) -> Result<Contents, NetworkError> {
-        let NetworkShape {
-            grid,
-            n_observations,
-            ..
-        } = *self.autoencoder.shape();
+    pub fn to_contents(&self, robot: &Robot) -> Result<Contents, NetworkError> {
+        let shape = self.autoencoder.shape();
         let frames = self.replay.frames();
         let state = SavedNetwork {
-            shape: grid,
-            n_observations,
+            shape: shape.grid,
+            n_observations: shape.n_observations,
             counters: self.autoencoder.counters(),
             dqn: self.dqn.saved(),
-            track: self.track.clone(),
-            follower: follower.clone(),
-            estimate: estimate.cloned(),
             frames: frames.map(|frame| frame.as_bytes().to_vec()).collect(),
             tracks: self.replay.tracks().collect(),
-            reward: self.reward.clone(),
-            iterations: self.iterations,
-            place,
+            position: Position {
+                follower: follower(robot).clone(),
+                estimate: robot.agent.estimate().cloned(),
+                place: Some(robot.observation().place()),
+                ..self.position.clone()
+            },
         };
         let mut tensors = self.autoencoder.named_tensors()?;
         tensors.extend(self.dqn.named_tensors());
@@ -175,21 +167,13 @@ impl Progress {
         let config = contents.settings()?;
         let saved: SavedNetwork = contents.state()?;
         let (shape, n_observations) = (saved.shape, saved.n_observations);
-        let fits = (1..=MAX_VALUES).contains(&n_observations);
-        check(
-            fits,
-            "n_observations",
-            format!("1 to {MAX_VALUES}"),
-            n_observations,
-        )?;
+        let (fits, expected) = (1..=MAX_VALUES, format!("1 to {MAX_VALUES}"));
+        let fits = fits.contains(&n_observations);
+        check(fits, "n_observations", expected, n_observations)?;
         let sizes = network_shape(shape, n_observations, &config);
         check_size(contents, &sizes)?;
-        check_belief(
-            "prediction",
-            saved.follower.prediction(),
-            sizes.n_states,
-            shape,
-        )?;
+        let prediction = saved.position.follower.prediction();
+        check_belief("prediction", prediction, sizes.n_states, shape)?;
         let site = Site {
             shape,
             n_observations,
@@ -209,52 +193,54 @@ impl Progress {
         let [expected, got] = [self.input, contents.settings()?.dqn.input].map(DqnInput::label);
         check(got == expected, "dqn.input", expected, got)?;
         let saved: SavedNetwork = contents.state()?;
-        let NetworkShape { grid, n_states, .. } = *self.autoencoder.shape();
-        let [adam_steps, updates] = saved.counters;
+        let (mut position, n_updates) = (saved.position, saved.dqn.n_updates);
         check_counts(&[
-            ("adam_steps", adam_steps),
-            ("updates", updates),
-            ("dqn.n_updates", saved.dqn.n_updates),
-            ("iterations", saved.iterations),
+            ("adam_steps", saved.counters[0]),
+            ("updates", saved.counters[1]),
+            ("dqn.n_updates", n_updates),
+            ("iterations", position.iterations),
         ])?;
         contents.check_squares()?;
         let find = |name: &str, shape: &[usize]| contents.tensor(name, shape);
         self.autoencoder.load(find, saved.counters)?;
         self.dqn.load(find, &saved.dqn)?;
-        self.track = self.dqn.resume_track(saved.track.clone())?;
-        let follower = &saved.follower;
-        check_numbers("hidden", follower.hidden(), self.follower.hidden().len())?;
-        check_belief("prediction", follower.prediction(), n_states, grid)?;
-        let mut estimate = saved.estimate.iter();
+        self.load_replay(&saved.frames, &saved.tracks)?;
+        let NetworkShape {
+            grid,
+            n_states,
+            hidden,
+            ..
+        } = *self.autoencoder.shape();
+        check_numbers("hidden", position.follower.hidden(), hidden)?;
+        let prediction = position.follower.prediction();
+        check_belief("prediction", prediction, n_states, grid)?;
+        let mut estimate = position.estimate.iter();
         estimate.try_for_each(|estimate| check_belief("estimate", estimate, n_states, grid))?;
-        saved.reward.check(n_states)?;
-        self.load_replay(&saved)?;
-        self.follower = saved.follower;
-        self.estimate = saved.estimate;
-        self.reward = saved.reward;
-        self.iterations = saved.iterations;
-        self.place = Some(saved.place);
+        position.reward.check(n_states)?;
+        position.track = self.dqn.resume_track(position.track)?;
+        self.position = position;
         Ok(())
     }
 
-    fn load_replay(&mut self, saved: &SavedNetwork) -> Result<(), Problem> {
-        let NetworkShape {
-            grid,
-            n_observations,
-            ..
-        } = *self.autoencoder.shape();
-        let mut tracks = saved.tracks.iter().peekable();
-        for (index, bytes) in saved.frames.iter().enumerate() {
-            if tracks.next_if_eq(&&(index as u64)).is_some() {
+    fn load_replay(&mut self, frames: &[Vec<u8>], tracks: &[u64]) -> Result<(), Problem> {
+        let shape = self.autoencoder.shape();
+        let mut tracks = tracks.iter().peekable();
+        for (index, bytes) in (0..).zip(frames) {
+            if tracks.next_if_eq(&&index).is_some() {
                 self.replay.begin();
             }
-            let frame = Frame::from_bytes(grid, n_observations, bytes);
-            let frame =
-                frame.map_err(|error| Problem::value("frames", "frames of these worlds", error))?;
-            self.replay.push(frame);
+            let frame = Frame::from_bytes(shape.grid, shape.n_observations, bytes);
+            let wrong = |error| Problem::value("frames", "frames of these worlds", error);
+            self.replay.push(frame.map_err(wrong)?);
         }
         Ok(())
     }
+}
+
+/// What the network of a robot's agent knows of its world.
+pub(super) fn follower(robot: &Robot) -> &Follower {
+    let follower = robot.agent.estimator().follower();
+    follower.expect("invariant: its estimator is an autoencoder")
 }
 
 /// The network that settings ask for.
