@@ -2,6 +2,8 @@
 
 use crate::commands::{AGENT, check};
 use crate::harness::{Ended, Server, fly, run};
+use agent::learning::checkpoint::{self, Contents};
+use agent::learning::student::network::{KIND, SavedNetwork};
 use protocol::Move;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -82,11 +84,14 @@ fn agent(words: &str) -> Ended {
 }
 
 /// What a checkpoint holds, but for its settings.
-fn contents(path: &Path) -> agent::learning::checkpoint::Contents {
-    let mut contents =
-        agent::learning::checkpoint::read(path, "autoencoder").expect("a checkpoint");
-    contents.texts.remove("settings");
+fn contents(path: &Path) -> Contents {
+    let (_, mut contents) = checkpoint::read(path, &[KIND]).expect("a checkpoint");
+    contents.settings.clear();
     contents
+}
+
+fn state(contents: &Contents) -> SavedNetwork {
+    contents.state().expect("its state")
 }
 
 #[test]
@@ -111,6 +116,7 @@ fn the_same_seed_gives_the_same_losses_bit_for_bit() {
 fn a_training_that_stopped_goes_on_as_if_it_had_not() {
     goes_on_as_if_it_had_not_stopped(SETTINGS);
     goes_on_as_if_it_had_not_stopped(&printed());
+    goes_on_as_if_it_had_not_stopped(&SETTINGS.replace("[dqn]", "[dqn]\nn_step = 3"));
 }
 
 fn goes_on_as_if_it_had_not_stopped(settings: &str) {
@@ -152,35 +158,25 @@ fn settings_of_sizes_and_of_plans_reach_the_training() {
         assert_ne!(default[LOSS], other[LOSS], "{index}");
     }
     // Only shown in part, as paths are flown.
-    assert_ne!(
-        stored.bytes["replay.frames"],
-        planned.bytes["replay.frames"]
-    );
-    let has_estimate = |stored: &agent::learning::checkpoint::Contents| {
-        stored.tensors.contains_key("state.estimate")
-    };
-    assert!(!has_estimate(&stored) && has_estimate(&planned));
+    let [stored, planned] = [stored, planned].map(|contents| state(&contents));
+    assert_ne!(stored.frames, planned.frames);
+    assert!(stored.position.estimate.is_none() && planned.position.estimate.is_some());
 }
 
 #[test]
 fn actions_go_by_what_the_settings_say_and_a_checkpoint_by_its_own() {
-    let inputs = [
-        ("after_frame", 4, Some("state.hidden")),
-        ("summary", 74, None),
-    ];
-    for (input, length, last) in inputs {
+    for (input, length) in [("after_frame", 4), ("summary", 74)] {
         let place = Place::new(&SETTINGS.replace("[dqn]", &format!("[dqn]\ninput = \"{input}\"")));
         place.train("out", &format!("{WORLD} --steps 15"));
-        let stored = contents(&place.checkpoint("out"));
-        let rows = |name: &str| -> Vec<Vec<f32>> {
-            let numbers = stored.tensors[name].numbers.chunks(length);
-            numbers.map(<[f32]>::to_vec).collect()
-        };
-        let (before, after) = (rows("dqn.replay.input"), rows("dqn.replay.next"));
-        assert_eq!(before.len(), 15, "{input}");
-        assert_eq!(before[1..], after[..14], "{input}");
-        if let Some(last) = last {
-            assert_eq!(after[14], stored.tensors[last].numbers, "{input}");
+        let stored = state(&contents(&place.checkpoint("out")));
+        let transitions = stored.dqn.transitions;
+        assert_eq!(transitions.len(), 15, "{input}");
+        for pair in transitions.windows(2) {
+            assert_eq!(pair[0].next.len(), length, "{input}");
+            assert_eq!(pair[0].next, pair[1].input, "{input}");
+        }
+        if input == "after_frame" {
+            assert_eq!(transitions[14].next, stored.position.follower.hidden());
         }
         let checkpoint = place.checkpoint("out");
         let checkpoint = checkpoint.display();
@@ -281,8 +277,10 @@ fn full_observation_tells_which_state_pays() {
         .iter()
         .filter_map(|row| row[4].parse::<f64>().ok())
         .sum();
-    let stored = contents(&place.checkpoint("out"));
-    let estimate = stored.floats("reward.rewards", 3).expect("three states");
+    let estimate = state(&contents(&place.checkpoint("out")))
+        .position
+        .reward
+        .rewards;
     assert_eq!(rewards > 0.0, estimate.iter().sum::<f64>() > 0.0);
 }
 
@@ -292,8 +290,7 @@ fn numbers_that_are_not_finite_stop_training_with_a_checkpoint() {
         let place = Place::new(SETTINGS);
         place.train("out", &format!("{WORLD} --steps 10"));
         let path = place.checkpoint("out");
-        let mut broken =
-            agent::learning::checkpoint::read(&path, "autoencoder").expect("a checkpoint");
+        let (_, mut broken) = checkpoint::read(&path, &[KIND]).expect("a checkpoint");
         let numbers = broken.tensors.iter_mut();
         for (name, stored) in numbers {
             if name.starts_with(tensor) {
@@ -301,7 +298,7 @@ fn numbers_that_are_not_finite_stop_training_with_a_checkpoint() {
                 stored.numbers.fill(3e38);
             }
         }
-        agent::learning::checkpoint::write(&path, "autoencoder", &broken).expect("written");
+        checkpoint::write(&path, KIND, &broken).expect("written");
         let resume = place.words("out", &format!("{WORLD} --steps 10 --resume"));
         let words = ["world steps: update ", "expected finite numbers", "is in"];
         check(AGENT, &resume, &words);

@@ -3,7 +3,8 @@
 use crate::commands::{AGENT, check, check_table};
 use crate::harness::{Ended, Program, SMALL, Server, eventually, fly, run};
 use agent::learning::checkpoint::{self, Contents};
-use agent::learning::learner::KIND;
+use agent::learning::learner::{KIND, SavedLearner};
+use agent::learning::student::filter::SavedFilter;
 use protocol::Move;
 use rustix::process::Signal;
 use std::ffi::OsString;
@@ -46,7 +47,8 @@ impl Place {
     }
 
     fn contents(&self, out: &str) -> Contents {
-        checkpoint::read(&self.checkpoint(out), KIND).expect("a checkpoint")
+        let read = checkpoint::read(&self.checkpoint(out), &[KIND]);
+        read.expect("a checkpoint").1
     }
 
     /// The command's words for training into a folder.
@@ -79,6 +81,10 @@ fn agent(words: &str) -> Ended {
     let ended = run(AGENT, &words.split_whitespace().collect::<Vec<_>>(), LIMIT);
     assert_eq!(ended.code, Some(0), "{words}: {}", ended.stderr);
     ended
+}
+
+fn learner(contents: &Contents) -> SavedLearner {
+    contents.state::<SavedFilter>().expect("its state").learner
 }
 
 fn bytes(path: &Path) -> Vec<u8> {
@@ -133,7 +139,7 @@ fn training_goes_on_bit_for_bit_where_it_stopped() {
         });
         assert_eq!(whole.0, parts.0, "{stops:?}");
         assert_eq!(whole.0.last().map(|row| &*row[1]), Some("200"));
-        // Parameters, moments, replay, places and beliefs alike.
+        // Parameters, moments, replay, streams and beliefs alike.
         assert!(whole.1 == parts.1, "{stops:?}: checkpoints differ");
     }
 }
@@ -195,7 +201,7 @@ fn a_number_that_is_not_finite_ends_training_by_name_with_a_checkpoint() {
     }
     checkpoint::write(&checkpoint, KIND, &contents).expect("written");
     let n_rows = place.rows("out").len();
-    let next = contents.count("updates").expect("updates") + 1;
+    let next = learner(&contents).n_updates + 1;
     let words = place.words("out", &format!("{WORLDS} --steps 80 --resume"));
     let ended = run(AGENT, &words.split_whitespace().collect::<Vec<_>>(), LIMIT);
     assert_eq!(ended.code, Some(1), "{}", ended.stderr);
@@ -211,7 +217,7 @@ fn a_number_that_is_not_finite_ends_training_by_name_with_a_checkpoint() {
         let tensors = [&contents, &saved].map(|contents| contents.tensors.get(name));
         assert_eq!(tensors[0], tensors[1], "{name}: as before the update");
     }
-    assert_eq!(saved.count("updates").expect("updates"), next - 1);
+    assert_eq!(learner(&saved).n_updates, next - 1);
     assert!(place.rows("out").len() >= n_rows);
     // It reads back whole: a later run gets as far, and no further.
     check(AGENT, &words, &["likelihood: expected finite numbers"]);

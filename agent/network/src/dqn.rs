@@ -8,6 +8,7 @@ mod memory;
 mod state;
 mod track;
 
+pub use state::SavedDqn;
 pub use track::Track;
 
 use crate::adam::{Adam, AdamSettings};
@@ -80,7 +81,7 @@ impl DqnSettings {
 }
 
 /// One row `(h, a, r, h')` of the replay.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Transition {
     /// Before.
     pub input: Vec<f32>,

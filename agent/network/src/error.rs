@@ -18,13 +18,15 @@ pub enum NetworkError {
     /// The numbers.
     #[error(transparent)]
     NotFinite(#[from] NotFinite),
-    /// An action that the DQN does not have.
-    #[error("dqn.replay.action: expected actions below {expected}, got {got}")]
-    Action {
-        /// Number of actions.
-        expected: usize,
-        /// What was found.
-        got: f32,
+    /// A saved transition of another DQN.
+    #[error("dqn.transitions: {at}: expected {expected}, got {got}")]
+    Transition {
+        /// Which one, the oldest first.
+        at: usize,
+        /// What it must have.
+        expected: String,
+        /// What it has.
+        got: String,
     },
     /// The device, as for want of memory.
     #[error("the network's device: {0}")]

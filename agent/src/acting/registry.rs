@@ -7,7 +7,7 @@ use crate::estimation::{AutoencoderEstimator, BayesFilter, Estimator, EstimatorE
 use crate::learning::checkpoint::Problem;
 use crate::learning::learned::Learned;
 use crate::learning::learner::LearnedModel;
-use crate::learning::settings::settings;
+
 use crate::learning::student::decisions::Decisions;
 use crate::learning::student::network::LearnedNetwork;
 use crate::planning::policy::{EstimatorKind, Policy};
@@ -85,7 +85,7 @@ fn basis(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<Basis
         }
         _ if policy.is_decided => {
             let contents = present(policy, &learned.decisions, "decisions")?;
-            settings(contents).map_err(unfit)?.objective.belief
+            contents.settings().map_err(unfit)?.objective.belief
         }
         _ => config.objective.belief,
     })

@@ -14,7 +14,8 @@ use thiserror::Error;
 const SUM_TOLERANCE: f32 = 5e-5;
 
 /// One distribution over states per cell, shape `[S, H, W]`; each cell sums to one.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Probabilities", into = "Probabilities")]
 pub struct Belief {
     probabilities: Probabilities,
     shape: Shape,
@@ -179,6 +180,20 @@ impl Belief {
             probabilities,
             shape,
         }
+    }
+}
+
+impl TryFrom<Probabilities> for Belief {
+    type Error = BeliefError;
+
+    fn try_from(probabilities: Probabilities) -> Result<Self, BeliefError> {
+        Self::from_probabilities(probabilities)
+    }
+}
+
+impl From<Belief> for Probabilities {
+    fn from(belief: Belief) -> Self {
+        belief.probabilities
     }
 }
 

@@ -3,9 +3,10 @@
 use crate::estimation::belief::Belief;
 use ::network::{Autoencoder, NetworkError};
 use protocol::Probabilities;
+use serde::{Deserialize, Serialize};
 
 /// What a network knows of one world. Every method takes the same network.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Follower {
     /// `h_k`.
     hidden: Vec<f32>,

@@ -9,6 +9,7 @@ use ndarray::{Array2, NdFloat};
 use protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
 use protocol::randomness::split_mix;
 use protocol::{Model, Shape};
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 /// Largest size of a free number: weights from 1e-7, probabilities from 1e-14 on.
@@ -27,7 +28,7 @@ const OWN_OBSERVATION: f32 = 2.5;
 /// their own must not start alike.
 const NOISE: f32 = 0.1;
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Dimensions {
     /// Number of states S.
     pub n_states: usize,

@@ -1,32 +1,165 @@
-//! What a learner keeps between runs: named tensors, bytes and text in one safetensors file.
+//! What a learner keeps between runs, in one safetensors file: weights and the optimiser's moments as tensors by
+//! name, everything else as one value that bincode encodes, the tensor of bytes `state`.
 //!
-//! Written beside the file and renamed, so whoever reads finds all or nothing. Read whole or refused:
-//! the file says which learner it is of, and a digest tells damage that keeps its form.
+//! Written beside the file and renamed, so that a reader finds all or nothing. Read whole or refused: the file says
+//! which learner and which format it is of, and a digest tells damage that keeps its form.
 
-mod contents;
 mod problem;
 
-pub use self::contents::{Bytes, Contents, Tensor};
-pub use self::problem::{CheckpointError, Problem};
+pub use self::problem::{
+    CheckpointError, Problem, check, check_belief, check_counts, check_numbers,
+};
 
 use self::problem::MAX_BYTES;
-
+use crate::config::AgentConfig;
+use ::network::NamedTensor;
+use bincode::config::{Configuration, Fixint, LittleEndian};
 use safetensors::tensor::TensorView;
-use safetensors::{Dtype, SafeTensors};
-use std::collections::HashMap;
+use safetensors::{Dtype, SafeTensorError, SafeTensors};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use std::collections::{BTreeMap, HashMap};
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-/// Entries of the metadata that this file makes itself.
+/// Entries of the metadata.
 const KIND: &str = "emberwatch.kind";
+const FORMAT: &str = "emberwatch.format";
 const DIGEST: &str = "emberwatch.digest";
+const SETTINGS: &str = "settings";
+
+/// Changes with what any state holds.
+const VERSION: &str = "1";
+
+/// The tensor of bytes.
+const STATE: &str = "state";
+
+/// How states are encoded: integers of fixed size.
+const FORM: Configuration<LittleEndian, Fixint> =
+    bincode::config::standard().with_fixed_int_encoding();
+
+/// One tensor.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Tensor {
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// Its numbers, row-major.
+    pub numbers: Vec<f32>,
+}
+
+/// The contents of a checkpoint.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Contents {
+    /// By name.
+    pub tensors: BTreeMap<String, Tensor>,
+    /// A learner's other values, encoded.
+    pub state: Vec<u8>,
+    /// The effective settings, TOML.
+    pub settings: String,
+}
+
+impl Contents {
+    /// Tensors and state; the settings are still to be added.
+    pub fn new(tensors: impl IntoIterator<Item = NamedTensor>, state: &impl Serialize) -> Self {
+        let tensors = tensors.into_iter();
+        let tensor = |(name, shape, numbers)| (name, Tensor { shape, numbers });
+        let mut contents = Self {
+            tensors: tensors.map(tensor).collect(),
+            state: Vec::new(),
+            settings: String::new(),
+        };
+        contents.set_state(state);
+        contents
+    }
+
+    /// Replaces the state.
+    pub fn set_state(&mut self, state: &impl Serialize) {
+        let state = bincode::serde::encode_to_vec(state, FORM);
+        self.state = state.expect("invariant: states hold values and sequences of known length");
+    }
+
+    /// The state, as a learner's type.
+    ///
+    /// # Errors
+    /// For bytes that are no such state. What its values mean is not checked.
+    pub fn state<S: DeserializeOwned>(&self) -> Result<S, Problem> {
+        use bincode::serde::decode_from_slice as decode;
+        // The limit is part of a type: the smallest one, so that a small file cannot ask for much memory.
+        let decoded = match self.state.len() {
+            0..0x1_0000 => decode(&self.state, FORM.with_limit::<0x10_0000>()),
+            0x1_0000..0x100_0000 => decode(&self.state, FORM.with_limit::<0x1000_0000>()),
+            _ => decode(&self.state, FORM.with_limit::<{ MAX_BYTES as usize }>()),
+        };
+        let (state, length) =
+            decoded.map_err(|error| Problem::value(STATE, "that of its learner", error))?;
+        let got = self.state.len();
+        check(length == got, STATE, format!("{length} bytes"), got)?;
+        Ok(state)
+    }
+
+    /// A tensor's numbers; it must be there, in this shape, with finite numbers.
+    ///
+    /// # Errors
+    /// Names what is wrong with it.
+    pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>, Problem> {
+        let wrong = |got: &str| Problem::value(name, format_args!("shape {expected:?}"), got);
+        let tensor = self.tensors.get(name).ok_or_else(|| wrong("none"))?;
+        if tensor.shape != expected {
+            return Err(wrong(&format!("{:?}", tensor.shape)));
+        }
+        check_numbers(name, &tensor.numbers, expected.iter().product())?;
+        Ok(tensor.numbers.clone())
+    }
+
+    /// Refuses means of squares, whose roots are taken, that are negative.
+    ///
+    /// # Errors
+    /// Names the tensor.
+    pub fn check_squares(&self) -> Result<(), Problem> {
+        let ends = [".second_moment", "running_var"];
+        let is_square = |name: &str| {
+            name.contains("adam.second.") || ends.iter().any(|end| name.ends_with(end))
+        };
+        let mut squares = self.tensors.iter().filter(|(name, _)| is_square(name));
+        squares.try_for_each(|(name, tensor)| {
+            let least = tensor.numbers.iter().copied().fold(0.0, f32::min);
+            check(least >= 0.0, name, "numbers from 0 on", least)
+        })
+    }
+
+    /// The settings that it was trained with.
+    ///
+    /// # Errors
+    /// For none, or others than an agent's.
+    pub fn settings(&self) -> Result<AgentConfig, Problem> {
+        let wrong = |got: String| Problem::value(SETTINGS, "those of an agent", got);
+        if self.settings.is_empty() {
+            return Err(wrong("none".into()));
+        }
+        let config: Result<AgentConfig, _> = toml::from_str(&self.settings);
+        let config = config.map_err(|error| wrong(error.to_string()))?;
+        config.check().map_err(|error| wrong(error.to_string()))
+    }
+
+    /// Against damage, not malice.
+    fn digest(&self) -> String {
+        let mut digest = crc32fast::Hasher::new();
+        for (name, Tensor { shape, numbers }) in &self.tensors {
+            digest.update(format!("{name} {shape:?} ").as_bytes());
+            digest.update(&little_endian(numbers));
+        }
+        digest.update(&self.state);
+        digest.update(self.settings.as_bytes());
+        format!("{:08x}", digest.finalize())
+    }
+}
 
 /// Writes a checkpoint of a kind of learner, whole or not at all.
 ///
 /// # Errors
-/// [`CheckpointError`]; the file is then as it was.
+/// Where the system refuses; the file is then as it was.
 pub fn write(path: &Path, kind: &'static str, contents: &Contents) -> Result<(), CheckpointError> {
     let bytes = encode(kind, contents).map_err(|problem| problem.of(path))?;
     let mut beside = path.as_os_str().to_owned();
@@ -48,30 +181,20 @@ pub fn write(path: &Path, kind: &'static str, contents: &Contents) -> Result<(),
     written.map_err(|error| Problem::Io(error).of(path))
 }
 
-/// Reads a checkpoint of a kind of learner.
-///
-/// # Errors
-/// [`CheckpointError`] names the file and what is wrong with it.
-pub fn read(path: &Path, kind: &'static str) -> Result<Contents, CheckpointError> {
-    read_any(path, &[kind]).map(|(_, contents)| contents)
-}
-
 /// Reads a checkpoint of one of some kinds, and tells which.
 ///
 /// # Errors
-/// [`CheckpointError`] names the file and what is wrong with it.
-pub fn read_any(
+/// Names the file and what is wrong with it.
+pub fn read(
     path: &Path,
     kinds: &[&'static str],
 ) -> Result<(&'static str, Contents), CheckpointError> {
     let bytes = || {
         let found = std::fs::metadata(path)?;
         if !found.is_file() {
-            return Err(Problem::NoFile);
+            return Err(Problem::whole("a regular file", "something else"));
         }
-        if found.len() > MAX_BYTES {
-            return Err(Problem::Large(found.len()));
-        }
+        check_size(found.len())?;
         let mut bytes = Vec::new();
         File::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
         Ok(bytes)
@@ -83,92 +206,85 @@ pub fn read_any(
 /// A checkpoint of a kind of learner as bytes.
 ///
 /// # Errors
-/// [`Problem`].
+/// For one that is too large.
 pub fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>, Problem> {
-    let form = |error: safetensors::SafeTensorError| Problem::Form(error.to_string());
-    let Contents {
-        tensors,
-        bytes,
-        texts,
-    } = contents;
-    let numbers = |tensor: &Tensor| -> Vec<u8> {
-        let numbers = tensor.numbers.iter();
-        numbers.flat_map(|number| number.to_le_bytes()).collect()
+    let tensors = contents.tensors.iter();
+    let tensor = |(name, tensor): (&String, &Tensor)| {
+        let bytes = little_endian(&tensor.numbers);
+        (name.clone(), Dtype::F32, tensor.shape.clone(), bytes)
     };
-    let numbers: Vec<Vec<u8>> = tensors.values().map(numbers).collect();
-    let floats = tensors.iter().zip(&numbers);
-    let floats = floats.map(|((name, tensor), numbers)| (name, Dtype::F32, &tensor.shape, numbers));
-    let bytes = bytes.iter();
-    let bytes = bytes.map(|(name, Bytes { shape, bytes })| (name, Dtype::U8, shape, bytes));
-    let views = floats.chain(bytes);
-    let views = views
-        .map(|(name, kind, shape, bytes)| Ok((name, TensorView::new(kind, shape.clone(), bytes)?)));
-    let views = views.collect::<Result<Vec<_>, _>>().map_err(form)?;
-    let mut texts: HashMap<String, String> = texts.clone().into_iter().collect();
-    texts.insert(KIND.into(), kind.into());
-    texts.insert(DIGEST.into(), contents.digest());
-    let file = safetensors::serialize(views, Some(texts)).map_err(form)?;
-    match file.len() as u64 {
-        ..=MAX_BYTES => Ok(file),
-        size => Err(Problem::Large(size)),
-    }
+    let mut all: Vec<_> = tensors.map(tensor).collect();
+    let state = contents.state.clone();
+    all.push((STATE.into(), Dtype::U8, vec![state.len()], state));
+    let views = all.iter();
+    let views = views.map(|(name, kind, shape, bytes)| {
+        Ok((name, TensorView::new(*kind, shape.clone(), bytes)?))
+    });
+    let views = views.collect::<Result<Vec<_>, _>>().map_err(damaged)?;
+    let texts = [
+        (KIND, kind),
+        (FORMAT, VERSION),
+        (DIGEST, &contents.digest()),
+        (SETTINGS, &contents.settings),
+    ];
+    let texts = texts.map(|(name, text)| (name.into(), text.into()));
+    let bytes = safetensors::serialize(views, Some(HashMap::from(texts))).map_err(damaged)?;
+    check_size(bytes.len() as u64)?;
+    Ok(bytes)
 }
 
 /// The checkpoint of one of some kinds that bytes are, and which.
 ///
 /// # Errors
-/// [`Problem`].
+/// Names what is wrong with it.
 pub fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Contents), Problem> {
-    let form = |error: safetensors::SafeTensorError| Problem::Form(error.to_string());
-    let file = SafeTensors::deserialize(bytes).map_err(form)?;
-    let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(form)?;
+    let file = SafeTensors::deserialize(bytes).map_err(damaged)?;
+    let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(damaged)?;
     let mut texts = metadata.metadata().clone().unwrap_or_default();
     let got = texts
         .remove(KIND)
         .unwrap_or_else(|| "something else".into());
     let Some(&kind) = kinds.iter().find(|kind| **kind == got) else {
-        let expected = kinds.join(" or ");
-        return Err(Problem::Kind { expected, got });
+        let expected = format!("a checkpoint of {}", kinds.join(" or "));
+        return Err(Problem::whole(expected, format_args!("one of {got}")));
     };
-    let expected = texts.remove(DIGEST).unwrap_or_default();
-    let mut contents = Contents {
-        texts: texts.into_iter().collect(),
-        ..Contents::default()
-    };
+    let got = texts.remove(FORMAT).unwrap_or_else(|| "none".into());
+    check(got == VERSION, FORMAT, VERSION, got)?;
+    let mut contents = Contents::new([], &());
+    contents.settings = texts.remove(SETTINGS).unwrap_or_default();
     for (name, view) in file.iter() {
-        contents.insert(name, &view)?;
+        match (name, view.dtype()) {
+            (STATE, Dtype::U8) => contents.state = view.data().to_vec(),
+            (_, Dtype::F32) => {
+                let (numbers, _) = view.data().as_chunks();
+                let numbers = numbers.iter().map(|&number| f32::from_le_bytes(number));
+                let (shape, numbers) = (view.shape().to_vec(), numbers.collect());
+                let tensor = Tensor { shape, numbers };
+                contents.tensors.insert(name.into(), tensor);
+            }
+            (_, other) => return Err(Problem::value(name, "F32", other)),
+        }
     }
-    let got = contents.digest();
-    if got != expected {
-        return Err(Problem::Digest { expected, got });
+    let (expected, got) = (texts.remove(DIGEST).unwrap_or_default(), contents.digest());
+    match got == expected {
+        true => Ok((kind, contents)),
+        false => Err(Problem::Digest { expected, got }),
     }
-    Ok((kind, contents))
 }
 
-impl Contents {
-    fn insert(&mut self, name: &str, view: &TensorView<'_>) -> Result<(), Problem> {
-        let (shape, bytes) = (view.shape().to_vec(), view.data());
-        match view.dtype() {
-            Dtype::U8 => {
-                let bytes = bytes.to_vec();
-                self.bytes.insert(name.into(), Bytes { shape, bytes });
-            }
-            Dtype::F32 => {
-                let (numbers, _) = bytes.as_chunks();
-                let numbers = numbers.iter().map(|&number| f32::from_le_bytes(number));
-                let numbers = numbers.collect();
-                self.tensors.insert(name.into(), Tensor { shape, numbers });
-            }
-            other => {
-                return Err(Problem::Value {
-                    name: name.into(),
-                    expected: "32-bit floats or bytes".into(),
-                    got: format!("{other:?}"),
-                });
-            }
-        }
-        Ok(())
-    }
+fn little_endian(numbers: &[f32]) -> Vec<u8> {
+    let numbers = numbers.iter();
+    numbers.flat_map(|number| number.to_le_bytes()).collect()
+}
+
+fn check_size(n_bytes: u64) -> Result<(), Problem> {
+    let expected = format!("at most {MAX_BYTES} bytes");
+    check(n_bytes <= MAX_BYTES, "file", expected, n_bytes)
+}
+
+fn damaged(error: SafeTensorError) -> Problem {
+    let got = format!("one that is damaged or cut off: {error}");
+    Problem::whole("a whole safetensors file", got)
 }
 
 #[cfg(test)]
@@ -176,20 +292,16 @@ mod tests {
     use super::*;
     use std::os::unix::fs::PermissionsExt;
 
+    type State = (Vec<u64>, Option<String>);
+
+    fn state() -> State {
+        (vec![3, u64::MAX], Some("words".into()))
+    }
+
     fn contents() -> Contents {
-        let mut contents = Contents::default();
-        let tensor = Tensor {
-            shape: vec![2, 2],
-            numbers: vec![1.0, -0.5, 0.0, 3e-9],
-        };
-        contents.tensors.insert("kernel".into(), tensor);
-        let counts = Bytes::of_counts([3, u64::MAX]);
-        contents.bytes.insert("lap".into(), counts);
-        let floats = Bytes::of_floats([0.1, 1e-300]);
-        contents.bytes.insert("owed".into(), floats);
-        let empty = Bytes::of_rows(5, Vec::new());
-        contents.bytes.insert("frames".into(), empty);
-        contents.texts.insert("updates".into(), "12".into());
+        let kernel = ("kernel".into(), vec![2, 2], vec![1.0, -0.5, 0.0, 3e-9]);
+        let mut contents = Contents::new([kernel], &state());
+        contents.settings = "seed = 3".into();
         contents
     }
 
@@ -205,7 +317,10 @@ mod tests {
         std::fs::write(&path, "open to everybody").expect("written");
         write(&path, "tests", &contents()).expect("written");
         write(&path, "tests", &contents()).expect("written over");
-        assert_eq!(read(&path, "tests").expect("read"), contents());
+        let (kind, read) = read(&path, &["others", "tests"]).expect("read");
+        assert_eq!((kind, &read), ("tests", &contents()));
+        assert_eq!(read.state::<State>().expect("its state"), state());
+        assert_eq!(read.settings().expect("settings").seed, 3);
         let mode = path.metadata().expect("the file").permissions().mode();
         assert_eq!(mode & 0o777, 0o600);
         let files = std::fs::read_dir(folder.path()).expect("the folder");
@@ -217,59 +332,65 @@ mod tests {
         let (_folder, path) = place();
         write(&path, "tests", &contents()).expect("written");
         let whole = std::fs::read(&path).expect("readable");
-        let check = |bytes: &[u8], what: &str| {
+        let read = |bytes: &[u8]| {
             std::fs::write(&path, bytes).expect("written");
-            let error = read(&path, "tests").expect_err(what).to_string();
-            assert!(
-                error.contains("checkpoint.safetensors: expected"),
-                "{what}: {error}"
-            );
+            let read = read(&path, &["tests"]).map(|(_, contents)| contents);
+            read.map_err(|error| error.to_string())
         };
-        for length in 0..whole.len() {
-            check(&whole[..length], &format!("cut to {length}"));
-        }
+        let check = |bytes: &[u8], what: String| match read(bytes) {
+            // Space that pads the header may change without a change of meaning.
+            Ok(got) => assert!(bytes.len() == whole.len() && got == contents(), "{what}"),
+            Err(error) => assert!(
+                error.contains("checkpoint.safetensors: ") && error.contains("expected"),
+                "{what}: {error}"
+            ),
+        };
         for at in 0..whole.len() {
+            check(&whole[..at], format!("cut to {at}"));
             let mut bytes = whole.clone();
             bytes[at] ^= 1;
-            std::fs::write(&path, &bytes).expect("written");
-            // Space that pads the header may change without a change of meaning.
-            if let Ok(got) = read(&path, "tests") {
-                assert_eq!(got, contents(), "byte {at}");
-            }
+            check(&bytes, format!("byte {at}"));
         }
     }
 
     #[test]
-    fn another_kind_shape_or_number_is_named() {
-        let (_folder, path) = place();
-        write(&path, "tests", &contents()).expect("written");
-        let error = read(&path, "others").expect_err("another kind").to_string();
+    fn another_kind_format_tensor_or_state_is_named() {
+        let whole = encode("tests", &contents()).expect("small");
+        let refused = |kind, from: &str, to: &str| {
+            let at = whole
+                .windows(from.len())
+                .position(|word| word == from.as_bytes());
+            let (mut bytes, at) = (whole.clone(), at.expect("in the file"));
+            bytes[at..at + to.len()].copy_from_slice(to.as_bytes());
+            decode(&[kind], &bytes).expect_err(to).to_string()
+        };
+        let words = "expected a checkpoint of others, got one of tests";
+        assert_eq!(refused("others", "kernel", "kernel"), words);
+        for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"1""#, "none")] {
+            let words = format!("emberwatch.format: expected 1, got {got}");
+            assert_eq!(refused("tests", r#"format":"1""#, to), words);
+        }
+        let got = contents();
+        let error = |name, shape: &[usize]| got.tensor(name, shape).expect_err(name).to_string();
+        assert_eq!(
+            error("kernel", &[4]),
+            "kernel: expected shape [4], got [2, 2]"
+        );
+        assert_eq!(error("bias", &[4]), "bias: expected shape [4], got none");
+        let error = got.state::<u64>().expect_err("longer").to_string();
         assert!(
-            error.ends_with("expected a checkpoint of others, got one of tests"),
+            error.starts_with("state: expected 8 bytes, got "),
             "{error}"
         );
-        let read = read(&path, "tests").expect("read");
-        let error = |result: Result<&[f32], Problem>| result.expect_err("wrong").to_string();
-        let words = "kernel: expected shape [4], got [2, 2]";
-        assert_eq!(error(read.tensor("kernel", &[4])), words);
-        assert_eq!(
-            error(read.tensor("bias", &[4])),
-            "expected \"bias\" in it, found none"
+        let error = Contents::new([], &u64::MAX).state::<Vec<String>>();
+        let error = error.expect_err("a forged length").to_string();
+        assert!(
+            error.starts_with("state: expected that of its learner"),
+            "{error}"
         );
-        assert_eq!(read.count("updates").ok(), Some(12));
-        assert_eq!(read.counts("lap").ok(), Some(vec![3, u64::MAX]));
-        assert_eq!(read.floats("owed", 2).ok(), Some(vec![0.1, 1e-300]));
-        assert_eq!(read.rows("frames", 5).ok(), Some(&[][..]));
-        let error = |result: Result<&[u8], Problem>| result.expect_err("wrong").to_string();
-        let words = "frames: expected shape [0, 4], got [0, 5]";
-        assert_eq!(error(read.rows("frames", 4)), words);
-        let words = "lap: expected shape [16], got [2, 8]";
-        assert_eq!(error(read.bytes("lap", &[16])), words);
-        let error = read.counts("kernel").expect_err("floats").to_string();
-        assert_eq!(error, "expected \"kernel\" in it, found none");
-        let endless = super::read(Path::new("/dev/zero"), "tests").expect_err("no file");
+        let endless = read(Path::new("/dev/zero"), &["tests"]).expect_err("no file");
         assert!(endless.to_string().contains("expected a regular file"));
-        let missing = super::read(Path::new("no/such"), "tests").expect_err("none");
+        let missing = read(Path::new("no/such"), &["tests"]).expect_err("none");
         assert!(
             missing
                 .to_string()

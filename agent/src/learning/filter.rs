@@ -11,10 +11,9 @@
 pub mod adam;
 mod layout;
 mod operator;
-mod stored;
 pub mod trainer;
 pub mod vector;
 pub mod window;
 
 pub use adam::Adam;
-pub use trainer::{Iterates, NotFinite, Trainer, Update};
+pub use trainer::{Iterates, Laps, NotFinite, Trainer, Update};

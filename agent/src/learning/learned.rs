@@ -2,6 +2,7 @@
 
 use crate::learning::checkpoint::{self, CheckpointError, Contents, Problem};
 use crate::learning::learner::{self, LearnedModel};
+use crate::learning::student::filter::SavedFilter;
 use crate::learning::student::network::LearnedNetwork;
 use crate::learning::student::{decisions, network};
 use crate::planning::policy::EstimatorKind;
@@ -34,7 +35,7 @@ impl Learned {
     ) -> Result<Self, CheckpointError> {
         let mut learned = Self::default();
         for path in paths {
-            let (kind, contents) = checkpoint::read_any(path, &KINDS)?;
+            let (kind, contents) = checkpoint::read(path, &KINDS)?;
             let added = learned.add(kind, contents, device);
             added.map_err(|problem| problem.of(path))?;
         }
@@ -60,7 +61,11 @@ impl Learned {
     ) -> Result<(), Problem> {
         let twice = match kind {
             learner::KIND => {
-                let model = learner::Progress::from_contents(&contents, None)?.learned();
+                let saved = contents.state::<SavedFilter>()?.learner;
+                let dimensions = saved.dimensions.check();
+                let dimensions = dimensions
+                    .map_err(|error| Problem::value("dimensions", "those of a filter", error))?;
+                let model = saved.progress(&contents, dimensions)?.learned();
                 self.filter.replace(model).is_some()
             }
             decisions::KIND => self.decisions.replace(Arc::new(contents)).is_some(),
@@ -70,7 +75,8 @@ impl Learned {
             }
         };
         if twice {
-            Err(Problem::Twice(kind))
+            let expected = format!("one checkpoint of {kind}");
+            Err(Problem::whole(expected, "two"))
         } else {
             Ok(())
         }

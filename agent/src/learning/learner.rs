@@ -1,6 +1,8 @@
 //! What learns a model while an agent acts: replay in, parameters out. Pure.
 
-mod stored;
+mod saved;
+
+pub use self::saved::SavedLearner;
 
 use crate::config::{AgentConfig, LearningConfig};
 use crate::estimation::belief::Belief;
@@ -133,15 +135,6 @@ impl Learner {
     /// Updates made.
     pub fn n_updates(&self) -> u64 {
         self.trainer.iterates().adam.n_steps
-    }
-
-    /// The state of learning, to go on from.
-    pub fn progress(&self) -> Progress {
-        Progress {
-            iterates: self.trainer.iterates().clone(),
-            reward: self.reward.clone(),
-            world_steps: self.world_steps,
-        }
     }
 }
 

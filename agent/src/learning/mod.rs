@@ -7,7 +7,6 @@ pub mod learner;
 pub mod metrics;
 pub mod replay;
 pub mod reward;
-pub mod settings;
 pub mod student;
 pub mod tensorboard;
 pub mod train;

@@ -5,15 +5,14 @@
 //! before it renews. Frames of a block that is not full yet are not replayed. The oldest blocks go
 //! when there is no room.
 
-mod stored;
-
-pub use stored::Form;
-
-use protocol::Frame;
+use crate::estimation::belief::Belief;
+use crate::learning::checkpoint::{Problem, check, check_counts, check_numbers};
+use protocol::{Frame, Probabilities, Shape};
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// One observed cell.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Sighting {
     /// Row-major index of the cell.
     pub cell: u32,
@@ -22,7 +21,7 @@ pub struct Sighting {
 }
 
 /// Consecutive frames of one track.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Block {
     /// What each frame shows.
     pub frames: Vec<Vec<Sighting>>,
@@ -33,7 +32,7 @@ pub struct Block {
 }
 
 /// Blocks of all tracks.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Replay {
     block_length: usize,
     max_blocks: usize,
@@ -101,9 +100,7 @@ impl Replay {
                 block.next = next;
                 self.full.insert(id, block);
             }
-            while self.full.len() > self.max_blocks {
-                self.full.pop_first();
-            }
+            self.drop_oldest();
         }
     }
 
@@ -132,6 +129,48 @@ impl Replay {
         }
     }
 
+    /// Goes on from another replay with blocks of the same length; of more blocks than fit, the newest stay.
+    ///
+    /// # Errors
+    /// Names what cannot have been seen of such worlds.
+    pub fn resume(
+        &mut self,
+        other: Self,
+        shape: Shape,
+        n_states: usize,
+        n_observations: usize,
+    ) -> Result<(), Problem> {
+        let full = other
+            .full
+            .iter()
+            .map(|(number, block)| (*number, block, true));
+        let open = other.open.values();
+        let open = open.map(|(number, block)| (*number, block, false));
+        for (number, block, is_full) in full.chain(open) {
+            let fits = number < other.n_opened;
+            check(fits, "replay.blocks", "numbers of opened blocks", number)?;
+            let (n_frames, most) = (block.frames.len(), self.block_length);
+            let fits = (n_frames == most) == is_full && n_frames <= most;
+            check(
+                fits,
+                "replay.frames",
+                format_args!("blocks of {most} frames"),
+                n_frames,
+            )?;
+            block.check(shape, n_states, n_observations)?;
+        }
+        check_counts(&[("replay.n_opened", other.n_opened)])?;
+        (self.full, self.open, self.n_opened) = (other.full, other.open, other.n_opened);
+        self.drop_oldest();
+        Ok(())
+    }
+
+    fn drop_oldest(&mut self) {
+        while self.full.len() > self.max_blocks {
+            self.full.pop_first();
+        }
+    }
+
     fn new_block(&mut self, start: Option<Vec<f32>>) -> (u64, Block) {
         let number = self.n_opened;
         self.n_opened += 1;
@@ -144,10 +183,38 @@ impl Replay {
     }
 }
 
+impl Block {
+    fn check(&self, shape: Shape, n_states: usize, n_observations: usize) -> Result<(), Problem> {
+        for Sighting { cell, value } in self.frames.iter().flatten().copied() {
+            let fits = (cell as usize) < shape.n_cells();
+            check(fits, "replay.cell", format_args!("cells of {shape}"), cell)?;
+            let fits = usize::from(value) < n_observations;
+            check(
+                fits,
+                "replay.value",
+                format_args!("values below {n_observations}"),
+                value,
+            )?;
+        }
+        match self.start.as_deref() {
+            None => Ok(()),
+            // Still to be given.
+            Some([]) if self.frames.is_empty() => Ok(()),
+            Some(start) => {
+                let dim = (n_states, shape.height(), shape.width());
+                check_numbers("replay.start", start, n_states * shape.n_cells())?;
+                let start = Probabilities::from_shape_vec(dim, start.to_vec());
+                let start = start.expect("invariant: as many numbers");
+                let wrong = |error| Problem::value("replay.start", "a belief", error);
+                Belief::from_probabilities(start).map(drop).map_err(wrong)
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::Shape;
 
     fn frame(value: u8) -> Frame {
         let shape = Shape::new(1, 3).expect("test shape");
@@ -215,6 +282,92 @@ mod tests {
         assert_eq!(
             last.map(|block| (block.frames.len(), block.start.clone())),
             Some((2, None))
+        );
+    }
+
+    /// Blocks of 2, room for 3.
+    fn seen(n_frames: u8) -> Replay {
+        let mut replay = Replay::new(2, 7);
+        replay.begin(0);
+        replay.begin(5);
+        (0..n_frames).for_each(|value| see(&mut replay, value));
+        replay
+    }
+
+    fn see(replay: &mut Replay, value: u8) {
+        for world in [0, 5] {
+            if replay.wants_belief(world) {
+                replay.give_belief(world, &[0.25, 0.5, 1.0, 0.75, 0.5, 0.0]);
+            }
+            replay.push(world, &frame(value));
+        }
+    }
+
+    fn resumed(other: Replay) -> Result<Replay, Problem> {
+        let mut replay = Replay::new(2, 7);
+        let shape = Shape::new(1, 3).expect("test shape");
+        replay.resume(other, shape, 2, 9).map(|()| replay)
+    }
+
+    #[test]
+    fn a_replay_goes_on_alike_and_the_newest_blocks_stay() {
+        for n_frames in 0..9 {
+            let mut before = seen(n_frames);
+            let mut after = resumed(before.clone()).expect("whole");
+            for value in 0..4 {
+                assert_eq!(before, after, "{n_frames} frames, then {value}");
+                see(&mut before, value);
+                see(&mut after, value);
+            }
+        }
+        let mut longer = seen(1);
+        longer.max_blocks = 9;
+        (1..8).for_each(|value| see(&mut longer, value));
+        assert_eq!(longer.n_blocks(), 8);
+        let shorter = resumed(longer).expect("whole");
+        assert_eq!(shorter.blocks().collect::<Vec<_>>(), [5, 6, 7]);
+    }
+
+    #[test]
+    fn what_no_replay_holds_is_named() {
+        let check = |change: fn(&mut Replay), words: &str| {
+            let mut other = seen(5);
+            change(&mut other);
+            assert_eq!(resumed(other).expect_err(words).to_string(), words);
+        };
+        fn full(replay: &mut Replay) -> &mut Block {
+            replay.full.get_mut(&2).expect("kept")
+        }
+        check(
+            |replay| full(replay).frames[1][0].cell = 3,
+            "replay.cell: expected cells of 1 x 3, got 3",
+        );
+        check(
+            |replay| full(replay).frames[1][0].value = 9,
+            "replay.value: expected values below 9, got 9",
+        );
+        check(
+            |replay| drop(full(replay).frames.pop()),
+            "replay.frames: expected blocks of 2 frames, got 1",
+        );
+        check(
+            |replay| replay.n_opened = 3,
+            "replay.blocks: expected numbers of opened blocks, got 3",
+        );
+        check(
+            |replay| replay.n_opened = u64::MAX,
+            "replay.n_opened: expected at most 9007199254740992, got 18446744073709551615",
+        );
+        let lengths = "replay.start: expected 6 finite numbers, got 0";
+        check(|replay| full(replay).start = Some(Vec::new()), lengths);
+        check(
+            |replay| full(replay).start = Some(vec![f32::NAN; 6]),
+            "replay.start: expected 6 finite numbers, got NaN",
+        );
+        check(
+            |replay| full(replay).start = Some(vec![0.25; 6]),
+            "replay.start: expected a belief, got belief of cell (0, 0): expected probabilities >= 0 \
+             with sum 1, got [0.25, 0.25]",
         );
     }
 }

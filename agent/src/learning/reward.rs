@@ -6,6 +6,8 @@
 //! other way to know which of its states is the fire.
 
 use crate::estimation::belief::Belief;
+use crate::learning::checkpoint::{Problem, check_numbers};
+use serde::{Deserialize, Serialize};
 
 /// Share of what was known that is kept at each path: a memory of 2,000 paths.
 const KEPT: f64 = 0.9995;
@@ -22,7 +24,7 @@ pub fn met(posterior: &Belief, visited: impl Iterator<Item = usize> + Clone) -> 
 }
 
 /// Sums of products of what was met, for least squares.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RewardEstimate {
     /// `sum x x'`, shape `[S, S]`.
     pub products: Vec<f64>,
@@ -37,6 +39,15 @@ impl RewardEstimate {
             products: vec![0.0; n_states * n_states],
             rewards: vec![0.0; n_states],
         }
+    }
+
+    /// Refuses one from a checkpoint that is not of so many states.
+    ///
+    /// # Errors
+    /// Names the field.
+    pub fn check(&self, n_states: usize) -> Result<(), Problem> {
+        check_numbers("reward.products", &self.products, n_states * n_states)?;
+        check_numbers("reward.rewards", &self.rewards, n_states)
     }
 
     /// Takes in a path: the expected number of visited cells in each state, and its reward.

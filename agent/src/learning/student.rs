@@ -3,7 +3,6 @@
 pub mod decisions;
 pub mod filter;
 pub mod network;
-mod stored;
 #[cfg(test)]
 mod tests;
 

@@ -235,8 +235,7 @@ impl Trainee {
         if !training.freeze {
             let contents = self.student.contents();
             let mut contents = contents.map_err(|error| training.stopped(error, &*self.student))?;
-            let settings = toml::to_string(&training.config)?;
-            contents.texts.insert("settings".into(), settings);
+            contents.settings = toml::to_string(&training.config)?;
             let place = training.out.join(CHECKPOINT);
             checkpoint::write(&place, self.student.kind(), &contents)?;
         }

@@ -1,13 +1,22 @@
 //! What the programs read from files: models, checkpoints.
 
 use super::target::Seed;
+use agent::config::{AgentConfig, DecisionsConfig};
+use agent::estimation::Follower;
+use agent::estimation::belief::Belief;
 use agent::estimation::parameters::Dimensions;
-use agent::learning::checkpoint::{Contents, Problem, encode};
+use agent::learning::checkpoint::{Contents, Problem, decode, encode};
 use agent::learning::learned::Learned;
-use agent::learning::{learner, student};
+use agent::learning::learner::{self, Learner, Progress};
+use agent::learning::reward::RewardEstimate;
+use agent::learning::student::decisions::{self, Decisions};
+use agent::learning::student::filter::{FilterStudent, SavedFilter};
+use agent::learning::student::network::{self, Position, SavedNetwork};
+use agent::learning::student::{Site, Student};
 use ndarray::{Array3, Axis};
 use protocol::model::ModelFile;
-use protocol::{Dynamics, Model, Shape, Transition};
+use protocol::{Dynamics, Frame, Model, Shape, Transition};
+use std::collections::BTreeMap;
 
 /// Steps that a model is simulated for.
 const N_STEPS: u64 = 8;
@@ -73,23 +82,20 @@ fn states_stay_states(model: &Model, mut dynamics: Dynamics) {
     assert!(reward.is_finite(), "the reward sums to {reward}");
 }
 
-/// A checkpoint: refused, or what it holds is finite. Its digest is mended, which keeps damage out but
-/// nobody who means harm.
+/// A checkpoint: refused, or what it holds is finite, and a learner goes on from it or refuses it. Its digest is
+/// mended, which keeps damage out but nobody who means harm.
 pub fn checkpoint(bytes: &[u8]) -> bool {
-    let learned = match Learned::from_bytes(bytes) {
-        Err(Problem::Digest { expected, got }) if expected.len() == got.len() => {
-            let place = bytes
-                .windows(got.len())
-                .position(|word| word == expected.as_bytes());
-            let mut mended = bytes.to_vec();
-            mended.splice(
-                place.map_or(0..0, |at| at..at + got.len()),
-                got.into_bytes(),
-            );
-            Learned::from_bytes(&mended)
-        }
-        learned => learned,
-    };
+    let mut bytes = bytes.to_vec();
+    let mut learned = Learned::from_bytes(&bytes);
+    if let Err(Problem::Digest { expected, got }) = &learned
+        && expected.len() == got.len()
+    {
+        let mut words = bytes.windows(got.len());
+        let place = words.position(|word| word == expected.as_bytes());
+        let place = place.map_or(0..0, |at| at..at + got.len());
+        bytes.splice(place, got.bytes());
+        learned = Learned::from_bytes(&bytes);
+    }
     let Ok(learned) = learned else { return false };
     if let Some(filter) = learned.filter {
         let likelihood = filter.tables.likelihood_array();
@@ -98,8 +104,45 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
             sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3),
             "likelihoods sum to {sums}"
         );
+        let (_, contents) = decode(&[learner::KIND], &bytes).expect("read before");
+        if let Ok(mut student) = FilterStudent::resume(&contents, DIMENSIONS, site(), &config()) {
+            student.contents().expect("no device");
+            // Numbers that are finite may be too large to work with.
+            let _ = student.learn();
+        }
+    }
+    if let Some(contents) = learned.decisions {
+        let _ = decisions().load(&contents);
     }
     true
+}
+
+const DIMENSIONS: Dimensions = Dimensions {
+    n_states: 2,
+    n_observations: 2,
+    kernel: (1, 3),
+};
+
+/// Worlds of three cells.
+fn site() -> Site {
+    Site {
+        shape: Shape::new(1, 3).expect("a grid"),
+        n_observations: 2,
+        n_moves: 2,
+        worlds: 0..1,
+    }
+}
+
+fn config() -> AgentConfig {
+    let mut config = AgentConfig::default();
+    config.learning.window = 2;
+    config.learning.block_windows = 1;
+    config.learning.streams = 2;
+    config
+}
+
+fn decisions() -> Decisions {
+    Decisions::first(&Model::wildfire(), &DecisionsConfig::default(), 0)
 }
 
 pub fn model_seeds() -> Vec<Seed> {
@@ -132,44 +175,64 @@ kernel = [
 "##;
 
 pub fn checkpoint_seeds() -> Vec<Seed> {
-    let dimensions = Dimensions {
-        n_states: 2,
-        n_observations: 2,
-        kernel: (1, 3),
-    };
-    let filter = learner::Progress::first(dimensions, 5).to_contents();
-    let texts = |texts: &[(&str, &str)]| Contents {
-        texts: texts
-            .iter()
-            .map(|(name, text)| ((*name).into(), (*text).into()))
-            .collect(),
-        ..Contents::default()
-    };
-    // Its tensors would be too long for a corpus: as far as the sizes that it asks for.
-    let autoencoder = |side: &str, length: usize| {
-        let settings = format!("[autoencoder]\nencoding = {length}\nhidden = {length}\n");
-        texts(&[
-            ("settings", &*settings),
-            ("height", side),
-            ("width", side),
-            ("observations", "3"),
-            ("adam_steps", "0"),
-            ("updates", "0"),
-        ])
-    };
-    let decisions = texts(&[("states", "3"), ("world_steps", "100")]);
     let encoded = |kind, contents| encode(kind, &contents).expect("checkpoints serialise");
+    let (small, large) = (autoencoder(8, 4), autoencoder(4096, 256));
+    // The tensors of networks would be too long for a corpus.
+    let decisions = Contents {
+        tensors: BTreeMap::new(),
+        ..decisions().to_contents()
+    };
     vec![
-        ("filter", encoded(learner::KIND, filter)),
-        (
-            "autoencoder",
-            encoded(student::network::KIND, autoencoder("8", 4)),
-        ),
+        ("filter", encoded(learner::KIND, filter())),
+        ("autoencoder", encoded(network::KIND, small)),
         // Asked for 30 GiB once.
-        (
-            "autoencoder_large",
-            encoded(student::network::KIND, autoencoder("4096", 256)),
-        ),
-        ("decisions", encoded(student::decisions::KIND, decisions)),
+        ("autoencoder_large", encoded(network::KIND, large)),
+        ("decisions", encoded(decisions::KIND, decisions)),
     ]
+}
+
+/// A learner that has seen some frames.
+fn filter() -> Contents {
+    let (shape, config) = (site().shape, config());
+    let mut learner = Learner::new(Progress::first(DIMENSIONS, 5), shape, &config);
+    let belief = Belief::uniform(2, shape);
+    learner.begin(0);
+    for value in [0, 1, 1, 0, 1] {
+        let frame = Frame::from_bytes(shape, 2, &[value, 255, 1]).expect("a frame");
+        learner.expect(0, &belief);
+        learner.see(0, &frame);
+        learner.reward(&belief, &[0, 2], 0.5);
+        learner.learn().expect("finite");
+    }
+    let state = SavedFilter {
+        learner: learner.saved(),
+        worlds: BTreeMap::new(),
+    };
+    Contents::new(learner.named_tensors(), &state)
+}
+
+/// As far as the sizes that it asks for.
+fn autoencoder(side: usize, length: usize) -> Contents {
+    let cell = Shape::new(1, 1).expect("a grid");
+    let state = SavedNetwork {
+        shape: Shape::new(side, side).expect("a grid"),
+        n_observations: 3,
+        counters: [0, 0],
+        dqn: decisions().dqn.saved(),
+        frames: Vec::new(),
+        tracks: Vec::new(),
+        position: Position {
+            follower: Follower::at(vec![0.0; length], Belief::uniform(3, cell)),
+            estimate: None,
+            track: decisions().dqn.track(),
+            reward: RewardEstimate::new(3),
+            iterations: 0,
+            place: None,
+        },
+    };
+    let settings = format!("[autoencoder]\nencoding = {length}\nhidden = {length}\n");
+    Contents {
+        settings,
+        ..Contents::new([], &state)
+    }
 }

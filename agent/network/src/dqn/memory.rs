@@ -36,6 +36,17 @@ impl<'a> From<&'a Transition> for Row<'a> {
     }
 }
 
+impl From<Row<'_>> for Transition {
+    fn from(row: Row<'_>) -> Self {
+        Self {
+            input: row.input.to_vec(),
+            action: row.action,
+            reward: row.reward,
+            next: row.next.to_vec(),
+        }
+    }
+}
+
 impl Memory {
     pub(super) fn new(capacity: usize, n_inputs: usize) -> Self {
         Self {

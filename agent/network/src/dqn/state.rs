@@ -1,69 +1,101 @@
-//! What a resumed run needs of the DQN: tensors by name out, and in again.
+//! What a resumed run needs of the DQN: tensors by name and a [`SavedDqn`] out, and in again.
 
 use super::memory::{Memory, Row};
-use super::{Dqn, Perceptron, on_cpu};
+use super::{Dqn, Perceptron, Track, Transition, on_cpu};
 use crate::error::NetworkError;
 use crate::tensors::{NamedTensor, named, restored};
 use candle_core::Tensor;
 use candle_nn::Linear;
+use serde::{Deserialize, Serialize};
 
-/// Where the actions of the replay are.
-const ACTION: &str = "dqn.replay.action";
+/// A DQN without its tensors, settings and seed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SavedDqn {
+    /// Updates so far.
+    pub n_updates: u64,
+    /// The replay, the oldest transition first.
+    pub transitions: Vec<Transition>,
+}
 
 impl Dqn {
-    /// Everything that a resumed run needs but settings, seed and [`Self::n_updates`]: the network and its
-    /// target by PyTorch's names, Adam's moments, and the replay, the oldest transition first.
+    /// The network and its target by PyTorch's names, and Adam's moments.
     pub fn named_tensors(&self) -> Vec<NamedTensor> {
         let networks = self.network_tensors().chain(self.target_tensors());
-        let mut all = on_cpu(named(networks.chain(self.adam.tensors("dqn.adam"))));
-        let rows = || self.memory.rows();
-        let (n, n_inputs) = (self.memory.len(), self.n_inputs);
-        let vectors = |vector: fn(&Row<'_>) -> Vec<f32>| rows().flat_map(move |row| vector(&row));
-        let mut add = |name: &str, dims: Vec<usize>, numbers: Vec<f32>| {
-            all.push((name.to_owned(), dims, numbers));
-        };
-        let input = vectors(|row| row.input.to_vec()).collect();
-        add("dqn.replay.input", vec![n, n_inputs], input);
-        add(
-            ACTION,
-            vec![n],
-            rows().map(|row| row.action as f32).collect(),
-        );
-        add(
-            "dqn.replay.reward",
-            vec![n],
-            rows().map(|row| row.reward).collect(),
-        );
-        let next = vectors(|row| row.next.to_vec()).collect();
-        add("dqn.replay.next", vec![n, n_inputs], next);
-        all
+        on_cpu(named(networks.chain(self.adam.tensors("dqn.adam"))))
     }
 
-    /// Takes over what [`Self::named_tensors`] gave, of a DQN of the same inputs and actions with so many
-    /// transitions, after so many updates: from here on, it learns as that one would have, bit for bit. Of a
-    /// longer replay the latest transitions stay. `find` gives the numbers of a name and shape.
+    /// What else a resumed run needs.
+    pub fn saved(&self) -> SavedDqn {
+        SavedDqn {
+            n_updates: self.n_updates,
+            transitions: self.memory.rows().map(Transition::from).collect(),
+        }
+    }
+
+    /// Takes over what [`Self::named_tensors`] and [`Self::saved`] gave, of a DQN of the same inputs and
+    /// actions: from here on, it learns as that one would have, bit for bit. Of a longer replay the latest
+    /// transitions stay. `find` gives the numbers of a name and shape.
     ///
     /// # Errors
-    /// As of `find`, or for an action that there is not; nothing has changed then.
+    /// As of `find`, or for a transition of another DQN; nothing has changed then.
     pub fn load<E: From<NetworkError>>(
         &mut self,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
-        n_remembered: usize,
-        n_updates: u64,
+        saved: &SavedDqn,
     ) -> Result<(), E> {
         let variables = self.network_tensors();
         let variables = variables.map(|(name, tensor)| restored(&name, tensor, &find));
         let variables = variables.collect::<Result<Vec<_>, E>>()?;
         let target = self.target_from(&find)?;
         let moments = self.adam.found("dqn.adam", &find)?;
-        self.memory = self.memory_from(&find, n_remembered)?;
+        let mut memory = Memory::new(self.settings.replay, self.n_inputs);
+        for (at, transition) in saved.transitions.iter().enumerate() {
+            self.check_transition(at, transition)?;
+            memory.push(Row::from(transition));
+        }
         for (var, tensor) in self.variables.values().zip(&variables) {
             var.set(tensor).map_err(NetworkError::from)?;
         }
+        self.memory = memory;
         self.target = target;
-        self.adam.restore(moments, n_updates);
-        self.n_updates = n_updates;
+        self.adam.restore(moments, saved.n_updates);
+        self.n_updates = saved.n_updates;
         Ok(())
+    }
+
+    /// A world's saved track to go on with; without steps if its transitions were of other lengths or discounts.
+    ///
+    /// # Errors
+    /// For a step of another DQN.
+    pub fn resume_track(&self, saved: Track) -> Result<Track, NetworkError> {
+        let track = self.track();
+        let length = saved.open.len();
+        if (saved.n_step, saved.gamma) != (track.n_step, track.gamma) || length >= saved.n_step {
+            return Ok(track);
+        }
+        let mut steps = saved.open.iter().enumerate();
+        steps.try_for_each(|(at, step)| self.check_transition(at, step))?;
+        Ok(saved)
+    }
+
+    fn check_transition(&self, at: usize, transition: &Transition) -> Result<(), NetworkError> {
+        let Transition {
+            input,
+            action,
+            reward,
+            next,
+        } = transition;
+        let (n_inputs, n_actions) = (self.n_inputs, self.n_actions);
+        let numbers = || input.iter().chain(next).chain([reward]);
+        let fits = [input, next].iter().all(|vector| vector.len() == n_inputs);
+        if fits && *action < n_actions && numbers().all(|number| number.is_finite()) {
+            return Ok(());
+        }
+        Err(NetworkError::Transition {
+            at,
+            expected: format!("{n_inputs} finite inputs and an action below {n_actions}"),
+            got: format!("{} and {action}", input.len()),
+        })
     }
 
     pub(super) fn network_tensors(&self) -> impl Iterator<Item = (String, &Tensor)> {
@@ -90,32 +122,5 @@ impl Dqn {
         let layers = tensors.chunks_exact(2);
         let layer = |pair: &[Tensor]| Linear::new(pair[0].clone(), Some(pair[1].clone()));
         Ok(Perceptron(layers.map(layer).collect()))
-    }
-
-    fn memory_from<E: From<NetworkError>>(
-        &self,
-        find: &impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
-        n: usize,
-    ) -> Result<Memory, E> {
-        let inputs = find("dqn.replay.input", &[n, self.n_inputs])?;
-        let actions = find(ACTION, &[n])?;
-        let rewards = find("dqn.replay.reward", &[n])?;
-        let nexts = find("dqn.replay.next", &[n, self.n_inputs])?;
-        let mut memory = Memory::new(self.settings.replay, self.n_inputs);
-        for index in 0..n {
-            let action = actions[index] as usize;
-            if action >= self.n_actions || action as f32 != actions[index] {
-                let (expected, got) = (self.n_actions, actions[index]);
-                return Err(NetworkError::Action { expected, got }.into());
-            }
-            let range = index * self.n_inputs..(index + 1) * self.n_inputs;
-            memory.push(Row {
-                input: &inputs[range.clone()],
-                action,
-                reward: rewards[index],
-                next: &nexts[range],
-            });
-        }
-        Ok(memory)
     }
 }

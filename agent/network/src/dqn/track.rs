@@ -1,15 +1,16 @@
 //! Transitions over several steps: from one world's steps in a row.
 
 use super::Transition;
+use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 
 /// One world's latest steps. Where the world or its robot begins anew, so does its track.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Track {
-    n_step: usize,
-    gamma: f32,
-    /// Steps whose transition is not complete: before, action, reward.
-    open: VecDeque<(Vec<f32>, usize, f32)>,
+    pub(super) n_step: usize,
+    pub(super) gamma: f32,
+    /// Steps whose transition is not complete.
+    pub(super) open: VecDeque<Transition>,
 }
 
 impl Track {
@@ -25,18 +26,18 @@ impl Track {
     /// Takes the next step; gives the transition that it completes: `n` steps from where the oldest
     /// began, with the reward `r_1 + gamma r_2 + ... + gamma^(n-1) r_n`. `None` for the first `n - 1`.
     pub fn add(&mut self, step: Transition) -> Option<Transition> {
-        self.open.push_back((step.input, step.action, step.reward));
+        let next = step.next.clone();
+        self.open.push_back(step);
         if self.open.len() < self.n_step {
             return None;
         }
         let later = self.open.iter().rev();
-        let reward = later.fold(0.0, |sum, (_, _, reward)| reward + self.gamma * sum);
-        let (input, action, _) = self.open.pop_front()?;
+        let reward = later.fold(0.0, |sum, step| step.reward + self.gamma * sum);
+        let first = self.open.pop_front()?;
         Some(Transition {
-            input,
-            action,
             reward,
-            next: step.next,
+            next,
+            ..first
         })
     }
 }

@@ -2,7 +2,7 @@
 
 use candle_core::{DType, Device, Result, Tensor, Var};
 use candle_nn::{AdamW, Optimizer, ParamsAdamW};
-use network::{Dqn, DqnSettings, NamedTensor, NetworkError, NotFinite, Transition};
+use network::{Dqn, DqnSettings, NamedTensor, NetworkError, NotFinite, SavedDqn, Transition};
 use protocol::randomness::split_mix;
 
 const N_INPUTS: usize = 6;
@@ -190,8 +190,14 @@ fn small() -> DqnSettings {
     }
 }
 
+type Saved = (Vec<NamedTensor>, SavedDqn);
+
+fn saved(dqn: &Dqn) -> Saved {
+    (dqn.named_tensors(), dqn.saved())
+}
+
 /// Finds tensors by name, and says what is wrong with them.
-fn load(dqn: &mut Dqn, tensors: &[NamedTensor]) -> std::result::Result<(), Problem> {
+fn load(dqn: &mut Dqn, (tensors, saved): &Saved) -> std::result::Result<(), Problem> {
     let find = |name: &str, dims: &[usize]| {
         let found = tensors.iter().find(|tensor| tensor.0 == name);
         let found = found.ok_or_else(|| Problem(format!("{name}: missing")))?;
@@ -200,15 +206,7 @@ fn load(dqn: &mut Dqn, tensors: &[NamedTensor]) -> std::result::Result<(), Probl
             false => Err(Problem(format!("{name}: {dims:?}, got {:?}", found.1))),
         }
     };
-    let n = find_rewards(tensors).len();
-    dqn.load(find, n, 1)
-}
-
-fn find_rewards(tensors: &[NamedTensor]) -> &[f32] {
-    let found = tensors
-        .iter()
-        .find(|tensor| tensor.0 == "dqn.replay.reward");
-    &found.expect("rewards").2
+    dqn.load(find, saved)
 }
 
 #[derive(Debug, PartialEq)]
@@ -225,7 +223,7 @@ fn a_saved_dqn_resumes_bit_for_bit() {
     let mut dqn = learner(small(), 2);
     dqn.set_learning_rate(0.003);
     let mut resumed = Dqn::new(*dqn.settings(), N_INPUTS, N_ACTIONS, 2);
-    load(&mut resumed, &dqn.named_tensors()).expect("the same sizes");
+    load(&mut resumed, &saved(&dqn)).expect("the same sizes");
     assert_eq!(resumed.n_updates(), 1);
     assert_eq!(resumed.n_remembered(), 150);
     for update in 0..5 {
@@ -235,51 +233,55 @@ fn a_saved_dqn_resumes_bit_for_bit() {
         let bits = |dqn: &mut Dqn| dqn.update().expect("finite").map(f32::to_bits);
         assert_eq!(bits(&mut dqn), bits(&mut resumed), "update {update}");
     }
-    assert_eq!(dqn.named_tensors(), resumed.named_tensors());
+    assert_eq!(saved(&dqn), saved(&resumed));
 }
 
 #[test]
 fn a_shorter_replay_loads_the_latest_transitions() {
-    let tensors = learner(small(), 2).named_tensors();
+    let longer = saved(&learner(small(), 2));
     let settings = DqnSettings {
         replay: 70,
         ..small()
     };
     let mut dqn = Dqn::new(settings, N_INPUTS, N_ACTIONS, 2);
-    load(&mut dqn, &tensors).expect("the same sizes");
-    assert_eq!(
-        find_rewards(&dqn.named_tensors()),
-        &find_rewards(&tensors)[80..]
-    );
+    load(&mut dqn, &longer).expect("the same sizes");
+    assert_eq!(dqn.saved().transitions, longer.1.transitions[80..]);
 }
 
 #[test]
-fn tensors_of_something_else_are_refused_by_name_and_change_nothing() {
-    let tensors = learner(small(), 2).named_tensors();
-    let check = |change: fn(&mut NamedTensor), name: &str, words: &str| {
-        let mut tensors = tensors.clone();
-        let found = tensors.iter_mut().find(|tensor| tensor.0 == name);
-        change(found.expect("a tensor"));
+fn what_another_dqn_saved_is_refused_by_name_and_changes_nothing() {
+    let other = saved(&learner(small(), 2));
+    let check = |change: fn(&mut Saved), words: &str| {
+        let mut other = other.clone();
+        change(&mut other);
         let mut dqn = learner(small(), 3);
-        let before = dqn.named_tensors();
-        assert_eq!(load(&mut dqn, &tensors), Err(Problem(words.into())));
-        assert_eq!(dqn.named_tensors(), before, "{words}");
+        let before = saved(&dqn);
+        assert_eq!(load(&mut dqn, &other), Err(Problem(words.into())));
+        assert_eq!(saved(&dqn), before, "{words}");
     };
     check(
-        |tensor| tensor.0.clear(),
-        "dqn.target.2.bias",
+        |(tensors, _)| tensors.retain(|tensor| tensor.0 != "dqn.target.2.bias"),
         "dqn.target.2.bias: missing",
     );
-    check(
-        |tensor| tensor.2[7] = 4.0,
-        "dqn.replay.action",
-        "dqn.replay.action: expected actions below 4, got 4",
-    );
-    check(
-        |tensor| tensor.1 = vec![75, 12],
-        "dqn.replay.next",
-        "dqn.replay.next: [150, 6], got [75, 12]",
-    );
+    let words = |got: &str| {
+        format!("dqn.transitions: 7: expected 6 finite inputs and an action below 4, got {got}")
+    };
+    let action = words("6 and 4");
+    check(|(_, saved)| saved.transitions[7].action = 4, &action);
+    let inputs = words("5 and 0");
+    let shorter = |(_, saved): &mut Saved| {
+        let transition = &mut saved.transitions[7];
+        transition.action = 0;
+        transition.input.pop();
+    };
+    check(shorter, &inputs);
+    let number = words("6 and 0");
+    let infinite = |(_, saved): &mut Saved| {
+        let transition = &mut saved.transitions[7];
+        transition.action = 0;
+        transition.next[0] = f32::INFINITY;
+    };
+    check(infinite, &number);
 }
 
 /// Whose number is not finite, and after how many updates.
@@ -303,9 +305,9 @@ fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
             // Squared, it is no longer finite.
             _ => rows[at].reward = 1e30,
         }
-        let before = dqn.named_tensors();
+        let before = saved(&dqn);
         assert_eq!(tensor_of(dqn.learn(&rows)), (1, words.to_owned()));
-        assert_eq!(dqn.named_tensors(), before, "{words}");
+        assert_eq!(saved(&dqn), before, "{words}");
         dqn.learn(&batch(7)).expect("finite again");
     };
     check("dqn.replay.input", 5, "dqn.replay.input");
@@ -317,11 +319,11 @@ fn a_number_that_is_not_finite_is_named_and_changes_nothing() {
 #[test]
 fn a_step_that_overflows_is_not_made() {
     let mut dqn = learner(small(), 2);
-    let before = dqn.named_tensors();
+    let before = saved(&dqn);
     dqn.set_learning_rate(f32::INFINITY);
     let words = "dqn.network.0.bias after the update";
     assert_eq!(tensor_of(dqn.update()), (1, words.to_owned()));
-    assert_eq!(dqn.named_tensors(), before);
+    assert_eq!(saved(&dqn), before);
 }
 
 #[test]

@@ -163,9 +163,8 @@ fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
         let error = agent("dqn_beam", &other, &learned)
             .err()
             .expect("no settings");
-        assert!(error.to_string().contains("\"settings\""), "{error}");
-        let settings = toml::to_string(&config(basis)).expect("TOML");
-        contents.texts.insert("settings".into(), settings);
+        assert!(error.to_string().contains("settings: expected"), "{error}");
+        contents.settings = toml::to_string(&config(basis)).expect("TOML");
         learned.decisions = Some(Arc::new(contents));
         let agent = agent("dqn_beam", &other, &learned).expect("an agent");
         assert_eq!(agent.basis.kind(), basis);

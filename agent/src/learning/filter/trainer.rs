@@ -7,6 +7,7 @@
 
 use crate::config::LearningConfig;
 use crate::estimation::parameters::{Dimensions, Parameters, Tables};
+use crate::learning::checkpoint::{Problem, check, check_counts, check_numbers};
 use crate::learning::filter::adam::{Adam, StepSize};
 use crate::learning::filter::window::{Outcome, Start, Window};
 use crate::learning::replay::{Block, Replay};
@@ -14,6 +15,7 @@ use protocol::Shape;
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 /// Parts that the streams are dealt into, each with its own work space: as many threads are of use.
@@ -24,13 +26,20 @@ const N_PARTS: usize = 8;
 #[derive(Debug, Clone)]
 pub struct Trainer {
     iterates: Iterates,
-    pub(super) config: LearningConfig,
+    config: LearningConfig,
     seed: u64,
-    pub(super) streams: Vec<Stream>,
+    shape: Shape,
+    laps: Laps,
     windows: Vec<Window<f32>>,
+}
+
+/// Where the streams are in the replay.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Laps {
+    streams: Vec<Stream>,
     /// Blocks still to be run through in this lap.
-    pub(super) lap: Vec<u64>,
-    pub(super) n_laps: u64,
+    lap: Vec<u64>,
+    n_laps: u64,
 }
 
 /// Where the updates have come to.
@@ -66,11 +75,13 @@ pub struct NotFinite {
 }
 
 /// A place in the replay, and the belief before the frame there.
-#[derive(Debug, Clone)]
-pub(super) struct Stream {
-    pub(super) block: Option<u64>,
-    pub(super) n_done: usize,
-    pub(super) belief: Vec<f32>,
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Stream {
+    block: Option<u64>,
+    n_done: usize,
+    belief: Vec<f32>,
+    /// Room for the belief after the next window.
+    #[serde(skip)]
     end: Vec<f32>,
 }
 
@@ -101,20 +112,49 @@ impl Trainer {
             belief: numbers.clone(),
             end: numbers,
         };
-        Self {
+        let laps = Laps {
+            streams: vec![stream; config.streams],
+            lap: Vec::new(),
             n_laps: iterates.adam.n_steps,
+        };
+        Self {
             iterates,
             config,
             seed,
-            streams: vec![stream; config.streams],
+            shape,
+            laps,
             windows: vec![Window::new(tables, shape, config.window); N_PARTS],
-            lap: Vec::new(),
         }
     }
 
     /// Where the updates have come to.
     pub fn iterates(&self) -> &Iterates {
         &self.iterates
+    }
+
+    /// Where the streams are.
+    pub fn laps(&self) -> &Laps {
+        &self.laps
+    }
+
+    /// Puts the streams where others were, with the same settings.
+    ///
+    /// # Errors
+    /// Names what no such streams have; nothing was changed then.
+    pub fn resume_laps(&mut self, mut laps: Laps) -> Result<(), Problem> {
+        let (expected, got) = (self.laps.streams.len(), laps.streams.len());
+        check(got == expected, "streams", expected, got)?;
+        check_counts(&[("n_laps", laps.n_laps)])?;
+        let length = self.dimensions().n_states * self.shape.n_cells();
+        for stream in &mut laps.streams {
+            let (most, got) = (self.config.block_windows, stream.n_done);
+            let expected = format!("at most {most} windows of a block");
+            check(got <= most, "streams.n_done", expected, got)?;
+            check_numbers("streams.belief", &stream.belief, length)?;
+            stream.end = vec![0.0; length];
+        }
+        self.laps = laps;
+        Ok(())
     }
 
     /// The parameters.
@@ -137,7 +177,7 @@ impl Trainer {
         replay: &mut Replay,
         sure: Option<usize>,
     ) -> Result<Option<Update>, NotFinite> {
-        if replay.n_blocks() < self.streams.len() {
+        if replay.n_blocks() < self.laps.streams.len() {
             return Ok(None);
         }
         if let Some(tensor) = self.iterates.parameters.not_finite() {
@@ -167,8 +207,9 @@ impl Trainer {
 
     /// Takes the streams out of their blocks: the replay is another.
     pub fn leave_replay(&mut self) {
-        self.lap.clear();
-        self.streams
+        self.laps.lap.clear();
+        self.laps
+            .streams
             .iter_mut()
             .for_each(|stream| stream.block = None);
     }
@@ -176,12 +217,12 @@ impl Trainer {
     /// Gives streams at the end of a block, or whose block is gone, another one.
     fn place_streams(&mut self, replay: &Replay) {
         let n_windows = self.config.block_windows;
-        for index in 0..self.streams.len() {
-            let stream = &self.streams[index];
+        for index in 0..self.laps.streams.len() {
+            let stream = &self.laps.streams[index];
             let block = stream.block.filter(|_| stream.n_done < n_windows);
             if block.is_none_or(|number| replay.block(number).is_none()) {
                 let (number, block) = self.next_block(replay);
-                let stream = &mut self.streams[index];
+                let stream = &mut self.laps.streams[index];
                 (stream.block, stream.n_done) = (Some(number), 0);
                 if let Some(start) = &block.start {
                     stream.belief.clone_from(start);
@@ -193,16 +234,16 @@ impl Trainer {
     /// The next block of the lap, or the first of a new lap through all blocks.
     fn next_block<'a>(&mut self, replay: &'a Replay) -> (u64, &'a Block) {
         loop {
-            match self.lap.pop() {
+            match self.laps.lap.pop() {
                 Some(number) => {
                     if let Some(block) = replay.block(number) {
                         return (number, block);
                     }
                 }
                 None => {
-                    self.lap = replay.blocks().collect();
-                    shuffle(&mut self.lap, self.seed, self.n_laps);
-                    self.n_laps += 1;
+                    self.laps.lap = replay.blocks().collect();
+                    shuffle(&mut self.laps.lap, self.seed, self.laps.n_laps);
+                    self.laps.n_laps += 1;
                 }
             }
         }
@@ -211,8 +252,12 @@ impl Trainer {
     fn run_windows(&mut self, replay: &Replay) -> Vec<Outcome> {
         let tables = self.iterates.parameters.tables();
         let length = self.config.window;
-        let part = self.streams.len().div_ceil(N_PARTS);
-        let parts = self.streams.par_chunks_mut(part).zip(&mut self.windows);
+        let part = self.laps.streams.len().div_ceil(N_PARTS);
+        let parts = self
+            .laps
+            .streams
+            .par_chunks_mut(part)
+            .zip(&mut self.windows);
         let outcomes = parts.flat_map_iter(|(streams, window)| {
             window.set(&tables);
             streams.iter_mut().filter_map(move |stream| {
@@ -229,7 +274,7 @@ impl Trainer {
     }
 
     fn move_streams(&mut self, replay: &mut Replay) {
-        for stream in &mut self.streams {
+        for stream in &mut self.laps.streams {
             std::mem::swap(&mut stream.belief, &mut stream.end);
             stream.n_done += 1;
             if let Some(block) = stream.block

@@ -5,9 +5,8 @@ use crate::config::{AgentConfig, DecisionsConfig};
 use crate::estimation::BayesFilter;
 use crate::estimation::belief::Belief;
 use crate::estimation::summary::{spread_summary, summary_length};
-use crate::learning::checkpoint::{Contents, Problem};
+use crate::learning::checkpoint::{Contents, Problem, check, check_counts};
 use crate::learning::metrics::{Lesson, Tick};
-use crate::learning::student::stored::{load_dqn, save_dqn};
 use crate::learning::student::{Fly, Look, NotFinite, Site, Student, StudentError, without_truth};
 use crate::planning::PlanBasis;
 use crate::planning::action::{Action, ActionSet};
@@ -15,16 +14,14 @@ use crate::planning::policy::Policy;
 use crate::rollout::agent::{Agent, Setup};
 use crate::rollout::{self, Robot};
 use crate::server::client::Observation;
-use ::network::{Dqn, Track, Transition};
+use ::network::{Dqn, SavedDqn, Track, Transition};
 use protocol::{Cell, Model};
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
 
 /// How checkpoints of this learner call it.
 pub const KIND: &str = "decisions";
-
-/// Between the names of actions in a checkpoint.
-const SEPARATOR: &str = " ";
 
 /// A DQN over the actions of a model.
 #[derive(Debug)]
@@ -36,6 +33,19 @@ pub struct Decisions {
     /// World steps that were learned from.
     pub world_steps: u64,
     n_states: usize,
+}
+
+/// All of a checkpoint of decisions but the tensors.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SavedDecisions {
+    /// Of the model.
+    pub n_states: usize,
+    /// Their names.
+    pub actions: Vec<String>,
+    /// World steps that were learned from.
+    pub world_steps: u64,
+    /// The DQN without its tensors.
+    pub dqn: SavedDqn,
 }
 
 /// A DQN that learns on several worlds.
@@ -83,40 +93,31 @@ impl Decisions {
 
     /// As a checkpoint, without settings.
     pub fn to_contents(&self) -> Contents {
-        let mut contents = Contents::default();
-        save_dqn(&self.dqn, &mut contents);
-        for (name, text) in [
-            ("actions", self.actions.names().join(SEPARATOR)),
-            ("states", self.n_states.to_string()),
-            ("world_steps", self.world_steps.to_string()),
-        ] {
-            contents.texts.insert(name.into(), text);
-        }
-        contents
+        let state = SavedDecisions {
+            n_states: self.n_states,
+            actions: self.actions.names(),
+            world_steps: self.world_steps,
+            dqn: self.dqn.saved(),
+        };
+        Contents::new(self.dqn.named_tensors(), &state)
     }
 
     /// Takes over a checkpoint.
     ///
     /// # Errors
-    /// [`Problem`] names what is missing, of another form, or of a model with other states or actions.
+    /// Names what is missing, of another form, or of a model with other states or actions.
     pub fn load(&mut self, contents: &Contents) -> Result<(), Problem> {
-        for (name, expected) in [
-            ("states", self.n_states.to_string()),
-            ("actions", self.actions.names().join(SEPARATOR)),
-        ] {
-            let got = contents.texts.get(name);
-            let got = got.ok_or_else(|| Problem::Missing(name.into()))?.clone();
-            if got != expected {
-                let name = name.into();
-                return Err(Problem::Value {
-                    name,
-                    expected,
-                    got,
-                });
-            }
-        }
-        load_dqn(&mut self.dqn, contents)?;
-        self.world_steps = contents.count("world_steps")?;
+        let saved: SavedDecisions = contents.state()?;
+        let [expected, got] = [self.n_states, saved.n_states];
+        check(got == expected, "states", expected, got)?;
+        let [expected, got] = [self.actions.names(), saved.actions].map(|names| names.join(" "));
+        check(got == expected, "actions", &expected, &got)?;
+        let (updates, world_steps) = (saved.dqn.n_updates, saved.world_steps);
+        check_counts(&[("dqn.n_updates", updates), ("world_steps", world_steps)])?;
+        contents.check_squares()?;
+        let find = |name: &str, shape: &[usize]| contents.tensor(name, shape);
+        self.dqn.load(find, &saved.dqn)?;
+        self.world_steps = world_steps;
         Ok(())
     }
 }
@@ -313,21 +314,22 @@ mod tests {
         let contents = decisions.to_contents();
         let mut again = Decisions::first(&model, &config, 4);
         again.load(&contents).expect("of the same model");
-        assert_eq!(again.dqn.named_tensors(), decisions.dqn.named_tensors());
-        let mut other = contents.clone();
-        other.texts.insert("states".into(), "4".into());
-        let error = again.load(&other).expect_err("other states").to_string();
-        assert_eq!(error, "states: expected 3, got 4");
-        other = contents.clone();
-        other.texts.insert("actions".into(), "exploit".into());
-        let error = again.load(&other).expect_err("other actions").to_string();
-        assert!(
-            error.starts_with("actions: expected exploit exploit_explore"),
-            "{error}"
+        assert_eq!(again.to_contents(), contents);
+        let mut refused = |change: fn(&mut SavedDecisions), words: &str| {
+            let (mut other, mut saved) = (contents.clone(), contents.state().expect("its state"));
+            change(&mut saved);
+            other.set_state(&saved);
+            let error = again.load(&other).expect_err(words).to_string();
+            assert!(error.starts_with(words), "{error}");
+        };
+        refused(|saved| saved.n_states = 4, "states: expected 3, got 4");
+        refused(
+            |saved| saved.actions.truncate(1),
+            "actions: expected exploit exploit_explore",
         );
-        other = contents;
-        other.texts.remove("actions");
-        let error = again.load(&other).expect_err("none").to_string();
-        assert_eq!(error, "expected \"actions\" in it, found none");
+        refused(
+            |saved| saved.dqn.n_updates = u64::MAX,
+            "dqn.n_updates: expected at most",
+        );
     }
 }

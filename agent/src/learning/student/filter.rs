@@ -3,6 +3,8 @@
 
 mod saved;
 
+pub use self::saved::SavedFilter;
+
 use self::saved::SavedWorld;
 use crate::config::AgentConfig;
 use crate::estimation::BayesFilter;
@@ -52,16 +54,25 @@ impl FilterStudent {
     /// Goes on from a checkpoint.
     ///
     /// # Errors
-    /// [`Problem`] names what is missing or of another shape.
+    /// Names what is missing or of another form.
     pub fn resume(
         contents: &Contents,
         dimensions: Dimensions,
         site: Site,
         config: &AgentConfig,
     ) -> Result<Self, Problem> {
-        let learner = Learner::from_contents(contents, dimensions, site.shape, config)?;
-        let left = SavedWorld::restored(dimensions.n_states, site.shape, contents)?;
-        Ok(Self::of(learner, left, site, config))
+        let SavedFilter {
+            learner,
+            mut worlds,
+        } = contents.state()?;
+        let shape = learner.shape;
+        let learner = Learner::resume(learner, contents, dimensions, site.shape, config)?;
+        let mut all = worlds.values();
+        all.try_for_each(|world| world.check(dimensions.n_states, shape))?;
+        if shape != site.shape {
+            worlds.clear();
+        }
+        Ok(Self::of(learner, worlds, site, config))
     }
 
     fn of(
@@ -239,11 +250,12 @@ impl Student for FilterStudent {
     }
 
     fn contents(&self) -> Result<Contents, StudentError> {
-        let mut contents = self.learner.to_contents();
-        let robots = self.runs.iter().map(|run| &run.robot);
-        let robots = self.site.worlds.clone().zip(robots);
-        SavedWorld::store(robots, self.site.shape, &mut contents);
-        Ok(contents)
+        let saved = self.runs.iter().map(|run| SavedWorld::of(&run.robot));
+        let state = SavedFilter {
+            learner: self.learner.saved(),
+            worlds: self.site.worlds.clone().zip(saved).collect(),
+        };
+        Ok(Contents::new(self.learner.named_tensors(), &state))
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {

@@ -7,7 +7,9 @@
 
 mod progress;
 
-pub use self::progress::{LearnedNetwork, Progress};
+pub use self::progress::{LearnedNetwork, Position, Progress, SavedNetwork};
+
+use self::progress::follower;
 
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
@@ -21,7 +23,7 @@ use crate::planning::policy::Policy;
 use crate::rollout::agent::{Agent, Setup, numbered_states};
 use crate::rollout::{self, Robot};
 use crate::server::client::Observation;
-use ::network::{Track, Transition, Window};
+use ::network::{Transition, Window};
 use protocol::path;
 use std::time::{Duration, Instant};
 
@@ -39,7 +41,6 @@ pub struct NetworkStudent {
     /// Its world's, once it is attached.
     robot: Option<Robot>,
     decision: Option<Decision>,
-    track: Track,
     is_frozen: bool,
     times: [(&'static str, Duration); 3],
 }
@@ -56,7 +57,6 @@ impl NetworkStudent {
     pub fn new(progress: Progress, site: Site, config: &AgentConfig) -> Self {
         Self {
             choices: Policy::network_choices(progress.autoencoder.shape().n_states),
-            track: progress.dqn.track(),
             progress,
             site,
             config: config.clone(),
@@ -93,7 +93,7 @@ impl NetworkStudent {
         let (dqn, input) = (&self.progress.dqn, self.input(robot));
         let action = match self.is_frozen {
             true => dqn.best(&input),
-            false => dqn.act(&input, self.progress.iterations),
+            false => dqn.act(&input, self.progress.position.iterations),
         };
         Decision {
             value: dqn.values(&input)[action],
@@ -110,14 +110,18 @@ impl NetworkStudent {
             reward: robot.observation().result.reward as f32,
             next: self.input(robot),
         };
-        if let Some(transition) = self.track.add(step) {
+        if let Some(transition) = self.progress.position.track.add(step) {
             self.progress.dqn.remember(transition);
         }
     }
 
     fn update_dqn(&mut self) -> Result<[Option<f64>; 2], NotFinite> {
         let start = Instant::now();
-        let rate = self.config.dqn.step_size.at(self.progress.iterations);
+        let rate = self
+            .config
+            .dqn
+            .step_size
+            .at(self.progress.position.iterations);
         self.progress.dqn.set_learning_rate(rate as f32);
         let loss = self.progress.dqn.update();
         self.times[1].1 += start.elapsed();
@@ -134,7 +138,7 @@ impl NetworkStudent {
             return Ok([None; 2]);
         };
         // Both step sizes go by the iteration, as eq. 20 compares them.
-        let rate = config.step_size.at(self.progress.iterations);
+        let rate = config.step_size.at(self.progress.position.iterations);
         self.progress.autoencoder.set_learning_rate(rate as f32);
         let loss = self.progress.autoencoder.update(&window);
         self.times[2].1 += start.elapsed();
@@ -164,7 +168,7 @@ impl NetworkStudent {
                 tick.reward = robot.observation().result.reward;
                 let cells = path::fly(self.site.shape, turn.before.robot(), &turn.plan.moves);
                 let met = met(robot.agent.belief(), cells.visited.iter().copied());
-                self.progress.reward.add(&met, tick.reward);
+                self.progress.position.reward.add(&met, tick.reward);
                 look(index, robot);
                 Ok(())
             },
@@ -174,17 +178,11 @@ impl NetworkStudent {
         self.decision = Some(decision);
         let frame = robot.observation().frame.clone();
         self.progress.replay.push(frame);
-        self.progress.iterations += 1;
-        tick.world_steps = self.progress.iterations;
+        self.progress.position.iterations += 1;
+        tick.world_steps = self.progress.position.iterations;
         tick.n_worlds = 1;
         Ok(tick)
     }
-}
-
-/// What the network of a robot's agent knows of its world.
-fn follower(robot: &Robot) -> &Follower {
-    let follower = robot.agent.estimator().follower();
-    follower.expect("invariant: its estimator is an autoencoder")
 }
 
 impl Student for NetworkStudent {
@@ -197,17 +195,17 @@ impl Student for NetworkStudent {
     }
 
     fn wants_full_frames(&self) -> bool {
-        !self.is_frozen && self.progress.iterations < self.config.autoencoder.full_frames
+        !self.is_frozen && self.progress.position.iterations < self.config.autoencoder.full_frames
     }
 
     fn attach(&mut self, mut observations: Vec<Observation>) -> Result<usize, StudentError> {
         let observation = observations.remove(0);
         let shown = self.progress.replay.frames().last();
-        let goes_on =
-            self.progress.place == Some(observation.place()) && shown == Some(&observation.frame);
+        let goes_on = self.progress.position.place == Some(observation.place())
+            && shown == Some(&observation.frame);
         if goes_on {
-            let mut robot = self.robot(self.progress.follower.clone(), observation);
-            if let Some(estimate) = &self.progress.estimate {
+            let mut robot = self.robot(self.progress.position.follower.clone(), observation);
+            if let Some(estimate) = &self.progress.position.estimate {
                 robot.agent.basis_mut().see(estimate);
             }
             self.robot = Some(robot);
@@ -218,7 +216,7 @@ impl Student for NetworkStudent {
     }
 
     fn begin(&mut self, _: u32, observation: Observation) -> Result<(), StudentError> {
-        self.track = self.progress.dqn.track();
+        self.progress.position.track = self.progress.dqn.track();
         self.progress.replay.begin();
         self.progress.replay.push(observation.frame.clone());
         let follower = Follower::new(&self.progress.autoencoder)?;
@@ -241,7 +239,7 @@ impl Student for NetworkStudent {
             .config
             .dqn
             .settings()
-            .epsilon_at(self.progress.iterations - 1);
+            .epsilon_at(self.progress.position.iterations - 1);
         let [dqn_loss, dqn_rate] = self.update_dqn()?;
         let [loss, rate] = self.update_autoencoder()?;
         let decision = self.decision.as_ref();
@@ -266,7 +264,7 @@ impl Student for NetworkStudent {
     }
 
     fn world_steps(&self) -> u64 {
-        self.progress.iterations
+        self.progress.position.iterations
     }
 
     fn n_updates(&self) -> u64 {
@@ -281,11 +279,7 @@ impl Student for NetworkStudent {
     fn contents(&self) -> Result<Contents, StudentError> {
         let robot = self.robot.as_ref();
         let robot = robot.expect("invariant: a world begins before it is saved");
-        let place = robot.observation().place();
-        let estimate = robot.agent.estimate();
-        Ok(self
-            .progress
-            .to_contents(place, follower(robot), estimate)?)
+        Ok(self.progress.to_contents(robot)?)
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {

@@ -46,7 +46,7 @@ pub fn student(
                 progress.load(contents).map_err(wrong)?;
             }
             let full_frames = config.autoencoder.full_frames;
-            let wants = progress.iterations < full_frames && !training.freeze;
+            let wants = progress.position.iterations < full_frames && !training.freeze;
             if wants && info.coverage == CoverageRule::Path {
                 return Err(TrainError::NoFullFrames(full_frames));
             }

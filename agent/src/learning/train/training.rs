@@ -127,19 +127,16 @@ impl Training {
             LearnerKind::Autoencoder => network::KIND,
             LearnerKind::Decisions => decisions::KIND,
         };
-        let contents = self.resume.then(|| checkpoint::read(&place, kind));
-        let contents = contents.transpose()?;
-        let before = contents
-            .as_ref()
-            .and_then(|contents| contents.texts.get("settings"));
-        if before
-            .is_some_and(|before| toml::to_string(&self.config).is_ok_and(|now| now != *before))
-        {
+        if !self.resume {
+            return Ok(None);
+        }
+        let (_, contents) = checkpoint::read(&place, &[kind])?;
+        if toml::to_string(&self.config)? != contents.settings {
             tracing::warn!(
                 "settings: other than the checkpoint was trained with; these hold from here on"
             );
         }
-        Ok(contents)
+        Ok(Some(contents))
     }
 
     /// The error for a student that cannot go on; what it learned is saved when training ends.

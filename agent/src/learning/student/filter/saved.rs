@@ -1,27 +1,28 @@
-//! Where a learner's robots are, in a checkpoint.
+//! A learned filter in a checkpoint: the learner, and where its robots are.
 
 use crate::estimation::belief::Belief;
-use crate::learning::checkpoint::{Bytes, Contents, Problem, Tensor};
+use crate::learning::checkpoint::{Problem, check_belief};
+use crate::learning::learner::SavedLearner;
 use crate::rollout::Robot;
 use crate::rollout::agent::Agent;
 use crate::server::client::{Observation, Place};
-use ndarray::Array3;
 use protocol::Shape;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-/// Names in checkpoints.
-const PLACES: &str = "worlds.places";
-const FRAMES: &str = "worlds.frames";
-const BELIEFS: &str = "worlds.beliefs";
-const ESTIMATES: &str = "worlds.estimates";
-
-/// Numbers of a place.
-const N_PLACE: usize = size_of::<Place>() / size_of::<u64>();
+/// All of a learned filter's checkpoint but the tensors.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SavedFilter {
+    /// What learns.
+    pub learner: SavedLearner,
+    /// By number.
+    pub worlds: BTreeMap<u32, SavedWorld>,
+}
 
 /// Where a checkpoint left a world: what it showed, the belief about what comes next, and the estimate
 /// behind it, where paths are planned on that.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SavedWorld {
     place: Place,
     frame: Vec<u8>,
@@ -30,6 +31,17 @@ pub struct SavedWorld {
 }
 
 impl SavedWorld {
+    /// Where a robot is.
+    pub fn of(robot: &Robot) -> Self {
+        let (agent, observation) = (&robot.agent, robot.observation());
+        Self {
+            place: observation.place(),
+            frame: observation.frame.as_bytes().to_vec(),
+            belief: agent.belief().clone(),
+            estimate: agent.estimate().cloned(),
+        }
+    }
+
     /// Whether a world shows what it showed then. That may be another server's: seeds, step, flight
     /// and noise of sensors would all have to be the same.
     pub fn is_of(&self, observation: &Observation) -> bool {
@@ -56,97 +68,14 @@ impl SavedWorld {
         }
     }
 
-    /// Puts where robots are into a checkpoint.
-    pub fn store<'a>(
-        robots: impl Iterator<Item = (u32, &'a Robot)>,
-        shape: Shape,
-        contents: &mut Contents,
-    ) {
-        let (height, width) = shape.dim();
-        let (mut places, mut frames) = (Vec::new(), Vec::new());
-        let (mut beliefs, mut estimates) = (Vec::new(), Vec::new());
-        let (mut n_worlds, mut n_states) = (0, 0);
-        for (world, robot) in robots {
-            let (agent, observation) = (&robot.agent, robot.observation());
-            places.push(u64::from(world));
-            places.extend(observation.place());
-            frames.extend_from_slice(observation.frame.as_bytes());
-            beliefs.extend_from_slice(agent.belief().as_slice());
-            estimates.extend(agent.estimate().map(Belief::as_slice));
-            n_states = agent.belief().n_states();
-            n_worlds += 1;
-        }
-        let tensor = |numbers| Tensor {
-            shape: vec![n_worlds, n_states, height, width],
-            numbers,
-        };
-        if estimates.len() == n_worlds {
-            let estimates = tensor(estimates.concat());
-            contents.tensors.insert(ESTIMATES.into(), estimates);
-        }
-        let frames = Bytes {
-            shape: vec![n_worlds, height, width],
-            bytes: frames,
-        };
-        let places = Bytes::of_counts(places);
-        contents.bytes.insert(PLACES.into(), places);
-        contents.bytes.insert(FRAMES.into(), frames);
-        contents.tensors.insert(BELIEFS.into(), tensor(beliefs));
-    }
-
-    /// What [`Self::store`] put there, by world; none of another grid.
+    /// Refuses beliefs of another grid or about other states.
     ///
     /// # Errors
-    /// [`Problem`] names what is missing or of another shape.
-    pub fn restored(
-        n_states: usize,
-        shape: Shape,
-        contents: &Contents,
-    ) -> Result<BTreeMap<u32, Self>, Problem> {
-        let (height, width) = shape.dim();
-        let places = contents.counts(PLACES)?;
-        let (places, _) = places.as_chunks::<{ N_PLACE + 1 }>();
-        let frames = contents.bytes.get(FRAMES);
-        if frames.is_some_and(|frames| frames.shape.get(1..) != Some(&[height, width])) {
-            return Ok(BTreeMap::new());
-        }
-        let frames = contents.bytes(FRAMES, &[places.len(), height, width])?;
-        let dim = [places.len(), n_states, height, width];
-        let beliefs = contents.tensor(BELIEFS, &dim)?;
-        let estimates = match contents.tensors.contains_key(ESTIMATES) {
-            true => Some(contents.tensor(ESTIMATES, &dim)?),
-            false => None,
-        };
-        let n_cells = height * width;
-        let belief = |name: &str, numbers: &[f32], index: usize| {
-            let numbers = numbers[index * n_states * n_cells..][..n_states * n_cells].to_vec();
-            let numbers = Array3::from_shape_vec((n_states, height, width), numbers);
-            let numbers = numbers.expect("invariant: S x H x W numbers");
-            let belief = Belief::from_probabilities(numbers);
-            belief.map_err(|error| wrong(name, "beliefs", error))
-        };
-        let each = places.iter().zip(frames.chunks_exact(n_cells));
-        let saved = |(index, (numbers, frame)): (usize, (&[u64; N_PLACE + 1], &[u8]))| {
-            // Before the place, the world.
-            let &[world, ref place @ ..] = numbers;
-            let world = u32::try_from(world).map_err(|_| wrong(PLACES, "worlds", world))?;
-            let estimate = estimates.map(|estimates| belief(ESTIMATES, estimates, index));
-            let saved = Self {
-                place: *place,
-                frame: frame.to_vec(),
-                belief: belief(BELIEFS, beliefs, index)?,
-                estimate: estimate.transpose()?,
-            };
-            Ok((world, saved))
-        };
-        each.enumerate().map(saved).collect()
-    }
-}
-
-fn wrong(name: &str, expected: &str, got: impl ToString) -> Problem {
-    Problem::Value {
-        name: name.into(),
-        expected: expected.into(),
-        got: got.to_string(),
+    /// Names the belief.
+    pub fn check(&self, n_states: usize, shape: Shape) -> Result<(), Problem> {
+        check_belief("worlds.belief", &self.belief, n_states, shape)?;
+        self.estimate
+            .iter()
+            .try_for_each(|estimate| check_belief("worlds.estimate", estimate, n_states, shape))
     }
 }

@@ -4,45 +4,70 @@ use crate::config::AgentConfig;
 use crate::estimation::Follower;
 use crate::estimation::belief::Belief;
 use crate::estimation::dqn_input::DqnInput;
-use crate::learning::checkpoint::{Bytes, Contents, Problem};
+use crate::learning::checkpoint::{
+    Contents, Problem, check, check_belief, check_counts, check_numbers,
+};
 use crate::learning::reward::RewardEstimate;
-use crate::learning::settings::settings;
 use crate::learning::student::Site;
-use crate::learning::student::stored::{find, load_dqn, save_dqn, save_tensors};
 use crate::planning::BasisKind;
 use crate::planning::policy::Policy;
+use crate::rollout::Robot;
 use crate::server::client::Place;
-use ::network::{Autoencoder, Device, Dqn, NamedTensor, NetworkError, NetworkShape, Replay};
+use ::network::{Autoencoder, Device, Dqn, NetworkError, NetworkShape, Replay, SavedDqn, Track};
 use protocol::model::MAX_VALUES;
-use protocol::{Frame, Probabilities, Shape};
-
-/// Names in checkpoints of where the world is, and of the estimate where paths are planned on it.
-const HIDDEN: &str = "state.hidden";
-const PREDICTION: &str = "state.prediction";
-const ESTIMATE: &str = "state.estimate";
+use protocol::{Frame, Shape};
+use serde::{Deserialize, Serialize};
 
 /// What is learned, and where learning stands.
 pub struct Progress {
     /// The model.
     pub autoencoder: Autoencoder,
-    /// What it knows of the world.
-    pub follower: Follower,
     /// The choice of objectives.
     pub dqn: Dqn,
     /// What that sees.
     pub input: DqnInput,
-    /// The estimate where paths are planned on it, as a checkpoint left it.
-    pub estimate: Option<Belief>,
     /// What paths are planned on.
     pub basis: BasisKind,
     /// The frames that are learned from.
     pub replay: Replay,
+    /// Where learning stands beside.
+    pub position: Position,
+}
+
+/// Where Algorithm 1 stands in its world.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Position {
+    /// What the network knows of the world.
+    pub follower: Follower,
+    /// The estimate where paths are planned on it, as a checkpoint left it.
+    pub estimate: Option<Belief>,
+    /// The world's latest steps, for the DQN's replay.
+    pub track: Track,
     /// Which state pays.
     pub reward: RewardEstimate,
     /// Iterations of Algorithm 1.
     pub iterations: u64,
     /// Where the world is that the hidden vector knows, if any.
     pub place: Option<Place>,
+}
+
+/// All of a checkpoint of Algorithm 1 but the tensors.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct SavedNetwork {
+    /// The grid.
+    pub shape: Shape,
+    /// Number of values that an observed cell may show.
+    pub n_observations: usize,
+    /// Steps of the autoencoder's Adam, and its updates.
+    pub counters: [u64; 2],
+    /// The DQN.
+    pub dqn: SavedDqn,
+    /// The replay, the oldest frame first.
+    pub frames: Vec<Vec<u8>>,
+    /// The places of frames with which tracks begin.
+    pub tracks: Vec<u64>,
+    /// Where learning stands beside.
+    pub position: Position,
 }
 
 /// What Algorithm 1 learned, with its parameters fixed.
@@ -72,24 +97,29 @@ impl Progress {
         let n_actions = Policy::network_choices(n_states).len();
         let input = config.dqn.input;
         let n_inputs = input.length(settings.hidden, n_states);
-        Ok(Self {
+        let dqn = Dqn::new(config.dqn.settings(), n_inputs, n_actions, config.seed);
+        let position = Position {
             follower: Follower::new(&autoencoder)?,
-            dqn: Dqn::new(config.dqn.settings(), n_inputs, n_actions, config.seed),
-            input,
             estimate: None,
-            basis: config.objective.belief,
-            autoencoder,
-            replay: Replay::new(settings.replay),
+            track: dqn.track(),
             reward: RewardEstimate::new(n_states),
             iterations: 0,
             place: None,
+        };
+        Ok(Self {
+            autoencoder,
+            dqn,
+            input,
+            basis: config.objective.belief,
+            replay: Replay::new(settings.replay),
+            position,
         })
     }
 
     /// The state that pays most, as far as rewards tell by now.
     pub(super) fn target(&self) -> usize {
-        let target = self.reward.target();
-        target.unwrap_or(self.reward.rewards.len() - 1)
+        let reward = &self.position.reward;
+        reward.target().unwrap_or(reward.rewards.len() - 1)
     }
 
     /// What is known by then.
@@ -103,85 +133,50 @@ impl Progress {
         }
     }
 
-    /// As a checkpoint, without the settings: the world stands at `place`.
+    /// As a checkpoint, without the settings: a robot stands in the world.
     ///
     /// # Errors
     /// As the network's device.
-    pub fn to_contents(
-        &self,
-        place: Place,
-        follower: &Follower,
-        estimate: Option<&Belief>,
-    ) -> Result<Contents, NetworkError> {
-        let mut contents = Contents::default();
-        let tensors = self.autoencoder.named_tensors()?;
-        save_tensors(tensors, &mut contents);
-        save_tensors(state(follower, estimate), &mut contents);
-        save_dqn(&self.dqn, &mut contents);
-        let frames = self
-            .replay
-            .frames()
-            .flat_map(|frame| frame.as_bytes().to_vec());
-        let shape = self.autoencoder.shape().grid;
-        let (height, width) = shape.dim();
-        let [adam_steps, updates] = self.autoencoder.counters();
-        for (name, bytes) in [
-            (
-                "replay.frames",
-                Bytes::of_rows(shape.n_cells(), frames.collect()),
-            ),
-            ("replay.tracks", Bytes::of_counts(self.replay.tracks())),
-            (
-                "reward.products",
-                Bytes::of_floats(self.reward.products.iter().copied()),
-            ),
-            (
-                "reward.rewards",
-                Bytes::of_floats(self.reward.rewards.iter().copied()),
-            ),
-            ("place", Bytes::of_counts(place)),
-        ] {
-            contents.bytes.insert(name.into(), bytes);
-        }
-        for (name, count) in [
-            ("height", height as u64),
-            ("width", width as u64),
-            (
-                "observations",
-                self.autoencoder.shape().n_observations as u64,
-            ),
-            ("adam_steps", adam_steps),
-            ("updates", updates),
-            ("iterations", self.iterations),
-        ] {
-            contents.texts.insert(name.into(), count.to_string());
-        }
-        Ok(contents)
+    pub fn to_contents(&self, robot: &Robot) -> Result<Contents, NetworkError> {
+        let shape = self.autoencoder.shape();
+        let frames = self.replay.frames();
+        let state = SavedNetwork {
+            shape: shape.grid,
+            n_observations: shape.n_observations,
+            counters: self.autoencoder.counters(),
+            dqn: self.dqn.saved(),
+            frames: frames.map(|frame| frame.as_bytes().to_vec()).collect(),
+            tracks: self.replay.tracks().collect(),
+            position: Position {
+                follower: follower(robot).clone(),
+                estimate: robot.agent.estimate().cloned(),
+                place: Some(robot.observation().place()),
+                ..self.position.clone()
+            },
+        };
+        let mut tensors = self.autoencoder.named_tensors()?;
+        tensors.extend(self.dqn.named_tensors());
+        Ok(Contents::new(tensors, &state))
     }
 
     /// From a checkpoint, with its own settings; the autoencoder computes on `device`.
     ///
     /// # Errors
-    /// [`Problem`] names what is missing or of another form.
+    /// Names what is missing or of another form.
     pub fn read(contents: &Contents, device: &Device) -> Result<Self, Problem> {
-        let config = settings(contents)?;
-        let wrong = |name: &str, expected: &str, got: String| Problem::Value {
-            name: name.into(),
-            expected: expected.into(),
-            got,
-        };
-        let count = |name: &str| contents.count(name).map(|count| count as usize);
-        let shape = Shape::new(count("height")?, count("width")?);
-        let observations = count("observations")?;
-        if !(1..=MAX_VALUES).contains(&observations) {
-            let expected = format!("1 to {MAX_VALUES}");
-            return Err(wrong("observations", &expected, observations.to_string()));
-        }
-        let shape = shape.map_err(|error| wrong("height", "a grid", error.to_string()))?;
-        check_size(contents, &network_shape(shape, observations, &config))?;
+        let config = contents.settings()?;
+        let saved: SavedNetwork = contents.state()?;
+        let (shape, n_observations) = (saved.shape, saved.n_observations);
+        let (fits, expected) = (1..=MAX_VALUES, format!("1 to {MAX_VALUES}"));
+        let fits = fits.contains(&n_observations);
+        check(fits, "n_observations", expected, n_observations)?;
+        let sizes = network_shape(shape, n_observations, &config);
+        check_size(contents, &sizes)?;
+        let prediction = saved.position.follower.prediction();
+        check_belief("prediction", prediction, sizes.n_states, shape)?;
         let site = Site {
             shape,
-            n_observations: observations,
+            n_observations,
             n_moves: 0,
             worlds: 0..1,
         };
@@ -193,94 +188,59 @@ impl Progress {
     /// Takes over a checkpoint of the same sizes.
     ///
     /// # Errors
-    /// [`Problem`] names what is missing or of another form; some of it may have been taken over then.
+    /// Names what is missing or of another form; some of it may have been taken over then.
     pub fn load(&mut self, contents: &Contents) -> Result<(), Problem> {
-        let input = settings(contents)?.dqn.input;
-        if input != self.input {
-            return Err(Problem::Value {
-                name: "dqn.input".into(),
-                expected: self.input.label().into(),
-                got: input.label().into(),
-            });
-        }
-        squares_are_not_negative(contents)?;
-        let counters = [contents.count("adam_steps")?, contents.count("updates")?];
-        self.autoencoder.load(find(contents), counters)?;
-        load_dqn(&mut self.dqn, contents)?;
-        self.load_state(contents)?;
-        let n_states = self.reward.rewards.len();
-        self.reward.products = contents.floats("reward.products", n_states * n_states)?;
-        self.reward.rewards = contents.floats("reward.rewards", n_states)?;
-        self.load_replay(contents)?;
-        self.iterations = contents.count("iterations")?;
-        let place = contents.counts("place")?;
-        self.place = match place[..] {
-            [] => None,
-            _ => Some(place.try_into().map_err(|got: Vec<u64>| Problem::Value {
-                name: "place".into(),
-                expected: "five numbers".into(),
-                got: got.len().to_string(),
-            })?),
-        };
+        let [expected, got] = [self.input, contents.settings()?.dqn.input].map(DqnInput::label);
+        check(got == expected, "dqn.input", expected, got)?;
+        let saved: SavedNetwork = contents.state()?;
+        let (mut position, n_updates) = (saved.position, saved.dqn.n_updates);
+        check_counts(&[
+            ("adam_steps", saved.counters[0]),
+            ("updates", saved.counters[1]),
+            ("dqn.n_updates", n_updates),
+            ("iterations", position.iterations),
+        ])?;
+        contents.check_squares()?;
+        let find = |name: &str, shape: &[usize]| contents.tensor(name, shape);
+        self.autoencoder.load(find, saved.counters)?;
+        self.dqn.load(find, &saved.dqn)?;
+        self.load_replay(&saved.frames, &saved.tracks)?;
+        let NetworkShape {
+            grid,
+            n_states,
+            hidden,
+            ..
+        } = *self.autoencoder.shape();
+        check_numbers("hidden", position.follower.hidden(), hidden)?;
+        let prediction = position.follower.prediction();
+        check_belief("prediction", prediction, n_states, grid)?;
+        let mut estimate = position.estimate.iter();
+        estimate.try_for_each(|estimate| check_belief("estimate", estimate, n_states, grid))?;
+        position.reward.check(n_states)?;
+        position.track = self.dqn.resume_track(position.track)?;
+        self.position = position;
         Ok(())
     }
 
-    /// What [`state`] gave. Without an estimate, as where others were not wanted, the next path is
-    /// planned on the predictor.
-    fn load_state(&mut self, contents: &Contents) -> Result<(), Problem> {
-        let belief = |name: &str| self.belief_from(contents, name);
-        let hidden = contents.tensor(HIDDEN, &[self.follower.hidden().len()])?;
-        let follower = Follower::at(hidden.to_vec(), belief(PREDICTION)?);
-        let has_estimate = contents.tensors.contains_key(ESTIMATE);
-        self.estimate = has_estimate.then(|| belief(ESTIMATE)).transpose()?;
-        self.follower = follower;
-        Ok(())
-    }
-
-    fn belief_from(&self, contents: &Contents, name: &str) -> Result<Belief, Problem> {
-        let dim = self.follower.prediction().view().dim();
-        let numbers = contents.tensor(name, &[dim.0, dim.1, dim.2])?.to_vec();
-        let belief = Probabilities::from_shape_vec(dim, numbers);
-        let belief = belief.expect("invariant: the tensor has this shape");
-        Belief::from_probabilities(belief).map_err(|error| Problem::Value {
-            name: name.into(),
-            expected: "a belief".into(),
-            got: error.to_string(),
-        })
-    }
-
-    fn load_replay(&mut self, contents: &Contents) -> Result<(), Problem> {
+    fn load_replay(&mut self, frames: &[Vec<u8>], tracks: &[u64]) -> Result<(), Problem> {
         let shape = self.autoencoder.shape();
-        let rows = contents.rows("replay.frames", shape.grid.n_cells())?;
-        let mut tracks = contents.counts("replay.tracks")?.into_iter().peekable();
-        for (index, row) in rows.chunks_exact(shape.grid.n_cells()).enumerate() {
-            if tracks.next_if_eq(&(index as u64)).is_some() {
+        let mut tracks = tracks.iter().peekable();
+        for (index, bytes) in (0..).zip(frames) {
+            if tracks.next_if_eq(&&index).is_some() {
                 self.replay.begin();
             }
-            let frame = Frame::from_bytes(shape.grid, shape.n_observations, row);
-            self.replay.push(frame.map_err(|error| Problem::Value {
-                name: "replay.frames".into(),
-                expected: "frames of these worlds".into(),
-                got: error.to_string(),
-            })?);
+            let frame = Frame::from_bytes(shape.grid, shape.n_observations, bytes);
+            let wrong = |error| Problem::value("frames", "frames of these worlds", error);
+            self.replay.push(frame.map_err(wrong)?);
         }
         Ok(())
     }
 }
 
-/// What a network knows of its world, as tensors.
-fn state(follower: &Follower, estimate: Option<&Belief>) -> Vec<NamedTensor> {
-    let (hidden, prediction) = (follower.hidden(), follower.prediction());
-    let belief = |name: &str, belief: &Belief| {
-        let numbers = belief.as_slice().to_vec();
-        (name.to_owned(), belief.view().shape().to_vec(), numbers)
-    };
-    let mut state = vec![
-        (HIDDEN.to_owned(), vec![hidden.len()], hidden.to_vec()),
-        belief(PREDICTION, prediction),
-    ];
-    state.extend(estimate.map(|estimate| belief(ESTIMATE, estimate)));
-    state
+/// What the network of a robot's agent knows of its world.
+pub(super) fn follower(robot: &Robot) -> &Follower {
+    let follower = robot.agent.estimator().follower();
+    follower.expect("invariant: its estimator is an autoencoder")
 }
 
 /// The network that settings ask for.
@@ -300,34 +260,12 @@ fn network_shape(grid: Shape, n_observations: usize, config: &AgentConfig) -> Ne
 
 /// Refuses sizes whose numbers are not in the file: a few words could ask for all memory otherwise.
 fn check_size(contents: &Contents, shape: &NetworkShape) -> Result<(), Problem> {
-    let expected = shape.n_numbers() + shape.n_states * shape.grid.n_cells();
+    let expected = shape.n_numbers();
     let tensors = contents.tensors.values();
     let got: usize = tensors.map(|tensor| tensor.numbers.len()).sum();
-    if got >= expected {
-        return Ok(());
-    }
-    Err(Problem::Value {
-        name: "tensors".into(),
-        expected: format!(
-            "the {expected} numbers or more of a network on a {} grid",
-            shape.grid
-        ),
-        got: got.to_string(),
-    })
-}
-
-/// Means of squares, whose roots are taken.
-fn squares_are_not_negative(contents: &Contents) -> Result<(), Problem> {
-    let is_square = |name: &str| name.contains("adam.second.") || name.ends_with("running_var");
-    let squares = contents.tensors.iter().filter(|(name, _)| is_square(name));
-    for (name, tensor) in squares {
-        if let Some(got) = tensor.numbers.iter().find(|number| **number < 0.0) {
-            return Err(Problem::Value {
-                name: name.clone(),
-                expected: "numbers from 0 on".into(),
-                got: got.to_string(),
-            });
-        }
-    }
-    Ok(())
+    let words = format!(
+        "the {expected} numbers or more of a network on a {} grid",
+        shape.grid
+    );
+    check(got >= expected, "tensors", words, got)
 }
