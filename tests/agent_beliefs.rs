@@ -1,4 +1,4 @@
-//! What agents show of their beliefs, to whoever looks.
+//! What agents show of their beliefs, to readers of their channel.
 
 use crate::harness::{PATIENCE, Program, Server, eventually};
 use protocol::agent_belief::AgentBelief;

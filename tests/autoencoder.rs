@@ -200,7 +200,7 @@ fn actions_go_by_what_the_settings_say_and_a_checkpoint_by_its_own() {
 }
 
 #[test]
-fn another_world_is_begun_anew() {
+fn another_world_is_begun_again() {
     let place = Place::new(SETTINGS);
     place.train("out", &format!("{WORLD} --steps 20"));
     let rows = place.train("out", &format!("{WORLD} --steps 20 --resume --seed 7"));
@@ -248,7 +248,7 @@ fn a_kill_costs_no_more_than_the_steps_since_the_checkpoint() {
 }
 
 #[test]
-fn episodes_that_end_are_begun_anew() {
+fn episodes_that_end_are_begun_again() {
     let place = Place::new(&SETTINGS.replace("[dqn]", "[dqn]\nn_step = 2"));
     let server = Server::start(&format!("{WORLD} --coverage client --max-steps 7"));
     let instance = format!("--instance {}", server.instance.name());

@@ -345,7 +345,7 @@ impl Paths {
     }
 }
 
-/// Starts world 0 and its neighbours anew with consecutive seeds.
+/// Starts world 0 and its neighbours again with consecutive seeds.
 pub fn reset(client: &mut Client, first_seed: u64) {
     let seeds: Vec<WorldSeed> = client
         .worlds()

@@ -425,7 +425,7 @@ fn snapshots_that_cannot_be_written_are_warned_of_now_and_then() {
 }
 
 #[test]
-fn a_world_in_its_burn_in_begins_anew_after_a_restart() {
+fn a_world_in_its_burn_in_begins_again_after_a_restart() {
     let folder = TempDir::new().expect("a folder");
     let server = Server::start_with_endless_resets(&format!(
         "--snapshot-every 10 --snapshot-dir {}",

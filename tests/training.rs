@@ -152,7 +152,7 @@ fn other_worlds_begin_new_tracks_and_an_empty_replay() {
     let refused = place.words("out", &format!("{WORLDS} --steps 60"));
     check(AGENT, &refused, &["--out", "expected --resume"]);
     let ended = place.train("out", &format!("{WORLDS} --steps 60 --resume"));
-    let told = "beliefs begin anew worlds=2";
+    let told = "beliefs begin again worlds=2";
     assert!(ended.stderr.contains(told), "{}", ended.stderr);
     let files = std::fs::read_dir(place.path("out")).expect("the folder");
     let names = files.map(|file| file.expect("a file").file_name());
@@ -179,7 +179,7 @@ fn a_world_that_stands_elsewhere_begins_a_new_track_and_the_replay_stays() {
     let n_rows = place.rows("out").len();
     fly(&mut server.acquire(0..1), vec![Move::from_low_bits(0); 6]);
     let ended = place.train("out", &format!("{flags} --steps 60 --resume"));
-    let told = "beliefs begin anew worlds=1";
+    let told = "beliefs begin again worlds=1";
     assert!(ended.stderr.contains(told), "{}", ended.stderr);
     let rows = place.rows("out");
     let updates = |row: &Vec<String>| row[0].parse::<u64>().expect("a number");
@@ -269,7 +269,7 @@ fn a_server_that_dies_leaves_what_was_learned() {
 }
 
 #[test]
-fn episodes_that_end_are_begun_anew() {
+fn episodes_that_end_are_begun_again() {
     let place = Place::new();
     let server = Server::start(&format!("{SMALL} --worlds 2 --max-steps 9"));
     let name = server.instance.name();

@@ -45,7 +45,7 @@ pub enum DecisionsError {
 /// releases the world. `model` is for servers that do not reveal theirs.
 ///
 /// # Errors
-/// [`DecisionsError`]; whoever waits for an answer then is refused first.
+/// [`DecisionsError`]; those who wait for an answer are refused first.
 pub fn serve_decisions(
     task: &Assignment,
     model: Option<&Model>,
@@ -257,7 +257,7 @@ impl Desk {
         self.responder.answer(request, reply.status(), reply);
     }
 
-    /// Refuses whoever still asks, and lets clients read before the channel closes.
+    /// Refuses those who still ask, and lets clients read before the channel closes.
     fn refuse_everybody(&mut self, reply: &Reply) {
         while let Some(request) = self.responder.receive() {
             self.answer(&request, reply);

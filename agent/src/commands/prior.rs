@@ -74,7 +74,7 @@ fn check_place(path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Writes to a file beside it, then renames: whoever reads finds all or nothing.
+/// Writes to a file beside it, then renames: readers find all or nothing.
 fn write_whole(path: &Path, belief: &Belief) -> Result<()> {
     let mut name = path.file_name().map_or_else(OsString::new, OsString::from);
     name.push(format!(".{}", std::process::id()));

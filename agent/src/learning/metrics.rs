@@ -34,7 +34,7 @@ pub struct Tick {
 
 /// What one update did.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Lesson {
+pub struct ModelUpdate {
     /// Number of updates of the model so far.
     pub number: u64,
     /// The model's loss before it, if the model was updated.
@@ -45,7 +45,7 @@ pub struct Lesson {
     pub more: Vec<Option<f64>>,
 }
 
-impl Lesson {
+impl ModelUpdate {
     /// No update, after so many; `n_more`: length of [`crate::learning::student::Student::columns`].
     pub fn nothing(number: u64, n_more: usize) -> Self {
         Self {
@@ -159,13 +159,13 @@ impl Metrics {
     pub fn add(
         &mut self,
         tick: &Tick,
-        lessons: &[Lesson],
+        updates: &[ModelUpdate],
         n_updates: u64,
     ) -> Result<(), MetricsError> {
-        let nothing = Lesson::nothing(n_updates, self.n_more);
-        let nothing = lessons.is_empty().then_some(&nothing);
-        for lesson in lessons.iter().chain(nothing) {
-            let written = self.writer.write_record(row(tick, lesson));
+        let nothing = ModelUpdate::nothing(n_updates, self.n_more);
+        let nothing = updates.is_empty().then_some(&nothing);
+        for update in updates.iter().chain(nothing) {
+            let written = self.writer.write_record(row(tick, update));
             written.map_err(|problem| self.fail(problem))?;
         }
         Ok(())
@@ -185,39 +185,39 @@ impl Metrics {
     }
 }
 
-fn row(tick: &Tick, lesson: &Lesson) -> Vec<String> {
-    let counts = [lesson.number, tick.world_steps].map(|count| count.to_string());
+fn row(tick: &Tick, update: &ModelUpdate) -> Vec<String> {
+    let counts = [update.number, tick.world_steps].map(|count| count.to_string());
     // The shortest form that reads back as the same number.
     let text = |number: f64| format!("{number:?}");
-    let numbers = numbers(tick, lesson).map(|number| number.map_or(String::new(), text));
+    let numbers = numbers(tick, update).map(|number| number.map_or(String::new(), text));
     counts.into_iter().chain(numbers).collect()
 }
 
 /// What stands behind the two counts of a row.
-fn numbers<'a>(tick: &Tick, lesson: &'a Lesson) -> impl Iterator<Item = Option<f64>> + 'a {
+fn numbers<'a>(tick: &Tick, update: &'a ModelUpdate) -> impl Iterator<Item = Option<f64>> + 'a {
     let held_out = (tick.score.n_seen > 0).then(|| tick.score.mean());
     let mean_reward = tick.reward / tick.n_worlds.max(1) as f64;
-    let numbers = [lesson.loss, held_out, Some(mean_reward), lesson.rate];
-    numbers.into_iter().chain(lesson.more.iter().copied())
+    let numbers = [update.loss, held_out, Some(mean_reward), update.rate];
+    numbers.into_iter().chain(update.more.iter().copied())
 }
 
 /// A step's numbers by column, means over its rows; without `world_steps`, and without columns that have
 /// no number. `more`: columns of the learner's own.
 pub fn averages(
     tick: &Tick,
-    lessons: &[Lesson],
+    updates: &[ModelUpdate],
     n_updates: u64,
     more: &[&'static str],
 ) -> Vec<(&'static str, f64)> {
-    let nothing = [Lesson::nothing(n_updates, more.len())];
-    let lessons = if lessons.is_empty() {
+    let nothing = [ModelUpdate::nothing(n_updates, more.len())];
+    let updates = if updates.is_empty() {
         &nothing
     } else {
-        lessons
+        updates
     };
-    let rows: Vec<Vec<Option<f64>>> = lessons
+    let rows: Vec<Vec<Option<f64>>> = updates
         .iter()
-        .map(|lesson| numbers(tick, lesson).collect())
+        .map(|update| numbers(tick, update).collect())
         .collect();
     let mean = |(column, name): (usize, &&'static str)| {
         let there: Vec<f64> = rows.iter().filter_map(|row| row[column]).collect();
@@ -280,7 +280,7 @@ mod tests {
 
     #[test]
     fn averages_are_over_the_updates_of_a_step() {
-        let lesson = |loss: f64, more: Option<f64>| Lesson {
+        let update = |loss: f64, more: Option<f64>| ModelUpdate {
             number: 7,
             loss: Some(loss),
             rate: Some(0.1),
@@ -292,8 +292,8 @@ mod tests {
             reward: 48.0,
             score: Score::default(),
         };
-        let lessons = [lesson(1.0, None), lesson(2.0, Some(5.0))];
-        let got = averages(&tick, &lessons, 7, &["dqn_loss"]);
+        let updates = [update(1.0, None), update(2.0, Some(5.0))];
+        let got = averages(&tick, &updates, 7, &["dqn_loss"]);
         let expected = [
             ("update", 7.0),
             ("loss", 1.5),

@@ -64,11 +64,11 @@ pub fn train(
     contents: Option<Contents>,
     stop: &AtomicBool,
 ) -> Result<TrainSummary, TrainError> {
-    let mut trainee = Trainee::attach(instance, training, contents)?;
+    let mut trainer = Trainer::attach(instance, training, contents)?;
     let deadline = training.time_limit.map(|limit| Instant::now() + limit);
-    let outcome = trainee.act(training, stop, deadline);
-    let saved = trainee.save(training);
-    trainee.summary.times = trainee.student.times();
+    let outcome = trainer.act(training, stop, deadline);
+    let saved = trainer.save(training);
+    trainer.summary.times = trainer.student.times();
     match (outcome, saved) {
         (Ok(()), saved) => saved?,
         (Err(problem), Ok(())) => return Err(problem),
@@ -77,15 +77,15 @@ pub fn train(
             return Err(TrainError::NotSaved { problem, also });
         }
     }
-    trainee.client.release()?;
-    if let Some(feed) = trainee.feed {
+    trainer.client.release()?;
+    if let Some(feed) = trainer.feed {
         feed.end();
     }
-    Ok(trainee.summary)
+    Ok(trainer.summary)
 }
 
 /// A learner at its worlds.
-struct Trainee {
+struct Trainer {
     client: Client,
     student: Box<dyn Student>,
     metrics: Metrics,
@@ -104,7 +104,7 @@ struct Told {
     score: Score,
 }
 
-impl Trainee {
+impl Trainer {
     fn attach(
         instance: &Instance,
         training: &Training,
@@ -136,7 +136,7 @@ impl Trainee {
             let worlds = n_new;
             tracing::info!(
                 worlds,
-                "not where the checkpoint left them: beliefs begin anew"
+                "not where the checkpoint left them: beliefs begin again"
             );
         }
         let belief = student.belief();
@@ -165,16 +165,16 @@ impl Trainee {
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
             let tick = self.step();
             let tick = tick.map_err(|problem| training.stopped(problem, &*self.student))?;
-            let lessons = match training.freeze {
+            let updates = match training.freeze {
                 true => Ok(Vec::new()),
                 false => self.student.learn(),
             };
-            let lessons =
-                lessons.map_err(|problem| training.stopped(problem.into(), &*self.student))?;
+            let updates =
+                updates.map_err(|problem| training.stopped(problem.into(), &*self.student))?;
             self.summary.updates = self.student.n_updates();
             let n_updates = self.student.n_updates();
-            self.metrics.add(&tick, &lessons, n_updates)?;
-            self.events.add(&tick, &lessons, &*self.student)?;
+            self.metrics.add(&tick, &updates, n_updates)?;
+            self.events.add(&tick, &updates, &*self.student)?;
             self.report(&tick);
             if self.saved.elapsed() > SAVE_INTERVAL {
                 self.save(training)?;
@@ -292,7 +292,7 @@ fn metrics(training: &Training, student: &dyn Student) -> Result<Metrics, Metric
     }
 }
 
-/// The file of TensorBoard's events: a run without learning has a folder of its own, and begins anew.
+/// The file of TensorBoard's events: a run without learning has a folder of its own, and begins again.
 fn events(training: &Training, student: &dyn Student) -> Result<Events, EventsError> {
     match (training.freeze, training.resume) {
         (true, _) => Events::begin(&training.out.join(FROZEN_EVENTS), 0),

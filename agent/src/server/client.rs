@@ -160,7 +160,7 @@ impl Client {
         self.observations(&answer)
     }
 
-    /// Leaves a belief about the first world, as it stands after a result, to whoever acts on it next.
+    /// Leaves a belief about the first world, as it stands after a result, for the next agent.
     pub fn leave_belief(
         &mut self,
         at: &StepResult,

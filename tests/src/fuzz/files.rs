@@ -12,7 +12,7 @@ use agent::learning::reward::RewardEstimate;
 use agent::learning::student::decisions::{self, Decisions};
 use agent::learning::student::filter::{FilterStudent, SavedFilter};
 use agent::learning::student::network::{self, Position, SavedNetwork};
-use agent::learning::student::{Site, Student};
+use agent::learning::student::{Student, Worlds};
 use ndarray::{Array3, Axis};
 use protocol::model::ModelFile;
 use protocol::{Dynamics, Frame, Model, Shape, Transition};
@@ -105,7 +105,7 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
             "likelihoods sum to {sums}"
         );
         let (_, contents) = decode(&[learner::KIND], &bytes).expect("read before");
-        if let Ok(mut student) = FilterStudent::resume(&contents, DIMENSIONS, site(), &config()) {
+        if let Ok(mut student) = FilterStudent::resume(&contents, DIMENSIONS, worlds(), &config()) {
             student.contents().expect("no device");
             // Numbers that are finite may be too large to work with.
             let _ = student.learn();
@@ -124,12 +124,12 @@ const DIMENSIONS: Dimensions = Dimensions {
 };
 
 /// Worlds of three cells.
-fn site() -> Site {
-    Site {
+fn worlds() -> Worlds {
+    Worlds {
         shape: Shape::new(1, 3).expect("a grid"),
         n_observations: 2,
         n_moves: 2,
-        worlds: 0..1,
+        numbers: 0..1,
     }
 }
 
@@ -193,7 +193,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
 
 /// A learner that has seen some frames.
 fn filter() -> Contents {
-    let (shape, config) = (site().shape, config());
+    let (shape, config) = (worlds().shape, config());
     let mut learner = Learner::new(Progress::first(DIMENSIONS, 5), shape, &config);
     let belief = Belief::uniform(2, shape);
     learner.begin(0);

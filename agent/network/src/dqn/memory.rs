@@ -1,6 +1,19 @@
 //! The DQN's replay: the latest transitions, in flat vectors.
 
-use super::Transition;
+use serde::{Deserialize, Serialize};
+
+/// One row `(h, a, r, h')` of the replay.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Transition {
+    /// Before.
+    pub input: Vec<f32>,
+    /// What was chosen.
+    pub action: usize,
+    /// What it brought.
+    pub reward: f32,
+    /// After.
+    pub next: Vec<f32>,
+}
 
 /// Up to `capacity` transitions; the oldest gives way.
 #[derive(Debug, Clone)]

@@ -1,7 +1,8 @@
 //! What a resumed run needs of the DQN: tensors by name and a [`SavedDqn`] out, and in again.
 
-use super::memory::{Memory, Row};
-use super::{Dqn, Perceptron, Track, Transition, on_cpu};
+use super::learner::{Dqn, Perceptron, on_cpu};
+use super::memory::{Memory, Row, Transition};
+use super::track::Track;
 use crate::error::NetworkError;
 use crate::tensors::{NamedTensor, named, restored};
 use candle_core::Tensor;

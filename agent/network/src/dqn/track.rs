@@ -1,10 +1,10 @@
 //! Transitions over several steps: from one world's steps in a row.
 
-use super::Transition;
+use super::memory::Transition;
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 
-/// One world's latest steps. Where the world or its robot begins anew, so does its track.
+/// One world's latest steps. Where the world or its robot begins again, so does its track.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Track {
     pub(super) n_step: usize,

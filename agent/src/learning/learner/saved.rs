@@ -4,7 +4,7 @@ use crate::config::AgentConfig;
 use crate::estimation::parameters::{Dimensions, Parameters};
 use crate::learning::checkpoint::{Contents, Problem, check, check_counts};
 use crate::learning::filter::{Adam, Iterates, Laps};
-use crate::learning::learner::{Learner, Progress};
+use crate::learning::learner::online::{Learner, Progress};
 use crate::learning::replay::Replay;
 use crate::learning::reward::RewardEstimate;
 use ::network::NamedTensor;

@@ -6,8 +6,10 @@ use crate::estimation::BayesFilter;
 use crate::estimation::belief::Belief;
 use crate::estimation::summary::{spread_summary, summary_length};
 use crate::learning::checkpoint::{Contents, Problem, check, check_counts};
-use crate::learning::metrics::{Lesson, Tick};
-use crate::learning::student::{Fly, Look, NotFinite, Site, Student, StudentError, without_truth};
+use crate::learning::metrics::{ModelUpdate, Tick};
+use crate::learning::student::base::{
+    Fly, Look, NotFinite, Student, StudentError, Worlds, without_truth,
+};
 use crate::planning::PlanBasis;
 use crate::planning::action::{Action, ActionSet};
 use crate::planning::policy::Policy;
@@ -50,7 +52,7 @@ pub struct SavedDecisions {
 
 /// A DQN that learns on several worlds.
 pub struct DecisionsStudent {
-    site: Site,
+    worlds: Worlds,
     config: AgentConfig,
     policy: Policy,
     decisions: Decisions,
@@ -128,11 +130,11 @@ impl DecisionsStudent {
         decisions: Decisions,
         filter: BayesFilter,
         model: &Model,
-        site: Site,
+        worlds: Worlds,
         config: &AgentConfig,
     ) -> Self {
         Self {
-            site,
+            worlds,
             config: config.clone(),
             policy: Policy::named("dqn_beam", model).expect("invariant: every model has it"),
             decisions,
@@ -151,7 +153,7 @@ impl DecisionsStudent {
         let setup = Setup {
             basis: PlanBasis::new(self.config.objective.belief),
             state_names: self.state_names.clone(),
-            n_moves: self.site.n_moves,
+            n_moves: self.worlds.n_moves,
             seed: self.config.planner_seed(observation.result.seed),
         };
         let (filter, policy) = (Box::new(self.filter.clone()), &self.policy);
@@ -159,7 +161,7 @@ impl DecisionsStudent {
         let mut robot = Robot::new(agent, observation);
         robot.begin(None, |_| ())?;
         Ok(Run {
-            input: input(&robot, self.site.n_moves),
+            input: input(&robot, self.worlds.n_moves),
             robot,
             action: 0,
             track: self.decisions.dqn.track(),
@@ -203,7 +205,7 @@ impl Student for DecisionsStudent {
 
     fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {
         let run = self.run(observation)?;
-        self.runs[(world - self.site.worlds.start) as usize] = run;
+        self.runs[(world - self.worlds.numbers.start) as usize] = run;
         Ok(())
     }
 
@@ -238,7 +240,7 @@ impl Student for DecisionsStudent {
                 Ok(())
             },
         )?;
-        let (n_moves, config) = (self.site.n_moves, &self.config.decisions);
+        let (n_moves, config) = (self.worlds.n_moves, &self.config.decisions);
         let bring = |run: &mut Run| run.bring(config.reward_scale, n_moves);
         let transitions: Vec<_> = self.runs.par_iter_mut().map(bring).collect();
         for transition in transitions.into_iter().flatten() {
@@ -251,17 +253,17 @@ impl Student for DecisionsStudent {
         Ok(tick)
     }
 
-    fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>, NotFinite> {
         let start = Instant::now();
         let settings = self.config.decisions.settings();
         let epsilon = f64::from(settings.epsilon_at(self.decisions.world_steps));
-        let mut lessons = Vec::new();
+        let mut updates = Vec::new();
         while self.owed >= 1.0 {
             self.owed -= 1.0;
             let Some(loss) = self.decisions.dqn.update()? else {
                 continue;
             };
-            lessons.push(Lesson {
+            updates.push(ModelUpdate {
                 number: self.n_updates(),
                 loss: None,
                 rate: None,
@@ -273,7 +275,7 @@ impl Student for DecisionsStudent {
             });
         }
         self.times[1].1 += start.elapsed();
-        Ok(lessons)
+        Ok(updates)
     }
 
     fn freeze(&mut self) {

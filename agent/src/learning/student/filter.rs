@@ -12,8 +12,10 @@ use crate::estimation::belief::Belief;
 use crate::estimation::parameters::{Dimensions, Tables};
 use crate::learning::checkpoint::{Contents, Problem};
 use crate::learning::learner::{KIND, LearnedModel, Learner, Progress};
-use crate::learning::metrics::{Lesson, Tick};
-use crate::learning::student::{Fly, Look, NotFinite, Site, Student, StudentError, without_truth};
+use crate::learning::metrics::{ModelUpdate, Tick};
+use crate::learning::student::base::{
+    Fly, Look, NotFinite, Student, StudentError, Worlds, without_truth,
+};
 use crate::planning::policy::{PlannerKind, Policy};
 use crate::planning::{Objective, Plan, PlanBasis, Target};
 use crate::rollout::agent::{Agent, Setup, numbered_states};
@@ -31,7 +33,7 @@ struct Run {
 
 /// A filter that is learned.
 pub struct FilterStudent {
-    site: Site,
+    worlds: Worlds,
     config: AgentConfig,
     learner: Learner,
     learned: LearnedModel,
@@ -45,10 +47,10 @@ pub struct FilterStudent {
 
 impl FilterStudent {
     /// A student before its first frame.
-    pub fn new(dimensions: Dimensions, site: Site, config: &AgentConfig) -> Self {
+    pub fn new(dimensions: Dimensions, worlds: Worlds, config: &AgentConfig) -> Self {
         let progress = Progress::first(dimensions, config.seed);
-        let learner = Learner::new(progress, site.shape, config);
-        Self::of(learner, BTreeMap::new(), site, config)
+        let learner = Learner::new(progress, worlds.shape, config);
+        Self::of(learner, BTreeMap::new(), worlds, config)
     }
 
     /// Goes on from a checkpoint.
@@ -58,34 +60,34 @@ impl FilterStudent {
     pub fn resume(
         contents: &Contents,
         dimensions: Dimensions,
-        site: Site,
+        worlds: Worlds,
         config: &AgentConfig,
     ) -> Result<Self, Problem> {
         let SavedFilter {
             learner,
-            mut worlds,
+            worlds: mut left,
         } = contents.state()?;
         let shape = learner.shape;
-        let learner = Learner::resume(learner, contents, dimensions, site.shape, config)?;
-        let mut all = worlds.values();
+        let learner = Learner::resume(learner, contents, dimensions, worlds.shape, config)?;
+        let mut all = left.values();
         all.try_for_each(|world| world.check(dimensions.n_states, shape))?;
-        if shape != site.shape {
-            worlds.clear();
+        if shape != worlds.shape {
+            left.clear();
         }
-        Ok(Self::of(learner, worlds, site, config))
+        Ok(Self::of(learner, left, worlds, config))
     }
 
     fn of(
         learner: Learner,
         left: BTreeMap<u32, SavedWorld>,
-        site: Site,
+        worlds: Worlds,
         config: &AgentConfig,
     ) -> Self {
         Self {
             learned: learner.learned(),
             learner,
             left,
-            site,
+            worlds,
             config: config.clone(),
             runs: Vec::new(),
             is_frozen: false,
@@ -97,11 +99,11 @@ impl FilterStudent {
     /// A robot before it takes in what its world shows.
     fn robot(&self, observation: Observation) -> Robot {
         let tables = &self.learned.tables;
-        let filter = BayesFilter::learned(tables, tables.prior(self.site.shape));
+        let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape));
         let setup = Setup {
             basis: PlanBasis::new(self.config.objective.belief),
             state_names: numbered_states(tables.dimensions.n_states),
-            n_moves: self.site.n_moves,
+            n_moves: self.worlds.n_moves,
             seed: self.config.planner_seed(observation.result.seed),
         };
         let policy = Policy::learned(PlannerKind::Beam);
@@ -144,7 +146,7 @@ impl Student for FilterStudent {
     }
 
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError> {
-        let worlds = self.site.worlds.clone();
+        let worlds = self.worlds.numbers.clone();
         let mut n_gone_on = 0;
         if !SavedWorld::any_is_of(&self.left, worlds.clone(), &observations) {
             // Frames of other worlds, perhaps of another model.
@@ -172,7 +174,7 @@ impl Student for FilterStudent {
 
     fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {
         let run = self.begun(world, observation)?;
-        self.runs[(world - self.site.worlds.start) as usize] = run;
+        self.runs[(world - self.worlds.numbers.start) as usize] = run;
         Ok(())
     }
 
@@ -181,7 +183,7 @@ impl Student for FilterStudent {
         if !self.is_frozen {
             self.learned = self.learner.learned();
         }
-        let (n_walking, first_world) = (self.n_walking(), self.site.worlds.start);
+        let (n_walking, first_world) = (self.n_walking(), self.worlds.numbers.start);
         for (index, run) in self.runs.iter_mut().enumerate() {
             run.is_walking = index < n_walking;
             let world = first_world + index as u32;
@@ -202,7 +204,7 @@ impl Student for FilterStudent {
             },
             |index, run, turn| {
                 let (agent, observation) = (&run.robot.agent, run.robot.observation());
-                let visited = path::fly(self.site.shape, turn.before.robot(), &turn.plan.moves);
+                let visited = path::fly(self.worlds.shape, turn.before.robot(), &turn.plan.moves);
                 let reward = observation.result.reward;
                 self.learner
                     .see(first_world + index as u32, &observation.frame);
@@ -219,17 +221,17 @@ impl Student for FilterStudent {
         Ok(tick)
     }
 
-    fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>, NotFinite> {
         let start = Instant::now();
         let updates = self.learner.learn();
         self.learning += start.elapsed();
-        let lesson = |update: crate::learning::filter::Update| Lesson {
+        let update = |update: crate::learning::filter::Update| ModelUpdate {
             number: update.number,
             loss: Some(update.loss),
             rate: Some(update.rate),
             more: Vec::new(),
         };
-        Ok(updates?.into_iter().map(lesson).collect())
+        Ok(updates?.into_iter().map(update).collect())
     }
 
     fn freeze(&mut self) {
@@ -253,7 +255,7 @@ impl Student for FilterStudent {
         let saved = self.runs.iter().map(|run| SavedWorld::of(&run.robot));
         let state = SavedFilter {
             learner: self.learner.saved(),
-            worlds: self.site.worlds.clone().zip(saved).collect(),
+            worlds: self.worlds.numbers.clone().zip(saved).collect(),
         };
         Ok(Contents::new(self.learner.named_tensors(), &state))
     }

@@ -15,9 +15,11 @@ use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
 use crate::estimation::{AutoencoderEstimator, Follower};
 use crate::learning::checkpoint::Contents;
-use crate::learning::metrics::{Lesson, Tick};
+use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::reward::met;
-use crate::learning::student::{Fly, Look, NotFinite, Site, Student, StudentError, without_truth};
+use crate::learning::student::base::{
+    Fly, Look, NotFinite, Student, StudentError, Worlds, without_truth,
+};
 use crate::planning::PlanBasis;
 use crate::planning::policy::Policy;
 use crate::rollout::agent::{Agent, Setup, numbered_states};
@@ -34,7 +36,7 @@ const COLUMNS: [&str; 5] = ["dqn_loss", "dqn_rate", "action", "action_value", "e
 
 /// An autoencoder and a DQN that are learned.
 pub struct NetworkStudent {
-    site: Site,
+    worlds: Worlds,
     config: AgentConfig,
     progress: Progress,
     choices: Vec<Policy>,
@@ -54,11 +56,11 @@ struct Decision {
 
 impl NetworkStudent {
     /// Goes on from some progress, or begins.
-    pub fn new(progress: Progress, site: Site, config: &AgentConfig) -> Self {
+    pub fn new(progress: Progress, worlds: Worlds, config: &AgentConfig) -> Self {
         Self {
             choices: Policy::network_choices(progress.autoencoder.shape().n_states),
             progress,
-            site,
+            worlds,
             config: config.clone(),
             robot: None,
             decision: None,
@@ -74,7 +76,7 @@ impl NetworkStudent {
         let setup = Setup {
             basis: PlanBasis::new(self.config.objective.belief),
             state_names: numbered_states(network.shape().n_states),
-            n_moves: self.site.n_moves,
+            n_moves: self.worlds.n_moves,
             seed: self.config.planner_seed(observation.result.seed),
         };
         let agent = Agent::new(Box::new(estimator), &self.choices[0], &self.config, setup);
@@ -86,7 +88,7 @@ impl NetworkStudent {
         let cell = robot.observation().robot();
         self.progress
             .input
-            .of(follower(robot), cell, self.site.n_moves)
+            .of(follower(robot), cell, self.worlds.n_moves)
     }
 
     fn decide(&self, robot: &Robot) -> Decision {
@@ -166,7 +168,7 @@ impl NetworkStudent {
             |index, robot, turn| {
                 tick.score = turn.score.unwrap_or_default();
                 tick.reward = robot.observation().result.reward;
-                let cells = path::fly(self.site.shape, turn.before.robot(), &turn.plan.moves);
+                let cells = path::fly(self.worlds.shape, turn.before.robot(), &turn.plan.moves);
                 let met = met(robot.agent.belief(), cells.visited.iter().copied());
                 self.progress.position.reward.add(&met, tick.reward);
                 look(index, robot);
@@ -210,7 +212,7 @@ impl Student for NetworkStudent {
             }
             self.robot = Some(robot);
         } else {
-            self.begin(self.site.worlds.start, observation)?;
+            self.begin(self.worlds.numbers.start, observation)?;
         }
         Ok(usize::from(goes_on))
     }
@@ -234,7 +236,7 @@ impl Student for NetworkStudent {
         stepped
     }
 
-    fn learn(&mut self) -> Result<Vec<Lesson>, NotFinite> {
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>, NotFinite> {
         let epsilon = self
             .config
             .dqn
@@ -251,7 +253,7 @@ impl Student for NetworkStudent {
             Some(f64::from(epsilon)),
         ];
         let number = self.n_updates();
-        Ok(vec![Lesson {
+        Ok(vec![ModelUpdate {
             number,
             loss,
             rate,

@@ -7,7 +7,7 @@ use crate::estimation::parameters::Dimensions;
 use crate::learning::student::decisions::{Decisions, DecisionsStudent};
 use crate::learning::student::filter::FilterStudent;
 use crate::learning::student::network::{NetworkStudent, Progress};
-use crate::learning::student::{Site, Student};
+use crate::learning::student::{Student, Worlds};
 use crate::planning::action::ActionSet;
 use crate::planning::policy::{PlannerKind, Policy};
 use crate::planning::{BasisKind, Objective, PlanningProblem, Target};
@@ -19,12 +19,12 @@ use protocol::{Cell, Frame, Model, Move, Shape};
 
 const ROBOT: Cell = Cell { row: 4, col: 4 };
 
-fn site() -> Site {
-    Site {
+fn worlds() -> Worlds {
+    Worlds {
         shape: Shape::new(8, 9).expect("test shape"),
         n_observations: 3,
         n_moves: 6,
-        worlds: 0..1,
+        numbers: 0..1,
     }
 }
 
@@ -39,8 +39,8 @@ fn config(belief: BasisKind) -> AgentConfig {
 }
 
 fn observation(step: u64) -> Observation {
-    let mut frame = Frame::empty(site().shape);
-    for cell in 0..site().shape.n_cells() {
+    let mut frame = Frame::empty(worlds().shape);
+    for cell in 0..worlds().shape.n_cells() {
         let bits = split_mix(step, cell as u64);
         if bits.is_multiple_of(4) {
             frame.observe(cell, (bits >> 32) as u8 % 3);
@@ -66,7 +66,7 @@ fn path(
 ) -> Vec<Move> {
     let problem = PlanningProblem {
         start: ROBOT,
-        n_moves: site().n_moves,
+        n_moves: worlds().n_moves,
         values: &objective.values(belief),
         seed: config.planner_seed(0),
         step,
@@ -123,7 +123,7 @@ fn students_plan_on_the_belief_that_settings_say() {
             n_observations: 3,
             kernel: (3, 3),
         };
-        let student = FilterStudent::new(dimensions, site(), config);
+        let student = FilterStudent::new(dimensions, worlds(), config);
         check(student, basis, |belief, target, step| {
             let policy = Policy::learned(PlannerKind::Beam);
             let objective = Objective {
@@ -132,24 +132,24 @@ fn students_plan_on_the_belief_that_settings_say() {
             };
             vec![path(config, &policy, objective, belief, step)]
         });
-        let progress = Progress::first(&site(), config, &::network::Device::Cpu);
-        let student = NetworkStudent::new(progress.expect("a network"), site(), config);
+        let progress = Progress::first(&worlds(), config, &::network::Device::Cpu);
+        let student = NetworkStudent::new(progress.expect("a network"), worlds(), config);
         check(student, basis, |belief, _, step| {
             let choices = Policy::network_choices(3);
             let path = |choice| path(config, choice, config.objective(choice), belief, step);
             choices.iter().map(path).collect()
         });
         let model = Model::wildfire();
-        let filter = BayesFilter::known(&model, Belief::uniform(3, site().shape)).expect("valid");
+        let filter = BayesFilter::known(&model, Belief::uniform(3, worlds().shape)).expect("valid");
         let decisions = Decisions::first(&model, &config.decisions, 0);
-        let student = DecisionsStudent::new(decisions, filter, &model, site(), config);
+        let student = DecisionsStudent::new(decisions, filter, &model, worlds(), config);
         let actions = ActionSet::beam(&model);
         let beam = Policy::learned(PlannerKind::Beam);
         check(student, basis, |belief, _, step| {
             let path = |action: &crate::planning::action::Action| {
                 let random = (config.planner_seed(0), step);
                 let mut planner = config.planner(&beam);
-                let plan = action.plan(&mut *planner, belief, ROBOT, site().n_moves, random);
+                let plan = action.plan(&mut *planner, belief, ROBOT, worlds().n_moves, random);
                 plan.moves
             };
             actions.actions().iter().map(path).collect()

@@ -1,7 +1,7 @@
 //! What TensorBoard shows of a training: the columns of the CSV, and now and then the belief.
 
 use crate::estimation::belief::Belief;
-use crate::learning::metrics::{Lesson, Tick, averages};
+use crate::learning::metrics::{ModelUpdate, Tick, averages};
 use crate::learning::student::Student;
 use crate::learning::tensorboard::{EventFile, EventsError, Value};
 use figures::{Heat, heat};
@@ -33,10 +33,10 @@ impl Events {
     pub fn add(
         &mut self,
         tick: &Tick,
-        lessons: &[Lesson],
+        updates: &[ModelUpdate],
         student: &dyn Student,
     ) -> Result<(), EventsError> {
-        let averages = averages(tick, lessons, student.n_updates(), student.columns());
+        let averages = averages(tick, updates, student.n_updates(), student.columns());
         let scalars = averages
             .iter()
             .map(|&(name, value)| (name, Value::Scalar(value)));

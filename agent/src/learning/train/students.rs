@@ -8,7 +8,7 @@ use crate::learning::checkpoint::{Contents, Problem};
 use crate::learning::student::decisions::{Decisions, DecisionsStudent};
 use crate::learning::student::filter::FilterStudent;
 use crate::learning::student::network::{self, NetworkStudent};
-use crate::learning::student::{Site, Student};
+use crate::learning::student::{Student, Worlds};
 use crate::learning::train::training::{TrainError, Training};
 use crate::server::client::Client;
 use protocol::Model;
@@ -23,25 +23,25 @@ pub fn student(
     place: &Path,
 ) -> Result<Box<dyn Student>, TrainError> {
     let (info, config) = (client.info(), &training.config);
-    let site = Site {
+    let worlds = Worlds {
         shape: client.shape(),
         n_observations: info.n_observations,
         n_moves: info.n_moves,
-        worlds: training.worlds.clone(),
+        numbers: training.worlds.clone(),
     };
     let wrong = |problem: Problem| problem.of(place);
     Ok(match config.learner {
         LearnerKind::Filter => {
-            let dimensions = dimensions(config, site.n_observations)?;
+            let dimensions = dimensions(config, worlds.n_observations)?;
             Box::new(match contents {
                 Some(contents) => {
-                    FilterStudent::resume(contents, dimensions, site, config).map_err(wrong)?
+                    FilterStudent::resume(contents, dimensions, worlds, config).map_err(wrong)?
                 }
-                None => FilterStudent::new(dimensions, site, config),
+                None => FilterStudent::new(dimensions, worlds, config),
             })
         }
         LearnerKind::Autoencoder => {
-            let mut progress = network::Progress::first(&site, config, &training.device)?;
+            let mut progress = network::Progress::first(&worlds, config, &training.device)?;
             if let Some(contents) = contents {
                 progress.load(contents).map_err(wrong)?;
             }
@@ -50,7 +50,7 @@ pub fn student(
             if wants && info.coverage == CoverageRule::Path {
                 return Err(TrainError::NoFullFrames(full_frames));
             }
-            Box::new(NetworkStudent::new(progress, site, config))
+            Box::new(NetworkStudent::new(progress, worlds, config))
         }
         LearnerKind::Decisions => {
             let model = info.model.as_deref().ok_or(TrainError::NoModel)?;
@@ -60,10 +60,10 @@ pub fn student(
                 decisions.load(contents).map_err(wrong)?;
             }
             let prior = config.prior(info.burn_in);
-            let prior = first_belief(prior, &model, site.shape, config.seed)?;
+            let prior = first_belief(prior, &model, worlds.shape, config.seed)?;
             let filter = BayesFilter::known(&model, prior)?;
             Box::new(DecisionsStudent::new(
-                decisions, filter, &model, site, config,
+                decisions, filter, &model, worlds, config,
             ))
         }
     })

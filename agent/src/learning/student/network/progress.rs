@@ -8,7 +8,7 @@ use crate::learning::checkpoint::{
     Contents, Problem, check, check_belief, check_counts, check_numbers,
 };
 use crate::learning::reward::RewardEstimate;
-use crate::learning::student::Site;
+use crate::learning::student::base::Worlds;
 use crate::planning::BasisKind;
 use crate::planning::policy::Policy;
 use crate::rollout::Robot;
@@ -90,8 +90,12 @@ impl Progress {
     ///
     /// # Errors
     /// As the device.
-    pub fn first(site: &Site, config: &AgentConfig, device: &Device) -> Result<Self, NetworkError> {
-        let shape = network_shape(site.shape, site.n_observations, config);
+    pub fn first(
+        worlds: &Worlds,
+        config: &AgentConfig,
+        device: &Device,
+    ) -> Result<Self, NetworkError> {
+        let shape = network_shape(worlds.shape, worlds.n_observations, config);
         let (settings, n_states) = (config.autoencoder.settings(), shape.n_states);
         let autoencoder = Autoencoder::new(settings, shape, config.seed, device)?;
         let n_actions = Policy::network_choices(n_states).len();
@@ -174,13 +178,13 @@ impl Progress {
         check_size(contents, &sizes)?;
         let prediction = saved.position.follower.prediction();
         check_belief("prediction", prediction, sizes.n_states, shape)?;
-        let site = Site {
+        let worlds = Worlds {
             shape,
             n_observations,
             n_moves: 0,
-            worlds: 0..1,
+            numbers: 0..1,
         };
-        let mut progress = Self::first(&site, &config, device)?;
+        let mut progress = Self::first(&worlds, &config, device)?;
         progress.load(contents)?;
         Ok(progress)
     }

@@ -1,0 +1,136 @@
+//! What every student does, and what it is told.
+
+use crate::estimation::belief::Belief;
+use crate::learning::checkpoint::Contents;
+
+use crate::learning::metrics::{ModelUpdate, Tick};
+use crate::rollout::agent::AgentError;
+use crate::rollout::{Robot, Seen};
+use crate::server::client::Observation;
+use ::network::NetworkError;
+use protocol::connection::ConnectionError;
+use protocol::{Move, Shape};
+use std::ops::Range;
+use std::time::Duration;
+use thiserror::Error;
+
+/// The worlds to act on, as far as a learner is told.
+#[derive(Debug, Clone)]
+pub struct Worlds {
+    /// The grid.
+    pub shape: Shape,
+    /// Number of values that an observed cell may show.
+    pub n_observations: usize,
+    /// Moves in a path.
+    pub n_moves: usize,
+    /// The worlds' numbers.
+    pub numbers: Range<u32>,
+}
+
+/// Flies a path in each world; gives what they show then, in order.
+pub type Fly<'a> = &'a mut dyn FnMut(&[Vec<Move>]) -> Result<Vec<Observation>, ConnectionError>;
+
+/// Is told of each robot, by its index, when its belief is the posterior.
+pub type Look<'a> = &'a mut dyn FnMut(usize, &Robot);
+
+/// Why a student cannot go on.
+#[derive(Debug, Error)]
+pub enum StudentError {
+    /// What it sees does not fit what it believes.
+    #[error(transparent)]
+    Agent(#[from] AgentError),
+    /// The worlds cannot be reached.
+    #[error(transparent)]
+    Connection(#[from] ConnectionError),
+    /// A number that is not finite.
+    #[error(transparent)]
+    NotFinite(#[from] NotFinite),
+}
+
+/// A number that is not finite, or a device that fails: learning cannot go on; nothing was changed by the
+/// step or update that met it.
+#[derive(Debug, PartialEq, Error)]
+#[non_exhaustive]
+pub enum NotFinite {
+    /// In the learned filter.
+    #[error(transparent)]
+    Filter(#[from] crate::learning::filter::NotFinite),
+    /// In the autoencoder or the DQN.
+    #[error(transparent)]
+    Network(#[from] NetworkError),
+}
+
+impl From<NetworkError> for StudentError {
+    fn from(error: NetworkError) -> Self {
+        NotFinite::from(error).into()
+    }
+}
+
+/// What learns while it acts.
+pub trait Student {
+    /// How its checkpoints call it.
+    fn kind(&self) -> &'static str;
+
+    /// Names of what its updates tell beside loss and rate.
+    fn columns(&self) -> &'static [&'static str];
+
+    /// Whether its next frames should show every cell, where the server gives such.
+    fn wants_full_frames(&self) -> bool {
+        false
+    }
+
+    /// Takes in what the worlds show when it comes to them. Returns in how many of them it goes on where
+    /// its checkpoint left it.
+    ///
+    /// # Errors
+    /// [`StudentError`].
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError>;
+
+    /// A world begins again.
+    ///
+    /// # Errors
+    /// [`StudentError`].
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError>;
+
+    /// One step of the rollout in all worlds: plans, flies, scores, corrects, remembers, predicts.
+    ///
+    /// # Errors
+    /// [`StudentError`].
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError>;
+
+    /// Makes the updates that the steps since the last call have earned.
+    ///
+    /// # Errors
+    /// [`NotFinite`].
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>, NotFinite>;
+
+    /// From here on it acts on what was learned, as well as it knows: without random actions.
+    fn freeze(&mut self);
+
+    /// World steps that were learned from, of all worlds together.
+    fn world_steps(&self) -> u64;
+
+    /// Updates of the model so far.
+    fn n_updates(&self) -> u64;
+
+    /// What it predicts of its first world, and the state of that which it thinks pays most.
+    fn belief(&self) -> Option<(&Belief, usize)>;
+
+    /// What a later run goes on from.
+    ///
+    /// # Errors
+    /// Where a network's device fails.
+    fn contents(&self) -> Result<Contents, StudentError>;
+
+    /// Time spent so far, by part.
+    fn times(&self) -> Vec<(&'static str, Duration)>;
+}
+
+/// Observations without hidden states, as learners get them.
+pub(super) fn without_truth(observations: Vec<Observation>) -> Vec<Seen> {
+    let seen = |observation| Seen {
+        observation,
+        truth: None,
+    };
+    observations.into_iter().map(seen).collect()
+}
