@@ -10,7 +10,7 @@ use agent::benchmark::report::{
 };
 use agent::config::AgentFlags;
 use agent::learning::learned::Learned;
-use agent::planning::policy::{EstimatorKind, Policy};
+use agent::planning::policy::{EstimatorKind, OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, Policy};
 use agent::rollout::agent::AgentError;
 use agent::server::launch::OwnDashboard;
 use anyhow::{Context, Result, ensure};
@@ -182,15 +182,15 @@ fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
     };
     let is_known = |policy: &Policy| policy.estimator == EstimatorKind::KnownModel;
     if learned.decisions.is_some() {
-        insert(is_known, &Policy::OF_DECISIONS);
+        insert(is_known, &OF_DECISIONS);
     }
     if learned.filter.is_some() {
-        insert(is_known, &Policy::OF_FILTER);
+        insert(is_known, &OF_FILTER);
     }
     if learned.network.is_some() {
         insert(
             |policy| policy.estimator == EstimatorKind::None,
-            &Policy::OF_AUTOENCODER,
+            &OF_AUTOENCODER,
         );
     }
     ladder

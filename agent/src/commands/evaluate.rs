@@ -10,7 +10,7 @@ use agent::benchmark::report::{render_table, statistics::Estimate, write_csv};
 use agent::config::{AgentConfig, AgentFlags};
 use agent::estimation::scoring::Score;
 use agent::learning::learned::Learned;
-use agent::planning::policy::{EstimatorKind, Policy};
+use agent::planning::policy::{EstimatorKind, OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, Policy};
 use anyhow::Result;
 use clap::Args;
 use network::DeviceKind;
@@ -84,13 +84,13 @@ impl EvaluateCommand {
     fn policies(&self, arena: &mut Arena, config: AgentConfig, learned: Learned) -> Result<()> {
         let mut names = POLICIES.to_vec();
         if learned.filter.is_some() {
-            names.extend(Policy::OF_FILTER);
+            names.extend(OF_FILTER);
         }
         if learned.network.is_some() {
-            names.extend(Policy::OF_AUTOENCODER);
+            names.extend(OF_AUTOENCODER);
         }
         if learned.decisions.is_some() {
-            names.extend(Policy::OF_DECISIONS);
+            names.extend(OF_DECISIONS);
         }
         let named = |name| Policy::named(name, arena.model());
         let comparison = Comparison {

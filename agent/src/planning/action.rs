@@ -3,8 +3,8 @@
 
 use crate::estimation::belief::{Belief, EntropyKind};
 use crate::estimation::summary::{N_BLOCKS, block};
-use crate::planning::objective::BEAM_BONUS;
-use crate::planning::{CellValues, Objective, Plan, Planner, PlanningProblem, Target};
+use crate::planning::objective::{BEAM_BONUS, CellValues, Objective, Target};
+use crate::planning::planner::{Plan, Planner, PlanningProblem};
 use protocol::{Cell, Grid, Model, Shape};
 
 /// Rise in a cell's value per cell nearer to an action's region. A straight flight of T = 12 moves gains

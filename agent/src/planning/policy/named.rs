@@ -1,0 +1,336 @@
+//! What a policy is, and policies by name.
+
+use super::names::{known_names, ladder_names};
+use crate::planning::action::{Action, ActionSet};
+use crate::planning::objective::{BEAM_BONUS, Objective, Target};
+use protocol::Model;
+use thiserror::Error;
+
+/// Where a policy's belief comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum EstimatorKind {
+    /// No belief at all.
+    None,
+    /// The Bayes filter with the true parameters (paper section III.A, masked as in III.C).
+    KnownModel,
+    /// A Bayes filter with learned parameters.
+    Learned,
+    /// The paper's dynamic autoencoder (sections III.B and III.C).
+    Autoencoder,
+    /// The hidden state X_k, predicted one step ahead: an upper bound on estimation.
+    Truth,
+    /// The hidden state X_{k+1} that the path will meet: an upper bound on prediction too.
+    NextTruth,
+}
+
+/// How a policy plans.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum PlannerKind {
+    /// Uniform moves: the paper's baseline.
+    RandomWalk,
+    /// The best of many random paths (paper section III.D).
+    Shooting,
+    /// Beam search.
+    Beam,
+}
+
+/// A way to act.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Policy {
+    /// Its name in commands, tables and files.
+    pub name: String,
+    /// Where its belief comes from.
+    pub estimator: EstimatorKind,
+    /// How it plans.
+    pub planner: PlannerKind,
+    /// What it maximises.
+    pub objective: Objective,
+    /// Whether a DQN chooses what each path is for instead (paper section III.E).
+    pub is_decided: bool,
+    /// What each path is for instead, always the same.
+    pub action: Option<Action>,
+}
+
+/// A name that is no policy's.
+#[derive(Debug, Error, PartialEq, Eq)]
+#[error("policy: expected one of {expected}, got {name:?}")]
+pub struct UnknownPolicy {
+    name: String,
+    expected: String,
+}
+
+impl EstimatorKind {
+    /// Its name in tables and files.
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::KnownModel => "known_model",
+            Self::Learned => "learned_filter",
+            Self::Autoencoder => "autoencoder",
+            Self::Truth => "truth",
+            Self::NextTruth => "next_truth",
+        }
+    }
+}
+
+impl PlannerKind {
+    /// Its name in commands and messages.
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::RandomWalk => "random_walk",
+            Self::Shooting => "shooting",
+            Self::Beam => "beam",
+        }
+    }
+}
+
+impl Policy {
+    /// The policy of a name under a model.
+    ///
+    /// Names are `random_walk`, `coverage`, `shooting_*` and `beam_*` with `exploit` (the state that
+    /// pays most), `exploit_only` (the same without the coverage bonus), `explore` (entropy) or the name
+    /// of a state, and `oracle_*`, `clairvoyant_*` and `learned_*` with `shooting` or `beam`. On the
+    /// autoencoder's belief there are `autoencoder_exploit` and `autoencoder_explore`, which shoot,
+    /// `autoencoder_policy`, for which the DQN chooses among the paper's objectives, and `autoencoder_beam`.
+    /// `dqn_beam` chooses among [`ActionSet::beam`] by a DQN; `act_*` always takes the action of that name.
+    ///
+    /// # Errors
+    /// [`UnknownPolicy`] lists the names that there are.
+    pub fn named(name: &str, model: &Model) -> Result<Self, UnknownPolicy> {
+        let unknown = || UnknownPolicy {
+            name: name.into(),
+            expected: known_names(model).join(", "),
+        };
+        let target = Target::State(model.target_state());
+        let policy = |estimator, planner, objective| Self {
+            name: name.into(),
+            estimator,
+            planner,
+            objective,
+            is_decided: false,
+            action: None,
+        };
+        Ok(match name {
+            "random_walk" => policy(
+                EstimatorKind::None,
+                PlannerKind::RandomWalk,
+                Objective::new(Target::Coverage),
+            ),
+            "coverage" => policy(
+                EstimatorKind::None,
+                PlannerKind::Shooting,
+                Objective::new(Target::Coverage),
+            ),
+            _ => {
+                let (family, rest) = name.split_once('_').ok_or_else(unknown)?;
+                match family {
+                    "dqn" if rest == "beam" => Self {
+                        is_decided: true,
+                        ..policy(
+                            EstimatorKind::KnownModel,
+                            PlannerKind::Beam,
+                            objective(PlannerKind::Beam, target),
+                        )
+                    },
+                    "act" => Self::always(name, rest, model).ok_or_else(unknown)?,
+                    "autoencoder" => Self::of_autoencoder(rest).ok_or_else(unknown)?,
+                    "oracle" | "clairvoyant" | "learned" => {
+                        let planner = planner_named(rest).ok_or_else(unknown)?;
+                        let estimator = match family {
+                            "oracle" => EstimatorKind::Truth,
+                            "learned" => EstimatorKind::Learned,
+                            _ => EstimatorKind::NextTruth,
+                        };
+                        policy(estimator, planner, objective(planner, target))
+                    }
+                    _ => {
+                        let planner = planner_named(family).ok_or_else(unknown)?;
+                        let objective = match rest {
+                            "exploit" => objective(planner, target),
+                            "exploit_only" => Objective::new(target),
+                            "explore" => objective(planner, Target::Entropy),
+                            state => objective(
+                                planner,
+                                Target::State(model.state_named(state).ok_or_else(unknown)?),
+                            ),
+                        };
+                        policy(EstimatorKind::KnownModel, planner, objective)
+                    }
+                }
+            }
+        })
+    }
+
+    /// What a high-level decision chooses among (the paper's actions `a_k`): the probability of each
+    /// state in the model's order, then `entropy`; each named by its target, with the bonus of
+    /// `shooting_*` and `beam_*`.
+    pub fn choices(planner: PlannerKind, model: &Model) -> Vec<Self> {
+        let choice = |name: &str, target| Self {
+            name: name.into(),
+            estimator: EstimatorKind::KnownModel,
+            planner,
+            objective: objective(planner, target),
+            is_decided: false,
+            action: None,
+        };
+        let states = model.file().states.iter().enumerate();
+        let states = states.map(|(state, entry)| choice(&entry.name, Target::State(state)));
+        states.chain([choice("entropy", Target::Entropy)]).collect()
+    }
+
+    /// A planner on the learned belief; what it maximises is learned too.
+    pub fn learned(planner: PlannerKind) -> Self {
+        // The agent puts the state that pays most, as learned, in the place of this one.
+        let target = match planner {
+            PlannerKind::RandomWalk => Target::Coverage,
+            PlannerKind::Shooting | PlannerKind::Beam => Target::State(0),
+        };
+        Self {
+            name: format!("learned_{}", planner.label()),
+            estimator: EstimatorKind::Learned,
+            planner,
+            objective: objective(planner, target),
+            is_decided: false,
+            action: None,
+        }
+    }
+
+    /// Beam search on the known model's belief that always takes one action.
+    fn always(name: &str, action: &str, model: &Model) -> Option<Self> {
+        let actions = ActionSet::beam(model);
+        let action = actions.named(action)?;
+        Some(Self {
+            name: name.into(),
+            estimator: EstimatorKind::KnownModel,
+            planner: PlannerKind::Beam,
+            objective: action.objective,
+            is_decided: false,
+            action: Some(action.clone()),
+        })
+    }
+
+    /// A policy on the autoencoder's belief; the agent puts the state that pays most, as learned, in the
+    /// place of this one.
+    fn of_autoencoder(name: &str) -> Option<Self> {
+        let (planner, target) = match name {
+            "exploit" | "policy" => (PlannerKind::Shooting, Target::State(0)),
+            "explore" => (PlannerKind::Shooting, Target::Entropy),
+            "beam" => (PlannerKind::Beam, Target::State(0)),
+            _ => return None,
+        };
+        Some(Self {
+            name: format!("autoencoder_{name}"),
+            estimator: EstimatorKind::Autoencoder,
+            planner,
+            objective: objective(planner, target),
+            is_decided: name == "policy",
+            action: None,
+        })
+    }
+
+    /// What the DQN of Algorithm 1 chooses among (paper section IV): the probability of each of the
+    /// autoencoder's states, then entropy.
+    pub fn network_choices(n_states: usize) -> Vec<Self> {
+        let choice = |name: String, target| Self {
+            name,
+            estimator: EstimatorKind::Autoencoder,
+            planner: PlannerKind::Shooting,
+            objective: objective(PlannerKind::Shooting, target),
+            is_decided: false,
+            action: None,
+        };
+        let states =
+            (0..n_states).map(|state| choice(format!("state_{state}"), Target::State(state)));
+        let entropy = choice("entropy".into(), Target::Entropy);
+        states.chain([entropy]).collect()
+    }
+
+    /// The benchmark's ladder under a model, from the least to the most informed.
+    pub fn ladder(model: &Model) -> Vec<Self> {
+        let named = |name: &String| {
+            Self::named(name, model).expect("invariant: the ladder's names are known")
+        };
+        ladder_names(model).iter().map(named).collect()
+    }
+}
+
+/// The authors' objective for shooting; for beam search hardly any bonus.
+fn objective(planner: PlannerKind, target: Target) -> Objective {
+    match planner {
+        PlannerKind::Shooting => Objective::paper(target),
+        PlannerKind::Beam | PlannerKind::RandomWalk => Objective {
+            coverage_bonus: BEAM_BONUS,
+            ..Objective::new(target)
+        },
+    }
+}
+
+fn planner_named(name: &str) -> Option<PlannerKind> {
+    match name {
+        "shooting" => Some(PlannerKind::Shooting),
+        "beam" => Some(PlannerKind::Beam),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_listed_name_is_a_policy_and_no_other() {
+        let model = Model::wildfire();
+        for name in known_names(&model) {
+            assert_eq!(
+                Policy::named(&name, &model).map(|policy| policy.name),
+                Ok(name)
+            );
+        }
+        for wrong in [
+            "",
+            "beam",
+            "beam_",
+            "oracle_exploit",
+            "shooting_ash",
+            "Random_walk",
+        ] {
+            let error = Policy::named(wrong, &model).expect_err(wrong).to_string();
+            assert!(
+                error.contains("shooting_latent") && error.ends_with(&format!("got {wrong:?}")),
+                "{error}"
+            );
+        }
+    }
+
+    #[test]
+    fn choices_are_the_policies_of_their_planner() {
+        let model = Model::wildfire();
+        for (family, planner) in [
+            ("beam", PlannerKind::Beam),
+            ("shooting", PlannerKind::Shooting),
+        ] {
+            let choices = Policy::choices(planner, &model);
+            let names = ["normal", "latent", "fire", "explore"];
+            assert_eq!(choices.len(), names.len());
+            for (choice, name) in choices.iter().zip(names) {
+                let named = Policy::named(&format!("{family}_{name}"), &model).expect("known");
+                assert_eq!(choice.objective, named.objective, "{name}");
+                assert_eq!(choice.planner, named.planner);
+                assert_eq!(choice.estimator, named.estimator);
+            }
+        }
+    }
+
+    #[test]
+    fn the_ladder_goes_through_the_states_of_its_model() {
+        let names: Vec<String> = Policy::ladder(&Model::wildfire())
+            .into_iter()
+            .map(|policy| policy.name)
+            .collect();
+        assert!(
+            names.contains(&"shooting_normal".to_string())
+                && names.contains(&"shooting_latent".to_string())
+        );
+        assert!(!names.contains(&"shooting_fire".to_string()));
+    }
+}
