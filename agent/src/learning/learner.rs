@@ -1,8 +1,6 @@
 //! What learns a model while an agent acts: replay in, parameters out. Pure.
 
-mod saved;
-
-pub use self::saved::SavedLearner;
+pub mod saved;
 
 use crate::config::{AgentConfig, LearningConfig};
 use crate::estimation::belief::Belief;

@@ -2,7 +2,7 @@
 
 use crate::estimation::belief::Belief;
 use crate::learning::checkpoint::{Problem, check_belief};
-use crate::learning::learner::SavedLearner;
+use crate::learning::learner::saved::SavedLearner;
 use crate::rollout::Robot;
 use crate::rollout::agent::Agent;
 use crate::server::client::{Observation, Place};
