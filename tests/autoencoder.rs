@@ -373,7 +373,7 @@ fn what_does_not_fit_is_named() {
     };
     check_settings(
         &SETTINGS.replace("[dqn]", "hidden = 5\n[dqn]"),
-        &["decoder.0.weight: expected shape"],
+        &["decoder.0.weight: expected shape [5, 128, 1, 1], got [4, "],
     );
     check_settings(
         &SETTINGS.replace("learner = \"autoencoder\"\n", ""),

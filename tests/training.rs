@@ -3,7 +3,8 @@
 use crate::commands::{AGENT, check, check_table};
 use crate::harness::{Ended, Program, SMALL, Server, eventually, fly, run};
 use agent::learning::checkpoint::{self, Contents};
-use agent::learning::learner::{KIND, SavedLearner};
+use agent::learning::learner::KIND;
+use agent::learning::learner::SavedLearner;
 use agent::learning::student::filter::SavedFilter;
 use protocol::Move;
 use rustix::process::Signal;

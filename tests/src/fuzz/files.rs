@@ -106,9 +106,10 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         );
         let (_, contents) = decode(&[learner::KIND], &bytes).expect("read before");
         if let Ok(mut student) = FilterStudent::resume(&contents, DIMENSIONS, worlds(), &config()) {
-            student.contents().expect("no device");
-            // Numbers that are finite may be too large to work with.
-            let _ = student.learn();
+            let again = student.contents().expect("no device");
+            let saved: SavedFilter = again.state().expect("its state");
+            // More takes its time. Numbers that are finite may be too large to work with.
+            let _ = (saved.learner.owed < 8.0).then(|| student.learn());
         }
     }
     if let Some(contents) = learned.decisions {
