@@ -155,9 +155,10 @@ pub(super) fn check_status(
         Ok(Status::Ok) => Ok(()),
         Ok(status) => {
             let message = match status {
-                // In the words of the commands that connect this way.
+                // In the words of the commands that connect this way; not all of them can.
                 Status::Busy => format!(
-                    "busy: held by pid {detail}; wait for its release, or take over with --takeover"
+                    "busy: held by pid {detail}; wait for its release, or take over with the flag \
+                     --takeover of `emberwatch-agent run`"
                 ),
                 _ => message.unwrap_or_else(|| status.explain(detail)),
             };
