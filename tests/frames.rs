@@ -1,7 +1,7 @@
 //! Observers: what `frames` and `truth` show, to whom, and that nobody waits for them.
 
 use crate::harness::{PATIENCE, Paths, SMALL, Server, eventually, fly, frames_until, new_instance};
-use protocol::channels::FRAME_BUFFER;
+use protocol::channels::{FRAME_BUFFER, channel_directory};
 use protocol::message::FrameHeader;
 use protocol::observer::{Observer, Sample};
 use protocol::path::path_to_bytes;

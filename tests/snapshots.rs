@@ -12,7 +12,6 @@ use protocol::control::{Reply, Request};
 use protocol::message::Status;
 use protocol::observer::Observer;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 use tempfile::TempDir;
 
 const N_MOVES: usize = 6;

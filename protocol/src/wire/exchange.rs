@@ -32,7 +32,7 @@ pub enum ConnectionError {
         instance: String,
     },
     /// No answer in time. A step may have been made nevertheless: observe before the next one.
-    #[error("no answer to {what} from instance {instance:?} within {timeout:?}")]
+    #[error("no answer to {what} from instance {instance:?} within {timeout:.1?}")]
     Timeout {
         /// Kind of the request.
         what: &'static str,
