@@ -11,7 +11,7 @@ from typing import Any, Final, TypeVar, cast
 
 from emberwatch import wire
 from emberwatch.channels import Closable, Node, in_turn
-from emberwatch.errors import refusal
+from emberwatch.errors import RequestTimeoutError, refusal
 from emberwatch.ports import STEP_TIMEOUT, Peer, RequestPort
 from emberwatch.release import VERSION
 from emberwatch.replies import ServerInfo, record
@@ -26,6 +26,7 @@ class Connection(Closable):
 
     def __init__(self, instance: str, service: str, wake: str, who: str, limit: float) -> None:
         """Opens it within `limit` seconds, all services in one turn."""
+        self._limit, self._began = limit, time.monotonic()
         self._lock = threading.Lock()
         self._sequence = 0
         self._parts: list[Peer | RequestPort[Any]] = []
@@ -81,14 +82,22 @@ class Connection(Closable):
         wire.check_answer(f"answer to {what}", head, sequence)
         return reply
 
-    def _shake_hands(self, kind: type[_Record], timeout: float) -> _Record:
+    def _shake_hands(self, kind: type[_Record]) -> _Record:
         """The process's description of itself; from now on its end is noticed."""
         client = f"emberwatch-python {VERSION}"
         hello = {"op": "hello", "protocol": wire.VERSION, "client": client}
-        reply = self.control(hello, timeout=timeout)
+        try:
+            reply = self.control(hello, timeout=self._left())
+        except RequestTimeoutError:
+            problem = f"no answer to 'hello' from instance {self.instance!r} within {self._limit} s"
+            raise RequestTimeoutError(problem) from None
         info = record(kind, reply)
         self._peer.watch(reply["pid"])
         return info
+
+    def _left(self) -> float:
+        """What is left of the time to open it, seconds."""
+        return self._limit - (time.monotonic() - self._began)
 
     @contextmanager
     def _closed_on_error(self) -> Generator[None]:
@@ -103,11 +112,10 @@ class ServerConnection(Connection):
     """A connection to a server, which also steps worlds."""
 
     def __init__(self, instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> None:
-        end = time.monotonic() + timeout
         super().__init__(instance, "control", "wake-server", "server", timeout)
         with self._closed_on_error():
-            self.info: Final = self._shake_hands(ServerInfo, end - time.monotonic())
-            with in_turn(end - time.monotonic()):
+            self.info: Final = self._shake_hands(ServerInfo)
+            with in_turn(self._left()):
                 self._step.create(slice_len=self.info.n_worlds * self.info.n_moves, grows=False)
 
     def _open_others(self) -> None:

@@ -5,7 +5,6 @@ PROTOCOL.md section 13. `WildfireObjectiveEnv` makes an environment of it.
 
 from __future__ import annotations
 
-import time
 from typing import Any, Final
 
 from emberwatch.connection import Connection
@@ -20,7 +19,6 @@ class Decisions(Connection):
     def __init__(
         self, instance: str = "default", world: int = 0, *, timeout: float = STEP_TIMEOUT
     ) -> None:
-        end = time.monotonic() + timeout
         names = (f"decisions-{world}", f"wake-agent-{world}", "agent")
         try:
             super().__init__(instance, *names, timeout)
@@ -30,7 +28,7 @@ class Decisions(Connection):
                 f"with `emberwatch-agent serve-decisions --instance {instance} --world {world}`"
             ) from None
         with self._closed_on_error():
-            self.info: Final = self._shake_hands(DecisionsInfo, end - time.monotonic())
+            self.info: Final = self._shake_hands(DecisionsInfo)
 
     def reset(self, seed: int | None = None, *, timeout: float = RESET_TIMEOUT) -> Decision:
         """Begins an episode with a new belief; without a seed, the server chooses one."""

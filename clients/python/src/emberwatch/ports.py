@@ -106,8 +106,7 @@ class Peer:
             # Not "<=": "not a number" would end the process inside iceoryx2.
             if not remaining > 0:
                 raise RequestTimeoutError(
-                    f"no answer to {what} from instance {self.node.instance!r} "
-                    f"within {timeout:.3g} s"
+                    f"no answer to {what} from instance {self.node.instance!r} within {timeout} s"
                 )
             longest = _SLEEP if remaining > 0.05 else iox2.Duration.from_secs_f64(remaining)
             try:
