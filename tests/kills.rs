@@ -186,14 +186,14 @@ fn programs_that_are_killed_at_any_moment_leave_nothing_in_the_way_of_others() {
 #[test]
 fn an_idle_server_reads_no_files_of_others() {
     let server = Server::start_with(&new_instance(), &FLAGS);
-    let n_reads = || {
+    let n_bytes = || {
         let usage = format!("/proc/{}/io", server.program.pid());
         let usage = std::fs::read_to_string(usage).expect("what it read");
-        let line = usage.lines().find_map(|line| line.strip_prefix("syscr: "));
+        let line = usage.lines().find_map(|line| line.strip_prefix("rchar: "));
         line.expect("a line").parse::<u64>().expect("a number")
     };
-    let before = n_reads();
+    let before = n_bytes();
     std::thread::sleep(Duration::from_secs(5));
-    let read = n_reads() - before;
-    assert!(read < 20, "{read} reads");
+    let read = n_bytes() - before;
+    assert!(read < 1000, "{read} bytes");
 }
