@@ -1,7 +1,7 @@
 //! Observers: what `frames` and `truth` show, to whom, and that nobody waits for them.
 
 use crate::harness::{PATIENCE, Paths, SMALL, Server, eventually, fly, frames_until, new_instance};
-use protocol::channels::FRAME_BUFFER;
+use protocol::channels::{FRAME_BUFFER, channel_directory};
 use protocol::message::FrameHeader;
 use protocol::observer::{Observer, Sample};
 use protocol::path::path_to_bytes;
@@ -196,4 +196,24 @@ fn what_is_told_of_a_world_agrees_with_its_hidden_states() {
     let share = n_right as f64 / n_cells as f64;
     let bound = 6.0 * (0.98 * 0.02 / n_cells as f64).sqrt();
     assert!((share - 0.98).abs() < bound, "{share} of {n_cells}");
+}
+
+#[test]
+fn an_observer_whose_files_are_removed_says_so() {
+    let instance = new_instance();
+    let frames = Observer::frames(&instance).expect("observe");
+    let agents = Observer::agents(&instance).expect("observe");
+    let services = std::fs::read_dir(channel_directory().join("services")).expect("services");
+    for entry in services.flatten() {
+        let text = std::fs::read_to_string(entry.path()).unwrap_or_default();
+        if text.contains(&format!("emberwatch/v1/{}/", instance.name())) {
+            std::fs::remove_file(entry.path()).expect("remove it");
+        }
+    }
+    let frames = frames.receive(PATIENCE).map(|sample| sample.is_some());
+    let agents = agents.receive(PATIENCE).map(|sample| sample.is_some());
+    for received in [frames, agents] {
+        let words = received.expect_err("its files are gone").to_string();
+        assert!(words.contains("was removed while it was in use"), "{words}");
+    }
 }

@@ -1,9 +1,7 @@
 //! Programs that are killed at any moment of their start or end: the next ones find nothing in their way.
 
 use crate::harness::{PATIENCE, Program, Server, new_instance, status};
-use protocol::Connection;
-use protocol::channels::{ChannelError, Instance, SHARED_MEMORY};
-use protocol::connection::ConnectionError;
+use protocol::channels::{Instance, SHARED_MEMORY};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -37,7 +35,7 @@ pub struct Kills {
     pub connects: usize,
 }
 
-/// What such loops left.
+/// What such loops left: all instances are of processes that have ended.
 #[derive(Default)]
 pub struct Left {
     /// Instances that were used.
@@ -65,7 +63,10 @@ pub fn kill_in_loops(n_loops: u64, kills: Kills) -> Left {
 fn kill_in_loop(seed: u64, kills: Kills) -> Left {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let instances: Vec<Instance> = (0..10).map(|_| new_instance()).collect();
+    let began = Instant::now();
     let running = Server::start_with(&new_instance(), &FLAGS);
+    // As long as starts take here, else none would be killed in the middle of one.
+    let longest = (began.elapsed().as_micros() as u64).max(60_000);
     let folder = TempDir::new().expect("a folder");
     let mut killed = HashSet::new();
     let (mut starts, mut ends, mut connects) = (kills.starts, kills.ends, kills.connects);
@@ -75,7 +76,7 @@ fn kill_in_loop(seed: u64, kills: Kills) -> Left {
         if chosen < starts {
             starts -= 1;
             let server = Server::start_without_waiting(instance, &FLAGS);
-            killed.insert(kill_after(server.program, &mut rng, 1..60_000));
+            killed.insert(kill_after(server.program, &mut rng, 1..longest));
         } else if chosen < starts + ends {
             ends -= 1;
             let server = Server::start_without_waiting(instance, &FLAGS);
@@ -85,7 +86,7 @@ fn kill_in_loop(seed: u64, kills: Kills) -> Left {
         } else {
             connects -= 1;
             let program = connect(&running.instance, &folder, rng.random_range(0..3));
-            killed.insert(kill_after(program, &mut rng, 1..30_000));
+            killed.insert(kill_after(program, &mut rng, 1..longest / 2));
         }
     }
     assert!(status(&running.instance).is_ok(), "the others' server");
@@ -124,27 +125,33 @@ fn kill_after(program: Program, rng: &mut ChaCha8Rng, micros: Range<u64>) -> u32
     pid
 }
 
-/// How long it takes to learn that nobody serves an instance.
+/// How long it takes a program to learn that nobody serves an instance; a program, as that could take without end.
 pub fn look_up_nobody() -> Duration {
-    let start = Instant::now();
-    let found = Connection::open(&new_instance(), "tests", PATIENCE).map(drop);
-    let is_absent = matches!(
-        found,
-        Err(ConnectionError::Channel(ChannelError::NoServer { .. }))
-    );
-    assert!(is_absent, "{found:?}");
+    let (start, instance) = (Instant::now(), new_instance());
+    let flags = ["status", "--instance", instance.name()];
+    let ended = Program::start("emberwatch-server", &flags).wait(PATIENCE);
+    assert!(ended.stderr.contains("no server on"), "{}", ended.stderr);
     start.elapsed()
 }
 
-/// The channels' files that processes began, by the ids in their names.
-pub fn files_of(pids: &HashSet<u32>) -> Vec<PathBuf> {
+/// The channels' files that are left: by the ids in their names, and of services of the instances.
+pub fn files_of(left: &Left) -> Vec<PathBuf> {
+    let names: Vec<String> = left
+        .instances
+        .iter()
+        .map(|instance| format!("emberwatch/v1/{}/", instance.name()))
+        .collect();
     let is_theirs = |path: &PathBuf| {
+        if path.extension() == Some("service".as_ref()) {
+            let text = std::fs::read_to_string(path).unwrap_or_default();
+            return text.is_empty() || names.iter().any(|name| text.contains(name));
+        }
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let ids = name
             .split(['_', '.'])
             .filter_map(|word| word.parse::<u128>().ok());
         let mut began = ids.map(|id| (id >> 64) as u32);
-        began.any(|pid| pids.contains(&pid))
+        began.any(|pid| left.killed.contains(&pid))
     };
     let mut all = vec![PathBuf::from(SHARED_MEMORY)];
     let mut next = 0;
@@ -173,5 +180,20 @@ fn programs_that_are_killed_at_any_moment_leave_nothing_in_the_way_of_others() {
         assert_eq!(ended.code, Some(0), "{}", ended.stderr);
     }
     protocol::cleanup::remove_leftovers().expect("a turn");
-    assert_eq!(files_of(&left.killed), Vec::<PathBuf>::new());
+    assert_eq!(files_of(&left), Vec::<PathBuf>::new());
+}
+
+#[test]
+fn an_idle_server_reads_no_files_of_others() {
+    let server = Server::start_with(&new_instance(), &FLAGS);
+    let n_bytes = || {
+        let usage = format!("/proc/{}/io", server.program.pid());
+        let usage = std::fs::read_to_string(usage).expect("what it read");
+        let line = usage.lines().find_map(|line| line.strip_prefix("rchar: "));
+        line.expect("a line").parse::<u64>().expect("a number")
+    };
+    let before = n_bytes();
+    std::thread::sleep(Duration::from_secs(5));
+    let read = n_bytes() - before;
+    assert!(read < 1000, "{read} bytes");
 }

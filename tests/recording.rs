@@ -324,7 +324,9 @@ fn nobody_else_reads_a_recording() {
     let everybody = std::fs::Permissions::from_mode(0o666);
     std::fs::set_permissions(&file, everybody).expect("a mode");
     let flags = ["--truth", "--force"];
-    for path in [&file, &link, &folder.path().join("new")] {
+    let (target, dangling) = (folder.path().join("target"), folder.path().join("dangling"));
+    std::os::unix::fs::symlink(&target, &dangling).expect("a link to nothing");
+    for path in [&file, &link, &folder.path().join("new"), &dangling] {
         stop(start_recorder(&server.instance, path, &flags));
         let mode = path.metadata().expect("the file").permissions().mode();
         assert_eq!(mode & 0o777, 0o600, "{}", path.display());

@@ -11,7 +11,6 @@ use protocol::observer::Observer;
 use rustix::process::Signal;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
-use std::time::Instant;
 
 fn start_agent(instance: &Instance) -> Program {
     let flags = [
@@ -95,13 +94,12 @@ fn a_server_takes_the_place_of_a_killed_one_whose_client_stays() {
 }
 
 #[test]
-fn a_client_that_waits_learns_at_once_that_its_server_was_killed() {
+fn a_client_that_waits_learns_that_its_server_was_killed() {
     let flags = ["--height", "64", "--width", "64", "--burn-in", "0"];
     let instance = new_instance();
     let server = Server::start_with(&instance, &flags);
     let mut connection = server.connect();
     server.program.stop();
-    let began = Instant::now();
     let refused = std::thread::scope(|scope| {
         scope.spawn(|| server.program.signal(Signal::KILL));
         connection.control(&Request::Status {}, 4 * PATIENCE)
@@ -110,7 +108,6 @@ fn a_client_that_waits_learns_at_once_that_its_server_was_killed() {
         matches!(refused, Err(ConnectionError::ServerGone { .. })),
         "{refused:?}"
     );
-    assert!(began.elapsed() < PATIENCE, "it waited for its timeout");
 }
 
 #[test]

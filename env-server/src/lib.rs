@@ -12,5 +12,4 @@ pub mod recording;
 pub mod server;
 pub mod simulator;
 pub mod snapshot;
-mod throttle;
 pub mod world;

@@ -6,6 +6,7 @@
 
 pub mod model;
 pub mod program;
+pub mod throttle;
 pub mod wire;
 
 pub use model::dynamics::{self, Dynamics};
@@ -16,8 +17,8 @@ pub use model::transition::{self, Transition};
 pub use model::{Model, randomness};
 pub use wire::connection::{self, Connection};
 pub use wire::{
-    agent_belief, channels, cleanup, control, decisions, message, observer, recording, responder,
-    turn, wait,
+    agent_belief, channels, cleanup, control, decisions, failed_connections, message, observer,
+    recording, responder, turn, wait,
 };
 
 /// The names that `agent` uses for [`agent_belief`].

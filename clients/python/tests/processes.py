@@ -151,14 +151,6 @@ def stopped(pid: int) -> Iterator[None]:
         os.kill(pid, signal.SIGCONT)
 
 
-@contextmanager
-def in_time() -> Iterator[None]:
-    """What ends sooner than a wait of `LONG` does."""
-    start = time.monotonic()
-    yield
-    assert time.monotonic() - start < PATIENCE
-
-
 def connects(server: Server) -> bool:
     """Opens one more connection, if there is a place for it."""
     try:

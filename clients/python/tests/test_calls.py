@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from failures import fails
-from processes import LONG, PATIENCE, Script, Server, eventually, in_time
+from processes import LONG, PATIENCE, Script, Server, eventually
 
 from emberwatch import errors
 from emberwatch.client import connect
@@ -176,7 +176,7 @@ def test_ctrl_c_ends_a_blocked_step_and_the_client_goes_on(server: Start) -> Non
 
     started.stop()
     thread = threading.Thread(target=interrupt)
-    with in_time(), pytest.raises(KeyboardInterrupt) as raised:
+    with pytest.raises(KeyboardInterrupt) as raised:
         thread.start()
         lease.step([3] * 6, timeout=LONG)
     thread.join()

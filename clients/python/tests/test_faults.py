@@ -11,7 +11,7 @@ from unittest import mock
 import iceoryx2 as iox2
 import pytest
 from failures import fails
-from processes import LONG, PATIENCE, Script, Server, connects, eventually, in_time, is_running
+from processes import LONG, PATIENCE, Script, Server, connects, eventually, is_running
 
 from emberwatch import channels, errors, ports, wire
 from emberwatch.client import connect
@@ -66,7 +66,6 @@ def check_kill(started: Server, call: Callable[[], object]) -> None:
 
     with (
         mock.patch.object(ports.Peer, "_sleep", be_killed_and_sleep),
-        in_time(),
         pytest.raises(errors.ServerGoneError, match=started.instance),
     ):
         call()

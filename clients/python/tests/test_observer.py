@@ -8,7 +8,7 @@ import pytest
 from failures import fails
 from processes import PATIENCE, Server, eventually
 
-from emberwatch import errors, wire
+from emberwatch import channels, errors, wire
 from emberwatch.observer import (
     Frame,
     Observer,
@@ -300,3 +300,13 @@ def test_an_impossible_timeout_is_refused(timeout: float) -> None:
 def test_a_bad_instance_name_is_refused() -> None:
     with pytest.raises(errors.InvalidArgumentError, match="instance"):
         observe("a/b")
+
+
+def test_a_reader_whose_files_are_removed_says_so() -> None:
+    with observe(unused_instance()) as observer:
+        name = f"emberwatch/v1/{observer.instance}/"
+        for path in (channels.directory() / "services").iterdir():
+            if name in path.read_text(errors="replace"):
+                path.unlink()
+        with fails("channel", match="was removed while it was in use"):
+            observer.receive(PATIENCE)

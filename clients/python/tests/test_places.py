@@ -1,19 +1,24 @@
 """Where a client connects: limits, instance names, and the directory of the channels."""
 
+import errno
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from failures import fails
 from processes import PATIENCE, Server, connects, eventually
 
-from emberwatch import channels, errors
+from emberwatch import channels, cleanup, errors
+from emberwatch import turn as turn_module
 from emberwatch.client import connect
+from emberwatch.observer import observe
 from emberwatch.programs import unused_instance
 
 Start = Callable[..., Server]
@@ -134,8 +139,9 @@ def test_what_dead_processes_left_half_made_is_removed_and_the_young_of_others_s
     dead += [_segment(f"{_identity(US, max(time.monotonic() - 60, 0))}.data")]
     dead += [_segment(f"{_identity(nobody, 0)}_{_identity(nobody, 1)}.connection")]
     young = _segment(f"{_identity(US, time.monotonic() + 60)}.dynamic")
-    for path in (*dead, young):
+    for path in dead:
         path.touch(0o200)
+    young.write_text("finished")
     node = channels.directory() / "nodes" / str(_identity(nobody, time.monotonic()))
     node.mkdir()
     (node / "emberwatch-0_node.details").touch(0o600)
@@ -143,6 +149,95 @@ def test_what_dead_processes_left_half_made_is_removed_and_the_young_of_others_s
         with pytest.raises(errors.NoServerError):
             connect("nobody-here")
         assert [path for path in (*dead, node) if path.exists()] == []
+        assert young.exists()
+    finally:
+        young.unlink()
+
+
+def test_what_a_living_process_does_not_finish_is_not_waited_for_without_end() -> None:
+    young = _segment(f"{_identity(US, time.monotonic() + 60)}.dynamic")
+    young.touch(0o200)
+    try:
+        with fails("channel", match=young.name):
+            connect("nobody-here")
+    finally:
+        young.unlink()
+
+
+def test_services_are_opened_in_one_turn(server: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    started = server()
+    events: list[str] = []
+    turn = channels.turn
+
+    @contextmanager
+    def noted(*arguments: Any) -> Iterator[bool]:
+        is_outermost = turn_module._held.alone is None
+        with turn(*arguments) as alone:
+            events.extend(["turn"] * is_outermost)
+            yield alone
+
+    monkeypatch.setattr(channels, "turn", noted)
+    for name in ("open_request_response", "open_publications", "open_wake"):
+        opens = getattr(channels.Node, name)
+
+        def counted(self: channels.Node, *rest: Any, opens: Any = opens) -> Any:
+            events.append("open")
+            return opens(self, *rest)
+
+        monkeypatch.setattr(channels.Node, name, counted)
+    opened = [connect(started.instance), observe(started.instance)]
+    # Only the port for steps is made in a turn of its own: the server tells its size.
+    assert events == ["turn", *["open"] * 4, "turn", "turn", "open", "open"]
+    for one in opened:
+        one.close()
+
+
+def test_a_lock_that_is_interrupted_is_free_for_others(tmp_path: Path) -> None:
+    code = """
+import signal, sys
+from pathlib import Path
+from emberwatch import turn
+
+def interrupt(frame, event, argument):
+    if frame.f_code.co_filename == turn.__file__:
+        steps[0] -= 1
+        if steps[0] == 0:
+            raise KeyboardInterrupt
+    return interrupt
+
+for number in range(1, 200):
+    steps = [number]
+    sys.settrace(interrupt)
+    try:
+        with turn.turn(Path(sys.argv[1])):
+            pass
+    except KeyboardInterrupt:
+        pass
+    sys.settrace(None)
+    turn._held.alone = None
+    with turn.turn(Path(sys.argv[1]), 0.0) as alone:
+        assert alone, number
+    if steps[0] > 0:
+        print("done")
+        break
+"""
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    assert done.stdout == "done\n", done.stderr
+
+
+def test_an_unreadable_process_counts_as_living(monkeypatch: pytest.MonkeyPatch) -> None:
+    young = _segment(f"{_identity(1 << 30, time.monotonic())}.dynamic")
+    young.touch(0o200)
+
+    def unreadable(_pid: int) -> str | None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(cleanup, "process_state", unreadable)
+    places = channels._files_of_user()
+    try:
+        with channels.in_turn(), pytest.raises(OSError):
+            places.remove_leftovers(channels._config())
         assert young.exists()
     finally:
         young.unlink()

@@ -66,6 +66,9 @@ class Port:
         reply, answer = self.answer(header) if callable(self.answer) else self.answer
         return self.header.from_buffer_copy(reply), bytearray(answer)
 
+    def create(self, **_: object) -> None:
+        pass
+
     def close(self) -> None:
         pass
 
@@ -95,12 +98,13 @@ class Wired:
 
     @contextmanager
     def _in_place(self) -> Iterator[None]:
-        def port(_peer: object, service: str, headers: Any, **_: object) -> Port:
+        def port(_peer: object, service: str, headers: Any) -> Port:
             made: Port = getattr(self, service)
             made.header = headers[1]
             return made
 
-        node = SimpleNamespace(clean_up=lambda: None, check=lambda: None, close=lambda: None)
+        names = ("clean_up", "check", "close", "remember_files")
+        node = SimpleNamespace(**dict.fromkeys(names, lambda: None))
         with (
             patch.object(emberwatch.connection, "Node", lambda _: node),
             patch.object(emberwatch.connection, "Peer", lambda *_: self.peer),

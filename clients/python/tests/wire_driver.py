@@ -9,7 +9,7 @@ import json
 import sys
 
 from emberwatch import wire
-from emberwatch.channels import Node
+from emberwatch.channels import Node, in_turn
 from emberwatch.ports import Peer, RequestPort
 
 HEADERS = {
@@ -19,11 +19,11 @@ HEADERS = {
 
 
 def main() -> None:
-    peer = Peer(Node(sys.argv[1]))
-    ports = {
-        service: RequestPort(peer, service, headers, slice_len=4096, grows=True)
-        for service, headers in HEADERS.items()
-    }
+    with in_turn():
+        peer = Peer(Node(sys.argv[1]))
+        ports = {service: RequestPort(peer, service, both) for service, both in HEADERS.items()}
+        for port in ports.values():
+            port.create(slice_len=4096, grows=True)
     for line in sys.stdin:
         request = json.loads(line)
         header, payload = bytes.fromhex(request["header"]), bytes.fromhex(request["payload"])

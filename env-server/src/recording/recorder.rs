@@ -385,6 +385,7 @@ fn create(path: &Path, overwrite: bool) -> std::io::Result<File> {
             file_options.create_new(true).open(path)
         }),
         Some(false) => file_options.open(path), // a pipe, perhaps
+        None if overwrite => file_options.create(true).open(path), // a link to nothing, perhaps
         None => file_options.create_new(true).open(path),
     };
     file.map_err(|error| match error.kind() {

@@ -4,7 +4,7 @@
 
 use super::pace::Pace;
 use super::replies::{ConnectionCounts, Next, ReplayState};
-use crate::server::{Cleaner, PortConfig, Ports};
+use crate::server::{Clients, PortConfig, Ports};
 use anyhow::{Context, Error, Result, bail};
 use protocol::channels::{Instance, ipc_error};
 use protocol::control::{Reply, ServerInfo};
@@ -66,7 +66,7 @@ pub fn replay(options: &ReplayOptions, stop: &AtomicBool) -> Result<()> {
         state: ReplayState::new(summary.info, summary.totals.n_truths > 0),
         pace: Pace::new(options.speed, Instant::now()),
         is_over: false,
-        _cleaner: Cleaner::start(),
+        clients: Clients::default(),
     };
     let outcome = replay.run();
     tracing::info!(steps = replay.state.n_steps(), "replayed");
@@ -89,7 +89,7 @@ struct Replay<'a> {
     state: ReplayState,
     pace: Pace,
     is_over: bool,
-    _cleaner: Cleaner,
+    clients: Clients,
 }
 
 impl RecordingSummary {
@@ -242,6 +242,7 @@ impl Replay<'_> {
                 self.answer(request);
             }
             self.ports.check_entries()?;
+            self.clients.take_dead(&self.ports.nodes());
             let now = Instant::now();
             self.ports.warn_of_descriptors(now);
             let left = until.saturating_duration_since(now);

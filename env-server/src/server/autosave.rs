@@ -6,8 +6,8 @@ use crate::snapshot::{
     Done, Durability, FileError, Folder, Job, SnapshotError, SnapshotWorld, WorldSpec, load,
     refused,
 };
-use crate::throttle::Throttle;
 use crate::world::Episode;
+use protocol::throttle::Throttle;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};

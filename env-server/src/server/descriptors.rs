@@ -1,20 +1,12 @@
 //! File descriptors. iceoryx2 takes some for each client and observer; without them, a new one gets no answer at all.
 //! So there must be enough for all before a server starts.
 
-use crate::throttle::Throttle;
-use rustix::event::{EventfdFlags, eventfd};
-use rustix::io::Errno;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
-use std::os::fd::OwnedFd;
-use std::time::Instant;
 use thiserror::Error;
 
 /// What a server, all clients and all observers take, and some more: 40 alone, 10 for each of 16 clients, up to 8 more where
 /// its requests grow, 1 for each of 16 observers and 4 readers (measured).
 const NEEDED: u64 = 512;
-
-/// What a new client takes.
-const PER_CLIENT: usize = 10;
 
 /// A limit that is too low for all clients and observers.
 #[derive(Debug, Error, PartialEq, Eq)]
@@ -50,31 +42,6 @@ fn enough(limits: Rlimit) -> Result<Option<Rlimit>, TooFewDescriptors> {
         maximum => Err(TooFewDescriptors {
             got: maximum.unwrap_or(0),
         }),
-    }
-}
-
-/// Warns, at most every ten seconds, that there are too few: limits may change, and the system has one too.
-#[derive(Debug, Default)]
-pub struct DescriptorWarning(Throttle);
-
-impl DescriptorWarning {
-    /// Warns if connections could not be opened for this reason; another reason is the death of their clients.
-    pub fn warn(&mut self, now: Instant, n_connections: u64) {
-        if n_connections == 0 {
-            return;
-        }
-        let free: Result<Vec<OwnedFd>, Errno> = (0..PER_CLIENT)
-            .map(|_| eventfd(0, EventfdFlags::CLOEXEC))
-            .collect();
-        let Err(problem) = free else { return };
-        if let Some(n_unsaid) = self.0.pass(now) {
-            let limit = getrlimit(Resource::Nofile).current;
-            tracing::warn!(
-                limit,
-                n_unsaid,
-                "no file descriptors for a client or an observer, which gets no answer: {problem}"
-            );
-        }
     }
 }
 

@@ -12,6 +12,6 @@ mod resets;
 mod serve;
 mod state;
 
-pub use liveness::Cleaner;
+pub use liveness::Clients;
 pub use ports::{PortConfig, Ports};
 pub use serve::serve;

@@ -1,9 +1,8 @@
 //! The server's ends of the channels.
 
-use super::descriptors::{DescriptorWarning, raise_limit};
+use super::descriptors::raise_limit;
 use crate::config::Checked;
-use crate::throttle::Throttle;
-use anyhow::{Result, anyhow, bail, ensure};
+use anyhow::{Result, anyhow, ensure};
 use iceoryx2::node::Node;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::publisher::Publisher;
@@ -14,21 +13,21 @@ use iceoryx2::service::dynamic_config::publish_subscribe::SubscriberDetails;
 use iceoryx2::service::dynamic_config::request_response::ClientDetails;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use protocol::channels::{
-    Channel, ChannelError, ControlService, FRAME_BUFFER, FrameService, Instance, Ipc, MAX_CLIENTS,
-    MAX_OBSERVERS, MAX_TRUTH_READERS, RequestResponse, SHARED_MEMORY, Services, StepService,
-    TRUTH_BUFFER, TruthService, create_node, entries_of, ipc_error,
+    Channel, ChannelError, ControlService, Entries, FRAME_BUFFER, FrameService, Instance, Ipc,
+    MAX_CLIENTS, MAX_OBSERVERS, MAX_TRUTH_READERS, RequestResponse, SHARED_MEMORY, Services,
+    StepService, TRUTH_BUFFER, TruthService, create_node, ipc_error,
 };
+use protocol::failed_connections::FailedConnections;
 use protocol::message::{FrameHeader, Header, RESULT_BYTES, StepReply, StepRequest, TruthHeader};
 use protocol::responder::{
-    Active, ActiveControl, Answers, ControlServer, FailedConnections, control_server, port_owner,
-    received,
+    Active, ActiveControl, Answers, ControlServer, control_server, port_owner, received,
 };
+use protocol::throttle::Throttle;
 use protocol::turn::Turn;
 use protocol::wait::{descriptor, drain};
 use std::cell::RefCell;
 use std::collections::HashSet;
 use std::os::fd::BorrowedFd;
-use std::path::PathBuf;
 use std::time::Instant;
 
 /// A request on `step` that waits for its answer.
@@ -63,13 +62,12 @@ pub struct Ports {
     listener: Listener<Ipc>,
     answers: Answers,
     failed_connections: FailedConnections,
-    descriptor_warning: DescriptorWarning,
     unpublished: RefCell<Throttle>,
     control_service: ControlService,
     step_service: StepService,
     frame_service: FrameService,
     truth_service: Option<TruthService>,
-    entries: Vec<PathBuf>,
+    entries: Entries,
     _node: Node<Ipc>,
     /// Last, so that all else is dropped within it.
     end: Option<Turn>,
@@ -143,17 +141,18 @@ impl Ports {
                 .create()
                 .map_err(ipc_error("publish the truth"))
         });
-        let services_made = [control_service.service_hash(), step_service.service_hash()];
-        let entries = entries_of(&node, &services_made);
+        let truth = truth.transpose()?;
+        let listener = services.listener(Channel::WakeServer)?;
+        let answers = Answers::new(&services)?;
+        let entries = Entries::of(&node)?;
         Ok(Self {
             step,
             control,
             frames,
-            truth: truth.transpose()?,
-            listener: services.listener(Channel::WakeServer)?,
-            answers: Answers::new(&services)?,
+            truth,
+            listener,
+            answers,
             failed_connections,
-            descriptor_warning: DescriptorWarning::default(),
             unpublished: RefCell::default(),
             control_service,
             step_service,
@@ -169,19 +168,13 @@ impl Ports {
     ///
     /// # Errors
     /// If the server's files were removed.
-    pub fn check_entries(&self) -> Result<()> {
-        if let Some(path) = self.entries.iter().find(|path| !path.exists()) {
-            bail!(
-                "{} was removed while the server was running: keep cleaners of old files away from {SHARED_MEMORY}",
-                path.display()
-            );
-        }
-        Ok(())
+    pub fn check_entries(&self) -> Result<(), ChannelError> {
+        self.entries.check_at(Instant::now())
     }
 
     /// Closes the ports, unless their files were removed: those of the same names are another server's then.
     pub fn close(self) {
-        if self.check_entries().is_err() {
+        if self.entries.check().is_err() {
             std::mem::forget(self);
         }
     }
@@ -244,9 +237,8 @@ impl Ports {
     }
 
     /// Warns, at most every ten seconds, of clients and observers that cannot connect.
-    pub fn warn_of_descriptors(&mut self, now: Instant) {
-        self.descriptor_warning
-            .warn(now, self.failed_connections.take());
+    pub fn warn_of_descriptors(&self, now: Instant) {
+        self.failed_connections.warn(now);
     }
 
     /// The number of observers of frames and of readers of the truth.
@@ -260,9 +252,20 @@ impl Ports {
 
     /// Who observes frames or reads the truth.
     pub fn observer_ids(&self) -> Vec<u128> {
-        let mut ids = Vec::new();
-        let mut add = |subscriber: &SubscriberDetails| {
-            ids.push(subscriber.subscriber_id.value());
+        self.list_observers(|observer| observer.subscriber_id.value())
+    }
+
+    /// The nodes with an open connection, and those of observers.
+    pub fn nodes(&self) -> HashSet<u128> {
+        let mut nodes = self.client_nodes();
+        nodes.extend(self.list_observers(|observer| observer.node_id.value()));
+        nodes
+    }
+
+    fn list_observers(&self, of: impl Fn(&SubscriberDetails) -> u128) -> Vec<u128> {
+        let mut list = Vec::new();
+        let mut add = |observer: &SubscriberDetails| {
+            list.push(of(observer));
             CallbackProgression::Continue
         };
         self.frame_service
@@ -271,7 +274,7 @@ impl Ports {
         if let Some(service) = &self.truth_service {
             service.dynamic_config().list_subscribers(&mut add);
         }
-        ids
+        list
     }
 
     /// Connects to new observers.

@@ -5,6 +5,7 @@ use super::state::Server;
 use crate::config::Checked;
 use crate::simulator::{Outcome, ServerStats};
 use anyhow::Result;
+use iceoryx2::prelude::PayloadHeader;
 use protocol::channels::ipc_error;
 use protocol::control::Reply;
 use protocol::message::Operation;
@@ -118,7 +119,7 @@ impl Server {
     }
 
     fn answer_step(&mut self, now: Instant, request: &ActiveStep) {
-        let client = self.clients.identify(request.header());
+        let client = self.clients.identify(request.header().node_id().value());
         let header = *request.user_header();
         let mut reply =
             self.simulator
@@ -138,7 +139,7 @@ impl Server {
     fn answer_control(&mut self, now: Instant, request: ActiveControl) {
         // The worlds of a holder that died a moment ago must be free.
         self.forget_ended_clients();
-        let client = self.clients.identify(request.header());
+        let client = self.clients.identify(request.header().node_id().value());
         let stats = ServerStats {
             uptime: self.started.elapsed(),
             steps_per_second: self.rate.per_second,
@@ -190,14 +191,13 @@ impl Server {
         self.publications
             .publish_to_new(&self.ports, &self.simulator);
         self.rate.update(now, self.simulator.n_steps());
-        self.ports.check_entries()
+        Ok(self.ports.check_entries()?)
     }
 
     fn forget_ended_clients(&mut self) {
-        for pid in self.clients.take_dead() {
+        for pid in self.clients.take_dead(&self.ports.nodes()) {
             let n_leases = self.simulator.end_of_process(pid);
-            tracing::info!(pid, n_leases, "a client ended");
-            self.cleaner.request();
+            tracing::info!(pid, n_leases, "a client or observer ended");
         }
         let n_leases = self
             .simulator

@@ -2,18 +2,18 @@
 
 use super::autosave::{Autosave, FirstWorlds, first_worlds};
 use super::files::Files;
-use super::liveness::{Cleaner, Clients};
+use super::liveness::Clients;
 use super::ports::Ports;
 use super::publications::Publications;
 use super::resets::Resets;
 use crate::config::Checked;
 use crate::simulator::{PendingFile, PendingReply, Simulator};
-use crate::throttle::Throttle;
 use anyhow::{Context, Result};
 use protocol::control::Reply;
 use protocol::message::Status;
 use protocol::program::WatchedProcess;
 use protocol::responder::ActiveControl;
+use protocol::throttle::Throttle;
 use protocol::wait::Waiter;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
@@ -36,7 +36,6 @@ pub(super) struct Server {
     pub(super) waiter: Waiter,
     pub(super) clients: Clients,
     pub(super) exit_with: Option<WatchedProcess>,
-    pub(super) cleaner: Cleaner,
     pub(super) resets: Resets,
     pub(super) pending_replies: Vec<(ActiveControl, PendingReply)>,
     pub(super) files: Files,
@@ -103,7 +102,6 @@ impl Server {
             waiter: Waiter::default(),
             clients: Clients::default(),
             exit_with,
-            cleaner: Cleaner::start(),
             resets,
             pending_replies: Vec::new(),
             files,

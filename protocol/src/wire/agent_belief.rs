@@ -4,9 +4,10 @@
 //! from each sample.
 
 use super::channels::{
-    AgentService, ChannelError, Instance, Ipc, Services, create_node, ipc_error,
+    AgentService, ChannelError, Entries, Instance, Ipc, Services, create_node, ipc_error,
 };
 use super::message::{AgentHeader, VERSION};
+use super::node::Opened;
 use super::observer::Sample;
 use super::turn::Turn;
 use crate::model::grid::{Probabilities, Shape};
@@ -58,18 +59,15 @@ pub struct BeliefError {
 /// An agent's side of the channel.
 #[derive(Debug)]
 pub struct BeliefPublisher {
-    service: AgentService,
-    publisher: Publisher<Ipc, [u8], AgentHeader>,
+    ports: Opened<Ports>,
     sequence: u64,
-    _node: Node<Ipc>,
-    /// Last, so that all else is dropped within it.
-    end: Option<Turn>,
 }
 
-impl Drop for BeliefPublisher {
-    fn drop(&mut self) {
-        self.end = Turn::take().ok();
-    }
+#[derive(Debug)]
+struct Ports {
+    service: AgentService,
+    publisher: Publisher<Ipc, [u8], AgentHeader>,
+    _node: Node<Ipc>,
 }
 
 impl BeliefPublisher {
@@ -94,34 +92,40 @@ impl BeliefPublisher {
             .map_err(ipc_error(
                 "publish beliefs (are there more than 16 agents?)",
             ))?;
-        Ok(Self {
+        let entries = Entries::of(&node)?;
+        let ports = Ports {
             service,
             publisher,
-            sequence: 0,
             _node: node,
-            end: None,
+        };
+        Ok(Self {
+            ports: Opened::new(entries, ports),
+            sequence: 0,
         })
     }
 
-    /// Whether there are readers.
+    /// Whether there are readers, or its files were removed, so that there can be none.
     pub fn is_watched(&self) -> bool {
-        self.service.dynamic_config().number_of_subscribers() > 0
+        self.ports.check().is_err()
+            || self.ports.service.dynamic_config().number_of_subscribers() > 0
     }
 
     /// Publishes a belief of shape `[S, H, W]`; the header needs world, episode, step and seed.
     ///
     /// # Errors
-    /// If iceoryx2 cannot publish it.
+    /// If iceoryx2 cannot publish it, or its files were removed.
     pub fn show(
         &mut self,
         about: AgentHeader,
         belief: &Probabilities,
         intent: &Intent,
     ) -> Result<(), ChannelError> {
+        self.ports.check()?;
         let (n_states, height, width) = belief.dim();
         let text = serde_json::to_vec(intent).expect("invariant: an intent serialises");
         let n_bytes = belief.len() * size_of::<f32>() + text.len();
         let mut sample = self
+            .ports
             .publisher
             .loan_slice(n_bytes)
             .map_err(ipc_error("loan a sample"))?;

@@ -16,7 +16,7 @@ use iceoryx2::service::builder::request_response::RequestResponseOpenError;
 use iceoryx2::service::port_factory::{PortFactory, event, publish_subscribe, request_response};
 use std::sync::{Mutex, PoisonError};
 
-pub use super::directory::{SHARED_MEMORY, channel_directory, entries_of, node_config};
+pub use super::directory::{Entries, SHARED_MEMORY, channel_directory, node_config};
 pub use super::error::{ChannelError, Ipc, ipc_error};
 pub use super::node::create_node;
 

@@ -2,19 +2,22 @@
 //!
 //! Nothing returned points into shared memory.
 
-use super::channels::{Channel, Instance, Ipc, Services, create_node, ipc_error, server_pid};
+use super::channels::{
+    Channel, Entries, Instance, Ipc, Services, StepService, create_node, ipc_error, server_pid,
+};
 use super::control::{Reply, Request, ServerInfo};
 use super::exchange::{Exchange, check_answer, check_status};
 use super::message::{
     ControlReply, ControlRequest, StepReply, StepRequest, StepResult, VERSION, split_step_payload,
 };
+use super::node::Opened;
 use super::process::WatchedProcess;
 use super::turn::Turn;
 use super::wait::Waiter;
 use iceoryx2::port::client::Client;
 use iceoryx2::prelude::AllocationStrategy;
 use std::os::fd::BorrowedFd;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 pub use super::exchange::ConnectionError;
 
@@ -34,19 +37,15 @@ pub struct StepAnswer {
 
 /// A connection to a running server.
 pub struct Connection {
-    step: Client<Ipc, [u8], StepRequest, [u8], StepReply>,
-    control: Client<Ipc, [u8], ControlRequest, [u8], ControlReply>,
-    exchange: Exchange,
+    ports: Opened<Ports>,
     info: ServerInfo,
     sequence: u64,
-    /// Last, so that the ports are dropped within it.
-    end: Option<Turn>,
 }
 
-impl Drop for Connection {
-    fn drop(&mut self) {
-        self.end = Turn::take().ok();
-    }
+struct Ports {
+    step: Option<Client<Ipc, [u8], StepRequest, [u8], StepReply>>,
+    control: Client<Ipc, [u8], ControlRequest, [u8], ControlReply>,
+    exchange: Exchange,
 }
 
 impl Connection {
@@ -59,7 +58,29 @@ impl Connection {
         client: &str,
         timeout: Duration,
     ) -> Result<Self, ConnectionError> {
-        let mut turn = Some(Turn::take()?); // declared first: what fails below is dropped within it
+        let start = Instant::now();
+        let left = || timeout.saturating_sub(start.elapsed());
+        let (mut ports, step) = Self::open_ports(instance, left())?;
+        let info = shake_hands(&ports.control, &ports.exchange, client, left())?;
+        let longest = info.n_worlds as usize * info.n_moves;
+        let _turn = Turn::take_within(left())?;
+        let step = step.client_builder().initial_max_slice_len(longest.max(1));
+        ports.step = Some(step.create().map_err(ipc_error(
+            "create a step client (are there more than 16 clients?)",
+        ))?);
+        Ok(Self {
+            ports,
+            info,
+            sequence: 1,
+        })
+    }
+
+    /// All ports but that for steps, whose size the server tells.
+    fn open_ports(
+        instance: &Instance,
+        limit: Duration,
+    ) -> Result<(Opened<Ports>, StepService), ConnectionError> {
+        let _turn = Turn::take_within(limit)?; // declared first: what fails below is dropped within it
         let node = create_node()?;
         let services = Services {
             node: &node,
@@ -86,6 +107,7 @@ impl Connection {
         let control = control.map_err(ipc_error(
             "create a control client (are there more than 16 clients?)",
         ))?;
+        let entries = Entries::of(&node)?;
         let exchange = Exchange {
             instance: instance.clone(),
             server,
@@ -94,27 +116,12 @@ impl Connection {
             waiter: Waiter::default(),
             _node: node,
         };
-        drop(turn.take());
-        let info = shake_hands(&control, &exchange, client, timeout);
-        turn = Some(Turn::take()?);
-        let info = info?;
-        let longest = info.n_worlds as usize * info.n_moves;
-        let step = step_service
-            .client_builder()
-            .initial_max_slice_len(longest.max(1))
-            .create();
-        let step = step.map_err(ipc_error(
-            "create a step client (are there more than 16 clients?)",
-        ))?;
-        drop(turn);
-        Ok(Self {
-            step,
+        let ports = Ports {
+            step: None,
             control,
             exchange,
-            info,
-            sequence: 1,
-            end: None,
-        })
+        };
+        Ok((Opened::new(entries, ports), step_service))
     }
 
     /// What the server said of itself.
@@ -124,7 +131,7 @@ impl Connection {
 
     /// The server's process: readable when it has ended.
     pub fn server_process(&self) -> BorrowedFd<'_> {
-        self.exchange.server_process.descriptor()
+        self.ports.exchange.server_process.descriptor()
     }
 
     /// Checks that the server's process runs, without asking it.
@@ -132,8 +139,8 @@ impl Connection {
     /// # Errors
     /// If it has ended.
     pub fn check_server(&self) -> Result<(), ConnectionError> {
-        match self.exchange.server_process.has_ended() {
-            true => Err(self.exchange.server_gone()),
+        match self.ports.exchange.server_process.has_ended() {
+            true => Err(self.ports.exchange.server_gone()),
             false => Ok(()),
         }
     }
@@ -149,8 +156,8 @@ impl Connection {
     ) -> Result<Reply, ConnectionError> {
         self.sequence += 1;
         ask(
-            &self.control,
-            &self.exchange,
+            &self.ports.control,
+            &self.ports.exchange,
             self.sequence,
             request,
             timeout,
@@ -169,7 +176,9 @@ impl Connection {
     ) -> Result<StepAnswer, ConnectionError> {
         const WHAT: &str = "step";
         self.sequence += 1;
-        let (listener_low, listener_high) = self.exchange.listener_id();
+        let step = self.ports.step.as_ref();
+        let step = step.expect("invariant: made when it was opened");
+        let (listener_low, listener_high) = self.ports.exchange.listener_id();
         let header = StepRequest {
             version: VERSION,
             sequence: self.sequence,
@@ -177,20 +186,16 @@ impl Connection {
             listener_high,
             ..request
         };
-        let (reply, answer) = self.exchange.request(
-            &self.step,
-            header,
-            paths,
-            WHAT,
-            timeout,
-            |reply, payload| {
-                let parts = split_step_payload(reply, payload);
-                (
-                    *reply,
-                    parts.map(|(results, frames)| (results, frames.to_vec())),
-                )
-            },
-        )?;
+        let (reply, answer) =
+            self.ports
+                .exchange
+                .request(step, header, paths, WHAT, timeout, |reply, payload| {
+                    let parts = split_step_payload(reply, payload);
+                    (
+                        *reply,
+                        parts.map(|(results, frames)| (results, frames.to_vec())),
+                    )
+                })?;
         check_status(WHAT, reply.status, reply.detail, None)?;
         check_answer(WHAT, reply.version, (reply.sequence, self.sequence))?;
         let (results, frames) = answer.map_err(|expected| ConnectionError::Garbled {

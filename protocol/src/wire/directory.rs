@@ -3,18 +3,22 @@
 use super::error::{ChannelError, Ipc, ipc_error};
 use iceoryx2::node::Node;
 use iceoryx2::prelude::{Config, FileName, Path, SemanticString};
-use iceoryx2::service::service_hash::ServiceHash;
+use std::cell::Cell;
 use std::fs::{DirBuilder, Permissions};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::PathBuf;
+use std::time::{Duration, Instant};
 
 /// Where iceoryx2 keeps shared memory: a folder that every user may write to.
 pub const SHARED_MEMORY: &str = "/dev/shm";
 
+/// How often to check that a program's files are still there.
+const CHECK_INTERVAL: Duration = Duration::from_millis(200);
+
 /// The directory of this user's channel files: `/dev/shm/emberwatch-<uid>/`.
 ///
-/// Beside the shared memory, so that both are there or neither: no cleaner of old files comes here, and it is the
-/// same for every process of the user, of a session or not.
+/// Beside the shared memory, so that both are there or neither, and the same for every process of the user, of a
+/// session or not.
 pub fn channel_directory() -> PathBuf {
     PathBuf::from(format!(
         "{SHARED_MEMORY}/emberwatch-{}/",
@@ -22,15 +26,68 @@ pub fn channel_directory() -> PathBuf {
     ))
 }
 
-/// The files by which others find a node and services: without them it is cut off.
-pub fn entries_of(node: &Node<Ipc>, services: &[&ServiceHash]) -> Vec<PathBuf> {
-    let (directory, prefix) = (channel_directory(), prefix());
-    let monitor = format!("nodes/{prefix}{}.node_monitor", node.id().value());
-    let services = services
-        .iter()
-        .map(|hash| format!("services/{prefix}{hash}.service"));
-    let names = services.chain([monitor]);
-    names.map(|name| directory.join(name)).collect()
+/// The files by which others find a node, its services and ports: without one of them it is cut off.
+#[derive(Debug)]
+pub struct Entries {
+    paths: Vec<PathBuf>,
+    checked: Cell<Instant>,
+}
+
+impl Entries {
+    /// Those of a node, when its ports are made.
+    ///
+    /// # Errors
+    /// If they cannot be listed.
+    pub fn of(node: &Node<Ipc>) -> Result<Self, ChannelError> {
+        let (directory, id) = (channel_directory(), node.id().value());
+        let folder = directory.join(format!("nodes/{id}"));
+        let monitor = directory.join(format!("nodes/{}{id}.node_monitor", prefix()));
+        let mut paths = vec![monitor];
+        let wrong = |error: std::io::Error| directory_error(&folder, error.to_string());
+        for entry in std::fs::read_dir(&folder).map_err(wrong)? {
+            let path = entry.map_err(wrong)?.path();
+            if path.extension() == Some("service_tag".as_ref()) {
+                let service = path.with_extension("service");
+                let name = service.file_name().unwrap_or_default();
+                paths.push(directory.join("services").join(name));
+            }
+            paths.push(path);
+        }
+        Ok(Self {
+            paths,
+            checked: Cell::new(Instant::now()),
+        })
+    }
+
+    /// As [`Self::check`], unless the last time was a moment before `now`.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn check_at(&self, now: Instant) -> Result<(), ChannelError> {
+        if now.saturating_duration_since(self.checked.get()) < CHECK_INTERVAL {
+            return Ok(());
+        }
+        self.check()?;
+        self.checked.set(now);
+        Ok(())
+    }
+
+    /// Checks that all are there.
+    ///
+    /// # Errors
+    /// If one was removed.
+    pub fn check(&self) -> Result<(), ChannelError> {
+        let removed = self
+            .paths
+            .iter()
+            .find(|path| matches!(path.try_exists(), Ok(false)));
+        removed.map_or(Ok(()), |path| {
+            let problem = format!(
+                "it was removed while it was in use: keep cleaners of old files away from {SHARED_MEMORY}"
+            );
+            Err(directory_error(path, problem))
+        })
+    }
 }
 
 /// The channel directory, made if it is missing, and checked.

@@ -32,7 +32,7 @@ pub enum ConnectionError {
         instance: String,
     },
     /// No answer in time. A step may have been made nevertheless: observe before the next one.
-    #[error("no answer to {what} from instance {instance:?} within {timeout:?}")]
+    #[error("no answer to {what} from instance {instance:?} within {timeout:.1?}")]
     Timeout {
         /// Kind of the request.
         what: &'static str,
@@ -155,9 +155,10 @@ pub(super) fn check_status(
         Ok(Status::Ok) => Ok(()),
         Ok(status) => {
             let message = match status {
-                // In the words of the commands that connect this way.
+                // In the words of the commands that connect this way; not all of them can.
                 Status::Busy => format!(
-                    "busy: held by pid {detail}; wait for its release, or take over with --takeover"
+                    "busy: held by pid {detail}; wait for its release, or take over with the flag \
+                     --takeover of `emberwatch-agent run`"
                 ),
                 _ => message.unwrap_or_else(|| status.explain(detail)),
             };

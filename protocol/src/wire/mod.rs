@@ -14,6 +14,7 @@ pub mod decisions;
 mod directory;
 mod error;
 mod exchange;
+pub mod failed_connections;
 mod json;
 pub mod message;
 mod node;

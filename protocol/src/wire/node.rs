@@ -1,13 +1,15 @@
 //! The iceoryx2 node of a process.
 
-use super::cleanup::{remove_leftovers, unfinished_segment};
-use super::directory::{SHARED_MEMORY, directory_error, node_config, prefix};
+use super::cleanup::make_way;
+use super::directory::{Entries, SHARED_MEMORY, directory_error, node_config, prefix};
 use super::error::{ChannelError, Ipc, ipc_error};
-use super::turn::Turn;
+use super::turn::{SHORT_WAIT, Turn};
 use iceoryx2::node::{Node, NodeBuilder};
 use iceoryx2::prelude::SignalHandlingMode;
 use std::fs::Permissions;
+use std::ops::{Deref, DerefMut};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::time::Instant;
 
 /// Makes this process known to iceoryx2, under the user's own directory and prefix, after removing what dead processes
 /// left there.
@@ -18,15 +20,8 @@ pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
     iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
     let shared_memory = std::path::Path::new(SHARED_MEMORY);
     let config = node_config()?;
-    let turn = Turn::take()?;
-    remove_leftovers()?;
-    if !turn.is_alone()
-        && let Some(segment) = unfinished_segment()
-    {
-        // iceoryx2 might wait for it without end.
-        let problem = "a stopped process is making it: continue or kill that process";
-        return Err(directory_error(&segment, problem.into()));
-    }
+    let _turn = Turn::take()?;
+    make_way()?;
     own_segments(shared_memory, &prefix())?;
     let node = NodeBuilder::new()
         .config(&config)
@@ -35,6 +30,53 @@ pub fn create_node() -> Result<Node<Ipc>, ChannelError> {
     // Of the first node of all, iceoryx2 lets everybody write to the counter of nodes.
     own_segments(shared_memory, &prefix())?;
     Ok(node)
+}
+
+/// Ports and their node, which are closed in a turn.
+#[derive(Debug)]
+pub(crate) struct Opened<T> {
+    ports: Option<T>,
+    entries: Entries,
+}
+
+impl<T> Opened<T> {
+    /// Keeps the ports of a node with these entries.
+    pub(crate) fn new(entries: Entries, ports: T) -> Self {
+        Self {
+            ports: Some(ports),
+            entries,
+        }
+    }
+
+    /// Checks that others can still find them.
+    pub(crate) fn check(&self) -> Result<(), ChannelError> {
+        self.entries.check_at(Instant::now())
+    }
+}
+
+impl<T> Deref for Opened<T> {
+    type Target = T;
+
+    fn deref(&self) -> &T {
+        self.ports.as_ref().expect("invariant: taken on drop only")
+    }
+}
+
+impl<T> DerefMut for Opened<T> {
+    fn deref_mut(&mut self) -> &mut T {
+        self.ports.as_mut().expect("invariant: taken on drop only")
+    }
+}
+
+impl<T> Drop for Opened<T> {
+    fn drop(&mut self) {
+        let _turn = Turn::take_within(SHORT_WAIT);
+        let ports = self.ports.take();
+        if self.entries.check().is_err() {
+            // Files of the same names are other programs' by now.
+            std::mem::forget(ports);
+        }
+    }
 }
 
 /// Checks that shared memory of this prefix belongs to this user, and closes it to all others.

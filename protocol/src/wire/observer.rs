@@ -1,10 +1,11 @@
 //! An observer's side of `frames`, `truth` and `agent`: it reads, never acts, and never slows the server.
 
 use super::channels::{
-    AGENT_BUFFER, Channel, ChannelError, FRAME_BUFFER, Instance, Ipc, Services, TRUTH_BUFFER,
-    create_node, ipc_error,
+    AGENT_BUFFER, Channel, ChannelError, Entries, FRAME_BUFFER, Instance, Ipc, Services,
+    TRUTH_BUFFER, create_node, ipc_error,
 };
 use super::message::{AgentHeader, FrameHeader, Header, TruthHeader};
+use super::node::Opened;
 use super::turn::Turn;
 use iceoryx2::node::Node;
 use iceoryx2::port::subscriber::Subscriber;
@@ -35,18 +36,9 @@ pub struct Sample<H> {
 
 /// Reads one channel of an instance, whether a server runs or not.
 pub struct Observer<H: Header> {
-    subscriber: Subscriber<Ipc, [u8], H>,
+    ports: Opened<(Subscriber<Ipc, [u8], H>, Node<Ipc>)>,
     publisher: Cell<Option<u32>>,
     polling: Polling,
-    node: Node<Ipc>,
-    /// Last, so that all else is dropped within it.
-    end: Option<Turn>,
-}
-
-impl<H: Header> Drop for Observer<H> {
-    fn drop(&mut self) {
-        self.end = Turn::take().ok();
-    }
 }
 
 /// How often to poll.
@@ -67,14 +59,8 @@ impl Observer<FrameHeader> {
     /// If the channel cannot be opened, or has too many observers.
     pub fn frames(instance: &Instance) -> Result<Self, ChannelError> {
         let refusal = "observe frames (are there more than 16 observers?)";
-        let observer = Self::new(
-            instance,
-            |services| services.frames(),
-            FRAME_BUFFER,
-            refusal,
-        )?;
-        wake_server(&observer.node, instance)?;
-        Ok(observer)
+        let frames = |services: &Services<'_>| services.frames();
+        Self::new(instance, frames, FRAME_BUFFER, refusal, true)
     }
 }
 
@@ -85,9 +71,8 @@ impl Observer<TruthHeader> {
     /// If the channel cannot be opened, or has too many readers.
     pub fn truth(instance: &Instance) -> Result<Self, ChannelError> {
         let refusal = "read the truth (are there more than 4 readers?)";
-        let observer = Self::new(instance, |services| services.truth(), TRUTH_BUFFER, refusal)?;
-        wake_server(&observer.node, instance)?;
-        Ok(observer)
+        let truth = |services: &Services<'_>| services.truth();
+        Self::new(instance, truth, TRUTH_BUFFER, refusal, true)
     }
 }
 
@@ -98,7 +83,8 @@ impl Observer<AgentHeader> {
     /// If the channel cannot be opened, or has too many readers.
     pub fn agents(instance: &Instance) -> Result<Self, ChannelError> {
         let refusal = "read the agents' beliefs (are there more than 4 readers?)";
-        Self::new(instance, |services| services.agent(), AGENT_BUFFER, refusal)
+        let agent = |services: &Services<'_>| services.agent();
+        Self::new(instance, agent, AGENT_BUFFER, refusal, false)
     }
 }
 
@@ -108,25 +94,30 @@ impl<H: Header> Observer<H> {
         service: impl FnOnce(&Services<'_>) -> Result<PortFactory<Ipc, [u8], H>, ChannelError>,
         buffer: usize,
         refusal: &'static str,
+        is_of_server: bool,
     ) -> Result<Self, ChannelError> {
         let _turn = Turn::take()?;
         let node = create_node()?;
-        let service = service(&Services {
+        let services = Services {
             node: &node,
             instance,
-        })?;
+        };
+        let service = service(&services)?;
         let subscriber = service.subscriber_builder().buffer_size(buffer).create();
+        let subscriber = subscriber.map_err(ipc_error(refusal))?;
+        if is_of_server {
+            wake_server(&services)?;
+        }
+        let now = Instant::now();
         Ok(Self {
-            subscriber: subscriber.map_err(ipc_error(refusal))?,
+            ports: Opened::new(Entries::of(&node)?, (subscriber, node)),
             publisher: Cell::new(None),
             polling: Polling {
                 buffer,
                 is_eager: false,
                 n_found: Cell::new(0),
-                busy: Cell::new(Instant::now()),
+                busy: Cell::new(now),
             },
-            node,
-            end: None,
         })
     }
 
@@ -142,7 +133,7 @@ impl<H: Header> Observer<H> {
     /// samples that this observer lost, as it was too slow.
     ///
     /// # Errors
-    /// If iceoryx2 cannot read the channel.
+    /// If iceoryx2 cannot read the channel, or its files were removed.
     pub fn receive(&self, timeout: Duration) -> Result<Option<Sample<H>>, ChannelError> {
         let start = Instant::now();
         loop {
@@ -158,12 +149,15 @@ impl<H: Header> Observer<H> {
     /// The next sample, if there is one already.
     ///
     /// # Errors
-    /// If iceoryx2 cannot read the channel.
+    /// If iceoryx2 cannot read the channel, or its files were removed.
     pub fn try_receive(&self) -> Result<Option<Sample<H>>, ChannelError> {
-        let sample = self
-            .subscriber
+        let (subscriber, _) = &*self.ports;
+        let sample = subscriber
             .receive()
             .map_err(ipc_error("receive a sample"))?;
+        if sample.is_none() {
+            self.ports.check()?;
+        }
         let n_found = &self.polling.n_found;
         Ok(sample.map(|sample| {
             n_found.set(n_found.get() + 1);
@@ -196,18 +190,11 @@ impl Polling {
 }
 
 /// Wakes a sleeping server, so that it notices the new observer now.
-fn wake_server(node: &Node<Ipc>, instance: &Instance) -> Result<(), ChannelError> {
-    let _turn = Turn::take()?;
-    let services = Services { node, instance };
-    let notifier = services
-        .wake(Channel::WakeServer)?
-        .notifier_builder()
-        .create();
-    notifier
-        .map_err(ipc_error("create a notifier"))?
-        .notify()
-        .map_err(ipc_error("wake the server"))?;
-    Ok(())
+fn wake_server(services: &Services<'_>) -> Result<(), ChannelError> {
+    let wake = services.wake(Channel::WakeServer)?;
+    let notifier = wake.notifier_builder().create();
+    let notified = notifier.map_err(ipc_error("create a notifier"))?.notify();
+    notified.map(drop).map_err(ipc_error("wake the server"))
 }
 
 #[cfg(test)]

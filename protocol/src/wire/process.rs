@@ -3,15 +3,15 @@
 use super::poll::is_readable;
 use rustix::io::Errno;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
+use std::io::{Error, ErrorKind};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use thiserror::Error;
 
 /// A process that is watched until it ends.
 #[derive(Debug)]
 pub struct WatchedProcess(OwnedFd);
 
 /// The process to end with does not run.
-#[derive(Debug, Error, PartialEq, Eq)]
+#[derive(Debug, thiserror::Error, PartialEq, Eq)]
 #[error("--exit-with {pid}: expected a running process, got {errno}")]
 pub struct NotRunning {
     pid: i32,
@@ -48,8 +48,19 @@ impl WatchedProcess {
 }
 
 /// A process's state, such as `R` or `Z`, as `/proc` says; `None` if there is no such process.
-pub(crate) fn process_state(pid: i32) -> Option<char> {
-    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+pub(crate) fn process_state(pid: i32) -> Result<Option<char>, Error> {
+    let stat = if_there(std::fs::read_to_string(format!("/proc/{pid}/stat")))?;
     // After its name, which may hold anything, in brackets.
-    stat.rsplit_once(") ")?.1.chars().next()
+    Ok(stat.and_then(|stat| stat.rsplit_once(") ")?.1.chars().next()))
+}
+
+/// What was read; `None` if it does not exist. Any other error says nothing about that.
+pub(crate) fn if_there<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
+    match read {
+        Ok(found) => Ok(Some(found)),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+        // Of a file in `/proc` that was opened before its process ended.
+        Err(error) if error.raw_os_error() == Some(Errno::SRCH.raw_os_error()) => Ok(None),
+        Err(error) => Err(error),
+    }
 }

@@ -3,27 +3,25 @@
 //! The server uses [`Answers`] on each of its channels; an agent uses a [`Responder`] for the decisions of a world.
 
 use super::channels::{
-    Channel, ChannelError, ControlService, Instance, Ipc, RequestResponse, Services, create_node,
-    ipc_error, server_pid,
+    Channel, ChannelError, ControlService, Entries, Instance, Ipc, RequestResponse, Services,
+    create_node, ipc_error, server_pid,
 };
+use super::failed_connections::FailedConnections;
 use super::message::{ControlReply, ControlRequest, Header, Status, VERSION};
+use super::node::Opened;
 use super::turn::Turn;
 use super::wait::{descriptor, drain};
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::node::Node;
+use iceoryx2::port::ReceiveError;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::{ListenerKey, Notifier};
 use iceoryx2::port::server::Server;
-use iceoryx2::port::{
-    DegradationAction, DegradationCause, DegradationFn, DegradationInfo, ReceiveError,
-};
 use iceoryx2::prelude::{AllocationStrategy, CallbackProgression};
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use serde::Serialize;
 use std::collections::HashMap;
 use std::os::fd::BorrowedFd;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 use thiserror::Error;
 
@@ -52,27 +50,19 @@ pub struct Answers {
     listeners: HashMap<u128, ListenerKey>,
 }
 
-/// Counts connections that could not be opened, for example as no file descriptors are left: their clients get no
-/// answer.
-#[derive(Debug, Clone, Default)]
-pub struct FailedConnections(Arc<AtomicU64>);
-
 /// The answering port for the decisions of a world.
 #[derive(Debug)]
 pub struct Responder {
-    server: ControlServer,
-    answers: Answers,
+    ports: Opened<Ports>,
     failed_connections: FailedConnections,
-    listener: Listener<Ipc>,
-    _node: Node<Ipc>,
-    /// Last, so that all else is dropped within it.
-    end: Option<Turn>,
 }
 
-impl Drop for Responder {
-    fn drop(&mut self) {
-        self.end = Turn::take().ok();
-    }
+#[derive(Debug)]
+struct Ports {
+    server: ControlServer,
+    answers: Answers,
+    listener: Listener<Ipc>,
+    _node: Node<Ipc>,
 }
 
 /// Why decisions cannot be answered.
@@ -95,22 +85,6 @@ pub enum ResponderError {
     /// A channel could not be made.
     #[error(transparent)]
     Channel(#[from] ChannelError),
-}
-
-impl FailedConnections {
-    /// A handler that counts, for a port.
-    pub fn counter(&self) -> impl DegradationFn + 'static {
-        let count = self.0.clone();
-        move |_: DegradationCause, _: &DegradationInfo| {
-            count.fetch_add(1, Ordering::Relaxed);
-            DegradationAction::Ignore
-        }
-    }
-
-    /// The count since the last call.
-    pub fn take(&self) -> u64 {
-        self.0.swap(0, Ordering::Relaxed)
-    }
 }
 
 impl Answers {
@@ -215,28 +189,30 @@ impl Responder {
                 }
             })?;
         let listener = services.listener(Channel::WakeAgent(world))?;
-        Ok(Self {
+        let answers = Answers::new(&services)?;
+        let entries = Entries::of(&node)?;
+        let ports = Ports {
             server,
-            answers: Answers::new(&services)?,
-            failed_connections,
+            answers,
             listener,
             _node: node,
-            end: None,
+        };
+        Ok(Self {
+            ports: Opened::new(entries, ports),
+            failed_connections,
         })
     }
 
     /// The next request.
     pub fn receive(&self) -> Option<ActiveControl> {
-        let request = received(self.server.receive(), &self.failed_connections);
-        if self.failed_connections.take() > 0 {
-            tracing::warn!("a connection could not be opened: are no file descriptors left?");
-        }
+        let request = received(self.ports.server.receive(), &self.failed_connections);
+        self.failed_connections.warn(Instant::now());
         request
     }
 
     /// Answers a request.
     pub fn answer(&mut self, request: &ActiveControl, status: Status, reply: &impl Serialize) {
-        self.answers.send_json(request, status, reply);
+        self.ports.answers.send_json(request, status, reply);
     }
 
     /// Drops wake-ups; returns whether there were any.
@@ -244,12 +220,12 @@ impl Responder {
     /// # Errors
     /// If iceoryx2 cannot read them.
     pub fn drain(&self) -> Result<bool, ChannelError> {
-        drain(&self.listener)
+        drain(&self.ports.listener)
     }
 
     /// Readable while there are wake-ups.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
-        descriptor(&self.listener)
+        descriptor(&self.ports.listener)
     }
 }
 
@@ -261,7 +237,7 @@ pub fn received<T>(
 ) -> Option<T> {
     result.unwrap_or_else(|error| {
         if matches!(error, ReceiveError::ConnectionFailure(_)) {
-            failed_connections.0.fetch_add(1, Ordering::Relaxed);
+            failed_connections.add();
         }
         tracing::debug!(?error, "a request was not received");
         None

@@ -16,8 +16,14 @@ use std::time::{Duration, Instant};
 /// How long to wait for others, each of which takes milliseconds.
 const LONGEST_WAIT: Duration = Duration::from_secs(10);
 
-/// How long to wait before asking whether the process that has the turn is stopped.
+/// The same for what can also be done without a turn, or by the next program: closing and cleaning up.
+pub(crate) const SHORT_WAIT: Duration = Duration::from_secs(1);
+
+/// How long to wait before asking which process has the turn, and whether it is stopped.
 const STOPPED_WAIT: Duration = Duration::from_millis(50);
+
+/// A process that has had the turn for so long does not run: it may be frozen, which it does not show.
+const FROZEN_WAIT: Duration = Duration::from_secs(2);
 
 /// How often to try.
 const INTERVAL: Duration = Duration::from_micros(500);
@@ -46,14 +52,22 @@ pub struct Turn {
 }
 
 impl Turn {
-    /// Waits for a turn. A stopped process that has it is not waited for.
+    /// Waits for a turn. A process that has it and is stopped or frozen is not waited for.
     ///
     /// # Errors
     /// If others hold it for too long, or the directory cannot be written to.
     pub fn take() -> Result<Self, ChannelError> {
+        Self::take_within(LONGEST_WAIT)
+    }
+
+    /// As [`Self::take`], but waits no longer than a limit.
+    pub(crate) fn take_within(limit: Duration) -> Result<Self, ChannelError> {
         let is_outermost = HELD.get() == Held::No;
         let lock = match is_outermost {
-            true => wait(&own_channel_directory()?.join(LOCK), LONGEST_WAIT)?,
+            true => wait(
+                &own_channel_directory()?.join(LOCK),
+                limit.min(LONGEST_WAIT),
+            )?,
             false => None,
         };
         if is_outermost {
@@ -83,9 +97,10 @@ impl Drop for Turn {
     }
 }
 
-/// The lock; `None` if a stopped process has it.
+/// The lock; `None` if a stopped or frozen process has it.
 fn wait(path: &Path, limit: Duration) -> Result<Option<OwnedFd>, ChannelError> {
     let start = Instant::now();
+    let mut held_since = (None, start);
     let flags = OFlags::RDWR | OFlags::CREATE | OFlags::CLOEXEC;
     let wrong = |errno: Errno| not_usable(path, errno.into());
     loop {
@@ -97,8 +112,15 @@ fn wait(path: &Path, limit: Duration) -> Result<Option<OwnedFd>, ChannelError> {
             Err(errno) => return Err(wrong(errno)),
         }
         let elapsed = start.elapsed();
-        if elapsed > STOPPED_WAIT && holder(&file).is_some_and(is_stopped) {
-            return Ok(None);
+        if elapsed > STOPPED_WAIT {
+            let pid = holder(&file);
+            if held_since.0 != pid {
+                held_since = (pid, Instant::now());
+            }
+            let is_frozen = pid.is_some() && held_since.1.elapsed() > FROZEN_WAIT;
+            if is_frozen || pid.is_some_and(is_stopped) {
+                return Ok(None);
+            }
         }
         if elapsed > limit {
             let pid = holder(&file).map_or("a process".into(), |pid| format!("pid {pid}"));
@@ -133,7 +155,7 @@ fn holder(file: &OwnedFd) -> Option<i32> {
 }
 
 fn is_stopped(pid: i32) -> bool {
-    process_state(pid) == Some('T')
+    matches!(process_state(pid), Ok(Some('T' | 't')))
 }
 
 #[cfg(test)]

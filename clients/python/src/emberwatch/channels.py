@@ -11,6 +11,7 @@ import importlib
 import os
 import re
 import stat
+import time
 import weakref
 from collections.abc import Generator
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import Any, Final, Self
 from emberwatch import wire
 from emberwatch.cleanup import ChannelFiles
 from emberwatch.errors import EmberwatchError, InvalidArgumentError
-from emberwatch.turn import cannot_create, turn
+from emberwatch.turn import LONGEST_WAIT, SHORT_WAIT, cannot_create, turn
 
 _INSTANCE: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -30,6 +31,12 @@ _BYTES: Final[Any] = iox2.Slice[ctypes.c_uint8]
 
 #: Where iceoryx2 keeps shared memory: a folder that every user may write to.
 _SHARED_MEMORY: Final = Path("/dev/shm")
+
+#: How often to check that a node's files are still there, seconds.
+_CHECK_INTERVAL: Final = 0.2
+
+#: How long to wait for a segment to be finished, or to be left over, seconds.
+_UNFINISHED: Final = 1.5
 
 iox2.set_log_level(iox2.LogLevel.Fatal)
 
@@ -52,9 +59,11 @@ class Node:
         self._forked = False
         builder = iox2.NodeBuilder.new().signal_handling_mode(iox2.SignalHandlingMode.Disabled)
         config = _config()
+        self._files: list[Path] = []
+        self._checked = 0.0
         with in_turn() as is_alone, channel_errors("create a node"):
             _own_segments(_SHARED_MEMORY, _prefix())
-            _remove_leftovers(is_alone)
+            _make_way(is_alone)
             self.node: Any = builder.config(config).create(iox2.ServiceType.Ipc)
             # Of the first node of all, iceoryx2 lets everybody write to the counter of nodes.
             _own_segments(_SHARED_MEMORY, _prefix())
@@ -86,11 +95,37 @@ class Node:
         _nodes.discard(self)
         with contextlib.ExitStack() as stack:
             with contextlib.suppress(EmberwatchError):
-                stack.enter_context(in_turn())
+                stack.enter_context(in_turn(SHORT_WAIT))
+            if self._removed_file() is not None:
+                self._leak()  # Files of the same names are other programs' by now.
             # The youngest first: ports before the node that they were made from.
             while self._held:
                 self._held.pop()
             self.node = None
+
+    def remember_files(self) -> None:
+        """Lists the files by which others find this node; call it when all ports are made."""
+        base, node = directory(), str(self.node.id.value)
+        tags = list((base / "nodes" / node).iterdir())
+        names = [f"{it.stem}.service" for it in tags if it.suffix == ".service_tag"]
+        services = [base / "services" / name for name in names]
+        self._files = [base / "nodes" / f"{_prefix()}{node}.node_monitor", *tags, *services]
+
+    def check_files(self) -> None:
+        """Raises if these files were removed, which cuts this node off. Costs little."""
+        now = time.monotonic()
+        if now - self._checked > _CHECK_INTERVAL:
+            removed = self._removed_file()
+            if removed is not None:
+                raise EmberwatchError(
+                    f"{removed} was removed while it was in use: keep cleaners of old files away "
+                    f"from {_SHARED_MEMORY}",
+                    "channel",
+                )
+            self._checked = now
+
+    def _removed_file(self) -> Path | None:
+        return next((path for path in self._files if not path.exists()), None)
 
     def open_request_response(
         self, service: str, request: type[wire.Header], reply: type[wire.Header]
@@ -124,28 +159,31 @@ class Node:
         builder = builder.user_header(header).max_publishers(publishers)
         builder = builder.max_subscribers(readers).max_nodes(wire.MAX_NODES).history_size(1)
         builder = builder.subscriber_max_buffer_size(buffer).subscriber_max_borrowed_samples(1)
-        with in_turn(), channel_errors(f"open {service} on instance {self.instance!r}"):
+        with channel_errors(f"open {service} on instance {self.instance!r}"):
             return self.keep(builder.enable_safe_overflow(True).open_or_create())
 
     def open_wake(self, service: str) -> Any:
         builder = self.node.service_builder(self._name(service)).event()
         builder = builder.max_listeners(wire.MAX_NODES).max_notifiers(wire.MAX_NODES)
-        with in_turn(), channel_errors(f"open {service} on instance {self.instance!r}"):
+        with channel_errors(f"open {service} on instance {self.instance!r}"):
             return self.keep(builder.max_nodes(wire.MAX_NODES).open_or_create())
 
     def clean_up(self) -> None:
         """Removes what dead processes left behind, unless another process has the turn."""
         with (
             contextlib.suppress(EmberwatchError),
-            in_turn() as is_alone,
+            in_turn(SHORT_WAIT) as is_alone,
             channel_errors("clean up"),
         ):
             if is_alone:
-                _remove_leftovers(is_alone)
+                _files_of_user().remove_leftovers(_config())
 
     def abandon(self) -> None:
         """In a forked child: nothing of the parent's may be dropped here, so all of it leaks."""
         self._usable, self._forked = False, True
+        self._leak()
+
+    def _leak(self) -> None:
         for port in self._held:
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(port))
 
@@ -183,19 +221,32 @@ def directory() -> Path:
     return _SHARED_MEMORY / f"emberwatch-{os.getuid()}"
 
 
-def in_turn() -> contextlib.AbstractContextManager[bool]:
+def in_turn(limit: float = LONGEST_WAIT) -> contextlib.AbstractContextManager[bool]:
     """A turn of making and removing; yields whether no other process has it."""
-    return turn(_own_directory(directory()))
+    return turn(_own_directory(directory()), limit)
 
 
-def _remove_leftovers(is_alone: bool) -> None:
-    places = ChannelFiles(directory(), _SHARED_MEMORY, _prefix())
-    if is_alone:
-        places.remove_leftovers(_config())
-        return
-    for segment in places.unfinished():
-        problem = "a stopped process is in the middle of making it: continue that, or kill it"
-        raise EmberwatchError(f"{segment}: {problem}", "channel")
+def _files_of_user() -> ChannelFiles:
+    return ChannelFiles(directory(), _SHARED_MEMORY, _prefix())
+
+
+def _make_way(is_alone: bool) -> None:
+    """Removes what dead processes left, and waits for what processes without turns are making.
+
+    iceoryx2 waits without end for an unfinished segment.
+    """
+    deadline = time.monotonic() + _UNFINISHED
+    while True:
+        if is_alone:
+            with contextlib.suppress(Exception):  # The next program tries again.
+                _files_of_user().remove_leftovers(_config())
+        unfinished = _files_of_user().unfinished()
+        if not unfinished:
+            return
+        if time.monotonic() > deadline:
+            problem = "a process is making it, perhaps a stopped one: continue or kill that"
+            raise EmberwatchError(f"{unfinished[0]}: {problem}", "channel")
+        time.sleep(0.01)
 
 
 def _config() -> Any:

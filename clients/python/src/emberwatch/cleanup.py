@@ -7,6 +7,7 @@ a node uses, or left over.
 from __future__ import annotations
 
 import importlib
+import os
 import shutil
 import stat
 import time
@@ -32,30 +33,33 @@ class ChannelFiles:
 
     def unfinished(self) -> list[Path]:
         """Segments that are not finished, which iceoryx2 might wait for without end."""
-        return [path for path in self._shared.glob(f"{self._prefix}*") if _is_unfinished(path)]
+        return [path for path in _entries(self._shared, self._prefix) if self._is_unfinished(path)]
 
     def remove_leftovers(self, config: Any) -> None:
-        """Removes what dead processes left; call it in a turn that no other process shares."""
+        """Removes what dead processes left; call it in a turn that no other process shares.
+
+        The first error ends it: what cannot be read may belong to a process that lives.
+        """
         # Files before nodes and tags, to leave out what others make meanwhile without turns.
-        node_files = list((self._root / "nodes").glob("*"))
-        service_files = list((self._root / "services").glob(f"{self._prefix}*.service"))
+        node_files = _entries(self._root / "nodes")
+        service_files = _entries(self._root / "services", self._prefix, ".service")
         folders = (self._shared, self._root)
-        port_files = [path for folder in folders for path in folder.glob(f"{self._prefix}*")]
+        port_files = [path for folder in folders for path in _entries(folder, self._prefix)]
         living, dead = _nodes(config)
-        ports, services = self._used(living)
+        _, services = self._used(living)
         for path in self.unfinished():
-            ids = self._ids(path)
-            # A port's memory grows without a turn.
-            grows = path.suffix == ".data" and ids & ports
-            if not grows and not any(map(_is_in_the_making, ids)):
+            if not any(map(_is_in_the_making, self._ids(path))):
                 _remove(path)
         for node in dead:
             identity = int(node.id.value)
             # iceoryx2 cannot remove a folder with unfinished tags, which mean nothing yet.
-            for path in filter(_is_writable, self._folder(identity).glob("*")):
+            for path in filter(_is_writable, _entries(self._folder(identity))):
                 _remove(path)
             # Else none of its memory is used by others; the details go last.
-            if node.details is not None and services & self._tags(identity, ".service_tag"):
+            if node.details is None:
+                if (self._folder(identity) / f"{self._prefix}node.details").exists():
+                    living.add(identity)  # They could not be read.
+            elif services & self._tags(identity, ".service_tag"):
                 try:
                     node.try_remove_stale_resources()
                 except _iox2.NodeCleanupFailure:
@@ -81,7 +85,7 @@ class ChannelFiles:
             if path.stem.removeprefix(self._prefix) not in hashes:
                 _remove(path)
                 continue
-            with suppress(OSError, ValueError, KeyError, TypeError):  # It is in the making.
+            with suppress(FileNotFoundError):
                 identity = tomllib.loads(path.read_text())["unique_service_id"]
                 yield identity["unique_value"] << 64 | identity["payload_value"]
 
@@ -98,7 +102,7 @@ class ChannelFiles:
 
     def _tags(self, node: int, suffix: str) -> set[str]:
         """What a node's folder has finished tags of one kind for."""
-        found = self._folder(node).glob(f"{self._prefix}*{suffix}")
+        found = _entries(self._folder(node), self._prefix, suffix)
         found = (path for path in found if not _is_writable(path))
         return {path.name.removeprefix(self._prefix).removesuffix(suffix) for path in found}
 
@@ -107,6 +111,15 @@ class ChannelFiles:
         words = path.name.removeprefix(self._prefix).partition(".")[0].split("_")
         # The segments of one port are numbered; a hash has letters, or more digits than an id.
         return {int(word) for word in words if word.isdecimal() and 10 < len(word) < 40}
+
+    def _is_unfinished(self, path: Path) -> bool:
+        """A segment can be read only when it is finished."""
+        with suppress(FileNotFoundError):
+            found = path.lstat()
+            # A living port's memory grows without a turn, and is not opened before.
+            grows = path.suffix == ".data" and any(map(_lives, self._ids(path)))
+            return not grows and (found.st_size == 0 or not found.st_mode & stat.S_IRUSR)
+        return False
 
 
 def _nodes(config: Any) -> tuple[set[int], list[Any]]:
@@ -118,16 +131,21 @@ def _nodes(config: Any) -> tuple[set[int], list[Any]]:
             dead.append(node._0)
         elif isinstance(node, _iox2.NodeState.Alive):
             living.add(int(node._0.id.value))
-        elif isinstance(node, _iox2.NodeState.Inaccessible):
+        elif isinstance(node, _iox2.NodeState.Inaccessible) or _lives(int(node._0.value)):
+            # Of undefined state are those that died in their start, and those that cannot be read.
             living.add(int(node._0.value))
     return living, dead
 
 
 def _is_in_the_making(identity: int) -> bool:
     """Whether an id was begun just now, by a process that lives."""
-    seconds, nanos, pid = (identity >> shift & 0xFFFFFFFF for shift in (0, 32, 64))
-    is_young = time.monotonic() - seconds - nanos * 1e-9 < _MAKING
-    return is_young and process_state(pid) not in (None, "Z", "X")
+    seconds, nanos = (identity >> shift & 0xFFFFFFFF for shift in (0, 32))
+    return time.monotonic() - seconds - nanos * 1e-9 < _MAKING and _lives(identity)
+
+
+def _lives(identity: int) -> bool:
+    """Whether the process that began an id lives, or another one of its number."""
+    return process_state(identity >> 64 & 0xFFFFFFFF) not in (None, "Z", "X")
 
 
 def _is_writable(path: Path) -> bool:
@@ -137,12 +155,11 @@ def _is_writable(path: Path) -> bool:
     return False
 
 
-def _is_unfinished(path: Path) -> bool:
-    """A segment can be read only when it is finished."""
+def _entries(folder: Path, prefix: str = "", suffix: str = "") -> list[Path]:
     with suppress(FileNotFoundError):
-        found = path.lstat()
-        return found.st_size == 0 or not found.st_mode & stat.S_IRUSR
-    return False
+        names = os.listdir(folder)
+        return [folder / it for it in names if it.startswith(prefix) and it.endswith(suffix)]
+    return []
 
 
 def _remove(path: Path) -> None:

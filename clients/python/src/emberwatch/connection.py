@@ -4,35 +4,51 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final, TypeVar, cast
 
 from emberwatch import wire
-from emberwatch.channels import Closable, Node
-from emberwatch.errors import refusal
+from emberwatch.channels import Closable, Node, in_turn
+from emberwatch.errors import RequestTimeoutError, refusal
 from emberwatch.ports import STEP_TIMEOUT, Peer, RequestPort
 from emberwatch.release import VERSION
 from emberwatch.replies import ServerInfo, record
 from emberwatch.wire import StepAnswer
 
 _Record = TypeVar("_Record")
+_Header = TypeVar("_Header", bound=wire.Header)
 
 
 class Connection(Closable):
     """A channel of JSON messages. Threads may share it: they take turns."""
 
-    def __init__(self, instance: str, service: str, wake: str, who: str) -> None:
-        self._node = Node(instance)
+    def __init__(self, instance: str, service: str, wake: str, who: str, limit: float) -> None:
+        """Opens it within `limit` seconds, all services in one turn."""
+        self._limit, self._began = limit, time.monotonic()
         self._lock = threading.Lock()
         self._sequence = 0
         self._parts: list[Peer | RequestPort[Any]] = []
-        with self._closed_on_error():
-            self._peer = Peer(self._node, wake, who)
-            self._parts.append(self._peer)
-            headers = (wire.ControlRequest, wire.ControlReply)
-            self._control = RequestPort(self._peer, service, headers, slice_len=4096, grows=True)
-            self._parts.insert(0, self._control)
+        with in_turn(limit):
+            self._node = Node(instance)
+            with self._closed_on_error():
+                self._peer = Peer(self._node, wake, who)
+                self._parts.append(self._peer)
+                self._control = self._open(service, wire.ControlRequest, wire.ControlReply)
+                self._control.create(slice_len=4096, grows=True)
+                self._open_others()
+                self._node.remember_files()
+
+    def _open_others(self) -> None:
+        """Opens further services, in the same turn."""
+
+    def _open(
+        self, service: str, request: type[wire.Header], reply: type[_Header]
+    ) -> RequestPort[_Header]:
+        port = RequestPort(self._peer, service, (request, reply))
+        self._parts.insert(0, port)
+        return port
 
     @property
     def instance(self) -> str:
@@ -66,14 +82,22 @@ class Connection(Closable):
         wire.check_answer(f"answer to {what}", head, sequence)
         return reply
 
-    def _shake_hands(self, kind: type[_Record], timeout: float) -> _Record:
+    def _shake_hands(self, kind: type[_Record]) -> _Record:
         """The process's description of itself; from now on its end is noticed."""
         client = f"emberwatch-python {VERSION}"
         hello = {"op": "hello", "protocol": wire.VERSION, "client": client}
-        reply = self.control(hello, timeout=timeout)
+        try:
+            reply = self.control(hello, timeout=self._left())
+        except RequestTimeoutError:
+            problem = f"no answer to 'hello' from instance {self.instance!r} within {self._limit} s"
+            raise RequestTimeoutError(problem) from None
         info = record(kind, reply)
         self._peer.watch(reply["pid"])
         return info
+
+    def _left(self) -> float:
+        """What is left of the time to open it, seconds."""
+        return self._limit - (time.monotonic() - self._began)
 
     @contextmanager
     def _closed_on_error(self) -> Generator[None]:
@@ -88,17 +112,14 @@ class ServerConnection(Connection):
     """A connection to a server, which also steps worlds."""
 
     def __init__(self, instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> None:
-        super().__init__(instance, "control", "wake-server", "server")
+        super().__init__(instance, "control", "wake-server", "server", timeout)
         with self._closed_on_error():
-            self.info: Final = self._shake_hands(ServerInfo, timeout)
-            self._step = RequestPort(
-                self._peer,
-                "step",
-                (wire.StepRequest, wire.StepReply),
-                slice_len=self.info.n_worlds * self.info.n_moves,
-                grows=False,
-            )
-            self._parts.insert(0, self._step)
+            self.info: Final = self._shake_hands(ServerInfo)
+            with in_turn(self._left()):
+                self._step.create(slice_len=self.info.n_worlds * self.info.n_moves, grows=False)
+
+    def _open_others(self) -> None:
+        self._step = self._open("step", wire.StepRequest, wire.StepReply)
 
     def observe(
         self, first_world: int = 0, n_worlds: int = 1, *, timeout: float = STEP_TIMEOUT

@@ -19,15 +19,16 @@ class Decisions(Connection):
     def __init__(
         self, instance: str = "default", world: int = 0, *, timeout: float = STEP_TIMEOUT
     ) -> None:
+        names = (f"decisions-{world}", f"wake-agent-{world}", "agent")
         try:
-            super().__init__(instance, f"decisions-{world}", f"wake-agent-{world}", "agent")
+            super().__init__(instance, *names, timeout)
         except NoServerError:
             raise NoServerError(
                 f"no agent serves decisions for world {world} of instance {instance!r}: start one "
                 f"with `emberwatch-agent serve-decisions --instance {instance} --world {world}`"
             ) from None
         with self._closed_on_error():
-            self.info: Final = self._shake_hands(DecisionsInfo, timeout)
+            self.info: Final = self._shake_hands(DecisionsInfo)
 
     def reset(self, seed: int | None = None, *, timeout: float = RESET_TIMEOUT) -> Decision:
         """Begins an episode with a new belief; without a seed, the server chooses one."""

@@ -106,21 +106,20 @@ class _Reader(Closable, Generic[_Sample]):
         self._many = buffer // 4
         self._n_found = 0
         self._busy_at = time.perf_counter()
-        self._node = Node(instance)
-        try:
-            factory = self._node.open_publications(service, header, readers, buffer, publishers)
-            with (
-                in_turn(),
-                channel_errors(f"read {service} (are there more than {readers} readers?)"),
-            ):
-                port = factory.subscriber_builder().buffer_size(buffer).create()
-                self._subscriber: Any = self._node.keep(port)
-                if publishers == 1:  # the server, which publishes the current state on this
-                    wake = self._node.keep(self._node.open_wake("wake-server").notifier_builder())
-                    self._node.keep(wake.create()).notify()
-        except BaseException:
-            self._node.close()
-            raise
+        with in_turn():
+            self._node = node = Node(instance)
+            try:
+                factory = node.open_publications(service, header, readers, buffer, publishers)
+                with channel_errors(f"read {service} (are there more than {readers} readers?)"):
+                    port = factory.subscriber_builder().buffer_size(buffer).create()
+                    self._subscriber: Any = node.keep(port)
+                    if publishers == 1:  # the server, which publishes the current state on this
+                        wake = node.keep(node.open_wake("wake-server").notifier_builder())
+                        node.keep(wake.create()).notify()
+                    node.remember_files()
+            except BaseException:
+                node.close()
+                raise
 
     @property
     def instance(self) -> str:
@@ -155,6 +154,7 @@ class _Reader(Closable, Generic[_Sample]):
             if sample is not None:
                 self._n_found += 1
                 return self._copied(sample)
+            self._node.check_files()
             waited = time.perf_counter() - start
             if not waited < timeout:
                 return None

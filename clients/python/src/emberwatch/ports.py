@@ -14,7 +14,7 @@ import weakref
 from typing import Any, Final, Generic, TypeVar
 
 from emberwatch import wire
-from emberwatch.channels import Node, channel_errors, in_turn, iox2
+from emberwatch.channels import Node, channel_errors, iox2
 from emberwatch.errors import EmberwatchError, NoServerError, RequestTimeoutError, ServerGoneError
 from emberwatch.spinning import Spinning
 
@@ -43,10 +43,7 @@ class Peer:
         """`wake` is the event service that it listens on, `who` its name in errors."""
         self.node: Final = node
         self._who = who
-        with (
-            in_turn(),
-            channel_errors("open the wake services (are there more than 64 processes?)"),
-        ):
+        with channel_errors("open the wake services (are there more than 64 processes?)"):
             notifier = node.open_wake(wake).notifier_builder().create()
             listener = node.open_wake("wake-client").listener_builder().create()
         self.notify: Any = node.keep(notifier).notify
@@ -131,38 +128,38 @@ class Peer:
 
 
 class RequestPort(Generic[Reply]):
-    """One request-response channel of a server."""
+    """One request-response channel of a server: its service is opened, then its port made."""
 
     def __init__(
         self,
         peer: Peer,
         service: str,
         headers: tuple[type[wire.Header], type[Reply]],
-        *,
-        slice_len: int,
-        grows: bool,
     ) -> None:
-        """Opens the service below the instance.
-
-        `slice_len` is the longest payload of a request, bytes; with `grows`, to begin with.
-        """
-        self._peer = peer
+        """Opens the service below the instance."""
+        self._peer, self._service = peer, service
         self._request, self._reply = headers
         self._request_bytes = ctypes.sizeof(self._request)
         self._reply_bytes = ctypes.sizeof(self._reply)
-        node = peer.node
+        self._factory: Any = peer.node.open_request_response(service, *headers)
+        if self._factory is None or self._factory.dynamic_config.number_of_servers == 0:
+            raise no_server(peer.node, service)
+        self._client: Any = None
+
+    def create(self, *, slice_len: int, grows: bool) -> None:
+        """Makes the port.
+
+        `slice_len` is the longest payload of a request, bytes; with `grows`, to begin with.
+        """
         growth = iox2.AllocationStrategy.PowerOfTwo if grows else iox2.AllocationStrategy.Static
-        with in_turn():
-            factory = node.open_request_response(service, *headers)
-            if factory is None or factory.dynamic_config.number_of_servers == 0:
-                raise no_server(node, service)
-            builder = factory.client_builder().initial_max_slice_len(max(slice_len, 1))
-            with channel_errors(f"create a {service} client (are there more than 16 clients?)"):
-                self._client: Any = node.keep(builder.allocation_strategy(growth).create())
+        builder = self._factory.client_builder().initial_max_slice_len(max(slice_len, 1))
+        problem = f"create a {self._service} client (are there more than 16 clients?)"
+        with channel_errors(problem):
+            self._client = self._peer.node.keep(builder.allocation_strategy(growth).create())
 
     def close(self) -> None:
         """Drops the port; closing the node closes it."""
-        self._client = None
+        self._client = self._factory = None
 
     def exchange(
         self, header: bytes, payload: bytes, what: str, timeout: float

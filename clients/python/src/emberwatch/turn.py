@@ -11,18 +11,26 @@ import fcntl
 import os
 import threading
 import time
+import weakref
 from collections.abc import Generator
 from contextlib import contextmanager
+from io import FileIO
 from pathlib import Path
 from typing import Final
 
 from emberwatch.errors import EmberwatchError
 
 #: How long to wait for the turns of others, which take milliseconds each; seconds.
-_LONGEST_WAIT: Final = 10.0
+LONGEST_WAIT: Final = 10.0
 
-#: How long to wait before asking whether the process that has the turn is stopped, seconds.
+#: The same for what can also be done without one, or by the next program: closing, cleaning up.
+SHORT_WAIT: Final = 1.0
+
+#: How long to wait before asking which process has the turn, and whether it is stopped, seconds.
 _STOPPED_WAIT: Final = 0.05
+
+#: A process that has had it for so long does not run: a frozen one does not look stopped; seconds.
+_FROZEN_WAIT: Final = 2.0
 
 #: How often to try, seconds.
 _INTERVAL: Final = 500e-6
@@ -34,29 +42,29 @@ class _Held(threading.local):
 
 
 _held: Final = _Held()
-_locks: Final[set[int]] = set()
+_locks: Final[weakref.WeakSet[FileIO]] = weakref.WeakSet()
 
 
 @contextmanager
-def turn(directory: Path) -> Generator[bool]:
+def turn(directory: Path, limit: float = LONGEST_WAIT) -> Generator[bool]:
     """Takes a turn; turns of one thread may nest. Yields whether no other process has it.
 
-    It does not wait for a stopped process.
+    It waits `limit` seconds at most, and not for a stopped or frozen process.
     """
     if _held.alone is not None:
         yield _held.alone
         return
-    lock = _wait(directory / "lock")
-    _held.alone = lock is not None
+    lock = None
     try:
+        lock = _wait(directory / "lock", limit)
+        _held.alone = lock is not None
         yield _held.alone
     finally:
         _held.alone = None
-        if lock in _locks:
-            _locks.discard(lock)
+        if lock is not None and not lock.closed:
             # Not by closing alone: a child of a fork may have a copy.
             fcntl.flock(lock, fcntl.LOCK_UN)
-            os.close(lock)
+            lock.close()
 
 
 def process_state(pid: int) -> str | None:
@@ -64,7 +72,7 @@ def process_state(pid: int) -> str | None:
     try:
         # After its name, which may hold anything, in brackets.
         return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(") ")[2][:1]
-    except OSError:
+    except (FileNotFoundError, ProcessLookupError):
         return None
 
 
@@ -78,38 +86,48 @@ def cannot_create(path: Path, error: OSError) -> EmberwatchError:
     return EmberwatchError(f"create {path}: {error.strerror}{remedy}", "channel")
 
 
-def _wait(path: Path) -> int | None:
+def _wait(path: Path, limit: float) -> FileIO | None:
+    """The lock, which ends with its last reference; None if a stopped or frozen process has it."""
     start = time.monotonic()
+    holder, since = None, start
     try:
         while True:
-            lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            lock = _open(path)
+            _locks.add(lock)
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if os.path.samestat(os.fstat(lock), path.stat()):
-                    _locks.add(lock)
+                if os.path.samestat(os.fstat(lock.fileno()), path.stat()):
                     return lock
             except (BlockingIOError, FileNotFoundError):
-                waited = time.monotonic() - start
-                holder = _holder(lock) if waited > _STOPPED_WAIT else None
-                if holder is not None and process_state(holder) == "T":
-                    return None
-                if waited > _LONGEST_WAIT:
-                    raise EmberwatchError(
-                        f"{path}: expected the lock within {_LONGEST_WAIT} s, got it held by "
-                        f"pid {holder}",
-                        "channel",
-                    ) from None
+                now = time.monotonic()
+                if now - start > _STOPPED_WAIT:
+                    before, holder = holder, _holder(lock)
+                    since = since if holder == before else now
+                    if holder is not None and (
+                        now - since > _FROZEN_WAIT or process_state(holder) in ("T", "t")
+                    ):
+                        lock.close()
+                        return None
+                # Not ">": "not a number" would never end.
+                if not now - start < limit:
+                    problem = f"expected the lock within {limit} s, got it held by pid {holder}"
+                    raise EmberwatchError(f"{path}: {problem}", "channel") from None
                 time.sleep(_INTERVAL)
-            finally:
-                if lock not in _locks:
-                    os.close(lock)
+            lock.close()
     except OSError as error:
         raise cannot_create(path, error) from None
 
 
-def _holder(lock: int) -> int | None:
+def _open(path: Path) -> FileIO:
+    def opener(name: str, _flags: int) -> int:
+        return os.open(name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+
+    return open(path, "rb+", buffering=0, opener=opener)
+
+
+def _holder(lock: FileIO) -> int | None:
     """The process that has the lock, as the kernel says."""
-    found = os.fstat(lock)
+    found = os.fstat(lock.fileno())
     inode = f"{os.major(found.st_dev):02x}:{os.minor(found.st_dev):02x}:{found.st_ino}"
     # "1: FLOCK  ADVISORY  WRITE 4711 00:1a:5678 0 EOF"; a process that waits has an arrow in front.
     for line in Path("/proc/locks").read_text().splitlines():
@@ -121,7 +139,7 @@ def _holder(lock: int) -> int | None:
 
 def _forget() -> None:
     for lock in _locks:
-        os.close(lock)
+        lock.close()
     _locks.clear()
     _held.alone = None
 
