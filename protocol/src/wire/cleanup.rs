@@ -373,11 +373,10 @@ mod tests {
             .flat_map(|folder| entries(folder).expect("a folder"))
             .collect();
         for node in entries(&nodes).expect("a folder") {
-            all.extend(
-                node.is_dir()
-                    .then(|| entries(&node).expect("a folder"))
-                    .unwrap_or_default(),
-            );
+            all.extend(match node.is_dir() {
+                true => entries(&node).expect("a folder"),
+                false => Vec::new(),
+            });
         }
         all.extend(files.segments().expect("a folder"));
         all.sort();

@@ -42,8 +42,10 @@ pub struct Connection {
     sequence: u64,
 }
 
+type StepClient = Client<Ipc, [u8], StepRequest, [u8], StepReply>;
+
 struct Ports {
-    step: Option<Client<Ipc, [u8], StepRequest, [u8], StepReply>>,
+    step: Option<StepClient>,
     control: Client<Ipc, [u8], ControlRequest, [u8], ControlReply>,
     exchange: Exchange,
 }

@@ -34,9 +34,11 @@ pub struct Sample<H> {
     pub payload: Vec<u8>,
 }
 
+type Ports<H> = (Subscriber<Ipc, [u8], H>, Node<Ipc>);
+
 /// Reads one channel of an instance, whether a server runs or not.
 pub struct Observer<H: Header> {
-    ports: Opened<(Subscriber<Ipc, [u8], H>, Node<Ipc>)>,
+    ports: Opened<Ports<H>>,
     publisher: Cell<Option<u32>>,
     polling: Polling,
 }
