@@ -136,7 +136,7 @@ fn predictions(guide: &str, estimators: &[EstimatorKind], marks: &[Marks]) -> St
     }
     let mut text = format!("log-likelihood per visited cell on the paths of {guide}:\n");
     for (name, values) in rows {
-        text += &format!("  {name:28}{}\n", estimate(&values));
+        text += &format!("  {name:28} {}\n", estimate(&values));
     }
     text
 }
