@@ -53,7 +53,7 @@ fn kill(program: &Program, notice: impl FnOnce()) -> (Duration, Duration) {
     let process = pidfd_open(pid, PidfdFlags::empty()).expect("a process");
     std::thread::scope(|scope| {
         let killer = scope.spawn(|| {
-            std::thread::sleep(Duration::from_millis(20)); // Whoever waits sleeps by now.
+            std::thread::sleep(Duration::from_millis(20)); // The waiting process sleeps by now.
             let killed = Instant::now();
             program.signal(Signal::KILL);
             sleep_until_readable(&[process.as_fd()], PATIENCE).expect("wait");

@@ -1,7 +1,7 @@
 //! Recent frames of one or more worlds, in blocks that learners run through.
 //!
 //! A *track* is what one robot saw in one episode, without gaps. It is cut into blocks of equal
-//! length; a block keeps the belief before its first frame, which whoever runs through the block
+//! length; a block keeps the belief before its first frame, which the learner that runs through the block
 //! before it renews. Frames of a block that is not full yet are not replayed. The oldest blocks go
 //! when there is no room.
 

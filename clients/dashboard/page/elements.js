@@ -18,7 +18,7 @@ export function swatch(color) {
   return square;
 }
 
-/** Sets an element's text, if it differs: what does not change is not laid out anew. */
+/** Sets an element's text, if it differs: what does not change is not laid out again. */
 export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }

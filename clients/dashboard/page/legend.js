@@ -7,7 +7,7 @@ import { beliefNames, observationNames, stateNames } from "/words.js";
 // More names than this would leave no room for what they explain.
 const MOST_NAMES = 16;
 
-/** The legends above and below the panels; drawn anew only when they change. */
+/** The legends above and below the panels; drawn again only when they change. */
 export function createLegend(list, ramps) {
   let drawn = "";
   return {

@@ -50,7 +50,7 @@ const link = connect({
 function show(next) {
   picture = next;
   facts.recovered();
-  // A server that began anew counts from the start again: nothing is left of the entry looked at.
+  // A server that began again counts from the start again: nothing is left of the entry looked at.
   if (view.at != null && next.kept && view.at > next.kept.last) view.at = null;
   // So does a link to a world that this server has not.
   if (next.info && view.world >= next.info.n_worlds) act.world(0);

@@ -20,7 +20,7 @@ export function createPanels(parent, { pointer, byKey, inspector }) {
   const hold = (cell) => { keyed = cell; byKey(cell); };
   const release = () => { keyed = null; };
 
-  /** Builds panels anew when their number, names or shape change. Tells whether it did. */
+  /** Builds panels again when their number, names or shape change. Tells whether it did. */
   function build(picture) {
     const beliefs = namesOf(picture);
     const key = JSON.stringify([shapeOf(picture), beliefs, stateNames(picture).length]);

@@ -70,7 +70,7 @@ pub fn play(
             while !stop.load(Ordering::Relaxed) && !is_playing(&stage) {
                 std::thread::sleep(TICK);
             }
-            stage.change(begin_anew);
+            stage.change(begin_again);
         }
     });
     Ok(thread?)
@@ -87,7 +87,7 @@ fn wrong(path: &Path, problem: RecordingError) -> PlayError {
     PlayError::File { path, problem }
 }
 
-fn begin_anew(scene: &mut Scene) {
+fn begin_again(scene: &mut Scene) {
     scene.album.clear();
     scene.lost = Lost::default();
     if let Some(player) = &mut scene.player {

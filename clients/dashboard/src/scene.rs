@@ -52,7 +52,7 @@ pub struct Player {
     pub speed: f64,
     /// Whether it runs.
     pub playing: bool,
-    /// Whether it has come to its end; to play it then begins anew.
+    /// Whether it has come to its end; to play it then begins again.
     pub ended: bool,
     /// Why it ended early.
     pub error: Option<String>,
@@ -152,7 +152,7 @@ impl Stage {
 
     /// Reads the scene.
     pub fn look(&self) -> MutexGuard<'_, Scene> {
-        // Whoever panicked while changing it left counts and pictures, nothing that others rely on.
+        // A thread that panicked while changing it left counts and pictures, nothing that others rely on.
         self.scene.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

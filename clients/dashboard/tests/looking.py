@@ -49,7 +49,7 @@ class Look:
         return sum(bool(re.search(pattern, complaint)) for complaint in self._complaints)
 
     def alter(self, change: Callable[[bytes], bytes]) -> None:
-        """Loads the page anew; what the dashboard sends it is changed on the way."""
+        """Loads the page again; what the dashboard sends it is changed on the way."""
 
         def route(socket: WebSocketRoute) -> None:
             dashboard = socket.connect_to_server()

@@ -190,7 +190,7 @@ fn a_belief_without_its_frame_is_not_taken() {
 }
 
 #[test]
-fn an_episode_that_begins_anew_remembers_nothing() {
+fn an_episode_that_begins_again_remembers_nothing() {
     let mut album = Album::default();
     album.add_frame(&frame(5, [255, 0, 1, 255, 255, 255]), Instant::now());
     album.add_frame(&frame(1, [255; 6]), Instant::now());

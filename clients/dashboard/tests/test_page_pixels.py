@@ -189,7 +189,7 @@ def check_levels(levels: np.ndarray, exact: np.ndarray) -> None:
 def check_panels(look, theme, states, observations, unseen) -> None:
     """The pixels are what the arrays are to be coloured like."""
     grid = look.pixels("panel-frame").shape[:2]
-    # The page draws anew in its next frame.
+    # The page draws again in its next frame.
     frame = of_values(look.array("frame").reshape(grid), observations, unseen)
     eventually(
         lambda: np.abs(look.pixels("panel-frame")[..., :3] - frame).max() < 1, f"the theme {theme}"

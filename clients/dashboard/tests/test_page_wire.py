@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable
 
 
-def told_anew(message: bytes, change: Callable[[dict], None]) -> bytes:
+def told_again(message: bytes, change: Callable[[dict], None]) -> bytes:
     """A picture whose words are changed."""
     end = 4 + int.from_bytes(message[:4], "little")
     words = json.loads(message[4:end])
@@ -49,7 +49,7 @@ def test_what_is_lost_or_not_known_is_told(watched):
         for array in words["arrays"]:
             array["name"] = names.get(array["name"], array["name"])
 
-    look.alter(lambda message: told_anew(message, change))
+    look.alter(lambda message: told_again(message, change))
     look.eventually(lambda: look.has("belief", "seen"), "a belief is shown")
     look.eventually(lambda: look.picture(".agent.is_live") is False, "the last picture")
     assert look.text("lost") == "0"

@@ -97,7 +97,7 @@ def test_every_field_is_that_of_single_environments(mode: AutoresetMode, observa
 
 @pytest.mark.parametrize("truth", [False, True])
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=str)
-def test_episodes_end_and_begin_anew_as_in_single_environments(
+def test_episodes_end_and_begin_again_as_in_single_environments(
     mode: AutoresetMode, truth: bool
 ) -> None:
     ours, theirs = pair(4, mode, observation=PARTS, truth=truth, max_episode_steps=3)

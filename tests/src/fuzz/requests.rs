@@ -1,7 +1,7 @@
 //! What the server reads: requests of attackers, while a victim acts on a world of its own.
 //!
 //! A simulator is kept from one input to the next, so that leases, resets and episodes come to every
-//! state, and begins anew after some inputs, so that a failure comes of few of them.
+//! state, and begins again after some inputs, so that few of them cause a failure.
 
 use super::messages::{split_header, survives};
 use super::target::Seed;
