@@ -20,8 +20,3 @@ pub use wire::{
     agent_belief, channels, cleanup, control, decisions, failed_connections, message, observer,
     recording, responder, turn, wait,
 };
-
-/// The names that `agent` uses for [`agent_belief`].
-pub mod outlook {
-    pub use crate::wire::agent_belief::{BeliefPublisher as Showcase, Intent};
-}

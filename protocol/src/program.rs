@@ -10,7 +10,6 @@ use std::sync::atomic::AtomicBool;
 use tracing_subscriber::EnvFilter;
 
 /// The name that `agent` uses.
-pub use crate::wire::process::WatchedProcess as Keeper;
 pub use crate::wire::process::{NotRunning, WatchedProcess};
 
 /// Longest settings or model file, bytes: a model of 64 states with kernels of 15 x 15 cells has 5 MB.

@@ -14,7 +14,7 @@ use protocol::connection::ConnectionError;
 use protocol::control::parse;
 use protocol::decisions::{Reply, Request};
 use protocol::message::{Status, VERSION};
-use protocol::program::Keeper;
+use protocol::program::WatchedProcess;
 use protocol::responder::{ActiveControl, Responder, ResponderError, wait_until_taken};
 use protocol::wait::{Waiter, sleep_until_event};
 use std::cell::Cell;
@@ -49,7 +49,7 @@ pub enum DecisionsError {
 pub fn serve_decisions(
     task: &Assignment,
     model: Option<&Model>,
-    keeper: Option<Keeper>,
+    keeper: Option<WatchedProcess>,
     stop: &AtomicBool,
 ) -> Result<(), DecisionsError> {
     let mut service = Service::start(task, model, keeper)?;
@@ -65,7 +65,7 @@ pub fn serve_decisions(
 struct Service {
     desk: Desk,
     decider: Decider,
-    keeper: Option<Keeper>,
+    keeper: Option<WatchedProcess>,
     waiter: Waiter,
     last_look: Instant,
 }
@@ -94,7 +94,7 @@ impl Service {
     fn start(
         task: &Assignment,
         model: Option<&Model>,
-        keeper: Option<Keeper>,
+        keeper: Option<WatchedProcess>,
     ) -> Result<Self, DecisionsError> {
         // What takes long is done before anybody can ask and before the lease begins to run.
         let (info, model) = prepare(&task.instance, task.world, model)?;
@@ -180,7 +180,7 @@ impl Service {
             self.desk.responder.descriptor(),
             self.decider.server_process(),
         ];
-        let keeper = self.keeper.iter().map(Keeper::descriptor);
+        let keeper = self.keeper.iter().map(WatchedProcess::descriptor);
         let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(keeper).collect();
         sleep_until_event(&descriptors, limit).map_err(ipc_error("sleep"))
     }
@@ -245,7 +245,7 @@ impl Service {
     }
 
     fn keeper_has_ended(&self) -> bool {
-        self.keeper.as_ref().is_some_and(Keeper::has_ended)
+        self.keeper.as_ref().is_some_and(WatchedProcess::has_ended)
     }
 }
 

@@ -8,7 +8,7 @@ use agent::planning::policy::PlannerKind;
 use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
 use protocol::channels::Instance;
-use protocol::program::{Keeper, stop_on_signals};
+use protocol::program::{WatchedProcess, stop_on_signals};
 
 /// Take decisions for one world from a learner outside.
 #[derive(Args)]
@@ -60,7 +60,7 @@ impl ServeDecisionsCommand {
             },
             config: self.settings.effective()?,
         };
-        let keeper = self.exit_with.map(Keeper::watch).transpose()?;
+        let keeper = self.exit_with.map(WatchedProcess::watch).transpose()?;
         let stop = stop_on_signals().context("handle signals")?;
         if !self.wait.for_server(&task.instance, &stop)? {
             return Ok(());

@@ -21,10 +21,10 @@ use crate::rollout::Robot;
 use crate::server::client::{Claim, Client, Observation};
 use crate::server::feed::{Feed, View};
 use protocol::Move;
+use protocol::agent_belief::Intent;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::WorldSeed;
-use protocol::outlook::Intent;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 

@@ -9,8 +9,8 @@ use crate::planning::policy::{PlannerKind, Policy};
 use crate::planning::{
     CellValues, Objective, Plan, PlanBasis, Planner, PlanningProblem, RandomWalk, Target,
 };
+use protocol::agent_belief::Intent;
 use protocol::model::ModelError;
-use protocol::outlook::Intent;
 use protocol::{Cell, Frame, Grid};
 use std::time::Duration;
 use thiserror::Error;

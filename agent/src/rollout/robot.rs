@@ -6,7 +6,7 @@ use crate::estimation::scoring::Score;
 use crate::planning::Plan;
 use crate::rollout::agent::{Agent, AgentError};
 use crate::server::client::Observation;
-use protocol::outlook::Intent;
+use protocol::agent_belief::Intent;
 use protocol::{Cell, Grid, Move};
 use rayon::prelude::*;
 use std::time::{Duration, Instant};

@@ -1,9 +1,9 @@
 //! Shows beliefs to those who look on, as often as a screen shows: the agent's side of the channel `agent`.
 
 use crate::estimation::belief::Belief;
+use protocol::agent_belief::{BeliefPublisher, Intent};
 use protocol::channels::{AGENT_BUFFER, Instance};
 use protocol::message::{AgentHeader, StepResult};
-use protocol::outlook::{Intent, Showcase};
 use std::time::{Duration, Instant};
 
 /// Time between two beliefs of a world that are shown: no screen is faster, and each costs a copy.
@@ -15,7 +15,7 @@ const FAREWELL: Duration = Duration::from_millis(500);
 
 /// What agents of one process show.
 pub struct Feed {
-    showcase: Option<Showcase>,
+    publisher: Option<BeliefPublisher>,
     turns: Turns,
 }
 
@@ -45,11 +45,11 @@ impl Feed {
     pub fn open(instance: &Instance, belief: &Belief) -> Self {
         // The intent is some hundred bytes of text.
         let n_bytes = belief.probabilities().len() * size_of::<f32>() + 1024;
-        let showcase = Showcase::open(instance, n_bytes)
+        let publisher = BeliefPublisher::open(instance, n_bytes)
             .inspect_err(|error| tracing::warn!("beliefs are not shown: {error}"))
             .ok();
         Self {
-            showcase,
+            publisher,
             turns: Turns::default(),
         }
     }
@@ -70,7 +70,9 @@ impl Feed {
 
     /// Whether anybody looks.
     pub fn is_watched(&self) -> bool {
-        self.showcase.as_ref().is_some_and(Showcase::is_watched)
+        self.publisher
+            .as_ref()
+            .is_some_and(BeliefPublisher::is_watched)
     }
 
     /// Ends, when readers have had time to fetch what was shown last.
@@ -83,7 +85,7 @@ impl Feed {
 
     /// Shows a world's belief.
     pub fn show(&mut self, view: &View<'_>) {
-        let Some(showcase) = &mut self.showcase else {
+        let Some(publisher) = &mut self.publisher else {
             return;
         };
         self.turns.pass(Instant::now());
@@ -94,9 +96,9 @@ impl Feed {
             seed: view.result.seed,
             ..AgentHeader::default()
         };
-        if let Err(error) = showcase.show(about, view.belief.probabilities(), &view.intent) {
+        if let Err(error) = publisher.show(about, view.belief.probabilities(), &view.intent) {
             tracing::warn!("beliefs are no longer shown: {error}");
-            self.showcase = None;
+            self.publisher = None;
         }
     }
 }
