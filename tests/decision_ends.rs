@@ -1,6 +1,6 @@
 //! How agents that serve decisions begin, keep their world and end; and learners that are killed.
 
-use crate::harness::{PATIENCE, Program, SMALL, Server, eventually, takeover};
+use crate::harness::{PATIENCE, Program, SMALL, Server, eventually, new_instance, takeover};
 use crate::learner::{Learner, refusal, reply_to, start_agent, start_with_learner};
 use crate::wire::control_header;
 use agent::acting::decider::{Assignment, Decider};
@@ -84,6 +84,17 @@ fn attach(server: &Server) -> Decider {
     let shape = shape_of(&info).expect("a grid");
     let prior = task.config.prior(info.burn_in).belief(&model, shape, 0);
     Decider::attach(&task, model, prior.expect("a belief")).expect("attach")
+}
+
+#[test]
+fn an_agent_that_waits_for_a_server_ends_with_the_process_it_watches() {
+    let mut watched = Command::new("sleep").arg("600").spawn().expect("sleep");
+    let flags = format!("--wait 600 --exit-with {}", watched.id());
+    let agent = start_agent(&new_instance(), &flags);
+    agent.wait_for_words("waiting for it", PATIENCE);
+    watched.kill().expect("kill it");
+    watched.wait().expect("its end");
+    assert_eq!(agent.wait(PATIENCE).code, Some(0));
 }
 
 #[test]

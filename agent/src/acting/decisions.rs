@@ -41,7 +41,7 @@ pub enum DecisionsError {
     Channel(#[from] ChannelError),
 }
 
-/// Serves until `stop` is set, a client asks to shut down, or the keeper ends; then
+/// Serves until `stop` is set, a client asks to shut down, or the process `exit_with` ends; then
 /// releases the world. `model` is for servers that do not reveal theirs.
 ///
 /// # Errors
@@ -49,10 +49,10 @@ pub enum DecisionsError {
 pub fn serve_decisions(
     task: &Assignment,
     model: Option<&Model>,
-    keeper: Option<WatchedProcess>,
+    exit_with: Option<WatchedProcess>,
     stop: &AtomicBool,
 ) -> Result<(), DecisionsError> {
-    let mut service = Service::start(task, model, keeper)?;
+    let mut service = Service::start(task, model, exit_with)?;
     match service.serve(stop) {
         Ok(asked) => service.stop(asked),
         Err(error) => {
@@ -65,7 +65,7 @@ pub fn serve_decisions(
 struct Service {
     desk: Desk,
     decider: Decider,
-    keeper: Option<WatchedProcess>,
+    exit_with: Option<WatchedProcess>,
     waiter: Waiter,
     last_look: Instant,
 }
@@ -94,7 +94,7 @@ impl Service {
     fn start(
         task: &Assignment,
         model: Option<&Model>,
-        keeper: Option<WatchedProcess>,
+        exit_with: Option<WatchedProcess>,
     ) -> Result<Self, DecisionsError> {
         // What takes long is done before anybody can ask and before the lease begins to run.
         let (info, model) = prepare(&task.instance, task.world, model)?;
@@ -119,7 +119,7 @@ impl Service {
                 answered: Vec::new(),
             },
             decider,
-            keeper,
+            exit_with,
             waiter: Waiter::default(),
             last_look: Instant::now(),
         })
@@ -127,7 +127,7 @@ impl Service {
 
     /// Serves to the end; returns the request that asked for it, if it was one.
     fn serve(&mut self, stop: &AtomicBool) -> Result<Option<ActiveControl>, DecisionsError> {
-        while !stop.load(Ordering::Relaxed) && !self.keeper_has_ended() {
+        while !stop.load(Ordering::Relaxed) && !self.watched_has_ended() {
             if let Some(request) = self.wait()? {
                 match self.handle(&request) {
                     Ok(Answer::Reply(reply)) => self.desk.answer(&request, &reply),
@@ -180,8 +180,8 @@ impl Service {
             self.desk.responder.descriptor(),
             self.decider.server_process(),
         ];
-        let keeper = self.keeper.iter().map(WatchedProcess::descriptor);
-        let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(keeper).collect();
+        let exit_with = self.exit_with.iter().map(WatchedProcess::descriptor);
+        let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(exit_with).collect();
         sleep_until_event(&descriptors, limit).map_err(ipc_error("sleep"))
     }
 
@@ -244,8 +244,10 @@ impl Service {
         }
     }
 
-    fn keeper_has_ended(&self) -> bool {
-        self.keeper.as_ref().is_some_and(WatchedProcess::has_ended)
+    fn watched_has_ended(&self) -> bool {
+        self.exit_with
+            .as_ref()
+            .is_some_and(WatchedProcess::has_ended)
     }
 }
 

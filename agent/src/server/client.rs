@@ -12,7 +12,6 @@ use protocol::path::path_to_bytes;
 use protocol::{Cell, Connection, Frame, Move, Shape};
 use std::ops::Range;
 use std::os::fd::BorrowedFd;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// How this program names itself to servers.
@@ -303,17 +302,17 @@ pub fn server_info(instance: &Instance) -> Result<ServerInfo, ConnectionError> {
 }
 
 /// Waits until an instance has a server, and says so once if that is not at once; returns whether it has
-/// one: not if `stop` was set meanwhile.
+/// one: not once `is_over`.
 ///
 /// # Errors
 /// [`ConnectionError`], that of the last try, if there is none within `limit`.
 pub fn wait_for_server(
     instance: &Instance,
     limit: Duration,
-    stop: &AtomicBool,
+    is_over: impl Fn() -> bool,
 ) -> Result<bool, ConnectionError> {
     let (start, mut is_told) = (Instant::now(), false);
-    while !stop.load(Ordering::Relaxed) {
+    while !is_over() {
         match server_info(instance) {
             Ok(_) => return Ok(true),
             Err(error) if is_away(&error) && start.elapsed() < limit => {
