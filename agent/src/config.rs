@@ -172,9 +172,6 @@ impl AgentConfig {
     }
 
     /// Checks every setting.
-    ///
-    /// # Errors
-    /// [`ConfigError::Range`] names the first setting that is wrong.
     pub fn check(self) -> Result<Self, ConfigError> {
         in_range("beam_width", self.beam_width, 10_000)?;
         in_range("shooting_samples", self.shooting_samples, 1_000_000)?;
@@ -250,9 +247,6 @@ impl AgentConfig {
 
 impl AgentFlags {
     /// The effective settings.
-    ///
-    /// # Errors
-    /// [`ConfigError`].
     pub fn effective(&self) -> Result<AgentConfig, ConfigError> {
         let mut config = match (&self.config, self.preset) {
             (Some(path), Preset::Default) => read(path)?,

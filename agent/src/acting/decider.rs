@@ -30,14 +30,12 @@ const RENEW_AFTER: u32 = 3;
 /// Which world to decide for, and how.
 #[derive(Debug, Clone)]
 pub struct Assignment {
-    /// The server.
     pub instance: Instance,
     pub world: u32,
     /// Take the world from its holder.
     pub takeover: bool,
     /// What plans: beam search or shooting.
     pub planner: PlannerKind,
-    /// Settings of planners and estimators.
     pub config: AgentConfig,
 }
 
@@ -99,7 +97,6 @@ impl Decider {
         })
     }
 
-    /// What it says of itself.
     pub fn info(&self) -> &AgentInfo {
         &self.info
     }
@@ -169,9 +166,6 @@ impl Decider {
     }
 
     /// Checks that the server lives; renews the lease if it is time.
-    ///
-    /// # Errors
-    /// [`RunError::Connection`]: the server is gone, or the lease is lost.
     pub fn keep_alive(&mut self, now: Instant) -> Result<(), RunError> {
         self.client.check_server()?;
         if self.until_renewal(now).is_zero() {
@@ -186,7 +180,6 @@ impl Decider {
         self.client.server_process()
     }
 
-    /// Gives the world back.
     pub fn release(mut self) -> Result<(), RunError> {
         leave(&mut self.client, &self.robot)?;
         Ok(self.client.release()?)

@@ -43,9 +43,6 @@ pub enum DecisionsError {
 
 /// Serves until `stop` is set, a client asks to shut down, or the keeper ends; then
 /// releases the world. `model` is for servers that do not reveal theirs.
-///
-/// # Errors
-/// [`DecisionsError`]; those who wait for an answer are refused first.
 pub fn serve_decisions(
     task: &Assignment,
     model: Option<&Model>,

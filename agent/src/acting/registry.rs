@@ -21,9 +21,7 @@ use std::sync::Arc;
 pub struct Task<'a> {
     /// The model, for filters and predictions.
     pub model: &'a Model,
-    /// The grid.
     pub shape: Shape,
-    /// Moves in a path.
     pub n_moves: usize,
     /// The belief before the first frame.
     pub prior: &'a Belief,
@@ -34,10 +32,6 @@ pub struct Task<'a> {
 }
 
 /// A policy's agent, before its first frame.
-///
-/// # Errors
-/// For a model that does not fit the grid, and where what the policy needs to have learned is missing or does
-/// not fit the world.
 pub fn agent(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Agent, AgentError> {
     let estimator = estimator(policy, &task)?;
     let state_names = match policy.estimator {
@@ -61,7 +55,6 @@ pub fn agent(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Ag
     Ok(agent.with_target(target).with_decider(decider))
 }
 
-/// Where the belief comes from.
 fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>, AgentError> {
     let prior = task.prior.clone();
     Ok(match policy.estimator {

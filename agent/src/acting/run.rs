@@ -31,10 +31,8 @@ const REPORT_INTERVAL: Duration = Duration::from_secs(2);
 /// What to do on one world.
 #[derive(Debug, Clone)]
 pub struct Mission {
-    /// The server.
     pub instance: Instance,
     pub world: u32,
-    /// The policy's name.
     pub policy: String,
     /// Steps to act for; 0: until stopped.
     pub steps: u64,
@@ -42,7 +40,6 @@ pub struct Mission {
     pub takeover: bool,
     /// The model, where the server does not reveal its own.
     pub model: Option<Model>,
-    /// Settings of planners and estimators.
     pub config: AgentConfig,
     /// What was learned, for policies that act on it.
     pub learned: Learned,
@@ -51,16 +48,12 @@ pub struct Mission {
 /// What a mission did.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Summary {
-    /// Steps acted.
     pub steps: u64,
     /// Sum of their rewards.
     pub reward: f64,
 }
 
 /// Acts until the steps are done or `stop` is set. Waits for a server that ends, however often.
-///
-/// # Errors
-/// [`RunError`]; a lost lease is one.
 pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
     let (mut summary, mut is_in_step) = (Summary::default(), true);
     let mut attached = Attached::attach(mission, mission.takeover)?;

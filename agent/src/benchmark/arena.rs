@@ -56,9 +56,6 @@ pub enum ArenaError {
 
 impl Arena {
     /// Acquires up to `n_seeds` main worlds, as many scouts if asked, and a spare if there is one.
-    ///
-    /// # Errors
-    /// [`ArenaError::Unfit`] if the server hides its model or its truth or has too few worlds.
     pub fn open(instance: &Instance, n_seeds: u32, needs_scouts: bool) -> Result<Self, ArenaError> {
         let unfit = |needs: String| ArenaError::Unfit {
             instance: instance.name().into(),
@@ -104,12 +101,10 @@ impl Arena {
         })
     }
 
-    /// The server's instance.
     pub fn instance(&self) -> &Instance {
         &self.instance
     }
 
-    /// The main worlds.
     pub fn worlds(&self) -> Range<u32> {
         self.main.clone()
     }
@@ -118,7 +113,6 @@ impl Arena {
         &self.model
     }
 
-    /// The grid.
     pub fn shape(&self) -> Shape {
         self.client.shape()
     }

@@ -27,11 +27,9 @@ const SHOWS_TRUTH: &str = "invariant: an arena shows hidden states";
 pub struct Comparison {
     /// The policies, in the order of the table.
     pub policies: Vec<Policy>,
-    /// The worlds.
     pub seeds: Range<u64>,
     /// Scored steps of each world.
     pub steps: u64,
-    /// Settings of planners and estimators.
     pub config: AgentConfig,
     /// What was learned, for policies that act on it.
     pub learned: Learned,
@@ -51,13 +49,10 @@ pub struct Results {
 /// One world at one step, as a policy saw it.
 #[derive(Debug, Clone)]
 pub struct Moment {
-    /// The world's seed.
     pub seed: u64,
-    /// Step index k.
     pub step: u64,
     /// Hidden states, shape `[H, W]`.
     pub truth: Grid<u8>,
-    /// What the robot saw.
     pub frame: Frame,
     /// The cells of the path, its start first.
     pub path_cells: Vec<Cell>,

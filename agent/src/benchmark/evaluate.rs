@@ -21,26 +21,18 @@ use thiserror::Error;
 /// What is scored.
 #[derive(Debug, Clone)]
 pub struct Examination<'a> {
-    /// Chooses the paths: its name.
     pub guide: &'a str,
-    /// The worlds.
     pub seeds: Range<u64>,
-    /// Steps of each world.
     pub steps: u64,
-    /// Settings of planners and estimators.
     pub config: &'a AgentConfig,
-    /// Whose predictions.
     pub estimators: &'a [EstimatorKind],
-    /// What was learned.
     pub learned: &'a Learned,
 }
 
 /// Scores on one world.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Marks {
-    /// The world.
     pub seed: u64,
-    /// Of each estimator.
     pub scores: Vec<Score>,
     /// How often each value was seen.
     pub counts: Vec<u64>,

@@ -55,9 +55,6 @@ impl Default for DecisionsConfig {
 
 impl DecisionsConfig {
     /// Checks every setting.
-    ///
-    /// # Errors
-    /// [`ConfigError`] names the first that is wrong.
     pub fn check(&self) -> Result<(), ConfigError> {
         let ranges = [
             ("decisions.batch", self.batch, 1, 65_536),
@@ -90,7 +87,6 @@ impl DecisionsConfig {
         }
     }
 
-    /// As the DQN takes them.
     pub fn settings(&self) -> DqnSettings {
         let paper = DqnSettings::paper();
         DqnSettings {

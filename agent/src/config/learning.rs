@@ -31,9 +31,7 @@ pub struct LearningConfig {
     pub steady_updates: u64,
     /// Updates over which it falls linearly.
     pub falling_updates: u64,
-    /// What remains of it.
     pub final_rate: f64,
-    /// Updates per world step.
     pub updates_per_step: f64,
     /// Weight of the prior that the state that pays most is seen almost surely, in cells per cell.
     pub anchor: f64,
@@ -69,9 +67,6 @@ impl Default for LearningConfig {
 
 impl LearningConfig {
     /// Checks every setting.
-    ///
-    /// # Errors
-    /// [`ConfigError`] names the first that is wrong.
     pub fn check(&self) -> Result<(), ConfigError> {
         let sizes = [
             ("learning.window", self.window, 1, 1024),

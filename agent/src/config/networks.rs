@@ -17,7 +17,6 @@ const PAPER_DQN_RATE: f64 = 0.01;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StepSize {
-    /// At the first iteration.
     pub rate: f64,
     /// Iterations after which it has fallen to `2^-power` of that.
     pub steady: u64,
@@ -26,7 +25,6 @@ pub struct StepSize {
 }
 
 impl StepSize {
-    /// Always the same.
     pub fn constant(rate: f64) -> Self {
         Self {
             rate,
@@ -64,7 +62,6 @@ pub struct AutoencoderConfig {
     pub full_frames: u64,
     /// Adam's decay of the mean of gradients, and of the mean of their squares.
     pub betas: [f32; 2],
-    /// Adam's step size.
     pub step_size: StepSize,
 }
 
@@ -98,9 +95,6 @@ impl AutoencoderConfig {
     }
 
     /// Checks every setting.
-    ///
-    /// # Errors
-    /// [`ConfigError`] names the first that is wrong.
     pub fn check(&self) -> Result<(), ConfigError> {
         let least_states = if self.states == 0 { 0 } else { 2 };
         let sizes = [
@@ -164,7 +158,6 @@ pub struct DqnConfig {
     pub epsilon_steps: u64,
     /// Double DQN: the network picks the action whose value its target gives.
     pub double: bool,
-    /// Adam's step size.
     pub step_size: StepSize,
 }
 
@@ -182,7 +175,6 @@ impl Default for DqnConfig {
 }
 
 impl DqnConfig {
-    /// What the authors ran.
     pub fn paper() -> Self {
         let settings = DqnSettings::paper();
         Self {
@@ -201,9 +193,6 @@ impl DqnConfig {
     }
 
     /// Checks every setting.
-    ///
-    /// # Errors
-    /// [`ConfigError`] names the first that is wrong.
     pub fn check(&self) -> Result<(), ConfigError> {
         between("dqn.batch", self.batch, 1, 65_536)?;
         between("dqn.n_step", self.n_step, 1, 1_000)?;

@@ -26,9 +26,6 @@ pub trait Estimator: Send {
     fn belief(&self) -> &Belief;
 
     /// Takes in the state X_{k+1} that the next path will meet, where somebody knows it.
-    ///
-    /// # Errors
-    /// [`BeliefError`] for states that the model does not have.
     fn foresee(&mut self, _next: &Grid<u8>) -> Result<(), BeliefError> {
         Ok(())
     }
@@ -48,9 +45,6 @@ pub trait Estimator: Send {
     fn set_belief(&mut self, _belief: Belief) {}
 
     /// How well the belief predicts a frame; `None` of estimators that predict none.
-    ///
-    /// # Errors
-    /// Where a network's device fails.
     fn score(&self, _frame: &Frame) -> Result<Option<Score>, EstimatorError> {
         Ok(None)
     }

@@ -30,9 +30,7 @@ const NOISE: f32 = 0.1;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Dimensions {
-    /// Number of states S.
     pub n_states: usize,
-    /// Number of observations O.
     pub n_observations: usize,
     /// Rows and columns of the kernel, odd.
     pub kernel: (usize, usize),
@@ -41,7 +39,6 @@ pub struct Dimensions {
 /// The three tensors, in the order of [`Parameters::NAMES`]: free numbers, gradients or moments.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameters {
-    /// Their shapes.
     pub dimensions: Dimensions,
     /// `[S, S, KH, KW]`, `[S, O]` and `[S]`, row-major.
     pub tensors: [Vec<f32>; 3],
@@ -50,7 +47,6 @@ pub struct Parameters {
 /// What the free numbers stand for.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tables<T = f32> {
-    /// Their shapes.
     pub dimensions: Dimensions,
     /// `w[to, from, row, col]`.
     pub kernel: Vec<T>,
@@ -107,7 +103,6 @@ impl Dimensions {
         ]
     }
 
-    /// Numbers in each tensor.
     pub fn lengths(&self) -> [usize; 3] {
         self.shapes().map(|shape| shape.iter().product())
     }
@@ -148,7 +143,6 @@ impl Parameters {
         }
     }
 
-    /// Zeros of the same shapes.
     pub fn zeros(dimensions: Dimensions) -> Self {
         let tensors = dimensions.lengths().map(|length| vec![0.0; length]);
         Self {
@@ -157,7 +151,6 @@ impl Parameters {
         }
     }
 
-    /// What these numbers stand for.
     pub fn tables<T: NdFloat>(&self) -> Tables<T> {
         let cast = |value: f64| T::from(value).expect("invariant: f64 casts to T");
         let [kernel, likelihood, initial] = &self.tensors;

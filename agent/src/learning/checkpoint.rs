@@ -43,7 +43,6 @@ const FORM: Configuration<LittleEndian, Fixint> =
 /// One tensor.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor {
-    /// Its shape.
     pub shape: Vec<usize>,
     /// Its numbers, row-major.
     pub numbers: Vec<f32>,
@@ -52,11 +51,8 @@ pub struct Tensor {
 /// The contents of a checkpoint.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Contents {
-    /// By name.
     pub tensors: BTreeMap<String, Tensor>,
-    /// A learner's other values, encoded.
     pub state: Vec<u8>,
-    /// The effective settings, TOML.
     pub settings: String,
 }
 
@@ -74,16 +70,12 @@ impl Contents {
         contents
     }
 
-    /// Replaces the state.
     pub fn set_state(&mut self, state: &impl Serialize) {
         let state = bincode::serde::encode_to_vec(state, FORM);
         self.state = state.expect("invariant: states hold values and sequences of known length");
     }
 
     /// The state, as a learner's type.
-    ///
-    /// # Errors
-    /// For bytes that are no such state. What its values mean is not checked.
     pub fn state<S: DeserializeOwned>(&self) -> Result<S, Problem> {
         use bincode::serde::decode_from_slice as decode;
         // The limit is part of a type: the smallest one, so that a small file cannot ask for much memory.
@@ -100,9 +92,6 @@ impl Contents {
     }
 
     /// A tensor's numbers; it must be there, in this shape, with finite numbers.
-    ///
-    /// # Errors
-    /// Names what is wrong with it.
     pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>, Problem> {
         let wrong = |got: &str| Problem::value(name, format_args!("shape {expected:?}"), got);
         let tensor = self.tensors.get(name).ok_or_else(|| wrong("none"))?;
@@ -114,9 +103,6 @@ impl Contents {
     }
 
     /// Refuses means of squares, whose roots are taken, that are negative.
-    ///
-    /// # Errors
-    /// Names the tensor.
     pub fn check_squares(&self) -> Result<(), Problem> {
         let ends = [".second_moment", "running_var"];
         let is_square = |name: &str| {
@@ -130,9 +116,6 @@ impl Contents {
     }
 
     /// The settings that it was trained with.
-    ///
-    /// # Errors
-    /// For none, or others than an agent's.
     pub fn settings(&self) -> Result<AgentConfig, Problem> {
         let wrong = |got: String| Problem::value(SETTINGS, "those of an agent", got);
         if self.settings.is_empty() {
@@ -182,9 +165,6 @@ pub fn write(path: &Path, kind: &'static str, contents: &Contents) -> Result<(),
 }
 
 /// Reads a checkpoint of one of some kinds, and tells which.
-///
-/// # Errors
-/// Names the file and what is wrong with it.
 pub fn read(
     path: &Path,
     kinds: &[&'static str],
@@ -204,9 +184,6 @@ pub fn read(
 }
 
 /// A checkpoint of a kind of learner as bytes.
-///
-/// # Errors
-/// For one that is too large.
 pub fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>, Problem> {
     let tensors = contents.tensors.iter();
     let tensor = |(name, tensor): (&String, &Tensor)| {
@@ -234,9 +211,6 @@ pub fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>, Proble
 }
 
 /// The checkpoint of one of some kinds that bytes are, and which.
-///
-/// # Errors
-/// Names what is wrong with it.
 pub fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Contents), Problem> {
     let file = SafeTensors::deserialize(bytes).map_err(damaged)?;
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(damaged)?;

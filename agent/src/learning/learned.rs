@@ -26,9 +26,6 @@ pub struct Learned {
 
 impl Learned {
     /// What some checkpoints hold, of each kind one at most; networks compute on `device`.
-    ///
-    /// # Errors
-    /// [`CheckpointError`] names the file that cannot be read, or is the second of its kind.
     pub fn read<'a>(
         paths: impl IntoIterator<Item = &'a Path>,
         device: &Device,
@@ -43,9 +40,6 @@ impl Learned {
     }
 
     /// What one checkpoint holds, of whatever kind.
-    ///
-    /// # Errors
-    /// [`Problem`].
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, Problem> {
         let (kind, contents) = checkpoint::decode(&KINDS, bytes)?;
         let mut learned = Self::default();

@@ -24,7 +24,6 @@ const HEADER: [&str; 6] = [
 pub struct Tick {
     /// World steps so far, of all worlds together.
     pub world_steps: u64,
-    /// Worlds that made the step.
     pub n_worlds: u64,
     /// Sum of their rewards.
     pub reward: f64,
@@ -87,24 +86,17 @@ impl MetricsError {
 pub struct Metrics {
     path: PathBuf,
     writer: csv::Writer<std::fs::File>,
-    /// Columns of the learner's own.
     n_more: usize,
 }
 
 impl Metrics {
     /// Begins a file. `more`: columns of the learner's own.
-    ///
-    /// # Errors
-    /// [`MetricsError`].
     pub fn begin(path: &Path, more: &[&str]) -> Result<Self, MetricsError> {
         Self::write(path, more, &[])
     }
 
     /// Goes on with a file, from which rows after some world step go, as they came after what is gone on
     /// from, and rows that a kill cut off; begins it if it is not there.
-    ///
-    /// # Errors
-    /// [`MetricsError`], also for a file with other columns.
     pub fn go_on(path: &Path, more: &[&str], world_steps: u64) -> Result<Self, MetricsError> {
         if !path.exists() {
             return Self::begin(path, more);
@@ -153,9 +145,6 @@ impl Metrics {
     }
 
     /// Adds a step's rows.
-    ///
-    /// # Errors
-    /// [`MetricsError`].
     pub fn add(
         &mut self,
         tick: &Tick,
@@ -172,9 +161,6 @@ impl Metrics {
     }
 
     /// Writes what is still in memory.
-    ///
-    /// # Errors
-    /// [`MetricsError`].
     pub fn flush(&mut self) -> Result<(), MetricsError> {
         let flushed = self.writer.flush();
         flushed.map_err(|problem| self.fail(problem.into()))
@@ -238,9 +224,6 @@ pub struct Rows {
 
 impl Rows {
     /// Reads the file of a folder. What is no number is as if it were not there.
-    ///
-    /// # Errors
-    /// [`MetricsError`].
     pub fn read(folder: &Path) -> Result<Self, MetricsError> {
         let path = folder.join(METRICS);
         let fail = |problem: csv::Error| MetricsError::new(&path, problem);
@@ -256,12 +239,10 @@ impl Rows {
         Ok(Self { names, rows })
     }
 
-    /// Number of rows.
     pub fn len(&self) -> usize {
         self.rows.len()
     }
 
-    /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.rows.is_empty()
     }

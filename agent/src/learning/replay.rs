@@ -23,7 +23,6 @@ pub struct Sighting {
 /// Consecutive frames of one track.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Block {
-    /// What each frame shows.
     pub frames: Vec<Vec<Sighting>>,
     /// The belief before the first frame, shape `[S, H, W]`; `None` at the start of a track.
     pub start: Option<Vec<f32>>,
@@ -104,7 +103,6 @@ impl Replay {
         }
     }
 
-    /// Number of full blocks.
     pub fn n_blocks(&self) -> usize {
         self.full.len()
     }
@@ -130,9 +128,6 @@ impl Replay {
     }
 
     /// Goes on from another replay with blocks of the same length; of more blocks than fit, the newest stay.
-    ///
-    /// # Errors
-    /// Names what cannot have been seen of such worlds.
     pub fn resume(
         &mut self,
         other: Self,

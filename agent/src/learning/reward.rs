@@ -33,7 +33,6 @@ pub struct RewardEstimate {
 }
 
 impl RewardEstimate {
-    /// Before the first path.
     pub fn new(n_states: usize) -> Self {
         Self {
             products: vec![0.0; n_states * n_states],
@@ -42,9 +41,6 @@ impl RewardEstimate {
     }
 
     /// Refuses one from a checkpoint that is not of so many states.
-    ///
-    /// # Errors
-    /// Names the field.
     pub fn check(&self, n_states: usize) -> Result<(), Problem> {
         check_numbers("reward.products", &self.products, n_states * n_states)?;
         check_numbers("reward.rewards", &self.rewards, n_states)

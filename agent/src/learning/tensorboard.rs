@@ -27,15 +27,12 @@ const RGB: u64 = 3;
 /// What is told of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Value<'a> {
-    /// A number.
     Scalar(f64),
-    /// A picture.
     Image {
         /// Height in pixels.
         height: usize,
         /// Width in pixels.
         width: usize,
-        /// The file.
         png: &'a [u8],
     },
 }
@@ -58,9 +55,6 @@ pub struct EventFile {
 impl EventFile {
     /// Begins a file in a folder, which is made where it is not there. What other files of the folder hold
     /// for `next_step` and later steps counts no more.
-    ///
-    /// # Errors
-    /// [`EventsError`].
     pub fn begin(folder: &Path, next_step: u64) -> Result<Self, EventsError> {
         let fail = |problem| EventsError {
             path: folder.to_owned(),
@@ -78,9 +72,6 @@ impl EventFile {
     }
 
     /// Adds what is told of a step, by name.
-    ///
-    /// # Errors
-    /// [`EventsError`].
     pub fn add<'a>(
         &mut self,
         step: u64,
@@ -92,9 +83,6 @@ impl EventFile {
     }
 
     /// Writes what is still in memory.
-    ///
-    /// # Errors
-    /// [`EventsError`].
     pub fn flush(&mut self) -> Result<(), EventsError> {
         let flushed = self.file.flush();
         flushed.map_err(|problem| self.fail(problem))

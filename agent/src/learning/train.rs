@@ -47,17 +47,12 @@ pub struct TrainSummary {
     pub steps: u64,
     /// Updates made, with those before a resume.
     pub updates: u64,
-    /// Sum of rewards.
     pub reward: f64,
-    /// Time spent, by part.
     pub times: Vec<(&'static str, Duration)>,
 }
 
 /// Trains on a server until the steps are done, the time is over or `stop` is set; saves in any case.
 /// `contents`: what [`Training::check`] gave.
-///
-/// # Errors
-/// [`TrainError`].
 pub fn train(
     instance: &Instance,
     training: &Training,
@@ -276,7 +271,6 @@ fn is_over(seen: &Observation) -> bool {
     seen.result.truncated != 0 || seen.result.terminated != 0
 }
 
-/// Starts a world's next episode.
 fn reset(client: &mut Client, world: u32) -> Result<Observation, ConnectionError> {
     client.reset(&[WorldSeed { world, seed: None }])?;
     Ok(client.observe(world..world + 1)?.remove(0))

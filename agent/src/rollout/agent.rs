@@ -30,7 +30,6 @@ pub struct Agent {
     target: Option<usize>,
     /// What the last path was for.
     pub(crate) aim: Aim,
-    /// Names of the belief's states.
     state_names: Vec<String>,
     n_moves: usize,
     seed: u64,
@@ -61,11 +60,8 @@ pub enum Choice {
 /// What an agent has beside its estimator and its policy.
 #[derive(Debug, Clone)]
 pub struct Setup {
-    /// What paths are planned on.
     pub basis: PlanBasis,
-    /// Names of the belief's states.
     pub state_names: Vec<String>,
-    /// Moves in a path.
     pub n_moves: usize,
     /// Seed of the planner's random numbers: the agent's and the world's.
     pub seed: u64,
@@ -191,9 +187,6 @@ impl Agent {
     }
 
     /// How well the belief predicts a frame; `None` of an estimator that predicts none.
-    ///
-    /// # Errors
-    /// Where a network's device fails.
     pub fn score(&self, frame: &Frame) -> Result<Option<Score>, AgentError> {
         Ok(self.estimator.score(frame)?)
     }
@@ -220,9 +213,6 @@ impl Agent {
     }
 
     /// Tells a clairvoyant agent the state X_{k+1} that its next path will meet; others ignore it.
-    ///
-    /// # Errors
-    /// [`BeliefError`] for states that the model does not have.
     pub fn foresee(&mut self, next: &Grid<u8>) -> Result<(), BeliefError> {
         self.estimator.foresee(next)
     }
@@ -232,17 +222,14 @@ impl Agent {
         self.estimator.belief()
     }
 
-    /// Where its belief comes from.
     pub fn estimator(&self) -> &dyn Estimator {
         &*self.estimator
     }
 
-    /// The same, to be changed.
     pub fn estimator_mut(&mut self) -> &mut dyn Estimator {
         &mut *self.estimator
     }
 
-    /// What paths are planned on.
     pub fn basis_mut(&mut self) -> &mut PlanBasis {
         &mut self.basis
     }

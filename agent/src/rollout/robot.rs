@@ -13,7 +13,6 @@ use std::time::{Duration, Instant};
 
 /// An agent at its world.
 pub struct Robot {
-    /// What estimates and plans.
     pub agent: Agent,
     observation: Observation,
     planning: Duration,
@@ -22,7 +21,6 @@ pub struct Robot {
 /// What a world shows after a step.
 #[derive(Debug, Clone)]
 pub struct Seen {
-    /// Result and frame.
     pub observation: Observation,
     /// The hidden states X_k, shape `[H, W]`, where they are published.
     pub truth: Option<Grid<u8>>,
@@ -30,9 +28,7 @@ pub struct Seen {
 
 /// What a step did to one robot. Between correction and prediction: its agent's belief is the posterior.
 pub struct Turn {
-    /// What the world showed before.
     pub before: Observation,
-    /// The path that was flown.
     pub plan: Plan,
     /// The hidden states X_{k+1}, where they are published.
     pub truth: Option<Grid<u8>>,
@@ -51,9 +47,6 @@ impl Robot {
     }
 
     /// Takes in what the world shows; `look` finds the posterior. The belief is then about X_{k+1}.
-    ///
-    /// # Errors
-    /// If the frame is impossible or the hidden states are missing.
     pub fn begin(
         &mut self,
         truth: Option<&Grid<u8>>,
@@ -66,9 +59,6 @@ impl Robot {
     }
 
     /// [`Self::new`] and [`Self::begin`].
-    ///
-    /// # Errors
-    /// As [`Self::begin`].
     pub fn at(agent: Agent, seen: Seen) -> Result<Self, AgentError> {
         let mut robot = Self::new(agent, seen.observation);
         robot.begin(seen.truth.as_ref(), |_| ())?;
@@ -80,7 +70,6 @@ impl Robot {
         self.agent.intent(self.planning)
     }
 
-    /// What its world shows.
     pub fn observation(&self) -> &Observation {
         &self.observation
     }
@@ -124,9 +113,6 @@ impl Robot {
 
 /// One step of all robots. `robot` finds a run's own; `plan` chooses its path; `fly` flies all paths and gives what
 /// each world shows then, in order; `look` is told of each run's turn, by its index, one after the other.
-///
-/// # Errors
-/// Those of `fly` and `look`, and that of the first agent that cannot take in what it sees.
 pub fn step<R: Send, E: From<AgentError>>(
     runs: &mut [R],
     robot: impl Fn(&mut R) -> &mut Robot + Sync,

@@ -30,9 +30,7 @@ pub const CONTROL_TIMEOUT: Duration = Duration::from_secs(120);
 /// What a world shows after a step, or when it is taken over.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Observation {
-    /// Step index, reward, counts, robot.
     pub result: StepResult,
-    /// What the robot saw.
     pub frame: Frame,
 }
 
@@ -71,7 +69,6 @@ impl Observation {
         ]
     }
 
-    /// The robot's cell.
     pub fn robot(&self) -> Cell {
         Cell {
             row: self.result.row as usize,
@@ -102,12 +99,10 @@ impl Client {
         self.connection.info()
     }
 
-    /// The grid.
     pub fn shape(&self) -> Shape {
         self.shape
     }
 
-    /// The worlds held.
     pub fn worlds(&self) -> Range<u32> {
         self.worlds.clone()
     }
@@ -238,7 +233,6 @@ impl Client {
         self.connection.check_server()
     }
 
-    /// Gives the worlds back.
     pub fn release(mut self) -> Result<(), ConnectionError> {
         let request = Request::Release { lease: self.lease };
         self.connection.control(&request, STEP_TIMEOUT).map(|_| ())
@@ -304,9 +298,6 @@ pub fn server_info(instance: &Instance) -> Result<ServerInfo, ConnectionError> {
 
 /// Waits until an instance has a server, and says so once if that is not at once; returns whether it has
 /// one: not if `stop` was set meanwhile.
-///
-/// # Errors
-/// [`ConnectionError`], that of the last try, if there is none within `limit`.
 pub fn wait_for_server(
     instance: &Instance,
     limit: Duration,
@@ -356,9 +347,6 @@ pub fn is_belief_left(
 }
 
 /// A server's grid.
-///
-/// # Errors
-/// [`ConnectionError::Garbled`] if it is none.
 pub fn shape_of(info: &ServerInfo) -> Result<Shape, ConnectionError> {
     let shape = Shape::new(info.height, info.width);
     shape.map_err(|error| ConnectionError::Garbled {

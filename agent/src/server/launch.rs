@@ -90,9 +90,6 @@ impl OwnServer {
 impl OwnDashboard {
     /// Starts `emberwatch-dashboard` for an instance; browsers reach its page at `address`. It ends with this
     /// process, however that ends.
-    ///
-    /// # Errors
-    /// [`LaunchError`], also when the address is taken: its own words stand above.
     pub fn start(instance: &Instance, address: SocketAddr) -> Result<Self, LaunchError> {
         let mut command = private(beside_this("emberwatch-dashboard"));
         let address = address.to_string();
@@ -122,7 +119,6 @@ impl OwnDashboard {
         }
     }
 
-    /// Where its page is.
     pub fn url(&self) -> &str {
         &self.url
     }

@@ -34,7 +34,6 @@ pub struct TruthFeed {
 }
 
 impl TruthFeed {
-    /// Attaches to the truth channel.
     pub fn open(instance: &Instance, shape: Shape) -> Result<Self, TruthError> {
         Ok(Self {
             observer: Observer::truth(instance)?,
@@ -45,9 +44,6 @@ impl TruthFeed {
     /// The states of consecutive worlds at a step of the episodes with these seeds.
     ///
     /// Samples of other worlds, steps and episodes are passed over, so read each step once, in order.
-    ///
-    /// # Errors
-    /// [`TruthError::Missing`] names the first world whose state did not come.
     pub fn states(
         &self,
         worlds: Range<u32>,

@@ -31,22 +31,16 @@ pub struct Snapshot<'a> {
     pub truth: Grid<u8>,
     /// What the sensor would have shown of each cell.
     pub observation: Grid<u8>,
-    /// What the robot saw.
     pub frame: Frame,
     /// The robot's cells, the start first.
     pub path_cells: Vec<Cell>,
     /// The belief after the frame, shape `[S, H, W]`.
     pub belief: &'a Probabilities,
-    /// The step k.
     pub step: u64,
-    /// Seed of the world.
     pub seed: u64,
 }
 
 /// Puts a page at `path`: as SVG where the path ends so, else as PNG.
-///
-/// # Errors
-/// [`ReportError::Write`] names `path`.
 pub fn save(path: &Path, svg: &str) -> Result<(), ReportError> {
     let is_svg = path.extension().is_some_and(|extension| extension == "svg");
     replace_file(path, if is_svg { "svg" } else { "png" }, |temporary| {
@@ -60,9 +54,6 @@ pub fn save(path: &Path, svg: &str) -> Result<(), ReportError> {
 
 /// Draws mean reward per policy, the best at the top. `axis_label` says what the reward counts, see
 /// [`FIRE_CELLS_PER_STEP`].
-///
-/// # Errors
-/// [`ReportError::Empty`] without runs; a reward that is not finite, or a file that cannot be written.
 pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<(), ReportError> {
     if runs.is_empty() {
         return Err(ReportError::Empty { what: "ladder" });
@@ -138,9 +129,6 @@ fn ladder_note(runs: &[PolicyRun]) -> String {
 
 /// Draws the rewards over time of up to eight policies (those with the highest mean), means over worlds;
 /// `fire_cells` is the number of burning cells per step, shaded in the background.
-///
-/// # Errors
-/// [`ReportError::Empty`] without rewards; a reward that is not finite, or a file that cannot be written.
 pub fn draw_rewards(
     path: &Path,
     runs: &[PolicyRun],
@@ -161,10 +149,6 @@ pub fn draw_rewards(
 }
 
 /// Draws a step; the picture grows in height with the number of states.
-///
-/// # Errors
-/// [`ReportError::Snapshot`] names the part that does not fit the grid or the model; a file that cannot be
-/// written.
 pub fn draw_snapshot(path: &Path, snapshot: &Snapshot<'_>) -> Result<(), ReportError> {
     let (file, shape) = (snapshot.model.file(), snapshot.truth.dim());
     let states = file.states.iter().map(|it| named(&it.name, &it.color));

@@ -33,9 +33,6 @@ pub enum ReportError {
 }
 
 /// Writes a file beside `path` and renames it, so that `path` is never half a file.
-///
-/// # Errors
-/// [`ReportError::Write`] names `path`.
 pub(crate) fn replace_file<E: Display>(
     path: &Path,
     extension: &str,

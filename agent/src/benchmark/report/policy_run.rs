@@ -10,9 +10,7 @@ pub struct PolicyRun {
     /// Where the belief came from: `none`, `known_model`, `truth`, `next_truth` or a learned one.
     pub estimator: String,
     pub world_seed: u64,
-    /// Number of scored steps.
     pub steps: u64,
-    /// Mean reward of a step.
     pub mean_reward: f64,
     /// Mean number of distinct cells visited in a step.
     pub mean_distinct_cells: f64,

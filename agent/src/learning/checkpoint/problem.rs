@@ -24,18 +24,11 @@ pub struct CheckpointError {
 /// What is wrong with a checkpoint.
 #[derive(Debug, Error)]
 pub enum Problem {
-    /// The system refused.
     #[error("{0}")]
     Io(#[from] std::io::Error),
     /// The form is right and the numbers are not those that were written.
     #[error("expected contents with digest {expected}, got {got}: the file is damaged")]
-    Digest {
-        /// What the file says.
-        expected: String,
-        /// What its contents give.
-        got: String,
-    },
-    /// The networks in it.
+    Digest { expected: String, got: String },
     #[error(transparent)]
     Network(#[from] ::network::NetworkError),
     /// Contents that the program cannot work with: what, expected and got.
@@ -44,7 +37,6 @@ pub enum Problem {
 }
 
 impl Problem {
-    /// The error for a file.
     pub fn of(self, path: &Path) -> CheckpointError {
         let path = path.to_owned();
         let problem = self;
@@ -75,7 +67,6 @@ pub fn check(
     }
 }
 
-/// Refuses counters that might overflow.
 pub fn check_counts(counts: &[(&str, u64)]) -> Result<(), Problem> {
     let expected = format!("at most {MAX_COUNT}");
     let mut counts = counts.iter();

@@ -45,9 +45,7 @@ pub struct Laps {
 /// Where the updates have come to.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Iterates {
-    /// The parameters.
     pub parameters: Parameters,
-    /// The optimiser.
     pub adam: Adam,
 }
 
@@ -58,7 +56,6 @@ pub struct Update {
     pub number: u64,
     /// Minus the mean log-likelihood of a visited cell, before the update.
     pub loss: f64,
-    /// The kernel's step size.
     pub rate: f64,
 }
 
@@ -66,11 +63,8 @@ pub struct Update {
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("update {update}: {tensor}: expected finite numbers, got {what}")]
 pub struct NotFinite {
-    /// The update.
     pub update: u64,
-    /// The tensor.
     pub tensor: &'static str,
-    /// Which number of it.
     pub what: &'static str,
 }
 
@@ -86,7 +80,6 @@ struct Stream {
 }
 
 impl Iterates {
-    /// Before the first update.
     pub fn first(parameters: Parameters) -> Self {
         Self {
             adam: Adam::new(parameters.dimensions),
@@ -96,7 +89,6 @@ impl Iterates {
 }
 
 impl Trainer {
-    /// Before the first update.
     pub fn new(parameters: Parameters, shape: Shape, config: LearningConfig, seed: u64) -> Self {
         Self::resume(Iterates::first(parameters), shape, config, seed)
     }
@@ -132,7 +124,6 @@ impl Trainer {
         &self.iterates
     }
 
-    /// Where the streams are.
     pub fn laps(&self) -> &Laps {
         &self.laps
     }
@@ -157,12 +148,10 @@ impl Trainer {
         Ok(())
     }
 
-    /// The parameters.
     pub fn parameters(&self) -> &Parameters {
         &self.iterates.parameters
     }
 
-    /// Their dimensions.
     pub fn dimensions(&self) -> Dimensions {
         self.iterates.parameters.dimensions
     }
@@ -345,7 +334,6 @@ fn add_up(outcomes: &[Outcome], dimensions: Dimensions) -> (f64, usize, [Vec<f64
     (log_likelihood, n_seen, gradient)
 }
 
-/// Fisher and Yates's shuffle.
 fn shuffle(numbers: &mut [u64], seed: u64, lap: u64) {
     let mut random = stream(seed, Purpose::Learner, lap);
     for last in (1..numbers.len()).rev() {

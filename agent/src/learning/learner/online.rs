@@ -14,7 +14,6 @@ pub const KIND: &str = "learned_filter";
 /// What was learned: all that acting on it needs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LearnedModel {
-    /// The filter's parameters.
     pub tables: Tables,
     /// The state that pays most.
     pub target: usize,
@@ -25,7 +24,6 @@ pub struct LearnedModel {
 pub struct Progress {
     /// The parameters, and how they come to be.
     pub iterates: Iterates,
-    /// Which state pays.
     pub reward: RewardEstimate,
     /// World steps seen, of all worlds together.
     pub world_steps: u64,
@@ -82,7 +80,6 @@ impl Learner {
         }
     }
 
-    /// A world's next frame.
     pub fn see(&mut self, world: u32, frame: &Frame) {
         self.replay.push(world, frame);
     }
@@ -118,7 +115,6 @@ impl Learner {
         self.owed = 0.0;
     }
 
-    /// What is known by now.
     pub fn learned(&self) -> LearnedModel {
         learned(&self.trainer.iterates().parameters, &self.reward)
     }
@@ -128,14 +124,12 @@ impl Learner {
         self.world_steps
     }
 
-    /// Updates made.
     pub fn n_updates(&self) -> u64 {
         self.trainer.iterates().adam.n_steps
     }
 }
 
 impl Progress {
-    /// Before the first frame.
     pub fn first(dimensions: Dimensions, seed: u64) -> Self {
         Self {
             iterates: Iterates::first(Parameters::first(dimensions, seed)),
@@ -144,7 +138,6 @@ impl Progress {
         }
     }
 
-    /// What is known by then.
     pub fn learned(&self) -> LearnedModel {
         learned(&self.iterates.parameters, &self.reward)
     }

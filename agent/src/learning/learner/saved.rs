@@ -20,28 +20,22 @@ const MAX_OWED: f64 = 2e6;
 /// A learner without its tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SavedLearner {
-    /// The parameters'.
     pub dimensions: Dimensions,
-    /// Updates so far.
     pub n_updates: u64,
-    /// Which state pays.
     pub reward: RewardEstimate,
     /// World steps seen, of all worlds together.
     pub world_steps: u64,
-    /// The grid.
     pub shape: Shape,
     /// Window, windows of a block, streams.
     pub cut: [usize; 3],
     /// Updates that steps have earned and that are not made yet.
     pub owed: f64,
-    /// What was seen.
     pub replay: Replay,
     /// Where the streams are in it.
     pub laps: Laps,
 }
 
 impl Learner {
-    /// Parameters and moments by name.
     pub fn named_tensors(&self) -> Vec<NamedTensor> {
         let Iterates { parameters, adam } = self.trainer.iterates();
         let parts = [parameters, &adam.first, &adam.second];
@@ -72,9 +66,6 @@ impl Learner {
 
     /// From a checkpoint; with an empty replay if it was of another grid or cut into other windows
     /// than the settings say.
-    ///
-    /// # Errors
-    /// Names what is missing or of another form.
     pub fn resume(
         saved: SavedLearner,
         contents: &Contents,
@@ -104,9 +95,6 @@ impl Learner {
 
 impl SavedLearner {
     /// What was learned, of given dimensions; its tensors are in `contents`.
-    ///
-    /// # Errors
-    /// Names what is missing or of another form.
     pub fn progress(
         &self,
         contents: &Contents,

@@ -17,13 +17,10 @@ use thiserror::Error;
 /// The worlds to act on, as far as a learner is told.
 #[derive(Debug, Clone)]
 pub struct Worlds {
-    /// The grid.
     pub shape: Shape,
     /// Number of values that an observed cell may show.
     pub n_observations: usize,
-    /// Moves in a path.
     pub n_moves: usize,
-    /// The worlds' numbers.
     pub numbers: Range<u32>,
 }
 
@@ -39,7 +36,6 @@ pub enum StudentError {
     /// What it sees does not fit what it believes.
     #[error(transparent)]
     Agent(#[from] AgentError),
-    /// The worlds cannot be reached.
     #[error(transparent)]
     Connection(#[from] ConnectionError),
     /// A number that is not finite.
@@ -52,7 +48,6 @@ pub enum StudentError {
 #[derive(Debug, PartialEq, Error)]
 #[non_exhaustive]
 pub enum NotFinite {
-    /// In the learned filter.
     #[error(transparent)]
     Filter(#[from] crate::learning::filter::NotFinite),
     /// In the autoencoder or the DQN.
@@ -81,27 +76,15 @@ pub trait Student {
 
     /// Takes in what the worlds show when it comes to them. Returns in how many of them it goes on where
     /// its checkpoint left it.
-    ///
-    /// # Errors
-    /// [`StudentError`].
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError>;
 
     /// A world begins again.
-    ///
-    /// # Errors
-    /// [`StudentError`].
     fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError>;
 
     /// One step of the rollout in all worlds: plans, flies, scores, corrects, remembers, predicts.
-    ///
-    /// # Errors
-    /// [`StudentError`].
     fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError>;
 
     /// Makes the updates that the steps since the last call have earned.
-    ///
-    /// # Errors
-    /// [`NotFinite`].
     fn learn(&mut self) -> Result<Vec<ModelUpdate>, NotFinite>;
 
     /// From here on it acts on what was learned, as well as it knows: without random actions.
@@ -117,9 +100,6 @@ pub trait Student {
     fn belief(&self) -> Option<(&Belief, usize)>;
 
     /// What a later run goes on from.
-    ///
-    /// # Errors
-    /// Where a network's device fails.
     fn contents(&self) -> Result<Contents, StudentError>;
 
     /// Time spent so far, by part.

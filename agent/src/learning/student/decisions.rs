@@ -28,7 +28,6 @@ pub const KIND: &str = "decisions";
 /// A DQN over the actions of a model.
 #[derive(Debug)]
 pub struct Decisions {
-    /// Values of actions.
     pub dqn: Dqn,
     /// The actions, in the order of the values.
     pub actions: ActionSet,
@@ -40,13 +39,10 @@ pub struct Decisions {
 /// All of a checkpoint of decisions but the tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SavedDecisions {
-    /// Of the model.
     pub n_states: usize,
-    /// Their names.
     pub actions: Vec<String>,
     /// World steps that were learned from.
     pub world_steps: u64,
-    /// The DQN without its tensors.
     pub dqn: SavedDqn,
 }
 
@@ -93,7 +89,6 @@ impl Decisions {
         &self.actions.actions()[self.dqn.best(&spread_summary(belief, robot, n_moves))]
     }
 
-    /// As a checkpoint, without settings.
     pub fn to_contents(&self) -> Contents {
         let state = SavedDecisions {
             n_states: self.n_states,
@@ -105,9 +100,6 @@ impl Decisions {
     }
 
     /// Takes over a checkpoint.
-    ///
-    /// # Errors
-    /// Names what is missing, of another form, or of a model with other states or actions.
     pub fn load(&mut self, contents: &Contents) -> Result<(), Problem> {
         let saved: SavedDecisions = contents.state()?;
         let [expected, got] = [self.n_states, saved.n_states];
@@ -169,7 +161,6 @@ impl DecisionsStudent {
     }
 }
 
-/// What a decision goes by.
 fn input(robot: &Robot, n_moves: usize) -> Vec<f32> {
     spread_summary(robot.agent.belief(), robot.observation().robot(), n_moves)
 }

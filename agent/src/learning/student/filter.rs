@@ -54,9 +54,6 @@ impl FilterStudent {
     }
 
     /// Goes on from a checkpoint.
-    ///
-    /// # Errors
-    /// Names what is missing or of another form.
     pub fn resume(
         contents: &Contents,
         dimensions: Dimensions,

@@ -18,18 +18,12 @@ pub struct Events {
 
 impl Events {
     /// Begins a file; what the folder's files tell of later world steps counts no more.
-    ///
-    /// # Errors
-    /// [`EventsError`].
     pub fn begin(folder: &Path, world_steps: u64) -> Result<Self, EventsError> {
         let file = EventFile::begin(folder, world_steps + 1)?;
         Ok(Self { file, n_ticks: 0 })
     }
 
     /// Adds a step: one number a column, as TensorBoard shows one value a step.
-    ///
-    /// # Errors
-    /// [`EventsError`].
     pub fn add(
         &mut self,
         tick: &Tick,
@@ -50,9 +44,6 @@ impl Events {
     }
 
     /// Writes what is still in memory.
-    ///
-    /// # Errors
-    /// [`EventsError`].
     pub fn flush(&mut self) -> Result<(), EventsError> {
         self.file.flush()
     }

@@ -21,7 +21,6 @@ pub const CHECKPOINT: &str = "checkpoint.safetensors";
 /// What to train on, for how long.
 #[derive(Debug, Clone)]
 pub struct Training {
-    /// The worlds to act on.
     pub worlds: Range<u32>,
     /// Take the worlds from their holder.
     pub takeover: bool,
@@ -29,15 +28,12 @@ pub struct Training {
     pub steps: u64,
     /// Time to act for; `None`: until stopped.
     pub time_limit: Option<Duration>,
-    /// Folder of checkpoint and metrics.
     pub out: PathBuf,
     /// Go on from the folder's checkpoint.
     pub resume: bool,
     /// Act on the parameters as they are.
     pub freeze: bool,
-    /// Where an autoencoder computes.
     pub device: Device,
-    /// Settings.
     pub config: AgentConfig,
 }
 
@@ -48,37 +44,28 @@ pub enum TrainError {
     /// The server refused or is gone; what was learned is saved.
     #[error(transparent)]
     Connection(#[from] ConnectionError),
-    /// The checkpoint.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// The metrics.
     #[error(transparent)]
     Metrics(#[from] MetricsError),
-    /// The same for TensorBoard.
     #[error(transparent)]
     Events(#[from] EventsError),
-    /// The settings.
     #[error(transparent)]
     Config(#[from] ConfigError),
     /// Settings that no filter has with the server's observations.
     #[error(transparent)]
     Dimensions(#[from] DimensionsError),
-    /// The learner.
     #[error("after {world_steps} world steps: {problem}; what was learned before is in {saved}")]
     Student {
-        /// What is wrong.
         problem: Box<StudentError>,
         /// World steps that were learned from.
         world_steps: u64,
-        /// The checkpoint.
         saved: String,
     },
     /// What was learned could not be saved either.
     #[error("{problem}; what was learned is lost: {also}")]
     NotSaved {
-        /// Why training ended.
         problem: Box<TrainError>,
-        /// Why it is not saved.
         also: Box<TrainError>,
     },
     /// A folder that holds a training already.
@@ -99,7 +86,6 @@ pub enum TrainError {
     /// The model that a filter needs.
     #[error(transparent)]
     Model(#[from] ModelError),
-    /// A server that hides it.
     #[error("learning decisions needs the server's model: start it with --reveal-model true")]
     NoModel,
     /// Settings that cannot be written into a checkpoint.
@@ -110,9 +96,6 @@ pub enum TrainError {
 impl Training {
     /// Checks folder and number of worlds, before a server is held or started for them; returns the
     /// contents of the checkpoint to go on from.
-    ///
-    /// # Errors
-    /// [`TrainError`].
     pub fn check(&self) -> Result<Option<Contents>, TrainError> {
         let place = self.out.join(CHECKPOINT);
         if place.exists() && !self.resume {

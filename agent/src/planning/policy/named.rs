@@ -9,7 +9,6 @@ use thiserror::Error;
 /// Where a policy's belief comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum EstimatorKind {
-    /// No belief at all.
     None,
     /// The Bayes filter with the true parameters (paper section III.A, masked as in III.C).
     KnownModel,
@@ -30,7 +29,6 @@ pub enum PlannerKind {
     RandomWalk,
     /// The best of many random paths (paper section III.D).
     Shooting,
-    /// Beam search.
     Beam,
 }
 
@@ -39,11 +37,8 @@ pub enum PlannerKind {
 pub struct Policy {
     /// Its name in commands, tables and files.
     pub name: String,
-    /// Where its belief comes from.
     pub estimator: EstimatorKind,
-    /// How it plans.
     pub planner: PlannerKind,
-    /// What it maximises.
     pub objective: Objective,
     /// Whether a DQN chooses what each path is for instead (paper section III.E).
     pub is_decided: bool,
@@ -93,9 +88,6 @@ impl Policy {
     /// autoencoder's belief there are `autoencoder_exploit` and `autoencoder_explore`, which shoot,
     /// `autoencoder_policy`, for which the DQN chooses among the paper's objectives, and `autoencoder_beam`.
     /// `dqn_beam` chooses among [`ActionSet::beam`] by a DQN; `act_*` always takes the action of that name.
-    ///
-    /// # Errors
-    /// [`UnknownPolicy`] lists the names that there are.
     pub fn named(name: &str, model: &Model) -> Result<Self, UnknownPolicy> {
         let unknown = || UnknownPolicy {
             name: name.into(),

@@ -14,9 +14,7 @@ use std::ops::Range;
 /// All of a learned filter's checkpoint but the tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SavedFilter {
-    /// What learns.
     pub learner: SavedLearner,
-    /// By number.
     pub worlds: BTreeMap<u32, SavedWorld>,
 }
 
@@ -31,7 +29,6 @@ pub struct SavedWorld {
 }
 
 impl SavedWorld {
-    /// Where a robot is.
     pub fn of(robot: &Robot) -> Self {
         let (agent, observation) = (&robot.agent, robot.observation());
         Self {
@@ -69,9 +66,6 @@ impl SavedWorld {
     }
 
     /// Refuses beliefs of another grid or about other states.
-    ///
-    /// # Errors
-    /// Names the belief.
     pub fn check(&self, n_states: usize, shape: Shape) -> Result<(), Problem> {
         check_belief("worlds.belief", &self.belief, n_states, shape)?;
         self.estimate

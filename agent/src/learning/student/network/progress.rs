@@ -20,17 +20,12 @@ use serde::{Deserialize, Serialize};
 
 /// What is learned, and where learning stands.
 pub struct Progress {
-    /// The model.
     pub autoencoder: Autoencoder,
-    /// The choice of objectives.
     pub dqn: Dqn,
-    /// What that sees.
     pub input: DqnInput,
-    /// What paths are planned on.
     pub basis: BasisKind,
     /// The frames that are learned from.
     pub replay: Replay,
-    /// Where learning stands beside.
     pub position: Position,
 }
 
@@ -43,7 +38,6 @@ pub struct Position {
     pub estimate: Option<Belief>,
     /// The world's latest steps, for the DQN's replay.
     pub track: Track,
-    /// Which state pays.
     pub reward: RewardEstimate,
     /// Iterations of Algorithm 1.
     pub iterations: u64,
@@ -54,19 +48,16 @@ pub struct Position {
 /// All of a checkpoint of Algorithm 1 but the tensors.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct SavedNetwork {
-    /// The grid.
     pub shape: Shape,
     /// Number of values that an observed cell may show.
     pub n_observations: usize,
     /// Steps of the autoencoder's Adam, and its updates.
     pub counters: [u64; 2],
-    /// The DQN.
     pub dqn: SavedDqn,
     /// The replay, the oldest frame first.
     pub frames: Vec<Vec<u8>>,
     /// The places of frames with which tracks begin.
     pub tracks: Vec<u64>,
-    /// Where learning stands beside.
     pub position: Position,
 }
 
@@ -75,9 +66,7 @@ pub struct SavedNetwork {
 pub struct LearnedNetwork {
     /// The model; each world follows it with a copy of its own.
     pub autoencoder: Autoencoder,
-    /// The choice of objectives.
     pub dqn: Dqn,
-    /// What that sees.
     pub input: DqnInput,
     /// What the paths were planned on that it values.
     pub basis: BasisKind,
@@ -87,9 +76,6 @@ pub struct LearnedNetwork {
 
 impl Progress {
     /// Before the first frame; the autoencoder computes on `device`.
-    ///
-    /// # Errors
-    /// As the device.
     pub fn first(
         worlds: &Worlds,
         config: &AgentConfig,
@@ -126,7 +112,6 @@ impl Progress {
         reward.target().unwrap_or(reward.rewards.len() - 1)
     }
 
-    /// What is known by then.
     pub fn learned(self) -> LearnedNetwork {
         LearnedNetwork {
             target: self.target(),
@@ -138,9 +123,6 @@ impl Progress {
     }
 
     /// As a checkpoint, without the settings: a robot stands in the world.
-    ///
-    /// # Errors
-    /// As the network's device.
     pub fn to_contents(&self, robot: &Robot) -> Result<Contents, NetworkError> {
         let shape = self.autoencoder.shape();
         let frames = self.replay.frames();
@@ -164,9 +146,6 @@ impl Progress {
     }
 
     /// From a checkpoint, with its own settings; the autoencoder computes on `device`.
-    ///
-    /// # Errors
-    /// Names what is missing or of another form.
     pub fn read(contents: &Contents, device: &Device) -> Result<Self, Problem> {
         let config = contents.settings()?;
         let saved: SavedNetwork = contents.state()?;
@@ -190,9 +169,6 @@ impl Progress {
     }
 
     /// Takes over a checkpoint of the same sizes.
-    ///
-    /// # Errors
-    /// Names what is missing or of another form; some of it may have been taken over then.
     pub fn load(&mut self, contents: &Contents) -> Result<(), Problem> {
         let [expected, got] = [self.input, contents.settings()?.dqn.input].map(DqnInput::label);
         check(got == expected, "dqn.input", expected, got)?;
