@@ -1,7 +1,7 @@
 //! The learned filter against the known-model filter, finite differences and itself.
 
 use agent::Belief;
-use agent::config::LearningConfig;
+use agent::config::{AgentConfig, LearningConfig};
 use agent::estimation::BayesFilter;
 use agent::estimation::parameters::{Dimensions, Parameters, Tables};
 use agent::learning::filter::window::{Start, Window};
@@ -177,7 +177,7 @@ fn config() -> LearningConfig {
         window: 4,
         streams: 5,
         block_windows: 2,
-        ..LearningConfig::default()
+        ..AgentConfig::default().learning
     }
 }
 

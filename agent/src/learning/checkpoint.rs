@@ -121,9 +121,7 @@ impl Contents {
         if self.settings.is_empty() {
             return Err(wrong("none".into()));
         }
-        let config: Result<AgentConfig, _> = toml::from_str(&self.settings);
-        let config = config.map_err(|error| wrong(error.to_string()))?;
-        config.check().map_err(|error| wrong(error.to_string()))
+        AgentConfig::from_toml(&self.settings).map_err(|error| wrong(error.to_string()))
     }
 
     /// Against damage, not malice.

@@ -1,7 +1,7 @@
 //! What the programs read from files: models, checkpoints.
 
 use super::target::Seed;
-use agent::config::{AgentConfig, DecisionsConfig};
+use agent::config::AgentConfig;
 use agent::estimation::Follower;
 use agent::estimation::belief::Belief;
 use agent::estimation::parameters::Dimensions;
@@ -143,7 +143,7 @@ fn config() -> AgentConfig {
 }
 
 fn decisions() -> Decisions {
-    Decisions::first(&Model::wildfire(), &DecisionsConfig::default(), 0)
+    Decisions::first(&Model::wildfire(), &AgentConfig::default().decisions, 0)
 }
 
 pub fn model_seeds() -> Vec<Seed> {

@@ -302,7 +302,7 @@ mod tests {
     #[test]
     fn decisions_survive_a_checkpoint_and_others_are_refused_by_name() {
         let model = Model::wildfire();
-        let config = DecisionsConfig::default();
+        let config = AgentConfig::default().decisions;
         let decisions = Decisions::first(&model, &config, 3);
         let contents = decisions.to_contents();
         let mut again = Decisions::first(&model, &config, 4);

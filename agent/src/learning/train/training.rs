@@ -1,6 +1,6 @@
 //! What to train on, and why that ended early.
 
-use crate::config::{AgentConfig, ConfigError, LearnerKind};
+use crate::config::{AgentConfig, LearnerKind};
 use crate::estimation::parameters::DimensionsError;
 use crate::learning::checkpoint::{self, CheckpointError, Contents};
 use crate::learning::learner;
@@ -50,8 +50,6 @@ pub enum TrainError {
     Metrics(#[from] MetricsError),
     #[error(transparent)]
     Events(#[from] EventsError),
-    #[error(transparent)]
-    Config(#[from] ConfigError),
     /// Settings that no filter has with the server's observations.
     #[error(transparent)]
     Dimensions(#[from] DimensionsError),
