@@ -1,24 +1,22 @@
 //! The benchmark: every policy on the same worlds, scored against the hidden states.
 
 use crate::acting::registry::{self, Task};
-use crate::benchmark::arena::{Arena, ArenaError};
+use crate::benchmark::arena::Arena;
 use crate::benchmark::report::PolicyRun;
 use crate::config::AgentConfig;
-use crate::estimation::EstimatorError;
 use crate::estimation::belief::Belief;
 use crate::estimation::first_belief::first_belief;
 use crate::learning::learned::Learned;
 use crate::planning::policy::{EstimatorKind, Policy};
-use crate::rollout::agent::{Agent, AgentError};
+use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Seen, Turn};
 use crate::server::client::Observation;
 use crate::server::feed::{Feed, View};
-use protocol::model::ModelError;
+use anyhow::{Context, Result};
 use protocol::path::fly;
 use protocol::{Cell, Frame, Grid};
 use std::ops::Range;
 use std::time::Duration;
-use thiserror::Error;
 
 const SHOWS_TRUTH: &str = "invariant: an arena shows hidden states";
 
@@ -60,18 +58,6 @@ pub struct Moment {
     pub belief: Belief,
 }
 
-/// Why a comparison failed.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum CompareError {
-    #[error(transparent)]
-    Arena(#[from] ArenaError),
-    #[error("policy {policy:?}: {problem}")]
-    Agent { policy: String, problem: AgentError },
-    #[error(transparent)]
-    Model(#[from] ModelError),
-}
-
 /// One world's run of one policy.
 struct Run {
     robot: Robot,
@@ -98,7 +84,7 @@ pub fn compare(
     arena: &mut Arena,
     comparison: &Comparison,
     progress: &dyn Fn(&str, u64),
-) -> Result<Results, CompareError> {
+) -> Result<Results> {
     let prior = comparison.config.prior(arena.info().burn_in);
     let prior = first_belief(prior, arena.model(), arena.shape(), comparison.config.seed)?;
     let seeds: Vec<u64> = comparison.seeds.clone().collect();
@@ -118,12 +104,13 @@ pub fn compare(
     for policy in &comparison.policies {
         let game = game(policy, &seeds[..1]);
         let agent = game.agent(arena, seeds[0]);
-        agent.map_err(|problem| game.wrong(problem))?;
+        agent.with_context(|| format!("policy {:?}", policy.name))?;
     }
     for policy in &comparison.policies {
         for batch in seeds.chunks(arena.batch_size()) {
             let game = game(policy, batch);
-            let mut runs = game.play(arena, &mut feed, progress)?;
+            let runs = game.play(arena, &mut feed, progress);
+            let mut runs = runs.with_context(|| format!("policy {:?}", policy.name))?;
             if *policy == comparison.policies[0] {
                 let share = 1.0 / seeds.len() as f32;
                 results.add_fire(share, &runs);
@@ -164,7 +151,7 @@ impl Match<'_> {
         arena: &mut Arena,
         feed: &mut Feed,
         progress: &dyn Fn(&str, u64),
-    ) -> Result<Vec<Run>, CompareError> {
+    ) -> Result<Vec<Run>> {
         let mut runs = self.start(arena)?;
         for step in 0..self.comparison.steps {
             self.step(arena, feed, &mut runs, step)?;
@@ -173,7 +160,7 @@ impl Match<'_> {
         Ok(runs)
     }
 
-    fn start(&self, arena: &mut Arena) -> Result<Vec<Run>, CompareError> {
+    fn start(&self, arena: &mut Arena) -> Result<Vec<Run>> {
         let worlds = arena.reset(self.seeds)?;
         let worlds = self.seeds.iter().zip(worlds);
         let run = |(&seed, seen): (&u64, Seen)| {
@@ -184,27 +171,15 @@ impl Match<'_> {
                 moment: None,
             })
         };
-        worlds
-            .map(run)
-            .collect::<Result<_, AgentError>>()
-            .map_err(|problem| self.wrong(problem))
+        worlds.map(run).collect()
     }
 
-    fn step(
-        &self,
-        arena: &mut Arena,
-        feed: &mut Feed,
-        runs: &mut [Run],
-        step: u64,
-    ) -> Result<(), CompareError> {
+    fn step(&self, arena: &mut Arena, feed: &mut Feed, runs: &mut [Run], step: u64) -> Result<()> {
         if self.policy.estimator == EstimatorKind::NextTruth {
             let next = arena.foresee(self.seeds, step + 1)?;
-            let foreseen = runs
-                .iter_mut()
-                .zip(&next)
-                .try_for_each(|(run, next)| run.robot.agent.foresee(next))
-                .map_err(EstimatorError::from);
-            foreseen.map_err(|problem| self.wrong(problem.into()))?;
+            for (run, next) in runs.iter_mut().zip(&next) {
+                run.robot.agent.foresee(next)?;
+            }
         }
         let is_last = step + 1 == self.comparison.steps;
         let target = arena.model().target_state();
@@ -213,11 +188,7 @@ impl Match<'_> {
             runs,
             |run| &mut run.robot,
             |run| run.robot.plan(),
-            |paths| {
-                arena
-                    .step(self.seeds, paths, step + 1)
-                    .map_err(StepError::Arena)
-            },
+            |paths| arena.step(self.seeds, paths, step + 1),
             |index, run, turn| {
                 run.look(turn, target, is_last);
                 if shown.contains(&index) {
@@ -226,13 +197,9 @@ impl Match<'_> {
                 Ok(())
             },
         )
-        .map_err(|error| match error {
-            StepError::Arena(error) => error.into(),
-            StepError::Agent(problem) => self.wrong(problem),
-        })
     }
 
-    fn agent(&self, arena: &Arena, seed: u64) -> Result<Agent, AgentError> {
+    fn agent(&self, arena: &Arena, seed: u64) -> Result<Agent> {
         let (model, shape, n_moves) = (arena.model(), arena.shape(), arena.info().n_moves);
         let seed = self.comparison.config.planner_seed(seed);
         let task = Task {
@@ -244,25 +211,6 @@ impl Match<'_> {
             learned: &self.comparison.learned,
         };
         registry::agent(self.policy, &self.comparison.config, task)
-    }
-
-    fn wrong(&self, problem: AgentError) -> CompareError {
-        CompareError::Agent {
-            policy: self.policy.name.clone(),
-            problem,
-        }
-    }
-}
-
-/// Why a step failed.
-enum StepError {
-    Arena(ArenaError),
-    Agent(AgentError),
-}
-
-impl From<AgentError> for StepError {
-    fn from(error: AgentError) -> Self {
-        Self::Agent(error)
     }
 }
 

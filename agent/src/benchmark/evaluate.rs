@@ -4,19 +4,18 @@
 //! is scored is each frame's log-likelihood per visited cell under the prediction made before it.
 
 use crate::acting::registry::{self, Task};
-use crate::benchmark::arena::{Arena, ArenaError};
+use crate::benchmark::arena::Arena;
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
 use crate::estimation::first_belief::first_belief;
 use crate::estimation::scoring::Score;
 use crate::learning::learned::Learned;
-use crate::planning::policy::{EstimatorKind, Policy, UnknownPolicy};
-use crate::rollout::agent::{Agent, AgentError};
+use crate::planning::policy::{EstimatorKind, Policy};
+use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Seen};
-use protocol::model::ModelError;
+use anyhow::Result;
 use rayon::prelude::*;
 use std::ops::Range;
-use thiserror::Error;
 
 /// What is scored.
 #[derive(Debug, Clone)]
@@ -38,25 +37,8 @@ pub struct Marks {
     pub counts: Vec<u64>,
 }
 
-/// Why an examination failed.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum ExaminationError {
-    #[error(transparent)]
-    Arena(#[from] ArenaError),
-    #[error(transparent)]
-    Agent(#[from] AgentError),
-    #[error(transparent)]
-    Policy(#[from] UnknownPolicy),
-    #[error(transparent)]
-    Model(#[from] ModelError),
-}
-
 /// Flies the guide's paths and scores each estimator's prediction of every frame.
-pub fn examine(
-    arena: &mut Arena,
-    examination: &Examination<'_>,
-) -> Result<Vec<Marks>, ExaminationError> {
+pub fn examine(arena: &mut Arena, examination: &Examination<'_>) -> Result<Vec<Marks>> {
     let config = examination.config;
     let prior = config.prior(arena.info().burn_in);
     let prior = first_belief(prior, arena.model(), arena.shape(), config.seed)?;
@@ -72,7 +54,7 @@ pub fn examine(
                 &mut examinees,
                 |examinee| &mut examinee.guide,
                 |examinee| examinee.guide.plan(),
-                |paths| Ok::<_, ExaminationError>(arena.step(batch, paths, step)?),
+                |paths| arena.step(batch, paths, step),
                 |_, _, _| Ok(()),
             )?;
             examinees.par_iter_mut().try_for_each(Examinee::look)?;
@@ -110,9 +92,9 @@ impl Examinee {
         prior: &Belief,
         seed: u64,
         seen: Seen,
-    ) -> Result<Self, ExaminationError> {
+    ) -> Result<Self> {
         let model = arena.model();
-        let agent = |name: &str| -> Result<Agent, ExaminationError> {
+        let agent = |name: &str| -> Result<Agent> {
             let task = Task {
                 model,
                 shape: arena.shape(),
@@ -144,7 +126,7 @@ impl Examinee {
     }
 
     /// Scores each estimator's prediction of the frame that the guide has seen, then feeds them with it.
-    fn look(&mut self) -> Result<(), AgentError> {
+    fn look(&mut self) -> Result<()> {
         let frame = &self.guide.observation().frame;
         let scores = self.marks.scores.iter_mut().zip(&self.estimators);
         for (sum, agent) in scores {
@@ -156,7 +138,7 @@ impl Examinee {
         self.filter()
     }
 
-    fn filter(&mut self) -> Result<(), AgentError> {
+    fn filter(&mut self) -> Result<()> {
         for agent in &mut self.estimators {
             agent.correct(&self.guide.observation().frame, None)?;
             agent.predict();

@@ -2,6 +2,7 @@
 
 use super::shared::{make_folder, make_folder_of, write};
 use super::worlds::WorldFlags;
+use agent::acting::registry::needs_checkpoint;
 use agent::benchmark::arena::Arena;
 use agent::benchmark::compare::{Comparison, Moment, Results, compare};
 use agent::benchmark::report::{
@@ -11,9 +12,8 @@ use agent::benchmark::report::{
 use agent::config::AgentFlags;
 use agent::learning::learned::Learned;
 use agent::planning::policy::{EstimatorKind, OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, Policy};
-use agent::rollout::agent::AgentError;
 use agent::server::launch::OwnDashboard;
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use network::DeviceKind;
@@ -157,8 +157,7 @@ impl CompareCommand {
                 }
                 _ => continue,
             };
-            let policy = policy.name.clone();
-            return Err(AgentError::NeedsCheckpoint { policy, kind }.into());
+            bail!(needs_checkpoint(policy, kind));
         }
         Ok(policies)
     }

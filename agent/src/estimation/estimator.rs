@@ -71,6 +71,6 @@ pub enum EstimatorError {
     #[error("hidden states: {0}")]
     Belief(#[from] BeliefError),
     /// An upper bound that is not told the hidden states.
-    #[error("expected the hidden states, got none")]
+    #[error("the policy needs the truth channel: start the server with --publish-truth")]
     NoTruth,
 }

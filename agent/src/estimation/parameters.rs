@@ -5,12 +5,12 @@
 //! by zero.
 
 use crate::estimation::belief::Belief;
+use anyhow::{Result, bail};
 use ndarray::{Array2, NdFloat};
 use protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
 use protocol::randomness::split_mix;
 use protocol::{Model, Shape};
 use serde::{Deserialize, Serialize};
-use thiserror::Error;
 
 /// Largest size of a free number: weights from 1e-7, probabilities from 1e-14 on.
 pub const BOUND: f32 = 16.0;
@@ -56,27 +56,14 @@ pub struct Tables<T = f32> {
     pub initial: Vec<T>,
 }
 
-/// Dimensions that no filter has.
-#[derive(Debug, Error, PartialEq, Eq)]
-#[error("learned filter: {what}: expected {expected}, got {got}")]
-pub struct DimensionsError {
-    what: &'static str,
-    expected: String,
-    got: String,
-}
-
 impl Dimensions {
     /// Checks them against the limits of a model.
-    pub fn check(self) -> Result<Self, DimensionsError> {
+    pub fn check(self) -> Result<Self> {
         let values = 2..=MAX_VALUES;
         let side = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
         let (height, width) = self.kernel;
         let wrong = |what, expected: String, got: String| {
-            Err(DimensionsError {
-                what,
-                expected,
-                got,
-            })
+            bail!("learned filter: {what}: expected {expected}, got {got}")
         };
         let range = format!("2 to {MAX_VALUES}");
         if !values.contains(&self.n_states) {

@@ -6,7 +6,8 @@
 //! when there is no room.
 
 use crate::estimation::belief::Belief;
-use crate::learning::checkpoint::{Problem, check, check_counts, check_numbers};
+use crate::learning::checkpoint::{check, check_counts, check_numbers};
+use anyhow::{Context, Result};
 use protocol::{Frame, Probabilities, Shape};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -134,7 +135,7 @@ impl Replay {
         shape: Shape,
         n_states: usize,
         n_observations: usize,
-    ) -> Result<(), Problem> {
+    ) -> Result<()> {
         let full = other
             .full
             .iter()
@@ -179,7 +180,7 @@ impl Replay {
 }
 
 impl Block {
-    fn check(&self, shape: Shape, n_states: usize, n_observations: usize) -> Result<(), Problem> {
+    fn check(&self, shape: Shape, n_states: usize, n_observations: usize) -> Result<()> {
         for Sighting { cell, value } in self.frames.iter().flatten().copied() {
             let fits = (cell as usize) < shape.n_cells();
             check(fits, "replay.cell", format_args!("cells of {shape}"), cell)?;
@@ -200,8 +201,8 @@ impl Block {
                 check_numbers("replay.start", start, n_states * shape.n_cells())?;
                 let start = Probabilities::from_shape_vec(dim, start.to_vec());
                 let start = start.expect("invariant: as many numbers");
-                let wrong = |error| Problem::value("replay.start", "a belief", error);
-                Belief::from_probabilities(start).map(drop).map_err(wrong)
+                let start = Belief::from_probabilities(start).map(drop);
+                start.context("replay.start: expected a belief")
             }
         }
     }
@@ -298,7 +299,7 @@ mod tests {
         }
     }
 
-    fn resumed(other: Replay) -> Result<Replay, Problem> {
+    fn resumed(other: Replay) -> Result<Replay> {
         let mut replay = Replay::new(2, 7);
         let shape = Shape::new(1, 3).expect("test shape");
         replay.resume(other, shape, 2, 9).map(|()| replay)

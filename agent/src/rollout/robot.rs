@@ -4,8 +4,9 @@
 
 use crate::estimation::scoring::Score;
 use crate::planning::Plan;
-use crate::rollout::agent::{Agent, AgentError};
+use crate::rollout::agent::Agent;
 use crate::server::client::Observation;
+use anyhow::Result;
 use protocol::agent_belief::Intent;
 use protocol::{Cell, Grid, Move};
 use rayon::prelude::*;
@@ -47,11 +48,7 @@ impl Robot {
     }
 
     /// Takes in what the world shows; `look` finds the posterior. The belief is then about X_{k+1}.
-    pub fn begin(
-        &mut self,
-        truth: Option<&Grid<u8>>,
-        look: impl FnOnce(&Self),
-    ) -> Result<(), AgentError> {
+    pub fn begin(&mut self, truth: Option<&Grid<u8>>, look: impl FnOnce(&Self)) -> Result<()> {
         self.correct(truth)?;
         look(self);
         self.agent.predict();
@@ -59,7 +56,7 @@ impl Robot {
     }
 
     /// [`Self::new`] and [`Self::begin`].
-    pub fn at(agent: Agent, seen: Seen) -> Result<Self, AgentError> {
+    pub fn at(agent: Agent, seen: Seen) -> Result<Self> {
         let mut robot = Self::new(agent, seen.observation);
         robot.begin(seen.truth.as_ref(), |_| ())?;
         Ok(robot)
@@ -93,7 +90,7 @@ impl Robot {
         plan
     }
 
-    fn see(&mut self, plan: Plan, seen: Seen) -> Result<Turn, AgentError> {
+    fn see(&mut self, plan: Plan, seen: Seen) -> Result<Turn> {
         let Seen { observation, truth } = seen;
         let score = self.agent.score(&observation.frame)?;
         let before = std::mem::replace(&mut self.observation, observation);
@@ -106,20 +103,20 @@ impl Robot {
         })
     }
 
-    fn correct(&mut self, truth: Option<&Grid<u8>>) -> Result<(), AgentError> {
+    fn correct(&mut self, truth: Option<&Grid<u8>>) -> Result<()> {
         self.agent.correct(&self.observation.frame, truth)
     }
 }
 
 /// One step of all robots. `robot` finds a run's own; `plan` chooses its path; `fly` flies all paths and gives what
 /// each world shows then, in order; `look` is told of each run's turn, by its index, one after the other.
-pub fn step<R: Send, E: From<AgentError>>(
+pub fn step<R: Send>(
     runs: &mut [R],
     robot: impl Fn(&mut R) -> &mut Robot + Sync,
     plan: impl Fn(&mut R) -> Plan + Sync,
-    fly: impl FnOnce(&[Vec<Move>]) -> Result<Vec<Seen>, E>,
-    mut look: impl FnMut(usize, &mut R, Turn) -> Result<(), E>,
-) -> Result<(), E> {
+    fly: impl FnOnce(&[Vec<Move>]) -> Result<Vec<Seen>>,
+    mut look: impl FnMut(usize, &mut R, Turn) -> Result<()>,
+) -> Result<()> {
     let plans = in_parallel(runs.iter_mut(), plan);
     let paths: Vec<Vec<Move>> = plans.iter().map(|plan| plan.moves.clone()).collect();
     let seen = runs.iter_mut().zip(plans).zip(fly(&paths)?);

@@ -7,7 +7,7 @@ use protocol::connection::{ConnectionError, StepAnswer, unexpected};
 use protocol::control::{
     LeaseInfo, LeftPart, MAX_BELIEF_PART, Reply, Request, ServerInfo, WorldInfo, WorldSeed,
 };
-use protocol::message::{FLAG_FULL_COVERAGE, Operation, StepRequest, StepResult};
+use protocol::message::{FLAG_FULL_COVERAGE, Operation, Status, StepRequest, StepResult};
 use protocol::path::path_to_bytes;
 use protocol::{Cell, Connection, Frame, Move, Shape};
 use std::ops::Range;
@@ -78,6 +78,24 @@ impl Observation {
 }
 
 impl Client {
+    /// Acquires one world, which stays as it is, and observes it.
+    pub fn acquire_one(
+        instance: &Instance,
+        world: u32,
+        takeover: bool,
+    ) -> Result<(Self, Observation), ConnectionError> {
+        let mut client = Self::acquire(
+            instance,
+            &Claim {
+                worlds: world..world + 1,
+                takeover,
+                time_to_live: None,
+            },
+        )?;
+        let observation = client.observe(client.worlds())?.remove(0);
+        Ok((client, observation))
+    }
+
     /// Connects and acquires worlds; they stay where they are.
     ///
     /// # Errors
@@ -327,6 +345,23 @@ pub fn is_away(error: &ConnectionError) -> bool {
         ConnectionError::ServerGone { .. } | ConnectionError::Timeout { .. } => true,
         ConnectionError::Channel(channel) => matches!(channel, ChannelError::NoServer { .. }),
         _ => false,
+    }
+}
+
+/// Whether something failed because a server is away that may come back.
+pub fn is_outage(error: &anyhow::Error) -> bool {
+    error.downcast_ref().is_some_and(is_away)
+}
+
+/// Status, detail and message, if something failed because a server refused.
+pub fn refusal(error: &anyhow::Error) -> Option<(Status, u64, &str)> {
+    match error.downcast_ref()? {
+        ConnectionError::Refused {
+            status,
+            detail,
+            message,
+        } => Some((*status, *detail, message)),
+        _ => None,
     }
 }
 

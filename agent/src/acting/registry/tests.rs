@@ -5,6 +5,7 @@ use crate::estimation::dqn_input::DqnInput;
 use crate::planning::PlanningProblem;
 use crate::rollout::agent::Aim;
 use ::network::{Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, NetworkShape};
+use anyhow::Result;
 use protocol::randomness::split_mix;
 use protocol::{Frame, Grid};
 
@@ -61,7 +62,7 @@ fn network(input: DqnInput, basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> L
     }
 }
 
-fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent, AgentError> {
+fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent> {
     let model = Model::wildfire();
     let task = Task {
         model: &model,

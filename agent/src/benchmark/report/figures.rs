@@ -1,10 +1,11 @@
 //! The figures of a comparison: results in, files out. The crate `figures` draws them.
 
-use crate::benchmark::report::file::{ReportError, replace_file};
 use crate::benchmark::report::number::{decimals, readable, with_error};
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::rewards::rewards;
 use crate::benchmark::report::statistics::Estimate;
+use crate::file::{Readers, replace_file};
+use anyhow::{Context, Result, bail, ensure};
 use figures::{Bar, Color, Ladder, Named};
 use protocol::model::parse_color;
 use protocol::{Cell, Frame, Grid, Model, Probabilities};
@@ -41,23 +42,21 @@ pub struct Snapshot<'a> {
 }
 
 /// Puts a page at `path`: as SVG where the path ends so, else as PNG.
-pub fn save(path: &Path, svg: &str) -> Result<(), ReportError> {
+pub fn save(path: &Path, svg: &str) -> Result<()> {
     let is_svg = path.extension().is_some_and(|extension| extension == "svg");
-    replace_file(path, if is_svg { "svg" } else { "png" }, |temporary| {
-        let file = match is_svg {
-            true => svg.as_bytes().to_vec(),
-            false => figures::png(svg).map_err(|error| error.to_string())?,
-        };
-        std::fs::write(temporary, file).map_err(|error| error.to_string())
-    })
+    match is_svg {
+        true => replace_file(path, svg.as_bytes(), Readers::Any),
+        false => replace_file(path, &figures::png(svg)?, Readers::Any),
+    }
 }
 
 /// Draws mean reward per policy, the best at the top. `axis_label` says what the reward counts, see
 /// [`FIRE_CELLS_PER_STEP`].
-pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<(), ReportError> {
-    if runs.is_empty() {
-        return Err(ReportError::Empty { what: "ladder" });
-    }
+pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<()> {
+    ensure!(
+        !runs.is_empty(),
+        "ladder: expected at least one policy run, got none"
+    );
     for run in runs {
         check_finite(run, "mean reward", std::iter::once(run.mean_reward))?;
     }
@@ -134,7 +133,7 @@ pub fn draw_rewards(
     runs: &[PolicyRun],
     axis_label: &str,
     fire_cells: Option<&[f32]>,
-) -> Result<(), ReportError> {
+) -> Result<()> {
     let recorded: Vec<PolicyRun> = runs
         .iter()
         .filter(|run| !run.rewards.is_empty())
@@ -144,12 +143,13 @@ pub fn draw_rewards(
         check_finite(run, "reward", run.rewards.iter().copied().map(f64::from))?;
     }
     let page = rewards(&recorded, axis_label, fire_cells.unwrap_or_default());
-    let svg = page.svg().ok_or(ReportError::Empty { what: "rewards" })?;
+    let svg = page.svg();
+    let svg = svg.context("rewards: expected at least one policy run, got none")?;
     save(path, &svg)
 }
 
 /// Draws a step; the picture grows in height with the number of states.
-pub fn draw_snapshot(path: &Path, snapshot: &Snapshot<'_>) -> Result<(), ReportError> {
+pub fn draw_snapshot(path: &Path, snapshot: &Snapshot<'_>) -> Result<()> {
     let (file, shape) = (snapshot.model.file(), snapshot.truth.dim());
     let states = file.states.iter().map(|it| named(&it.name, &it.color));
     let observations = file
@@ -185,18 +185,12 @@ fn named(name: &str, color: &str) -> Named {
     }
 }
 
-fn check_finite(
-    run: &PolicyRun,
-    what: &'static str,
-    mut values: impl Iterator<Item = f64>,
-) -> Result<(), ReportError> {
+fn check_finite(run: &PolicyRun, what: &str, mut values: impl Iterator<Item = f64>) -> Result<()> {
+    let (policy, seed) = (&run.policy, run.world_seed);
     match values.find(|value| !value.is_finite()) {
-        Some(got) => Err(ReportError::NotFinite {
-            policy: run.policy.clone(),
-            world_seed: run.world_seed,
-            what,
-            got,
-        }),
+        Some(got) => bail!(
+            "policy {policy:?} on world seed {seed}: {what}: expected a finite number, got {got}"
+        ),
         None => Ok(()),
     }
 }

@@ -7,10 +7,11 @@
 
 use crate::config::LearningConfig;
 use crate::estimation::parameters::{Dimensions, Parameters, Tables};
-use crate::learning::checkpoint::{Problem, check, check_counts, check_numbers};
+use crate::learning::checkpoint::{check, check_counts, check_numbers};
 use crate::learning::filter::adam::{Adam, StepSize};
 use crate::learning::filter::window::{Outcome, Start, Window};
 use crate::learning::replay::{Block, Replay};
+use anyhow::Result;
 use protocol::Shape;
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
@@ -132,7 +133,7 @@ impl Trainer {
     ///
     /// # Errors
     /// Names what no such streams have; nothing was changed then.
-    pub fn resume_laps(&mut self, mut laps: Laps) -> Result<(), Problem> {
+    pub fn resume_laps(&mut self, mut laps: Laps) -> Result<()> {
         let (expected, got) = (self.laps.streams.len(), laps.streams.len());
         check(got == expected, "streams", expected, got)?;
         check_counts(&[("n_laps", laps.n_laps)])?;

@@ -2,12 +2,13 @@
 
 use crate::config::AgentConfig;
 use crate::estimation::parameters::{Dimensions, Parameters};
-use crate::learning::checkpoint::{Contents, Problem, check, check_counts};
+use crate::learning::checkpoint::{Contents, check, check_counts};
 use crate::learning::filter::{Adam, Iterates, Laps};
 use crate::learning::learner::online::{Learner, Progress};
 use crate::learning::replay::Replay;
 use crate::learning::reward::RewardEstimate;
 use ::network::NamedTensor;
+use anyhow::Result;
 use protocol::Shape;
 use serde::{Deserialize, Serialize};
 
@@ -72,7 +73,7 @@ impl Learner {
         dimensions: Dimensions,
         shape: Shape,
         config: &AgentConfig,
-    ) -> Result<Self, Problem> {
+    ) -> Result<Self> {
         let progress = saved.progress(contents, dimensions)?;
         let mut learner = Self::new(progress, shape, config);
         if (saved.shape, saved.cut) == (shape, learner.cut()) {
@@ -95,15 +96,11 @@ impl Learner {
 
 impl SavedLearner {
     /// What was learned, of given dimensions; its tensors are in `contents`.
-    pub fn progress(
-        &self,
-        contents: &Contents,
-        dimensions: Dimensions,
-    ) -> Result<Progress, Problem> {
+    pub fn progress(&self, contents: &Contents, dimensions: Dimensions) -> Result<Progress> {
         let (n_steps, world_steps) = (self.n_updates, self.world_steps);
         check_counts(&[("n_updates", n_steps), ("world_steps", world_steps)])?;
         let shapes = dimensions.shapes();
-        let part = |suffix: &str| -> Result<Parameters, Problem> {
+        let part = |suffix: &str| -> Result<Parameters> {
             let tensor = |at: usize| {
                 contents.tensor(&format!("{}{suffix}", Parameters::NAMES[at]), &shapes[at])
             };

@@ -2,17 +2,15 @@
 
 use crate::estimation::belief::Belief;
 use crate::learning::checkpoint::Contents;
+use anyhow::Result;
 
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::rollout::agent::AgentError;
 use crate::rollout::{Robot, Seen};
 use crate::server::client::Observation;
-use ::network::NetworkError;
 use protocol::connection::ConnectionError;
 use protocol::{Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
-use thiserror::Error;
 
 /// The worlds to act on, as far as a learner is told.
 #[derive(Debug, Clone)]
@@ -30,37 +28,6 @@ pub type Fly<'a> = &'a mut dyn FnMut(&[Vec<Move>]) -> Result<Vec<Observation>, C
 /// Is told of each robot, by its index, when its belief is the posterior.
 pub type Look<'a> = &'a mut dyn FnMut(usize, &Robot);
 
-/// Why a student cannot go on.
-#[derive(Debug, Error)]
-pub enum StudentError {
-    /// What it sees does not fit what it believes.
-    #[error(transparent)]
-    Agent(#[from] AgentError),
-    #[error(transparent)]
-    Connection(#[from] ConnectionError),
-    /// A number that is not finite.
-    #[error(transparent)]
-    NotFinite(#[from] NotFinite),
-}
-
-/// A number that is not finite, or a device that fails: learning cannot go on; nothing was changed by the
-/// step or update that met it.
-#[derive(Debug, PartialEq, Error)]
-#[non_exhaustive]
-pub enum NotFinite {
-    #[error(transparent)]
-    Filter(#[from] crate::learning::filter::NotFinite),
-    /// In the autoencoder or the DQN.
-    #[error(transparent)]
-    Network(#[from] NetworkError),
-}
-
-impl From<NetworkError> for StudentError {
-    fn from(error: NetworkError) -> Self {
-        NotFinite::from(error).into()
-    }
-}
-
 /// What learns while it acts.
 pub trait Student {
     /// How its checkpoints call it.
@@ -76,16 +43,16 @@ pub trait Student {
 
     /// Takes in what the worlds show when it comes to them. Returns in how many of them it goes on where
     /// its checkpoint left it.
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError>;
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize>;
 
     /// A world begins again.
-    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError>;
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<()>;
 
     /// One step of the rollout in all worlds: plans, flies, scores, corrects, remembers, predicts.
-    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError>;
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick>;
 
     /// Makes the updates that the steps since the last call have earned.
-    fn learn(&mut self) -> Result<Vec<ModelUpdate>, NotFinite>;
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>>;
 
     /// From here on it acts on what was learned, as well as it knows: without random actions.
     fn freeze(&mut self);
@@ -100,7 +67,7 @@ pub trait Student {
     fn belief(&self) -> Option<(&Belief, usize)>;
 
     /// What a later run goes on from.
-    fn contents(&self) -> Result<Contents, StudentError>;
+    fn contents(&self) -> Result<Contents>;
 
     /// Time spent so far, by part.
     fn times(&self) -> Vec<(&'static str, Duration)>;

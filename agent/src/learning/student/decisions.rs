@@ -5,11 +5,9 @@ use crate::config::{AgentConfig, DecisionsConfig};
 use crate::estimation::BayesFilter;
 use crate::estimation::belief::Belief;
 use crate::estimation::summary::{spread_summary, summary_length};
-use crate::learning::checkpoint::{Contents, Problem, check, check_counts};
+use crate::learning::checkpoint::{Contents, check, check_counts};
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::learning::student::base::{
-    Fly, Look, NotFinite, Student, StudentError, Worlds, without_truth,
-};
+use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
 use crate::planning::PlanBasis;
 use crate::planning::action::{Action, ActionSet};
 use crate::planning::policy::Policy;
@@ -17,6 +15,7 @@ use crate::rollout::agent::{Agent, Setup};
 use crate::rollout::{self, Robot};
 use crate::server::client::Observation;
 use ::network::{Dqn, SavedDqn, Track, Transition};
+use anyhow::Result;
 use protocol::{Cell, Model};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -100,7 +99,7 @@ impl Decisions {
     }
 
     /// Takes over a checkpoint.
-    pub fn load(&mut self, contents: &Contents) -> Result<(), Problem> {
+    pub fn load(&mut self, contents: &Contents) -> Result<()> {
         let saved: SavedDecisions = contents.state()?;
         let [expected, got] = [self.n_states, saved.n_states];
         check(got == expected, "states", expected, got)?;
@@ -141,7 +140,7 @@ impl DecisionsStudent {
     }
 
     /// A robot that has taken in what its world shows.
-    fn run(&self, observation: Observation) -> Result<Run, StudentError> {
+    fn run(&self, observation: Observation) -> Result<Run> {
         let setup = Setup {
             basis: PlanBasis::new(self.config.objective.belief),
             state_names: self.state_names.clone(),
@@ -187,20 +186,20 @@ impl Student for DecisionsStudent {
         &["dqn_loss", "dqn_rate", "epsilon"]
     }
 
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError> {
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
         let runs = observations.into_iter().map(|seen| self.run(seen));
         self.runs = runs.collect::<Result<_, _>>()?;
         // Beliefs begin again, wherever the worlds stand.
         Ok(0)
     }
 
-    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<()> {
         let run = self.run(observation)?;
         self.runs[(world - self.worlds.numbers.start) as usize] = run;
         Ok(())
     }
 
-    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError> {
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick> {
         let start = Instant::now();
         let (decisions, is_frozen) = (&self.decisions, self.is_frozen);
         for (index, run) in self.runs.iter_mut().enumerate() {
@@ -222,7 +221,7 @@ impl Student for DecisionsStudent {
             },
             |paths| {
                 self.times[0].1 += start.elapsed();
-                Ok::<_, StudentError>(without_truth(fly(paths)?))
+                anyhow::Ok(without_truth(fly(paths)?))
             },
             |index, run, turn| {
                 tick.reward += run.robot.observation().result.reward;
@@ -244,7 +243,7 @@ impl Student for DecisionsStudent {
         Ok(tick)
     }
 
-    fn learn(&mut self) -> Result<Vec<ModelUpdate>, NotFinite> {
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
         let start = Instant::now();
         let settings = self.config.decisions.settings();
         let epsilon = f64::from(settings.epsilon_at(self.decisions.world_steps));
@@ -286,7 +285,7 @@ impl Student for DecisionsStudent {
         Some((run.robot.agent.belief(), self.target))
     }
 
-    fn contents(&self) -> Result<Contents, StudentError> {
+    fn contents(&self) -> Result<Contents> {
         Ok(self.decisions.to_contents())
     }
 

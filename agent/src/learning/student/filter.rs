@@ -10,17 +10,16 @@ use crate::config::AgentConfig;
 use crate::estimation::BayesFilter;
 use crate::estimation::belief::Belief;
 use crate::estimation::parameters::{Dimensions, Tables};
-use crate::learning::checkpoint::{Contents, Problem};
+use crate::learning::checkpoint::Contents;
 use crate::learning::learner::{KIND, LearnedModel, Learner, Progress};
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::learning::student::base::{
-    Fly, Look, NotFinite, Student, StudentError, Worlds, without_truth,
-};
+use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
 use crate::planning::policy::{PlannerKind, Policy};
 use crate::planning::{Objective, Plan, PlanBasis, Target};
 use crate::rollout::agent::{Agent, Setup, numbered_states};
 use crate::rollout::{self, Robot};
 use crate::server::client::Observation;
+use anyhow::Result;
 use protocol::path;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -59,7 +58,7 @@ impl FilterStudent {
         dimensions: Dimensions,
         worlds: Worlds,
         config: &AgentConfig,
-    ) -> Result<Self, Problem> {
+    ) -> Result<Self> {
         let SavedFilter {
             learner,
             worlds: mut left,
@@ -109,7 +108,7 @@ impl FilterStudent {
     }
 
     /// A robot that has taken in what its world shows, with a track that begins there.
-    fn begun(&mut self, world: u32, observation: Observation) -> Result<Run, StudentError> {
+    fn begun(&mut self, world: u32, observation: Observation) -> Result<Run> {
         self.learner.begin(world);
         self.learner.see(world, &observation.frame);
         let mut robot = self.robot(observation);
@@ -142,7 +141,7 @@ impl Student for FilterStudent {
         &[]
     }
 
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError> {
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
         let worlds = self.worlds.numbers.clone();
         let mut n_gone_on = 0;
         if !SavedWorld::any_is_of(&self.left, worlds.clone(), &observations) {
@@ -169,13 +168,13 @@ impl Student for FilterStudent {
         Ok(n_gone_on)
     }
 
-    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<()> {
         let run = self.begun(world, observation)?;
         self.runs[(world - self.worlds.numbers.start) as usize] = run;
         Ok(())
     }
 
-    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError> {
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick> {
         let start = Instant::now();
         if !self.is_frozen {
             self.learned = self.learner.learned();
@@ -197,7 +196,7 @@ impl Student for FilterStudent {
             |run| run.plan(&self.learned.tables, objective),
             |paths| {
                 self.planning += start.elapsed();
-                Ok::<_, StudentError>(without_truth(fly(paths)?))
+                anyhow::Ok(without_truth(fly(paths)?))
             },
             |index, run, turn| {
                 let (agent, observation) = (&run.robot.agent, run.robot.observation());
@@ -218,7 +217,7 @@ impl Student for FilterStudent {
         Ok(tick)
     }
 
-    fn learn(&mut self) -> Result<Vec<ModelUpdate>, NotFinite> {
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
         let start = Instant::now();
         let updates = self.learner.learn();
         self.learning += start.elapsed();
@@ -248,7 +247,7 @@ impl Student for FilterStudent {
         Some((run.robot.agent.belief(), self.learned.target))
     }
 
-    fn contents(&self) -> Result<Contents, StudentError> {
+    fn contents(&self) -> Result<Contents> {
         let saved = self.runs.iter().map(|run| SavedWorld::of(&run.robot));
         let state = SavedFilter {
             learner: self.learner.saved(),

@@ -3,7 +3,8 @@
 use crate::estimation::belief::Belief;
 use crate::learning::metrics::{ModelUpdate, Tick, averages};
 use crate::learning::student::Student;
-use crate::learning::tensorboard::{EventFile, EventsError, Value};
+use crate::learning::tensorboard::{EventFile, Value};
+use anyhow::Result;
 use figures::{Heat, heat};
 use std::path::Path;
 
@@ -18,7 +19,7 @@ pub struct Events {
 
 impl Events {
     /// Begins a file; what the folder's files tell of later world steps counts no more.
-    pub fn begin(folder: &Path, world_steps: u64) -> Result<Self, EventsError> {
+    pub fn begin(folder: &Path, world_steps: u64) -> Result<Self> {
         let file = EventFile::begin(folder, world_steps + 1)?;
         Ok(Self { file, n_ticks: 0 })
     }
@@ -29,7 +30,7 @@ impl Events {
         tick: &Tick,
         updates: &[ModelUpdate],
         student: &dyn Student,
-    ) -> Result<(), EventsError> {
+    ) -> Result<()> {
         let averages = averages(tick, updates, student.n_updates(), student.columns());
         let scalars = averages
             .iter()
@@ -44,11 +45,11 @@ impl Events {
     }
 
     /// Writes what is still in memory.
-    pub fn flush(&mut self) -> Result<(), EventsError> {
+    pub fn flush(&mut self) -> Result<()> {
         self.file.flush()
     }
 
-    fn show(&mut self, step: u64, belief: &Belief, state: usize) -> Result<(), EventsError> {
+    fn show(&mut self, step: u64, belief: &Belief, state: usize) -> Result<()> {
         let picture = heat(belief.probability(state).view());
         let Heat { height, width, png } = picture.expect("invariant: a grid has cells, and fits");
         let png = &png;

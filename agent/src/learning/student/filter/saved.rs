@@ -1,11 +1,12 @@
 //! A learned filter in a checkpoint: the learner, and where its robots are.
 
 use crate::estimation::belief::Belief;
-use crate::learning::checkpoint::{Problem, check_belief};
+use crate::learning::checkpoint::check_belief;
 use crate::learning::learner::SavedLearner;
 use crate::rollout::Robot;
 use crate::rollout::agent::Agent;
 use crate::server::client::{Observation, Place};
+use anyhow::Result;
 use protocol::Shape;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -66,7 +67,7 @@ impl SavedWorld {
     }
 
     /// Refuses beliefs of another grid or about other states.
-    pub fn check(&self, n_states: usize, shape: Shape) -> Result<(), Problem> {
+    pub fn check(&self, n_states: usize, shape: Shape) -> Result<()> {
         check_belief("worlds.belief", &self.belief, n_states, shape)?;
         self.estimate
             .iter()

@@ -4,9 +4,7 @@ use crate::config::AgentConfig;
 use crate::estimation::Follower;
 use crate::estimation::belief::Belief;
 use crate::estimation::dqn_input::DqnInput;
-use crate::learning::checkpoint::{
-    Contents, Problem, check, check_belief, check_counts, check_numbers,
-};
+use crate::learning::checkpoint::{Contents, check, check_belief, check_counts, check_numbers};
 use crate::learning::reward::RewardEstimate;
 use crate::learning::student::base::Worlds;
 use crate::planning::BasisKind;
@@ -14,6 +12,7 @@ use crate::planning::policy::Policy;
 use crate::rollout::Robot;
 use crate::server::client::Place;
 use ::network::{Autoencoder, Device, Dqn, NetworkError, NetworkShape, Replay, SavedDqn, Track};
+use anyhow::{Context, Result};
 use protocol::model::MAX_VALUES;
 use protocol::{Frame, Shape};
 use serde::{Deserialize, Serialize};
@@ -146,7 +145,7 @@ impl Progress {
     }
 
     /// From a checkpoint, with its own settings; the autoencoder computes on `device`.
-    pub fn read(contents: &Contents, device: &Device) -> Result<Self, Problem> {
+    pub fn read(contents: &Contents, device: &Device) -> Result<Self> {
         let config = contents.settings()?;
         let saved: SavedNetwork = contents.state()?;
         let (shape, n_observations) = (saved.shape, saved.n_observations);
@@ -169,7 +168,7 @@ impl Progress {
     }
 
     /// Takes over a checkpoint of the same sizes.
-    pub fn load(&mut self, contents: &Contents) -> Result<(), Problem> {
+    pub fn load(&mut self, contents: &Contents) -> Result<()> {
         let [expected, got] = [self.input, contents.settings()?.dqn.input].map(DqnInput::label);
         check(got == expected, "dqn.input", expected, got)?;
         let saved: SavedNetwork = contents.state()?;
@@ -202,7 +201,7 @@ impl Progress {
         Ok(())
     }
 
-    fn load_replay(&mut self, frames: &[Vec<u8>], tracks: &[u64]) -> Result<(), Problem> {
+    fn load_replay(&mut self, frames: &[Vec<u8>], tracks: &[u64]) -> Result<()> {
         let shape = self.autoencoder.shape();
         let mut tracks = tracks.iter().peekable();
         for (index, bytes) in (0..).zip(frames) {
@@ -210,8 +209,8 @@ impl Progress {
                 self.replay.begin();
             }
             let frame = Frame::from_bytes(shape.grid, shape.n_observations, bytes);
-            let wrong = |error| Problem::value("frames", "frames of these worlds", error);
-            self.replay.push(frame.map_err(wrong)?);
+            let frame = frame.context("frames: expected frames of these worlds")?;
+            self.replay.push(frame);
         }
         Ok(())
     }
@@ -239,7 +238,7 @@ fn network_shape(grid: Shape, n_observations: usize, config: &AgentConfig) -> Ne
 }
 
 /// Refuses sizes whose numbers are not in the file: a few words could ask for all memory otherwise.
-fn check_size(contents: &Contents, shape: &NetworkShape) -> Result<(), Problem> {
+fn check_size(contents: &Contents, shape: &NetworkShape) -> Result<()> {
     let expected = shape.n_numbers();
     let tensors = contents.tensors.values();
     let got: usize = tensors.map(|tensor| tensor.numbers.len()).sum();
