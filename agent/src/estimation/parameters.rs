@@ -37,10 +37,11 @@ pub struct Dimensions {
 }
 
 /// The three tensors, in the order of [`Parameters::NAMES`]: free numbers, gradients or moments.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Parameters {
     pub dimensions: Dimensions,
     /// `[S, S, KH, KW]`, `[S, O]` and `[S]`, row-major.
+    #[serde(skip)]
     pub tensors: [Vec<f32>; 3],
 }
 

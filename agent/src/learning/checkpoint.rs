@@ -29,7 +29,7 @@ const DIGEST: &str = "emberwatch.digest";
 const SETTINGS: &str = "settings";
 
 /// Changes with what any state holds.
-const VERSION: &str = "1";
+const VERSION: &str = "2";
 
 /// The tensor of bytes.
 const STATE: &str = "state";
@@ -99,7 +99,8 @@ impl Contents {
             0x1_0000..0x100_0000 => decode(&self.state, FORM.with_limit::<0x1000_0000>()),
             _ => decode(&self.state, FORM.with_limit::<{ MAX_BYTES as usize }>()),
         };
-        let (state, length) = decoded.context("state: expected that of its learner")?;
+        let (state, length) =
+            decoded.map_err(|error| wrong(STATE, "that of its learner", error))?;
         let got = self.state.len();
         check(length == got, STATE, format!("{length} bytes"), got)?;
         Ok(state)
@@ -133,7 +134,8 @@ impl Contents {
     pub fn settings(&self) -> Result<AgentConfig> {
         let is_there = !self.settings.is_empty();
         check(is_there, SETTINGS, "those of an agent", "none")?;
-        AgentConfig::from_toml(&self.settings).context("settings: expected those of an agent")
+        let config = AgentConfig::from_toml(&self.settings);
+        config.map_err(|error| wrong(SETTINGS, "those of an agent", error))
     }
 
     /// Against damage, not malice.
@@ -230,7 +232,7 @@ pub fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Con
                 let tensor = Tensor { shape, numbers };
                 contents.tensors.insert(name.into(), tensor);
             }
-            (_, other) => bail!("{name}: expected F32, got {other}"),
+            (_, other) => return Err(wrong(name, "F32", other)),
         }
     }
     let (expected, got) = (texts.remove(DIGEST).unwrap_or_default(), contents.digest());
@@ -254,8 +256,13 @@ fn damaged(error: SafeTensorError) -> anyhow::Error {
 
 /// Refuses a field that does not fit.
 pub fn check(fits: bool, name: &str, expected: impl Display, got: impl Display) -> Result<()> {
-    ensure!(fits, "{name}: expected {expected}, got {got}");
+    ensure!(fits, wrong(name, expected, got));
     Ok(())
+}
+
+/// What is wrong with a tensor or a field of the state.
+pub fn wrong(name: &str, expected: impl Display, got: impl Display) -> anyhow::Error {
+    anyhow!("{name}: expected {expected}, got {got:#}")
 }
 
 pub fn check_counts(counts: &[(&str, u64)]) -> Result<()> {
@@ -360,9 +367,9 @@ mod tests {
         };
         let words = "expected a checkpoint of others, got one of tests";
         assert_eq!(refused("others", "kernel", "kernel"), words);
-        for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"1""#, "none")] {
-            let words = format!("emberwatch.format: expected 1, got {got}");
-            assert_eq!(refused("tests", r#"format":"1""#, to), words);
+        for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"2""#, "none")] {
+            let words = format!("emberwatch.format: expected 2, got {got}");
+            assert_eq!(refused("tests", r#"format":"2""#, to), words);
         }
         let got = contents();
         let error = |name, shape: &[usize]| got.tensor(name, shape).expect_err(name).to_string();

@@ -1,6 +1,6 @@
 //! What checkpoints hold, by kind: all that policies on a learned belief need.
 
-use crate::learning::checkpoint::{self, Contents};
+use crate::learning::checkpoint::{self, Contents, wrong};
 use crate::learning::learner::{self, LearnedModel};
 use crate::learning::student::filter::SavedFilter;
 use crate::learning::student::network::LearnedNetwork;
@@ -48,11 +48,12 @@ impl Learned {
     fn add(&mut self, kind: &'static str, contents: Contents, device: &Device) -> Result<()> {
         let twice = match kind {
             learner::KIND => {
-                let saved = contents.state::<SavedFilter>()?.learner;
-                let dimensions = saved.dimensions.check();
-                let dimensions = dimensions.context("dimensions: expected those of a filter")?;
-                let model = saved.progress(&contents, dimensions)?.learned();
-                self.filter.replace(model).is_some()
+                let mut saved = contents.state::<SavedFilter>()?.learner;
+                let dimensions = saved.trainer.dimensions().check();
+                let dimensions =
+                    dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
+                saved.load(&contents, dimensions)?;
+                self.filter.replace(saved.learned()).is_some()
             }
             decisions::KIND => self.decisions.replace(Arc::new(contents)).is_some(),
             _ => {

@@ -6,8 +6,8 @@
 //! when there is no room.
 
 use crate::estimation::belief::Belief;
-use crate::learning::checkpoint::{check, check_counts, check_numbers};
-use anyhow::{Context, Result};
+use crate::learning::checkpoint::{check, check_counts, check_numbers, wrong};
+use anyhow::Result;
 use protocol::{Frame, Probabilities, Shape};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -202,7 +202,7 @@ impl Block {
                 let start = Probabilities::from_shape_vec(dim, start.to_vec());
                 let start = start.expect("invariant: as many numbers");
                 let start = Belief::from_probabilities(start).map(drop);
-                start.context("replay.start: expected a belief")
+                start.map_err(|error| wrong("replay.start", "a belief", error))
             }
         }
     }

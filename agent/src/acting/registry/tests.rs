@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::estimation::dqn_input::DqnInput;
+use crate::learning::learner::Learner;
 use crate::planning::PlanningProblem;
 use crate::rollout::agent::Aim;
 use ::network::{Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, NetworkShape};
@@ -121,7 +122,7 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
         kernel: (3, 3),
     };
     let learned = Learned {
-        filter: Some(crate::learning::learner::Progress::first(dimensions, 0).learned()),
+        filter: Some(Learner::new(dimensions, shape(), &AgentConfig::default()).learned()),
         network: Some(Arc::new(network)),
         decisions: None,
     };
@@ -164,7 +165,10 @@ fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
         let error = agent("dqn_beam", &other, &learned)
             .err()
             .expect("no settings");
-        assert!(error.to_string().contains("settings: expected"), "{error}");
+        assert!(
+            format!("{error:#}").contains("settings: expected"),
+            "{error}"
+        );
         contents.settings = toml::to_string(&config(basis)).expect("TOML");
         learned.decisions = Some(Arc::new(contents));
         let agent = agent("dqn_beam", &other, &learned).expect("an agent");

@@ -1,12 +1,13 @@
 //! Adam (Kingma and Ba, 2015, algorithm 1) on the filter's three tensors.
 
 use crate::estimation::parameters::{Dimensions, Parameters};
+use serde::{Deserialize, Serialize};
 
 /// Added to the root of the second moment: the paper's.
 const EPSILON: f64 = 1e-8;
 
 /// The optimiser's state.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Adam {
     /// Decaying mean of gradients.
     pub first: Parameters,

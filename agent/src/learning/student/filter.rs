@@ -11,7 +11,7 @@ use crate::estimation::BayesFilter;
 use crate::estimation::belief::Belief;
 use crate::estimation::parameters::{Dimensions, Tables};
 use crate::learning::checkpoint::Contents;
-use crate::learning::learner::{KIND, LearnedModel, Learner, Progress};
+use crate::learning::learner::{KIND, LearnedModel, Learner};
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
 use crate::planning::policy::{PlannerKind, Policy};
@@ -47,8 +47,7 @@ pub struct FilterStudent {
 impl FilterStudent {
     /// A student before its first frame.
     pub fn new(dimensions: Dimensions, worlds: Worlds, config: &AgentConfig) -> Self {
-        let progress = Progress::first(dimensions, config.seed);
-        let learner = Learner::new(progress, worlds.shape, config);
+        let learner = Learner::new(dimensions, worlds.shape, config);
         Self::of(learner, BTreeMap::new(), worlds, config)
     }
 
@@ -63,7 +62,7 @@ impl FilterStudent {
             learner,
             worlds: mut left,
         } = contents.state()?;
-        let shape = learner.shape;
+        let shape = learner.trainer.shape;
         let learner = Learner::resume(learner, contents, dimensions, worlds.shape, config)?;
         let mut all = left.values();
         all.try_for_each(|world| world.check(dimensions.n_states, shape))?;
@@ -125,7 +124,7 @@ impl FilterStudent {
             return 0;
         }
         let learning = &self.config.learning;
-        if self.learner.world_steps() < learning.explore_steps {
+        if self.learner.world_steps < learning.explore_steps {
             return self.runs.len();
         }
         (learning.explore_share * self.runs.len() as f64).round() as usize
@@ -213,7 +212,7 @@ impl Student for FilterStudent {
             },
         )?;
         tick.n_worlds = self.runs.len() as u64;
-        tick.world_steps = self.learner.world_steps();
+        tick.world_steps = self.learner.world_steps;
         Ok(tick)
     }
 
@@ -235,7 +234,7 @@ impl Student for FilterStudent {
     }
 
     fn world_steps(&self) -> u64 {
-        self.learner.world_steps()
+        self.learner.world_steps
     }
 
     fn n_updates(&self) -> u64 {
@@ -249,10 +248,9 @@ impl Student for FilterStudent {
 
     fn contents(&self) -> Result<Contents> {
         let saved = self.runs.iter().map(|run| SavedWorld::of(&run.robot));
-        let state = SavedFilter {
-            learner: self.learner.saved(),
-            worlds: self.worlds.numbers.clone().zip(saved).collect(),
-        };
+        let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(saved).collect();
+        // As `SavedFilter`, without a copy of the learner.
+        let state = (&self.learner, worlds);
         Ok(Contents::new(self.learner.named_tensors(), &state))
     }
 

@@ -2,7 +2,7 @@
 
 use crate::estimation::belief::Belief;
 use crate::learning::checkpoint::check_belief;
-use crate::learning::learner::SavedLearner;
+use crate::learning::learner::Learner;
 use crate::rollout::Robot;
 use crate::rollout::agent::Agent;
 use crate::server::client::{Observation, Place};
@@ -13,9 +13,9 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 /// All of a learned filter's checkpoint but the tensors.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct SavedFilter {
-    pub learner: SavedLearner,
+    pub learner: Learner,
     pub worlds: BTreeMap<u32, SavedWorld>,
 }
 

@@ -4,7 +4,9 @@ use crate::config::AgentConfig;
 use crate::estimation::Follower;
 use crate::estimation::belief::Belief;
 use crate::estimation::dqn_input::DqnInput;
-use crate::learning::checkpoint::{Contents, check, check_belief, check_counts, check_numbers};
+use crate::learning::checkpoint::{
+    Contents, check, check_belief, check_counts, check_numbers, wrong,
+};
 use crate::learning::reward::RewardEstimate;
 use crate::learning::student::base::Worlds;
 use crate::planning::BasisKind;
@@ -12,7 +14,7 @@ use crate::planning::policy::Policy;
 use crate::rollout::Robot;
 use crate::server::client::Place;
 use ::network::{Autoencoder, Device, Dqn, NetworkError, NetworkShape, Replay, SavedDqn, Track};
-use anyhow::{Context, Result};
+use anyhow::Result;
 use protocol::model::MAX_VALUES;
 use protocol::{Frame, Shape};
 use serde::{Deserialize, Serialize};
@@ -209,8 +211,8 @@ impl Progress {
                 self.replay.begin();
             }
             let frame = Frame::from_bytes(shape.grid, shape.n_observations, bytes);
-            let frame = frame.context("frames: expected frames of these worlds")?;
-            self.replay.push(frame);
+            let misfit = |error| wrong("frames", "frames of these worlds", error);
+            self.replay.push(frame.map_err(misfit)?);
         }
         Ok(())
     }
