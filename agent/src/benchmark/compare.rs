@@ -2,7 +2,7 @@
 
 use crate::acting::registry::{self, Task};
 use crate::benchmark::arena::Arena;
-use crate::benchmark::report::PolicyRun;
+use crate::benchmark::report::{PolicyRun, Snapshot};
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
 use crate::estimation::first_belief::first_belief;
@@ -13,8 +13,8 @@ use crate::rollout::{self, Robot, Seen, Turn};
 use crate::server::client::Observation;
 use crate::server::feed::{Feed, View};
 use anyhow::{Context, Result};
+use protocol::Grid;
 use protocol::path::fly;
-use protocol::{Cell, Frame, Grid};
 use std::ops::Range;
 use std::time::Duration;
 
@@ -41,21 +41,7 @@ pub struct Results {
     /// Cells in the state that pays most, per step, means over worlds: the same for all policies.
     pub fire_cells: Vec<f32>,
     /// The end of the first world's run of the last policy with a belief of its own.
-    pub moment: Option<Moment>,
-}
-
-/// One world at one step, as a policy saw it.
-#[derive(Debug, Clone)]
-pub struct Moment {
-    pub seed: u64,
-    pub step: u64,
-    /// Hidden states, shape `[H, W]`.
-    pub truth: Grid<u8>,
-    pub frame: Frame,
-    /// The cells of the path, its start first.
-    pub path_cells: Vec<Cell>,
-    /// The posterior after the frame.
-    pub belief: Belief,
+    pub snapshot: Option<Snapshot>,
 }
 
 /// One world's run of one policy.
@@ -63,7 +49,7 @@ struct Run {
     robot: Robot,
     seed: u64,
     tally: Tally,
-    moment: Option<Moment>,
+    snapshot: Option<Snapshot>,
 }
 
 /// Sums over the steps of a run.
@@ -91,7 +77,7 @@ pub fn compare(
     let mut results = Results {
         runs: Vec::new(),
         fire_cells: Vec::new(),
-        moment: None,
+        snapshot: None,
     };
     let mut feed = Feed::open(arena.instance(), &prior);
     let game = |policy, seeds| Match {
@@ -116,7 +102,7 @@ pub fn compare(
                 results.add_fire(share, &runs);
             }
             if batch[0] == comparison.seeds.start {
-                results.moment = runs[0].moment.take().or(results.moment);
+                results.snapshot = runs[0].snapshot.take().or(results.snapshot);
             }
             results
                 .runs
@@ -168,7 +154,7 @@ impl Match<'_> {
                 robot: Robot::at(self.agent(arena, seed)?, seen)?,
                 seed,
                 tally: Tally::default(),
-                moment: None,
+                snapshot: None,
             })
         };
         worlds.map(run).collect()
@@ -223,7 +209,7 @@ impl Run {
         self.tally.planning += self.robot.planning();
         self.tally.add(self.robot.observation(), brier);
         if is_last && is_known {
-            self.moment = Some(self.moment(turn));
+            self.snapshot = Some(self.snapshot(turn));
         }
     }
 
@@ -236,13 +222,13 @@ impl Run {
         });
     }
 
-    fn moment(&self, turn: Turn) -> Moment {
+    fn snapshot(&self, turn: Turn) -> Snapshot {
         let (agent, observation) = (&self.robot.agent, self.robot.observation());
         let (shape, start) = (agent.belief().shape(), turn.before.robot());
         let moves = &turn.plan.moves;
         let mut path_cells = vec![start];
         path_cells.extend((1..=moves.len()).map(|n| fly(shape, start, &moves[..n]).end));
-        Moment {
+        Snapshot {
             seed: self.seed,
             step: observation.result.step,
             truth: turn.truth.expect(SHOWS_TRUTH),

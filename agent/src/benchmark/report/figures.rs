@@ -4,11 +4,12 @@ use crate::benchmark::report::number::{decimals, readable, with_error};
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::rewards::rewards;
 use crate::benchmark::report::statistics::Estimate;
+use crate::estimation::belief::Belief;
 use crate::file::{Readers, replace_file};
 use anyhow::{Context, Result, bail, ensure};
 use figures::{Bar, Color, Ladder, Named};
 use protocol::model::parse_color;
-use protocol::{Cell, Frame, Grid, Model, Probabilities};
+use protocol::{Cell, Frame, Grid, Model};
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -24,21 +25,19 @@ const FAMILIES: [(&str, Color); 5] = [
     ("fed with the truth", Color(0xe6, 0x9f, 0x00)),
 ];
 
-/// One step of one world, with hindsight.
-pub struct Snapshot<'a> {
-    /// Names and colours of states and observations.
-    pub model: &'a Model,
-    /// The hidden state of each cell.
+/// One step of one world, as a policy saw it.
+#[derive(Debug, Clone)]
+pub struct Snapshot {
+    pub seed: u64,
+    /// Step index k.
+    pub step: u64,
+    /// Hidden states, shape `[H, W]`.
     pub truth: Grid<u8>,
-    /// What the sensor would have shown of each cell.
-    pub observation: Grid<u8>,
     pub frame: Frame,
     /// The robot's cells, the start first.
     pub path_cells: Vec<Cell>,
-    /// The belief after the frame, shape `[S, H, W]`.
-    pub belief: &'a Probabilities,
-    pub step: u64,
-    pub seed: u64,
+    /// The posterior after the frame.
+    pub belief: Belief,
 }
 
 /// Puts a page at `path`: as SVG where the path ends so, else as PNG.
@@ -148,16 +147,22 @@ pub fn draw_rewards(
     save(path, &svg)
 }
 
-/// Draws a step; the picture grows in height with the number of states.
-pub fn draw_snapshot(path: &Path, snapshot: &Snapshot<'_>) -> Result<()> {
-    let (file, shape) = (snapshot.model.file(), snapshot.truth.dim());
+/// Draws a step; the picture grows in height with the number of states. `observation`: what the sensor would
+/// have shown of each cell.
+pub fn draw_snapshot(
+    path: &Path,
+    model: &Model,
+    snapshot: &Snapshot,
+    observation: &Grid<u8>,
+) -> Result<()> {
+    let (file, shape) = (model.file(), snapshot.truth.dim());
     let states = file.states.iter().map(|it| named(&it.name, &it.color));
     let observations = file
         .observations
         .iter()
         .map(|it| named(&it.name, &it.color));
     let page = figures::Snapshot {
-        title: format!("{}, step k = {}", snapshot.model.name(), snapshot.step),
+        title: format!("{}, step k = {}", model.name(), snapshot.step),
         note: format!(
             "world seed {}, {} x {} cells",
             snapshot.seed, shape.0, shape.1
@@ -165,7 +170,7 @@ pub fn draw_snapshot(path: &Path, snapshot: &Snapshot<'_>) -> Result<()> {
         states: states.collect(),
         observations: observations.collect(),
         truth: snapshot.truth.view(),
-        observation: snapshot.observation.view(),
+        observation: observation.view(),
         frame: snapshot.frame.values(),
         path: snapshot
             .path_cells
@@ -174,7 +179,7 @@ pub fn draw_snapshot(path: &Path, snapshot: &Snapshot<'_>) -> Result<()> {
             .collect(),
         belief: snapshot.belief.view(),
     };
-    save(path, &page.svg()?)
+    save(path, &page.svg())
 }
 
 fn named(name: &str, color: &str) -> Named {
