@@ -7,7 +7,7 @@ use crate::estimation::{AutoencoderEstimator, BayesFilter, Estimator};
 use crate::learning::learned::Learned;
 use crate::learning::learner::LearnedModel;
 use crate::learning::student::decisions::Decisions;
-use crate::learning::student::network::LearnedNetwork;
+use crate::learning::student::network::Progress;
 use crate::planning::policy::{EstimatorKind, Policy};
 use crate::planning::{BasisKind, Objective, PlanBasis};
 use crate::rollout::agent::{Agent, Choice, Decider, Setup, numbered_states};
@@ -105,7 +105,7 @@ fn decider(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<Box
 
 /// The DQN of Algorithm 1.
 struct NetworkDecider {
-    network: Arc<LearnedNetwork>,
+    network: Arc<Progress>,
     objectives: Vec<Objective>,
 }
 

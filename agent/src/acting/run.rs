@@ -55,7 +55,7 @@ pub struct Summary {
 /// Acts until the steps are done or `stop` is set. Waits for a server that ends, however often.
 pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
     let (mut summary, mut is_in_step) = (Summary::default(), true);
-    let mut attached = Attached::attach(mission, mission.takeover)?;
+    let mut attached = Attached::attach(mission)?;
     while !stop.load(Ordering::Relaxed) && (mission.steps == 0 || summary.steps < mission.steps) {
         match attached.step(summary.steps + 1 == mission.steps) {
             Ok(reward) => {
@@ -112,7 +112,7 @@ struct Report {
 
 impl Attached {
     /// Acquires the world where it stands and takes in its last frame.
-    fn attach(mission: &Mission, takeover: bool) -> Result<Self> {
+    fn attach(mission: &Mission) -> Result<Self> {
         let (info, model) = prepare(&mission.instance, mission.world, mission.model.as_ref())?;
         let policy = Policy::named(&mission.policy, &model)?;
         ensure!(
@@ -125,7 +125,7 @@ impl Attached {
         let prior = match policy.estimator {
             EstimatorKind::KnownModel => {
                 let any = Belief::from_initial(&model, shape);
-                if let Some(attached) = Self::go_on(mission, takeover, &model, &policy, &any)? {
+                if let Some(attached) = Self::go_on(mission, &model, &policy, &any)? {
                     return Ok(attached);
                 }
                 mission.config.prior(info.burn_in)
@@ -133,7 +133,7 @@ impl Attached {
             _ => Prior::Initial,
         };
         let prior = first_belief(prior, &model, shape, mission.config.seed)?;
-        let mut attached = Self::acquire(mission, takeover, &model, &policy, &prior)?;
+        let mut attached = Self::acquire(mission, &model, &policy, &prior)?;
         if !resume(&mut attached.client, &mut attached.robot)? {
             attached.begin()?;
         }
@@ -143,7 +143,6 @@ impl Attached {
     /// Acquires the world if a belief was left about it, in the place of `any`.
     fn go_on(
         mission: &Mission,
-        takeover: bool,
         model: &Model,
         policy: &Policy,
         any: &Belief,
@@ -152,7 +151,7 @@ impl Attached {
         if !is_belief_left(&mission.instance, mission.world, &kind)? {
             return Ok(None);
         }
-        let mut attached = Self::acquire(mission, takeover, model, policy, any)?;
+        let mut attached = Self::acquire(mission, model, policy, any)?;
         if take_over_left(&mut attached.client, &mut attached.robot)? {
             return Ok(Some(attached));
         }
@@ -162,15 +161,9 @@ impl Attached {
     }
 
     /// Acquires the world for an agent before its first frame.
-    fn acquire(
-        mission: &Mission,
-        takeover: bool,
-        model: &Model,
-        policy: &Policy,
-        prior: &Belief,
-    ) -> Result<Self> {
+    fn acquire(mission: &Mission, model: &Model, policy: &Policy, prior: &Belief) -> Result<Self> {
         let (client, observation) =
-            Client::acquire_one(&mission.instance, mission.world, takeover)?;
+            Client::acquire_one(&mission.instance, mission.world, mission.takeover)?;
         let (seed, step) = (observation.result.seed, observation.result.step);
         tracing::info!(
             world = mission.world,
@@ -179,22 +172,17 @@ impl Attached {
             policy = policy.name,
             "acting"
         );
-        let n_moves = client.info().n_moves;
-        let seed = mission.config.planner_seed(seed);
         let task = Task {
             model,
             shape: client.shape(),
-            n_moves,
+            n_moves: client.info().n_moves,
             prior,
-            seed,
+            seed: mission.config.planner_seed(seed),
             learned: &mission.learned,
         };
         let agent = registry::agent(policy, &mission.config, task)?;
-        let truth = if policy.estimator == EstimatorKind::Truth {
-            Some(open_truth(mission, &client)?)
-        } else {
-            None
-        };
+        let is_told = policy.estimator == EstimatorKind::Truth;
+        let truth = is_told.then(|| open_truth(mission, &client)).transpose()?;
         let feed = Feed::open(&mission.instance, agent.belief());
         let report = Report {
             since: Instant::now(),
@@ -338,14 +326,15 @@ fn open_truth(mission: &Mission, client: &Client) -> Result<TruthFeed> {
 
 /// Attaches to a server that has come back; `None` if it is time to stop.
 fn attach_again(mission: &Mission, stop: &AtomicBool) -> Result<Option<Attached>> {
-    let mut takeover = false;
+    let mut mission = mission.clone();
+    mission.takeover = false;
     while !stop.load(Ordering::Relaxed) {
-        match Attached::attach(mission, takeover) {
+        match Attached::attach(&mission) {
             Ok(attached) => return Ok(Some(attached)),
             // The server did not end, it paused: our former connection holds the world still.
-            Err(error) if is_own_lease(&error) && !takeover => takeover = true,
+            Err(error) if is_own_lease(&error) && !mission.takeover => mission.takeover = true,
             Err(error) if is_outage(&error) => {
-                takeover = false;
+                mission.takeover = false;
                 std::thread::sleep(RETRY_INTERVAL);
             }
             Err(error) => return Err(error),

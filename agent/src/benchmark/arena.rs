@@ -4,7 +4,13 @@
 //! *scouts* of the same seeds, kept one step ahead for clairvoyant policies (a world does not depend
 //! on the path, so a scout shows the future lawfully); and one *spare*, for full observations.
 
+use crate::acting::registry::{self, Task};
+use crate::config::AgentConfig;
+use crate::estimation::belief::Belief;
+use crate::learning::learned::Learned;
+use crate::planning::policy::Policy;
 use crate::rollout::Seen;
+use crate::rollout::agent::Agent;
 use crate::server::client::{Claim, Client, Observation, server_info};
 use crate::server::truth::TruthFeed;
 use anyhow::{Context, Result, ensure};
@@ -154,6 +160,26 @@ impl Arena {
         Ok(seen
             .first()
             .map(|observation| observation.frame.values().to_owned()))
+    }
+
+    /// A policy's agent for the world of a seed.
+    pub fn agent(
+        &self,
+        policy: &Policy,
+        config: &AgentConfig,
+        prior: &Belief,
+        seed: u64,
+        learned: &Learned,
+    ) -> Result<Agent> {
+        let task = Task {
+            model: &self.model,
+            shape: self.shape(),
+            n_moves: self.info().n_moves,
+            prior,
+            seed: config.planner_seed(seed),
+            learned,
+        };
+        registry::agent(policy, config, task)
     }
 
     fn any_path(&self) -> Vec<Move> {

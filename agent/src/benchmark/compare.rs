@@ -1,6 +1,5 @@
 //! The benchmark: every policy on the same worlds, scored against the hidden states.
 
-use crate::acting::registry::{self, Task};
 use crate::benchmark::arena::Arena;
 use crate::benchmark::report::{PolicyRun, Snapshot};
 use crate::config::AgentConfig;
@@ -186,17 +185,10 @@ impl Match<'_> {
     }
 
     fn agent(&self, arena: &Arena, seed: u64) -> Result<Agent> {
-        let (model, shape, n_moves) = (arena.model(), arena.shape(), arena.info().n_moves);
-        let seed = self.comparison.config.planner_seed(seed);
-        let task = Task {
-            model,
-            shape,
-            n_moves,
-            prior: self.prior,
-            seed,
-            learned: &self.comparison.learned,
-        };
-        registry::agent(self.policy, &self.comparison.config, task)
+        let Comparison {
+            config, learned, ..
+        } = self.comparison;
+        arena.agent(self.policy, config, self.prior, seed, learned)
     }
 }
 

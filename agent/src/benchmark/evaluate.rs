@@ -3,7 +3,6 @@
 //! All are fed the same frames, of paths that none of them, or the known-model filter, chose. What
 //! is scored is each frame's log-likelihood per visited cell under the prediction made before it.
 
-use crate::acting::registry::{self, Task};
 use crate::benchmark::arena::Arena;
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
@@ -95,16 +94,9 @@ impl Examinee {
     ) -> Result<Self> {
         let model = arena.model();
         let agent = |name: &str| -> Result<Agent> {
-            let task = Task {
-                model,
-                shape: arena.shape(),
-                n_moves: arena.info().n_moves,
-                prior,
-                seed: examination.config.planner_seed(seed),
-                learned: examination.learned,
-            };
+            let (config, learned) = (examination.config, examination.learned);
             let policy = Policy::named(name, model)?;
-            Ok(registry::agent(&policy, examination.config, task)?)
+            arena.agent(&policy, config, prior, seed, learned)
         };
         let estimator = |kind: &EstimatorKind| match kind {
             EstimatorKind::Learned => agent("learned_beam"),

@@ -3,7 +3,6 @@
 use crate::learning::checkpoint::{self, Contents, wrong};
 use crate::learning::learner::{self, LearnedModel};
 use crate::learning::student::filter::SavedFilter;
-use crate::learning::student::network::LearnedNetwork;
 use crate::learning::student::{decisions, network};
 use crate::planning::policy::EstimatorKind;
 use ::network::Device;
@@ -20,7 +19,7 @@ pub struct Learned {
     /// A filter, for policies `learned_*`.
     pub filter: Option<LearnedModel>,
     /// An autoencoder and a DQN, for policies `autoencoder_*`.
-    pub network: Option<Arc<LearnedNetwork>>,
+    pub network: Option<Arc<network::Progress>>,
     /// Decisions, for `dqn_beam`; they fit a model or not.
     pub decisions: Option<Arc<Contents>>,
 }
@@ -57,7 +56,7 @@ impl Learned {
             }
             decisions::KIND => self.decisions.replace(Arc::new(contents)).is_some(),
             _ => {
-                let network = network::Progress::read(&contents, device)?.learned();
+                let network = network::Progress::read(&contents, device)?;
                 self.network.replace(Arc::new(network)).is_some()
             }
         };
@@ -71,7 +70,7 @@ impl Learned {
     pub fn target(&self, estimator: EstimatorKind) -> Option<usize> {
         match estimator {
             EstimatorKind::Learned => self.filter.as_ref().map(|filter| filter.target),
-            EstimatorKind::Autoencoder => self.network.as_ref().map(|network| network.target),
+            EstimatorKind::Autoencoder => self.network.as_ref().map(|network| network.target()),
             _ => None,
         }
     }

@@ -1,10 +1,15 @@
 //! What every student does, and what it is told.
 
+use crate::config::AgentConfig;
+use crate::estimation::Estimator;
 use crate::estimation::belief::Belief;
 use crate::learning::checkpoint::Contents;
 use anyhow::Result;
 
 use crate::learning::metrics::{ModelUpdate, Tick};
+use crate::planning::PlanBasis;
+use crate::planning::policy::Policy;
+use crate::rollout::agent::{Agent, Setup};
 use crate::rollout::{Robot, Seen};
 use crate::server::client::Observation;
 use protocol::connection::ConnectionError;
@@ -20,6 +25,27 @@ pub struct Worlds {
     pub n_observations: usize,
     pub n_moves: usize,
     pub numbers: Range<u32>,
+}
+
+impl Worlds {
+    /// A robot on one of them before it takes in what that shows.
+    pub(super) fn robot(
+        &self,
+        config: &AgentConfig,
+        policy: &Policy,
+        estimator: Box<dyn Estimator>,
+        state_names: Vec<String>,
+        observation: Observation,
+    ) -> Robot {
+        let setup = Setup {
+            basis: PlanBasis::new(config.objective.belief),
+            state_names,
+            n_moves: self.n_moves,
+            seed: config.planner_seed(observation.result.seed),
+        };
+        let agent = Agent::new(estimator, policy, config, setup);
+        Robot::new(agent, observation)
+    }
 }
 
 /// Flies a path in each world; gives what they show then, in order.

@@ -8,10 +8,8 @@ use crate::estimation::summary::{spread_summary, summary_length};
 use crate::learning::checkpoint::{Contents, check, check_counts};
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
-use crate::planning::PlanBasis;
 use crate::planning::action::{Action, ActionSet};
 use crate::planning::policy::Policy;
-use crate::rollout::agent::{Agent, Setup};
 use crate::rollout::{self, Robot};
 use crate::server::client::Observation;
 use ::network::{Dqn, SavedDqn, Track, Transition};
@@ -141,15 +139,11 @@ impl DecisionsStudent {
 
     /// A robot that has taken in what its world shows.
     fn run(&self, observation: Observation) -> Result<Run> {
-        let setup = Setup {
-            basis: PlanBasis::new(self.config.objective.belief),
-            state_names: self.state_names.clone(),
-            n_moves: self.worlds.n_moves,
-            seed: self.config.planner_seed(observation.result.seed),
-        };
-        let (filter, policy) = (Box::new(self.filter.clone()), &self.policy);
-        let agent = Agent::new(filter, policy, &self.config, setup);
-        let mut robot = Robot::new(agent, observation);
+        let (filter, names) = (Box::new(self.filter.clone()), self.state_names.clone());
+        let (policy, config) = (&self.policy, &self.config);
+        let mut robot = self
+            .worlds
+            .robot(config, policy, filter, names, observation);
         robot.begin(None, |_| ())?;
         Ok(Run {
             input: input(&robot, self.worlds.n_moves),

@@ -15,8 +15,8 @@ use crate::learning::learner::{KIND, LearnedModel, Learner};
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
 use crate::planning::policy::{PlannerKind, Policy};
-use crate::planning::{Objective, Plan, PlanBasis, Target};
-use crate::rollout::agent::{Agent, Setup, numbered_states};
+use crate::planning::{Objective, Plan, Target};
+use crate::rollout::agent::numbered_states;
 use crate::rollout::{self, Robot};
 use crate::server::client::Observation;
 use anyhow::Result;
@@ -95,15 +95,10 @@ impl FilterStudent {
     fn robot(&self, observation: Observation) -> Robot {
         let tables = &self.learned.tables;
         let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape));
-        let setup = Setup {
-            basis: PlanBasis::new(self.config.objective.belief),
-            state_names: numbered_states(tables.dimensions.n_states),
-            n_moves: self.worlds.n_moves,
-            seed: self.config.planner_seed(observation.result.seed),
-        };
-        let policy = Policy::learned(PlannerKind::Beam);
-        let agent = Agent::new(Box::new(filter), &policy, &self.config, setup);
-        Robot::new(agent, observation)
+        let names = numbered_states(tables.dimensions.n_states);
+        let (policy, config) = (Policy::learned(PlannerKind::Beam), &self.config);
+        let worlds = &self.worlds;
+        worlds.robot(config, &policy, Box::new(filter), names, observation)
     }
 
     /// A robot that has taken in what its world shows, with a track that begins there.

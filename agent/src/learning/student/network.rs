@@ -7,7 +7,7 @@
 
 mod progress;
 
-pub use self::progress::{LearnedNetwork, Position, Progress, SavedNetwork};
+pub use self::progress::{Position, Progress, SavedNetwork};
 
 use self::progress::follower;
 use anyhow::Result;
@@ -19,9 +19,8 @@ use crate::learning::checkpoint::Contents;
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::reward::met;
 use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
-use crate::planning::PlanBasis;
 use crate::planning::policy::Policy;
-use crate::rollout::agent::{Agent, Setup, numbered_states};
+use crate::rollout::agent::numbered_states;
 use crate::rollout::{self, Robot};
 use crate::server::client::Observation;
 use ::network::{Transition, Window};
@@ -72,14 +71,10 @@ impl NetworkStudent {
     fn robot(&self, follower: Follower, observation: Observation) -> Robot {
         let network = &self.progress.autoencoder;
         let estimator = AutoencoderEstimator::at(network, follower);
-        let setup = Setup {
-            basis: PlanBasis::new(self.config.objective.belief),
-            state_names: numbered_states(network.shape().n_states),
-            n_moves: self.worlds.n_moves,
-            seed: self.config.planner_seed(observation.result.seed),
-        };
-        let agent = Agent::new(Box::new(estimator), &self.choices[0], &self.config, setup);
-        Robot::new(agent, observation)
+        let names = numbered_states(network.shape().n_states);
+        let (policy, config) = (&self.choices[0], &self.config);
+        let worlds = &self.worlds;
+        worlds.robot(config, policy, Box::new(estimator), names, observation)
     }
 
     /// What the next action goes by.

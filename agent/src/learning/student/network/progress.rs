@@ -19,11 +19,14 @@ use protocol::model::MAX_VALUES;
 use protocol::{Frame, Shape};
 use serde::{Deserialize, Serialize};
 
-/// What is learned, and where learning stands.
+/// What is learned, and where learning stands. Each world follows the autoencoder with a copy of its own.
+#[derive(Debug)]
 pub struct Progress {
     pub autoencoder: Autoencoder,
     pub dqn: Dqn,
+    /// What the DQN sees.
     pub input: DqnInput,
+    /// What the paths are planned on that the DQN values.
     pub basis: BasisKind,
     /// The frames that are learned from.
     pub replay: Replay,
@@ -62,19 +65,6 @@ pub struct SavedNetwork {
     pub position: Position,
 }
 
-/// What Algorithm 1 learned, with its parameters fixed.
-#[derive(Debug)]
-pub struct LearnedNetwork {
-    /// The model; each world follows it with a copy of its own.
-    pub autoencoder: Autoencoder,
-    pub dqn: Dqn,
-    pub input: DqnInput,
-    /// What the paths were planned on that it values.
-    pub basis: BasisKind,
-    /// The state that pays most.
-    pub target: usize,
-}
-
 impl Progress {
     /// Before the first frame; the autoencoder computes on `device`.
     pub fn first(
@@ -108,19 +98,9 @@ impl Progress {
     }
 
     /// The state that pays most, as far as rewards tell by now.
-    pub(super) fn target(&self) -> usize {
+    pub fn target(&self) -> usize {
         let reward = &self.position.reward;
         reward.target().unwrap_or(reward.rewards.len() - 1)
-    }
-
-    pub fn learned(self) -> LearnedNetwork {
-        LearnedNetwork {
-            target: self.target(),
-            autoencoder: self.autoencoder,
-            dqn: self.dqn,
-            input: self.input,
-            basis: self.basis,
-        }
     }
 
     /// As a checkpoint, without the settings: a robot stands in the world.
