@@ -58,19 +58,6 @@ struct Desk {
     answered: Vec<ActiveControl>,
 }
 
-/// What came of waiting.
-enum Found {
-    Request(ActiveControl),
-    /// A wake-up without a request, or a death.
-    Event,
-}
-
-/// How a request is answered.
-enum Answer {
-    Reply(Reply),
-    Shutdown,
-}
-
 impl Service {
     fn start(
         task: &Assignment,
@@ -111,8 +98,8 @@ impl Service {
         while !stop.load(Ordering::Relaxed) && !self.keeper_has_ended() {
             if let Some(request) = self.wait()? {
                 match self.handle(&request) {
-                    Ok(Answer::Reply(reply)) => self.desk.answer(&request, &reply),
-                    Ok(Answer::Shutdown) => return Ok(Some(request)),
+                    Ok(Some(reply)) => self.desk.answer(&request, &reply),
+                    Ok(None) => return Ok(Some(request)),
                     Err(error) => {
                         self.desk.answer(&request, &reply_to(&error));
                         if is_the_end(&error) {
@@ -136,20 +123,19 @@ impl Service {
         let woken = Cell::new(false);
         let tick = TICK.min(self.decider.until_renewal(Instant::now()));
         let look = || match self.desk.responder.receive() {
-            Some(request) => Ok(Some(Found::Request(request))),
-            None => Ok(woken.get().then_some(Found::Event)),
+            Some(request) => Ok(Some(Some(request))),
+            // A wake-up without a request, or a death.
+            None => Ok(woken.get().then_some(None)),
         };
         let found = self.waiter.wait(tick, look, |limit| {
             woken.set(self.sleep(limit)?);
             Ok::<_, ChannelError>(())
         })?;
-        match found {
-            Some(Found::Request(request)) => Ok(Some(request)),
-            Some(Found::Event) | None => {
-                self.decider.keep_alive(Instant::now())?;
-                Ok(None)
-            }
+        let request = found.flatten();
+        if request.is_none() {
+            self.decider.keep_alive(Instant::now())?;
         }
+        Ok(request)
     }
 
     /// Sleeps until a wake-up, a signal or a death; returns whether there was one.
@@ -166,10 +152,11 @@ impl Service {
         sleep_until_event(&descriptors, limit).map_err(ipc_error("sleep"))
     }
 
-    fn handle(&mut self, request: &ActiveControl) -> Result<Answer> {
+    /// The reply; `None` to a request to shut down.
+    fn handle(&mut self, request: &ActiveControl) -> Result<Option<Reply>> {
         let version = request.user_header().version;
         if version != VERSION {
-            return Ok(Answer::Reply(mismatch(version)));
+            return Ok(Some(mismatch(version)));
         }
         let reply = match parse(request.payload()) {
             Err(message) => error_reply(Status::Malformed, 0, message),
@@ -185,9 +172,9 @@ impl Service {
             }
             Ok(Request::Decide { objective }) => self.decide(objective)?,
             Ok(Request::Last {}) => Reply::Decision(self.decider.last().clone()),
-            Ok(Request::Shutdown {}) => return Ok(Answer::Shutdown),
+            Ok(Request::Shutdown {}) => return Ok(None),
         };
-        Ok(Answer::Reply(reply))
+        Ok(Some(reply))
     }
 
     fn decide(&mut self, objective: u64) -> Result<Reply> {

@@ -5,11 +5,12 @@ use base64::engine::general_purpose::STANDARD as BASE64;
 use protocol::channels::{ChannelError, Instance};
 use protocol::connection::{ConnectionError, StepAnswer, unexpected};
 use protocol::control::{
-    LeaseInfo, LeftPart, MAX_BELIEF_PART, Reply, Request, ServerInfo, WorldInfo, WorldSeed,
+    LeftPart, MAX_BELIEF_PART, Reply, Request, ServerInfo, WorldInfo, WorldSeed,
 };
 use protocol::message::{FLAG_FULL_COVERAGE, Operation, Status, StepRequest, StepResult};
 use protocol::path::path_to_bytes;
 use protocol::{Cell, Connection, Frame, Move, Shape};
+use std::fmt::Display;
 use std::ops::Range;
 use std::os::fd::BorrowedFd;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -103,7 +104,16 @@ impl Client {
     pub fn acquire(instance: &Instance, claim: &Claim) -> Result<Self, ConnectionError> {
         let mut connection = Connection::open(instance, CLIENT_NAME, CONTROL_TIMEOUT)?;
         let shape = shape_of(connection.info())?;
-        let lease = acquire(&mut connection, claim)?.lease;
+        let request = Request::Acquire {
+            first_world: claim.worlds.start,
+            n_worlds: claim.worlds.len() as u32,
+            takeover: claim.takeover,
+            ttl_millis: claim.time_to_live.map(|time| time.as_millis() as u64),
+        };
+        let lease = match connection.control(&request, CONTROL_TIMEOUT)? {
+            Reply::Lease(lease) => lease.lease,
+            other => return Err(unexpected("acquire", &other)),
+        };
         Ok(Self {
             connection,
             lease,
@@ -205,7 +215,9 @@ impl Client {
             let request = Request::Belief { world, offset };
             match self.connection.control(&request, STEP_TIMEOUT) {
                 Ok(Reply::Belief { info, data, .. }) if info.kind == kind => {
-                    let part = BASE64.decode(data).map_err(|error| garbled(&error))?;
+                    let part = BASE64
+                        .decode(data)
+                        .map_err(|error| garbled("belief", &error))?;
                     bytes.extend_from_slice(&part);
                     let (is_last, is_whole) = (part.is_empty(), bytes.len() as u64 == info.length);
                     if *first.get_or_insert_with(|| info.clone()) != info {
@@ -288,22 +300,18 @@ impl Client {
         let frames = answer.frames.chunks_exact(self.shape.n_cells());
         let observation = |(result, bytes): (&StepResult, &[u8])| {
             let frame = Frame::from_bytes(self.shape, n_observations, bytes);
-            let frame = frame.map_err(|error| ConnectionError::Garbled {
-                what: "step",
-                problem: error.to_string(),
-            })?;
             Ok(Observation {
                 result: *result,
-                frame,
+                frame: frame.map_err(|error| garbled("step", &error))?,
             })
         };
         answer.results.iter().zip(frames).map(observation).collect()
     }
 }
 
-fn garbled(problem: &dyn std::fmt::Display) -> ConnectionError {
+fn garbled(what: &'static str, problem: &dyn Display) -> ConnectionError {
     ConnectionError::Garbled {
-        what: "belief",
+        what,
         problem: problem.to_string(),
     }
 }
@@ -384,21 +392,5 @@ pub fn is_belief_left(
 /// A server's grid.
 pub fn shape_of(info: &ServerInfo) -> Result<Shape, ConnectionError> {
     let shape = Shape::new(info.height, info.width);
-    shape.map_err(|error| ConnectionError::Garbled {
-        what: "hello",
-        problem: error.to_string(),
-    })
-}
-
-fn acquire(connection: &mut Connection, claim: &Claim) -> Result<LeaseInfo, ConnectionError> {
-    let request = Request::Acquire {
-        first_world: claim.worlds.start,
-        n_worlds: claim.worlds.len() as u32,
-        takeover: claim.takeover,
-        ttl_millis: claim.time_to_live.map(|time| time.as_millis() as u64),
-    };
-    match connection.control(&request, CONTROL_TIMEOUT)? {
-        Reply::Lease(lease) => Ok(lease),
-        other => Err(unexpected("acquire", &other)),
-    }
+    shape.map_err(|error| garbled("hello", &error))
 }

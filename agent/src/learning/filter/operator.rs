@@ -8,8 +8,7 @@
 //! alike, of which a learned kernel has none, and does not know derivatives.
 
 use crate::learning::filter::layout::Layout;
-use crate::learning::filter::vector::{LANES, Real, lanes, load, store, total};
-use pulp::Simd;
+use crate::learning::filter::vector::{LANES, Lanes, Real};
 use std::array::from_fn;
 use std::ops::Range;
 
@@ -60,18 +59,17 @@ impl<T: Real> Operator<T> {
 
     /// `u = Phi_w(p)` in planes; `factors` (one plane) gets `1 / sum_m v`, 0 beside the grid.
     #[inline(always)]
-    pub(super) fn forward<S: Simd>(&self, simd: S, p: &[T], u: &mut [T], factors: &mut [T]) {
+    pub(super) fn forward<V: Lanes<T>>(&self, p: &[T], u: &mut [T], factors: &mut [T]) {
         for row in 0..self.layout.shape.height() {
-            self.correlate(simd, &self.weights, p, u, row);
-            self.normalise(simd, u, factors, row);
+            self.correlate::<V>(&self.weights, p, u, row);
+            self.normalise::<V>(u, factors, row);
         }
     }
 
     /// `h` from `g` and `u`, in some rows and columns.
     #[inline(always)]
-    pub(super) fn backward_normalise<S: Simd>(
+    pub(super) fn backward_normalise<V: Lanes<T>>(
         &self,
-        simd: S,
         g: &[T],
         u: &[T],
         factors: &[T],
@@ -80,18 +78,19 @@ impl<T: Real> Operator<T> {
     ) {
         let plane = self.layout.plane;
         for row in region.rows.clone() {
-            for at in region.places(&self.layout, row, lanes::<T, S>()) {
-                let mut mean = T::splat(simd, T::zero());
+            for at in region.places(&self.layout, row) {
+                let mut mean = V::splat(T::zero());
                 for state in 0..self.layout.n_states {
-                    let g = load::<T, S>(g, state * plane + at);
-                    let u = load::<T, S>(u, state * plane + at);
-                    mean = T::multiply_add(simd, g, u, mean);
+                    let (g, u) = (
+                        load::<T, V>(g, state * plane + at),
+                        load(u, state * plane + at),
+                    );
+                    mean = g.multiply_add(u, mean);
                 }
-                let factor = load::<T, S>(factors, at);
+                let factor: V = load(factors, at);
                 for state in 0..self.layout.n_states {
-                    let g = load::<T, S>(g, state * plane + at);
-                    let h_of_state = T::times(simd, T::minus(simd, g, mean), factor);
-                    store::<T, S>(h_of_state, h, state * plane + at);
+                    let g: V = load(g, state * plane + at);
+                    store(g.minus(mean).times(factor), h, state * plane + at);
                 }
             }
         }
@@ -99,9 +98,8 @@ impl<T: Real> Operator<T> {
 
     /// Adds `dL/dw` of some rows and columns of `h` to `gradient`.
     #[inline(always)]
-    pub(super) fn add_weight_gradient<S: Simd>(
+    pub(super) fn add_weight_gradient<V: Lanes<T>>(
         &self,
-        simd: S,
         p: &[T],
         h: &[T],
         region: &Region,
@@ -114,9 +112,9 @@ impl<T: Real> Operator<T> {
                 while to < n_states {
                     let corner = (to, from, kernel_row);
                     match n_states - to {
-                        1 => self.taps::<S, 1>(simd, p, h, region, corner, gradient),
-                        2 => self.taps::<S, 2>(simd, p, h, region, corner, gradient),
-                        _ => self.taps::<S, GROUP>(simd, p, h, region, corner, gradient),
+                        1 => self.taps::<V, 1>(p, h, region, corner, gradient),
+                        2 => self.taps::<V, 2>(p, h, region, corner, gradient),
+                        _ => self.taps::<V, GROUP>(p, h, region, corner, gradient),
                     }
                     to += GROUP;
                 }
@@ -126,28 +124,22 @@ impl<T: Real> Operator<T> {
 
     /// `dL/dp` from `h`, in some rows.
     #[inline(always)]
-    pub(super) fn backward_correlate<S: Simd>(
-        &self,
-        simd: S,
-        h: &[T],
-        g: &mut [T],
-        rows: Range<usize>,
-    ) {
+    pub(super) fn backward_correlate<V: Lanes<T>>(&self, h: &[T], g: &mut [T], rows: Range<usize>) {
         for row in rows {
-            self.correlate(simd, &self.turned, h, g, row);
+            self.correlate::<V>(&self.turned, h, g, row);
         }
     }
 
     /// One row of eq. 2.
     #[inline(always)]
-    fn correlate<S: Simd>(&self, simd: S, weights: &[T], from: &[T], to: &mut [T], row: usize) {
+    fn correlate<V: Lanes<T>>(&self, weights: &[T], from: &[T], to: &mut [T], row: usize) {
         let n_states = self.layout.n_states;
         let mut first = 0;
         while first < n_states {
             match n_states - first {
-                1 => self.group::<S, 1>(simd, weights, from, to, row, first),
-                2 => self.group::<S, 2>(simd, weights, from, to, row, first),
-                _ => self.group::<S, GROUP>(simd, weights, from, to, row, first),
+                1 => self.group::<V, 1>(weights, from, to, row, first),
+                2 => self.group::<V, 2>(weights, from, to, row, first),
+                _ => self.group::<V, GROUP>(weights, from, to, row, first),
             }
             first += GROUP;
         }
@@ -155,9 +147,8 @@ impl<T: Real> Operator<T> {
 
     /// The same for the next states from `first` on.
     #[inline(always)]
-    fn group<S: Simd, const G: usize>(
+    fn group<V: Lanes<T>, const G: usize>(
         &self,
-        simd: S,
         weights: &[T],
         from: &[T],
         to: &mut [T],
@@ -166,22 +157,20 @@ impl<T: Real> Operator<T> {
     ) {
         let columns = self.layout.columns();
         let mut col = 0;
-        let lanes = lanes::<T, S>();
-        while col + WIDE * lanes <= columns {
-            self.block::<S, G, WIDE>(simd, weights, from, to, (row, col), first);
-            col += WIDE * lanes;
+        while col + WIDE * LANES <= columns {
+            self.block::<V, G, WIDE>(weights, from, to, (row, col), first);
+            col += WIDE * LANES;
         }
         while col < columns {
-            self.block::<S, G, 1>(simd, weights, from, to, (row, col), first);
-            col += lanes;
+            self.block::<V, G, 1>(weights, from, to, (row, col), first);
+            col += LANES;
         }
     }
 
     /// The same for `B` vectors of cells.
     #[inline(always)]
-    fn block<S: Simd, const G: usize, const B: usize>(
+    fn block<V: Lanes<T>, const G: usize, const B: usize>(
         &self,
-        simd: S,
         weights: &[T],
         from: &[T],
         to: &mut [T],
@@ -190,18 +179,18 @@ impl<T: Real> Operator<T> {
     ) {
         let layout = &self.layout;
         let (n_states, n_taps) = (layout.n_states, layout.n_taps());
-        let mut sums = [[T::splat(simd, T::zero()); B]; G];
+        let mut sums = [[V::splat(T::zero()); B]; G];
         for state in 0..n_states {
             for a in 0..layout.kernel_height {
                 for c in 0..layout.kernel_width {
                     let at = state * layout.plane + (row + a) * layout.stride + c + col;
                     let tap = state * n_taps + a * layout.kernel_width + c;
                     let weight = |g: usize| weights[(first + g) * n_states * n_taps + tap];
-                    let taps: [_; G] = from_fn(|g| T::splat(simd, weight(g)));
-                    let cells: [_; B] = from_fn(|b| load::<T, S>(from, at + b * lanes::<T, S>()));
+                    let taps: [V; G] = from_fn(|g| V::splat(weight(g)));
+                    let cells: [V; B] = from_fn(|b| load(from, at + b * LANES));
                     for (&tap, sums) in taps.iter().zip(&mut sums) {
                         for (&cells, sum) in cells.iter().zip(sums) {
-                            *sum = T::multiply_add(simd, tap, cells, *sum);
+                            *sum = tap.multiply_add(cells, *sum);
                         }
                     }
                 }
@@ -210,38 +199,37 @@ impl<T: Real> Operator<T> {
         for (g, sums) in sums.iter().enumerate() {
             let at = (first + g) * layout.plane + layout.row(row) + col;
             for (b, sum) in sums.iter().enumerate() {
-                store::<T, S>(*sum, to, at + b * lanes::<T, S>());
+                store(*sum, to, at + b * LANES);
             }
         }
     }
 
     /// One row of eq. 3.
     #[inline(always)]
-    fn normalise<S: Simd>(&self, simd: S, u: &mut [T], factors: &mut [T], row: usize) {
+    fn normalise<V: Lanes<T>>(&self, u: &mut [T], factors: &mut [T], row: usize) {
         let layout = &self.layout;
-        for col in (0..layout.columns()).step_by(lanes::<T, S>()) {
+        for col in (0..layout.columns()).step_by(LANES) {
             let at = layout.row(row) + col;
-            let mask = load::<T, S>(&self.mask, col);
+            let mask: V = load(&self.mask, col);
             // Beside the grid the sum may be 0, where no factor is wanted.
-            let mut total = T::minus(simd, T::splat(simd, T::one()), mask);
+            let mut total = V::splat(T::one()).minus(mask);
             for state in 0..layout.n_states {
-                total = T::plus(simd, total, load::<T, S>(u, state * layout.plane + at));
+                total = total.plus(load(u, state * layout.plane + at));
             }
-            let factor = T::over(simd, mask, total);
-            store::<T, S>(factor, factors, at);
+            let factor = mask.over(total);
+            store(factor, factors, at);
             for state in 0..layout.n_states {
                 let at = state * layout.plane + at;
-                let weights = load::<T, S>(u, at);
-                store::<T, S>(T::times(simd, weights, factor), u, at);
+                let weights: V = load(u, at);
+                store(weights.times(factor), u, at);
             }
         }
     }
 
     /// The gradients of one row of the kernel between `from` and `G` next states, three taps a time.
     #[inline(always)]
-    fn taps<S: Simd, const G: usize>(
+    fn taps<V: Lanes<T>, const G: usize>(
         &self,
-        simd: S,
         p: &[T],
         h: &[T],
         region: &Region,
@@ -250,19 +238,18 @@ impl<T: Real> Operator<T> {
     ) {
         let mut first = 0;
         while first + 3 <= self.layout.kernel_width {
-            self.some_taps::<S, G, 3>(simd, p, h, region, corner, first, gradient);
+            self.some_taps::<V, G, 3>(p, h, region, corner, first, gradient);
             first += 3;
         }
         while first < self.layout.kernel_width {
-            self.some_taps::<S, G, 1>(simd, p, h, region, corner, first, gradient);
+            self.some_taps::<V, G, 1>(p, h, region, corner, first, gradient);
             first += 1;
         }
     }
 
     #[inline(always)]
-    fn some_taps<S: Simd, const G: usize, const C: usize>(
+    fn some_taps<V: Lanes<T>, const G: usize, const C: usize>(
         &self,
-        simd: S,
         p: &[T],
         h: &[T],
         region: &Region,
@@ -273,14 +260,14 @@ impl<T: Real> Operator<T> {
         let layout = &self.layout;
         let tap = from * layout.plane + kernel_row * layout.stride + first;
         let origin = layout.row(0);
-        let mut sums = [[T::splat(simd, T::zero()); C]; G];
+        let mut sums = [[V::splat(T::zero()); C]; G];
         for row in region.rows.clone() {
-            for at in region.places(layout, row, lanes::<T, S>()) {
-                let cells: [_; C] = from_fn(|c| load::<T, S>(p, tap + at - origin + c));
+            for at in region.places(layout, row) {
+                let cells: [V; C] = from_fn(|c| load(p, tap + at - origin + c));
                 for (g, sums) in sums.iter_mut().enumerate() {
-                    let h = load::<T, S>(h, (to + g) * layout.plane + at);
+                    let h: V = load(h, (to + g) * layout.plane + at);
                     for (&cells, sum) in cells.iter().zip(sums) {
-                        *sum = T::multiply_add(simd, cells, h, *sum);
+                        *sum = cells.multiply_add(h, *sum);
                     }
                 }
             }
@@ -289,7 +276,7 @@ impl<T: Real> Operator<T> {
             let entry = ((to + g) * layout.n_states + from) * layout.n_taps();
             let entry = entry + kernel_row * layout.kernel_width + first;
             for (gradient, &sum) in gradient[entry..].iter_mut().zip(sums) {
-                *gradient += total::<T, S>(sum);
+                *gradient += total(sum);
             }
         }
     }
@@ -327,14 +314,9 @@ impl Region {
 
     /// Places of the vectors in a row.
     #[inline(always)]
-    fn places(
-        &self,
-        layout: &Layout,
-        row: usize,
-        lanes: usize,
-    ) -> impl Iterator<Item = usize> + use<> {
+    fn places(&self, layout: &Layout, row: usize) -> impl Iterator<Item = usize> + use<> {
         let start = layout.row(row);
-        self.cols.clone().step_by(lanes).map(move |col| start + col)
+        self.cols.clone().step_by(LANES).map(move |col| start + col)
     }
 }
 
@@ -343,4 +325,26 @@ fn widened(range: &Range<usize>, other: Range<usize>) -> Range<usize> {
         return other;
     }
     range.start.min(other.start)..range.end.max(other.end)
+}
+
+#[inline(always)]
+fn load<T, V: Lanes<T>>(planes: &[T], at: usize) -> V {
+    let lanes = planes[at..].first_chunk();
+    V::load(lanes.expect("invariant: the layout has room for whole vectors"))
+}
+
+#[inline(always)]
+fn store<T, V: Lanes<T>>(numbers: V, planes: &mut [T], at: usize) {
+    let lanes = planes[at..].first_chunk_mut();
+    numbers.store(lanes.expect("invariant: the layout has room for whole vectors"));
+}
+
+#[inline(always)]
+fn total<T: Real, V: Lanes<T>>(numbers: V) -> f64 {
+    let mut lanes = [T::zero(); LANES];
+    numbers.store(&mut lanes);
+    let lanes = lanes.iter();
+    lanes
+        .map(|lane| lane.to_f64().expect("invariant: floats cast"))
+        .sum()
 }

@@ -9,10 +9,9 @@
 use crate::estimation::parameters::Tables;
 use crate::learning::filter::layout::Layout;
 use crate::learning::filter::operator::{Operator, Region};
-use crate::learning::filter::vector::Real;
+use crate::learning::filter::vector::{Lanes, Real, Vectorised, on_widest};
 use crate::learning::replay::Sighting;
 use protocol::Shape;
-use pulp::{Arch, Simd, WithSimd};
 
 /// Where a window's first predictor comes from.
 #[derive(Debug, Clone, Copy)]
@@ -87,7 +86,7 @@ impl<T: Real> Window<T> {
     /// # Panics
     /// If there are more frames than there is room for, or cells off the grid.
     pub fn run(&mut self, start: Start<'_>, frames: &[Vec<Sighting>], end: &mut [f32]) -> Outcome {
-        Arch::new().dispatch(Pass {
+        on_widest(Pass {
             window: self,
             start,
             frames,
@@ -151,22 +150,22 @@ impl<T: Real> Window<T> {
 
     /// Eq. 6.
     #[inline(always)]
-    fn predict<S: Simd>(&mut self, simd: S, frame: usize) {
+    fn predict<V: Lanes<T>>(&mut self, frame: usize) {
         let (before, after) = self.planes.split_at_mut(frame + 1);
         let factors = &mut self.factors[frame + 1];
         self.operator
-            .forward(simd, &before[frame], &mut after[0], factors);
+            .forward::<V>(&before[frame], &mut after[0], factors);
     }
 
     #[inline(always)]
-    fn backward<S: Simd>(&mut self, simd: S, n_frames: usize, outcome: &mut Outcome) {
+    fn backward<V: Lanes<T>>(&mut self, n_frames: usize, outcome: &mut Outcome) {
         self.by_belief.fill(T::zero());
         self.by_weights.fill(T::zero());
         let mut region = Region::default();
         for frame in (0..n_frames).rev() {
             self.uncorrect(frame, outcome, &mut region);
             if frame > 0 && !region.rows.is_empty() {
-                region = self.unpredict(simd, frame, &region, outcome);
+                region = self.unpredict::<V>(frame, &region, outcome);
             }
         }
     }
@@ -202,9 +201,8 @@ impl<T: Real> Window<T> {
 
     /// Eqs. 2 and 3 backward: from `dL/du` of a frame to `dL/dp` of the one before.
     #[inline(always)]
-    fn unpredict<S: Simd>(
+    fn unpredict<V: Lanes<T>>(
         &mut self,
-        simd: S,
         frame: usize,
         region: &Region,
         outcome: &mut Outcome,
@@ -212,10 +210,10 @@ impl<T: Real> Window<T> {
         let (u, p) = (&self.planes[frame], &self.planes[frame - 1]);
         let operator = &self.operator;
         let h = &mut self.by_weights;
-        operator.backward_normalise(simd, &self.by_belief, u, &self.factors[frame], h, region);
-        operator.add_weight_gradient(simd, p, h, region, &mut outcome.gradient[0]);
+        operator.backward_normalise::<V>(&self.by_belief, u, &self.factors[frame], h, region);
+        operator.add_weight_gradient::<V>(p, h, region, &mut outcome.gradient[0]);
         let reached = region.reached(&operator.layout);
-        operator.backward_correlate(simd, h, &mut self.by_belief, reached.rows.clone());
+        operator.backward_correlate::<V>(h, &mut self.by_belief, reached.rows.clone());
         reached
     }
 
@@ -243,11 +241,12 @@ struct Pass<'a, T> {
     end: &'a mut [f32],
 }
 
-impl<T: Real> WithSimd for Pass<'_, T> {
+impl<T: Real> Vectorised for Pass<'_, T> {
+    type Number = T;
     type Output = Outcome;
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) -> Outcome {
+    fn run<V: Lanes<T>>(self) -> Outcome {
         let (window, n_frames) = (self.window, self.frames.len());
         let mut outcome = Outcome {
             gradient: window.tables.dimensions.lengths().map(|n| vec![0.0; n]),
@@ -258,13 +257,13 @@ impl<T: Real> WithSimd for Pass<'_, T> {
         for (frame, sightings) in self.frames.iter().enumerate() {
             outcome.log_likelihood += window.correct(frame, sightings);
             outcome.n_seen += sightings.len();
-            window.predict(simd, frame);
+            window.predict::<V>(frame);
         }
         let cast = |p: T| p.to_f32().expect("invariant: floats cast");
         window
             .layout()
             .unload(&window.planes[n_frames], self.end, cast);
-        window.backward(simd, n_frames, &mut outcome);
+        window.backward::<V>(n_frames, &mut outcome);
         if matches!(self.start, Start::Initial) {
             window.add_initial_gradient(&mut outcome);
         }
