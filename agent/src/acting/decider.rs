@@ -201,7 +201,7 @@ fn agent(
         learned: &Learned::default(),
     };
     // Any choice will do: each has the same estimator and planner.
-    Ok(registry::agent(&choices[0], config, task)?)
+    registry::agent(&choices[0], config, task)
 }
 
 fn decision(robot: &Robot, client: &Client, objective: Option<u64>) -> Decision {

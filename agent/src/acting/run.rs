@@ -202,7 +202,7 @@ impl Attached {
         let truth = truth_of(truth, &self.client, self.robot.observation())?;
         let (feed, world) = (&mut self.feed, self.client.worlds().start);
         let look = |robot: &Robot| show(feed, world, robot, false);
-        Ok(self.robot.begin(truth.as_ref(), look)?)
+        self.robot.begin(truth.as_ref(), look)
     }
 
     /// One step of the rollout; returns the reward. The last belief is shown in any case.

@@ -210,7 +210,7 @@ pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Resu
         bar.inc(steps);
     });
     bar.finish_and_clear();
-    Ok(results?)
+    results
 }
 
 fn draw_step(path: &Path, arena: &mut Arena, snapshot: &Snapshot) -> Result<()> {

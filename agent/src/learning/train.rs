@@ -233,7 +233,7 @@ impl Trainer {
             checkpoint::write(&place, self.student.kind(), &contents)?;
         }
         self.metrics.flush()?;
-        Ok(self.events.flush()?)
+        self.events.flush()
     }
 
     fn report(&mut self, tick: &Tick) {
