@@ -30,7 +30,7 @@ pub struct Trainer {
     config: LearningConfig,
     seed: u64,
     pub shape: Shape,
-    pub(in crate::learning) streams: Vec<Stream>,
+    pub(crate) streams: Vec<Stream>,
     /// Blocks still to be run through in this lap.
     lap: Vec<u64>,
     n_laps: u64,
@@ -50,7 +50,7 @@ pub struct Update {
 
 /// A place in the replay, and the belief before the frame there.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(in crate::learning) struct Stream {
+pub(crate) struct Stream {
     block: Option<u64>,
     n_done: usize,
     belief: Vec<f32>,
