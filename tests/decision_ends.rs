@@ -4,13 +4,11 @@ use crate::harness::{PATIENCE, Program, SMALL, Server, eventually, new_instance,
 use crate::learner::{Learner, refusal, reply_to, start_agent, start_with_learner};
 use crate::wire::control_header;
 use agent::acting::decider::{Assignment, Decider};
-use agent::acting::error::RunError;
 use agent::acting::run::prepare;
 use agent::config::AgentConfig;
 use agent::planning::policy::PlannerKind;
-use agent::server::client::{Claim, Client, shape_of};
+use agent::server::client::{self, Claim, Client, shape_of};
 use protocol::channels::{ChannelError, Instance};
-use protocol::connection::ConnectionError;
 use protocol::decisions::{Reply, Request};
 use protocol::message::Status;
 use rustix::process::Signal;
@@ -58,17 +56,9 @@ fn an_agent_renews_its_lease_when_a_third_of_it_has_passed_without_use() {
     assert!(decider.until_renewal(due).is_zero());
     let _thief = Client::acquire(&server.instance, &takeover(0..1)).expect("take over");
     decider.keep_alive(almost).expect("nothing is asked");
-    let lost = decider.keep_alive(due);
-    assert!(
-        matches!(
-            &lost,
-            Err(RunError::Connection(ConnectionError::Refused {
-                status: Status::LeaseLost,
-                ..
-            }))
-        ),
-        "{lost:?}"
-    );
+    let lost = decider.keep_alive(due).expect_err("the lease is lost");
+    let status = client::refusal(&lost).map(|(status, ..)| status);
+    assert_eq!(status, Some(Status::LeaseLost), "{lost:?}");
 }
 
 /// What decides for world 0 in an agent, without what serves it.
