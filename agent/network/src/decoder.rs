@@ -70,7 +70,11 @@ impl Decoder {
 
     /// Logits of all cells of the padded grid, `[frames, states, rows, cols]`.
     pub fn forward(&self, hidden: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
-        self.doubled(self.levels.len(), hidden, pass)
+        let z = self.doubled(self.levels.len(), hidden, pass)?;
+        let [.., rows, cols] = *z.dims() else {
+            unreachable!("invariant: a map has rows and columns");
+        };
+        z.reshape((pass.window.len(), (), rows, cols))
     }
 
     /// Logits of the cells that each frame's successor shows, `[targets, states]`.
@@ -89,11 +93,14 @@ impl Decoder {
         z.apply_op3(&level.norm.weights()?, &level.kernels, op)
     }
 
-    /// The map after so many doublings.
+    /// The map after so many doublings: `[frames, channels, rows, cols]`, of our operators `[planes, rows, cols]`.
     fn doubled(&self, n_doublings: usize, hidden: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
         let (n_hidden, channels, rows, cols) = self.seed.dims4()?;
         let seed = hidden.matmul(&self.seed.reshape((n_hidden, ()))?)?;
-        let mut z = seed.reshape(((), channels, rows, cols))?;
+        let mut z = match self.is_stock {
+            true => seed.reshape(((), channels, rows, cols))?,
+            false => seed.reshape(((), rows, cols))?,
+        };
         for level in 0..n_doublings {
             z = match self.is_stock {
                 true => self.stock(level, &z, pass)?,

@@ -16,5 +16,7 @@ pub(crate) mod doubling_at_targets;
 pub(crate) mod drop_relu_norm;
 pub(crate) mod gru_sequence;
 pub(crate) mod norm;
+mod planes;
+mod product;
 mod taps;
 pub(crate) mod visited_conv;

@@ -35,24 +35,21 @@ impl DropReluNorm {
         let (gradient, terms) = norm.backward(&sums);
         let (channels, per_frame) = (terms.len(), z.len() / self.mask.n_frames());
         let mut dz = vec![0.0; z.len()];
-        frames(
-            &mut dz,
-            per_frame,
-            || (),
-            |(), frame, dz| {
-                let scales = self.mask.scales(frame);
-                let z = z[frame * per_frame..][..per_frame].chunks_exact(channels);
-                let dy = dy[frame * per_frame..][..per_frame].chunks_exact(channels);
-                for (dz, (z, dy)) in dz.chunks_exact_mut(channels).zip(z.zip(dy)) {
-                    for c in 0..channels {
-                        let m = z[c] * scales[c];
-                        let [p, q, r] = terms[c];
-                        let d = scales[c] * (p * dy[c] + q * m + r);
-                        dz[c] = if m > 0.0 { d } else { 0.0 };
-                    }
+        let one = |(): &mut (), frame: usize, dz: &mut [f32]| {
+            let scales = self.mask.scales(frame);
+            let z = z[frame * per_frame..][..per_frame].chunks_exact(channels);
+            let dy = dy[frame * per_frame..][..per_frame].chunks_exact(channels);
+            for (dz, (z, dy)) in dz.chunks_exact_mut(channels).zip(z.zip(dy)) {
+                for c in 0..channels {
+                    let m = z[c] * scales[c];
+                    let [p, q, r] = terms[c];
+                    let d = scales[c] * (p * dy[c] + q * m + r);
+                    dz[c] = if m > 0.0 { d } else { 0.0 };
                 }
-            },
-        );
+            }
+        };
+        let start = |frame| frame * per_frame;
+        frames(&mut dz, self.mask.n_frames(), start, || (), one);
         (dz, gradient)
     }
 }
@@ -101,20 +98,17 @@ impl CustomOp2 for DropReluNorm {
         let norm = Norm::new(weights, &self.moments, 1.0);
         let (channels, per_frame) = (norm.a.len(), z.len() / self.mask.n_frames());
         let mut out = vec![0.0; z.len()];
-        frames(
-            &mut out,
-            per_frame,
-            || (),
-            |(), frame, out| {
-                let scales = self.mask.scales(frame);
-                let rows = z[frame * per_frame..][..per_frame].chunks_exact(channels);
-                for (out, row) in out.chunks_exact_mut(channels).zip(rows) {
-                    for c in 0..channels {
-                        out[c] = norm.a[c] * (row[c] * scales[c]).max(0.0) + norm.b[c];
-                    }
+        let one = |(): &mut (), frame: usize, out: &mut [f32]| {
+            let scales = self.mask.scales(frame);
+            let rows = z[frame * per_frame..][..per_frame].chunks_exact(channels);
+            for (out, row) in out.chunks_exact_mut(channels).zip(rows) {
+                for c in 0..channels {
+                    out[c] = norm.a[c] * (row[c] * scales[c]).max(0.0) + norm.b[c];
                 }
-            },
-        );
+            }
+        };
+        let start = |frame| frame * per_frame;
+        frames(&mut out, self.mask.n_frames(), start, || (), one);
         Ok((CpuStorage::F32(out), z_layout.shape().clone()))
     }
 

@@ -57,9 +57,11 @@ impl CustomOp2 for VisitedConv {
         let biases = slice(biases, biases_layout)?;
         let (n, positions, n_frames) = (biases.len(), self.positions(), self.window.len());
         let mut out = vec![0.0; n_frames * positions * n];
+        let start = |frame| frame * positions * n;
         frames(
             &mut out,
-            positions * n,
+            n_frames,
+            start,
             || (),
             |(), frame, out| {
                 let places = out.chunks_exact_mut(n);
