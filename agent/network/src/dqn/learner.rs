@@ -4,7 +4,7 @@ use super::memory::{Memory, Row, Transition};
 use super::track::Track;
 use crate::adam::{Adam, AdamSettings};
 use crate::error::{NetworkError, NotFinite};
-use crate::tensors::first_not_finite;
+use crate::tensors::{first_not_finite, named};
 use crate::variables::{Variables, build, uniform, uniform_init};
 use candle_core::{DType, Device, Result as CandleResult, Tensor};
 use candle_nn::loss::mse;
@@ -76,17 +76,17 @@ pub struct Dqn {
     pub(super) seed: u64,
     pub(super) n_inputs: usize,
     pub(super) n_actions: usize,
-    pub(super) network: Perceptron,
-    pub(super) variables: Variables,
-    /// Follows the network slowly.
-    pub(super) target: Perceptron,
+    network: Perceptron,
     pub(super) adam: Adam,
+    /// Follows the network slowly.
+    target: Perceptron,
+    pub(super) target_variables: Variables,
     pub(super) memory: Memory,
     pub(super) n_updates: u64,
 }
 
 /// Linear layers with ReLU between them.
-pub(super) struct Perceptron(pub(super) Vec<Linear>);
+struct Perceptron(Vec<Linear>);
 
 /// Transitions as tensors.
 struct Batch {
@@ -116,38 +116,24 @@ impl Perceptron {
             .try_fold(input.clone(), |x, layer| layer.forward(&x)?.relu())?;
         last.forward(&x)
     }
-
-    /// A perceptron of other numbers: `f` of this one's weights and biases, and of another's.
-    fn zip(
-        &self,
-        other: &Self,
-        f: impl Fn(&Tensor, &Tensor) -> CandleResult<Tensor>,
-    ) -> CandleResult<Self> {
-        let layers = self.0.iter().zip(&other.0).map(|(one, other)| {
-            let bias = |layer: &Linear| layer.bias().expect("invariant: a bias").clone();
-            let bias = f(&bias(one), &bias(other))?;
-            Ok(Linear::new(f(one.weight(), other.weight())?, Some(bias)))
-        });
-        layers.collect::<CandleResult<_>>().map(Self)
-    }
 }
 
 impl Dqn {
     /// A learner over `n_inputs` numbers and `n_actions` actions; its target starts equal.
     pub fn new(settings: DqnSettings, n_inputs: usize, n_actions: usize, seed: u64) -> Self {
         let perceptron = |vb: VarBuilder<'_>| Perceptron::new(&vb, n_inputs, n_actions);
-        let made = build(seed, DType::F32, &Device::Cpu, perceptron);
-        let (network, variables) = on_cpu(made);
-        let target = network.zip(&network, |tensor, _| tensor.detach().copy());
+        // First values depend on the seed and names alone.
+        let made = || on_cpu(build(seed, DType::F32, &Device::Cpu, perceptron));
+        let ((network, variables), (target, target_variables)) = (made(), made());
         Self {
             settings,
             seed,
             n_inputs,
             n_actions,
-            target: on_cpu(target),
-            adam: on_cpu(Adam::new(&variables)),
             network,
-            variables,
+            adam: on_cpu(Adam::new(variables)),
+            target,
+            target_variables,
             memory: Memory::new(settings.replay, n_inputs),
             n_updates: 0,
         }
@@ -240,36 +226,37 @@ impl Dqn {
     }
 
     fn learn_batch(&mut self, batch: &Batch) -> Result<f32, NetworkError> {
-        let (network, target) = (self.network_tensors(), self.target_tensors());
-        let known = batch.named().into_iter().chain(network).chain(target);
-        self.check(known)?;
+        let groups = self.groups();
+        let known = batch.named().into_iter();
+        self.check(known.chain(named(&groups[..2])))?;
         let loss = self.loss(batch)?;
         let gradients = loss.backward()?;
         let loss = loss.to_scalar::<f32>()?;
-        let of_variables = self.variables.iter().filter_map(|(name, var)| {
+        let of_variables = named(&groups[..1]).zip(groups[0].1.values());
+        self.check(of_variables.filter_map(|((name, _), var)| {
             let gradient = gradients.get(var)?;
-            Some((format!("gradient of dqn.network.{name}"), gradient))
-        });
-        self.check(of_variables)?;
+            Some((format!("gradient of {name}"), gradient))
+        }))?;
         if !loss.is_finite() {
             return Err(self.not_finite("loss".into()));
         }
-        let step = self
-            .adam
-            .step(&self.settings.adam, &self.variables, &gradients)?;
+        let step = self.adam.step(&self.settings.adam, &gradients)?;
         let after = step.tensors();
         self.check(after.map(|(name, tensor)| (format!("dqn.network.{name}"), tensor)))?;
         self.adam.take(step)?;
         let tau = f64::from(self.settings.tau);
-        let towards = |target: &Tensor, now: &Tensor| target + ((now.detach() - target)? * tau)?;
-        self.target = self.target.zip(&self.network, towards)?;
+        for (name, target) in &self.target_variables {
+            let (now, old) = (&self.adam.variables()[name], target.as_detached_tensor());
+            let towards = ((now.as_detached_tensor() - &old)? * tau)?;
+            target.set(&(old + towards)?)?;
+        }
         self.n_updates += 1;
         Ok(loss)
     }
 
     /// The mean of `(Q(h, a) - (r + gamma^n Q'(h', a')))^2`.
     fn loss(&self, batch: &Batch) -> CandleResult<Tensor> {
-        let after = self.target.forward(&batch.next)?;
+        let after = self.target.forward(&batch.next)?.detach();
         let judge = match self.settings.double {
             true => self.network.forward(&batch.next)?.detach(),
             false => after.clone(),

@@ -67,14 +67,17 @@ pub(super) fn frames<A: Send>(
     }
     let run = |(frames, mut part): (Range<usize>, &mut [f32])| {
         let mut sums = new();
-        // Compiles the loop, and what is inlined into it, for AVX2 and AVX-512 as well.
-        pulp::Arch::new().dispatch(|| {
-            for frame in frames {
-                let (own, rest) = take(&mut part).split_at_mut(start(frame + 1) - start(frame));
-                f(&mut sums, frame, own);
-                part = rest;
-            }
-        });
+        // Compiles the loop, and what is always inlined into it, for AVX2 and AVX-512 as well.
+        pulp::Arch::new().dispatch(
+            #[inline(always)]
+            || {
+                for frame in frames {
+                    let (own, rest) = take(&mut part).split_at_mut(start(frame + 1) - start(frame));
+                    f(&mut sums, frame, own);
+                    part = rest;
+                }
+            },
+        );
         sums
     };
     chunks.into_par_iter().with_max_len(1).map(run).collect()
@@ -91,6 +94,7 @@ pub(super) fn sums_over_frames<A: Send>(
         n_frames,
         |_| 0,
         new,
+        #[inline(always)]
         |sums, frame, _| f(sums, frame),
     )
 }

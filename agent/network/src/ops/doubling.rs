@@ -247,6 +247,7 @@ impl<'a> Call<'a> {
             input.n_frames(),
             start,
             new,
+            #[inline(always)]
             |room, frame, out| {
                 self.read(frame, room);
                 let channels = [input.kept(frame), output.kept(frame)];
@@ -267,10 +268,17 @@ impl<'a> Call<'a> {
         };
         let n_frames = self.op.input.n_frames();
         let start = |frame| self.z.start(frame);
-        let chunks = frames(&mut dz, n_frames, start, new, |chunk, frame, dz| {
-            let d_out = &d_out[self.op.output.start(frame) * self.out_area()..];
-            self.gradients_of_frame(chunk, frame, d_out, dz);
-        });
+        let chunks = frames(
+            &mut dz,
+            n_frames,
+            start,
+            new,
+            #[inline(always)]
+            |chunk, frame, dz| {
+                let d_out = &d_out[self.op.output.start(frame) * self.out_area()..];
+                self.gradients_of_frame(chunk, frame, d_out, dz);
+            },
+        );
         let (mut kernels, mut d_outs, mut sums) = (vec![], vec![], vec![]);
         for chunk in chunks {
             kernels.push(chunk.kernels);

@@ -152,9 +152,16 @@ impl Call<'_> {
         let mut out = vec![0.0; window.all_targets().len() * n_out];
         let start = |frame| window.target_start(frame) * n_out;
         let new = || Room::new(&self.sizes);
-        frames(&mut out, window.len(), start, new, |room, frame, out| {
-            self.forward(frame, room, out);
-        });
+        frames(
+            &mut out,
+            window.len(),
+            start,
+            new,
+            #[inline(always)]
+            |room, frame, out| {
+                self.forward(frame, room, out);
+            },
+        );
         out
     }
 
@@ -171,12 +178,19 @@ impl Call<'_> {
         };
         let start = |frame| self.z.start(frame);
         let n_frames = self.op.window.len();
-        let chunks = frames(&mut dz, n_frames, start, new, |chunk, frame, dz| {
-            let first = self.op.window.target_start(frame) * self.sizes.channels_out;
-            self.read(frame, &mut chunk.room);
-            self.backward(frame, chunk, &d_out[first..], &turned);
-            self.gradients_of_frame(frame, chunk, dz);
-        });
+        let chunks = frames(
+            &mut dz,
+            n_frames,
+            start,
+            new,
+            #[inline(always)]
+            |chunk, frame, dz| {
+                let first = self.op.window.target_start(frame) * self.sizes.channels_out;
+                self.read(frame, &mut chunk.room);
+                self.backward(frame, chunk, &d_out[first..], &turned);
+                self.gradients_of_frame(frame, chunk, dz);
+            },
+        );
         let (kernels, sums): (Vec<_>, Vec<_>) = chunks
             .into_iter()
             .map(|chunk| (chunk.kernels, chunk.sums))

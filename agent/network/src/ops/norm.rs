@@ -25,11 +25,16 @@ impl Moments {
         let (n_frames, area, z) = (mask.n_frames(), rows * cols, numbers(z)?);
         let planes = Planes::new(&z, area, mask);
         let new = || Sums::new(mask.channels());
-        let sums = sums_over_frames(n_frames, new, |sums, frame| {
-            for (channel, plane) in planes.kept(frame) {
-                sums.add(channel, plane, plane);
-            }
-        });
+        let sums = sums_over_frames(
+            n_frames,
+            new,
+            #[inline(always)]
+            |sums, frame| {
+                for (channel, plane) in planes.kept(frame) {
+                    sums.add(channel, plane, plane);
+                }
+            },
+        );
         let mut sums = Sums::total(sums);
         let scale = f64::from(mask.scale());
         sums.first.iter_mut().for_each(|sum| *sum *= scale);
@@ -161,14 +166,20 @@ impl Norm {
 /// Puts `dz` in place of `dy` at kept channels.
 pub(super) fn finish(terms: &[[f32; 3]], z: &Planes<'_>, dy: &mut [f32]) {
     let start = |frame| z.start(frame);
-    let one = |(): &mut (), frame: usize, dy: &mut [f32]| {
-        for (index, (channel, z_plane)) in z.kept(frame).enumerate() {
-            let [p, q, r] = terms[channel];
-            let dy = &mut dy[z.place(frame, index)..][..z_plane.len()];
-            for (dy, z) in dy.iter_mut().zip(z_plane) {
-                *dy = p * *dy + q * z + r;
+    frames(
+        dy,
+        z.mask().n_frames(),
+        start,
+        || (),
+        #[inline(always)]
+        |(): &mut (), frame: usize, dy: &mut [f32]| {
+            for (index, (channel, z_plane)) in z.kept(frame).enumerate() {
+                let [p, q, r] = terms[channel];
+                let dy = &mut dy[z.place(frame, index)..][..z_plane.len()];
+                for (dy, z) in dy.iter_mut().zip(z_plane) {
+                    *dy = p * *dy + q * z + r;
+                }
             }
-        }
-    };
-    frames(dy, z.mask().n_frames(), start, || (), one);
+        },
+    );
 }

@@ -66,64 +66,96 @@ impl WithSimd for Call<'_> {
         for col in (0..whole).step_by(wide) {
             match S::F32_LANES {
                 // AVX2 has 16 registers, others of its kind 32.
-                8 => self.columns::<S, 6, 2>(simd, col),
-                _ => self.columns::<S, 8, 2>(simd, col),
+                8 => self.columns::<S, 6, 2, true>(simd, col),
+                _ => self.columns::<S, 8, 2, true>(simd, col),
             }
         }
         for col in (whole..cols).step_by(S::F32_LANES) {
-            self.columns::<S, 8, 1>(simd, col);
+            match col + S::F32_LANES <= cols {
+                true => self.columns::<S, 8, 1, true>(simd, col),
+                false => self.columns::<S, 8, 1, false>(simd, col),
+            }
         }
     }
 }
 
 impl Call<'_> {
-    /// `VECTORS` vectors of columns, `ROWS` rows at a time, whose sums stay in registers.
+    /// `VECTORS` vectors of columns, `ROWS` rows at a time, whose sums stay in registers. The vectors are whole,
+    /// or the row ends in the last.
     #[inline(always)]
     #[expect(
         unsafe_code,
         reason = "checks in the innermost loop take as long as it"
     )]
-    fn columns<S: Simd, const ROWS: usize, const VECTORS: usize>(&mut self, simd: S, col: usize) {
+    fn columns<S: Simd, const ROWS: usize, const VECTORS: usize, const WHOLE: bool>(
+        &mut self,
+        simd: S,
+        col: usize,
+    ) {
         let left = self.left.numbers.as_ptr();
         let right = self.right.numbers.as_ptr();
-        let mut masks = [simd.mask_between_m32s(0, 0); VECTORS];
-        for (vector, mask) in masks.iter_mut().enumerate() {
-            let first = col + vector * S::F32_LANES;
-            *mask = simd.mask_between_m32s(0, (self.right.cols - first).min(S::F32_LANES) as u32);
-        }
+        let vector = Vector::<WHOLE>(self.right.cols - col);
         for (places, rows) in self.left.rows.chunks(ROWS).zip(self.rows.chunks(ROWS)) {
             // The last block computes its last row several times.
             let mut from = [places[places.len() - 1]; ROWS];
             from[..places.len()].copy_from_slice(places);
             let mut sums = [[simd.splat_f32s(0.0); VECTORS]; ROWS];
             for (term, at) in self.left.terms.iter().zip(self.right.terms) {
-                let mut vectors = [simd.splat_f32s(0.0); VECTORS];
-                for vector in 0..VECTORS {
-                    // SAFETY: `add_product` has checked all places; the mask ends with the row.
-                    vectors[vector] = unsafe {
-                        let at = right.add(at + col + vector * S::F32_LANES);
-                        simd.mask_load_ptr_f32s(masks[vector], at)
-                    };
+                let mut numbers = [simd.splat_f32s(0.0); VECTORS];
+                for (index, numbers) in numbers.iter_mut().enumerate() {
+                    // SAFETY: `add_product` has checked all places.
+                    let at = unsafe { right.add(at + col + index * S::F32_LANES) };
+                    *numbers = vector.load(simd, at);
                 }
                 for row in 0..ROWS {
                     // SAFETY: as above.
                     let factor = simd.splat_f32s(unsafe { *left.add(from[row] + term) });
-                    for vector in 0..VECTORS {
-                        let sum = sums[row][vector];
-                        sums[row][vector] = simd.mul_add_f32s(factor, vectors[vector], sum);
+                    for index in 0..VECTORS {
+                        let sum = sums[row][index];
+                        sums[row][index] = simd.mul_add_f32s(factor, numbers[index], sum);
                     }
                 }
             }
             for (sums, row) in sums.iter().zip(rows) {
-                for vector in 0..VECTORS {
+                for (index, sum) in sums.iter().enumerate() {
                     // SAFETY: as above.
-                    unsafe {
-                        let to = self.out.as_mut_ptr();
-                        let to = to.add(row + col + vector * S::F32_LANES);
-                        let old = simd.mask_load_ptr_f32s(masks[vector], to);
-                        let new = simd.add_f32s(old, sums[vector]);
-                        simd.mask_store_ptr_f32s(masks[vector], to, new);
-                    }
+                    let to = unsafe { self.out.as_mut_ptr().add(row + col + index * S::F32_LANES) };
+                    vector.add(simd, to, *sum);
+                }
+            }
+        }
+    }
+}
+
+/// How vectors are read and written: whole, or only so many numbers.
+#[derive(Clone, Copy)]
+struct Vector<const WHOLE: bool>(usize);
+
+#[expect(
+    unsafe_code,
+    reason = "only `Call::columns` uses it, where its places are checked"
+)]
+impl<const WHOLE: bool> Vector<WHOLE> {
+    #[inline(always)]
+    fn load<S: Simd>(self, simd: S, from: *const f32) -> S::f32s {
+        // SAFETY: the numbers are within their slice.
+        unsafe {
+            match WHOLE {
+                true => from.cast::<S::f32s>().read_unaligned(),
+                false => simd.mask_load_ptr_f32s(simd.mask_between_m32s(0, self.0 as u32), from),
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn add<S: Simd>(self, simd: S, to: *mut f32, numbers: S::f32s) {
+        let sum = simd.add_f32s(self.load(simd, to), numbers);
+        // SAFETY: as above.
+        unsafe {
+            match WHOLE {
+                true => to.cast::<S::f32s>().write_unaligned(sum),
+                false => {
+                    simd.mask_store_ptr_f32s(simd.mask_between_m32s(0, self.0 as u32), to, sum)
                 }
             }
         }
