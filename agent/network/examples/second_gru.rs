@@ -40,7 +40,7 @@ impl TwoGrus {
 
     fn loss(&self, pass: &Pass<'_>, hidden: &[f32]) -> Result<Tensor> {
         let hidden = self.forward(pass, hidden)?;
-        let logits = self.decoder.at_targets(&hidden, pass)?;
+        let logits = self.decoder.forward(&hidden, pass)?;
         self.observation.loss(&logits, pass.window)
     }
 }

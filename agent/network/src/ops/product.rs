@@ -64,8 +64,9 @@ impl WithSimd for Call<'_> {
         let wide = 2 * S::F32_LANES;
         let whole = cols / wide * wide;
         for col in (0..whole).step_by(wide) {
+            // AVX2 has 16 registers, others of its kind 32.
             match S::F32_LANES {
-                // AVX2 has 16 registers, others of its kind 32.
+                _ if self.rows.len() <= 4 => self.columns::<S, 4, 2, true>(simd, col),
                 8 => self.columns::<S, 6, 2, true>(simd, col),
                 _ => self.columns::<S, 8, 2, true>(simd, col),
             }

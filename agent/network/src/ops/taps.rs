@@ -5,7 +5,7 @@
 //! convolution at the input's size, of shifted inputs.
 
 /// Side of a kernel.
-pub(super) const SIDE: usize = 4;
+const SIDE: usize = 4;
 
 /// Taps of a kernel.
 pub(super) const TAPS: usize = SIDE * SIDE;
@@ -152,14 +152,4 @@ impl Sizes {
     pub(super) fn padded(&self) -> usize {
         (2 * self.rows + 2) * (2 * self.cols + 2)
     }
-}
-
-/// The rows of taps that meet at a row of the output, `(tap's row, input's row)`; the same of columns.
-#[inline(always)]
-pub(super) fn meeting(row: usize, rows: usize) -> impl Iterator<Item = (usize, usize)> {
-    let (near, far) = match row % 2 {
-        0 => ((1, row / 2), (3, (row / 2).wrapping_sub(1))),
-        _ => ((2, row / 2), (0, row / 2 + 1)),
-    };
-    [near, far].into_iter().filter(move |(_, at)| *at < rows)
 }
