@@ -1,7 +1,6 @@
 //! The DQN itself: values of actions, and its updates.
 
-use super::memory::{Memory, Row, Transition};
-use super::track::Track;
+use super::track::{Track, Transition};
 use crate::adam::{Adam, AdamSettings};
 use crate::error::{NetworkError, NotFinite};
 use crate::tensors::{first_not_finite, named};
@@ -12,6 +11,7 @@ use candle_nn::{Linear, Module, VarBuilder};
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
+use std::collections::VecDeque;
 use std::fmt;
 
 /// Width of both hidden layers, as in the authors' code.
@@ -81,8 +81,8 @@ pub struct Dqn {
     /// Follows the network slowly.
     target: Perceptron,
     pub(super) target_variables: Variables,
-    pub(super) memory: Memory,
-    pub(super) n_updates: u64,
+    /// The latest transitions, the oldest first.
+    pub(super) memory: VecDeque<Transition>,
 }
 
 /// Linear layers with ReLU between them.
@@ -134,8 +134,7 @@ impl Dqn {
             adam: on_cpu(Adam::new(variables)),
             target,
             target_variables,
-            memory: Memory::new(settings.replay, n_inputs),
-            n_updates: 0,
+            memory: VecDeque::new(),
         }
     }
 
@@ -146,7 +145,7 @@ impl Dqn {
 
     /// Updates so far.
     pub fn n_updates(&self) -> u64 {
-        self.n_updates
+        self.adam.steps()
     }
 
     /// Transitions remembered.
@@ -197,7 +196,13 @@ impl Dqn {
     /// If it has other numbers of inputs or an action that there is not.
     pub fn remember(&mut self, transition: Transition) {
         assert!(transition.action < self.n_actions, "transition: action");
-        self.memory.push(Row::from(&transition));
+        for vector in [&transition.input, &transition.next] {
+            assert_eq!(vector.len(), self.n_inputs, "transition: numbers");
+        }
+        self.memory.push_back(transition);
+        if self.memory.len() > self.settings.replay {
+            self.memory.pop_front();
+        }
     }
 
     /// One step of Adam on a random batch, then of the target; the loss before it, or `None` while there
@@ -209,9 +214,9 @@ impl Dqn {
         if self.memory.len() < self.settings.batch.max(1) {
             return Ok(None);
         }
-        let mut rng = stream(self.seed, Purpose::Replay, self.n_updates);
+        let mut rng = stream(self.seed, Purpose::Replay, self.n_updates());
         let ages = std::iter::repeat_with(|| rng.next_u64() % self.memory.len() as u64);
-        let rows = ages.map(|age| self.memory.row(age as usize));
+        let rows = ages.map(|age| &self.memory[age as usize]);
         let batch = Batch::new(rows.take(self.settings.batch), self.n_inputs)?;
         self.learn_batch(&batch).map(Some)
     }
@@ -221,7 +226,7 @@ impl Dqn {
     /// # Errors
     /// [`NetworkError`] for a number that is not finite; nothing has changed then.
     pub fn learn(&mut self, batch: &[Transition]) -> Result<f32, NetworkError> {
-        let batch = Batch::new(batch.iter().map(Row::from), self.n_inputs)?;
+        let batch = Batch::new(batch.iter(), self.n_inputs)?;
         self.learn_batch(&batch)
     }
 
@@ -250,7 +255,6 @@ impl Dqn {
             let towards = ((now.as_detached_tensor() - &old)? * tau)?;
             target.set(&(old + towards)?)?;
         }
-        self.n_updates += 1;
         Ok(loss)
     }
 
@@ -279,23 +283,23 @@ impl Dqn {
     }
 
     fn not_finite(&self, tensor: String) -> NetworkError {
-        let update = self.n_updates;
+        let update = self.n_updates();
         NotFinite { update, tensor }.into()
     }
 }
 
 impl Batch {
-    fn new<'a>(rows: impl Iterator<Item = Row<'a>>, n_inputs: usize) -> CandleResult<Self> {
-        let rows: Vec<Row<'_>> = rows.collect();
-        let vectors = |vector: fn(&Row<'a>) -> &'a [f32]| {
+    fn new<'a>(rows: impl Iterator<Item = &'a Transition>, n_inputs: usize) -> CandleResult<Self> {
+        let rows: Vec<&Transition> = rows.collect();
+        let vectors = |vector: fn(&&'a Transition) -> &'a [f32]| {
             let numbers: Vec<f32> = rows.iter().flat_map(vector).copied().collect();
             Tensor::from_vec(numbers, (rows.len(), n_inputs), &Device::Cpu)
         };
         let actions: Vec<u32> = rows.iter().map(|row| row.action as u32).collect();
         let rewards: Vec<f32> = rows.iter().map(|row| row.reward).collect();
         Ok(Self {
-            input: vectors(|row| row.input)?,
-            next: vectors(|row| row.next)?,
+            input: vectors(|row| &row.input)?,
+            next: vectors(|row| &row.next)?,
             action: Tensor::new(actions, &Device::Cpu)?.unsqueeze(1)?,
             reward: Tensor::new(rewards, &Device::Cpu)?.unsqueeze(1)?,
         })
@@ -314,7 +318,7 @@ impl fmt::Debug for Dqn {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut debug = f.debug_struct("Dqn");
         debug.field("settings", &self.settings);
-        debug.field("n_updates", &self.n_updates);
+        debug.field("n_updates", &self.n_updates());
         debug.finish_non_exhaustive()
     }
 }

@@ -1,8 +1,7 @@
 //! What a resumed run needs of the DQN: tensors by name and a [`SavedDqn`] out, and in again.
 
 use super::learner::{Dqn, on_cpu};
-use super::memory::{Memory, Row, Transition};
-use super::track::Track;
+use super::track::{Track, Transition};
 use crate::error::NetworkError;
 use crate::tensors::{NamedTensor, found, named_numbers, set};
 use crate::variables::Variables;
@@ -35,8 +34,8 @@ impl Dqn {
     /// What else a resumed run needs.
     pub fn saved(&self) -> SavedDqn {
         SavedDqn {
-            n_updates: self.n_updates,
-            transitions: self.memory.rows().map(Transition::from).collect(),
+            n_updates: self.n_updates(),
+            transitions: self.memory.iter().cloned().collect(),
         }
     }
 
@@ -52,15 +51,12 @@ impl Dqn {
         saved: &SavedDqn,
     ) -> Result<(), E> {
         let changes = found(&self.groups(), find)?;
-        let mut memory = Memory::new(self.settings.replay, self.n_inputs);
-        for (at, transition) in saved.transitions.iter().enumerate() {
-            self.check_transition(at, transition)?;
-            memory.push(Row::from(transition));
-        }
+        let mut transitions = saved.transitions.iter().enumerate();
+        transitions.try_for_each(|(at, transition)| self.check_transition(at, transition))?;
         set(&changes).map_err(NetworkError::from)?;
-        self.memory = memory;
+        let forgotten = saved.transitions.len().saturating_sub(self.settings.replay);
+        self.memory = saved.transitions[forgotten..].to_vec().into();
         self.adam.set_steps(saved.n_updates);
-        self.n_updates = saved.n_updates;
         Ok(())
     }
 
