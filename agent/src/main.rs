@@ -4,7 +4,7 @@
 mod commands;
 
 use clap::{Parser, Subcommand};
-use network::{Allocator, keep_freed_memory};
+use network::{Allocator, set_up_process};
 use std::process::ExitCode;
 
 #[global_allocator]
@@ -37,7 +37,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    keep_freed_memory();
+    set_up_process();
     protocol::program::start_logging();
     let result = match &Cli::parse().command {
         Command::Run(command) => command.run(),

@@ -9,30 +9,18 @@
 //!     np.savez(f"{name}.npz", **{k: z[k] for k in z.files if z[k].dtype.kind != "U"})
 //! ```
 
+#[path = "../network/tests/network/golden_file.rs"]
+mod golden_file;
+
 use agent::estimation::BayesFilter;
 use agent::estimation::belief::Belief;
 use agent::planning::{Integration, Objective, Target};
-use ndarray::{Array, Array1, Array2, Array3, Array4, ArrayView2, ArrayView3, Dimension, s};
-use ndarray_npy::{NpzReader, ReadableElement};
-use protocol::frame::{Frame, UNOBSERVED};
+use golden_file::{Golden, frame_from};
+use ndarray::{Array1, Array2, Array3, Array4, ArrayView3, s};
+use protocol::frame::Frame;
 use protocol::grid::{Cell, Shape};
 use protocol::model::Model;
 use protocol::path::{Move, fly};
-use std::fs::File;
-
-struct Golden(NpzReader<File>);
-
-impl Golden {
-    fn open(name: &str) -> Self {
-        let path = format!("{}/tests/data/{name}.npz", env!("CARGO_MANIFEST_DIR"));
-        Self(NpzReader::new(File::open(path).expect("golden file")).expect("npz"))
-    }
-
-    fn get<T: ReadableElement, D: Dimension>(&mut self, name: &str) -> Array<T, D> {
-        let array = self.0.by_name(&format!("{name}.npy"));
-        array.unwrap_or_else(|error| panic!("{name}: {error}"))
-    }
-}
 
 fn shape_of(dim: (usize, usize)) -> Shape {
     Shape::new(dim.0, dim.1).expect("test shape")
@@ -42,12 +30,6 @@ fn shape_of(dim: (usize, usize)) -> Shape {
 fn belief_from(channels_last: ArrayView3<'_, f32>) -> Belief {
     let planes = channels_last.permuted_axes([2, 0, 1]);
     Belief::from_probabilities(planes.to_owned()).expect("on the simplex")
-}
-
-fn frame_from(observations: ArrayView2<'_, u8>, mask: ArrayView2<'_, u8>) -> Frame {
-    let seen = |(&value, &visited): (&u8, &u8)| if visited > 0 { value } else { UNOBSERVED };
-    let bytes: Vec<u8> = observations.iter().zip(mask).map(seen).collect();
-    Frame::from_bytes(shape_of(observations.dim()), 3, &bytes).expect("valid frame")
 }
 
 fn assert_close(belief: &Belief, channels_last: ArrayView3<'_, f32>, what: &str) {

@@ -5,7 +5,7 @@
 use criterion::{Criterion, criterion_group};
 use network::{
     Allocator, Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, NetworkShape,
-    Transition, Window, keep_freed_memory,
+    Transition, Window, set_up_process,
 };
 use protocol::frame::Frame;
 use protocol::grid::Shape;
@@ -106,7 +106,7 @@ fn dqn(c: &mut Criterion) {
 criterion_group!(benches, updates, steps, dqn);
 
 fn main() {
-    keep_freed_memory();
+    set_up_process();
     benches();
     Criterion::default().configure_from_args().final_summary();
 }

@@ -40,7 +40,7 @@ impl TwoGrus {
 
     fn loss(&self, pass: &Pass<'_>, hidden: &[f32]) -> Result<Tensor> {
         let hidden = self.forward(pass, hidden)?;
-        let logits = self.decoder.at_targets(&hidden, pass)?;
+        let logits = self.decoder.forward(&hidden, pass)?;
         self.observation.loss(&logits, pass.window)
     }
 }
@@ -69,12 +69,12 @@ fn main() -> Result<()> {
     };
     let model = |vb| TwoGrus::new(&vb, &shape);
     let (model, variables) = build(1, DType::F32, &Device::Cpu, model)?;
-    let (mut adam, settings) = (Adam::new(&variables)?, AdamSettings::paper(1e-3));
+    let (mut adam, settings) = (Adam::new(variables)?, AdamSettings::paper(1e-3));
     let window = Window::new(&frames(shape.grid));
     for update in 0..100 {
         let dropout = Dropout::draw(window.len(), 1, update);
         let loss = model.loss(&Pass::training(&window, &dropout), &[0.0; 8])?;
-        let step = adam.step(&settings, &variables, &loss.backward()?)?;
+        let step = adam.step(&settings, &loss.backward()?)?;
         adam.take(step)?;
         if update % 20 == 0 {
             println!("update {update}: loss {:.4}", loss.to_scalar::<f32>()?);

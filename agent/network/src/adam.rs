@@ -1,10 +1,10 @@
 //! Adam over candle variables, as PyTorch has it, with moments that can be saved.
 
+use crate::tensors::{Change, set};
 use crate::variables::{Variables, is_statistic};
 use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor, Var};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
 
 /// What is added to moments and taken off again: where gradients are zero, moments stay at a few roundings of this
 /// instead of subnormal numbers, which take some processors a hundred times as long.
@@ -33,33 +33,32 @@ impl AdamSettings {
     }
 }
 
-/// Adam's moments of each variable, by name, and how many steps they have seen.
-#[derive(Debug, Clone, Default)]
+/// Variables that are learned, with Adam's two moments of each parameter.
+#[derive(Debug, Clone)]
 pub struct Adam {
-    moments: BTreeMap<String, [Tensor; 2]>,
+    variables: Variables,
+    /// `first.<name>` and `second.<name>`.
+    moments: Variables,
     steps: u64,
 }
 
 /// A step that can still be refused: nothing has moved yet.
-pub struct Step {
-    /// Variables and where they go.
-    moved: Vec<(String, Var, Tensor)>,
-    moments: BTreeMap<String, [Tensor; 2]>,
-}
+#[derive(Debug)]
+pub struct Step(Vec<Change>);
 
 impl Adam {
     /// Before the first step.
     ///
     /// # Errors
     /// As candle's.
-    pub fn new(variables: &Variables) -> Result<Self> {
+    pub fn new(variables: Variables) -> Result<Self> {
         let parameters = variables.iter().filter(|(name, _)| !is_statistic(name));
-        let zeros = |(name, var): (&String, &Var)| {
-            let zeros = var.zeros_like()?;
-            Ok((name.clone(), [zeros.clone(), zeros]))
-        };
+        let moments = parameters.flat_map(|(name, var)| {
+            names(name).map(|name| Ok((name, Var::from_tensor(&var.zeros_like()?)?)))
+        });
         Ok(Self {
-            moments: parameters.map(zeros).collect::<Result<_>>()?,
+            moments: moments.collect::<Result<_>>()?,
+            variables,
             steps: 0,
         })
     }
@@ -68,28 +67,28 @@ impl Adam {
     ///
     /// # Errors
     /// As candle's.
-    pub fn step(
-        &self,
-        settings: &AdamSettings,
-        variables: &Variables,
-        gradients: &GradStore,
-    ) -> Result<Step> {
+    pub fn step(&self, settings: &AdamSettings, gradients: &GradStore) -> Result<Step> {
         let betas = settings.betas.map(f64::from);
         let bias = betas.map(|beta| 1.0 - beta.powf((self.steps + 1) as f64));
         let rate = f64::from(settings.learning_rate) / bias[0];
-        let (mut moved, mut moments) = (Vec::new(), self.moments.clone());
-        for (name, [first, second]) in &mut moments {
-            let var = &variables[name];
+        let mut changes = Vec::new();
+        for (name, var) in &self.variables {
             let Some(gradient) = gradients.get(var) else {
                 continue;
             };
-            *first = towards(first, gradient, betas[0])?;
-            *second = towards(second, &gradient.sqr()?, betas[1])?;
-            let root = (second.sqrt()? * (1.0 / bias[1].sqrt()))?;
-            let step = ((&*first * rate)? / (root + f64::from(settings.epsilon))?)?;
-            moved.push((name.clone(), var.clone(), (var.as_tensor() - step)?));
+            let names = names(name);
+            let [first, second] = names.each_ref().map(|name| &self.moments[name]);
+            let mean = towards(first, gradient, betas[0])?;
+            let square = towards(second, &gradient.sqr()?, betas[1])?;
+            let root = (square.sqrt()? * (1.0 / bias[1].sqrt()))?;
+            let step = ((&mean * rate)? / (root + f64::from(settings.epsilon))?)?;
+            let moved = (var.as_detached_tensor() - step)?;
+            changes.push((format!("{name} after the update"), var.clone(), moved));
+            let [of_mean, of_square] = names.map(|name| format!("adam.{name}"));
+            changes.push((of_mean, first.clone(), mean));
+            changes.push((of_square, second.clone(), square));
         }
-        Ok(Step { moved, moments })
+        Ok(Step(changes))
     }
 
     /// Makes a step.
@@ -97,16 +96,18 @@ impl Adam {
     /// # Errors
     /// As candle's.
     pub fn take(&mut self, step: Step) -> Result<()> {
-        for (_, var, tensor) in &step.moved {
-            var.set(tensor)?;
-        }
-        self.moments = step.moments;
+        set(&step.0)?;
         self.steps += 1;
         Ok(())
     }
 
-    /// The moments, by the names of the variables.
-    pub fn moments(&self) -> &BTreeMap<String, [Tensor; 2]> {
+    /// What is learned.
+    pub fn variables(&self) -> &Variables {
+        &self.variables
+    }
+
+    /// The moments, as `first.<name>` and `second.<name>`.
+    pub fn moments(&self) -> &Variables {
         &self.moments
     }
 
@@ -115,28 +116,28 @@ impl Adam {
         self.steps
     }
 
-    /// Other moments after so many steps, of the same variables.
-    pub(crate) fn restore(&mut self, moments: BTreeMap<String, [Tensor; 2]>, steps: u64) {
-        (self.moments, self.steps) = (moments, steps);
+    /// Counts other steps, whose moments are loaded.
+    pub(crate) fn set_steps(&mut self, steps: u64) {
+        self.steps = steps;
     }
 }
 
 impl Step {
     /// Everything that is about to change: its name, and its values after the step.
     pub fn tensors(&self) -> impl Iterator<Item = (String, &Tensor)> {
-        let moved = self.moved.iter();
-        let moved = moved.map(|(name, _, tensor)| (format!("{name} after the update"), tensor));
-        let moments = self.moments.iter().flat_map(|(name, moments)| {
-            let names = ["first", "second"].map(|which| format!("adam.{which}.{name}"));
-            names.into_iter().zip(moments)
-        });
-        moved.chain(moments)
+        self.0
+            .iter()
+            .map(|(name, _, tensor)| (name.clone(), tensor))
     }
 }
 
+fn names(variable: &str) -> [String; 2] {
+    ["first", "second"].map(|which| format!("{which}.{variable}"))
+}
+
 /// An old mean, with a new number's share in it.
-fn towards(old: &Tensor, new: &Tensor, beta: f64) -> Result<Tensor> {
-    let mean = ((old * beta)? + (new * (1.0 - beta))?)?;
+fn towards(old: &Var, new: &Tensor, beta: f64) -> Result<Tensor> {
+    let mean = ((old.as_detached_tensor() * beta)? + (new * (1.0 - beta))?)?;
     (mean + FLUSH)? - FLUSH
 }
 
@@ -157,8 +158,8 @@ mod tests {
         [("p".to_owned(), var)].into()
     }
 
-    fn step(adam: &mut Adam, settings: &AdamSettings, variables: &Variables, g: [f32; 2]) {
-        let step = adam.step(settings, variables, &gradients(variables, g));
+    fn step(adam: &mut Adam, settings: &AdamSettings, g: [f32; 2]) {
+        let step = adam.step(settings, &gradients(&adam.variables, g));
         adam.take(step.expect("a step")).expect("numbers");
     }
 
@@ -166,13 +167,13 @@ mod tests {
     /// the formulas of Kingma and Ba in 64 bits.
     #[test]
     fn two_steps_are_those_of_the_published_formulas() {
-        let (settings, variables) = (AdamSettings::paper(0.1), variables());
-        let mut adam = Adam::new(&variables).expect("moments");
+        let settings = AdamSettings::paper(0.1);
+        let mut adam = Adam::new(variables()).expect("moments");
         let mut exact = [1.0_f64, -2.0];
         let (mut m, mut v) = ([0.0; 2], [0.0; 2]);
         for (at, gradient) in [(1, [0.5_f32, -3.0]), (2, [0.25, 4.0])] {
-            step(&mut adam, &settings, &variables, gradient);
-            let got: Vec<f32> = variables["p"].to_vec1().expect("numbers");
+            step(&mut adam, &settings, gradient);
+            let got: Vec<f32> = adam.variables["p"].to_vec1().expect("numbers");
             for index in 0..2 {
                 let d = f64::from(gradient[index]);
                 m[index] = 0.5 * m[index] + 0.5 * d;
@@ -187,13 +188,13 @@ mod tests {
 
     #[test]
     fn moments_without_a_gradient_do_not_become_subnormal() {
-        let (settings, variables) = (AdamSettings::paper(0.1), variables());
-        let mut adam = Adam::new(&variables).expect("moments");
-        step(&mut adam, &settings, &variables, [1e-3, 1.0]);
+        let settings = AdamSettings::paper(0.1);
+        let mut adam = Adam::new(variables()).expect("moments");
+        step(&mut adam, &settings, [1e-3, 1.0]);
         for _ in 0..2000 {
-            step(&mut adam, &settings, &variables, [0.0, 0.0]);
+            step(&mut adam, &settings, [0.0, 0.0]);
         }
-        for moment in &adam.moments()["p"] {
+        for moment in adam.moments.values() {
             let numbers: Vec<f32> = moment.to_vec1().expect("numbers");
             for number in numbers {
                 assert!(number < 1e-30 && !number.is_subnormal(), "{number}");

@@ -7,11 +7,11 @@ use crate::error::{NetworkError, NotFinite};
 use crate::model::{Network, Stock};
 use crate::pass::Pass;
 use crate::shape::NetworkShape;
-use crate::tensors::{NamedTensor, first_not_finite, named, numbers_of, restored};
+use crate::tensors::{NamedTensor, first_not_finite, found, named, named_numbers, numbers_of, set};
 use crate::variables::{Variables, build, normal};
 use crate::window::Window;
 use candle_core::backprop::GradStore;
-use candle_core::{DType, Device, Result as CandleResult, Tensor, Var};
+use candle_core::{DType, Device, Result as CandleResult, Tensor};
 use protocol::grid::Probabilities;
 use protocol::randomness::{Purpose, stream};
 use serde::{Deserialize, Serialize};
@@ -64,7 +64,6 @@ pub struct Autoencoder {
     seed: u64,
     device: Device,
     network: Arc<Network>,
-    variables: Variables,
     adam: Adam,
     n_updates: u64,
 }
@@ -83,13 +82,12 @@ impl Autoencoder {
         let network = |vb| Network::new(&vb, &shape, Stock::default());
         let (network, variables) = build(seed, DType::F32, device, network)?;
         Ok(Self {
-            adam: Adam::new(&variables)?,
+            adam: Adam::new(variables)?,
             settings,
             shape,
             seed,
             device: device.clone(),
             network: Arc::new(network),
-            variables,
             n_updates: 0,
         })
     }
@@ -102,7 +100,6 @@ impl Autoencoder {
             seed: self.seed,
             device: self.device.clone(),
             network: self.network.clone(),
-            variables: self.variables.clone(),
             adam: self.adam.clone(),
             n_updates: self.n_updates,
         }
@@ -130,7 +127,7 @@ impl Autoencoder {
 
     /// Its parameters and running statistics.
     pub fn variables(&self) -> &Variables {
-        &self.variables
+        self.adam.variables()
     }
 
     /// Changes the step size.
@@ -223,19 +220,15 @@ impl Autoencoder {
         if let Some(tensor) = self.cause(loss, &gradients)? {
             return Err(self.not_finite(tensor));
         }
-        let statistics = moved_statistics(&self.variables, &pass.into_moments())?;
-        let step = self
-            .adam
-            .step(&self.settings.adam, &self.variables, &gradients)?;
+        let statistics = moved_statistics(self.variables(), &pass.into_moments())?;
+        let step = self.adam.step(&self.settings.adam, &gradients)?;
         let after = statistics
             .iter()
-            .map(|(name, tensor)| (format!("{name} after the update"), tensor));
+            .map(|(name, _, tensor)| (name.clone(), tensor));
         if let Some(tensor) = first_not_finite(after.chain(step.tensors()))? {
             return Err(self.not_finite(tensor));
         }
-        for (name, tensor) in &statistics {
-            self.variables[name].set(tensor)?;
-        }
+        set(&statistics)?;
         self.adam.take(step)?;
         self.n_updates += 1;
         Ok(loss)
@@ -243,13 +236,12 @@ impl Autoencoder {
 
     /// The first thing that is not finite: a cause before what follows from it.
     fn cause(&self, loss: f64, gradients: &GradStore) -> CandleResult<Option<String>> {
-        let variables = self.variables.iter();
-        let all = variables.map(|(name, var)| (name.clone(), var.as_tensor()));
-        let gradients = self.variables.iter().filter_map(|(name, var)| {
+        let gradients = self.variables().iter().filter_map(|(name, var)| {
             let gradient = gradients.get(var)?;
             Some((format!("gradient of {name}"), gradient))
         });
-        let tensor = first_not_finite(all.chain(gradients))?;
+        let all = [("", self.variables())];
+        let tensor = first_not_finite(named(&all).chain(gradients))?;
         Ok(tensor.or_else(|| (!loss.is_finite()).then(|| "loss".to_owned())))
     }
 
@@ -264,9 +256,11 @@ impl Autoencoder {
     /// # Errors
     /// [`NetworkError`] where the device fails.
     pub fn named_tensors(&self) -> Result<Vec<NamedTensor>, NetworkError> {
-        let variables = self.variables.iter();
-        let variables = variables.map(|(name, var)| (name.clone(), var.as_tensor()));
-        Ok(named(variables.chain(self.adam.tensors("adam")))?)
+        Ok(named_numbers(&self.groups())?)
+    }
+
+    fn groups(&self) -> [(&'static str, &Variables); 2] {
+        [("", self.variables()), ("adam.", self.adam.moments())]
     }
 
     /// Steps of Adam, and updates.
@@ -284,10 +278,9 @@ impl Autoencoder {
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
         [steps, n_updates]: [u64; 2],
     ) -> Result<(), E> {
-        let found = self.found(&find)?;
-        let moments = self.adam.found("adam", &find)?;
-        set(found)?;
-        self.adam.restore(moments, steps);
+        let changes = found(&self.groups(), find)?;
+        set(&changes).map_err(NetworkError::from)?;
+        self.adam.set_steps(steps);
         self.n_updates = n_updates;
         Ok(())
     }
@@ -300,24 +293,9 @@ impl Autoencoder {
         &mut self,
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
     ) -> Result<(), E> {
-        Ok(set(self.found(&find)?)?)
+        let changes = found(&[("", self.variables())], find)?;
+        Ok(set(&changes).map_err(NetworkError::from)?)
     }
-
-    fn found<E: From<NetworkError>>(
-        &self,
-        find: &impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
-    ) -> Result<Vec<(&Var, Tensor)>, E> {
-        let variables = self.variables.iter();
-        let found = variables.map(|(name, var)| Ok((var, restored(name, var, find)?)));
-        found.collect()
-    }
-}
-
-fn set(found: Vec<(&Var, Tensor)>) -> Result<(), NetworkError> {
-    for (var, tensor) in found {
-        var.set(&tensor)?;
-    }
-    Ok(())
 }
 
 impl fmt::Debug for Autoencoder {

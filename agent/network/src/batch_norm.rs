@@ -2,6 +2,7 @@
 
 use crate::ops::norm::{EPSILON, Moments};
 use crate::pass::Pass;
+use crate::tensors::Change;
 use crate::variables::Variables;
 use candle_core::{DType, Result, Tensor};
 use candle_nn::{Init, VarBuilder};
@@ -85,11 +86,11 @@ fn exact(tensor: &Tensor) -> Result<Vec<f64>> {
     tensor.flatten_all()?.to_dtype(DType::F64)?.to_vec1()
 }
 
-/// What the running statistics become after a window: variables and their new values, by name.
+/// What the running statistics become after a window.
 pub(crate) fn moved_statistics(
     variables: &Variables,
     moments: &[(String, Moments)],
-) -> Result<Vec<(String, Tensor)>> {
+) -> Result<Vec<Change>> {
     let mut moved = Vec::with_capacity(2 * moments.len());
     for (norm, moments) in moments {
         // PyTorch keeps the variance of the sample, divided by the number of values less one.
@@ -102,8 +103,8 @@ pub(crate) fn moved_statistics(
             let name = format!("{norm}.{what}");
             let old = &variables[&name];
             let new = Tensor::new(new, old.device())?.to_dtype(old.dtype())?;
-            let now = ((old.as_tensor() * (1.0 - MOMENTUM))? + (new * MOMENTUM)?)?;
-            moved.push((name, now));
+            let now = ((old.as_detached_tensor() * (1.0 - MOMENTUM))? + (new * MOMENTUM)?)?;
+            moved.push((format!("{name} after the update"), old.clone(), now));
         }
     }
     Ok(moved)

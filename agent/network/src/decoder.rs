@@ -4,7 +4,6 @@
 use crate::batch_norm::BatchNorm;
 use crate::dropout::Mask;
 use crate::ops::doubling::Doubling;
-use crate::ops::doubling_at_targets::DoublingAtTargets;
 use crate::ops::norm::Moments;
 use crate::pass::Pass;
 use crate::shape::{DECODER_CHANNELS, NetworkShape};
@@ -70,37 +69,21 @@ impl Decoder {
 
     /// Logits of all cells of the padded grid, `[frames, states, rows, cols]`.
     pub fn forward(&self, hidden: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
-        self.doubled(self.levels.len(), hidden, pass)
-    }
-
-    /// Logits of the cells that each frame's successor shows, `[targets, states]`.
-    pub fn at_targets(&self, hidden: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
-        if self.is_stock {
-            return gather_targets(&self.forward(hidden, pass)?, pass);
-        }
-        let last = self.levels.len() - 1;
-        let z = self.doubled(last, hidden, pass)?;
-        let op = DoublingAtTargets {
-            moments: self.moments(last, &z, pass)?,
-            input: pass.decoder_mask(last).clone(),
-            window: pass.window.clone(),
-        };
-        let level = &self.levels[last];
-        z.apply_op3(&level.norm.weights()?, &level.kernels, op)
-    }
-
-    /// The map after so many doublings.
-    fn doubled(&self, n_doublings: usize, hidden: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
         let (n_hidden, channels, rows, cols) = self.seed.dims4()?;
         let seed = hidden.matmul(&self.seed.reshape((n_hidden, ()))?)?;
-        let mut z = seed.reshape(((), channels, rows, cols))?;
-        for level in 0..n_doublings {
+        // Ours are `[planes, rows, cols]`.
+        let mut z = match self.is_stock {
+            true => seed.reshape(((), channels, rows, cols))?,
+            false => seed.reshape(((), rows, cols))?,
+        };
+        for level in 0..self.levels.len() {
             z = match self.is_stock {
                 true => self.stock(level, &z, pass)?,
                 false => self.ours(level, &z, pass)?,
             };
         }
-        Ok(z)
+        let scale = 1 << self.levels.len();
+        z.reshape((pass.window.len(), (), scale * rows, scale * cols))
     }
 
     fn stock(&self, level: usize, z: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
@@ -117,31 +100,13 @@ impl Decoder {
             true => pass.decoder_mask(level + 1).clone(),
             false => Mask::all(pass.window.len(), kernels.dim(1)?),
         };
+        let input = pass.decoder_mask(level).clone();
+        let moments = norm.moments(pass, || Moments::of(z, &input))?;
         let op = Doubling {
-            moments: self.moments(level, z, pass)?,
-            input: pass.decoder_mask(level).clone(),
+            input,
             output,
+            moments,
         };
         z.apply_op3(&norm.weights()?, kernels, op)
     }
-
-    fn moments(&self, level: usize, z: &Tensor, pass: &Pass<'_>) -> Result<Moments> {
-        let of_window = || Moments::of(z, pass.decoder_mask(level));
-        self.levels[level].norm.moments(pass, of_window)
-    }
-}
-
-/// The stock path from logits of all cells to those of targets.
-fn gather_targets(logits: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
-    let (_, n_states, rows, cols) = logits.dims4()?;
-    let cells = (0..pass.window.len()).flat_map(|frame| {
-        let targets = pass.window.targets(frame).iter();
-        targets.map(move |visit| {
-            let (row, col) = (usize::from(visit.row), usize::from(visit.col));
-            ((frame * rows + row) * cols + col) as u32
-        })
-    });
-    let cells = Tensor::new(cells.collect::<Vec<u32>>(), logits.device())?;
-    let by_cell = logits.permute((0, 2, 3, 1))?.reshape(((), n_states))?;
-    by_cell.index_select(&cells, 0)
 }

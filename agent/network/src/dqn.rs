@@ -5,11 +5,9 @@
 //! that a copy to a device and back takes longer.
 
 mod learner;
-mod memory;
 mod state;
 mod track;
 
 pub use learner::{Dqn, DqnSettings};
-pub use memory::Transition;
 pub use state::SavedDqn;
-pub use track::Track;
+pub use track::{Track, Transition};

@@ -10,7 +10,6 @@
 //! does so outside.
 
 mod adam;
-mod allocator;
 mod autoencoder;
 mod batch_norm;
 mod decoder;
@@ -24,6 +23,7 @@ mod model;
 mod observation;
 mod ops;
 mod pass;
+mod process;
 mod replay;
 mod shape;
 mod tensors;
@@ -31,7 +31,6 @@ pub mod variables;
 mod window;
 
 pub use adam::{Adam, AdamSettings};
-pub use allocator::{Allocator, keep_freed_memory};
 pub use autoencoder::{Autoencoder, AutoencoderSettings};
 pub use candle_core::Device;
 pub use decoder::Decoder;
@@ -44,6 +43,7 @@ pub use gru::Gru;
 pub use model::{Network, Stock};
 pub use observation::Observation;
 pub use pass::Pass;
+pub use process::{Allocator, set_up_process};
 pub use replay::Replay;
 pub use shape::NetworkShape;
 pub use tensors::NamedTensor;

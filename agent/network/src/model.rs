@@ -81,7 +81,7 @@ impl Network {
     /// The loss of what the window's frames say about their successors (eqs. 8 and 11).
     pub fn loss(&self, pass: &Pass<'_>, first: &[f32]) -> Result<Tensor> {
         let hidden = self.forward(pass, first)?;
-        let logits = self.decoder.at_targets(&hidden, pass)?;
+        let logits = self.decoder.forward(&hidden, pass)?;
         self.observation.loss(&logits, pass.window)
     }
 

@@ -33,14 +33,15 @@ impl Observation {
         softmax(&self.weight, 0)
     }
 
-    /// The cross-entropy of what a window's targets showed, the mean over them, from logits `[targets,
-    /// states]`.
+    /// The cross-entropy of what a window's targets showed, the mean over them, from logits `[frames, states,
+    /// rows, cols]`.
     pub fn loss(&self, logits: &Tensor, window: &Window) -> Result<Tensor> {
         let (matrix, targets) = (self.matrix()?, window.all_targets());
         if !self.is_stock {
-            return logits.apply_op2(&matrix.contiguous()?, CellLoss::of(targets));
+            let window = window.clone();
+            return logits.apply_op2(&matrix.contiguous()?, CellLoss { window });
         }
-        let u = softmax(logits, 1)?;
+        let u = softmax(&at_targets(logits, window)?, 1)?;
         let q = u.matmul(&matrix.t()?)?;
         let y = one_hot(window, &q)?;
         let hit = (&y * (&q + LOG_FLOOR)?.log()?)?;
@@ -48,6 +49,21 @@ impl Observation {
         let miss = ((1.0 - &y)? * ((1.0 - &q)?.relu()? + LOG_FLOOR)?.log()?)?;
         (hit + miss)?.sum_all()?.neg()? / targets.len() as f64
     }
+}
+
+/// The logits of the targets, `[targets, states]`.
+fn at_targets(logits: &Tensor, window: &Window) -> Result<Tensor> {
+    let (_, n_states, rows, cols) = logits.dims4()?;
+    let cells = (0..window.len()).flat_map(|frame| {
+        let targets = window.targets(frame).iter();
+        targets.map(move |visit| {
+            let (row, col) = (usize::from(visit.row), usize::from(visit.col));
+            ((frame * rows + row) * cols + col) as u32
+        })
+    });
+    let cells = Tensor::new(cells.collect::<Vec<u32>>(), logits.device())?;
+    let by_cell = logits.permute((0, 2, 3, 1))?.reshape(((), n_states))?;
+    by_cell.index_select(&cells, 0)
 }
 
 /// What the targets showed, as rows like those of `q`.

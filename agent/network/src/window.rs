@@ -69,11 +69,6 @@ impl Window {
         }
     }
 
-    /// Place of a frame's first target among all.
-    pub(crate) fn target_start(&self, frame: usize) -> usize {
-        self.starts[(frame + 1).min(self.len())] - self.starts[1.min(self.len())]
-    }
-
     /// The targets of all frames: the terms of the loss.
     pub(crate) fn all_targets(&self) -> &[Visit] {
         &self.visits[self.starts[1.min(self.len())]..]

@@ -1,10 +1,9 @@
 //! The DQN itself: values of actions, and its updates.
 
-use super::memory::{Memory, Row, Transition};
-use super::track::Track;
+use super::track::{Track, Transition};
 use crate::adam::{Adam, AdamSettings};
 use crate::error::{NetworkError, NotFinite};
-use crate::tensors::first_not_finite;
+use crate::tensors::{first_not_finite, named};
 use crate::variables::{Variables, build, uniform, uniform_init};
 use candle_core::{DType, Device, Result as CandleResult, Tensor};
 use candle_nn::loss::mse;
@@ -12,6 +11,7 @@ use candle_nn::{Linear, Module, VarBuilder};
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
+use std::collections::VecDeque;
 use std::fmt;
 
 /// Width of both hidden layers, as in the authors' code.
@@ -76,17 +76,17 @@ pub struct Dqn {
     pub(super) seed: u64,
     pub(super) n_inputs: usize,
     pub(super) n_actions: usize,
-    pub(super) network: Perceptron,
-    pub(super) variables: Variables,
-    /// Follows the network slowly.
-    pub(super) target: Perceptron,
+    network: Perceptron,
     pub(super) adam: Adam,
-    pub(super) memory: Memory,
-    pub(super) n_updates: u64,
+    /// Follows the network slowly.
+    target: Perceptron,
+    pub(super) target_variables: Variables,
+    /// The latest transitions, the oldest first.
+    pub(super) memory: VecDeque<Transition>,
 }
 
 /// Linear layers with ReLU between them.
-pub(super) struct Perceptron(pub(super) Vec<Linear>);
+struct Perceptron(Vec<Linear>);
 
 /// Transitions as tensors.
 struct Batch {
@@ -116,40 +116,25 @@ impl Perceptron {
             .try_fold(input.clone(), |x, layer| layer.forward(&x)?.relu())?;
         last.forward(&x)
     }
-
-    /// A perceptron of other numbers: `f` of this one's weights and biases, and of another's.
-    fn zip(
-        &self,
-        other: &Self,
-        f: impl Fn(&Tensor, &Tensor) -> CandleResult<Tensor>,
-    ) -> CandleResult<Self> {
-        let layers = self.0.iter().zip(&other.0).map(|(one, other)| {
-            let bias = |layer: &Linear| layer.bias().expect("invariant: a bias").clone();
-            let bias = f(&bias(one), &bias(other))?;
-            Ok(Linear::new(f(one.weight(), other.weight())?, Some(bias)))
-        });
-        layers.collect::<CandleResult<_>>().map(Self)
-    }
 }
 
 impl Dqn {
     /// A learner over `n_inputs` numbers and `n_actions` actions; its target starts equal.
     pub fn new(settings: DqnSettings, n_inputs: usize, n_actions: usize, seed: u64) -> Self {
         let perceptron = |vb: VarBuilder<'_>| Perceptron::new(&vb, n_inputs, n_actions);
-        let made = build(seed, DType::F32, &Device::Cpu, perceptron);
-        let (network, variables) = on_cpu(made);
-        let target = network.zip(&network, |tensor, _| tensor.detach().copy());
+        // First values depend on the seed and names alone.
+        let made = || on_cpu(build(seed, DType::F32, &Device::Cpu, perceptron));
+        let ((network, variables), (target, target_variables)) = (made(), made());
         Self {
             settings,
             seed,
             n_inputs,
             n_actions,
-            target: on_cpu(target),
-            adam: on_cpu(Adam::new(&variables)),
             network,
-            variables,
-            memory: Memory::new(settings.replay, n_inputs),
-            n_updates: 0,
+            adam: on_cpu(Adam::new(variables)),
+            target,
+            target_variables,
+            memory: VecDeque::new(),
         }
     }
 
@@ -160,7 +145,7 @@ impl Dqn {
 
     /// Updates so far.
     pub fn n_updates(&self) -> u64 {
-        self.n_updates
+        self.adam.steps()
     }
 
     /// Transitions remembered.
@@ -211,7 +196,13 @@ impl Dqn {
     /// If it has other numbers of inputs or an action that there is not.
     pub fn remember(&mut self, transition: Transition) {
         assert!(transition.action < self.n_actions, "transition: action");
-        self.memory.push(Row::from(&transition));
+        for vector in [&transition.input, &transition.next] {
+            assert_eq!(vector.len(), self.n_inputs, "transition: numbers");
+        }
+        self.memory.push_back(transition);
+        if self.memory.len() > self.settings.replay {
+            self.memory.pop_front();
+        }
     }
 
     /// One step of Adam on a random batch, then of the target; the loss before it, or `None` while there
@@ -223,9 +214,9 @@ impl Dqn {
         if self.memory.len() < self.settings.batch.max(1) {
             return Ok(None);
         }
-        let mut rng = stream(self.seed, Purpose::Replay, self.n_updates);
+        let mut rng = stream(self.seed, Purpose::Replay, self.n_updates());
         let ages = std::iter::repeat_with(|| rng.next_u64() % self.memory.len() as u64);
-        let rows = ages.map(|age| self.memory.row(age as usize));
+        let rows = ages.map(|age| &self.memory[age as usize]);
         let batch = Batch::new(rows.take(self.settings.batch), self.n_inputs)?;
         self.learn_batch(&batch).map(Some)
     }
@@ -235,41 +226,41 @@ impl Dqn {
     /// # Errors
     /// [`NetworkError`] for a number that is not finite; nothing has changed then.
     pub fn learn(&mut self, batch: &[Transition]) -> Result<f32, NetworkError> {
-        let batch = Batch::new(batch.iter().map(Row::from), self.n_inputs)?;
+        let batch = Batch::new(batch.iter(), self.n_inputs)?;
         self.learn_batch(&batch)
     }
 
     fn learn_batch(&mut self, batch: &Batch) -> Result<f32, NetworkError> {
-        let (network, target) = (self.network_tensors(), self.target_tensors());
-        let known = batch.named().into_iter().chain(network).chain(target);
-        self.check(known)?;
+        let groups = self.groups();
+        let known = batch.named().into_iter();
+        self.check(known.chain(named(&groups[..2])))?;
         let loss = self.loss(batch)?;
         let gradients = loss.backward()?;
         let loss = loss.to_scalar::<f32>()?;
-        let of_variables = self.variables.iter().filter_map(|(name, var)| {
+        let of_variables = named(&groups[..1]).zip(groups[0].1.values());
+        self.check(of_variables.filter_map(|((name, _), var)| {
             let gradient = gradients.get(var)?;
-            Some((format!("gradient of dqn.network.{name}"), gradient))
-        });
-        self.check(of_variables)?;
+            Some((format!("gradient of {name}"), gradient))
+        }))?;
         if !loss.is_finite() {
             return Err(self.not_finite("loss".into()));
         }
-        let step = self
-            .adam
-            .step(&self.settings.adam, &self.variables, &gradients)?;
+        let step = self.adam.step(&self.settings.adam, &gradients)?;
         let after = step.tensors();
         self.check(after.map(|(name, tensor)| (format!("dqn.network.{name}"), tensor)))?;
         self.adam.take(step)?;
         let tau = f64::from(self.settings.tau);
-        let towards = |target: &Tensor, now: &Tensor| target + ((now.detach() - target)? * tau)?;
-        self.target = self.target.zip(&self.network, towards)?;
-        self.n_updates += 1;
+        for (name, target) in &self.target_variables {
+            let (now, old) = (&self.adam.variables()[name], target.as_detached_tensor());
+            let towards = ((now.as_detached_tensor() - &old)? * tau)?;
+            target.set(&(old + towards)?)?;
+        }
         Ok(loss)
     }
 
     /// The mean of `(Q(h, a) - (r + gamma^n Q'(h', a')))^2`.
     fn loss(&self, batch: &Batch) -> CandleResult<Tensor> {
-        let after = self.target.forward(&batch.next)?;
+        let after = self.target.forward(&batch.next)?.detach();
         let judge = match self.settings.double {
             true => self.network.forward(&batch.next)?.detach(),
             false => after.clone(),
@@ -292,23 +283,23 @@ impl Dqn {
     }
 
     fn not_finite(&self, tensor: String) -> NetworkError {
-        let update = self.n_updates;
+        let update = self.n_updates();
         NotFinite { update, tensor }.into()
     }
 }
 
 impl Batch {
-    fn new<'a>(rows: impl Iterator<Item = Row<'a>>, n_inputs: usize) -> CandleResult<Self> {
-        let rows: Vec<Row<'_>> = rows.collect();
-        let vectors = |vector: fn(&Row<'a>) -> &'a [f32]| {
+    fn new<'a>(rows: impl Iterator<Item = &'a Transition>, n_inputs: usize) -> CandleResult<Self> {
+        let rows: Vec<&Transition> = rows.collect();
+        let vectors = |vector: fn(&&'a Transition) -> &'a [f32]| {
             let numbers: Vec<f32> = rows.iter().flat_map(vector).copied().collect();
             Tensor::from_vec(numbers, (rows.len(), n_inputs), &Device::Cpu)
         };
         let actions: Vec<u32> = rows.iter().map(|row| row.action as u32).collect();
         let rewards: Vec<f32> = rows.iter().map(|row| row.reward).collect();
         Ok(Self {
-            input: vectors(|row| row.input)?,
-            next: vectors(|row| row.next)?,
+            input: vectors(|row| &row.input)?,
+            next: vectors(|row| &row.next)?,
             action: Tensor::new(actions, &Device::Cpu)?.unsqueeze(1)?,
             reward: Tensor::new(rewards, &Device::Cpu)?.unsqueeze(1)?,
         })
@@ -327,7 +318,7 @@ impl fmt::Debug for Dqn {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut debug = f.debug_struct("Dqn");
         debug.field("settings", &self.settings);
-        debug.field("n_updates", &self.n_updates);
+        debug.field("n_updates", &self.n_updates());
         debug.finish_non_exhaustive()
     }
 }

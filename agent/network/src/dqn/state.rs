@@ -1,12 +1,10 @@
 //! What a resumed run needs of the DQN: tensors by name and a [`SavedDqn`] out, and in again.
 
-use super::learner::{Dqn, Perceptron, on_cpu};
-use super::memory::{Memory, Row, Transition};
-use super::track::Track;
+use super::learner::{Dqn, on_cpu};
+use super::track::{Track, Transition};
 use crate::error::NetworkError;
-use crate::tensors::{NamedTensor, named, restored};
-use candle_core::Tensor;
-use candle_nn::Linear;
+use crate::tensors::{NamedTensor, found, named_numbers, set};
+use crate::variables::Variables;
 use serde::{Deserialize, Serialize};
 
 /// A DQN without its tensors, settings and seed.
@@ -21,15 +19,23 @@ pub struct SavedDqn {
 impl Dqn {
     /// The network and its target by PyTorch's names, and Adam's moments.
     pub fn named_tensors(&self) -> Vec<NamedTensor> {
-        let networks = self.network_tensors().chain(self.target_tensors());
-        on_cpu(named(networks.chain(self.adam.tensors("dqn.adam"))))
+        on_cpu(named_numbers(&self.groups()))
+    }
+
+    /// The network's variables, its target's, and Adam's moments.
+    pub(super) fn groups(&self) -> [(&'static str, &Variables); 3] {
+        [
+            ("dqn.network.", self.adam.variables()),
+            ("dqn.target.", &self.target_variables),
+            ("dqn.adam.", self.adam.moments()),
+        ]
     }
 
     /// What else a resumed run needs.
     pub fn saved(&self) -> SavedDqn {
         SavedDqn {
-            n_updates: self.n_updates,
-            transitions: self.memory.rows().map(Transition::from).collect(),
+            n_updates: self.n_updates(),
+            transitions: self.memory.iter().cloned().collect(),
         }
     }
 
@@ -44,23 +50,13 @@ impl Dqn {
         find: impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
         saved: &SavedDqn,
     ) -> Result<(), E> {
-        let variables = self.network_tensors();
-        let variables = variables.map(|(name, tensor)| restored(&name, tensor, &find));
-        let variables = variables.collect::<Result<Vec<_>, E>>()?;
-        let target = self.target_from(&find)?;
-        let moments = self.adam.found("dqn.adam", &find)?;
-        let mut memory = Memory::new(self.settings.replay, self.n_inputs);
-        for (at, transition) in saved.transitions.iter().enumerate() {
-            self.check_transition(at, transition)?;
-            memory.push(Row::from(transition));
-        }
-        for (var, tensor) in self.variables.values().zip(&variables) {
-            var.set(tensor).map_err(NetworkError::from)?;
-        }
-        self.memory = memory;
-        self.target = target;
-        self.adam.restore(moments, saved.n_updates);
-        self.n_updates = saved.n_updates;
+        let changes = found(&self.groups(), find)?;
+        let mut transitions = saved.transitions.iter().enumerate();
+        transitions.try_for_each(|(at, transition)| self.check_transition(at, transition))?;
+        set(&changes).map_err(NetworkError::from)?;
+        let forgotten = saved.transitions.len().saturating_sub(self.settings.replay);
+        self.memory = saved.transitions[forgotten..].to_vec().into();
+        self.adam.set_steps(saved.n_updates);
         Ok(())
     }
 
@@ -97,31 +93,5 @@ impl Dqn {
             expected: format!("{n_inputs} finite inputs and an action below {n_actions}"),
             got: format!("{} and {action}", input.len()),
         })
-    }
-
-    pub(super) fn network_tensors(&self) -> impl Iterator<Item = (String, &Tensor)> {
-        let variables = self.variables.iter();
-        variables.map(|(name, var)| (format!("dqn.network.{name}"), var.as_tensor()))
-    }
-
-    pub(super) fn target_tensors(&self) -> impl Iterator<Item = (String, &Tensor)> {
-        let layers = self.target.0.iter().enumerate();
-        layers.flat_map(|(index, layer)| {
-            let name = |what: &str| format!("dqn.target.{}.{what}", 2 * index);
-            let bias = layer.bias().expect("invariant: a bias");
-            [(name("weight"), layer.weight()), (name("bias"), bias)]
-        })
-    }
-
-    fn target_from<E: From<NetworkError>>(
-        &self,
-        find: &impl Fn(&str, &[usize]) -> Result<Vec<f32>, E>,
-    ) -> Result<Perceptron, E> {
-        let tensors = self.target_tensors();
-        let tensors = tensors.map(|(name, tensor)| restored(&name, tensor, find));
-        let tensors = tensors.collect::<Result<Vec<_>, E>>()?;
-        let layers = tensors.chunks_exact(2);
-        let layer = |pair: &[Tensor]| Linear::new(pair[0].clone(), Some(pair[1].clone()));
-        Ok(Perceptron(layers.map(layer).collect()))
     }
 }

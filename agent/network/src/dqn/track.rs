@@ -1,8 +1,20 @@
-//! Transitions over several steps: from one world's steps in a row.
+//! Transitions, and those over several steps: from one world's steps in a row.
 
-use super::memory::Transition;
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
+
+/// One row `(h, a, r, h')` of the replay.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Transition {
+    /// Before.
+    pub input: Vec<f32>,
+    /// What was chosen.
+    pub action: usize,
+    /// What it brought.
+    pub reward: f32,
+    /// After.
+    pub next: Vec<f32>,
+}
 
 /// One world's latest steps. Where the world or its robot begins again, so does its track.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

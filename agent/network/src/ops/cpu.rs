@@ -1,7 +1,8 @@
-//! What the operators share: tensors as slices, frames in parallel, products of small matrices.
+//! What the operators share: tensors as slices, frames in parallel, sums.
 
 use candle_core::{CpuStorage, Device, Layout, Result, Shape, Storage, Tensor};
 use rayon::prelude::*;
+use std::mem::take;
 use std::ops::{AddAssign, Deref, Range};
 
 /// Parts of a window that are worked on at the same time, each with sums of its own, which are added in
@@ -47,27 +48,39 @@ pub(super) fn tensor(numbers: Vec<f32>, shape: impl Into<Shape>) -> Result<Tenso
     Tensor::from_vec(numbers, shape.into(), &Device::Cpu)
 }
 
-/// Calls `f(sums, frame, its part of numbers)` for all frames; returns the sums of each chunk of frames.
+/// Calls `f(sums, frame, its part of numbers)` for all frames, whose parts begin at `start(frame)`; returns the
+/// sums of each chunk of frames.
 pub(super) fn frames<A: Send>(
-    numbers: &mut [f32],
-    per_frame: usize,
+    mut numbers: &mut [f32],
+    n_frames: usize,
+    start: impl Fn(usize) -> usize + Sync,
     new: impl Fn() -> A + Sync,
     f: impl Fn(&mut A, usize, &mut [f32]) + Sync,
 ) -> Vec<A> {
-    let n_frames = numbers.len() / per_frame;
-    let chunk = n_frames.div_ceil(N_CHUNKS).max(1);
-    let chunks = numbers.par_chunks_mut(chunk * per_frame).enumerate();
-    let run = |(index, part): (usize, &mut [f32])| {
+    let length = n_frames.div_ceil(N_CHUNKS).max(1);
+    let mut chunks = Vec::with_capacity(N_CHUNKS);
+    for first in (0..n_frames).step_by(length) {
+        let frames = first..(first + length).min(n_frames);
+        let (part, rest) = numbers.split_at_mut(start(frames.end) - start(frames.start));
+        chunks.push((frames, part));
+        numbers = rest;
+    }
+    let run = |(frames, mut part): (Range<usize>, &mut [f32])| {
         let mut sums = new();
-        // Compiles the loop, and what is inlined into it, for AVX2 and AVX-512 as well.
-        pulp::Arch::new().dispatch(|| {
-            for (at, part) in part.chunks_exact_mut(per_frame).enumerate() {
-                f(&mut sums, index * chunk + at, part);
-            }
-        });
+        // Compiles the loop, and what is always inlined into it, for AVX2 and AVX-512 as well.
+        pulp::Arch::new().dispatch(
+            #[inline(always)]
+            || {
+                for frame in frames {
+                    let (own, rest) = take(&mut part).split_at_mut(start(frame + 1) - start(frame));
+                    f(&mut sums, frame, own);
+                    part = rest;
+                }
+            },
+        );
         sums
     };
-    chunks.with_max_len(1).map(run).collect()
+    chunks.into_par_iter().with_max_len(1).map(run).collect()
 }
 
 /// As [`frames`] for sums alone.
@@ -76,8 +89,14 @@ pub(super) fn sums_over_frames<A: Send>(
     new: impl Fn() -> A + Sync,
     f: impl Fn(&mut A, usize) + Sync,
 ) -> Vec<A> {
-    let mut nothing = vec![0.0; n_frames];
-    frames(&mut nothing, 1, new, |sums, frame, _| f(sums, frame))
+    frames(
+        &mut [],
+        n_frames,
+        |_| 0,
+        new,
+        #[inline(always)]
+        |sums, frame, _| f(sums, frame),
+    )
 }
 
 /// Adds the chunks' sums, in their order.
@@ -118,75 +137,4 @@ pub(super) fn dot(a: &[f32], b: &[f32]) -> f32 {
         }
     }
     rest + lanes.iter().sum::<f32>()
-}
-
-/// A matrix in a slice: rows, columns, and the distance between neighbours of each.
-#[derive(Clone, Copy)]
-pub(super) struct Matrix<'a> {
-    numbers: &'a [f32],
-    rows: usize,
-    cols: usize,
-    row: usize,
-    col: usize,
-}
-
-/// The first numbers of a slice, row-major.
-pub(super) fn matrix(numbers: &[f32], rows: usize, cols: usize) -> Matrix<'_> {
-    assert!(numbers.len() >= rows * cols, "numbers of a matrix");
-    Matrix {
-        numbers,
-        rows,
-        cols,
-        row: cols,
-        col: 1,
-    }
-}
-
-impl Matrix<'_> {
-    pub(super) fn t(self) -> Self {
-        Self {
-            rows: self.cols,
-            cols: self.rows,
-            row: self.col,
-            col: self.row,
-            ..self
-        }
-    }
-}
-
-/// `out = a b` row by row, or `out += a b`.
-pub(super) fn product(out: &mut [f32], a: Matrix<'_>, b: Matrix<'_>, adds: bool) {
-    assert!(a.cols == b.rows, "sizes of a product");
-    let out = &mut out[..a.rows * b.cols];
-    if a.cols == 0 && !adds {
-        out.fill(0.0);
-    }
-    if out.is_empty() || a.cols == 0 {
-        return;
-    }
-    #[expect(unsafe_code, reason = "gemm takes pointers")]
-    // SAFETY: each matrix lies in its slice, as is asserted here and in `matrix`.
-    unsafe {
-        gemm::gemm(
-            a.rows,
-            b.cols,
-            a.cols,
-            out.as_mut_ptr(),
-            1,
-            b.cols as isize,
-            adds,
-            a.numbers.as_ptr(),
-            a.col as isize,
-            a.row as isize,
-            b.numbers.as_ptr(),
-            b.col as isize,
-            b.row as isize,
-            1.0,
-            1.0,
-            false,
-            false,
-            false,
-            gemm::Parallelism::None,
-        );
-    }
 }

@@ -1,19 +1,21 @@
-//! Normalisation, ReLU and a transposed convolution that doubles rows and columns, frame by frame: a product
-//! with the kernels, then sums of its shifted parts.
+//! Normalisation, ReLU and a transposed convolution that doubles rows and columns, frame by frame: for each of
+//! the output's four phases, a product of the kernels and the shifted input.
 //!
-//! Of each frame, only the channels that dropout keeps are read and computed. Behind the normalisation a lost
+//! Of each frame, only the channels that dropout keeps are stored and computed. Behind the normalisation a lost
 //! channel is the constant `relu(b)`. This constant is taken off all frames, so that lost channels are zero,
 //! and the constants of all channels go through the kernels once, as one more frame. Gradients follow the
 //! same split.
 
-use super::cpu::{add, frames, matrix, numbers, product, slice, tensor, total};
+use super::cpu::{add, frames, numbers, slice, tensor, total};
 use super::norm::{Moments, Norm, Sums, finish};
-use super::taps::{Sizes, TAPS, join, split};
+use super::planes::Planes;
+use super::product::{Left, Right, add_product, steps};
+use super::taps::{PHASES, Sizes, TAPS};
 use crate::dropout::Mask;
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor};
 
-/// Arguments: `z [frames, channels in, rows, cols]` before its dropout; `[gamma; beta]`; kernels `[channels in,
-/// channels out, 4, 4]`. The result is zero, and its gradient not read, at channels that `output` loses.
+/// Arguments: `z [planes, rows, cols]` before its dropout, of all channels or of those that it keeps; `[gamma;
+/// beta]`; kernels `[channels in, channels out, 4, 4]`. The result has the planes that `output` keeps.
 pub(crate) struct Doubling {
     /// Dropout of `z`.
     pub(crate) input: Mask,
@@ -25,11 +27,14 @@ pub(crate) struct Doubling {
 
 /// Room for one frame.
 struct Room {
+    /// One channel after normalisation and ReLU, less the constant.
     x: Vec<f32>,
+    shifted: Vec<f32>,
+    phases: Vec<f32>,
+    views: Vec<f32>,
+    padded: Vec<f32>,
+    patches: Vec<f32>,
     dx: Vec<f32>,
-    kernels: Vec<f32>,
-    d_kernels: Vec<f32>,
-    taps: Vec<f32>,
 }
 
 /// One call: what all frames share.
@@ -39,9 +44,8 @@ struct Call<'a> {
     norm: Norm,
     /// The constants of lost channels; zero if there are none.
     floors: Vec<f32>,
-    z: &'a [f32],
+    z: Planes<'a>,
     kernels: &'a [f32],
-    every_channel: Vec<usize>,
 }
 
 /// One chunk's sums in the backward pass.
@@ -55,13 +59,15 @@ struct Gradients {
 
 impl Room {
     fn new(sizes: &Sizes) -> Self {
-        let kernels = sizes.channels_in * sizes.channels_out * TAPS;
+        let (area, zeros) = (sizes.area(), |n: usize| vec![0.0; n]);
         Self {
-            x: vec![0.0; sizes.per_input()],
-            dx: vec![0.0; sizes.per_input()],
-            kernels: vec![0.0; kernels],
-            d_kernels: vec![0.0; kernels],
-            taps: vec![0.0; sizes.per_output() * TAPS / 4],
+            x: zeros(area),
+            shifted: zeros(sizes.channels_in * sizes.shifted()),
+            phases: zeros(sizes.channels_out * PHASES * area),
+            views: zeros(sizes.channels_out * sizes.views()),
+            padded: zeros(sizes.padded()),
+            patches: zeros(area * TAPS),
+            dx: zeros(sizes.channels_in * area),
         }
     }
 }
@@ -79,168 +85,200 @@ impl<'a> Call<'a> {
         let floor = |b: &f32| if is_whole { 0.0 } else { b.max(0.0) };
         Self {
             floors: norm.b.iter().map(floor).collect(),
-            every_channel: (0..sizes.channels_in.max(sizes.channels_out)).collect(),
+            z: Planes::new(z, sizes.area(), &op.input),
             op,
             sizes,
             norm,
-            z,
             kernels,
         }
     }
 
+    /// Numbers of an output channel.
+    fn out_area(&self) -> usize {
+        PHASES * self.sizes.area()
+    }
+
+    /// Every input and output channel.
+    fn all_channels(&self) -> [Vec<usize>; 2] {
+        [self.sizes.channels_in, self.sizes.channels_out].map(|n| (0..n).collect())
+    }
+
     /// The constants as a frame.
-    fn floors_as_frame(&self) -> Vec<f32> {
-        let area = self.sizes.area();
-        let floors = self.floors.iter();
-        floors
-            .flat_map(|floor| std::iter::repeat_n(*floor, area))
-            .collect()
-    }
-
-    /// Input and output channels.
-    fn all_channels(&self) -> [&[usize]; 2] {
-        let Sizes {
-            channels_in,
-            channels_out,
-            ..
-        } = self.sizes;
-        [channels_in, channels_out].map(|n| &self.every_channel[..n])
-    }
-
-    fn kept(&self, frame: usize) -> [&[usize]; 2] {
-        [self.op.input.kept(frame), self.op.output.kept(frame)]
+    fn write_floors(&self, room: &mut Room) {
+        let shifted = room.shifted.chunks_exact_mut(self.sizes.shifted());
+        for (floor, shifted) in self.floors.iter().zip(shifted) {
+            room.x.fill(*floor);
+            self.sizes.shift(&room.x, shifted);
+        }
     }
 
     /// A frame's kept channels, normalised and rectified, less the constants.
     #[inline(always)]
-    fn read(&self, z: &[f32], inputs: &[usize], x: &mut [f32]) {
-        let area = self.sizes.area();
-        for (&channel, x) in inputs.iter().zip(x.chunks_exact_mut(area)) {
-            let (a, b, floor) = (
-                self.norm.a[channel],
-                self.norm.b[channel],
-                self.floors[channel],
-            );
-            for (x, z) in x.iter_mut().zip(&z[channel * area..]) {
+    fn read(&self, frame: usize, room: &mut Room) {
+        let shifted = room.shifted.chunks_exact_mut(self.sizes.shifted());
+        for ((channel, z), shifted) in self.z.kept(frame).zip(shifted) {
+            let (a, b) = (self.norm.a[channel], self.norm.b[channel]);
+            let floor = self.floors[channel];
+            for (x, z) in room.x.iter_mut().zip(z) {
                 *x = (a * z + b).max(0.0) - floor;
             }
+            self.sizes.shift(&room.x, shifted);
         }
     }
 
-    /// The kernels between some channels.
+    /// Where the kernels of some inputs begin.
+    fn kernels_of(&self, inputs: &[usize]) -> Vec<usize> {
+        let places = inputs
+            .iter()
+            .map(|input| input * self.sizes.channels_out * TAPS);
+        places.collect()
+    }
+
+    /// What becomes of the frame in `room` of some channels, plus what becomes of the constants.
     #[inline(always)]
-    fn gather(&self, [inputs, outputs]: [&[usize]; 2], kernels: &mut [f32]) {
-        let n = self.sizes.channels_out;
-        let (from, _) = self.kernels.as_chunks::<TAPS>();
-        let (to, _) = kernels.as_chunks_mut::<TAPS>();
-        for (input, to) in inputs.iter().zip(to.chunks_exact_mut(outputs.len().max(1))) {
-            let from = &from[input * n..][..n];
-            for (output, to) in outputs.iter().zip(to) {
-                *to = from[*output];
-            }
+    fn forward(
+        &self,
+        room: &mut Room,
+        [inputs, outputs]: [&[usize]; 2],
+        constants: &[f32],
+        out: &mut [f32],
+    ) {
+        let (sizes, area) = (&self.sizes, self.sizes.area());
+        let (kernels, shifted) = (self.kernels_of(inputs), sizes.shifted());
+        let rows: Vec<usize> = outputs.iter().map(|output| output * TAPS).collect();
+        room.phases.fill(0.0);
+        for phase in 0..PHASES {
+            let terms = sizes.terms(phase);
+            let terms = kernels.iter().enumerate().flat_map(|(index, kernel)| {
+                terms.map(|(tap, from)| (kernel + tap, index * shifted + from))
+            });
+            let (left_terms, right_terms): (Vec<_>, Vec<_>) = terms.unzip();
+            let left = Left {
+                numbers: self.kernels,
+                rows: &rows,
+                terms: &left_terms,
+            };
+            let right = Right {
+                numbers: &room.shifted,
+                terms: &right_terms,
+                cols: area,
+            };
+            let to = steps(outputs.len(), PHASES * area);
+            add_product(&mut room.phases[phase * area..], &to, left, right);
+        }
+        let phases = room.phases.chunks_exact(PHASES * area);
+        let out = out.chunks_exact_mut(PHASES * area);
+        for ((output, phases), out) in outputs.iter().zip(phases).zip(out) {
+            let start = &constants[output * PHASES * area..][..PHASES * area];
+            sizes.interleave(phases, start, out);
         }
     }
 
-    /// Adds what becomes of the frame `room.x` of some channels to its output.
-    #[inline(always)]
-    fn forward(&self, room: &mut Room, channels: [&[usize]; 2], out: &mut [f32]) {
-        let [inputs, outputs] = channels;
-        let (area, n_taps) = (self.sizes.area(), outputs.len() * TAPS);
-        self.gather(channels, &mut room.kernels);
-        let kernels = matrix(&room.kernels, inputs.len(), n_taps);
-        let x = matrix(&room.x, inputs.len(), area);
-        product(&mut room.taps, kernels.t(), x, false);
-        for (output, taps) in outputs.iter().zip(room.taps.chunks_exact(TAPS * area)) {
-            let out = &mut out[output * 4 * area..][..4 * area];
-            join(taps, out, self.sizes.cols);
-        }
-    }
-
-    /// From the gradient of the output, that of the frame `room.x`, in `room.dx`, and adds that of the kernels.
+    /// From the gradient of some outputs, that of the frame in `room`, in `room.dx`, and adds that of the
+    /// kernels.
     #[inline(always)]
     fn backward(
         &self,
         room: &mut Room,
-        channels: [&[usize]; 2],
+        [inputs, outputs]: [&[usize]; 2],
         d_out: &[f32],
         d_kernels: &mut [f32],
     ) {
-        let [inputs, outputs] = channels;
-        let (area, n_taps) = (self.sizes.area(), outputs.len() * TAPS);
-        self.gather(channels, &mut room.kernels);
-        for (output, taps) in outputs.iter().zip(room.taps.chunks_exact_mut(TAPS * area)) {
-            split(
-                taps,
-                &d_out[output * 4 * area..][..4 * area],
-                self.sizes.cols,
-            );
+        let (sizes, area) = (&self.sizes, self.sizes.area());
+        let (kernels, views) = (self.kernels_of(inputs), sizes.views());
+        let d_out = d_out.chunks_exact(PHASES * area);
+        for (d_out, views) in d_out.clone().zip(room.views.chunks_exact_mut(views)) {
+            sizes.split(d_out, views);
         }
-        let taps = matrix(&room.taps, n_taps, area);
-        let kernels = matrix(&room.kernels, inputs.len(), n_taps);
-        product(&mut room.dx, kernels, taps, false);
-        let x = matrix(&room.x, inputs.len(), area);
-        product(&mut room.d_kernels, x, taps.t(), false);
-        let (from, _) = room.d_kernels.as_chunks::<TAPS>();
-        let (to, _) = d_kernels.as_chunks_mut::<TAPS>();
-        for (input, from) in inputs.iter().zip(from.chunks_exact(outputs.len().max(1))) {
-            let to = &mut to[input * self.sizes.channels_out..][..self.sizes.channels_out];
-            for (output, from) in outputs.iter().zip(from) {
-                add(&mut to[*output], from);
-            }
+        let terms = outputs.iter().enumerate().flat_map(|(index, output)| {
+            (0..TAPS).map(move |tap| (output * TAPS + tap, index * views + sizes.view(tap)))
+        });
+        let (left_terms, right_terms): (Vec<_>, Vec<_>) = terms.unzip();
+        let left = Left {
+            numbers: self.kernels,
+            rows: &kernels,
+            terms: &left_terms,
+        };
+        let right = Right {
+            numbers: &room.views,
+            terms: &right_terms,
+            cols: area,
+        };
+        let to = steps(inputs.len(), area);
+        room.dx.fill(0.0);
+        add_product(&mut room.dx, &to, left, right);
+        let x = Left {
+            numbers: &room.shifted[sizes.unshifted()..],
+            rows: &steps(inputs.len(), sizes.shifted()),
+            terms: &steps(area, 1),
+        };
+        let cells = steps(area, TAPS);
+        for (output, d_out) in outputs.iter().zip(d_out) {
+            sizes.patches(d_out, &mut room.padded, &mut room.patches);
+            let right = Right {
+                numbers: &room.patches,
+                terms: &cells,
+                cols: TAPS,
+            };
+            add_product(&mut d_kernels[output * TAPS..], &kernels, x, right);
         }
-    }
-
-    fn frame_of_z(&self, frame: usize) -> &[f32] {
-        let length = self.sizes.per_input();
-        &self.z[frame * length..][..length]
     }
 
     /// What becomes of the constants.
     fn output_of_floors(&self) -> Vec<f32> {
-        let mut room = Room {
-            x: self.floors_as_frame(),
-            ..Room::new(&self.sizes)
-        };
-        let mut out = vec![0.0; self.sizes.per_output()];
-        self.forward(&mut room, self.all_channels(), &mut out);
+        let zeros = vec![0.0; self.sizes.channels_out * self.out_area()];
+        let mut out = zeros.clone();
+        if !self.op.input.keeps_all() {
+            let (mut room, [inputs, outputs]) = (Room::new(&self.sizes), self.all_channels());
+            self.write_floors(&mut room);
+            self.forward(&mut room, [&inputs, &outputs], &zeros, &mut out);
+        }
         out
     }
 
     fn all_frames(&self) -> Vec<f32> {
-        let (area, per_output) = (4 * self.sizes.area(), self.sizes.per_output());
-        let constant = (!self.op.input.keeps_all()).then(|| self.output_of_floors());
-        let mut out = vec![0.0; self.op.input.n_frames() * per_output];
+        let (constants, area) = (self.output_of_floors(), self.out_area());
+        let [input, output] = [&self.op.input, &self.op.output];
+        let mut out = vec![0.0; output.start(output.n_frames()) * area];
         let new = || Room::new(&self.sizes);
-        frames(&mut out, per_output, new, |room, frame, out| {
-            let [inputs, outputs] = self.kept(frame);
-            self.read(self.frame_of_z(frame), inputs, &mut room.x);
-            if let Some(constant) = &constant {
-                for output in outputs {
-                    let at = output * area..(output + 1) * area;
-                    out[at.clone()].copy_from_slice(&constant[at]);
-                }
-            }
-            self.forward(room, [inputs, outputs], out);
-        });
+        let start = |frame: usize| output.start(frame) * area;
+        frames(
+            &mut out,
+            input.n_frames(),
+            start,
+            new,
+            #[inline(always)]
+            |room, frame, out| {
+                self.read(frame, room);
+                let channels = [input.kept(frame), output.kept(frame)];
+                self.forward(room, channels, &constants, out);
+            },
+        );
         out
     }
-}
 
-impl Call<'_> {
     /// Gradients of `z`, of `[gamma; beta]` and of the kernels.
     fn gradients(&self, d_out: &[f32]) -> [Vec<f32>; 3] {
         let mut dz = vec![0.0; self.z.len()];
         let new = || Gradients {
             room: Room::new(&self.sizes),
             kernels: vec![0.0; self.kernels.len()],
-            d_out: vec![0.0; self.sizes.per_output()],
+            d_out: vec![0.0; self.sizes.channels_out * self.out_area()],
             sums: Sums::new(self.sizes.channels_in),
         };
-        let per_output = self.sizes.per_output();
-        let chunks = frames(&mut dz, self.sizes.per_input(), new, |chunk, frame, dz| {
-            let d_out = &d_out[frame * per_output..][..per_output];
-            self.gradients_of_frame(chunk, frame, d_out, dz);
-        });
+        let n_frames = self.op.input.n_frames();
+        let start = |frame| self.z.start(frame);
+        let chunks = frames(
+            &mut dz,
+            n_frames,
+            start,
+            new,
+            #[inline(always)]
+            |chunk, frame, dz| {
+                let d_out = &d_out[self.op.output.start(frame) * self.out_area()..];
+                self.gradients_of_frame(chunk, frame, d_out, dz);
+            },
+        );
         let (mut kernels, mut d_outs, mut sums) = (vec![], vec![], vec![]);
         for chunk in chunks {
             kernels.push(chunk.kernels);
@@ -252,7 +290,7 @@ impl Call<'_> {
             self.gradients_of_floors(&total(d_outs), &mut d_kernels, &mut sums);
         }
         let (d_weights, terms) = self.norm.backward(&sums);
-        finish(&terms, self.z, &mut dz, &self.op.input);
+        finish(&terms, &self.z, &mut dz);
         [dz, d_weights, d_kernels]
     }
 
@@ -265,14 +303,13 @@ impl Call<'_> {
         d_out: &[f32],
         dz: &mut [f32],
     ) {
-        let ([inputs, outputs], area) = (self.kept(frame), self.sizes.area());
-        let z = self.frame_of_z(frame);
-        self.read(z, inputs, &mut chunk.room.x);
-        let channels = [inputs, outputs];
+        let area = self.sizes.area();
+        let channels = [self.op.input.kept(frame), self.op.output.kept(frame)];
+        self.read(frame, &mut chunk.room);
         self.backward(&mut chunk.room, channels, d_out, &mut chunk.kernels);
-        for (&channel, dx) in inputs.iter().zip(chunk.room.dx.chunks_exact(area)) {
-            let at = channel * area..(channel + 1) * area;
-            let (z, dz) = (&z[at.clone()], &mut dz[at]);
+        let dx = chunk.room.dx.chunks_exact(area);
+        for (index, ((channel, z), dx)) in self.z.kept(frame).zip(dx).enumerate() {
+            let dz = &mut dz[self.z.place(frame, index)..][..area];
             let (a, b) = (self.norm.a[channel], self.norm.b[channel]);
             for (dz, (z, dx)) in dz.iter_mut().zip(z.iter().zip(dx)) {
                 *dz = if a * z + b > 0.0 { *dx } else { 0.0 };
@@ -283,19 +320,17 @@ impl Call<'_> {
                 chunk.sums.lost[channel] -= f64::from(dx.iter().sum::<f32>());
             }
         }
-        for output in outputs {
-            let at = output * 4 * area..(output + 1) * 4 * area;
-            add(&mut chunk.d_out[at.clone()], &d_out[at]);
+        let area = self.out_area();
+        for (output, d_out) in channels[1].iter().zip(d_out.chunks_exact(area)) {
+            add(&mut chunk.d_out[output * area..][..area], d_out);
         }
     }
 
     /// The constants' part: `d_out` is the sum over frames.
     fn gradients_of_floors(&self, d_out: &[f32], d_kernels: &mut [f32], sums: &mut Sums) {
-        let mut room = Room {
-            x: self.floors_as_frame(),
-            ..Room::new(&self.sizes)
-        };
-        self.backward(&mut room, self.all_channels(), d_out, d_kernels);
+        let (mut room, [inputs, outputs]) = (Room::new(&self.sizes), self.all_channels());
+        self.write_floors(&mut room);
+        self.backward(&mut room, [&inputs, &outputs], d_out, d_kernels);
         let planes = room.dx.chunks_exact(self.sizes.area());
         for (channel, dx) in planes.enumerate() {
             let lost = sums.lost[channel] + f64::from(dx.iter().sum::<f32>());
@@ -325,12 +360,8 @@ impl CustomOp3 for Doubling {
         let sizes = Sizes::new(z_layout.dims(), kernels_layout.dims());
         let (z, kernels) = (slice(z, z_layout)?, slice(kernels, kernels_layout)?);
         let call = Call::new(self, sizes, z, slice(weights, weights_layout)?, kernels);
-        let dims = (
-            self.input.n_frames(),
-            sizes.channels_out,
-            2 * sizes.rows,
-            2 * sizes.cols,
-        );
+        let n_planes = self.output.start(self.output.n_frames());
+        let dims = (n_planes, 2 * sizes.rows, 2 * sizes.cols);
         Ok((CpuStorage::F32(call.all_frames()), dims.into()))
     }
 

@@ -19,27 +19,38 @@ impl DropReluNorm {
     pub(crate) fn moments(z: &Tensor, mask: &Mask) -> Result<Moments> {
         let (n_frames, positions, _) = z.dims3()?;
         let z = numbers(z)?;
-        let sums = sums_of(&z, mask, |z, scale, _| {
-            let m = (z * scale).max(0.0);
-            [m, m * m]
-        });
+        let sums = sums_of(
+            &z,
+            mask,
+            #[inline(always)]
+            |z, scale, _| {
+                let m = (z * scale).max(0.0);
+                [m, m * m]
+            },
+        );
         let count = (n_frames * positions) as f64;
         Ok(Moments::from_sums(&sums.first, &sums.with_z, count))
     }
 
     fn backward(&self, z: &[f32], weights: &[f32], dy: &[f32]) -> (Vec<f32>, Vec<f32>) {
-        let sums = sums_of(z, &self.mask, |z, scale, at| {
-            [dy[at], dy[at] * (z * scale).max(0.0)]
-        });
+        let sums = sums_of(
+            z,
+            &self.mask,
+            #[inline(always)]
+            |z, scale, at| [dy[at], dy[at] * (z * scale).max(0.0)],
+        );
         let norm = Norm::new(weights, &self.moments, 1.0);
         let (gradient, terms) = norm.backward(&sums);
         let (channels, per_frame) = (terms.len(), z.len() / self.mask.n_frames());
         let mut dz = vec![0.0; z.len()];
+        let start = |frame| frame * per_frame;
         frames(
             &mut dz,
-            per_frame,
+            self.mask.n_frames(),
+            start,
             || (),
-            |(), frame, dz| {
+            #[inline(always)]
+            |(): &mut (), frame: usize, dz: &mut [f32]| {
                 let scales = self.mask.scales(frame);
                 let z = z[frame * per_frame..][..per_frame].chunks_exact(channels);
                 let dy = dy[frame * per_frame..][..per_frame].chunks_exact(channels);
@@ -63,25 +74,30 @@ fn sums_of(z: &[f32], mask: &Mask, f: impl Fn(f32, f32, usize) -> [f32; 2] + Syn
     let per_frame = z.len() / mask.n_frames();
     let channels = mask.channels();
     let new = || Sums::new(channels);
-    let sums = sums_over_frames(mask.n_frames(), new, |sums, frame| {
-        let scales = mask.scales(frame);
-        let mut first = frame * per_frame;
-        for rows in z[first..][..per_frame].chunks(ROWS * channels) {
-            let (mut s, mut q) = (vec![0.0_f32; channels], vec![0.0_f32; channels]);
-            for z in rows.chunks_exact(channels) {
-                for c in 0..channels {
-                    let [one, other] = f(z[c], scales[c], first + c);
-                    s[c] += one;
-                    q[c] += other;
+    let sums = sums_over_frames(
+        mask.n_frames(),
+        new,
+        #[inline(always)]
+        |sums, frame| {
+            let scales = mask.scales(frame);
+            let mut first = frame * per_frame;
+            for rows in z[first..][..per_frame].chunks(ROWS * channels) {
+                let (mut s, mut q) = (vec![0.0_f32; channels], vec![0.0_f32; channels]);
+                for z in rows.chunks_exact(channels) {
+                    for c in 0..channels {
+                        let [one, other] = f(z[c], scales[c], first + c);
+                        s[c] += one;
+                        q[c] += other;
+                    }
+                    first += channels;
                 }
-                first += channels;
+                for c in 0..channels {
+                    sums.first[c] += f64::from(s[c]);
+                    sums.with_z[c] += f64::from(q[c]);
+                }
             }
-            for c in 0..channels {
-                sums.first[c] += f64::from(s[c]);
-                sums.with_z[c] += f64::from(q[c]);
-            }
-        }
-    });
+        },
+    );
     Sums::total(sums)
 }
 
@@ -101,11 +117,14 @@ impl CustomOp2 for DropReluNorm {
         let norm = Norm::new(weights, &self.moments, 1.0);
         let (channels, per_frame) = (norm.a.len(), z.len() / self.mask.n_frames());
         let mut out = vec![0.0; z.len()];
+        let start = |frame| frame * per_frame;
         frames(
             &mut out,
-            per_frame,
+            self.mask.n_frames(),
+            start,
             || (),
-            |(), frame, out| {
+            #[inline(always)]
+            |(): &mut (), frame: usize, out: &mut [f32]| {
                 let scales = self.mask.scales(frame);
                 let rows = z[frame * per_frame..][..per_frame].chunks_exact(channels);
                 for (out, row) in out.chunks_exact_mut(channels).zip(rows) {

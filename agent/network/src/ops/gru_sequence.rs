@@ -26,6 +26,7 @@ struct Weights<'a> {
 }
 
 impl Weights<'_> {
+    #[inline(always)]
     fn step(&self, input: &[f32], h: &[f32]) -> Step {
         let n = h.len();
         let product = |row: usize| self.b[row] + dot(&self.w[row * n..][..n], h);
@@ -44,6 +45,7 @@ impl Weights<'_> {
 }
 
 impl GruSequence {
+    #[inline(always)]
     fn forward(&self, inputs: &[f32], weights: Weights<'_>) -> Vec<f32> {
         let n = self.first.len();
         let (mut h, mut out) = (self.first.clone(), Vec::with_capacity(inputs.len() / 3));
@@ -58,6 +60,7 @@ impl GruSequence {
     }
 
     /// Gradients of the inputs, `W_hh` and `b_hh`.
+    #[inline(always)]
     fn backward(
         &self,
         inputs: &[f32],
@@ -114,7 +117,10 @@ impl CustomOp3 for GruSequence {
             w: slice(w, w_layout)?,
             b: slice(b, b_layout)?,
         };
-        let out = pulp::Arch::new().dispatch(|| self.forward(inputs, weights));
+        let out = pulp::Arch::new().dispatch(
+            #[inline(always)]
+            || self.forward(inputs, weights),
+        );
         let n_steps = inputs_layout.dims()[0];
         Ok((CpuStorage::F32(out), (n_steps, self.first.len()).into()))
     }
@@ -134,8 +140,11 @@ impl CustomOp3 for GruSequence {
             w: &arguments[0],
             b: &arguments[1],
         };
-        let backward = || self.backward(&x, weights, &out, &d_out);
-        let [d_inputs, dw, db] = pulp::Arch::new().dispatch(backward);
+        let arch = pulp::Arch::new();
+        let [d_inputs, dw, db] = arch.dispatch(
+            #[inline(always)]
+            || self.backward(&x, weights, &out, &d_out),
+        );
         Ok((
             Some(tensor(d_inputs, inputs.shape())?),
             Some(tensor(dw, w.shape())?),

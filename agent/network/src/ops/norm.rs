@@ -1,8 +1,8 @@
 //! The arithmetic of batch normalisation: `y = a z + b` per channel.
 
-use super::cpu::{frames, sums_over_frames, total};
+use super::cpu::{frames, numbers, sums_over_frames, total};
+use super::planes::Planes;
 use crate::dropout::Mask;
-use crate::ops::cpu::numbers;
 use candle_core::{Result, Tensor};
 
 /// Added to the variance, as PyTorch does.
@@ -19,18 +19,18 @@ pub(crate) struct Moments {
 }
 
 impl Moments {
-    /// Of a tensor `[frames, channels, rows, cols]` after dropout: lost channels are zeros, whatever the
-    /// tensor has there.
+    /// Of a tensor `[planes, rows, cols]` after dropout: lost channels are zeros, whatever the tensor has there.
     pub(crate) fn of(z: &Tensor, mask: &Mask) -> Result<Self> {
-        let (n_frames, channels, rows, cols) = z.dims4()?;
-        let (area, z) = (rows * cols, numbers(z)?);
-        let z: &[f32] = &z;
+        let (_, rows, cols) = z.dims3()?;
+        let (n_frames, area, z) = (mask.n_frames(), rows * cols, numbers(z)?);
+        let planes = Planes::new(&z, area, mask);
+        let new = || Sums::new(mask.channels());
         let sums = sums_over_frames(
             n_frames,
-            || Sums::new(channels),
+            new,
+            #[inline(always)]
             |sums, frame| {
-                for &channel in mask.kept(frame) {
-                    let plane = &z[(frame * channels + channel) * area..][..area];
+                for (channel, plane) in planes.kept(frame) {
                     sums.add(channel, plane, plane);
                 }
             },
@@ -163,19 +163,20 @@ impl Norm {
     }
 }
 
-/// Puts `dz` in place of `dy` at kept channels of `[frames, channels, ..]`.
-pub(crate) fn finish(terms: &[[f32; 3]], z: &[f32], dy: &mut [f32], mask: &Mask) {
-    let per_frame = dy.len() / mask.n_frames();
-    let area = per_frame / terms.len();
+/// Puts `dz` in place of `dy` at kept channels.
+pub(super) fn finish(terms: &[[f32; 3]], z: &Planes<'_>, dy: &mut [f32]) {
+    let start = |frame| z.start(frame);
     frames(
         dy,
-        per_frame,
+        z.mask().n_frames(),
+        start,
         || (),
-        |(), frame, dy| {
-            for &channel in mask.kept(frame) {
+        #[inline(always)]
+        |(): &mut (), frame: usize, dy: &mut [f32]| {
+            for (index, (channel, z_plane)) in z.kept(frame).enumerate() {
                 let [p, q, r] = terms[channel];
-                let z = &z[frame * per_frame + channel * area..][..area];
-                for (dy, z) in dy[channel * area..][..area].iter_mut().zip(z) {
+                let dy = &mut dy[z.place(frame, index)..][..z_plane.len()];
+                for (dy, z) in dy.iter_mut().zip(z_plane) {
                     *dy = p * *dy + q * z + r;
                 }
             }

@@ -57,10 +57,13 @@ impl CustomOp2 for VisitedConv {
         let biases = slice(biases, biases_layout)?;
         let (n, positions, n_frames) = (biases.len(), self.positions(), self.window.len());
         let mut out = vec![0.0; n_frames * positions * n];
+        let start = |frame| frame * positions * n;
         frames(
             &mut out,
-            positions * n,
+            n_frames,
+            start,
             || (),
+            #[inline(always)]
             |(), frame, out| {
                 let places = out.chunks_exact_mut(n);
                 places.for_each(|out| out.copy_from_slice(biases));
@@ -84,15 +87,20 @@ impl CustomOp2 for VisitedConv {
         let d_out = numbers(&d_out)?;
         let d_out: &[f32] = &d_out;
         let new = || (vec![0.0; kernels.elem_count()], vec![0.0; n]);
-        let sums = sums_over_frames(self.window.len(), new, |(d_kernels, d_biases), frame| {
-            let d_out = &d_out[frame * positions * n..][..positions * n];
-            for d_out in d_out.chunks_exact(n) {
-                add(d_biases, d_out);
-            }
-            self.for_each(frame, |position, row| {
-                add(&mut d_kernels[row * n..][..n], &d_out[position * n..][..n]);
-            });
-        });
+        let sums = sums_over_frames(
+            self.window.len(),
+            new,
+            #[inline(always)]
+            |(d_kernels, d_biases), frame| {
+                let d_out = &d_out[frame * positions * n..][..positions * n];
+                for d_out in d_out.chunks_exact(n) {
+                    add(d_biases, d_out);
+                }
+                self.for_each(frame, |position, row| {
+                    add(&mut d_kernels[row * n..][..n], &d_out[position * n..][..n]);
+                });
+            },
+        );
         let (d_kernels, d_biases): (Vec<_>, Vec<_>) = sums.into_iter().unzip();
         let d_kernels = tensor(total(d_kernels), kernels.shape())?;
         let d_biases = tensor(total(d_biases), biases.shape())?;

@@ -237,6 +237,19 @@ fn a_saved_dqn_resumes_bit_for_bit() {
 }
 
 #[test]
+fn the_latest_transitions_are_kept_oldest_first() {
+    let settings = DqnSettings {
+        replay: 3,
+        ..small()
+    };
+    let (mut dqn, rows) = (Dqn::new(settings, N_INPUTS, N_ACTIONS, 2), batch(0));
+    for n in 1..=8 {
+        dqn.remember(rows[n - 1].clone());
+        assert_eq!(dqn.saved().transitions, rows[n.saturating_sub(3)..n]);
+    }
+}
+
+#[test]
 fn a_shorter_replay_loads_the_latest_transitions() {
     let longer = saved(&learner(small(), 2));
     let settings = DqnSettings {

@@ -11,9 +11,9 @@
 //!     np.savez(f"{name}.npz", **z)
 //! ```
 
+use crate::golden_file::{Golden, frame_from};
 use candle_core::Tensor;
-use ndarray::{Array, Array1, Array3, Array4, ArrayD, ArrayView2, Axis, Dimension, IxDyn};
-use ndarray_npy::{NpzReader, ReadableElement};
+use ndarray::{Array, Array1, Array3, Array4, ArrayD, Axis, IxDyn};
 use network::{
     AdamSettings, Autoencoder, AutoencoderSettings, Device, Dropout, NetworkError, NetworkShape,
     Pass, Window,
@@ -21,26 +21,11 @@ use network::{
 use protocol::frame::{Frame, UNOBSERVED};
 use protocol::grid::Shape;
 use std::borrow::Borrow;
-use std::fs::File;
 
-struct Golden(NpzReader<File>);
-
-impl Golden {
-    fn open(name: &str) -> Self {
-        let path = format!("{}/tests/data/{name}.npz", env!("CARGO_MANIFEST_DIR"));
-        Self(NpzReader::new(File::open(path).expect("golden file")).expect("npz"))
-    }
-
-    fn get<T: ReadableElement, D: Dimension>(&mut self, name: &str) -> Array<T, D> {
-        let array = self.0.by_name(&format!("{name}.npy"));
-        array.unwrap_or_else(|error| panic!("{name}: {error}"))
-    }
-
-    fn names(&mut self) -> Vec<String> {
-        let names = self.0.names().expect("names");
-        let stems = names.iter().map(|name| name.trim_end_matches(".npy"));
-        stems.map(str::to_owned).collect()
-    }
+fn names(golden: &mut Golden) -> Vec<String> {
+    let names = golden.0.names().expect("names");
+    let stems = names.iter().map(|name| name.trim_end_matches(".npy"));
+    stems.map(str::to_owned).collect()
 }
 
 /// The authors' network with their weights.
@@ -64,14 +49,6 @@ fn authors_network() -> Autoencoder {
     };
     network.load_variables(find).expect("the authors' sizes");
     network
-}
-
-fn frame_from(observations: ArrayView2<'_, u8>, mask: ArrayView2<'_, u8>) -> Frame {
-    let seen = |(&value, &visited): (&u8, &u8)| if visited > 0 { value } else { UNOBSERVED };
-    let bytes: Vec<u8> = observations.iter().zip(mask).map(seen).collect();
-    let (height, width) = observations.dim();
-    let shape = Shape::new(height, width).expect("shape");
-    Frame::from_bytes(shape, 3, &bytes).expect("valid frame")
 }
 
 fn frames(golden: &mut Golden) -> Vec<Frame> {
@@ -175,7 +152,7 @@ fn an_update_without_dropout_reproduces_loss_gradients_and_parameters() {
         (loss / expected - 1.0).abs() < 1e-4,
         "loss {loss}, expected {expected}"
     );
-    for name in golden.names() {
+    for name in names(&mut golden) {
         let (what, tensor) = name.split_once('.').unwrap_or((&name, ""));
         let got = match what {
             "grad" => gradients[tensor].clone(),

@@ -2,6 +2,7 @@
 
 mod dqn;
 mod golden;
+mod golden_file;
 mod properties;
 mod stock;
 mod synthetic;
