@@ -151,6 +151,7 @@ fn the_documented_files_are_accepted() {
         "config/models/road-ice.toml",
         "config/models/wildfire-sparse.toml",
         "config/models/wildfire-latent.toml",
+        "config/models/wildfire-small.toml",
     ] {
         let path: PathBuf = repository().join(file);
         let path = path.to_str().expect("a plain path");

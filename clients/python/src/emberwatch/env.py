@@ -79,8 +79,8 @@ class WildfireEnv(WorldEnv):
     * `instance`: attach to this running server; None: a private one.
     * `world`: which of its worlds (0).
     * `takeover`: take the world from its holder (False).
-    * `model`: `"wildfire"` (the default), `"wildfire-sparse"`, `"wildfire-latent"` or the path of
-      a model file; `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `start`
+    * `model`: `"wildfire"` (the default), `"wildfire-sparse"`, `"wildfire-latent"`,
+      `"wildfire-small"` (for learning on 12 x 12 to 32 x 32 cells) or the path of a model file; `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `start`
       (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the private server. With `instance`
       they may be left out, or must agree.
     * `truth`: reveal the hidden states in `info` and pictures (False).
