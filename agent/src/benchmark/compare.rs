@@ -113,6 +113,7 @@ pub fn compare(
         moment: None,
     };
     let mut feed = Feed::open(arena.instance(), &prior);
+    let n_moves = arena.info().n_moves;
     let game = |policy, seeds| Match {
         comparison,
         policy,
@@ -138,7 +139,7 @@ pub fn compare(
             }
             results
                 .runs
-                .extend(runs.into_iter().map(Run::into_policy_run));
+                .extend(runs.into_iter().map(|run| run.into_policy_run(n_moves)));
         }
     }
     feed.end();
@@ -309,7 +310,7 @@ impl Run {
         }
     }
 
-    fn into_policy_run(self) -> PolicyRun {
+    fn into_policy_run(self, moves: usize) -> PolicyRun {
         let (tally, policy) = (self.tally, self.robot.agent.policy());
         let steps = tally.rewards.len() as u64;
         let mean = |sum: f64| sum / steps.max(1) as f64;
@@ -325,6 +326,8 @@ impl Run {
             mean_fire_cells: mean(tally.n_fire as f64),
             mean_plan_millis: mean(tally.planning.as_secs_f64() * 1e3),
             brier: (policy.estimator != EstimatorKind::None).then(|| mean(tally.brier)),
+            moves,
+            is_added: false,
             rewards: tally.rewards,
         }
     }

@@ -50,9 +50,11 @@ def make(name: str = WILDFIRE, **keywords: Any) -> gymnasium.Env[Any, Any]:
     return gymnasium.make(name, **_small(keywords))
 
 
-def make_vec(n_worlds: int, **keywords: Any) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
+def make_vec(
+    n_worlds: int, name: str = WILDFIRE, **keywords: Any
+) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
     """`gymnasium.make_vec` of small worlds, or with `instance` of a running server's."""
-    return gymnasium.make_vec(WILDFIRE, num_envs=n_worlds, **_small(keywords))
+    return gymnasium.make_vec(name, num_envs=n_worlds, **_small(keywords))
 
 
 @contextlib.contextmanager

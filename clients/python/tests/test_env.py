@@ -456,7 +456,10 @@ def test_wrong_options_are_named(keywords: dict[str, Any], message: str) -> None
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"observation": ()}, r"expected one or several of frame, robot, age, got \(\)"),
+        (
+            {"observation": ()},
+            r"expected one or several of frame, image, robot, age, belief, got \(\)",
+        ),
         ({"observation": "image"}, "got 'image'"),
         ({"observation": ["frame", "frame"]}, "observation"),
         ({"observation": ["frame", "visited"]}, "observation"),

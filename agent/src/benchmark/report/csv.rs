@@ -4,7 +4,7 @@ use crate::benchmark::report::file::{ReportError, replace_file};
 use crate::benchmark::report::policy_run::PolicyRun;
 use std::path::Path;
 
-const HEADER: [&str; 10] = [
+const HEADER: [&str; 11] = [
     "policy",
     "estimator",
     "world_seed",
@@ -15,6 +15,7 @@ const HEADER: [&str; 10] = [
     "mean_fire_cells",
     "mean_plan_millis",
     "brier",
+    "moves",
 ];
 
 /// Writes one row per run, ordered by policy, then seed; a missing Brier score is an empty field.
@@ -38,7 +39,7 @@ fn write_rows(path: &Path, runs: &[&PolicyRun]) -> Result<(), ::csv::Error> {
     Ok(writer.flush()?)
 }
 
-fn record(run: &PolicyRun) -> [String; 10] {
+fn record(run: &PolicyRun) -> [String; 11] {
     // `{:?}` is Rust's shortest round-trip form, with an exponent where `{}` would fill the line.
     let number = |value: f64| format!("{value:?}");
     [
@@ -52,5 +53,6 @@ fn record(run: &PolicyRun) -> [String; 10] {
         number(run.mean_fire_cells),
         number(run.mean_plan_millis),
         run.brier.map(number).unwrap_or_default(),
+        run.moves.to_string(),
     ]
 }

@@ -24,6 +24,10 @@ pub struct PolicyRun {
     pub mean_plan_millis: f64,
     /// Mean Brier score of the belief, where there is a belief.
     pub brier: Option<f64>,
+    /// Moves of a path.
+    pub moves: usize,
+    /// Whether it comes from a file.
+    pub is_added: bool,
     /// Reward of each step, in order.
     pub rewards: Vec<f32>,
 }

@@ -58,7 +58,7 @@ def prior_of(
     width: int,
     burn_in: int,
 ) -> NDArray[np.floating]:
-    """A prior by name, or a given one; None: ``"simulated"`` after a burn-in, else ``"initial"``."""
+    """A prior by name, or as given; None: ``"simulated"`` after a burn-in, else ``"initial"``."""
     if prior is None:
         prior = "simulated" if burn_in > 0 else "initial"
     if not isinstance(prior, str):

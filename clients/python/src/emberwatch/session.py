@@ -239,6 +239,11 @@ class SessionOwner:
         return self._session.spec.model
 
     @property
+    def n_moves(self) -> int:
+        """Moves of a path, T."""
+        return self._session.spec.n_moves
+
+    @property
     def burn_in(self) -> int:
         """Steps that the worlds are simulated before k = 0."""
         return self._session.spec.burn_in
