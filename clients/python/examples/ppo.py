@@ -193,6 +193,7 @@ class Training:
             round_ += 1
             if round_ % 25 == 0:
                 self.report("imitation", loss.item())
+        torch.save(self.network.state_dict(), self.args.out / "imitation.pt")
 
     def improve(self) -> None:
         """Proximal policy optimisation (Schulman et al., 2017)."""
@@ -212,19 +213,23 @@ class Training:
     def rollout(self) -> list[torch.Tensor]:
         """Windows, actions, their log-probabilities, advantages and returns of `horizon` moves."""
         args, n = self.args, self.args.worlds
+        # The world looks the same mirrored; turned, fire drifts another way.
+        turns, mirrored, names = SYMMETRIES[4 * self.rng.integers(2)]
+        back = names.argsort()
         windows, actions, log_probabilities, values, rewards, ends = [], [], [], [], [], []
         for _ in range(args.horizon):
-            window = torch.from_numpy(self.seen["local"])
+            window = turned(torch.from_numpy(self.seen["local"]), turns, mirrored)
             with torch.no_grad():
                 logits, value = self.network(window)
             moves = Categorical(logits=logits)
             action = moves.sample()
-            reward, truncated, infos = self.step(action.numpy())
+            reward, truncated, infos = self.step(back[action].numpy())
             earned, end = torch.from_numpy(reward).float(), torch.from_numpy(truncated)
             if truncated.any():  # the world would have gone on
                 last = np.stack([seen["local"] for seen in infos["final_obs"][truncated]])
                 with torch.no_grad():
-                    earned[end] += args.gamma * self.network(torch.from_numpy(last))[1]
+                    last = turned(torch.from_numpy(last), turns, mirrored)
+                    earned[end] += args.gamma * self.network(last)[1]
             windows.append(window)
             actions.append(action)
             log_probabilities.append(moves.log_prob(action))
@@ -232,7 +237,8 @@ class Training:
             rewards.append(earned)
             ends.append(end.float())
         with torch.no_grad():
-            values.append(self.network(torch.from_numpy(self.seen["local"]))[1])
+            last = turned(torch.from_numpy(self.seen["local"]), turns, mirrored)
+            values.append(self.network(last)[1])
         advantages, advantage = [], torch.zeros(n)
         for at in reversed(range(args.horizon)):
             goes_on = 1 - ends[at]
@@ -248,11 +254,9 @@ class Training:
         for _ in range(args.epochs):
             for batch in torch.randperm(len(rollout[0])).split(args.batch):
                 windows, actions, before, advantages, returns = (part[batch] for part in rollout)
-                # The world looks the same mirrored; turned, fire drifts another way.
-                turns, mirrored, names = SYMMETRIES[4 * self.rng.integers(2)]
-                logits, values = self.network(turned(windows, turns, mirrored))
+                logits, values = self.network(windows)
                 moves = Categorical(logits=logits)
-                ratio = (moves.log_prob(names[actions]) - before).exp()
+                ratio = (moves.log_prob(actions) - before).exp()
                 advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
                 gain = torch.min(ratio * advantages, ratio.clamp(0.8, 1.2) * advantages).mean()
                 entropy = moves.entropy().mean()

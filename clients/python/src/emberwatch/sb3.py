@@ -70,7 +70,8 @@ class WildfireVecEnv(VecEnv):
         reported: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for index in np.flatnonzero(ended).tolist():
             last = infos["final_info"]
-            reported[index] = {key: last[key][index] for key in last if not key.startswith("_")}
+            shown = [key for key in last if not key.startswith("_")]
+            reported[index] = {key: _plain(last[key][index]) for key in shown}
             reported[index]["terminal_observation"] = infos["final_obs"][index]
             reported[index]["TimeLimit.truncated"] = bool(truncated[index] & ~terminated[index])
         return observations, rewards.astype(np.float32), ended, reported
@@ -96,3 +97,8 @@ class WildfireVecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         return [False] * len(list(self._get_indices(indices)))
+
+
+def _plain(value: Any) -> Any:
+    """A number as Python's own, as the single environments have it."""
+    return value.item() if isinstance(value, np.generic) else value
