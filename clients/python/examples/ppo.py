@@ -44,7 +44,8 @@ class Network(nn.Module):
         self.both = nn.Sequential(
             *(nn.Linear(n_far + 128, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU())
         )
-        self.policy, self.value = nn.Linear(128, 4), nn.Linear(128, 1)
+        self.policy = nn.Linear(128, 4)
+        self.value = nn.Sequential(nn.Linear(128, 64), nn.ReLU(), nn.Linear(64, 1))
         nn.init.orthogonal_(self.policy.weight, 0.01)
         nn.init.zeros_(self.policy.bias)
 
@@ -52,7 +53,8 @@ class Network(nn.Module):
         images = windows.permute(0, 3, 1, 2).float() / 255
         near = slice(self.margin, self.margin + 7)
         both = self.both(torch.cat((self.far(images), self.near(images[:, :, near, near])), 1))
-        return self.policy(both), self.value(both)[:, 0]
+        # The value learns from what the policy sees, and leaves that as it is.
+        return self.policy(both), self.value(both.detach())[:, 0]
 
 
 def symmetries() -> list[tuple[int, bool, torch.Tensor]]:
@@ -205,7 +207,8 @@ class Training:
             for group in optimizer.param_groups:
                 group["lr"] = args.learning_rate * (1 - share)
             rollout = self.rollout()
-            entropy = self.update(optimizer, rollout, only_value=rounds < args.value_rounds)
+            only_value = args.imitate > 0 and rounds < args.value_rounds
+            entropy = self.update(optimizer, rollout, only_value=only_value)
             rounds += 1
             if rounds % 10 == 0:
                 self.report("PPO", entropy)
@@ -307,7 +310,8 @@ def draw(folder: Path) -> None:
 def world(args: argparse.Namespace) -> dict[str, Any]:
     """The keywords of the worlds."""
     names = ("model", "height", "width", "n_moves", "burn_in", "window")
-    return {name: getattr(args, name) for name in names}
+    # A busy machine may take its time.
+    return {name: getattr(args, name) for name in names} | {"timeout": 60.0}
 
 
 def arguments() -> argparse.Namespace:

@@ -66,7 +66,7 @@ def test_paths_flown_again_score_the_same_to_the_digit(
     tmp_path: Path, server: Callable[..., Server]
 ) -> None:
     settings = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn_in": 60}
-    running = server(worlds=5, publish_truth=True, coverage="client", **settings)
+    running = server(worlds=5, publish_truth="true", coverage="client", **settings)
     file = tmp_path / "beam.recording"
     recorder = subprocess.Popen(
         [find("emberwatch-server"), "record", f"--instance={running.instance}", f"--out={file}"]
@@ -81,11 +81,9 @@ def test_paths_flown_again_score_the_same_to_the_digit(
     finally:
         recorder.terminate()
         recorder.wait(20)
-    paths = {
-        (frame.result.seed, frame.result.step): frame.path
-        for frame in recording.read(file)
-        if isinstance(frame, emberwatch.Frame) and len(frame.path)
-    }
+    samples = (record.sample for record in recording.read(file))
+    frames = [sample for sample in samples if isinstance(sample, emberwatch.Frame)]
+    paths = {(frame.result.seed, frame.result.step): frame.path for frame in frames}
     steps = iter(range(1, 13))
 
     def again(_: Any) -> NDArray[np.int64]:

@@ -1,6 +1,7 @@
 //! Runs that others measured, from CSV files: they stand beside a comparison's own if their worlds are
 //! the same.
 
+use crate::benchmark::report::csv::HEADER;
 use crate::benchmark::report::policy_run::{PolicyRun, groups};
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -14,6 +15,8 @@ pub enum AddedError {
     /// A file that is not what `compare --csv` and `emberwatch.benchmark` write.
     #[error("--add: {}: {source}", path.display())]
     File { path: PathBuf, source: ::csv::Error },
+    #[error("--add: {}: expected the columns {}", .0.display(), HEADER.join(","))]
+    Header(PathBuf),
     #[error("--add: policy {0:?}: expected a name that no policy compared has")]
     Taken(String),
     #[error(
@@ -50,6 +53,9 @@ pub fn read_csv(path: &Path) -> Result<Vec<PolicyRun>, AddedError> {
         source,
     };
     let mut reader = ::csv::Reader::from_path(path).map_err(file)?;
+    if reader.headers().map_err(file)? != HEADER.as_slice() {
+        return Err(AddedError::Header(path.into()));
+    }
     let rows = reader.deserialize().map(|row| row.map(Row::into_run));
     rows.collect::<Result<_, _>>().map_err(file)
 }

@@ -4,7 +4,7 @@ use crate::benchmark::report::file::{ReportError, replace_file};
 use crate::benchmark::report::policy_run::PolicyRun;
 use std::path::Path;
 
-const HEADER: [&str; 11] = [
+pub(super) const HEADER: [&str; 11] = [
     "policy",
     "estimator",
     "world_seed",

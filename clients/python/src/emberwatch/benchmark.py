@@ -20,7 +20,6 @@ from typing import Any, Final, TextIO, cast
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
@@ -63,16 +62,26 @@ class Row:
 _HEADER: Final = [field.name for field in fields(Row)]
 
 
-@dataclass(slots=True)
 class _Tally:
     """Sums over the steps of some worlds."""
 
-    n_moves: int
-    reward: NDArray[np.float64]
-    n_visited: NDArray[np.int64]
-    n_hits: NDArray[np.int64]
-    n_fire: NDArray[np.int64]
-    seconds: float = 0.0
+    def __init__(self, n_moves: int, n_worlds: int) -> None:
+        self.n_moves: Final = n_moves
+        self.reward = np.zeros(n_worlds)
+        self.n_visited, self.n_hits, self.n_fire = np.zeros((3, n_worlds), np.int64)
+        self.seconds = 0.0
+
+    def timed(self, act: Policy, seen: Any) -> Any:
+        begin = time.perf_counter()
+        actions = act(seen)
+        self.seconds += time.perf_counter() - begin
+        return actions
+
+    def add(self, rewards: NDArray[Any], infos: dict[str, Any]) -> None:
+        self.reward += rewards
+        self.n_visited += infos["n_visited"]
+        self.n_hits += infos["n_hits"]
+        self.n_fire += infos["n_target_cells"]
 
 
 def evaluate(
@@ -115,21 +124,14 @@ def evaluate(
     chosen = _check(name, seeds, steps, batch, env)
     act = _acting(policy, deterministic)
     file = None if csv is None else _File(Path(csv))
-    if env == _MOVES:
-        keywords["reward"] = "path"
     done = {} if file is None else file.done(name, estimator, steps)
     missing = [seed for seed in chosen if seed not in done]
     report = _Progress(progress, name, chosen, len(missing) * steps)
-    begin = cast("Callable[[int], object]", getattr(policy, "begin", lambda _n: None))
+    keywords |= {"burn_in": burn_in} | ({"reward": "path"} if env == _MOVES else {})
     for first in range(0, len(missing), batch):
         part = missing[first : first + batch]
-        make = {"num_envs": len(part), "max_episode_steps": -1, "burn_in": burn_in, **keywords}
-        worlds = gymnasium.make_vec(env, autoreset_mode=AutoresetMode.DISABLED, **make)
-        try:
-            begin(len(part))
-            tally = _play(worlds, act, part, steps, report)
-        finally:
-            worlds.close()
+        getattr(policy, "begin", _nothing)(len(part))
+        tally = _play(env, keywords, act, part, steps, report)
         rows = _rows(tally, part, steps, name, estimator)
         done |= {row.world_seed: row for row in rows}
         if file is not None:
@@ -139,31 +141,30 @@ def evaluate(
 
 
 def _play(
-    worlds: Any,
+    env: str,
+    keywords: dict[str, Any],
     act: Policy,
     seeds: Sequence[int],
     steps: int,
     report: _Progress,
 ) -> _Tally:
-    n, n_moves = len(seeds), worlds.unwrapped.n_moves
-    a_step = n_moves if isinstance(worlds.single_action_space, spaces.Discrete) else 1
-    tally = _Tally(n_moves, np.zeros(n), *(np.zeros(n, np.int64) for _ in range(3)))
-    observations, _ = worlds.reset(seed=list(seeds))
-    for _ in range(steps):
-        for _ in range(a_step):
-            begin = time.perf_counter()
-            actions = act(observations)
-            tally.seconds += time.perf_counter() - begin
-            observations, rewards, _, truncated, infos = worlds.step(actions)
-            tally.reward += rewards
-        tally.n_visited += infos["n_visited"]
-        tally.n_hits += infos["n_hits"]
-        tally.n_fire += infos["n_target_cells"]
-        if truncated.any():
-            raise InvalidArgumentError(
-                "max-steps: expected a server that truncates no episode, for a benchmark"
-            )
-        report.add(n)
+    """Flies so many paths in some worlds."""
+    make: Any = {"num_envs": len(seeds), "max_episode_steps": -1, **keywords}
+    worlds = gymnasium.make_vec(env, autoreset_mode=AutoresetMode.DISABLED, **make)
+    try:
+        tally = _Tally(cast("int", getattr(worlds.unwrapped, "n_moves")), len(seeds))  # noqa: B009
+        seen, _ = worlds.reset(seed=cast("Any", list(seeds)))
+        n_actions = tally.n_moves if env == _MOVES else 1
+        for _ in range(steps):
+            for _ in range(n_actions - 1):
+                seen, *_ = worlds.step(tally.timed(act, seen))
+            seen, rewards, _, truncated, infos = worlds.step(tally.timed(act, seen))
+            if truncated.any():
+                raise InvalidArgumentError("instance: expected a server without --max-steps")
+            tally.add(rewards, infos)
+            report.add(len(seeds))
+    finally:
+        worlds.close()
     return tally
 
 
@@ -213,6 +214,10 @@ def _acting(policy: Any, deterministic: bool) -> Policy:
     return cast("Policy", policy)
 
 
+def _nothing(_n_worlds: int) -> None:
+    """What a policy without `begin` does."""
+
+
 class _File:
     """Rows in a CSV file, which is replaced whole whenever some are added."""
 
@@ -247,25 +252,22 @@ class _File:
 
 def read(path: str | os.PathLike[str]) -> list[Row]:
     """The rows of a CSV file of `evaluate` or `emberwatch-agent compare`."""
-    kinds = {"int": int, "float": float, "str": str}
-    with Path(path).open(newline="", encoding="utf-8") as file:
-        lines = csv_files.DictReader(file)
-        try:
+    try:
+        with Path(path).open(newline="", encoding="utf-8") as file:
+            lines = csv_files.DictReader(file)
             if lines.fieldnames != _HEADER:
-                raise ValueError(f"columns {lines.fieldnames}")
-            return [
-                Row(
-                    **{
-                        field.name: kinds[str(field.type)](line[field.name])
-                        for field in fields(Row)
-                    }
-                )
-                for line in lines
-            ]
-        except (ValueError, TypeError) as error:
-            raise InvalidArgumentError(
-                f"csv: expected {path} to have the columns {','.join(_HEADER)}, got {error}"
-            ) from None
+                raise ValueError(lines.fieldnames)
+            return [_row(line) for line in lines]
+    except (ValueError, TypeError) as error:
+        raise InvalidArgumentError(
+            f"csv: expected {path} to have the columns {','.join(_HEADER)}, got {error}"
+        ) from None
+
+
+def _row(line: dict[str, Any]) -> Row:
+    kinds: dict[Any, Callable[[str], Any]] = {"int": int, "float": float, "str": str}
+    values = {field.name: kinds[field.type](line[field.name]) for field in fields(Row)}
+    return Row(**values)
 
 
 class _Progress:

@@ -44,8 +44,14 @@ class WildfireEnv(WorldEnv):
     | part | space | meaning |
     |---|---|---|
     | `frame` | `Box(0, 255, (H, W, 1), uint8)` | what was observed; 255 where nothing was |
+    | `image` | `Box(0, 255, (H, W, O + 1), uint8)` | 255 in the channel of what was observed |
     | `robot` | `MultiDiscrete([H, W])` | the robot's row and column |
     | `age` | `Box(0, 255, (H, W, 1), uint8)` | steps since it was seen; 255: never, or as many |
+    | `belief` | `Box(0, 255, (H, W, S), uint8)` | 255 times each state's probability |
+
+    The last channel of `image` stands for nothing observed. `belief` is about what the next path will
+    meet, by the known model's Bayes filter (paper equations 5 and 6) given all frames so far; it
+    begins as `wrappers.BeliefObservation` does.
 
     ## Rewards
 

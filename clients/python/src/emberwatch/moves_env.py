@@ -35,13 +35,18 @@ class WildfireMovesEnv(WorldEnv):
 
     ## Observation Space
 
-    `observation` names the parts, as in `WildfireEnv`: `frame` (of the last complete path),
-    `robot`, `age`, and
+    `observation` names the parts, as in `WildfireEnv`: `frame` and `image` (of the last complete
+    path), `robot`, `age`, `belief`, and
 
     | part | space | meaning |
     |---|---|---|
     | `visited` | `Box(0, 255, (H, W, 1), uint8)` | 255 in the cells that this path has visited |
     | `move` | `Discrete(T)` | moves made of this path |
+    | `local` | `Box(0, 255, (L, L, 5), uint8)` | the belief around the robot, L = `window` |
+
+    The channels of `local`, times 255: the probability of the state that pays most, and the
+    entropy of the belief divided by log S, both 0 where this path has been; 1 where it has been;
+    1 off the grid; and the share of the path's moves that are left, everywhere alike.
 
     ## Rewards
 
@@ -67,8 +72,12 @@ class WildfireMovesEnv(WorldEnv):
 
     ## Arguments
 
-    As `WildfireEnv`; `observation` is `("frame", "visited", "robot", "move")` by default, and
-    `reward` is `"path"` or `"move"`.
+    As `WildfireEnv`; `observation` is `("frame", "visited", "robot", "move")` by default, `reward`
+    is `"path"` or `"move"`, and `window` an odd number of cells (15).
+
+    ## Vectorized environment
+
+    `gymnasium.make_vec("emberwatch/WildfireMoves-v0", num_envs=64)` is `WildfireMovesVectorEnv`.
 
     ## Version History
 

@@ -46,7 +46,8 @@ class WildfireVecEnv(VecEnv):
                 "env: expected gymnasium.make_vec of an environment of emberwatch with "
                 f"autoreset_mode='SameStep', got {env} with {mode}"
             )
-        self._env, self._worlds = env, worlds
+        self._env: Any = env
+        self._worlds = worlds
         self._actions: Any = None
         self.render_mode = worlds.render_mode
         super().__init__(
