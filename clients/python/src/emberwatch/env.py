@@ -49,9 +49,9 @@ class WildfireEnv(WorldEnv):
     | `age` | `Box(0, 255, (H, W, 1), uint8)` | steps since it was seen; 255: never, or as many |
     | `belief` | `Box(0, 255, (H, W, S), uint8)` | 255 times each state's probability |
 
-    The last channel of `image` stands for nothing observed. `belief` is about what the next path will
-    meet, by the known model's Bayes filter (paper equations 5 and 6) given all frames so far; it
-    begins as `wrappers.BeliefObservation` does.
+    The last channel of `image` stands for nothing observed. `belief` is about what the next path
+    will meet, by the known model's Bayes filter (paper equations 5 and 6) given all frames so far;
+    it begins as `wrappers.BeliefObservation` does.
 
     ## Rewards
 
