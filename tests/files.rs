@@ -150,7 +150,9 @@ fn worlds_in_which_nothing_burns_are_warned_of_once() {
             "--worlds 3 --model wildfire-small --height 16 --width 16 --burn-in {burn_in}"
         ));
         let log = server.program.stderr();
-        let found = log.matches("no cell is in the state that pays most").count();
+        let found = log
+            .matches("no cell is in the state that pays most")
+            .count();
         assert_eq!(found, n_warnings, "{log}");
     }
 }
