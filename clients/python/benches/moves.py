@@ -22,6 +22,8 @@ from emberwatch.programs import Program, unused_instance
 
 ENV = "emberwatch:emberwatch/WildfireMoves-v0"
 NO_END = 2**31 - 1
+#: Of one server.
+CLIENTS = 16
 
 
 class Trivial(gymnasium.Env[Any, Any]):
@@ -39,13 +41,14 @@ class Trivial(gymnasium.Env[Any, Any]):
         return self._seen, 0.0, False, False, {}
 
 
-def serve(args: argparse.Namespace) -> tuple[Program, str]:
-    """One server for all single environments."""
-    flags = {"worlds": args.worlds, "model": args.model, "height": 16, "width": 16, "moves": 16}
-    flags |= {"burn-in": 3000, "instance": unused_instance()}
+def serve(model: str) -> tuple[Program, str]:
+    """A server for as many single environments as may be its clients."""
+    instance = unused_instance()
+    flags = {"worlds": CLIENTS, "height": 16, "width": 16, "moves": 16, "burn-in": 3000}
+    flags |= {"model": model, "instance": instance}
     server = Program("emberwatch-server", [f"--{name}={value}" for name, value in flags.items()])
-    server.wait_for(lambda: emberwatch.connect(flags["instance"])).close()
-    return server, flags["instance"]
+    server.wait_for(lambda: emberwatch.connect(instance)).close()
+    return server, instance
 
 
 def main() -> None:
@@ -59,15 +62,19 @@ def main() -> None:
     world: dict[str, Any] = {"height": 16, "width": 16, "n_moves": 16, "burn_in": 3000}
     world |= {"model": args.model, "observation": "local", "max_episode_steps": NO_END}
     one = gymnasium.make(ENV, **world).unwrapped
-    server, instance = serve(args)
-    there = {"instance": instance, "observation": "local", "max_episode_steps": NO_END}
+    servers = [serve(args.model) for _ in range(0, args.worlds, CLIENTS)]
+    there = {"observation": "local", "max_episode_steps": NO_END}
+    places = [divmod(index, CLIENTS) for index in range(args.worlds)]
     peers: dict[str, Any] = {
         "native vector": gymnasium.make_vec(ENV, args.worlds, **world),
         "native vector, reward='move'": gymnasium.make_vec(
             ENV, args.worlds, reward="move", **world
         ),
         "SyncVectorEnv": SyncVectorEnv(
-            [partial(gymnasium.make, ENV, world=index, **there) for index in range(args.worlds)]
+            [
+                partial(gymnasium.make, ENV, instance=servers[server][1], world=number, **there)
+                for server, number in places
+            ]
         ),
         "SyncVectorEnv, simulates nothing": SyncVectorEnv([lambda: Trivial(one)] * args.worlds),
     }
@@ -86,7 +93,8 @@ def main() -> None:
         wall, cpu = (statistics.median(rate) for rate in zip(*rates[name], strict=True))
         print(f"{name:34} {wall:9.0f} moves/s, {cpu:9.0f} a processor second")
         envs.close()
-    server.stop()
+    for server, _ in servers:
+        server.stop()
 
 
 if __name__ == "__main__":

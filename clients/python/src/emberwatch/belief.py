@@ -91,7 +91,7 @@ class Filters:
             _correct(belief, self._likelihood, frames)
             self.posterior = belief
         else:
-            belief = self.predictor[:, moved]
+            belief = np.ascontiguousarray(self.predictor[:, moved])
             _correct(belief, self._likelihood, frames[moved])
             self.posterior[:, moved] = belief
         self.predictor = self._transition.apply(self.posterior)
@@ -100,7 +100,7 @@ class Filters:
 def _correct(
     belief: NDArray[np.float64], likelihood: NDArray[np.float64], frames: NDArray[np.uint8]
 ) -> None:
-    """Bayes' rule (eq. 5) in place; `belief` has shape (S, *frames.shape)."""
+    """Bayes' rule (eq. 5) in place; `belief` is contiguous, of shape (S, *frames.shape)."""
     values = frames.ravel()
     cells = np.flatnonzero(values != UNOBSERVED)
     observed = values[cells]
