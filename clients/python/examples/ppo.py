@@ -53,8 +53,7 @@ class Network(nn.Module):
         images = windows.permute(0, 3, 1, 2).float() / 255
         near = slice(self.margin, self.margin + 7)
         both = self.both(torch.cat((self.far(images), self.near(images[:, :, near, near])), 1))
-        # The value learns from what the policy sees, and leaves that as it is.
-        return self.policy(both), self.value(both.detach())[:, 0]
+        return self.policy(both), self.value(both)[:, 0]
 
 
 def symmetries() -> list[tuple[int, bool, torch.Tensor]]:
@@ -268,14 +267,17 @@ class Training:
                     loss = 0.5 * loss - gain - args.entropy * entropy
                 optimizer.zero_grad()
                 loss.backward()
+                if only_value:  # what the policy sees stays as it is
+                    for name, parameter in self.network.named_parameters():
+                        parameter.grad = parameter.grad if name.startswith("value") else None
                 nn.utils.clip_grad_norm_(self.network.parameters(), 0.5)
                 optimizer.step()
                 entropies.append(entropy.item())
         return float(np.mean(entropies))
 
 
-def greedy(network: Network) -> Any:
-    """The most probable moves, the mean of both mirror images."""
+def acting(network: Network, *, sampled: bool) -> Any:
+    """A policy for the benchmark: the mean of both mirror images, sampled or its most probable."""
 
     @torch.no_grad()
     def act(windows: np.ndarray) -> np.ndarray:
@@ -283,6 +285,8 @@ def greedy(network: Network) -> Any:
         for turns, mirrored, names in (SYMMETRIES[0], SYMMETRIES[4]):
             logits, _ = network(turned(torch.from_numpy(windows), turns, mirrored))
             total += logits.log_softmax(1)[:, names]
+        if sampled:
+            return Categorical(logits=total / 2).sample().numpy()
         return total.argmax(1).numpy()
 
     return act
@@ -323,6 +327,7 @@ def arguments() -> argparse.Namespace:
         "--evaluate", default="5000..5008", help="seeds, FIRST..END; below 1000: test"
     )
     parser.add_argument("--steps", type=int, default=100, help="paths of each world evaluated")
+    parser.add_argument("--sampled", action="store_true", help="evaluate sampled moves")
     parser.add_argument("--load", type=Path, help="a network to begin with")
     parser.add_argument("--name", default="ppo", help="in the benchmark's table")
     parser.add_argument("--seed", type=int, default=1000, help="of the first training world, too")
@@ -331,14 +336,14 @@ def arguments() -> argparse.Namespace:
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--window", type=int, default=15, help="cells along a side")
     parser.add_argument("--worlds", type=int, default=64)
-    parser.add_argument("--horizon", type=int, default=64, help="moves of a rollout")
-    parser.add_argument("--batch", type=int, default=1024)
-    parser.add_argument("--epochs", type=int, default=2)
+    parser.add_argument("--horizon", type=int, default=32, help="moves of a rollout")
+    parser.add_argument("--batch", type=int, default=512)
+    parser.add_argument("--epochs", type=int, default=4)
     parser.add_argument("--value-rounds", type=int, default=5, help="rollouts for the value alone")
-    parser.add_argument("--learning-rate", type=float, default=3e-4)
+    parser.add_argument("--learning-rate", type=float, default=7e-4)
     parser.add_argument("--gamma", type=float, default=0.95)
     parser.add_argument("--lambda", dest="lambda_", type=float, default=0.9)
-    parser.add_argument("--entropy", type=float, default=0.005)
+    parser.add_argument("--entropy", type=float, default=0.01)
     parser.add_argument("--threads", type=int, default=1)
     return parser.parse_args()
 
@@ -356,7 +361,7 @@ def main() -> None:
     draw(args.out)
     first, end = map(int, args.evaluate.split(".."))
     rows = evaluate(
-        greedy(training.network),
+        acting(training.network, sampled=args.sampled),
         name=args.name,
         estimator="known_model",
         seeds=range(first, end),
