@@ -43,8 +43,9 @@ def test_an_example_runs(name: str, arguments: str, line: str, tmp_path: Path) -
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
     assert re.search(line, done.stdout), done.stdout
-    for plot in tmp_path.glob("*.png"):
-        assert plot.stat().st_size > 10_000
+    plots = list(tmp_path.glob("*.png"))
+    assert bool(plots) == ("OUT" in arguments)
+    assert all(plot.stat().st_size > 10_000 for plot in plots)
 
 
 def test_every_example_is_run() -> None:
