@@ -65,7 +65,7 @@ run --wait=-1 => --wait | expected seconds
 run --instance a/b => instance name | "a/b"
 run --steps -1 => -1
 run --world x => --world | 'x'
-run --model no.toml => model file no.toml | No such file | wildfire, wildfire-sparse, wildfire-latent
+run --model no.toml => model file no.toml | No such file | wildfire, wildfire-sparse, wildfire-latent, wildfire-small
 run --model /dev/zero => model file /dev/zero | expected at most 16777216 bytes
 run --checkpoint /dev/zero => checkpoint /dev/zero: expected a regular file
 run --config no.toml => config file no.toml | No such file

@@ -144,6 +144,20 @@ fn a_model_in_which_no_state_pays_is_warned_of() {
 }
 
 #[test]
+fn worlds_in_which_nothing_burns_are_warned_of_once() {
+    for (burn_in, n_warnings) in [(0, 1), (3000, 0)] {
+        let server = Server::start(&format!(
+            "--worlds 3 --model wildfire-small --height 16 --width 16 --burn-in {burn_in}"
+        ));
+        let log = server.program.stderr();
+        let found = log
+            .matches("no cell is in the state that pays most")
+            .count();
+        assert_eq!(found, n_warnings, "{log}");
+    }
+}
+
+#[test]
 fn the_documented_files_are_accepted() {
     for file in [
         "config/server.toml",
@@ -151,6 +165,7 @@ fn the_documented_files_are_accepted() {
         "config/models/road-ice.toml",
         "config/models/wildfire-sparse.toml",
         "config/models/wildfire-latent.toml",
+        "config/models/wildfire-small.toml",
     ] {
         let path: PathBuf = repository().join(file);
         let path = path.to_str().expect("a plain path");

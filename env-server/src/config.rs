@@ -27,7 +27,8 @@ pub struct ServerConfig {
     pub instance: String,
     /// Number of independent worlds, 1 to 1024; world i starts from `seed + i`.
     pub worlds: u32,
-    /// A built-in model (`wildfire`, `wildfire-sparse`, `wildfire-latent`), or the path of a model file.
+    /// A built-in model (`wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`), or the path of
+    /// a model file.
     pub model: String,
     /// Grid height, cells.
     pub height: usize,

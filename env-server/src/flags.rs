@@ -19,7 +19,8 @@ pub struct ServerFlags {
     /// Number of independent worlds [default: 1]
     #[arg(long)]
     pub worlds: Option<u32>,
-    /// `wildfire`, `wildfire-sparse`, `wildfire-latent` or the path of a model file [default: wildfire]
+    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small` or the path of a model file
+    /// [default: wildfire]
     #[arg(long)]
     pub model: Option<String>,
     /// Grid height in cells [default: 64]

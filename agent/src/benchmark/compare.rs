@@ -79,6 +79,7 @@ pub fn compare(
         snapshot: None,
     };
     let mut feed = Feed::open(arena.instance(), &prior);
+    let n_moves = arena.info().n_moves;
     let game = |policy, seeds| Match {
         comparison,
         policy,
@@ -105,7 +106,7 @@ pub fn compare(
             }
             results
                 .runs
-                .extend(runs.into_iter().map(Run::into_policy_run));
+                .extend(runs.into_iter().map(|run| run.into_policy_run(n_moves)));
         }
     }
     feed.end();
@@ -230,7 +231,7 @@ impl Run {
         }
     }
 
-    fn into_policy_run(self) -> PolicyRun {
+    fn into_policy_run(self, moves: usize) -> PolicyRun {
         let (tally, policy) = (self.tally, self.robot.agent.policy());
         let steps = tally.rewards.len() as u64;
         let mean = |sum: f64| sum / steps.max(1) as f64;
@@ -246,6 +247,8 @@ impl Run {
             mean_fire_cells: mean(tally.n_fire as f64),
             mean_plan_millis: mean(tally.planning.as_secs_f64() * 1e3),
             brier: (policy.estimator != EstimatorKind::None).then(|| mean(tally.brier)),
+            moves,
+            is_added: false,
             rewards: tally.rewards,
         }
     }

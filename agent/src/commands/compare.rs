@@ -5,9 +5,10 @@ use super::worlds::WorldFlags;
 use agent::acting::registry::needs_checkpoint;
 use agent::benchmark::arena::Arena;
 use agent::benchmark::compare::{Comparison, Results, compare};
+use agent::benchmark::report::added::{check_settings, check_worlds, read_csv};
 use agent::benchmark::report::{
-    Snapshot, draw_ladder, draw_rewards, draw_snapshot, figures::FIRE_CELLS_PER_STEP, render_table,
-    write_csv, write_events,
+    PolicyRun, Snapshot, draw_ladder, draw_rewards, draw_snapshot, figures::FIRE_CELLS_PER_STEP,
+    render_table, write_csv, write_events,
 };
 use agent::config::AgentFlags;
 use agent::learning::learned::Learned;
@@ -41,6 +42,10 @@ pub struct CompareCommand {
     /// Write one line per policy and world to this file
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
+    /// Rows that others measured on the same worlds, such as `emberwatch.benchmark` in Python; may be
+    /// given for each
+    #[arg(long, value_name = "FILE")]
+    add: Vec<PathBuf>,
     /// Draw ladder and rewards as .png and .svg, and snapshot.png, into this directory
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
@@ -81,16 +86,19 @@ impl CompareCommand {
             config,
             learned,
         };
+        let added = self.read_added(&comparison, arena.info().n_moves)?;
         let results = run_comparison(arena, &comparison)?;
-        write(&render_table(&results.runs, &self.baseline))?;
+        check_worlds(&added, &results.runs)?;
+        let all = [&*results.runs, &*added].concat();
+        write(&render_table(&all, &self.baseline))?;
         if let Some(path) = &self.csv {
-            write_csv(path, &results.runs)?;
+            write_csv(path, &all)?;
         }
         if let Some(directory) = &self.tensorboard {
             write_events(directory, &results.runs)?;
         }
         if let Some(directory) = &self.figures {
-            self.draw(directory, arena, &comparison, &results)?;
+            self.draw(directory, arena, &comparison, (&results, &all))?;
         }
         Ok(())
     }
@@ -100,12 +108,12 @@ impl CompareCommand {
         directory: &Path,
         arena: &mut Arena,
         comparison: &Comparison,
-        results: &Results,
+        (results, all): (&Results, &[PolicyRun]),
     ) -> Result<()> {
         let label = axis_label(arena.model());
         for kind in ["png", "svg"] {
             let path = |name: &str| directory.join(name).with_extension(kind);
-            draw_ladder(&path("ladder"), &results.runs, &label)?;
+            draw_ladder(&path("ladder"), all, &label)?;
             let fire_cells = Some(&*results.fire_cells);
             draw_rewards(&path("rewards"), &results.runs, &label, fire_cells)?;
         }
@@ -116,6 +124,20 @@ impl CompareCommand {
         let settings = toml::to_string(&comparison.config)?;
         let path = directory.join("agent.toml");
         std::fs::write(&path, settings).with_context(|| format!("write {}", path.display()))
+    }
+
+    fn read_added(&self, comparison: &Comparison, n_moves: usize) -> Result<Vec<PolicyRun>> {
+        let read = |path: &PathBuf| {
+            let expected = "expected a CSV file of `compare --csv` or emberwatch.benchmark";
+            read_csv(path).with_context(|| format!("--add {}: {expected}", path.display()))
+        };
+        let files = self.add.iter().map(read);
+        let added = files.collect::<Result<Vec<_>>>()?.concat();
+        let policies = comparison.policies.iter();
+        let policies: Vec<&str> = policies.map(|policy| &*policy.name).collect();
+        let (seeds, steps) = (&comparison.seeds, comparison.steps);
+        check_settings(&added, &policies, seeds, steps, n_moves).context("--add")?;
+        Ok(added)
     }
 
     /// Makes the folders of the files to come: better to fail before a long comparison than after.

@@ -44,6 +44,8 @@ pub fn run(policy: &str, estimator: &str, world_seed: u64, mean_reward: f64) -> 
         mean_fire_cells: 100.0 * world_seed as f64,
         mean_plan_millis: 1.5,
         brier: (estimator == "known_model").then_some(0.125),
+        moves: 64,
+        is_added: false,
         rewards: Vec::new(),
     }
 }

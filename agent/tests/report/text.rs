@@ -127,7 +127,7 @@ fn csv_rows_read_back_as_the_same_numbers() {
     let text = std::fs::read_to_string(&path).expect("readable");
     assert!(text.starts_with(
         "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
-         mean_fire_cells,mean_plan_millis,brier\n"
+         mean_fire_cells,mean_plan_millis,brier,moves\n"
     ));
     let mut reader = csv::Reader::from_reader(text.as_bytes());
     let rows: Vec<_> = reader.records().map(|row| row.expect("a row")).collect();

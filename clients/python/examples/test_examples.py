@@ -14,7 +14,16 @@ FOLDER = Path(__file__).parent
 #: Each example, short arguments, and a line that it must print.
 EXAMPLES = [
     ("dqn.py", "--total-steps 3000 --report-every 1000", r"moves 3000  reward per path \d"),
-    ("sb3_moves.py", "--total-steps 600", r"reward of an episode of 50 paths: \d"),
+    (
+        "sb3_moves.py",
+        "--total-steps 600 --worlds 4 --steps 5 --out OUT",
+        r"sb3_ppo: \d\S* \+- \S+ a step on 8 worlds",
+    ),
+    (
+        "ppo.py",
+        "--worlds 8 --imitate 3 --cpu-seconds 6 --steps 5 --out OUT",
+        r"ppo: \d\S* \+- \S+ a step on 8 worlds",
+    ),
     (
         "sb3_objective.py",
         "--total-steps 500 --evaluation-steps 50",
@@ -34,8 +43,9 @@ def test_an_example_runs(name: str, arguments: str, line: str, tmp_path: Path) -
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
     assert re.search(line, done.stdout), done.stdout
-    if "OUT" in arguments:
-        assert (tmp_path / "plot.png").stat().st_size > 10_000
+    plots = list(tmp_path.glob("*.png"))
+    assert bool(plots) == ("OUT" in arguments)
+    assert all(plot.stat().st_size > 10_000 for plot in plots)
 
 
 def test_every_example_is_run() -> None:

@@ -18,7 +18,8 @@ from emberwatch import programs
 from emberwatch.belief import Filter, initial_prior, uniform_prior
 from emberwatch.errors import InvalidArgumentError
 from emberwatch.model import Model
-from emberwatch.wrappers import BeliefObservation, simulated_prior
+from emberwatch.prior import simulated_prior
+from emberwatch.wrappers import BeliefObservation
 
 WILDFIRE = Model.wildfire()
 SHAPE = (4, 6)

@@ -456,8 +456,11 @@ def test_wrong_options_are_named(keywords: dict[str, Any], message: str) -> None
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"observation": ()}, r"expected one or several of frame, robot, age, got \(\)"),
-        ({"observation": "image"}, "got 'image'"),
+        (
+            {"observation": ()},
+            r"expected one or several of frame, image, robot, age, belief, got \(\)",
+        ),
+        ({"observation": "smoke"}, "got 'smoke'"),
         ({"observation": ["frame", "frame"]}, "observation"),
         ({"observation": ["frame", "visited"]}, "observation"),
         ({"height": 0}, r"grid shape: expected .* in 1\.\.=4096, got 0 x 5"),
@@ -586,6 +589,16 @@ def test_a_model_in_which_no_state_pays_is_warned_of(tmp_path: Path) -> None:
     model.write_text(Path(LIVELY).read_text().replace("reward = 1.0", "reward = 0.0"))
     with pytest.warns(UserWarning, match="no state pays: every reward will be 0"):
         make(model=str(model))
+
+
+def test_worlds_in_which_nothing_burns_are_warned_of_once() -> None:
+    worlds = {"model": "wildfire-small", "burn_in": 0}
+    env, envs = make(**worlds), gymnasium.make_vec(WILDFIRE, num_envs=2, **SMALL | worlds)
+    for one in (env, envs):
+        with pytest.warns(UserWarning, match="no cell of world 0 .* give it a burn_in"):
+            one.reset(seed=1)
+        one.reset(seed=1)
+        one.close()
 
 
 def test_a_second_environment_on_a_world_names_the_holder() -> None:
@@ -814,13 +827,14 @@ def test_a_forked_child_makes_its_own_connection() -> None:
 def test_make_imports_the_package_by_name() -> None:
     code = (
         "import gymnasium\n"
-        "env = gymnasium.make('emberwatch:emberwatch/Wildfire-v0', height=7, width=5, burn_in=0)\n"
+        "env = gymnasium.make('emberwatch:emberwatch/Wildfire-v0', height=20, width=12,\n"
+        "    model='wildfire-small', burn_in=300)\n"
         "env.reset(seed=1)\n"
         "print(env.unwrapped.observation_space)\n"
     )
     command = [sys.executable, "-W", "error", "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert "Box(0, 255, (7, 5, 1), uint8)" in done.stdout, done.stderr
+    assert "Box(0, 255, (20, 12, 1), uint8)" in done.stdout, done.stderr
 
 
 @pytest.mark.parametrize("name", [WILDFIRE, MOVES])

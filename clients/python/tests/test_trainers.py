@@ -2,14 +2,19 @@
 
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
-from environments import LIVELY, MOVES, OBJECTIVE, WILDFIRE, make, no_warnings
+from environments import LIVELY, MOVES, OBJECTIVE, WILDFIRE, assert_same, make, no_warnings
 
 pytest.importorskip("stable_baselines3")
 
 from stable_baselines3.common.env_checker import check_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecTransposeImage
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecTransposeImage
+
+from emberwatch.benchmark import evaluate
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.sb3 import WildfireVecEnv, make_vec_env
 
 #: The smallest images that its convolutional policies take.
 IMAGE = {"height": 36, "width": 40, "n_moves": 4, "burn_in": 10, "model": LIVELY}
@@ -28,6 +33,8 @@ IMAGE = {"height": 36, "width": 40, "n_moves": 4, "burn_in": 10, "model": LIVELY
         (MOVES, {"observation": "move"}),
         (MOVES, {"observation": ("frame", "age", "visited", "robot", "move")}),
         (MOVES, {"reward": "move"}),
+        (MOVES, {"observation": "local", "window": 37}),
+        (MOVES, {"observation": ("image", "belief", "local"), "window": 37}),
         (OBJECTIVE, {"prior": "initial"}),
         (OBJECTIVE, {"prior": "uniform", "planner": "shooting", "truth": True}),
     ],
@@ -61,6 +68,53 @@ def test_its_vector_environments_carry_frames_and_ends(name: str) -> None:
         assert ended.tolist() == [step % 3 == 0] * 2
         if ended[0]:
             assert infos[0]["TimeLimit.truncated"] and "terminal_observation" in infos[0]
+    vector.close()
+
+
+def test_the_vector_environment_is_that_of_single_ones() -> None:
+    keywords = {**IMAGE, "max_episode_steps": 6, "observation": ("frame", "local")}
+    ours = make_vec_env(MOVES, 3, **keywords)
+    theirs = DummyVecEnv([lambda: make(MOVES, **keywords) for _ in range(3)])
+    for vector in (ours, theirs):
+        vector.seed(5)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert_same(dict(ours.reset()), dict(theirs.reset()))
+    n_ends = 0
+    for _ in range(20):
+        moves = np.array([ours.action_space.sample() for _ in range(3)])
+        (seen, *left), (expected, *right) = ours.step(moves), theirs.step(moves)
+        assert_same(dict(seen), dict(expected))
+        assert_same(left[:2], [right[0], right[1]])
+        for world in np.flatnonzero(right[1]):
+            assert_same(left[2][world], right[2][world])
+            n_ends += 1
+    assert n_ends == 9
+    ours.close()
+    theirs.close()
+
+
+def test_a_model_learns_on_the_vector_and_is_evaluated() -> None:
+    import stable_baselines3
+
+    world = {**IMAGE, "observation": "local"}
+    vector = VecMonitor(make_vec_env(MOVES, 4, max_episode_steps=8, reward="move", **world))
+    agent = stable_baselines3.PPO("MlpPolicy", vector, n_steps=8, batch_size=16, device="cpu")
+    agent.learn(64)
+    assert len(agent.ep_info_buffer) == 8
+    vector.close()
+    rows = evaluate(agent, name="ppo", seeds=[1000], steps=3, progress=None, **world)
+    assert rows[0].moves == 4 and rows[0].mean_distinct_cells > 0
+
+
+def test_what_is_no_vector_for_it_is_named() -> None:
+    with pytest.raises(InvalidArgumentError, match="env: expected gymnasium.make_vec of an env"):
+        WildfireVecEnv(gymnasium.make_vec(MOVES, num_envs=2, **IMAGE))
+    vector = make_vec_env(MOVES, 2, **IMAGE)
+    assert vector.get_attr("n_moves") == [4, 4] and vector.env_is_wrapped(VecMonitor) == [False] * 2
+    for call in (lambda: vector.set_attr("n_moves", 3), lambda: vector.env_method("render")):
+        with pytest.raises(InvalidArgumentError, match="the worlds share one environment"):
+            call()
     vector.close()
 
 

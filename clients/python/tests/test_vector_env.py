@@ -1,4 +1,4 @@
-"""`WildfireVectorEnv` against Gymnasium's `SyncVectorEnv` of single environments."""
+"""The vector environments against Gymnasium's `SyncVectorEnv` of single ones."""
 
 import copy
 import gc
@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 from environments import (
+    MOVES,
     WILDFIRE,
     actions,
     assert_same,
@@ -35,6 +36,14 @@ from emberwatch.errors import (
 )
 
 PARTS = ("frame", "robot", "age")
+
+#: Every part of an environment.
+ALL = {
+    WILDFIRE: ("frame", "image", "robot", "age", "belief"),
+    MOVES: ("frame", "image", "robot", "age", "belief", "local", "visited", "move"),
+}
+
+by_name = pytest.mark.parametrize("name", ALL)
 
 Vector = VectorEnv[Any, Any, Any]
 
@@ -79,10 +88,19 @@ def assert_same_steps(ours: Vector, theirs: Vector, n_steps: int) -> int:
 # Against SyncVectorEnv
 
 
-@pytest.mark.parametrize("observation", [*PARTS, ("frame", "robot"), PARTS], ids=str)
+@pytest.mark.parametrize(
+    ("name", "observation"),
+    [
+        *((WILDFIRE, parts) for parts in (*PARTS, ("frame", "robot"), ALL[WILDFIRE])),
+        *((MOVES, parts) for parts in ("local", "move", ALL[MOVES])),
+    ],
+    ids=str,
+)
 @pytest.mark.parametrize("mode", AutoresetMode, ids=str)
-def test_every_field_is_that_of_single_environments(mode: AutoresetMode, observation: Any) -> None:
-    ours, theirs = pair(3, mode, observation=observation, truth=True)
+def test_every_field_is_that_of_single_environments(
+    mode: AutoresetMode, name: str, observation: Any
+) -> None:
+    ours, theirs = pair(3, mode, name=name, observation=observation, truth=True)
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     assert ours.single_observation_space == theirs.single_observation_space
@@ -95,12 +113,16 @@ def test_every_field_is_that_of_single_environments(mode: AutoresetMode, observa
     theirs.close()
 
 
+@by_name
 @pytest.mark.parametrize("truth", [False, True])
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=str)
 def test_episodes_end_and_begin_again_as_in_single_environments(
-    mode: AutoresetMode, truth: bool
+    mode: AutoresetMode, truth: bool, name: str
 ) -> None:
-    ours, theirs = pair(4, mode, observation=PARTS, truth=truth, max_episode_steps=3)
+    n_steps = {WILDFIRE: 3, MOVES: 10}[name]
+    ours, theirs = pair(
+        4, mode, name=name, observation=ALL[name], truth=truth, max_episode_steps=n_steps
+    )
     assert_same_flight(ours, theirs, 2, seed=0)
     # Some are reset in between, so that episodes end at different times.
     for mask in ([True, False, True, False], [False, False, True, False]):
@@ -109,13 +131,16 @@ def test_episodes_end_and_begin_again_as_in_single_environments(
             right = theirs.reset(seed=env_seed, options={"reset_mask": np.array(mask)})
             assert_same(left, right, "masked reset")
             assert_same_steps(ours, theirs, 1)
-    assert assert_same_steps(ours, theirs, 14) > 8
+    assert assert_same_steps(ours, theirs, 5 * n_steps) > 8
     ours.close()
     theirs.close()
 
 
-def test_disabled_autoreset_leaves_resets_to_the_caller() -> None:
-    ours, theirs = pair(3, AutoresetMode.DISABLED, observation=PARTS, max_episode_steps=2)
+@by_name
+def test_disabled_autoreset_leaves_resets_to_the_caller(name: str) -> None:
+    ours, theirs = pair(
+        3, AutoresetMode.DISABLED, name=name, observation=ALL[name], max_episode_steps=2
+    )
     assert_same_flight(ours, theirs, 1, seed=3)
     mask = np.array([False, True, False])
     assert_same(
@@ -137,18 +162,19 @@ def test_disabled_autoreset_leaves_resets_to_the_caller() -> None:
     theirs.close()
 
 
+@by_name
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=str)
-def test_worlds_of_running_servers_are_the_same_too(mode: AutoresetMode) -> None:
+def test_worlds_of_running_servers_are_the_same_too(mode: AutoresetMode, name: str) -> None:
     # The servers truncate by themselves, and the vector's worlds begin at 2 of theirs.
     flags = {"publish_truth": True, "max_steps": 3}
     with serving(worlds=5, seed=40, **flags) as one, serving(worlds=3, seed=9, **flags) as other:
-        ours = make_vec(3, instance=one, world=2, truth=True, autoreset_mode=mode)
-        theirs = sync_of(3, mode, instance=other, truth=True)
+        ours = make_vec(3, name, instance=one, world=2, truth=True, autoreset_mode=mode)
+        theirs = sync_of(3, mode, name=name, instance=other, truth=True)
         assert_same_flight(ours, theirs, 2, seed=6)
         mask = np.array([False, True, False])
         options = [{"reset_mask": mask}, {"reset_mask": mask}]
         assert_same(ours.reset(options=options[0]), theirs.reset(options=options[1]))
-        assert assert_same_steps(ours, theirs, 8) > 4
+        assert assert_same_steps(ours, theirs, {WILDFIRE: 8, MOVES: 32}[name]) > 4
         with emberwatch.connect(one) as client:
             holders = [world.holder_pid for world in client.status().worlds]
         assert holders == [None, None, os.getpid(), os.getpid(), os.getpid()]
@@ -287,9 +313,11 @@ def test_wrong_actions_are_named_and_not_sent(action: Any, message: str) -> None
     env.close()
 
 
+@by_name
 @pytest.mark.parametrize("mode", AutoresetMode, ids=str)
-def test_what_was_returned_is_never_changed(mode: AutoresetMode) -> None:
-    env = make_vec(3, observation=PARTS, truth=True, max_episode_steps=3, autoreset_mode=mode)
+def test_what_was_returned_is_never_changed(mode: AutoresetMode, name: str) -> None:
+    keywords = {"observation": ALL[name], "truth": True, "max_episode_steps": 3}
+    env = make_vec(3, name, autoreset_mode=mode, **keywords)
     returned = [env.reset(seed=1)]
     kept: list[Any] = []
     for step, action in enumerate(actions(env, 12)):
@@ -303,11 +331,13 @@ def test_what_was_returned_is_never_changed(mode: AutoresetMode) -> None:
     env.close()
 
 
-def test_what_was_returned_may_be_written_to() -> None:
-    ours, theirs = pair(2, AutoresetMode.NEXT_STEP, observation=PARTS, max_episode_steps=2)
+@by_name
+def test_what_was_returned_may_be_written_to(name: str) -> None:
+    keywords = {"observation": ALL[name], "max_episode_steps": 2}
+    ours, theirs = pair(2, AutoresetMode.NEXT_STEP, name=name, **keywords)
     _spoil(ours.reset(seed=4))
     theirs.reset(seed=4)
-    for action in actions(theirs, 7):
+    for action in actions(theirs, 13):
         left = ours.step(action)
         assert_same(left, theirs.step(action))
         _spoil(left)
@@ -324,6 +354,57 @@ def _spoil(value: Any) -> None:
     else:
         for part in value:
             _spoil(part)
+
+
+@pytest.mark.parametrize("mode", AutoresetMode, ids=str)
+def test_moves_that_pay_are_those_of_single_environments(mode: AutoresetMode) -> None:
+    keywords = {"name": MOVES, "reward": "move", "max_episode_steps": 40}
+    ours, theirs = pair(3, mode, **keywords)
+    left, right = ours.reset(seed=6), theirs.reset(seed=6)
+    paid = 0.0
+    for action in actions(theirs, 40):
+        left, right = ours.step(action), theirs.step(action)
+        assert_same(left, right)
+        paid += left[1].sum()
+    assert paid > 0
+    ours.close()
+    theirs.close()
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([0], r"integers of shape \(2,\), got int64 \(1,\)"),
+        ([0.5, 1.0], r"integers of shape \(2,\), got float64"),
+        ([0, 4], "expected 0 to 3, got 4 for world 1"),
+        ([-1, 0], "expected 0 to 3, got -1 for world 0"),
+        ([[0], [1, 2]], "action: expected an array"),
+        ("up", "integers of shape"),
+    ],
+    ids=repr,
+)
+def test_wrong_moves_are_named_and_not_flown(action: Any, message: str) -> None:
+    env = make_vec(2, MOVES, observation="move")
+    env.reset(seed=1)
+    with pytest.raises(InvalidArgumentError, match=message):
+        env.step(action)
+    assert env.step(np.zeros(2, int))[0].tolist() == [1, 1]
+    env.close()
+
+
+def test_a_move_after_one_that_timed_out_needs_a_reset() -> None:
+    env = make_vec(2, MOVES, observation="move")
+    env.reset(seed=1)
+    for _ in range(3):
+        env.step(np.zeros(2, int))
+    session = env.unwrapped._session
+    with stopped(session._program.pid), impatient(env), pytest.raises(RequestTimeoutError):
+        env.step(np.zeros(2, int))
+    with fails("closed", "an earlier step timed out"):
+        env.step(np.zeros(2, int))
+    env.reset(seed=1)
+    assert env.step(np.zeros(2, int))[0].tolist() == [1, 1]
+    env.close()
 
 
 # Keywords and the registry

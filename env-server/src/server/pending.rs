@@ -3,6 +3,7 @@
 use super::state::Server;
 use crate::simulator::PendingFile;
 use crate::snapshot::{Done, FileError, Job};
+use crate::world::Episode;
 use protocol::control::Reply;
 use protocol::message::Status;
 use protocol::responder::ActiveControl;
@@ -42,10 +43,25 @@ impl Server {
             return;
         }
         for (world, episode) in finished {
+            self.warn_of_barren(world, &episode);
             self.simulator.put(world, episode);
             self.publish(world..world + 1);
         }
         self.answer_pending(now);
+    }
+
+    /// Warns of the first world in which there is nothing to find.
+    fn warn_of_barren(&mut self, world: usize, episode: &Episode) {
+        if self.has_warned_of_barren || episode.result().n_target_cells > 0 {
+            return;
+        }
+        self.has_warned_of_barren = true;
+        tracing::warn!(
+            world,
+            seed = episode.result().seed,
+            "no cell is in the state that pays most: set --burn-in, a larger grid, or a model for small ones, \
+             --model wildfire-small"
+        );
     }
 
     pub(super) fn take_files(&mut self, now: Instant) {

@@ -45,6 +45,7 @@ pub(super) struct Server {
     pub(super) payload: Vec<u8>,
     pub(super) publications: Publications,
     pub(super) expired_leases: Throttle,
+    pub(super) has_warned_of_barren: bool,
     pub(super) rate: Rate,
     pub(super) started: Instant,
     pub(super) last_tick: Instant,
@@ -110,6 +111,7 @@ impl Server {
             payload: Vec::new(),
             publications: Publications::default(),
             expired_leases: Throttle::default(),
+            has_warned_of_barren: false,
             rate: Rate {
                 since: now,
                 n_steps: 0,

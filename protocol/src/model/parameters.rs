@@ -10,7 +10,7 @@ use super::grid::{Cell, Shape};
 use ndarray::{Array1, Array2, Array4, Axis};
 
 /// The built-in models by name.
-const BUILT_IN: [(&str, &str); 3] = [
+const BUILT_IN: [(&str, &str); 4] = [
     (
         "wildfire",
         include_str!("../../../config/models/wildfire.toml"),
@@ -22,6 +22,10 @@ const BUILT_IN: [(&str, &str); 3] = [
     (
         "wildfire-latent",
         include_str!("../../../config/models/wildfire-latent.toml"),
+    ),
+    (
+        "wildfire-small",
+        include_str!("../../../config/models/wildfire-small.toml"),
     ),
 ];
 
@@ -42,8 +46,8 @@ impl Model {
         Self::built_in("wildfire").expect("invariant: the wildfire is built in")
     }
 
-    /// The built-in model of a name: `wildfire`, `wildfire-sparse` or `wildfire-latent`
-    /// (`config/models`).
+    /// The built-in model of a name: `wildfire`, `wildfire-sparse`, `wildfire-latent` or
+    /// `wildfire-small` (`config/models`).
     pub fn built_in(name: &str) -> Option<Self> {
         let (_, text) = BUILT_IN.iter().find(|(known, _)| *known == name)?;
         let model = Self::from_toml(text);

@@ -17,12 +17,13 @@ use std::path::Path;
 pub const FIRE_CELLS_PER_STEP: &str = "distinct fire cells found per step";
 
 /// What feeds a policy's plans, and the colour of its bar.
-const FAMILIES: [(&str, Color); 5] = [
+const FAMILIES: [(&str, Color); 6] = [
     ("no belief", Color(0xa3, 0xa3, 0xa3)),
     ("shooting, known model", Color(0x56, 0xb4, 0xe9)),
     ("beam search, known model", Color(0x00, 0x72, 0xb2)),
     ("learned", Color(0x00, 0x9e, 0x73)),
     ("fed with the truth", Color(0xe6, 0x9f, 0x00)),
+    ("added", Color(0xcc, 0x79, 0xa7)),
 ];
 
 /// One step of one world, as a policy saw it.
@@ -104,6 +105,7 @@ fn bar(group: &Group<'_>, reward: Estimate, decimals: usize) -> Bar {
 fn family(group: &Group<'_>) -> usize {
     let policy = group.policy.to_lowercase();
     match group.estimator {
+        _ if group.runs.iter().any(|run| run.is_added) => 5,
         "truth" | "next_truth" => 4,
         "none" => 0,
         "known_model" if policy.contains("beam") => 2,

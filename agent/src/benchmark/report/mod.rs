@@ -3,6 +3,7 @@
 //! Everything here turns finished [`PolicyRun`]s into text or a file; nothing here runs a policy.
 //! Read [`statistics`] first, then [`table`] and [`figures`]. [`training`] turns metrics into curves.
 
+pub mod added;
 pub mod events;
 pub mod figures;
 mod number;

@@ -2,12 +2,12 @@
 
 use crate::file::{Readers, replace_file};
 use anyhow::Result;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
 
 /// One policy on one world: what `emberwatch-agent compare` measured, and a row of its CSV.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PolicyRun {
     /// Name of the policy, such as `beam`.
     pub policy: String,
@@ -26,6 +26,11 @@ pub struct PolicyRun {
     pub mean_plan_millis: f64,
     /// Mean Brier score of the belief, where there is a belief.
     pub brier: Option<f64>,
+    /// Moves of a path.
+    pub moves: usize,
+    /// Whether it comes from a file.
+    #[serde(skip)]
+    pub is_added: bool,
     /// Reward of each step, in order.
     #[serde(skip)]
     pub rewards: Vec<f32>,

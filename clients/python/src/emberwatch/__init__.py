@@ -17,6 +17,7 @@ from emberwatch.env import WildfireEnv
 from emberwatch.errors import EmberwatchError
 from emberwatch.lease import Lease
 from emberwatch.moves_env import WildfireMovesEnv
+from emberwatch.moves_vector_env import WildfireMovesVectorEnv
 from emberwatch.objective_env import WildfireObjectiveEnv
 from emberwatch.observer import Frame, Observer, Outlook, OutlookReader, Truth, TruthReader, observe
 from emberwatch.release import VERSION
@@ -43,6 +44,7 @@ __all__ = [
     "TruthReader",
     "WildfireEnv",
     "WildfireMovesEnv",
+    "WildfireMovesVectorEnv",
     "WildfireObjectiveEnv",
     "WildfireVectorEnv",
     "WorldInfo",
@@ -65,6 +67,7 @@ gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
 gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
     "emberwatch/WildfireMoves-v0",
     entry_point="emberwatch.moves_env:WildfireMovesEnv",
+    vector_entry_point="emberwatch.moves_vector_env:WildfireMovesVectorEnv",
     max_episode_steps=64 * MAX_EPISODE_STEPS,
 )
 gymnasium.register(  # pyright: ignore[reportUnknownMemberType]

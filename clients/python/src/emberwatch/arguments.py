@@ -33,6 +33,23 @@ def as_choice(action: object, n_choices: int) -> int:
     )
 
 
+def as_choices(actions: object, n_worlds: int, n_choices: int) -> NDArray[np.uint8]:
+    """Checks actions, one integer below `n_choices` for each world, and makes them bytes."""
+    try:
+        given = np.asarray(actions)
+    except (ValueError, OverflowError) as error:
+        raise InvalidArgumentError(f"action: expected an array, got {error}") from None
+    if given.shape != (n_worlds,) or given.dtype.kind not in "iu":
+        got = f"{given.dtype} {given.shape}"
+        raise InvalidArgumentError(f"action: expected integers of shape ({n_worlds},), got {got}")
+    if (given < 0).any() or (given >= n_choices).any():
+        wrong = int(np.argmax((given < 0) | (given >= n_choices)))
+        raise InvalidArgumentError(
+            f"action: expected 0 to {n_choices - 1}, got {given[wrong]} for world {wrong}"
+        )
+    return given.astype(np.uint8)
+
+
 def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]:
     """Checks paths, `(n_worlds, T)` or for one world `(T,)`, and makes them bytes."""
     try:

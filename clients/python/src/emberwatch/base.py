@@ -22,6 +22,9 @@ NOTHING_TO_DRAW: Final = (
 #: Fields of a result that become `info`: not the seed, which gives the hidden states away.
 REPORTED: Final = ("step", "n_target_cells", "n_visited", "n_hits")
 
+#: What moves in an environment of one world.
+ONE_WORLD: Final = np.ones(1, np.bool_)
+
 
 class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
     """One world of a private or a running server."""

@@ -10,6 +10,8 @@ Beliefs have shape (S, H, W): one probability per state and cell, a distribution
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,28 +51,7 @@ class Filter:
             raise InvalidArgumentError(
                 f"frame: expected {expected}, got {frame.shape} and {frame.dtype}"
             )
-        values = frame.ravel()
-        cells = np.flatnonzero(values != UNOBSERVED)
-        observed = values[cells]
-        n_observations = self._likelihood.shape[1]
-        if (observed >= n_observations).any():
-            index = int(cells[np.argmax(observed >= n_observations)])
-            expected = f"a value below {n_observations}, or {UNOBSERVED}"
-            raise InvalidArgumentError(
-                f"frame: cell {self._cell(index)}: expected {expected}, got {values[index]}"
-            )
-        belief = self._belief.reshape(len(self._belief), -1)
-        prior = belief[:, cells]
-        joint = prior * self._likelihood[:, observed]
-        evidence = joint.sum(axis=0)
-        if not evidence.all():
-            first = int(np.argmin(evidence))
-            raise EmberwatchError(
-                f"frame: cell {self._cell(int(cells[first]))}: expected an observation that the "
-                f"belief {prior[:, first].tolist()} allows, got {observed[first]}",
-                "impossible_frame",
-            )
-        belief[:, cells] = joint / evidence
+        _correct(self._belief, self._likelihood, frame)
 
     def predict(self) -> None:
         """The predictor of the next step, ``u_{k+1} = Phi(p_k)`` (eq. 6)."""
@@ -80,8 +61,72 @@ class Filter:
         """Shannon entropy of each cell in nats (eq. 14), shape (H, W), 0 to log S."""
         return entropy(self._belief)
 
-    def _cell(self, index: int) -> tuple[int, int]:
-        return divmod(index, self._belief.shape[2])
+
+class Filters:
+    """The filters of many worlds, stepped together. Beliefs have shape (S, n_worlds, H, W)."""
+
+    def __init__(self, model: Model, prior: NDArray[np.floating], n_worlds: int) -> None:
+        """`prior`, shape (S, H, W), is that of each world."""
+        self._prior = _distribution(prior, n_states=model.n_states)[:, np.newaxis]
+        _, _, height, width = self._prior.shape
+        self._transition = Transition(model, height=height, width=width, n_worlds=n_worlds)
+        self._likelihood = np.ascontiguousarray(model.observation_matrix)
+        #: The posterior ``p_k`` given the last frames.
+        self.posterior = np.repeat(self._prior, n_worlds, axis=1)
+        #: The predictor ``u_{k+1}`` of what the next paths will meet.
+        self.predictor = self.posterior
+
+    def reset(self, indices: Sequence[int], frames: NDArray[np.uint8]) -> None:
+        """Begins with the prior in some worlds, and corrects it; `frames` are those of all."""
+        chosen = list(indices)
+        belief = np.repeat(self._prior, len(chosen), axis=1)
+        _correct(belief, self._likelihood, frames[chosen])
+        self.posterior[:, chosen] = belief
+        self.predictor = self._transition.apply(self.posterior)
+
+    def update(self, frames: NDArray[np.uint8], moved: NDArray[np.bool_]) -> None:
+        """One step of the worlds `moved`; `frames`, `(n_worlds, H, W)`, are those of all."""
+        if moved.all():
+            belief = self.predictor
+            _correct(belief, self._likelihood, frames)
+            self.posterior = belief
+        else:
+            belief = np.ascontiguousarray(self.predictor[:, moved])
+            _correct(belief, self._likelihood, frames[moved])
+            self.posterior[:, moved] = belief
+        self.predictor = self._transition.apply(self.posterior)
+
+
+def _correct(
+    belief: NDArray[np.float64], likelihood: NDArray[np.float64], frames: NDArray[np.uint8]
+) -> None:
+    """Bayes' rule (eq. 5) in place; `belief` is contiguous, of shape (S, *frames.shape)."""
+    values = frames.ravel()
+    cells = np.flatnonzero(values != UNOBSERVED)
+    observed = values[cells]
+    n_observations = likelihood.shape[1]
+
+    def cell(index: np.intp) -> tuple[int, int]:
+        return divmod(int(cells[index]) % (frames.shape[-2] * frames.shape[-1]), frames.shape[-1])
+
+    if (observed >= n_observations).any():
+        first = np.argmax(observed >= n_observations)
+        expected = f"a value below {n_observations}, or {UNOBSERVED}"
+        raise InvalidArgumentError(
+            f"frame: cell {cell(first)}: expected {expected}, got {observed[first]}"
+        )
+    flat = belief.reshape(len(belief), -1)
+    prior = flat[:, cells]
+    joint = prior * likelihood[:, observed]
+    evidence = joint.sum(axis=0)
+    if not evidence.all():
+        first = np.argmin(evidence)
+        raise EmberwatchError(
+            f"frame: cell {cell(first)}: expected an observation that the belief "
+            f"{prior[:, first].tolist()} allows, got {observed[first]}",
+            "impossible_frame",
+        )
+    flat[:, cells] = joint / evidence
 
 
 class Transition:
@@ -91,46 +136,55 @@ class Transition:
     (A, C) the centre of the kernel and ``x`` zero outside the grid (eq. 2), then divided by its sum
     over ``m`` (eq. 3).
 
-    It keeps work space: share none between threads. The belief lies in rows with a margin of
+    It keeps work space: share none between threads. The beliefs lie in rows with a margin of
     zeros, end to end, so that a neighbour is a shifted slice. Taps with the same
     weights are added up before they are multiplied, and those without weight are left out.
     """
 
-    def __init__(self, model: Model, *, height: int, width: int) -> None:
+    def __init__(
+        self, model: Model, *, height: int, width: int, n_worlds: int | None = None
+    ) -> None:
+        """Beliefs have shape (S, H, W), or with `n_worlds` (S, n_worlds, H, W)."""
         n_states, _, kernel_height, kernel_width = model.kernel.shape
-        self._shape = (n_states, height, width)
+        worlds = () if n_worlds is None else (n_worlds,)
+        self._shape = (n_states, *worlds, height, width)
         self._stride = width + kernel_width - 1
-        self._length = (height - 1) * self._stride + width
+        # Of all worlds, one above the other, with the margins between them.
+        self._rows = (n_worlds or 1, height + kernel_height - 1)
+        n_rows = self._rows[0] * self._rows[1]
+        self._length = (n_rows - kernel_height) * self._stride + width
         # A common factor, which eq. 3 cancels.
         largest = max(model.kernel.max(), model.bias.max()) or 1.0
         self._groups = [_grouped_taps(w / largest) for w in model.kernel.swapaxes(0, 1)]
         self._bias = (model.bias / largest)[:, None]
         top, left = kernel_height // 2, kernel_width // 2
-        self._planes = np.zeros((n_states, height + kernel_height - 1, self._stride))
-        self._inside = self._planes[:, top : top + height, left : left + width]
+        self._planes = np.zeros((n_states, *self._rows, self._stride))
+        self._inside = self._planes[:, :, top : top + height, left : left + width]
         self._sums = np.empty((max(len(taps) for _, taps in self._groups), self._length))
 
     def apply(self, belief: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``Phi(belief)``, a new array; both of shape (S, H, W), each cell's sum is one."""
+        """``Phi(belief)``, a new array of the same shape; each cell's sum is one."""
         if belief.shape != self._shape:
             raise InvalidArgumentError(f"belief: expected shape {self._shape}, got {belief.shape}")
-        n_states, height, width = self._shape
-        self._inside[:] = belief
-        out = np.empty((n_states, height * self._stride))
+        n_states, *_, height, width = self._shape
+        self._inside[:] = belief.reshape(self._inside.shape)
+        n_rows = self._rows[0] * self._rows[1]
+        out = np.empty((n_states, n_rows * self._stride))
         weights = out[:, : self._length]
         weights[:] = self._bias
         for plane, (columns, groups) in zip(self._planes, self._groups, strict=True):
             for total, group in zip(self._sums, groups, strict=False):
                 self._add_up(plane.ravel(), group, total)
             weights += columns @ self._sums[: len(groups)]
-        on_grid = out.reshape(n_states, height, self._stride)[:, :, :width]
+        on_grid = out.reshape(n_states, *self._rows, self._stride)[:, :, :height, :width]
         totals = on_grid.sum(axis=0)
         if not totals.all():
-            row, col = (int(at) for at in np.argwhere(totals == 0.0)[0])
+            _, row, col = (int(at) for at in np.argwhere(totals == 0.0)[0])
             raise InvalidArgumentError(
                 f"model: transition weights of cell ({row}, {col}): expected a positive sum"
             )
-        return np.divide(on_grid, totals, out=np.empty(self._shape))
+        beliefs = np.divide(on_grid, totals, out=np.empty(on_grid.shape))
+        return beliefs.reshape(self._shape)
 
     def _add_up(
         self, plane: NDArray[np.float64], taps: list[tuple[int, int]], total: NDArray[np.float64]

@@ -9,8 +9,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from emberwatch.arguments import as_moves
-from emberwatch.base import WorldEnv
-from emberwatch.observations import Observations, Parts
+from emberwatch.base import ONE_WORLD, WorldEnv
+from emberwatch.observations import Observations, Parts, of_world
 from emberwatch.settings import Settings, WorldArguments
 from emberwatch.view import fly
 from emberwatch.wire import StepAnswer, StepResult
@@ -44,8 +44,14 @@ class WildfireEnv(WorldEnv):
     | part | space | meaning |
     |---|---|---|
     | `frame` | `Box(0, 255, (H, W, 1), uint8)` | what was observed; 255 where nothing was |
+    | `image` | `Box(0, 255, (H, W, O + 1), uint8)` | 255 in the channel of what was observed |
     | `robot` | `MultiDiscrete([H, W])` | the robot's row and column |
     | `age` | `Box(0, 255, (H, W, 1), uint8)` | steps since it was seen; 255: never, or as many |
+    | `belief` | `Box(0, 255, (H, W, S), uint8)` | 255 times each state's probability |
+
+    The last channel of `image` stands for nothing observed. `belief` is about what the next path
+    will meet, by the known model's Bayes filter (paper equations 5 and 6) given all frames so far;
+    it begins as `wrappers.BeliefObservation` does.
 
     ## Rewards
 
@@ -79,8 +85,9 @@ class WildfireEnv(WorldEnv):
     * `instance`: attach to this running server; None: a private one.
     * `world`: which of its worlds (0).
     * `takeover`: take the world from its holder (False).
-    * `model`: `"wildfire"` (the default), `"wildfire-sparse"`, `"wildfire-latent"` or the path of
-      a model file; `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `start`
+    * `model`: `"wildfire"` (the default), `"wildfire-sparse"`, `"wildfire-latent"`,
+      `"wildfire-small"` (for learning on 12 x 12 to 32 x 32 cells) or the path of a model file;
+      `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `start`
       (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the private server. With `instance`
       they may be left out, or must agree.
     * `truth`: reveal the hidden states in `info` and pictures (False).
@@ -113,7 +120,7 @@ class WildfireEnv(WorldEnv):
     ) -> tuple[Any, dict[str, Any]]:
         """Begins an episode; see the class, *Starting State*."""
         self._answer = answer = self._begin(seed, options)
-        self._observations.reset([0], answer.frames)
+        self._observations.reset(ONE_WORLD, answer.frames)
         return self._seen(answer, answer.result())
 
     def step(
@@ -130,7 +137,7 @@ class WildfireEnv(WorldEnv):
         moves = as_moves(action, 1, self._spec.n_moves)
         before, answer = self._answer, self._session.step(moves)
         self._answer = answer
-        self._observations.update(answer)
+        self._observations.update(ONE_WORLD, answer.frames)
         result = answer.result()
         if self.render_mode is not None and before is not None:
             start = before.result()
@@ -140,13 +147,14 @@ class WildfireEnv(WorldEnv):
 
     def _seen(self, answer: StepAnswer, result: StepResult) -> tuple[Any, dict[str, Any]]:
         info = self._describe(answer, result)
-        frame = answer.frames[0]
+        frames = answer.frames
         if self.render_mode is not None:
             # The learner may write to its frame: pictures come from another.
-            frame = frame.copy()
+            frames = frames.copy()
         if self.render_mode == "human":
             self._draw()
-        return self._observations.one(frame, result.row, result.col), info
+        robots = np.array([(result.row, result.col)], np.int64)
+        return of_world(self._observations.all(frames, robots), 0), info
 
     def _draw(self) -> Any:
         if self._answer is None:

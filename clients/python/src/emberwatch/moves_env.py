@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Literal, TypeAlias, Unpack
+from typing import Any, Final, Literal, Unpack
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from emberwatch import wire
 from emberwatch.arguments import as_choice
-from emberwatch.base import WorldEnv
+from emberwatch.base import ONE_WORLD, WorldEnv
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.observations import Observations, image_space
+from emberwatch.flights import Flights
+from emberwatch.observations import WINDOW, MovesParts, Observations, of_world
 from emberwatch.session import not_reset
-from emberwatch.settings import Settings, WorldArguments
+from emberwatch.settings import Settings, WorldArguments, WorldSpec
 from emberwatch.view import fly
 from emberwatch.wire import StepAnswer
 
-MovesPart: TypeAlias = Literal["frame", "robot", "age", "visited", "move"]
+_FIRST: Final = np.zeros(1, np.intp)
 
 
 class WildfireMovesEnv(WorldEnv):
@@ -36,13 +35,18 @@ class WildfireMovesEnv(WorldEnv):
 
     ## Observation Space
 
-    `observation` names the parts, as in `WildfireEnv`: `frame` (of the last complete path),
-    `robot`, `age`, and
+    `observation` names the parts, as in `WildfireEnv`: `frame` and `image` (of the last complete
+    path), `robot`, `age`, `belief`, and
 
     | part | space | meaning |
     |---|---|---|
     | `visited` | `Box(0, 255, (H, W, 1), uint8)` | 255 in the cells that this path has visited |
     | `move` | `Discrete(T)` | moves made of this path |
+    | `local` | `Box(0, 255, (L, L, 5), uint8)` | the belief around the robot, L = `window` |
+
+    The channels of `local`, times 255: the probability of the state that pays most, and the
+    entropy of the belief divided by log S, both 0 where this path has been; 1 where it has been;
+    1 off the grid; and the share of the path's moves that are left, everywhere alike.
 
     ## Rewards
 
@@ -68,8 +72,12 @@ class WildfireMovesEnv(WorldEnv):
 
     ## Arguments
 
-    As `WildfireEnv`; `observation` is `("frame", "visited", "robot", "move")` by default, and
-    `reward` is `"path"` or `"move"`.
+    As `WildfireEnv`; `observation` is `("frame", "visited", "robot", "move")` by default, `reward`
+    is `"path"` or `"move"`, and `window` an odd number of cells (15).
+
+    ## Vectorized environment
+
+    `gymnasium.make_vec("emberwatch/WildfireMoves-v0", num_envs=64)` is `WildfireMovesVectorEnv`.
 
     ## Version History
 
@@ -79,37 +87,26 @@ class WildfireMovesEnv(WorldEnv):
     def __init__(
         self,
         *,
-        observation: MovesPart | Sequence[MovesPart] = ("frame", "visited", "robot", "move"),
+        observation: MovesParts = ("frame", "visited", "robot", "move"),
         reward: Literal["path", "move"] = "path",
+        window: int = WINDOW,
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class. No server of its own runs before the first reset."""
-        if reward not in ("path", "move"):
-            raise InvalidArgumentError(f"reward: expected 'path' or 'move', got {reward!r}")
         reveals = world.get("truth", False)
-        self._pays_moves = reward == "move"
-        world["truth"] = reveals or self._pays_moves
-        super().__init__(Settings.of(WildfireMovesEnv, world), reveals=reveals)
-        if self._pays_moves and self.model is None:
-            raise InvalidArgumentError("reward='move': expected a server that reveals its model")
-        spec = self._spec
-        extra = {"visited": image_space(spec), "move": spaces.Discrete(spec.n_moves)}
-        self._observations = Observations(observation, spec, extra=extra)
+        super().__init__(moves_settings(WildfireMovesEnv, reward, world), reveals=reveals)
+        self._flights = flights = moves_flights(self._spec, 1, reward)
+        self._observations = Observations(observation, self._spec, 1, flights, window)
         self.observation_space = self._observations.space
         self.action_space = spaces.Discrete(wire.N_MOVES)
         self._answer: StepAnswer | None = None
-        self._states: NDArray[np.uint8] | None = None
-        self._start = self._robot = (0, 0)
-        self._moves: list[int] = []
-        self._visited = np.zeros((spec.height, spec.width), np.uint8)
-        self._paid = 0.0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begins an episode; see `WildfireEnv`."""
         answer = self._begin(seed, options)
-        self._observations.reset([0], answer.frames)
+        self._observations.reset(ONE_WORLD, answer.frames)
         self._begin_path(answer)
         return self._seen(answer)
 
@@ -119,20 +116,21 @@ class WildfireMovesEnv(WorldEnv):
         Raises:
             EmberwatchError: As `WildfireEnv.step`.
         """
-        moves = [*self._moves, as_choice(action, wire.N_MOVES)]
+        move = np.array([as_choice(action, wire.N_MOVES)], np.uint8)
         if self._answer is None or not self._is_open():
             raise not_reset()
-        if len(moves) < self._spec.n_moves:
-            reward = self._visit(moves[-1])
-            self._paid += reward
-            self._moves = moves
+        flights = self._flights
+        if not flights.completes()[0]:
+            reward = float(flights.move(_FIRST, move)[0])
+            self._observations.visit(_FIRST)
             observation, info = self._seen(self._answer)
             return observation, reward, False, False, info
-        answer = self._session.step(np.array(moves, np.uint8))
+        path = flights.paths(move)
+        answer = self._session.step(path)
         result = answer.result()
-        reward = result.reward - self._paid
-        self._path = fly(self._start, moves, self._spec)
-        self._observations.update(answer)
+        reward = result.reward - float(flights.paid[0])
+        self._path = fly(self._start, path[0], self._spec)
+        self._observations.update(ONE_WORLD, answer.frames)
         self._begin_path(answer)
         observation, info = self._seen(answer)
         return observation, reward, bool(result.terminated), bool(result.truncated), info
@@ -140,40 +138,37 @@ class WildfireMovesEnv(WorldEnv):
     def _begin_path(self, answer: StepAnswer) -> None:
         result = answer.result()
         self._answer = answer
-        self._start = self._robot = (result.row, result.col)
-        self._moves = []
-        self._visited = np.zeros_like(self._visited)
-        self._paid = 0.0
-        if self._pays_moves:
-            self._states = self._session.truth(answer)[0]
-
-    def _visit(self, move: int) -> float:
-        """Moves the robot; returns what its cell pays at once."""
-        row, col = fly(self._robot, (move,), self._spec)[0].tolist()
-        self._robot = (row, col)
-        is_new = not self._visited[row, col]
-        self._visited[row, col] = 255
-        if self._states is None or self.model is None or not is_new:
-            return 0.0
-        return float(self.model.reward[self._states[row, col]])
+        self._start = (result.row, result.col)
+        states = self._session.truth(answer) if self._session.settings.truth else None
+        self._flights.begin(ONE_WORLD, np.array([self._start], np.int64), states)
 
     def _seen(self, answer: StepAnswer) -> tuple[Any, dict[str, Any]]:
         info = self._describe(answer, answer.result())
-        row, col = self._robot
         if self.render_mode == "human":
             self._draw()
         # Copies: each move of a path returns the frame again.
-        observation = self._observations.one(
-            answer.frames[0].copy(),
-            row,
-            col,
-            visited=self._visited[:, :, np.newaxis].copy(),
-            move=np.int64(len(self._moves)),
-        )
-        return observation, info
+        seen = self._observations.all(answer.frames.copy(), self._flights.robots.copy())
+        return of_world(seen, 0), info
 
     def _draw(self) -> Any:
         if self._answer is None:
             return None
-        flown = fly(self._start, self._moves, self._spec) if self._moves else self._path
-        return self._view.draw(self._answer.frames[0], self._robot, flown, self._truth)
+        made = self._flights.made(0)
+        flown = fly(self._start, made, self._spec) if len(made) else self._path
+        row, col = self._flights.robots[0].tolist()
+        return self._view.draw(self._answer.frames[0], (row, col), flown, self._truth)
+
+
+def moves_settings(environment: type, reward: str, world: WorldArguments) -> Settings:
+    """The settings of an environment, which a reward for each move adds the truth to."""
+    if reward not in ("path", "move"):
+        raise InvalidArgumentError(f"reward: expected 'path' or 'move', got {reward!r}")
+    reveals = world.get("truth", False)
+    return Settings.of(environment, {**world, "truth": reveals or reward == "move"})
+
+
+def moves_flights(spec: WorldSpec, n_worlds: int, reward: str) -> Flights:
+    """The flights of worlds that reward each move, or the path."""
+    if reward == "move" and spec.model is None:
+        raise InvalidArgumentError("reward='move': expected a server that reveals its model")
+    return Flights(spec, n_worlds, pays=reward == "move")

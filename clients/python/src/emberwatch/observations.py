@@ -2,50 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Final, Literal, TypeAlias
+from collections.abc import Sequence
+from typing import Any, Final, Literal, TypeAlias, cast
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from emberwatch import wire
+from emberwatch.belief import Filters
 from emberwatch.errors import InvalidArgumentError
+from emberwatch.flights import Flights
+from emberwatch.prior import prior_of
 from emberwatch.settings import WorldSpec
-from emberwatch.wire import StepAnswer
+from emberwatch.window import CHANNELS, Windows
 
-Part: TypeAlias = Literal["frame", "robot", "age"]
+Part: TypeAlias = Literal["frame", "image", "robot", "age", "belief"]
+MovesPart: TypeAlias = Literal[Part, "local", "visited", "move"]
 
 #: One part makes a plain observation, several make a flat dictionary.
 Parts: TypeAlias = Part | Sequence[Part]
+MovesParts: TypeAlias = MovesPart | Sequence[MovesPart]
 
 #: Age of a cell that was not seen for this many steps or more.
 MAX_AGE: Final = 255
 
+#: Cells along a side of the part `local`, unless told otherwise.
+WINDOW: Final = 15
+
+#: Parts that a filter is needed for.
+_OF_BELIEF: Final = frozenset(("belief", "local"))
+
 
 class Observations:
-    """Turns answers into observations of some worlds, counted from 0."""
+    """Observations of some worlds, counted from 0."""
 
     def __init__(
         self,
         parts: str | Sequence[str],
         spec: WorldSpec,
         n_worlds: int = 1,
-        extra: Mapping[str, spaces.Space[Any]] | None = None,
+        flights: Flights | None = None,
+        window: int = WINDOW,
     ) -> None:
-        """`extra` has the spaces of parts that `one` is given."""
-        known: dict[str, spaces.Space[Any]] = {
-            "frame": image_space(spec),
-            "robot": spaces.MultiDiscrete([spec.height, spec.width]),
-            "age": image_space(spec),
-            **(extra or {}),
-        }
+        """With `flights`, there are the parts of a path that is not complete."""
+        known = _spaces(spec, None if flights is None else window)
         names = (parts,) if isinstance(parts, str) else tuple(parts)
         if not names or len(set(names)) < len(names) or not known.keys() >= set(names):
             raise InvalidArgumentError(
                 f"observation: expected one or several of {', '.join(known)}, got {parts!r}"
             )
         self._names, self._is_plain = names, isinstance(parts, str)
+        self._spec, self._n_worlds, self._flights = spec, n_worlds, flights
+        self._side = window
+        if _OF_BELIEF & set(names) and spec.model is None:
+            raise InvalidArgumentError(
+                "observation: expected a server that reveals its model, for the belief"
+            )
         #: The space of one world's observation.
         self.space = (
             known[names[0]]
@@ -55,50 +68,111 @@ class Observations:
         self._ages: NDArray[np.uint8] | None = None
         if "age" in names:
             self._ages = np.full((n_worlds, spec.height, spec.width), MAX_AGE, np.uint8)
+        self._filters: Filters | None = None
+        self._windows: Windows | None = None
+        self._beliefs = np.empty(0, np.uint8)
+        # By observed value, the last for none.
+        self._one_hot = 255 * np.eye(spec.n_observations + 1, dtype=np.uint8)
 
-    def reset(self, indices: Sequence[int], frames: NDArray[np.uint8]) -> None:
-        """Forgets the ages of worlds whose episode has begun, or been resumed with a frame.
+    def reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
+        """Forgets all about worlds whose episode has begun, or been resumed with a frame.
 
         `frames` are those of all worlds, `(n_worlds, H, W)`.
         """
         if self._ages is not None:
-            chosen = list(indices)
-            is_seen = frames[chosen] != wire.UNOBSERVED
-            self._ages[chosen] = np.where(is_seen, np.uint8(0), np.uint8(MAX_AGE))
+            is_seen = frames[begun] != wire.UNOBSERVED
+            self._ages[begun] = np.where(is_seen, np.uint8(0), np.uint8(MAX_AGE))
+        if _OF_BELIEF & set(self._names):
+            filters = self._filters = self._filters or self._first_beliefs()
+            filters.reset(np.flatnonzero(begun).tolist(), frames)
+            self._show(filters, begun)
 
-    def update(self, answer: StepAnswer, first: int = 0) -> None:
-        """Adds one step to the ages of the worlds of an answer."""
+    def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
+        """One step of the worlds `moved`; `frames` are those of all."""
         if self._ages is not None:
-            ages = self._ages[first : first + len(answer.frames)]
-            ages += ages < MAX_AGE
-            ages[answer.frames != wire.UNOBSERVED] = 0
+            ages = self._ages
+            ages[moved] += ages[moved] < MAX_AGE
+            ages[moved[:, np.newaxis, np.newaxis] & (frames != wire.UNOBSERVED)] = 0
+        if self._filters is not None:
+            self._filters.update(frames, moved)
+            self._show(self._filters, moved)
 
-    def one(
-        self, frame: NDArray[np.uint8], row: int, col: int, index: int = 0, **extra: Any
-    ) -> Any:
-        """The observation of one world; `frame`, `(H, W)`, is taken as it is."""
-        ages = None if self._ages is None else self._ages[index]
-        return self._chosen(frame, np.array((row, col), np.int64), ages, extra)
+    def visit(self, indices: NDArray[np.intp]) -> None:
+        """The robots of some worlds have made a move."""
+        if self._windows is not None and self._flights is not None:
+            rows, cols = self._flights.robots[indices].T
+            self._windows.visit(indices, rows, cols)
 
     def all(self, frames: NDArray[np.uint8], robots: NDArray[np.int64]) -> Any:
         """The observations of all worlds, stacked; `frames` and `robots` are taken as they are."""
-        return self._chosen(frames, robots, self._ages, {})
+        parts = {name: self._part(name, frames, robots) for name in self._names}
+        return parts[self._names[0]] if self._is_plain else parts
 
-    def _chosen(
-        self,
-        frame: NDArray[np.uint8],
-        robot: NDArray[np.int64],
-        age: NDArray[np.uint8] | None,
-        parts: dict[str, Any],
-    ) -> Any:
-        parts["frame"], parts["robot"] = frame[..., np.newaxis], robot
-        if age is not None:
-            parts["age"] = age[..., np.newaxis].copy()
-        if self._is_plain:
-            return parts[self._names[0]]
-        return {name: parts[name] for name in self._names}
+    def _part(
+        self, name: str, frames: NDArray[np.uint8], robots: NDArray[np.int64]
+    ) -> NDArray[Any]:
+        if name == "frame":
+            return frames[..., np.newaxis]
+        if name == "image":
+            unseen = np.uint8(self._spec.n_observations)
+            return self._one_hot[np.where(frames == wire.UNOBSERVED, unseen, frames)]
+        if name == "robot":
+            return robots
+        if self._ages is not None and name == "age":
+            return self._ages[..., np.newaxis].copy()
+        if self._filters is not None and name == "belief":
+            return self._beliefs.copy()
+        assert self._flights is not None
+        if self._windows is not None and name == "local":
+            return self._windows.around(self._flights)
+        if name == "visited":
+            return self._flights.visited[..., np.newaxis].copy()
+        return self._flights.n_made.copy()
+
+    def _first_beliefs(self) -> Filters:
+        spec = self._spec
+        assert spec.model is not None
+        grid = {"height": spec.height, "width": spec.width, "burn_in": spec.burn_in}
+        filters = Filters(spec.model, prior_of(None, spec.model, **grid), self._n_worlds)
+        if "local" in self._names:
+            self._windows = Windows(spec.model, spec, self._n_worlds, self._side)
+        return filters
+
+    def _show(self, filters: Filters, worlds: NDArray[np.bool_]) -> None:
+        if "belief" in self._names:
+            beliefs = np.rint(255.0 * filters.predictor.transpose(1, 2, 3, 0))
+            self._beliefs = beliefs.astype(np.uint8)
+        if self._windows is not None:
+            self._windows.begin(filters, worlds)
 
 
-def image_space(spec: WorldSpec) -> spaces.Box:
-    """One byte a cell."""
-    return spaces.Box(0, 255, (spec.height, spec.width, 1), np.uint8)
+def of_world(observations: Any, index: int) -> Any:
+    """The observation of one world among stacked ones."""
+    if isinstance(observations, dict):
+        parts = cast("dict[str, NDArray[Any]]", observations)
+        return {name: part[index] for name, part in parts.items()}
+    return observations[index]
+
+
+def _spaces(spec: WorldSpec, window: int | None) -> dict[str, spaces.Space[Any]]:
+    def image(n_channels: int) -> spaces.Box:
+        return spaces.Box(0, 255, (spec.height, spec.width, n_channels), np.uint8)
+
+    n_states = 1 if spec.model is None else spec.model.n_states
+    known: dict[str, spaces.Space[Any]] = {
+        "frame": image(1),
+        "image": image(spec.n_observations + 1),
+        "robot": spaces.MultiDiscrete([spec.height, spec.width]),
+        "age": image(1),
+        "belief": image(n_states),
+    }
+    if window is None:
+        return known
+    if not isinstance(window, int | np.integer) or window < 3 or window % 2 == 0:  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise InvalidArgumentError(f"window: expected an odd number from 3 on, got {window!r}")
+    return {
+        **known,
+        "local": spaces.Box(0, 255, (window, window, len(CHANNELS)), np.uint8),
+        "visited": image(1),
+        "move": spaces.Discrete(spec.n_moves),
+    }

@@ -55,6 +55,7 @@ class Session:
         self._lease: Lease | None = None
         self._program: Program | None = None
         self._truth: HiddenStates | None = None
+        self._has_warned = False
         #: Whether a step has timed out, so that the worlds may stand elsewhere than expected.
         self._is_lost = False
         if settings.truth and n_worlds > wire.TRUTH_BUFFER:
@@ -196,10 +197,26 @@ class Session:
         lease = self._opened()
         try:
             lease.reset(seeds, worlds=[lease.worlds[index] for index in indices])
-            return self._observe()
+            answer = self._observe()
+            self._warn_of_barren(answer)
+            return answer
         except _LOST as error:
             self._lose(error)
             raise
+
+    def _warn_of_barren(self, answer: StepAnswer) -> None:
+        """Warns once of worlds in which there is nothing to find."""
+        results = answer.results
+        barren = np.flatnonzero((results["n_target_cells"] == 0) & (results["step"] == 0))
+        if self._has_warned or not len(barren):
+            return
+        self._has_warned = True
+        warnings.warn(
+            f"no cell of world {barren[0]} (of {len(barren)} of {len(results)} worlds) is in the "
+            "state that pays most: give it a burn_in, a larger grid, or a model for small ones, "
+            "model='wildfire-small'",
+            stacklevel=2,
+        )
 
     def _lose(self, error: EmberwatchError) -> None:
         if isinstance(error, RequestTimeoutError):
@@ -237,6 +254,11 @@ class SessionOwner:
     def model(self) -> Model | None:
         """The model behind the worlds; None if a running server hides it."""
         return self._session.spec.model
+
+    @property
+    def n_moves(self) -> int:
+        """Moves of a path, T."""
+        return self._session.spec.n_moves
 
     @property
     def burn_in(self) -> int:

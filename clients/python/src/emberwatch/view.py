@@ -19,7 +19,7 @@ RENDER_MODES: Final = ("human", "rgb_array", "ansi")
 RENDER_FPS: Final = 10
 
 #: Row and column that each move adds.
-_DIRECTIONS: Final[tuple[tuple[int, int], ...]] = ((-1, 0), (1, 0), (0, -1), (0, 1))
+DIRECTIONS: Final[tuple[tuple[int, int], ...]] = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 
 class View:
@@ -64,7 +64,7 @@ def fly(start: tuple[int, int], moves: ArrayLike, grid: WorldSpec | ServerInfo) 
     row, col = start
     cells: list[tuple[int, int]] = []
     for move in np.asarray(moves).tolist():
-        down, right = _DIRECTIONS[int(move)]
+        down, right = DIRECTIONS[int(move)]
         row = min(max(row + down, 0), grid.height - 1)
         col = min(max(col + right, 0), grid.width - 1)
         cells.append((row, col))

@@ -1,16 +1,13 @@
 """`BeliefObservation`: what the known-model filter makes of the frames, as the observation.
 
 A frame shows a path; the belief is what all frames so far say about every cell. For learning
-without memory, the belief is the better observation. Also `simulated_prior`, what can be known
-about a world before its first frame.
+without memory, the belief is the better observation.
 """
 
 from __future__ import annotations
 
-import functools
-import tempfile
 from pathlib import Path
-from typing import Any, Final, Literal, SupportsFloat
+from typing import Any, Literal, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -19,16 +16,10 @@ from gymnasium.core import ActType
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from emberwatch import programs
-from emberwatch.belief import Filter, initial_prior, uniform_prior
-from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.belief import Filter
+from emberwatch.errors import InvalidArgumentError
 from emberwatch.model import Model
-
-PriorKind = Literal["simulated", "initial", "uniform"]
-"""A prior by name, see `BeliefObservation`."""
-
-#: 64 worlds of 512 x 512 cells take minutes.
-_SIMULATION_TIMEOUT: Final = 1800.0
+from emberwatch.prior import PriorKind, prior_of
 
 
 class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordConstructorArgs):
@@ -84,7 +75,9 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
         self._model = _model_of(env, model)
         original = _parts_of(env.observation_space, spaces.Dict)
         height, width = _grid_of(original)
-        self._prior = _prior_of(env, prior, self._model, height=height, width=width)
+        burn_in = int(getattr(env.unwrapped, "burn_in", 0))
+        grid = {"height": height, "width": width, "burn_in": burn_in}
+        self._prior = prior_of(prior, self._model, **grid)
         Filter(self._model, prior=self._prior)  # refuses what does not fit, now
         self._filter: Filter | None = None
         self._step = 0
@@ -136,34 +129,6 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
         return spaces.Dict({**original, "belief": belief}) if self._keep else belief
 
 
-@functools.lru_cache(maxsize=8)
-def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> NDArray[np.floating]:
-    """How often each cell of 64 simulated worlds is in each state after the burn-in.
-
-    Runs ``emberwatch-agent prior``, whose worlds do not depend on any environment's seed. Shape
-    (S, H, W); the same array again for the same arguments, so it cannot be written to.
-    """
-    name = "emberwatch-agent"
-    with tempfile.TemporaryDirectory(prefix="emberwatch-prior-") as directory:
-        file, out = Path(directory, "model.toml"), Path(directory, "prior.npy")
-        file.write_text(model.toml, "utf-8")
-        flags = {"model": file, "height": height, "width": width, "burn-in": burn_in, "out": out}
-        arguments = ["prior", *(f"--{flag}={value}" for flag, value in flags.items())]
-        programs.run(name, arguments, _SIMULATION_TIMEOUT)
-        try:
-            with out.open("rb") as stream:
-                prior: NDArray[np.floating] = np.lib.format.read_array(stream)
-        except (OSError, ValueError) as error:
-            problem = f"{name} prior: expected an .npy file: {error}"
-            raise EmberwatchError(problem, "program") from error
-    expected = (model.n_states, height, width)
-    if prior.shape != expected:
-        problem = f"{name} prior: expected shape {expected}, got {prior.shape}"
-        raise EmberwatchError(problem, "program")
-    prior.flags.writeable = False
-    return prior
-
-
 def _model_of(env: gymnasium.Env[Any, Any], model: Model | str | Path | None) -> Model:
     if isinstance(model, Model):
         return model
@@ -193,31 +158,6 @@ def _grid_of(parts: dict[str, spaces.Space[Any]]) -> tuple[int, int]:
             raise InvalidArgumentError(
                 f"BeliefObservation: expected observations of {expected}, got {parts}"
             )
-
-
-def _prior_of(
-    env: gymnasium.Env[Any, Any],
-    prior: PriorKind | NDArray[np.floating] | None,
-    model: Model,
-    *,
-    height: int,
-    width: int,
-) -> NDArray[np.floating]:
-    burn_in = int(getattr(env.unwrapped, "burn_in", 0))
-    if prior is None:
-        prior = "simulated" if burn_in > 0 else "initial"
-    if not isinstance(prior, str):
-        expected = (model.n_states, height, width)
-        if prior.shape != expected:
-            raise InvalidArgumentError(f"prior: expected shape {expected}, got {prior.shape}")
-        return prior
-    if prior == "simulated":
-        return simulated_prior(model, height=height, width=width, burn_in=burn_in)
-    simple = {"initial": initial_prior, "uniform": uniform_prior}
-    if prior not in simple:
-        expected = "'simulated', 'initial', 'uniform' or an array"
-        raise InvalidArgumentError(f"prior: expected {expected}, got {prior!r}")
-    return simple[prior](model, height=height, width=width)
 
 
 def _frame_of(observation: Any) -> NDArray[np.uint8]:

@@ -19,8 +19,8 @@ from emberwatch.film.scenes import Scene, Selection, scenes
 from emberwatch.film.steps import steps
 from emberwatch.model import Model
 from emberwatch.observer import Frame
+from emberwatch.prior import simulated_prior
 from emberwatch.replies import ServerInfo
-from emberwatch.wrappers import simulated_prior
 
 if TYPE_CHECKING:
     from PIL.Image import Image

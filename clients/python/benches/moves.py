@@ -1,0 +1,101 @@
+"""Moves a second of many worlds of `WildfireMoves-v0`, beside peers in the same run.
+
+Peers: Gymnasium's `SyncVectorEnv` of the single environments, and of an environment with the same
+spaces that simulates nothing. Rounds take turns, so that a noisy machine is noisy for all. Prints
+the median over rounds, by the wall clock, and by this process's processor time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import SyncVectorEnv
+
+import emberwatch
+from emberwatch.programs import Program, unused_instance
+
+ENV = "emberwatch:emberwatch/WildfireMoves-v0"
+NO_END = 2**31 - 1
+#: Of one server.
+CLIENTS = 16
+
+
+class Trivial(gymnasium.Env[Any, Any]):
+    """The same spaces without a simulation."""
+
+    def __init__(self, like: gymnasium.Env[Any, Any]) -> None:
+        self.observation_space, self.action_space = like.observation_space, like.action_space
+        self._seen = np.zeros(like.observation_space.shape, np.uint8)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return self._seen, {}
+
+    def step(self, action: Any) -> Any:
+        return self._seen, 0.0, False, False, {}
+
+
+def serve(model: str) -> tuple[Program, str]:
+    """A server for as many single environments as may be its clients."""
+    instance = unused_instance()
+    flags = {"worlds": CLIENTS, "height": 16, "width": 16, "moves": 16, "burn-in": 3000}
+    flags |= {"model": model, "instance": instance}
+    server = Program("emberwatch-server", [f"--{name}={value}" for name, value in flags.items()])
+    server.wait_for(lambda: emberwatch.connect(instance)).close()
+    return server, instance
+
+
+def main() -> None:
+    """Steps each in turn."""
+    parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument("--worlds", type=int, default=64)
+    parser.add_argument("--moves", type=int, default=160, help="of each world, a round")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--model", default="wildfire-small")
+    args = parser.parse_args()
+    world: dict[str, Any] = {"height": 16, "width": 16, "n_moves": 16, "burn_in": 3000}
+    world |= {"model": args.model, "observation": "local", "max_episode_steps": NO_END}
+    one = gymnasium.make(ENV, **world).unwrapped
+    servers = [serve(args.model) for _ in range(0, args.worlds, CLIENTS)]
+    there = {"observation": "local", "max_episode_steps": NO_END}
+    places = [divmod(index, CLIENTS) for index in range(args.worlds)]
+    peers: dict[str, Any] = {
+        "native vector": gymnasium.make_vec(ENV, args.worlds, **world),
+        "native vector, reward='move'": gymnasium.make_vec(
+            ENV, args.worlds, reward="move", **world
+        ),
+        "SyncVectorEnv": SyncVectorEnv(
+            [
+                partial(gymnasium.make, ENV, instance=servers[server][1], world=number, **there)
+                for server, number in places
+            ]
+        ),
+        "SyncVectorEnv, simulates nothing": SyncVectorEnv([lambda: Trivial(one)] * args.worlds),
+    }
+    actions = np.random.default_rng(0).integers(0, 4, (args.moves, args.worlds))
+    rates: dict[str, list[tuple[float, float]]] = {name: [] for name in peers}
+    for envs in peers.values():
+        envs.reset(seed=1000)
+    for _ in range(args.rounds):
+        for name, envs in peers.items():
+            wall, cpu = time.perf_counter(), time.process_time()
+            for moves in actions:
+                envs.step(moves)
+            used = (time.perf_counter() - wall, time.process_time() - cpu)
+            rates[name].append((actions.size / used[0], actions.size / used[1]))
+    for name, envs in peers.items():
+        wall, cpu = (statistics.median(rate) for rate in zip(*rates[name], strict=True))
+        print(f"{name:34} {wall:9.0f} moves/s, {cpu:9.0f} a processor second")
+        envs.close()
+    for server, _ in servers:
+        server.stop()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,377 @@
+"""PPO on `emberwatch/WildfireMoves-v0` in one file, from a window of the belief around the robot.
+
+python ppo.py --imitate 60 --cpu-seconds 600 --out ppo --evaluate 0..32
+
+First the network may imitate beam search on the same belief, for the moves it chooses itself
+(DAgger: Ross, Gordon, Bagnell, 2011); then PPO improves on it. `--imitate 0` leaves that out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from torch import nn
+from torch.distributions import Categorical
+
+from emberwatch.benchmark import evaluate, summary
+
+ENV = "emberwatch/WildfireMoves-v0"
+MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])
+#: Columns of the log: what has been used, and what a path earned since the last row.
+COLUMNS = ("phase", "cpu_seconds", "seconds", "moves", "reward_per_path", "env_seconds", "entropy")
+
+
+class Network(nn.Module):
+    """Where to move, and what the future is worth, from a window `(n, side, side, channels)`."""
+
+    def __init__(self, side: int, n_channels: int) -> None:
+        super().__init__()
+        self.margin = side // 2 - 3
+        self.far = nn.Sequential(
+            *(nn.Conv2d(n_channels, 24, 3, 2, 1), nn.ReLU()),
+            *(nn.Conv2d(24, 32, 3, 1, 1), nn.ReLU()),
+            *(nn.Conv2d(32, 32, 3, 2, 1), nn.ReLU(), nn.Flatten()),
+        )
+        self.near = nn.Sequential(nn.Flatten(), nn.Linear(49 * n_channels, 128), nn.ReLU())
+        n_far = self.far(torch.zeros(1, n_channels, side, side)).shape[1]
+        self.both = nn.Sequential(
+            *(nn.Linear(n_far + 128, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU())
+        )
+        self.policy = nn.Linear(128, 4)
+        self.value = nn.Sequential(nn.Linear(128, 64), nn.ReLU(), nn.Linear(64, 1))
+        nn.init.orthogonal_(self.policy.weight, 0.01)
+        nn.init.zeros_(self.policy.bias)
+
+    def forward(self, windows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        images = windows.permute(0, 3, 1, 2).float() / 255
+        near = slice(self.margin, self.margin + 7)
+        both = self.both(torch.cat((self.far(images), self.near(images[:, :, near, near])), 1))
+        return self.policy(both), self.value(both)[:, 0]
+
+
+def symmetries() -> list[tuple[int, bool, torch.Tensor]]:
+    """Quarter turns, whether mirrored before, and what each move is called after."""
+    found = []
+    for mirrored in (False, True):
+        for turns in range(4):
+            names = []
+            for move in MOVES:
+                cells = np.zeros((3, 3))
+                cells[tuple(1 + move)] = 1
+                cells = np.rot90(cells[:, ::-1] if mirrored else cells, turns)
+                after = np.argwhere(cells)[0] - 1
+                names.append(int(np.flatnonzero((after == MOVES).all(1))[0]))
+            found.append((turns, mirrored, torch.tensor(names)))
+    return found
+
+
+SYMMETRIES = symmetries()
+
+
+def turned(windows: torch.Tensor, turns: int, mirrored: bool) -> torch.Tensor:
+    return torch.rot90(torch.flip(windows, (2,)) if mirrored else windows, turns, (1, 2))
+
+
+def first_moves(
+    values: np.ndarray,
+    robots: np.ndarray,
+    visited: np.ndarray,
+    n_moves: int,
+    rng: np.random.Generator,
+    width: int = 32,
+) -> np.ndarray:
+    """The first moves of paths that beam search finds to the highest sum of values, `(n, H, W)`."""
+    n, height, n_columns = values.shape
+    cells = np.stack(np.meshgrid(range(height), range(n_columns), indexing="ij"), -1)
+    after = (cells[:, :, None] + MOVES).clip(0, (height - 1, n_columns - 1))
+    after = (after[..., 0] * n_columns + after[..., 1]).reshape(-1, 4)
+    flat, worlds = values.reshape(n, -1), np.arange(n)[:, None]
+    at = (robots[:, 0] * n_columns + robots[:, 1])[:, None]
+    seen = visited.reshape(n, 1, -1) > 0
+    scores, firsts = np.zeros((n, 1)), np.zeros((n, 1), np.int64)
+    for move in range(n_moves):
+        reached = after[at].reshape(n, -1)
+        parents = np.repeat(np.arange(at.shape[1]), 4)[None]
+        new = scores[worlds, parents] + ~seen[worlds, parents, reached] * flat[worlds, reached]
+        new += 1e-6 * rng.random(new.shape)  # ties are broken at random
+        n_kept = min(width, new.shape[1])
+        kept = np.argpartition(-new, n_kept - 1, axis=1)[:, :n_kept]
+        parents = kept // 4
+        at, scores = reached[worlds, kept], new[worlds, kept]
+        firsts = kept % 4 if move == 0 else firsts[worlds, parents]
+        seen = seen[worlds, parents]
+        seen[worlds, np.arange(n_kept)[None], at] = True
+    return firsts[np.arange(n), scores.argmax(1)]
+
+
+class Training:
+    """The network, its worlds and its log."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        torch.set_num_threads(args.threads)
+        torch.manual_seed(args.seed)
+        self.args = args
+        imitates = ("belief", "robot", "visited", "move") if args.imitate > 0 else ()
+        self.envs = gymnasium.make_vec(
+            ENV,
+            num_envs=args.worlds,
+            autoreset_mode="SameStep",
+            max_episode_steps=args.n_moves * 50,
+            reward="move",
+            observation=("local", *imitates),
+            **world(args),
+        )
+        side, _, n_channels = self.envs.single_observation_space["local"].shape
+        self.network = Network(side, n_channels)
+        self.rng = np.random.default_rng(args.seed)
+        self.seen, _ = self.envs.reset(seed=args.seed)
+        self.begin, self.cpu = time.perf_counter(), time.process_time()
+        self.env_seconds, self.moves, self.rewards = 0.0, 0, []
+        args.out.mkdir(parents=True, exist_ok=True)
+        self.log = (args.out / "log.csv").open("w", buffering=1)
+        self.rows = csv.writer(self.log)
+        self.rows.writerow(COLUMNS)
+
+    def used(self) -> float:
+        """Processor seconds used."""
+        return time.process_time() - self.cpu
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+        begin = time.process_time()
+        self.seen, rewards, _, truncated, infos = self.envs.step(actions)
+        self.env_seconds += time.process_time() - begin
+        self.moves += len(actions)
+        self.rewards.append(rewards.mean())
+        return rewards, truncated, infos
+
+    def report(self, phase: str, entropy: float) -> None:
+        reward = float(np.mean(self.rewards)) * self.args.n_moves
+        self.rewards.clear()
+        wall = time.perf_counter() - self.begin
+        row = (phase, self.used(), wall, self.moves, reward, self.env_seconds, entropy)
+        self.rows.writerow(row)
+        print(f"{phase} {self.used():5.0f} s, {self.moves} moves: reward per path {reward:.2f}")
+        torch.save(self.network.state_dict(), self.args.out / "ppo.pt")
+
+    def imitate(self) -> None:
+        """Learns the first moves of beam search, wherever its own moves have led."""
+        args = self.args
+        shape = self.envs.single_observation_space["local"].shape
+        windows, wanted = np.zeros((40_960, *shape), np.uint8), np.zeros(40_960, np.int64)
+        optimizer = torch.optim.Adam(self.network.parameters(), 1e-3)
+        n_known, round_, target = 0, 0, self.envs.unwrapped.model.target_state
+        while self.used() < args.imitate:
+            for group in optimizer.param_groups:
+                group["lr"] = 1e-3 * (1.02 - self.used() / args.imitate)
+            for _ in range(args.n_moves):
+                seen, left = self.seen, args.n_moves - int(self.seen["move"][0])
+                values = seen["belief"][..., target] / 255 + 0.02
+                best = first_moves(values, seen["robot"], seen["visited"], left, self.rng)
+                at = (n_known + np.arange(len(best))) % len(wanted)
+                windows[at], wanted[at] = seen["local"], best
+                n_known += len(best)
+                with torch.no_grad():
+                    logits, _ = self.network(torch.from_numpy(seen["local"]))
+                own = Categorical(logits=logits).sample().numpy()
+                guided = self.rng.random(len(best)) < 1 - round_ / 20
+                self.step(np.where(guided, best, own))
+            for _ in range(3):
+                batch = self.rng.integers(0, min(n_known, len(wanted)), 512)
+                turns, mirrored, names = SYMMETRIES[self.rng.integers(8)]
+                images = turned(torch.from_numpy(windows[batch]), turns, mirrored)
+                logits, _ = self.network(images)
+                loss = nn.functional.cross_entropy(logits, names[wanted[batch]])
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+            round_ += 1
+            if round_ % 25 == 0:
+                self.report("imitation", loss.item())
+        torch.save(self.network.state_dict(), self.args.out / "imitation.pt")
+
+    def improve(self) -> None:
+        """Proximal policy optimisation (Schulman et al., 2017)."""
+        args, first = self.args, self.used()
+        optimizer = torch.optim.Adam(self.network.parameters(), args.learning_rate, eps=1e-5)
+        rounds = 0
+        while self.used() < args.cpu_seconds:
+            share = (self.used() - first) / (args.cpu_seconds - first)
+            for group in optimizer.param_groups:
+                group["lr"] = args.learning_rate * (1 - share)
+            rollout = self.rollout()
+            only_value = args.imitate > 0 and rounds < args.value_rounds
+            entropy = self.update(optimizer, rollout, only_value=only_value)
+            rounds += 1
+            if rounds % 10 == 0:
+                self.report("PPO", entropy)
+
+    def rollout(self) -> list[torch.Tensor]:
+        """Windows, actions, their log-probabilities, advantages and returns of `horizon` moves."""
+        args, n = self.args, self.args.worlds
+        # The world looks the same mirrored; turned, fire drifts another way.
+        turns, mirrored, names = SYMMETRIES[4 * self.rng.integers(2)]
+        back = names.argsort()
+        windows, actions, log_probabilities, values, rewards, ends = [], [], [], [], [], []
+        for _ in range(args.horizon):
+            window = turned(torch.from_numpy(self.seen["local"]), turns, mirrored)
+            with torch.no_grad():
+                logits, value = self.network(window)
+            moves = Categorical(logits=logits)
+            action = moves.sample()
+            reward, truncated, infos = self.step(back[action].numpy())
+            earned, end = torch.from_numpy(reward).float(), torch.from_numpy(truncated)
+            if truncated.any():  # the world would have gone on
+                last = np.stack([seen["local"] for seen in infos["final_obs"][truncated]])
+                with torch.no_grad():
+                    last = turned(torch.from_numpy(last), turns, mirrored)
+                    earned[end] += args.gamma * self.network(last)[1]
+            windows.append(window)
+            actions.append(action)
+            log_probabilities.append(moves.log_prob(action))
+            values.append(value)
+            rewards.append(earned)
+            ends.append(end.float())
+        with torch.no_grad():
+            last = turned(torch.from_numpy(self.seen["local"]), turns, mirrored)
+            values.append(self.network(last)[1])
+        advantages, advantage = [], torch.zeros(n)
+        for at in reversed(range(args.horizon)):
+            goes_on = 1 - ends[at]
+            error = rewards[at] + args.gamma * goes_on * values[at + 1] - values[at]
+            advantage = error + args.gamma * args.lambda_ * goes_on * advantage
+            advantages.insert(0, advantage)
+        returns = [a + v for a, v in zip(advantages, values, strict=False)]
+        parts = (windows, actions, log_probabilities, advantages, returns)
+        return [torch.cat(part) for part in parts]
+
+    def update(self, optimizer: Any, rollout: list[torch.Tensor], *, only_value: bool) -> float:
+        args, entropies = self.args, []
+        for _ in range(args.epochs):
+            for batch in torch.randperm(len(rollout[0])).split(args.batch):
+                windows, actions, before, advantages, returns = (part[batch] for part in rollout)
+                logits, values = self.network(windows)
+                moves = Categorical(logits=logits)
+                ratio = (moves.log_prob(actions) - before).exp()
+                advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+                gain = torch.min(ratio * advantages, ratio.clamp(0.8, 1.2) * advantages).mean()
+                entropy = moves.entropy().mean()
+                loss = 0.5 * (values - returns).square().mean()
+                if not only_value:
+                    loss = 0.5 * loss - gain - args.entropy * entropy
+                optimizer.zero_grad()
+                loss.backward()
+                if only_value:  # what the policy sees stays as it is
+                    for name, parameter in self.network.named_parameters():
+                        parameter.grad = parameter.grad if name.startswith("value") else None
+                nn.utils.clip_grad_norm_(self.network.parameters(), 0.5)
+                optimizer.step()
+                entropies.append(entropy.item())
+        return float(np.mean(entropies))
+
+
+def acting(network: Network, *, sampled: bool) -> Any:
+    """A policy for the benchmark: the mean of both mirror images, sampled or its most probable."""
+
+    @torch.no_grad()
+    def act(windows: np.ndarray) -> np.ndarray:
+        total = torch.zeros(len(windows), 4)
+        for turns, mirrored, names in (SYMMETRIES[0], SYMMETRIES[4]):
+            logits, _ = network(turned(torch.from_numpy(windows), turns, mirrored))
+            total += logits.log_softmax(1)[:, names]
+        if sampled:
+            return Categorical(logits=total / 2).sample().numpy()
+        return total.argmax(1).numpy()
+
+    return act
+
+
+def draw(folder: Path) -> None:
+    """The curve of a training, from its log."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    with (folder / "log.csv").open() as log:
+        rows = list(csv.DictReader(log))
+    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+    for phase in dict.fromkeys(row["phase"] for row in rows):
+        part = [row for row in rows if row["phase"] == phase]
+        seconds = [float(row["cpu_seconds"]) for row in part]
+        axes.plot(seconds, [float(row["reward_per_path"]) for row in part], label=phase)
+    axes.set(xlabel="processor seconds", ylabel="reward per path, sampled moves")
+    axes.legend()
+    figure.savefig(folder / "curve.png", dpi=120)
+
+
+def world(args: argparse.Namespace) -> dict[str, Any]:
+    """The keywords of the worlds."""
+    names = ("model", "height", "width", "n_moves", "burn_in", "window")
+    # A busy machine may take its time.
+    return {name: getattr(args, name) for name in names} | {"timeout": 60.0}
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument("--cpu-seconds", type=float, default=600, help="for all of the training")
+    parser.add_argument("--imitate", type=float, default=0, help="processor seconds of these")
+    parser.add_argument("--out", type=Path, default=Path("ppo"), help="folder of what comes out")
+    parser.add_argument(
+        "--evaluate", default="5000..5008", help="seeds, FIRST..END; below 1000: test"
+    )
+    parser.add_argument("--steps", type=int, default=100, help="paths of each world evaluated")
+    parser.add_argument("--sampled", action="store_true", help="evaluate sampled moves")
+    parser.add_argument("--load", type=Path, help="a network to begin with")
+    parser.add_argument("--name", default="ppo", help="in the benchmark's table")
+    parser.add_argument("--seed", type=int, default=1000, help="of the first training world, too")
+    parser.add_argument("--model", default="wildfire-small")
+    for name, default in (("height", 16), ("width", 16), ("n-moves", 16), ("burn-in", 3000)):
+        parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--window", type=int, default=15, help="cells along a side")
+    parser.add_argument("--worlds", type=int, default=64)
+    parser.add_argument("--horizon", type=int, default=32, help="moves of a rollout")
+    parser.add_argument("--batch", type=int, default=512)
+    parser.add_argument("--epochs", type=int, default=4)
+    parser.add_argument("--value-rounds", type=int, default=5, help="rollouts for the value alone")
+    parser.add_argument("--learning-rate", type=float, default=7e-4)
+    parser.add_argument("--gamma", type=float, default=0.95)
+    parser.add_argument("--lambda", dest="lambda_", type=float, default=0.9)
+    parser.add_argument("--entropy", type=float, default=0.01)
+    parser.add_argument("--threads", type=int, default=1)
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Trains, then scores the policy for the benchmark's table."""
+    args = arguments()
+    training = Training(args)
+    if args.load is not None:
+        training.network.load_state_dict(torch.load(args.load))
+    training.imitate()
+    training.improve()
+    training.envs.close()
+    training.log.close()
+    draw(args.out)
+    first, end = map(int, args.evaluate.split(".."))
+    rows = evaluate(
+        acting(training.network, sampled=args.sampled),
+        name=args.name,
+        estimator="known_model",
+        seeds=range(first, end),
+        steps=args.steps,
+        csv=args.out / "rows.csv",
+        observation="local",
+        **world(args),
+    )
+    print(summary(rows))
+
+
+if __name__ == "__main__":
+    main()

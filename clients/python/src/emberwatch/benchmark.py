@@ -1,0 +1,307 @@
+"""A policy in Python on the benchmark's worlds, for the table of `emberwatch-agent compare`.
+
+    rows = evaluate(policy, name="ppo", seeds=range(32), csv="ppo.csv", model="wildfire-small", ...)
+
+and `emberwatch-agent compare --add ppo.csv`, with the same worlds and steps, puts them beside its
+own policies, paired by world.
+"""
+
+from __future__ import annotations
+
+import csv as csv_files
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+from typing import Any, Final, TextIO, cast
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from emberwatch.arguments import as_seed
+from emberwatch.errors import InvalidArgumentError
+
+#: Takes the stacked observations of some worlds; returns an action for each.
+Policy = Callable[[Any], Any]
+
+#: Worlds with seeds below are for tests: nothing may be trained or tuned on them.
+FIRST_TRAINING_SEED: Final = 1000
+
+_MOVES: Final = "emberwatch/WildfireMoves-v0"
+_PATHS: Final = "emberwatch/Wildfire-v0"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """A policy on one world: a line of the CSV file, as `emberwatch-agent compare` writes it."""
+
+    policy: str
+    #: Where its belief came from: `none`, `known_model`, or a name of your own.
+    estimator: str
+    world_seed: int
+    #: Scored steps of the world.
+    steps: int
+    mean_reward: float
+    mean_distinct_cells: float
+    #: Distinct visited cells on target, as a share of the distinct visited cells.
+    hit_rate: float
+    #: Of the whole world: the same for every policy.
+    mean_fire_cells: float
+    mean_plan_millis: float
+    #: Empty: only the agent program scores beliefs.
+    brier: str
+    #: Moves of a path.
+    moves: int
+
+
+_HEADER: Final = [field.name for field in fields(Row)]
+
+
+class _Tally:
+    """Sums over the steps of some worlds."""
+
+    def __init__(self, n_moves: int, n_worlds: int) -> None:
+        self.n_moves: Final = n_moves
+        self.reward = np.zeros(n_worlds)
+        self.n_visited, self.n_hits, self.n_fire = np.zeros((3, n_worlds), np.int64)
+        self.seconds = 0.0
+
+    def timed(self, act: Policy, seen: Any) -> Any:
+        begin = time.perf_counter()
+        actions = act(seen)
+        self.seconds += time.perf_counter() - begin
+        return actions
+
+    def add(self, rewards: NDArray[Any], infos: dict[str, Any]) -> None:
+        self.reward += rewards
+        self.n_visited += infos["n_visited"]
+        self.n_hits += infos["n_hits"]
+        self.n_fire += infos["n_target_cells"]
+
+
+def evaluate(
+    policy: Any,
+    *,
+    name: str,
+    seeds: Iterable[int] = range(8),
+    steps: int = 1500,
+    burn_in: int = 25_000,
+    env: str = _MOVES,
+    estimator: str = "none",
+    deterministic: bool = True,
+    batch: int = 32,
+    csv: str | os.PathLike[str] | None = None,
+    progress: TextIO | None = sys.stderr,
+    **keywords: Any,
+) -> list[Row]:
+    """Scores a policy; defaults are those of `emberwatch-agent compare`.
+
+    Args:
+        policy: A function from the stacked observations of some worlds to their actions, or a model
+            of Stable-Baselines3. If it has a method `begin(n_worlds)`, that is called whenever
+            other worlds begin.
+        name: What the table calls it.
+        seeds: The worlds. Those below 1000 are test worlds.
+        steps: Scored steps, thus paths, of each world.
+        burn_in: Steps before the first scored one.
+        env: What it acts in: `"emberwatch/WildfireMoves-v0"` or `"emberwatch/Wildfire-v0"`.
+        estimator: What the table says of its belief.
+        deterministic: Passed on to Stable-Baselines3.
+        batch: Worlds at a time, in the order of the seeds.
+        csv: A file to write rows to. Rows of this policy that it has already are kept, and not
+            run again; those of other policies are kept.
+        progress: Where to write how far it is; None: nowhere.
+        keywords: Of the environment: `model`, `height`, `width`, `n_moves`, `observation`, ...
+
+    Returns:
+        A row for each seed, in order.
+    """
+    chosen = _check(name, seeds, steps, batch, env)
+    act = _acting(policy, deterministic)
+    file = None if csv is None else _File(Path(csv))
+    done = {} if file is None else file.done(name, estimator, steps)
+    missing = [seed for seed in chosen if seed not in done]
+    report = _Progress(progress, name, chosen, len(missing) * steps)
+    keywords |= {"burn_in": burn_in} | ({"reward": "path"} if env == _MOVES else {})
+    for first in range(0, len(missing), batch):
+        part = missing[first : first + batch]
+        getattr(policy, "begin", _nothing)(len(part))
+        tally = _play(env, keywords, act, part, steps, report)
+        rows = _rows(tally, part, steps, name, estimator)
+        done |= {row.world_seed: row for row in rows}
+        if file is not None:
+            file.add(rows)
+    report.end()
+    return [done[seed] for seed in chosen]
+
+
+def _play(
+    env: str,
+    keywords: dict[str, Any],
+    act: Policy,
+    seeds: Sequence[int],
+    steps: int,
+    report: _Progress,
+) -> _Tally:
+    """Flies so many paths in some worlds."""
+    make: Any = {"num_envs": len(seeds), "max_episode_steps": -1, **keywords}
+    worlds = gymnasium.make_vec(env, autoreset_mode=AutoresetMode.DISABLED, **make)
+    try:
+        tally = _Tally(cast("int", getattr(worlds.unwrapped, "n_moves")), len(seeds))  # noqa: B009
+        seen, _ = worlds.reset(seed=cast("Any", list(seeds)))
+        n_actions = tally.n_moves if env == _MOVES else 1
+        for _ in range(steps):
+            for _ in range(n_actions - 1):
+                seen, *_ = worlds.step(tally.timed(act, seen))
+            seen, rewards, _, truncated, infos = worlds.step(tally.timed(act, seen))
+            if truncated.any():
+                raise InvalidArgumentError("instance: expected a server without --max-steps")
+            tally.add(rewards, infos)
+            report.add(len(seeds))
+    finally:
+        worlds.close()
+    return tally
+
+
+def _rows(tally: _Tally, seeds: Sequence[int], steps: int, name: str, estimator: str) -> list[Row]:
+    return [
+        Row(
+            policy=name,
+            estimator=estimator,
+            world_seed=seed,
+            steps=steps,
+            mean_reward=float(tally.reward[index]) / steps,
+            mean_distinct_cells=int(tally.n_visited[index]) / steps,
+            hit_rate=int(tally.n_hits[index]) / max(int(tally.n_visited[index]), 1),
+            mean_fire_cells=int(tally.n_fire[index]) / steps,
+            mean_plan_millis=1e3 * tally.seconds / steps / len(seeds),
+            brier="",
+            moves=tally.n_moves,
+        )
+        for index, seed in enumerate(seeds)
+    ]
+
+
+def _check(name: str, seeds: Iterable[int], steps: int, batch: int, env: str) -> list[int]:
+    """The seeds as a list; refuses what no worlds can be made of."""
+    if not isinstance(name, str) or not name or not name.isprintable():  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise InvalidArgumentError(f"name: expected a name for the table, got {name!r}")
+    if env not in (_MOVES, _PATHS):
+        raise InvalidArgumentError(f"env: expected {_MOVES!r} or {_PATHS!r}, got {env!r}")
+    for what, number in (("steps", steps), ("batch", batch)):
+        if not isinstance(number, int | np.integer) or number < 1:  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise InvalidArgumentError(f"{what}: expected at least 1, got {number!r}")
+    chosen = [as_seed(seed) for seed in seeds]
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise InvalidArgumentError(f"seeds: expected some, each once, got {chosen}")
+    return chosen
+
+
+def _acting(policy: Any, deterministic: bool) -> Policy:
+    predict = getattr(policy, "predict", None)
+    if predict is not None:
+        return lambda observations: predict(observations, deterministic=deterministic)[0]
+    if not callable(policy):
+        raise InvalidArgumentError(
+            "policy: expected a function of observations, or a model of Stable-Baselines3, "
+            f"got {policy!r}"
+        )
+    return cast("Policy", policy)
+
+
+def _nothing(_n_worlds: int) -> None:
+    """What a policy without `begin` does."""
+
+
+class _File:
+    """Rows in a CSV file, which is replaced whole whenever some are added."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        if path.is_dir():
+            raise InvalidArgumentError(f"csv: expected a file, got the folder {path}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._rows = read(path) if path.exists() else []
+
+    def done(self, name: str, estimator: str, steps: int) -> dict[int, Row]:
+        """What a policy has done already, by seed."""
+        own = [row for row in self._rows if (row.policy, row.estimator) == (name, estimator)]
+        for row in own:
+            if row.steps != steps:
+                raise InvalidArgumentError(
+                    f"csv: {self._path} has {row.steps} steps of {name!r} on world "
+                    f"{row.world_seed}, expected {steps}: choose another file or name"
+                )
+        return {row.world_seed: row for row in own}
+
+    def add(self, rows: Iterable[Row]) -> None:
+        self._rows += rows
+        self._rows.sort(key=lambda row: (row.policy, row.world_seed, row.estimator))
+        temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}.tmp")
+        with temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv_files.writer(file, lineterminator="\n")
+            writer.writerow(_HEADER)
+            writer.writerows(astuple(row) for row in self._rows)
+        temporary.replace(self._path)
+
+
+def read(path: str | os.PathLike[str]) -> list[Row]:
+    """The rows of a CSV file of `evaluate` or `emberwatch-agent compare`."""
+    try:
+        with Path(path).open(newline="", encoding="utf-8") as file:
+            lines = csv_files.DictReader(file)
+            if lines.fieldnames != _HEADER:
+                raise ValueError(lines.fieldnames)
+            return [_row(line) for line in lines]
+    except (ValueError, TypeError) as error:
+        raise InvalidArgumentError(
+            f"csv: expected {path} to have the columns {','.join(_HEADER)}, got {error}"
+        ) from None
+
+
+def _row(line: dict[str, Any]) -> Row:
+    kinds: dict[Any, Callable[[str], Any]] = {"int": int, "float": float, "str": str}
+    values = {field.name: kinds[field.type](line[field.name]) for field in fields(Row)}
+    return Row(**values)
+
+
+class _Progress:
+    """Says how far an evaluation is, a line a second on a terminal, else a line at its end."""
+
+    def __init__(self, out: TextIO | None, name: str, seeds: Sequence[int], n_steps: int) -> None:
+        n_test = sum(seed < FIRST_TRAINING_SEED for seed in seeds)
+        sort = {0: "", len(seeds): " test"}.get(n_test, f" ({n_test} of them test)")
+        self._out, self._title = out, f"{name}: {len(seeds)}{sort} worlds"
+        self._n_steps, self._n_done = n_steps, 0
+        self._begin = self._last = time.monotonic()
+
+    def add(self, n_steps: int) -> None:
+        self._n_done += n_steps
+        now = time.monotonic()
+        if self._out is not None and self._out.isatty() and now - self._last > 1.0:
+            self._last = now
+            left = (now - self._begin) * (self._n_steps / self._n_done - 1.0)
+            share = 100 * self._n_done // self._n_steps
+            print(f"\r{self._title}, {share} %, {left:.0f} s left ", end="", file=self._out)
+
+    def end(self) -> None:
+        if self._out is not None:
+            start = "\r" if self._out.isatty() else ""
+            seconds = time.monotonic() - self._begin
+            print(f"{start}{self._title}, {seconds:.0f} s{' ' * 20}".rstrip(), file=self._out)
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """The mean reward of a step, and its standard error over worlds."""
+    rewards = np.array([row.mean_reward for row in rows])
+    n_test = sum(row.world_seed < FIRST_TRAINING_SEED for row in rows)
+    error = rewards.std(ddof=1) / math.sqrt(len(rows)) if len(rows) > 1 else math.nan
+    sort = "test " if n_test == len(rows) else "" if n_test == 0 else f"({n_test} test) "
+    return (
+        f"{rows[0].policy}: {rewards.mean():.2f} +- {error:.2f} a step on {len(rows)} {sort}worlds"
+    )

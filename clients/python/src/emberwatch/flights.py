@@ -1,0 +1,74 @@
+"""Paths flown move by move in many worlds: where the robots are, what they have visited."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.settings import WorldSpec
+from emberwatch.view import DIRECTIONS
+
+_DIRECTIONS: Final = np.array(DIRECTIONS, np.int64)
+
+
+class Flights:
+    """The present path of each world, as far as it is flown."""
+
+    def __init__(self, spec: WorldSpec, n_worlds: int, *, pays: bool) -> None:
+        """`pays`: each cell pays when it is first visited, what its hidden state pays."""
+        self.spec: Final = spec
+        self._reward = None if spec.model is None or not pays else spec.model.reward
+        self._last_cell = np.array((spec.height - 1, spec.width - 1), np.int64)
+        #: Row and column of each robot.
+        self.robots = np.zeros((n_worlds, 2), np.int64)
+        #: Number of moves made.
+        self.n_made = np.zeros(n_worlds, np.int64)
+        #: 255 in the cells visited, else 0.
+        self.visited = np.zeros((n_worlds, spec.height, spec.width), np.uint8)
+        #: What the moves have been paid.
+        self.paid = np.zeros(n_worlds)
+        self._states = np.zeros_like(self.visited)
+        self._moves = np.zeros((n_worlds, spec.n_moves), np.uint8)
+
+    def begin(
+        self,
+        worlds: NDArray[np.bool_],
+        robots: NDArray[np.int64],
+        states: NDArray[np.uint8] | None,
+    ) -> None:
+        """Begins paths in some worlds; `robots` and hidden `states` are those of all."""
+        self.robots[worlds] = robots[worlds]
+        self.n_made[worlds] = 0
+        self.visited[worlds] = 0
+        self.paid[worlds] = 0.0
+        if states is not None:
+            self._states[worlds] = states[worlds]
+
+    def completes(self) -> NDArray[np.bool_]:
+        """In which worlds the next move is the last of its path."""
+        return self.n_made == self.spec.n_moves - 1
+
+    def paths(self, actions: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The paths that these actions would complete, `(n_worlds, T)`."""
+        return np.concatenate((self._moves[:, :-1], actions[:, np.newaxis]), axis=1)
+
+    def made(self, world: int) -> NDArray[np.uint8]:
+        """The moves made in one world."""
+        return self._moves[world, : self.n_made[world]]
+
+    def move(self, indices: NDArray[np.intp], actions: NDArray[np.uint8]) -> NDArray[np.float64]:
+        """One move in some worlds; returns what it pays in them."""
+        chosen = actions[indices]
+        self._moves[indices, self.n_made[indices]] = chosen
+        self.n_made[indices] += 1
+        cells = (self.robots[indices] + _DIRECTIONS[chosen]).clip(0, self._last_cell)
+        self.robots[indices] = cells
+        at = (indices, cells[:, 0], cells[:, 1])
+        rewards = np.zeros(len(indices))
+        if self._reward is not None:
+            rewards = np.where(self.visited[at] == 0, self._reward[self._states[at]], 0.0)
+            self.paid[indices] += rewards
+        self.visited[at] = 255
+        return rewards

@@ -1,0 +1,100 @@
+"""`gymnasium.make_vec("emberwatch/WildfireMoves-v0")`: one move in each world."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, Unpack
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from emberwatch import wire
+from emberwatch.arguments import as_choices
+from emberwatch.moves_env import moves_flights, moves_settings
+from emberwatch.observations import WINDOW, MovesParts, Observations
+from emberwatch.session import Session, not_reset
+from emberwatch.settings import WorldArguments
+from emberwatch.vector_base import WorldVectorEnv
+from emberwatch.view import fly
+
+
+class WildfireMovesVectorEnv(WorldVectorEnv):
+    """Many worlds of `WildfireMovesEnv`: one message steps all whose paths are complete.
+
+    As `WildfireVectorEnv`; arguments are those of `WildfireMovesEnv`, and `num_envs`,
+    `max_episode_steps` (moves), `autoreset_mode`.
+    """
+
+    def __init__(
+        self,
+        *,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        observation: MovesParts = ("frame", "visited", "robot", "move"),
+        reward: Literal["path", "move"] = "path",
+        window: int = WINDOW,
+        **world: Unpack[WorldArguments],
+    ) -> None:
+        """See the class. No server of its own runs before the first reset."""
+        reveals = world.get("truth", False)
+        settings = moves_settings(WildfireMovesVectorEnv, reward, world)
+        session = Session(settings, num_envs)
+        self._flights = flights = moves_flights(session.spec, num_envs, reward)
+        super().__init__(
+            session,
+            Observations(observation, session.spec, num_envs, flights, window),
+            spaces.Discrete(wire.N_MOVES),
+            max_episode_steps=max_episode_steps,
+            autoreset_mode=autoreset_mode,
+            reveals=reveals,
+        )
+
+    def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
+        return as_choices(actions, self.num_envs, wire.N_MOVES)
+
+    def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
+        if not self._session.is_open:
+            raise not_reset()
+        completed = flown & self._flights.completes()
+        if not completed.any():
+            return self._move(actions, flown)
+        paths, starts = self._flights.paths(actions), super()._robots()
+        self._exchange(paths, completed)
+        rewards = self._results["reward"] - self._flights.paid
+        others = flown & ~completed
+        if others.any():
+            rewards = np.where(others, self._move(actions, others), rewards)
+        self._begin(completed)
+        if self.render_mode is not None:
+            for index in np.flatnonzero(completed).tolist():
+                row, col = starts[index].tolist()
+                self._paths[index] = fly((row, col), paths[index], self._spec)
+        return rewards
+
+    def _move(self, actions: NDArray[np.uint8], moved: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """One move that completes no path."""
+        indices = np.flatnonzero(moved)
+        rewards = np.zeros(self.num_envs)
+        rewards[indices] = self._flights.move(indices, actions)
+        self._observations.visit(indices)
+        return rewards
+
+    def _begin(self, begun: NDArray[np.bool_]) -> None:
+        self._flights.begin(begun, super()._robots(), self._truths)
+
+    def _robots(self) -> NDArray[np.int64]:
+        return self._flights.robots.copy()
+
+    def _shown(self) -> NDArray[np.uint8]:
+        return self._frames.copy()  # each move of a path returns the frames again
+
+    def _draw(self, index: int) -> Any:
+        flown = self._paths[index]
+        if self._flights.n_made[index]:
+            row, col = super()._robots()[index].tolist()
+            self._paths[index] = fly((row, col), self._flights.made(index), self._spec)
+        picture = super()._draw(index)
+        self._paths[index] = flown
+        return picture

@@ -1,0 +1,75 @@
+"""What can be known about a world before its first frame: a filter's first belief."""
+
+from __future__ import annotations
+
+import functools
+import tempfile
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch import programs
+from emberwatch.belief import initial_prior, uniform_prior
+from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.model import Model
+
+PriorKind = Literal["simulated", "initial", "uniform"]
+"""A prior by name, see `wrappers.BeliefObservation`."""
+
+#: 64 worlds of 512 x 512 cells take minutes.
+_SIMULATION_TIMEOUT: Final = 1800.0
+
+
+@functools.lru_cache(maxsize=8)
+def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> NDArray[np.floating]:
+    """How often each cell of 64 simulated worlds is in each state after the burn-in.
+
+    Runs ``emberwatch-agent prior``, whose worlds do not depend on any environment's seed. Shape
+    (S, H, W); the same array again for the same arguments, so it cannot be written to.
+    """
+    name = "emberwatch-agent"
+    with tempfile.TemporaryDirectory(prefix="emberwatch-prior-") as directory:
+        file, out = Path(directory, "model.toml"), Path(directory, "prior.npy")
+        file.write_text(model.toml, "utf-8")
+        flags = {"model": file, "height": height, "width": width, "burn-in": burn_in, "out": out}
+        arguments = ["prior", *(f"--{flag}={value}" for flag, value in flags.items())]
+        programs.run(name, arguments, _SIMULATION_TIMEOUT)
+        try:
+            with out.open("rb") as stream:
+                prior: NDArray[np.floating] = np.lib.format.read_array(stream)
+        except (OSError, ValueError) as error:
+            problem = f"{name} prior: expected an .npy file: {error}"
+            raise EmberwatchError(problem, "program") from error
+    expected = (model.n_states, height, width)
+    if prior.shape != expected:
+        problem = f"{name} prior: expected shape {expected}, got {prior.shape}"
+        raise EmberwatchError(problem, "program")
+    prior.flags.writeable = False
+    return prior
+
+
+def prior_of(
+    prior: PriorKind | NDArray[np.floating] | None,
+    model: Model,
+    *,
+    height: int,
+    width: int,
+    burn_in: int,
+) -> NDArray[np.floating]:
+    """A prior by name, or as given; None: ``"simulated"`` after a burn-in, else ``"initial"``."""
+    if prior is None:
+        prior = "simulated" if burn_in > 0 else "initial"
+    if not isinstance(prior, str):
+        expected = (model.n_states, height, width)
+        if prior.shape != expected:
+            raise InvalidArgumentError(f"prior: expected shape {expected}, got {prior.shape}")
+        return prior
+    if prior == "simulated":
+        return simulated_prior(model, height=height, width=width, burn_in=burn_in)
+    simple = {"initial": initial_prior, "uniform": uniform_prior}
+    if prior not in simple:
+        expected = "'simulated', 'initial', 'uniform' or an array"
+        raise InvalidArgumentError(f"prior: expected {expected}, got {prior!r}")
+    return simple[prior](model, height=height, width=width)

@@ -1,0 +1,105 @@
+"""The native vector environments for Stable-Baselines3, which is imported only here.
+
+from emberwatch.sb3 import make_vec_env
+model = PPO("MultiInputPolicy", make_vec_env("emberwatch/WildfireMoves-v0", 64, reward="move"))
+"""
+
+# Stable-Baselines3 need not be installed where types are checked.
+# pyright: reportMissingImports=false, reportMissingModuleSource=false, reportUnknownMemberType=false
+# pyright: reportUnknownVariableType=false, reportUntypedBaseClass=false
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.vector_base import WorldVectorEnv
+
+
+def make_vec_env(name: str, n_envs: int = 1, **keywords: Any) -> WildfireVecEnv:
+    """`gymnasium.make_vec` for Stable-Baselines3; wrap it in its `VecMonitor` for statistics."""
+    made = gymnasium.make_vec(
+        name, num_envs=n_envs, autoreset_mode=AutoresetMode.SAME_STEP, **keywords
+    )
+    return WildfireVecEnv(made)
+
+
+class WildfireVecEnv(VecEnv):
+    """A native vector environment in autoreset mode `SAME_STEP`.
+
+    The info of a world is empty, but at the end of its episode: it has `terminal_observation`,
+    `TimeLimit.truncated` and what the last complete path's info had.
+    """
+
+    def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
+        worlds = env.unwrapped
+        mode = env.metadata.get("autoreset_mode")
+        if not isinstance(worlds, WorldVectorEnv) or mode is not AutoresetMode.SAME_STEP:
+            raise InvalidArgumentError(
+                "env: expected gymnasium.make_vec of an environment of emberwatch with "
+                f"autoreset_mode='SameStep', got {env} with {mode}"
+            )
+        self._env: Any = env
+        self._worlds = worlds
+        self._actions: Any = None
+        self.render_mode = worlds.render_mode
+        super().__init__(
+            worlds.num_envs, worlds.single_observation_space, worlds.single_action_space
+        )
+
+    def reset(self) -> Any:
+        seeds = [None if seed is None else int(seed) for seed in self._seeds]
+        observations, _ = self._env.reset(seed=seeds if any(s is not None for s in seeds) else None)
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        return observations
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        observations, rewards, terminated, truncated, infos = self._env.step(self._actions)
+        ended = terminated | truncated
+        reported: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for index in np.flatnonzero(ended).tolist():
+            last = infos["final_info"]
+            shown = [key for key in last if not key.startswith("_")]
+            reported[index] = {key: _plain(last[key][index]) for key in shown}
+            reported[index]["terminal_observation"] = infos["final_obs"][index]
+            reported[index]["TimeLimit.truncated"] = bool(truncated[index] & ~terminated[index])
+        return observations, rewards.astype(np.float32), ended, reported
+
+    def close(self) -> None:
+        self._env.close()
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        return list(self._worlds.render() or [None] * self.num_envs)
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self._worlds, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise InvalidArgumentError(
+            f"set_attr: expected none, as the worlds share one environment, got {attr_name!r}"
+        )
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
+        raise InvalidArgumentError(
+            f"env_method: expected none, as the worlds share one environment, got {method_name!r}"
+        )
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        return [False] * len(list(self._get_indices(indices)))
+
+
+def _plain(value: Any) -> Any:
+    """A number as Python's own, as the single environments have it."""
+    return value.item() if isinstance(value, np.generic) else value

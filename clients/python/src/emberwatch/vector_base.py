@@ -1,0 +1,281 @@
+"""What the vector environments share: episodes, their ends, infos, pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from emberwatch.arguments import as_seed
+from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, wants_to_resume
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.observations import Observations, of_world
+from emberwatch.session import Session, SessionOwner
+from emberwatch.settings import draw_seed
+from emberwatch.view import View
+from emberwatch.wire import RESULT_DTYPE, StepAnswer
+
+
+class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
+    """Many worlds, stepped together."""
+
+    # Until it is made: Gymnasium 1.2 closes what failed to be made, too.
+    closed = True
+
+    def __init__(
+        self,
+        session: Session,
+        observations: Observations,
+        action_space: spaces.Space[Any],
+        *,
+        max_episode_steps: int | None,
+        autoreset_mode: AutoresetMode | str,
+        reveals: bool,
+    ) -> None:
+        """`reveals` puts the hidden states into infos and pictures."""
+        if max_episode_steps == -1:  # no limit in Gymnasium's own `make`
+            max_episode_steps = None
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise InvalidArgumentError(
+                f"max_episode_steps: expected at least 1 or None, got {max_episode_steps}"
+            )
+        self._mode = AutoresetMode(autoreset_mode)
+        self._session, self._spec = session, session.spec
+        spec, num_envs, mode = session.spec, session.n_worlds, session.settings.render_mode
+        self._observations = observations
+        self._views = [View(mode, spec) for _ in range(num_envs)]
+        self._max_steps = max_episode_steps
+        self._reveals = reveals
+        self.metadata = {**WorldEnv.metadata, "autoreset_mode": self._mode}
+        self.num_envs = num_envs
+        self.render_mode = mode
+        self.single_observation_space = observations.space
+        self.observation_space = batch_space(observations.space, num_envs)
+        self.single_action_space = action_space
+        self.action_space = batch_space(action_space, num_envs)
+        self._generators: list[np.random.Generator | None] = [None] * num_envs
+        self._frames = np.zeros((num_envs, spec.height, spec.width), np.uint8)
+        self._results = np.zeros(num_envs, RESULT_DTYPE)
+        self._elapsed = np.zeros(num_envs, np.int64)
+        self._over = np.zeros(num_envs, np.bool_)
+        self._truths: NDArray[np.uint8] | None = None
+        self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
+        self.closed = False
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins episodes in all worlds, or in those of `options["reset_mask"]`.
+
+        Args:
+            seed: For world 0, the others follow; or one per world; None: each world's own
+                generator goes on.
+            options: `reset_mask`, `(num_envs,)` booleans, at least one true; or `resume`, see
+                `WildfireEnv`.
+        """
+        rest = dict(options or {})
+        mask = self._check_mask(rest.pop("reset_mask", None))
+        seeds = self._check_seeds(seed)
+        resumes = wants_to_resume(rest, seed)
+        if not mask.all() and not self._session.is_open:
+            raise gymnasium.error.ResetNeeded("reset_mask: expected a reset of all worlds before")
+        self.closed = False
+        chosen = np.flatnonzero(mask).tolist()
+        if resumes:
+            self._take(self._session.resume())
+            self._reset_episodes(chosen)
+        else:
+            self._restart(chosen, seeds)
+        return self._seen(), self._infos(mask)
+
+    def step(
+        self, actions: NDArray[np.integer[Any]]
+    ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """One step of each world.
+
+        Raises:
+            gymnasium.error.ResetNeeded: In mode `DISABLED`, if an episode is over.
+            EmberwatchError: As `WildfireEnv.step`.
+        """
+        chosen = self._check_actions(actions)
+        over = self._over
+        if over.any() and self._mode is not AutoresetMode.NEXT_STEP:
+            raise gymnasium.error.ResetNeeded(
+                f"worlds {np.flatnonzero(over).tolist()}: the episode is over; reset with "
+                "options={'reset_mask': ...}"
+            )
+        flown = ~over
+        rewards = self._fly(chosen, flown)
+        self._elapsed += flown
+        if over.any():
+            self._restart(np.flatnonzero(over).tolist(), [None] * self.num_envs)
+        return self._outcome(flown, rewards)
+
+    def render(self) -> tuple[Any, ...] | None:
+        """The picture of each world, as `WildfireEnv.render` draws it."""
+        if self.render_mode is None or not self._session.is_open:
+            gymnasium.logger.warn(NOTHING_TO_DRAW)
+            return None
+        if self.render_mode == "human":
+            return (None,) * self.num_envs
+        return tuple(self._draw(index) for index in range(self.num_envs))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        self._session.close()
+        for view in self._views:
+            view.close()
+
+    def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
+        raise NotImplementedError
+
+    def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Steps the worlds `flown`; of the rewards, those of the others do not count."""
+        raise NotImplementedError
+
+    def _begin(self, begun: NDArray[np.bool_]) -> None:
+        """Episodes have begun in some worlds, or go on."""
+
+    def _robots(self) -> NDArray[np.int64]:
+        """Row and column of each robot, a new array."""
+        return np.stack((self._results["row"], self._results["col"]), axis=1).astype(np.int64)
+
+    def _exchange(self, paths: NDArray[np.uint8], moved: NDArray[np.bool_]) -> None:
+        """Flies whole paths in some worlds, in one message where they are consecutive."""
+        if moved.all():
+            self._take(self._session.step(paths))
+        elif moved.any():
+            self._frames = self._frames.copy()  # the learner has the others
+            for run in _runs(moved):
+                self._exchange_run(paths, run)
+        self._observations.update(moved, self._frames)
+
+    def _exchange_run(self, paths: NDArray[np.uint8], run: range) -> None:
+        chosen = slice(run.start, run.stop)
+        answer = self._session.step(paths[chosen], run)
+        self._frames[chosen], self._results[chosen] = answer.frames, answer.results
+        if self._truths is not None:
+            self._truths[chosen] = self._session.truth(answer)
+
+    def _restart(self, indices: list[int], seeds: Sequence[int | None]) -> None:
+        """Begins episodes in some worlds."""
+        chosen: list[int] = []
+        for index in indices:
+            seed, generator = seeds[index], self._generators[index]
+            if seed is not None or generator is None:
+                generator, _ = seeding.np_random(seed)
+                self._generators[index] = generator
+            chosen.append(draw_seed(generator) if seed is None else seed)
+        self._take(self._session.reset(indices, chosen))
+        self._reset_episodes(indices)
+
+    def _reset_episodes(self, chosen: list[int]) -> None:
+        self._elapsed[chosen] = 0
+        self._over = self._over.copy()
+        self._over[chosen] = False
+        begun = np.zeros(self.num_envs, np.bool_)
+        begun[chosen] = True
+        self._observations.reset(begun, self._frames)
+        self._begin(begun)
+        for index in chosen:
+            self._paths[index] = None
+
+    def _take(self, answer: StepAnswer) -> None:
+        self._frames, self._results = answer.frames, answer.results
+        if self._session.settings.truth:
+            self._truths = self._session.truth(answer)
+
+    def _outcome(
+        self, flown: NDArray[np.bool_], rewards: NDArray[np.float64]
+    ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """What `step` returns; worlds that began an episode in this step earned nothing."""
+        rewards = np.where(flown, rewards, 0.0)
+        terminations = flown & (self._results["terminated"] != 0)
+        truncations = flown & (self._results["truncated"] != 0)
+        if self._max_steps is not None:
+            truncations |= flown & (self._elapsed >= self._max_steps)
+        over = terminations | truncations
+        infos: dict[str, Any] = {}
+        if self._mode is AutoresetMode.SAME_STEP and over.any():
+            infos = self._final(over)
+            self._restart(np.flatnonzero(over).tolist(), [None] * self.num_envs)
+        else:
+            self._over = over
+        infos |= self._infos(np.ones(self.num_envs, np.bool_))
+        return self._seen(), rewards, terminations, truncations, infos
+
+    def _final(self, over: NDArray[np.bool_]) -> dict[str, Any]:
+        """The last observations and infos of episodes that end in this step."""
+        observations = np.full(self.num_envs, None, dtype=object)
+        seen = self._observations.all(self._frames.copy(), self._robots())
+        for index in np.flatnonzero(over).tolist():
+            observations[index] = of_world(seen, index)
+        return {
+            "final_obs": observations,
+            "_final_obs": over.copy(),
+            "final_info": self._infos(over),
+            "_final_info": over.copy(),
+        }
+
+    def _infos(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
+        """The infos of some worlds, zero for the others, as Gymnasium stacks them."""
+        infos: dict[str, Any] = {}
+        for name in REPORTED:
+            infos[name] = np.where(mask, self._results[name], 0).astype(np.int64)
+            infos[f"_{name}"] = mask.copy()
+        if self._truths is not None and self._reveals:
+            infos["truth"] = np.where(mask[:, np.newaxis, np.newaxis], self._truths, np.uint8(0))
+            infos["_truth"] = mask.copy()
+        return infos
+
+    def _seen(self) -> Any:
+        if self.render_mode == "human":
+            self._draw(0)
+        return self._observations.all(self._shown(), self._robots())
+
+    def _shown(self) -> NDArray[np.uint8]:
+        """The frames, which the learner may write to: pictures come from others."""
+        return self._frames if self.render_mode is None else self._frames.copy()
+
+    def _draw(self, index: int) -> Any:
+        row, col = self._robots()[index].tolist()
+        truth = self._truths[index] if self._truths is not None and self._reveals else None
+        return self._views[index].draw(self._frames[index], (row, col), self._paths[index], truth)
+
+    def _check_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int | np.integer):
+            return [int(seed) + index for index in range(self.num_envs)]
+        if not hasattr(seed, "__len__") or len(seed) != self.num_envs:
+            raise InvalidArgumentError(
+                f"seed: expected an integer, None or {self.num_envs} of them, got {seed!r}"
+            )
+        # Checked before any world's generator is replaced.
+        return [None if one is None else as_seed(one) for one in seed]
+
+    def _check_mask(self, mask: Any) -> NDArray[np.bool_]:
+        shape = (self.num_envs,)
+        if mask is None:
+            return np.ones(shape, np.bool_)
+        got = f"{mask.dtype} {mask.shape}" if hasattr(mask, "dtype") else repr(mask.__class__)
+        if got != f"bool {shape}" or not mask.any():
+            raise InvalidArgumentError(
+                f"reset_mask: expected an array {shape} of bool with at least one True, got {got}"
+            )
+        return mask
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[range]:
+    """The runs of consecutive true entries."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False]))))
+    return [range(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]

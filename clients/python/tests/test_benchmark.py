@@ -1,0 +1,203 @@
+"""`emberwatch.benchmark` against `emberwatch-agent compare`."""
+
+import io
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from environments import LIVELY, MOVES, WILDFIRE
+from numpy.typing import NDArray
+from processes import Server
+
+import emberwatch
+from emberwatch import recording
+from emberwatch.benchmark import Row, evaluate, read, summary
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.programs import find
+
+WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 6, "model": LIVELY, "burn_in": 60}
+SCALE: dict[str, Any] = {"seeds": range(3, 7), "steps": 12, "progress": None}
+
+
+def walk(seed: int) -> Callable[[Any], NDArray[np.int64]]:
+    """Random moves in as many worlds as are shown."""
+    rng = np.random.default_rng(seed)
+    return lambda frames: rng.integers(0, 4, len(frames))
+
+
+def compare(
+    *flags: object, seeds: str = "3..7", steps: int = 12
+) -> subprocess.CompletedProcess[str]:
+    command = [find("emberwatch-agent"), "compare", f"--seeds={seeds}", f"--steps={steps}"]
+    command += [str(flag) for flag in flags]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def private(**changes: object) -> list[str]:
+    """The same worlds as flags."""
+    flags = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn-in": 60, **changes}
+    return [f"--{name}={value}" for name, value in flags.items()]
+
+
+def score(path: Path | None = None, name: str = "mine", **changes: Any) -> list[Row]:
+    keywords = {**WORLDS, **SCALE, "observation": "frame", **changes}
+    return evaluate(walk(0), name=name, csv=path, **keywords)
+
+
+def test_random_moves_score_as_a_random_walk(tmp_path: Path) -> None:
+    rows = score(tmp_path / "mine.csv", seeds=range(1000, 1040), steps=60)
+    flags = ["--policies=random_walk", f"--csv={tmp_path / 'theirs.csv'}"]
+    done = compare(*flags, *private(), seeds="1000..1040", steps=60)
+    assert done.returncode == 0, done.stderr
+    theirs = read(tmp_path / "theirs.csv")
+    assert [row.mean_fire_cells for row in rows] == [row.mean_fire_cells for row in theirs]
+    for value in ("mean_reward", "mean_distinct_cells", "hit_rate"):
+        difference = np.array(
+            [getattr(a, value) - getattr(b, value) for a, b in zip(rows, theirs, strict=True)]
+        )
+        error = difference.std(ddof=1) / len(difference) ** 0.5
+        assert error > 0 and abs(difference.mean()) < 4 * error, value
+
+
+def test_paths_flown_again_score_the_same_to_the_digit(
+    tmp_path: Path, server: Callable[..., Server]
+) -> None:
+    settings = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn_in": 60}
+    running = server(worlds=5, publish_truth="true", coverage="client", **settings)
+    file = tmp_path / "beam.recording"
+    recorder = subprocess.Popen(
+        [find("emberwatch-server"), "record", f"--instance={running.instance}", f"--out={file}"]
+    )
+    try:
+        with emberwatch.connect(running.instance) as client:
+            while not client.status().n_observers:
+                pass
+        csv = tmp_path / "theirs.csv"
+        done = compare("--policies=beam_exploit", f"--instance={running.instance}", f"--csv={csv}")
+        assert done.returncode == 0, done.stderr
+    finally:
+        recorder.terminate()
+        recorder.wait(20)
+    samples = (record.sample for record in recording.read(file))
+    frames = [sample for sample in samples if isinstance(sample, emberwatch.Frame)]
+    paths = {(frame.result.seed, frame.result.step): frame.path for frame in frames}
+    steps = iter(range(1, 13))
+
+    def again(_: Any) -> NDArray[np.int64]:
+        step = next(steps)
+        return np.array([paths[seed, step] for seed in range(3, 7)], np.int64)
+
+    rows = evaluate(again, name="again", env=WILDFIRE, **{**WORLDS, **SCALE})
+    theirs = read(csv)
+    assert len(rows) == len(theirs) == 4
+    for mine, other in zip(rows, theirs, strict=True):
+        for value in (
+            "world_seed",
+            "steps",
+            "mean_reward",
+            "mean_distinct_cells",
+            "hit_rate",
+            "mean_fire_cells",
+            "moves",
+        ):
+            assert getattr(mine, value) == getattr(other, value), value
+
+
+def test_rows_stand_beside_the_ladder(tmp_path: Path) -> None:
+    file, figures = tmp_path / "mine.csv", tmp_path / "figures"
+    score(file)
+    score(file, name="other")
+    flags = ["--policies=random_walk,coverage", "--baseline=coverage", f"--add={file}"]
+    done = compare(*flags, f"--figures={figures}", f"--csv={tmp_path / 'all.csv'}", *private())
+    assert done.returncode == 0, done.stderr
+    assert "| mine " in done.stdout and "| other " in done.stdout
+    assert ">mine<" in (figures / "ladder.svg").read_text()
+    names = {row.policy for row in read(tmp_path / "all.csv")}
+    assert names == {"random_walk", "coverage", "mine", "other"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        (
+            {"seeds": range(3, 6)},
+            "expected worlds [3, 4, 5, 6], as those compared have, got [3, 4, 5]",
+        ),
+        ({"steps": 11}, "expected steps 12, as those compared have, got 11"),
+        ({"n_moves": 5}, "expected moves of a path 6, as those compared have, got 5"),
+        ({"burn_in": 61}, "burning cells of world 3 (model, grid, burn-in)"),
+        ({"width": 8}, "burning cells of world 3 (model, grid, burn-in)"),
+        ({"name": "random_walk"}, 'policy "random_walk": expected a name that no policy compared'),
+    ],
+    ids=str,
+)
+def test_rows_of_other_worlds_are_refused(
+    tmp_path: Path, changes: dict[str, Any], problem: str
+) -> None:
+    file = tmp_path / "mine.csv"
+    score(file, **changes)
+    done = compare("--policies=random_walk", f"--add={file}", *private())
+    assert done.returncode == 1 and problem in done.stderr, done.stderr
+    assert done.stderr.count("--add") == 1
+
+
+@pytest.mark.parametrize("text", ["", "policy,steps\nmine,3\n", "\x00\xff"], ids=repr)
+def test_what_is_no_file_of_rows_is_named(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "mine.csv"
+    file.write_text(text, "latin-1")
+    if text:
+        done = compare("--policies=random_walk", f"--add={file}", *private())
+        assert done.returncode == 1 and f"--add: {file}: " in done.stderr, done.stderr
+    with pytest.raises(InvalidArgumentError, match=r"csv: expected .* to have the columns policy,"):
+        score(file)
+
+
+def test_an_evaluation_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    file, told = tmp_path / "new" / "mine.csv", io.StringIO()
+    whole = score(batch=4)
+    score(file, name="other")
+    first = score(file, seeds=range(3, 5))
+    kept = file.read_bytes()
+    rows = score(file, batch=1, progress=told)
+    assert rows[:2] == first and len(rows) == 4
+    assert [row.mean_fire_cells for row in rows] == [row.mean_fire_cells for row in whole]
+    assert kept != file.read_bytes() and len(read(file)) == 8
+    assert "mine: 4 test worlds" in told.getvalue()
+    # Nothing is left to do: no server is started, the policy is not asked.
+    assert evaluate(lambda _: 1 / 0, name="mine", csv=file, **{**WORLDS, **SCALE}) == rows
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_a_summary_says_which_worlds_are_for_tests() -> None:
+    rows = score(seeds=[3, 5000], steps=2)
+    assert summary(rows).endswith("a step on 2 (1 test) worlds")
+    assert summary(rows[:1]).endswith("+- nan a step on 1 test worlds")
+    assert summary(rows[1:]).endswith("a step on 1 worlds")
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"name": ""}, "name: expected a name for the table, got ''"),
+        ({"seeds": []}, "seeds: expected some, each once"),
+        ({"seeds": [4, 4]}, "seeds: expected some, each once"),
+        ({"seeds": [-1]}, "seed: expected an integer"),
+        ({"steps": 0}, "steps: expected at least 1, got 0"),
+        ({"batch": 0}, "batch: expected at least 1, got 0"),
+        ({"env": "CartPole-v1"}, f"env: expected '{MOVES}' or '{WILDFIRE}', got 'CartPole-v1'"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_evaluated_is_named(changes: dict[str, Any], problem: str) -> None:
+    with pytest.raises(InvalidArgumentError, match=problem):
+        score(**changes)
+    with pytest.raises(InvalidArgumentError, match="policy: expected a function"):
+        evaluate(None, name="mine", **{**WORLDS, **SCALE})
+
+
+def test_a_csv_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InvalidArgumentError, match="csv: expected a file, got the folder"):
+        score(tmp_path)

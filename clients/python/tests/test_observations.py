@@ -1,0 +1,113 @@
+"""The parts of observations: what they show, and that single and vector environments agree."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from environments import LIVELY, MOVES, WILDFIRE, actions, make, serving
+
+from emberwatch.belief import Transition, entropy
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.wrappers import BeliefObservation
+
+#: On the smallest grid that they are meant for.
+SMALL: dict[str, Any] = {"height": 12, "width": 12, "n_moves": 6, "model": "wildfire-small"}
+
+
+def test_an_image_shows_each_value_in_a_channel_of_its_own() -> None:
+    env = make(observation=("frame", "image"))
+    env.reset(seed=3)
+    shown = set[int]()
+    for action in actions(env, 20):
+        frame, image = env.step(action)[0].values()
+        assert image.shape == (7, 5, 4) and set(image.ravel()) == {0, 255}
+        assert (image.sum(axis=2, dtype=int) == 255).all()
+        value = image.argmax(axis=2)
+        assert np.array_equal(np.where(value == 3, 255, value), frame[:, :, 0])
+        shown |= set(value.ravel().tolist())
+    assert shown == {0, 1, 2, 3}
+    env.close()
+
+
+@pytest.mark.parametrize("name", [WILDFIRE, MOVES])
+def test_a_belief_is_what_the_filter_predicts(name: str) -> None:
+    env, filtered = make(name, observation="belief"), BeliefObservation(make(name))
+    seen = [env.reset(seed=5)[0], *(env.step(action)[0] for action in actions(env, 9))]
+    filtered.reset(seed=5)
+    transition = Transition(filtered.unwrapped.model, height=7, width=5)
+    for number, action in enumerate(actions(env, 9), 1):
+        filtered.step(action)
+        predictor = transition.apply(filtered.filter.belief)
+        assert np.array_equal(seen[number], np.rint(255 * predictor.transpose(1, 2, 0)))
+    assert not np.array_equal(seen[0], seen[9])
+    env.close()
+    filtered.close()
+
+
+def test_a_window_shows_the_belief_around_the_robot() -> None:
+    env = make(MOVES, **SMALL, observation=("local", "belief", "visited", "robot"), window=5)
+    seen, _ = env.reset(seed=5)
+    steps = [seen, *(env.step(action)[0] for action in actions(env, 20))]
+    for number, seen in enumerate(steps):
+        local = seen["local"]
+        assert local.shape == (5, 5, 5)
+        belief, visited = seen["belief"] / 255, seen["visited"][:, :, 0]
+        left = 1 - visited / 255
+        maps = np.stack((belief[:, :, 2] * left, entropy(belief.transpose(2, 0, 1)) * left), -1)
+        maps[..., 1] /= np.log(3)
+        margin = ((2, 2), (2, 2))
+        row, col = seen["robot"]
+        window = (slice(row, row + 5), slice(col, col + 5))
+        expected = np.pad(maps, (*margin, (0, 0)))[window]
+        assert np.abs(local[..., :2] / 255 - expected).max() < 0.02
+        assert np.array_equal(local[..., 2], np.pad(visited, margin)[window])
+        assert np.array_equal(
+            local[..., 3], np.pad(0 * visited, margin, constant_values=255)[window]
+        )
+        assert (local[..., 4] == np.rint(255 * (1 - number % 6 / 6))).all()
+    assert len({tuple(seen["robot"]) for seen in steps}) > 3
+    env.close()
+
+
+def test_a_belief_goes_on_where_a_world_is_resumed() -> None:
+    with serving(model=LIVELY) as instance:
+        first = make(instance=instance, observation=("frame", "belief"))
+        first.reset(seed=4)
+        last = first.step(actions(first, 1)[0])[0]
+        first.close()
+        second = make(instance=instance, observation=("frame", "belief"))
+        seen, _ = second.reset(options={"resume": True})
+        # The prior, corrected with the last frame: what came before it is lost.
+        assert np.array_equal(seen["frame"], last["frame"])
+        unseen, _ = second.reset(seed=4)
+        assert not np.array_equal(seen["belief"], unseen["belief"])
+        second.close()
+
+
+@pytest.mark.parametrize("window", [0, 4, -3, 2.5, "5"], ids=repr)
+def test_an_impossible_window_is_named(window: Any) -> None:
+    with pytest.raises(InvalidArgumentError, match="window: expected an odd number from 3 on"):
+        make(MOVES, window=window)
+
+
+def test_a_belief_needs_a_model() -> None:
+    with serving(reveal_model=False) as instance:
+        for part in ("belief", "local"):
+            with pytest.raises(
+                InvalidArgumentError, match="observation: expected a server that reveals its mo"
+            ):
+                make(MOVES, instance=instance, observation=part)
+
+
+@pytest.mark.parametrize("cells", [12, 16, 23, 32])
+def test_fires_live_on_in_small_worlds(cells: int) -> None:
+    keywords = {**SMALL, "height": cells, "width": cells, "n_moves": 1, "burn_in": 1000}
+    worlds = gymnasium.make_vec(WILDFIRE, num_envs=50, max_episode_steps=-1, **keywords)
+    _, infos = worlds.reset(seed=1000)
+    fires = [infos["n_target_cells"]]
+    for _ in range(300):
+        fires.append(worlds.step(np.zeros((50, 1), np.int64))[4]["n_target_cells"])
+    worlds.close()
+    assert (np.array(fires) > 0).mean() >= 0.97
+    assert 0.05 < np.mean(fires) / cells**2 < 0.3
