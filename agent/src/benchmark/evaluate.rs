@@ -133,7 +133,9 @@ impl Examinee {
             Ok(registry::agent(&policy, examination.config, task)?)
         };
         let estimator = |kind: &EstimatorKind| match kind {
+            EstimatorKind::Spatial => agent("spatial_beam"),
             EstimatorKind::Learned => agent("learned_beam"),
+            EstimatorKind::LearnedSpatial => agent("learned_spatial_beam"),
             EstimatorKind::Autoencoder => agent("autoencoder_beam"),
             _ => agent("beam_exploit"),
         };

@@ -117,8 +117,8 @@ fn family(group: &Group<'_>) -> usize {
     match group.estimator {
         "truth" | "next_truth" => 4,
         "none" => 0,
-        "known_model" if policy.contains("beam") => 2,
-        "known_model" if !policy.contains("learn") => 1,
+        "known_model" | "spatial_filter" if policy.contains("beam") => 2,
+        "known_model" | "spatial_filter" if !policy.contains("learn") => 1,
         _ => 3,
     }
 }

@@ -1,12 +1,15 @@
 //! Replay in, parameters out, step by step.
 
 use crate::config::{AgentConfig, LearningConfig};
+use crate::estimation::Correlations;
 use crate::estimation::belief::Belief;
 use crate::estimation::parameters::{Dimensions, Parameters, Tables};
 use crate::learning::filter::{Iterates, NotFinite, Trainer, Update};
+use crate::learning::learner::neighbours::Neighbours;
 use crate::learning::replay::Replay;
 use crate::learning::reward::{RewardEstimate, met};
 use protocol::{Frame, Shape};
+use std::collections::BTreeMap;
 
 /// How checkpoints of this learner call it.
 pub const KIND: &str = "learned_filter";
@@ -18,6 +21,8 @@ pub struct LearnedModel {
     pub tables: Tables,
     /// The state that pays most.
     pub target: usize,
+    /// How much that state of one cell says of its neighbours'.
+    pub correlations: Correlations,
 }
 
 /// The state of learning.
@@ -29,6 +34,8 @@ pub struct Progress {
     pub reward: RewardEstimate,
     /// World steps seen, of all worlds together.
     pub world_steps: u64,
+    /// How much cells say of their neighbours.
+    pub neighbours: Neighbours,
 }
 
 /// Learns from frames as they come.
@@ -42,6 +49,9 @@ pub struct Learner {
     pub(super) world_steps: u64,
     /// Updates that steps have earned and that are not made yet.
     pub(super) owed: f64,
+    pub(super) neighbours: Neighbours,
+    /// Beliefs before the next frames, by world.
+    predictors: BTreeMap<u32, Belief>,
 }
 
 impl Learner {
@@ -52,6 +62,7 @@ impl Learner {
             iterates,
             reward,
             world_steps,
+            neighbours,
         } = progress;
         let block = learning.window * learning.block_windows;
         Self {
@@ -62,12 +73,15 @@ impl Learner {
             config: learning,
             world_steps,
             owed: 0.0,
+            neighbours,
+            predictors: BTreeMap::new(),
         }
     }
 
     /// A world's track begins, for the first time or again.
     pub fn begin(&mut self, world: u32) {
         self.replay.begin(world);
+        self.neighbours.begin(world, self.shape.n_cells());
     }
 
     /// Whether a world's track was begun.
@@ -80,11 +94,17 @@ impl Learner {
         if self.replay.wants_belief(world) {
             self.replay.give_belief(world, predictor.as_slice());
         }
+        self.predictors.insert(world, predictor.clone());
     }
 
     /// A world's next frame.
     pub fn see(&mut self, world: u32, frame: &Frame) {
         self.replay.push(world, frame);
+        let LearnedModel { tables, target, .. } = self.learned();
+        let learned = (&tables.likelihood_array(), target);
+        let predictor = self.predictors.remove(&world);
+        self.neighbours
+            .see(world, frame, predictor.as_ref(), learned);
     }
 
     /// The reward of a path that visited some cells, with the belief after its frame.
@@ -116,11 +136,13 @@ impl Learner {
         self.replay = Replay::new(block, learning.replay_frames);
         self.trainer.leave_replay();
         self.owed = 0.0;
+        self.neighbours.forget_worlds();
     }
 
     /// What is known by now.
     pub fn learned(&self) -> LearnedModel {
-        learned(&self.trainer.iterates().parameters, &self.reward)
+        let parameters = &self.trainer.iterates().parameters;
+        learned(parameters, &self.reward, &self.neighbours)
     }
 
     /// World steps seen, of all worlds together.
@@ -141,17 +163,23 @@ impl Progress {
             iterates: Iterates::first(Parameters::first(dimensions, seed)),
             reward: RewardEstimate::new(dimensions.n_states),
             world_steps: 0,
+            neighbours: Neighbours::default(),
         }
     }
 
     /// What is known by then.
     pub fn learned(&self) -> LearnedModel {
-        learned(&self.iterates.parameters, &self.reward)
+        learned(&self.iterates.parameters, &self.reward, &self.neighbours)
     }
 }
 
-fn learned(parameters: &Parameters, reward: &RewardEstimate) -> LearnedModel {
+fn learned(
+    parameters: &Parameters,
+    reward: &RewardEstimate,
+    neighbours: &Neighbours,
+) -> LearnedModel {
     LearnedModel {
+        correlations: neighbours.correlations().clone(),
         tables: parameters.tables(),
         target: reward
             .target()

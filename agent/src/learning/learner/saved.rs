@@ -4,6 +4,7 @@ use crate::config::AgentConfig;
 use crate::estimation::parameters::{Dimensions, Parameters};
 use crate::learning::checkpoint::{Contents, Problem, check, check_counts};
 use crate::learning::filter::{Adam, Iterates, Laps};
+use crate::learning::learner::neighbours::Neighbours;
 use crate::learning::learner::online::{Learner, Progress};
 use crate::learning::replay::Replay;
 use crate::learning::reward::RewardEstimate;
@@ -38,6 +39,8 @@ pub struct SavedLearner {
     pub replay: Replay,
     /// Where the streams are in it.
     pub laps: Laps,
+    /// How much cells say of their neighbours.
+    pub neighbours: Neighbours,
 }
 
 impl Learner {
@@ -67,6 +70,7 @@ impl Learner {
             owed: self.owed,
             replay: self.replay.clone(),
             laps: self.trainer.laps().clone(),
+            neighbours: self.neighbours.clone(),
         }
     }
 
@@ -92,6 +96,8 @@ impl Learner {
             let replay = &mut learner.replay;
             replay.resume(saved.replay, shape, n_states, n_observations)?;
             learner.trainer.resume_laps(saved.laps)?;
+        } else {
+            learner.neighbours.forget_worlds();
         }
         Ok(learner)
     }
@@ -129,6 +135,9 @@ impl SavedLearner {
         let (parameters, first, second) = (parameters?, first?, second?);
         contents.check_squares()?;
         self.reward.check(dimensions.n_states)?;
+        let n_cells = self.shape.n_cells();
+        let (name, expected) = ("neighbours.ages", format!("those of {n_cells} cells"));
+        check(self.neighbours.are_of(n_cells), name, expected, "others")?;
         Ok(Progress {
             iterates: Iterates {
                 parameters,
@@ -140,6 +149,7 @@ impl SavedLearner {
             },
             reward: self.reward.clone(),
             world_steps,
+            neighbours: self.neighbours.clone(),
         })
     }
 }
