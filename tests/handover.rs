@@ -52,6 +52,7 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
     for policy in [
         ["--policy", "beam_exploit"],
         ["--policy", "shooting_explore"],
+        ["--policy", "spatial_beam"],
     ] {
         let server = Server::start(&format!("{FLAGS} {ALL}"));
         let observer = Observer::frames(&server.instance).expect("observe");

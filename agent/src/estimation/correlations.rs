@@ -17,7 +17,7 @@ pub const RADIUS: usize = 4;
 pub const SIDE: usize = 2 * RADIUS + 1;
 
 /// Ranges of ages.
-pub const N_AGES: usize = 8;
+pub(super) const N_AGES: usize = 8;
 
 /// The last age of each range but the last one, steps.
 const LAST_AGES: [u8; N_AGES - 1] = [1, 2, 4, 7, 12, 25, 60];

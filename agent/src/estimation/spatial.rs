@@ -55,14 +55,17 @@ impl SpatialFilter {
         self.spread
             .begin(belief, &self.ages, seen, &self.correlations);
         for index in 0..self.spread.n_seen() {
-            let (cell, observed, prior) = self.spread.prior(index, belief);
-            let innovation = Innovation::of(&prior, likelihood, self.state, observed);
+            let (cell, observed, mut states) = self.spread.prior(index, belief);
+            let innovation = Innovation::of(&states, likelihood, self.state, observed);
             let innovation = innovation.ok_or_else(|| ZeroEvidence {
                 cell,
                 observed,
-                belief: prior.iter().map(|&p| p as f32).collect(),
+                belief: states.iter().map(|&p| p as f32).collect(),
             })?;
-            self.spread.spread(index, innovation);
+            let seen_as = likelihood.column(usize::from(observed));
+            let all = states.iter_mut().zip(seen_as);
+            all.for_each(|(p, b)| *p *= b / innovation.evidence);
+            self.spread.spread(index, &innovation, states);
         }
         self.spread.end(self.filter.belief_mut(), &mut self.ages);
         Ok(())

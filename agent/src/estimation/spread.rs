@@ -4,11 +4,13 @@ use crate::estimation::belief::Belief;
 use crate::estimation::correlations::{AGE_RANGES, Ages, Correlations, RADIUS, SIDE, class};
 use crate::estimation::innovation::Innovation;
 use protocol::{Cell, Shape};
-use std::ops::Range;
 
-/// Nothing is certain of a cell that was not seen: its paying state has at least this probability, and at most one
-/// minus it.
+/// Nothing that neighbours say is certain: after that, the paying state of a cell has at least this probability, and at
+/// most one minus it.
 const LEAST: f32 = 1e-5;
+
+/// Where a patch has the seen cell itself.
+const CENTRE: usize = RADIUS * WIDTH + 2 * RADIUS;
 
 /// The class of each offset, from the upper left one.
 const CLASSES: [[usize; SIDE]; SIDE] = {
@@ -22,8 +24,12 @@ const CLASSES: [[usize; SIDE]; SIDE] = {
     classes
 };
 
-/// Covariances of one seen cell with those around it.
-type Patch = [[f32; SIDE]; SIDE];
+/// Cells of a row of a [`Patch`]: a neighbourhood's, between margins.
+const WIDTH: usize = SIDE + 2 * RADIUS;
+
+/// Covariances of one seen cell with those around it, row by row. Thanks to the margins, two of them that lie some rows
+/// and columns apart are laid over each other by a single offset.
+type Patch = [f32; WIDTH * SIDE];
 
 /// The paying state of all cells during a correction, with a margin of [`RADIUS`] cells that vary with no others.
 #[derive(Debug, Clone)]
@@ -81,9 +87,12 @@ impl Spread {
         for (row, (numbers, ages)) in probability.rows().into_iter().zip(ages).enumerate() {
             let start = self.place(Cell { row, col: 0 });
             self.ages[start..start + ages.len()].copy_from_slice(ages);
-            for (col, &p) in numbers.iter().enumerate() {
-                self.probability[start + col] = p;
-                self.deviation[start + col] = (p * (1.0 - p)).max(0.0).sqrt();
+            let cells = start..start + ages.len();
+            let deviations = self.deviation[cells.clone()].iter_mut();
+            let cells = self.probability[cells].iter_mut().zip(deviations);
+            for ((probability, deviation), &p) in cells.zip(numbers) {
+                *probability = p;
+                *deviation = (p * (1.0 - p)).max(0.0).sqrt();
             }
         }
         let seen = seen.map(|(index, observed)| Seen {
@@ -105,14 +114,18 @@ impl Spread {
         let own = self.deviation[self.place(cell)];
         let age = self.ages[self.place(cell)];
         let table = correlations.of(AGE_RANGES[usize::from(age)]);
-        let mut patch = Patch::default();
-        for (offset, (row, classes)) in patch.iter_mut().zip(&CLASSES).enumerate() {
+        let mut patch = [0.0; WIDTH * SIDE];
+        let rows = patch.chunks_exact_mut(WIDTH);
+        for (offset, (row, classes)) in rows.zip(&CLASSES).enumerate() {
             let start = self.corner(cell) + offset * self.stride;
             let others = start..start + SIDE;
             let deviations = &self.deviation[others.clone()];
             let ages = &self.ages[others];
-            for (((to, class), deviation), &age) in
-                row.iter_mut().zip(classes).zip(deviations).zip(ages)
+            for (((to, class), deviation), &age) in row[RADIUS..]
+                .iter_mut()
+                .zip(classes)
+                .zip(deviations)
+                .zip(ages)
             {
                 *to = table[AGE_RANGES[usize::from(age)]][*class] * deviation * own;
             }
@@ -138,28 +151,32 @@ impl Spread {
         (cell, observed, states)
     }
 
-    /// Corrects the cells around a seen one, and the covariances of those that are still to come.
-    pub fn spread(&mut self, index: usize, innovation: Innovation) {
+    /// Corrects a seen cell and those around it, and the covariances of those that are still to come.
+    pub fn spread(&mut self, index: usize, innovation: &Innovation, posterior: Vec<f64>) {
         let cell = self.seen[index].cell;
         let (corner, place) = (self.corner(cell), self.place(cell));
         let (done, to_come) = self.patches.split_at_mut(index + 1);
         let patch = &mut done[index];
         let own = self.probability[place];
         let gain = (innovation.value / innovation.variance) as f32;
-        let own_variance = patch[RADIUS][RADIUS];
-        for (offset, row) in patch.iter_mut().enumerate() {
+        let own_variance = patch[CENTRE];
+        for (offset, row) in patch.chunks_exact_mut(WIDTH).enumerate() {
+            // What others left there is of no cell.
+            row[..RADIUS].fill(0.0);
+            row[RADIUS + SIDE..].fill(0.0);
             let start = corner + offset * self.stride;
             let others = &mut self.probability[start..start + SIDE];
-            for (covariance, p) in row.iter_mut().zip(others) {
+            for (covariance, p) in row[RADIUS..].iter_mut().zip(others) {
                 // Both paying is at most as likely as either, and at least what their sum exceeds one by.
                 let both = *p * own;
                 let least = (*p + own - 1.0).max(0.0) - both;
                 *covariance = covariance.max(least).min(p.min(own) - both);
-                *p = (*p + *covariance * gain).clamp(LEAST, 1.0 - LEAST);
+                let moved = (*p + *covariance * gain).clamp(LEAST, 1.0 - LEAST);
+                *p = if *covariance == 0.0 { *p } else { moved };
             }
         }
-        patch[RADIUS][RADIUS] = own_variance;
-        self.probability[place] = innovation.posterior[self.state] as f32;
+        patch[CENTRE] = own_variance;
+        self.probability[place] = posterior[self.state] as f32;
         let share = -innovation.reduction / innovation.variance.powi(2);
         for (seen, other) in self.seen[index + 1..].iter().zip(to_come) {
             let down = seen.cell.row as isize - cell.row as isize;
@@ -168,7 +185,7 @@ impl Spread {
                 reduce(other, patch, share, (down, across));
             }
         }
-        self.seen[index].posterior = innovation.posterior;
+        self.seen[index].posterior = posterior;
     }
 
     /// Ends a correction: writes it into the belief and the ages that it began with.
@@ -220,21 +237,11 @@ fn set_state(cell: &mut [f32], n_cells: usize, state: usize, probability: f32) {
 
 /// Takes off a patch what was learned of its cells from another one, which lies `down` and `across` before it.
 fn reduce(patch: &mut Patch, seen: &Patch, share: f64, (down, across): (isize, isize)) {
-    let covariance = seen[(RADIUS as isize + down) as usize][(RADIUS as isize + across) as usize];
+    let offset = down * WIDTH as isize + across;
+    let covariance = seen[CENTRE.wrapping_add_signed(offset)];
     let factor = (share * f64::from(covariance)) as f32;
-    let (rows, from_rows) = overlap(down);
-    let (cols, from_cols) = overlap(across);
-    for (row, from) in patch[rows].iter_mut().zip(&seen[from_rows]) {
-        let pairs = row[cols.clone()].iter_mut().zip(&from[from_cols.clone()]);
-        pairs.for_each(|(to, from)| *to += factor * from);
-    }
-}
-
-/// Where two neighbourhoods overlap, of which one begins `offset` after the other: in the one, and in the other.
-fn overlap(offset: isize) -> (Range<usize>, Range<usize>) {
-    let distance = offset.unsigned_abs();
-    match offset < 0 {
-        true => (distance..SIDE, 0..SIDE - distance),
-        false => (0..SIDE - distance, distance..SIDE),
+    let (skip, skip_seen) = ((-offset).max(0) as usize, offset.max(0) as usize);
+    for (to, from) in patch[skip..].iter_mut().zip(&seen[skip_seen..]) {
+        *to += factor * from;
     }
 }
