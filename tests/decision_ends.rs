@@ -1,16 +1,14 @@
 //! How agents that serve decisions begin, keep their world and end; and learners that are killed.
 
-use crate::harness::{PATIENCE, Program, SMALL, Server, eventually, takeover};
+use crate::harness::{PATIENCE, Program, SMALL, Server, eventually, new_instance, takeover};
 use crate::learner::{Learner, refusal, reply_to, start_agent, start_with_learner};
 use crate::wire::control_header;
 use agent::acting::decider::{Assignment, Decider};
-use agent::acting::error::RunError;
 use agent::acting::run::prepare;
 use agent::config::AgentConfig;
 use agent::planning::policy::PlannerKind;
-use agent::server::client::{Claim, Client, shape_of};
+use agent::server::client::{self, Claim, Client, shape_of};
 use protocol::channels::{ChannelError, Instance};
-use protocol::connection::ConnectionError;
 use protocol::decisions::{Reply, Request};
 use protocol::message::Status;
 use rustix::process::Signal;
@@ -58,17 +56,9 @@ fn an_agent_renews_its_lease_when_a_third_of_it_has_passed_without_use() {
     assert!(decider.until_renewal(due).is_zero());
     let _thief = Client::acquire(&server.instance, &takeover(0..1)).expect("take over");
     decider.keep_alive(almost).expect("nothing is asked");
-    let lost = decider.keep_alive(due);
-    assert!(
-        matches!(
-            &lost,
-            Err(RunError::Connection(ConnectionError::Refused {
-                status: Status::LeaseLost,
-                ..
-            }))
-        ),
-        "{lost:?}"
-    );
+    let lost = decider.keep_alive(due).expect_err("the lease is lost");
+    let status = client::refusal(&lost).map(|(status, ..)| status);
+    assert_eq!(status, Some(Status::LeaseLost), "{lost:?}");
 }
 
 /// What decides for world 0 in an agent, without what serves it.
@@ -84,6 +74,17 @@ fn attach(server: &Server) -> Decider {
     let shape = shape_of(&info).expect("a grid");
     let prior = task.config.prior(info.burn_in).belief(&model, shape, 0);
     Decider::attach(&task, model, prior.expect("a belief")).expect("attach")
+}
+
+#[test]
+fn an_agent_that_waits_for_a_server_ends_with_the_process_it_watches() {
+    let mut watched = Command::new("sleep").arg("600").spawn().expect("sleep");
+    let flags = format!("--wait 600 --exit-with {}", watched.id());
+    let agent = start_agent(&new_instance(), &flags);
+    agent.wait_for_words("waiting for it", PATIENCE);
+    watched.kill().expect("kill it");
+    watched.wait().expect("its end");
+    assert_eq!(agent.wait(PATIENCE).code, Some(0));
 }
 
 #[test]

@@ -62,9 +62,18 @@ pub struct Ended {
 impl Program {
     /// Starts a program of this workspace.
     pub fn start(name: &str, arguments: &[&str]) -> Self {
+        Self::start_at(&program_path(name), arguments)
+    }
+
+    /// Starts Python with the package, for the lines of a script.
+    pub fn start_python(script: &str) -> Self {
+        Self::start_at(&python(), &["-c", script])
+    }
+
+    fn start_at(program: &Path, arguments: &[&str]) -> Self {
         let folder = TempDir::new().expect("a folder for the program's output");
         let file = |name: &str| File::create(folder.path().join(name)).expect("an output file");
-        let child = Command::new(program_path(name))
+        let child = Command::new(program)
             .args(arguments)
             .stdin(Stdio::null())
             .stdout(file("stdout"))
@@ -388,6 +397,13 @@ pub fn frames_until(
 pub fn repository() -> PathBuf {
     let tests = Path::new(env!("CARGO_MANIFEST_DIR"));
     tests.parent().expect("tests lies in the repository").into()
+}
+
+/// The Python of the tests, which `scripts/test` makes.
+pub fn python() -> PathBuf {
+    let python = repository().join("target/venv/bin/python");
+    assert!(python.exists(), "no {}; run scripts/test", python.display());
+    python
 }
 
 /// The program of a name, as built from the present sources.

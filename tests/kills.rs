@@ -85,7 +85,7 @@ fn kill_in_loop(seed: u64, kills: Kills) -> Left {
             killed.insert(kill_after(server.program, &mut rng, 0..20_000));
         } else {
             connects -= 1;
-            let program = connect(&running.instance, &folder, rng.random_range(0..3));
+            let program = connect(&running.instance, &folder, rng.random_range(0..4));
             killed.insert(kill_after(program, &mut rng, 1..longest / 2));
         }
     }
@@ -93,7 +93,7 @@ fn kill_in_loop(seed: u64, kills: Kills) -> Left {
     Left { instances, killed }
 }
 
-/// A client, an observer, or one that acts.
+/// A client, an observer, one that acts, or a Python client that has been loaded.
 fn connect(instance: &Instance, folder: &TempDir, kind: u32) -> Program {
     let name = instance.name();
     let file = folder.path().join("recording").display().to_string();
@@ -103,7 +103,7 @@ fn connect(instance: &Instance, folder: &TempDir, kind: u32) -> Program {
             let flags = ["record", "--force", "--instance", name, "--out", &file];
             Program::start("emberwatch-server", &flags)
         }
-        _ => {
+        2 => {
             let flags = [
                 "run",
                 "--takeover",
@@ -113,6 +113,15 @@ fn connect(instance: &Instance, folder: &TempDir, kind: u32) -> Program {
                 name,
             ];
             Program::start("emberwatch-agent", &flags)
+        }
+        _ => {
+            let script = format!(
+                "import emberwatch, sys, time; sys.stderr.write('connecting'); sys.stderr.flush(); \
+                 client = emberwatch.connect({name:?}); time.sleep(60)"
+            );
+            let program = Program::start_python(&script);
+            program.wait_for_words("connecting", PATIENCE);
+            program
         }
     }
 }

@@ -1,6 +1,6 @@
 //! The protocol byte by byte through the Python package: `wire_driver.py` sends what it is told.
 
-use crate::harness::{PATIENCE, eventually, repository};
+use crate::harness::{PATIENCE, eventually, python, repository};
 use crate::wire::{ControlAnswer, RawClient, StepAnswer};
 use bytemuck::{AnyBitPattern, NoUninit, bytes_of, pod_read_unaligned};
 use protocol::channels::Instance;
@@ -20,14 +20,14 @@ pub struct PythonWire {
 impl PythonWire {
     /// Opens both channels of an instance, without a handshake.
     pub fn open(instance: &Instance) -> Self {
-        let python = repository().join("target/venv/bin/python");
+        let python = python();
         let driver = repository().join("clients/python/tests/wire_driver.py");
         let mut process = Command::new(&python)
             .args([driver.as_os_str(), instance.name().as_ref()])
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
-            .unwrap_or_else(|error| panic!("{}: {error}; run scripts/test", python.display()));
+            .expect("start the driver");
         Self {
             requests: RefCell::new(process.stdin.take()),
             answers: RefCell::new(BufReader::new(process.stdout.take().expect("piped"))),

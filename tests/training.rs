@@ -4,7 +4,7 @@ use crate::commands::{AGENT, check, check_table};
 use crate::harness::{Ended, Program, SMALL, Server, eventually, fly, run};
 use agent::learning::checkpoint::{self, Contents};
 use agent::learning::learner::KIND;
-use agent::learning::learner::SavedLearner;
+use agent::learning::learner::Learner;
 use agent::learning::student::filter::SavedFilter;
 use protocol::Move;
 use rustix::process::Signal;
@@ -84,7 +84,7 @@ fn agent(words: &str) -> Ended {
     ended
 }
 
-fn learner(contents: &Contents) -> SavedLearner {
+fn learner(contents: &Contents) -> Learner {
     contents.state::<SavedFilter>().expect("its state").learner
 }
 
@@ -202,7 +202,7 @@ fn a_number_that_is_not_finite_ends_training_by_name_with_a_checkpoint() {
     }
     checkpoint::write(&checkpoint, KIND, &contents).expect("written");
     let n_rows = place.rows("out").len();
-    let next = learner(&contents).n_updates + 1;
+    let next = learner(&contents).n_updates() + 1;
     let words = place.words("out", &format!("{WORLDS} --steps 80 --resume"));
     let ended = run(AGENT, &words.split_whitespace().collect::<Vec<_>>(), LIMIT);
     assert_eq!(ended.code, Some(1), "{}", ended.stderr);
@@ -218,7 +218,7 @@ fn a_number_that_is_not_finite_ends_training_by_name_with_a_checkpoint() {
         let tensors = [&contents, &saved].map(|contents| contents.tensors.get(name));
         assert_eq!(tensors[0], tensors[1], "{name}: as before the update");
     }
-    assert_eq!(learner(&saved).n_updates, next - 1);
+    assert_eq!(learner(&saved).n_updates(), next - 1);
     assert!(place.rows("out").len() >= n_rows);
     // It reads back whole: a later run gets as far, and no further.
     check(AGENT, &words, &["likelihood: expected finite numbers"]);

@@ -1,6 +1,6 @@
 //! Time of learning at the paper's size: 64 x 64 cells, 64 moves, 3 states, 16 streams x 16 frames.
 
-use agent::config::LearningConfig;
+use agent::config::AgentConfig;
 use agent::estimation::BayesFilter;
 use agent::estimation::parameters::{Dimensions, Parameters, Tables};
 use agent::learning::filter::Trainer;
@@ -64,7 +64,7 @@ fn updates(c: &mut Criterion) {
             .build();
         let pool = pool.expect("threads");
         let mut replay = replay(is_straight);
-        let mut trainer = Trainer::new(parameters(), shape(), LearningConfig::default(), 0);
+        let mut trainer = Trainer::new(parameters(), shape(), AgentConfig::default().learning, 0);
         let paths = if is_straight {
             "straight flights"
         } else {

@@ -16,12 +16,9 @@ pub use prior::PriorCommand;
 pub use run::RunCommand;
 pub use train::TrainCommand;
 
-use agent::acting::decisions::DecisionsError;
-use agent::acting::error::RunError;
-use agent::learning::train::TrainError;
 use agent::planning::policy;
+use agent::server::client::refusal;
 use protocol::Model;
-use protocol::connection::ConnectionError;
 use protocol::message::Status;
 use std::process::ExitCode;
 
@@ -39,22 +36,8 @@ pub fn policies() -> String {
 
 /// Where results go wrong for a reason that callers may want to tell apart, a code of its own.
 pub fn exit_code(error: &anyhow::Error) -> ExitCode {
-    let served = match error.downcast_ref::<DecisionsError>() {
-        Some(DecisionsError::Run(error)) => Some(error),
-        _ => None,
-    };
-    let connection = match served.or_else(|| error.downcast_ref::<RunError>()) {
-        Some(RunError::Connection(error)) => Some(error),
-        _ => match error.downcast_ref::<TrainError>() {
-            Some(TrainError::Connection(error)) => Some(error),
-            _ => None,
-        },
-    };
-    match connection {
-        Some(ConnectionError::Refused {
-            status: Status::LeaseLost,
-            ..
-        }) => LEASE_LOST.into(),
+    match refusal(error) {
+        Some((Status::LeaseLost, ..)) => LEASE_LOST.into(),
         _ => ExitCode::FAILURE,
     }
 }

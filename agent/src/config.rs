@@ -1,55 +1,50 @@
 //! The agent's settings: defaults or the paper's preset, then a TOML file, then flags.
 
-mod decisions;
-mod error;
-mod learning;
-mod networks;
+mod sections;
 
-pub use decisions::DecisionsConfig;
-pub use error::ConfigError;
-pub use learning::LearningConfig;
-pub use networks::{AutoencoderConfig, DqnConfig, StepSize};
-
-use crate::estimation::Prior;
-use crate::estimation::belief::EntropyKind;
-use crate::planning::beam::DEFAULT_WIDTH;
-use crate::planning::objective::BEAM_BONUS;
-use crate::planning::policy::{PlannerKind, Policy};
-use crate::planning::{
-    BasisKind, BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target,
+pub use sections::{
+    AutoencoderConfig, DecisionsConfig, DqnConfig, LearningConfig, NetworkDqnConfig,
+    ObjectiveConfig, StepSize,
 };
+
+use self::sections::check;
+use crate::estimation::Prior;
+use crate::planning::policy::{PlannerKind, Policy};
+use crate::planning::{BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target};
+use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use protocol::program::read_text;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
+use toml::{Table, Value};
 
-/// Settings of planners and estimators; `config/agent.toml` lists them with their defaults.
+/// Every setting with its default and meaning.
+const DEFAULTS: &str = include_str!("../../config/agent.toml");
+
+/// Where what the authors ran differs: moves clamped after the sum, a uniform first belief, the autoencoder and
+/// the DQN with steps of constant size.
+const PAPER: &str = r#"
+shooting_integration = "clamp_sum"
+prior = "uniform"
+learner = "autoencoder"
+autoencoder.step_size.power = 0.0
+dqn.step_size.power = 0.0
+"#;
+
+/// Settings of planners and estimators; `config/agent.toml` says what each means.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
 pub struct AgentConfig {
-    /// States that beam search keeps, 1 to 10,000.
     pub beam_width: usize,
-    /// Paths that shooting samples, 1 to 1,000,000.
     pub shooting_samples: usize,
-    /// How shooting turns samples into positions: `clamp_each_move` or `clamp_sum`.
     pub shooting_integration: Integration,
-    /// What planners maximise.
-    pub objective: ObjectiveConfig,
-    /// The known-model filter's first belief: `simulated`, `initial` or `uniform`.
     pub prior: PriorKind,
-    /// Worlds simulated for the prior `simulated`, 1 to 10,000.
     pub prior_worlds: usize,
-    /// Seed of planners, of the prior's worlds and of learners.
     pub seed: u64,
-    /// What `train` learns.
     pub learner: LearnerKind,
-    /// How the learned filter learns.
+    pub objective: ObjectiveConfig,
     pub learning: LearningConfig,
-    /// How the autoencoder learns.
     pub autoencoder: AutoencoderConfig,
-    /// How the DQN learns.
-    pub dqn: DqnConfig,
-    /// How the DQN over actions of beam search learns.
+    pub dqn: NetworkDqnConfig,
     pub decisions: DecisionsConfig,
 }
 
@@ -63,23 +58,6 @@ pub enum LearnerKind {
     Autoencoder,
     /// A DQN that chooses among actions of beam search on the known model's belief
     Decisions,
-}
-
-/// What planners maximise besides the target that a policy's name says (paper eqs. 13 to 15).
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ObjectiveConfig {
-    /// Shooting's bonus for each distinct cell, 0 to 1000.
-    pub shooting_bonus: f32,
-    /// Beam search's bonus for each distinct cell, 0 to 1000.
-    pub beam_bonus: f32,
-    /// Entropy as the `mean` (the authors' code) or the `sum` (the paper) of its terms.
-    pub entropy: EntropyKind,
-    /// Whether a cell's value counts at every visit (the paper as printed).
-    pub revisits: bool,
-    /// Paths are planned on the `predictor` `u_{k+1}` (the authors' code) or the `estimate` `p_k` (the
-    /// paper).
-    pub belief: BasisKind,
 }
 
 /// The known-model filter's first belief.
@@ -128,75 +106,44 @@ pub struct AgentFlags {
 
 impl Default for AgentConfig {
     fn default() -> Self {
-        Self {
-            beam_width: DEFAULT_WIDTH,
-            shooting_samples: 2048,
-            shooting_integration: Integration::ClampEachMove,
-            objective: ObjectiveConfig::default(),
-            prior: PriorKind::Simulated,
-            prior_worlds: 64,
-            seed: 0,
-            learner: LearnerKind::Filter,
-            learning: LearningConfig::default(),
-            autoencoder: AutoencoderConfig::default(),
-            dqn: DqnConfig::default(),
-            decisions: DecisionsConfig::default(),
-        }
-    }
-}
-
-impl Default for ObjectiveConfig {
-    fn default() -> Self {
-        Self {
-            shooting_bonus: 1.0,
-            beam_bonus: BEAM_BONUS,
-            entropy: EntropyKind::Mean,
-            revisits: false,
-            belief: BasisKind::Predictor,
-        }
+        Self::from_toml("").expect("invariant: the defaults are settings")
     }
 }
 
 impl AgentConfig {
-    /// What the authors ran: moves clamped after the sum, a uniform first belief, the autoencoder and the
-    /// DQN with steps of constant size.
+    /// What the authors ran.
     pub fn paper() -> Self {
-        Self {
-            shooting_integration: Integration::ClampSum,
-            prior: PriorKind::Uniform,
-            learner: LearnerKind::Autoencoder,
-            autoencoder: AutoencoderConfig::paper(),
-            dqn: DqnConfig::paper(),
-            ..Self::default()
-        }
+        Self::from_toml(PAPER).expect("invariant: the preset is settings")
+    }
+
+    /// The defaults, and a text's settings in their place.
+    ///
+    /// # Errors
+    /// Names the first setting that is unknown or out of its range.
+    pub fn from_toml(text: &str) -> Result<Self> {
+        let mut settings: Table = DEFAULTS.parse()?;
+        replace(&mut settings, text.parse()?, "")?;
+        let config: Self = settings.try_into()?;
+        config.check()?;
+        Ok(config)
     }
 
     /// Checks every setting.
     ///
     /// # Errors
-    /// [`ConfigError::Range`] names the first setting that is wrong.
-    pub fn check(self) -> Result<Self, ConfigError> {
-        in_range("beam_width", self.beam_width, 10_000)?;
-        in_range("shooting_samples", self.shooting_samples, 1_000_000)?;
-        in_range("prior_worlds", self.prior_worlds, 10_000)?;
-        let ObjectiveConfig {
-            shooting_bonus,
-            beam_bonus,
-            ..
-        } = self.objective;
-        for (setting, got) in [
-            ("shooting_bonus", shooting_bonus),
-            ("beam_bonus", beam_bonus),
-        ] {
-            if !(0.0..=1000.0).contains(&got) {
-                return Err(ConfigError::Bonus { setting, got });
-            }
-        }
+    /// Names the first that is out of its range.
+    pub fn check(&self) -> Result<()> {
+        let ranges = [
+            ("beam_width", self.beam_width as f64, 1.0, 1e4),
+            ("shooting_samples", self.shooting_samples as f64, 1.0, 1e6),
+            ("prior_worlds", self.prior_worlds as f64, 1.0, 1e4),
+        ];
+        check("", &ranges)?;
+        self.objective.check()?;
         self.learning.check()?;
         self.autoencoder.check()?;
         self.dqn.check()?;
-        self.decisions.check()?;
-        Ok(self)
+        self.decisions.check()
     }
 
     /// The prior for a server with this burn-in.
@@ -250,19 +197,13 @@ impl AgentConfig {
 
 impl AgentFlags {
     /// The effective settings.
-    ///
-    /// # Errors
-    /// [`ConfigError`].
-    pub fn effective(&self) -> Result<AgentConfig, ConfigError> {
+    pub fn effective(&self) -> Result<AgentConfig> {
         let mut config = match (&self.config, self.preset) {
             (Some(path), Preset::Default) => read(path)?,
-            (Some(path), Preset::Paper) => {
-                let (path, problem) = (
-                    path.display().to_string(),
-                    "expected no file beside --preset paper".into(),
-                );
-                return Err(ConfigError::File { path, problem });
-            }
+            (Some(path), Preset::Paper) => bail!(
+                "config file {}: expected no file beside --preset paper",
+                path.display()
+            ),
             (None, Preset::Default) => AgentConfig::default(),
             (None, Preset::Paper) => AgentConfig::paper(),
         };
@@ -270,29 +211,29 @@ impl AgentFlags {
         config.shooting_samples = self.shooting_samples.unwrap_or(config.shooting_samples);
         config.prior = self.prior.unwrap_or(config.prior);
         config.seed = self.agent_seed.unwrap_or(config.seed);
-        config.check()
+        config.check()?;
+        Ok(config)
     }
 }
 
-fn read(path: &Path) -> Result<AgentConfig, ConfigError> {
-    let wrong = |problem: String| ConfigError::File {
-        path: path.display().to_string(),
-        problem,
-    };
-    let text = read_text(path).map_err(|error| wrong(error.to_string()))?;
-    toml::from_str(&text).map_err(|error| wrong(error.to_string()))
+fn read(path: &Path) -> Result<AgentConfig> {
+    let text = read_text(path).map_err(anyhow::Error::from);
+    let config = text.and_then(|text| AgentConfig::from_toml(&text));
+    config.with_context(|| format!("config file {}", path.display()))
 }
 
-fn in_range(setting: &'static str, got: usize, most: usize) -> Result<(), ConfigError> {
-    if (1..=most).contains(&got) {
-        return Ok(());
+/// Puts settings in the place of others of the same names.
+fn replace(settings: &mut Table, by: Table, section: &str) -> Result<()> {
+    for (name, value) in by {
+        match (settings.get_mut(&name), value) {
+            (None, _) => bail!("{section}{name}: expected a setting's name"),
+            (Some(Value::Table(settings)), Value::Table(by)) => {
+                replace(settings, by, &format!("{section}{name}."))?;
+            }
+            (Some(setting), value) => *setting = value,
+        }
     }
-    Err(ConfigError::Range {
-        setting,
-        least: 1,
-        most,
-        got,
-    })
+    Ok(())
 }
 
 #[cfg(test)]
@@ -300,20 +241,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_documented_file_holds_the_defaults() {
-        let text = include_str!("../../config/agent.toml");
-        assert_eq!(
-            toml::from_str::<AgentConfig>(text).ok(),
-            Some(AgentConfig::default())
-        );
-        let n_settings = toml::Table::try_from(AgentConfig::default())
-            .expect("serialises")
-            .len();
-        assert_eq!(
-            text.parse::<toml::Table>().expect("TOML").len(),
-            n_settings,
-            "a setting is not listed"
-        );
+    fn settings_take_the_place_of_defaults_and_unknown_ones_are_named() {
+        let config = AgentConfig::from_toml("seed = 3\n[dqn]\nstep_size.rate = 1").expect("valid");
+        assert_eq!((config.seed, config.dqn.step_size.rate), (3, 1.0));
+        assert_eq!(config.dqn.step_size.power, 0.6);
+        let written = toml::to_string(&config).expect("TOML");
+        assert_eq!(AgentConfig::from_toml(&written).expect("valid"), config);
+        let error = AgentConfig::from_toml("[dqn]\ngama = 1").expect_err("no such setting");
+        assert_eq!(error.to_string(), "dqn.gama: expected a setting's name");
     }
 
     #[test]
@@ -364,7 +299,7 @@ mod tests {
                 "unknown variant `h`, expected `after_frame` or `summary`",
             ),
         ] {
-            let error = toml::from_str::<AgentConfig>(text).expect_err("no such name");
+            let error = AgentConfig::from_toml(text).expect_err("no such name");
             assert!(error.to_string().contains(words), "{error}");
         }
     }

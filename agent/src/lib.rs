@@ -9,6 +9,7 @@
 //! - [`rollout`] -- an agent, and the one step that all of these take
 //! - [`server`] -- the ends of the wire
 //! - [`config`] -- settings
+//! - [`file`] -- files written whole or not at all
 //! - [`planning`] -- from a belief to a path
 //! - [`estimation`] -- from frames to a belief
 
@@ -18,6 +19,7 @@ pub mod acting;
 pub mod benchmark;
 pub mod config;
 pub mod estimation;
+pub mod file;
 pub mod learning;
 pub mod planning;
 pub mod rollout;

@@ -12,7 +12,6 @@ pub fn is_drawable(value: f64) -> bool {
 /// Range and ticks of an axis.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Axis {
-    /// Position of each tick, ascending.
     pub ticks: Vec<f64>,
     range: (f64, f64),
     decimals: usize,
@@ -84,7 +83,6 @@ impl Axis {
         (value - first) / (last - first)
     }
 
-    /// Label of a tick.
     pub fn label(&self, tick: f64) -> String {
         let most = self.range.0.abs().max(self.range.1.abs());
         match self.decimals > 6 || most >= 1e7 {

@@ -19,34 +19,26 @@ const VALUE_ROOM: f64 = 200.0;
 /// A page of bars.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ladder {
-    /// Its title.
     pub title: String,
     /// A line of small print under it.
     pub note: String,
-    /// What the values count.
     pub axis: String,
     /// What colours mean; all of them fit on a line.
     pub legend: Vec<(&'static str, Color)>,
-    /// From top to bottom.
     pub bars: Vec<Bar>,
 }
 
 /// A row. What is not finite is not drawn.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bar {
-    /// Its name.
     pub name: String,
     /// What is said behind it, smaller; may be empty.
     pub remark: String,
-    /// The value as text.
     pub label: String,
-    /// Colour of the bar.
     pub color: Color,
-    /// The value.
     pub value: f64,
     /// Its standard error; none where there is none.
     pub error: Option<f64>,
-    /// Each world's seed and value.
     pub worlds: Vec<(u64, f64)>,
 }
 
@@ -60,7 +52,6 @@ struct Plot {
 }
 
 impl Ladder {
-    /// The page as SVG.
     pub fn svg(&self) -> String {
         let plot = Plot::of(&self.bars);
         let mut page = Svg::titled(plot.bottom + BOTTOM, &self.title, &self.note);

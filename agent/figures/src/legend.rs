@@ -7,9 +7,7 @@ use crate::text::TextStyle;
 /// A state or an observation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Named {
-    /// Its name.
     pub name: String,
-    /// Its colour.
     pub color: Color,
 }
 

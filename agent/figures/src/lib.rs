@@ -3,6 +3,11 @@
 //! [`Ladder`] has bars, [`Lines`] curves over one axis, [`Snapshot`] the cells of one step. Each makes a
 //! text; [`png`] turns it into pixels. [`svg`](crate::svg) draws, [`axis`](crate::axis) scales.
 
+#![allow(
+    missing_docs,
+    reason = "for one program: what names say is not said again"
+)]
+
 mod axis;
 mod ladder;
 mod legend;
@@ -19,4 +24,4 @@ pub use legend::Named;
 pub use lines::{Curve, Lines, MOST_CURVES, Panel, Scale, Shade};
 pub use palette::Color;
 pub use raster::{Heat, PngError, heat, png};
-pub use snapshot::{Misfit, Snapshot};
+pub use snapshot::Snapshot;

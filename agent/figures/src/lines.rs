@@ -31,7 +31,6 @@ const SHADE_HEIGHT: f64 = 0.4;
 /// A page of panels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Lines {
-    /// Its title.
     pub title: String,
     /// A line of small print under it.
     pub note: String,
@@ -46,18 +45,15 @@ pub struct Lines {
 pub struct Panel {
     /// What is drawn, with its unit.
     pub title: String,
-    /// How its values are placed.
     pub scale: Scale,
     /// At most [`MOST_CURVES`]; further ones are left out.
     pub curves: Vec<Curve>,
-    /// What lies behind them.
     pub shade: Option<Shade>,
 }
 
 /// How a panel's values are placed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scale {
-    /// As they are, over zero.
     Linear,
     /// By their decimal logarithm; values that have none are left out.
     Logarithmic,
@@ -66,7 +62,6 @@ pub enum Scale {
 /// A named line.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Curve {
-    /// Its name.
     pub name: String,
     /// Its points, from the least x to the greatest; those that are not finite are left out.
     pub points: Vec<(f64, f64)>,
@@ -77,14 +72,11 @@ pub struct Curve {
 /// An area over the axis, on a scale of its own.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shade {
-    /// What it means.
     pub name: String,
-    /// Its upper edge.
     pub points: Vec<(f64, f64)>,
 }
 
 impl Curve {
-    /// A curve without a band.
     pub fn new(name: &str, points: Vec<(f64, f64)>) -> Self {
         Self {
             name: name.into(),
@@ -144,7 +136,6 @@ impl Frame {
         self.left + self.steps.fraction(step) * (self.right - self.left)
     }
 
-    /// The common axis.
     fn draw(&self, page: &mut Svg, y: f64, name: &str) {
         for &tick in &self.steps.ticks {
             let x = self.x(tick);
@@ -224,7 +215,6 @@ impl<'a> Drawn<'a> {
         (!curves.is_empty()).then_some(Self { panel, curves })
     }
 
-    /// Of curves and bands.
     fn points(&self) -> impl Iterator<Item = (f64, f64)> + '_ {
         self.curves.iter().flat_map(|curve| {
             let edges = curve

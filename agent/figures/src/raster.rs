@@ -20,9 +20,6 @@ const MOST_PIXELS_PER_CELL: usize = 16;
 pub struct PngError(String);
 
 /// Turns a page into a PNG file of two pixels a point.
-///
-/// # Errors
-/// If the text is not SVG, or has no size that fits into memory.
 pub fn png(svg: &str) -> Result<Vec<u8>, PngError> {
     let tree = Tree::from_str(svg, &OPTIONS).map_err(|error| PngError(error.to_string()))?;
     let size = tree.size().to_int_size().scale_by(SCALE);
@@ -45,14 +42,10 @@ pub struct Heat {
     pub height: usize,
     /// Width in pixels.
     pub width: usize,
-    /// The file.
     pub png: Vec<u8>,
 }
 
 /// Turns probabilities into a PNG file, light for 0, dark for 1.
-///
-/// # Errors
-/// If the grid has no cell, or more than fit into memory.
 pub fn heat(probabilities: ArrayView2<'_, f32>) -> Result<Heat, PngError> {
     let (height, width) = probabilities.dim();
     let side = LEAST_SIDE.div_ceil(height.min(width).max(1));

@@ -19,11 +19,8 @@ pub type Run = (Point, usize);
 /// Where a text's horizontal position lies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Align {
-    /// At its start.
     Left,
-    /// In its middle.
     Center,
-    /// At its end.
     Right,
 }
 
@@ -61,7 +58,6 @@ impl Svg {
         page
     }
 
-    /// The text of the file.
     pub fn finish(self) -> String {
         self.body + "</svg>\n"
     }
@@ -94,7 +90,6 @@ impl Svg {
         self.rectangle((left, top), (right, bottom), color);
     }
 
-    /// A line through points.
     pub fn line(&mut self, points: &[Point], width: f64, color: Color) {
         if points.len() > 1 {
             self.add(format_args!(
@@ -112,7 +107,6 @@ impl Svg {
         ));
     }
 
-    /// Fills a disc.
     pub fn disc(&mut self, (x, y): Point, radius: f64, color: Color) {
         let (x, y) = (short(x), short(y));
         self.add(format_args!(
@@ -120,7 +114,6 @@ impl Svg {
         ));
     }
 
-    /// Fills squares of one colour.
     pub fn squares(&mut self, runs: &[Run], side: f64, color: Color) {
         let mut path = String::new();
         for &((x, y), n) in runs {

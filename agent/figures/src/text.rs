@@ -30,11 +30,8 @@ pub static OPTIONS: LazyLock<Options<'static>> = LazyLock::new(|| {
 /// How a text looks.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TextStyle {
-    /// Points per em.
     pub size: f64,
-    /// Whether it is bold.
     pub is_bold: bool,
-    /// Colour.
     pub color: Color,
 }
 
@@ -56,7 +53,6 @@ impl TextStyle {
         }
     }
 
-    /// The same in another colour.
     pub fn colored(self, color: Color) -> Self {
         Self { color, ..self }
     }

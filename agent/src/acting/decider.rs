@@ -2,7 +2,6 @@
 //!
 //! What [`crate::acting::run`] does with an objective of its own, one step at a time.
 
-use crate::acting::error::RunError;
 use crate::acting::handover::{leave, resume};
 use crate::acting::registry::{self, Task};
 use crate::acting::run::show;
@@ -14,8 +13,9 @@ use crate::planning::Objective;
 use crate::planning::policy::{PlannerKind, Policy};
 use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Seen};
-use crate::server::client::{Claim, Client, Observation};
+use crate::server::client::{Client, Observation};
 use crate::server::feed::Feed;
+use anyhow::Result;
 use protocol::Model;
 use protocol::channels::Instance;
 use protocol::control::WorldSeed;
@@ -30,14 +30,12 @@ const RENEW_AFTER: u32 = 3;
 /// Which world to decide for, and how.
 #[derive(Debug, Clone)]
 pub struct Assignment {
-    /// The server.
     pub instance: Instance,
     pub world: u32,
     /// Take the world from its holder.
     pub takeover: bool,
     /// What plans: beam search or shooting.
     pub planner: PlannerKind,
-    /// Settings of planners and estimators.
     pub config: AgentConfig,
 }
 
@@ -57,19 +55,11 @@ pub struct Decider {
 
 impl Decider {
     /// Acquires the world where it stands and takes in its last frame.
-    ///
-    /// # Errors
-    /// [`RunError`]; a refusal names the holder of a world that is taken.
-    pub fn attach(task: &Assignment, model: Model, prior: Belief) -> Result<Self, RunError> {
-        let claim = Claim {
-            worlds: task.world..task.world + 1,
-            takeover: task.takeover,
-            time_to_live: None,
-        };
-        let mut client = Client::acquire(&task.instance, &claim)?;
+    pub fn attach(task: &Assignment, model: Model, prior: Belief) -> Result<Self> {
+        let (mut client, observation) =
+            Client::acquire_one(&task.instance, task.world, task.takeover)?;
         let last_use = Instant::now();
         let choices = Policy::choices(task.planner, &model);
-        let observation = observe(&mut client)?;
         let agent = agent(
             &client,
             &model,
@@ -99,7 +89,6 @@ impl Decider {
         })
     }
 
-    /// What it says of itself.
     pub fn info(&self) -> &AgentInfo {
         &self.info
     }
@@ -112,12 +101,12 @@ impl Decider {
     /// Starts a new episode with a new belief.
     ///
     /// # Errors
-    /// [`RunError`]; after a refusal everything is as it was.
-    pub fn reset(&mut self, seed: Option<u64>) -> Result<&Decision, RunError> {
+    /// After a refusal everything is as it was.
+    pub fn reset(&mut self, seed: Option<u64>) -> Result<&Decision> {
         let world = self.client.worlds().start;
         self.client.reset(&[WorldSeed { world, seed }])?;
         self.last_use = Instant::now();
-        let observation = observe(&mut self.client)?;
+        let observation = self.client.observe(self.client.worlds())?.remove(0);
         let agent = agent(
             &self.client,
             &self.model,
@@ -137,8 +126,8 @@ impl Decider {
     /// One step of the rollout, for an objective; `None` if there is no such objective.
     ///
     /// # Errors
-    /// [`RunError`]; after a refusal everything is as it was.
-    pub fn decide(&mut self, objective: u64) -> Result<Option<&Decision>, RunError> {
+    /// After a refusal everything is as it was.
+    pub fn decide(&mut self, objective: u64) -> Result<Option<&Decision>> {
         let Some(target) = self.objective(objective) else {
             return Ok(None);
         };
@@ -151,7 +140,7 @@ impl Decider {
                 let observation = self.client.step(world..world + 1, paths)?.remove(0);
                 self.last_use = Instant::now();
                 let truth = None;
-                Ok::<_, RunError>(vec![Seen { observation, truth }])
+                anyhow::Ok(vec![Seen { observation, truth }])
             },
             |_, robot, _| {
                 show(&mut self.feed, world, robot, false);
@@ -169,10 +158,7 @@ impl Decider {
     }
 
     /// Checks that the server lives; renews the lease if it is time.
-    ///
-    /// # Errors
-    /// [`RunError::Connection`]: the server is gone, or the lease is lost.
-    pub fn keep_alive(&mut self, now: Instant) -> Result<(), RunError> {
+    pub fn keep_alive(&mut self, now: Instant) -> Result<()> {
         self.client.check_server()?;
         if self.until_renewal(now).is_zero() {
             self.client.renew()?;
@@ -186,8 +172,7 @@ impl Decider {
         self.client.server_process()
     }
 
-    /// Gives the world back.
-    pub fn release(mut self) -> Result<(), RunError> {
+    pub fn release(mut self) -> Result<()> {
         leave(&mut self.client, &self.robot)?;
         Ok(self.client.release()?)
     }
@@ -198,10 +183,6 @@ impl Decider {
     }
 }
 
-fn observe(client: &mut Client) -> Result<Observation, RunError> {
-    Ok(client.observe(client.worlds())?.remove(0))
-}
-
 /// An agent before its first frame.
 fn agent(
     client: &Client,
@@ -210,7 +191,7 @@ fn agent(
     config: &AgentConfig,
     choices: &[Policy],
     observation: &Observation,
-) -> Result<Agent, RunError> {
+) -> Result<Agent> {
     let task = Task {
         model,
         shape: client.shape(),
@@ -220,7 +201,7 @@ fn agent(
         learned: &Learned::default(),
     };
     // Any choice will do: each has the same estimator and planner.
-    Ok(registry::agent(&choices[0], config, task)?)
+    registry::agent(&choices[0], config, task)
 }
 
 fn decision(robot: &Robot, client: &Client, objective: Option<u64>) -> Decision {

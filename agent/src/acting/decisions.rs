@@ -4,59 +4,40 @@
 //! alive. Without the world there is nothing to serve, so a lost lease or a server that ends is the end.
 
 use crate::acting::decider::{Assignment, Decider};
-use crate::acting::error::{RunError, is_outage};
 use crate::acting::run::prepare;
 use crate::estimation::first_belief::first_belief;
-use crate::server::client::shape_of;
+use crate::server::client::{is_outage, refusal, shape_of};
+use anyhow::Result;
 use protocol::Model;
 use protocol::channels::{ChannelError, ipc_error};
-use protocol::connection::ConnectionError;
 use protocol::control::parse;
 use protocol::decisions::{Reply, Request};
 use protocol::message::{Status, VERSION};
 use protocol::program::WatchedProcess;
-use protocol::responder::{ActiveControl, Responder, ResponderError, wait_until_taken};
+use protocol::responder::{ActiveControl, Responder, wait_until_taken};
 use protocol::wait::{Waiter, sleep_until_event};
 use std::cell::Cell;
 use std::fmt::Display;
 use std::os::fd::BorrowedFd;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-use thiserror::Error;
 
 /// How often to look around without being asked: bounds how late a signal is noticed.
 const TICK: Duration = Duration::from_millis(250);
 
-/// Why no decisions are served any more, or none in the first place.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum DecisionsError {
-    /// The world, the server or the model; a lost lease too.
-    #[error(transparent)]
-    Run(#[from] RunError),
-    /// The place of the one that answers could not be taken.
-    #[error(transparent)]
-    Responder(#[from] ResponderError),
-    #[error(transparent)]
-    Channel(#[from] ChannelError),
-}
-
-/// Serves until `stop` is set, a client asks to shut down, or the keeper ends; then
+/// Serves until `stop` is set, a client asks to shut down, or the process `exit_with` ends; then
 /// releases the world. `model` is for servers that do not reveal theirs.
-///
-/// # Errors
-/// [`DecisionsError`]; those who wait for an answer are refused first.
 pub fn serve_decisions(
     task: &Assignment,
     model: Option<&Model>,
-    keeper: Option<WatchedProcess>,
+    exit_with: Option<WatchedProcess>,
     stop: &AtomicBool,
-) -> Result<(), DecisionsError> {
-    let mut service = Service::start(task, model, keeper)?;
+) -> Result<()> {
+    let mut service = Service::start(task, model, exit_with)?;
     match service.serve(stop) {
         Ok(asked) => service.stop(asked),
         Err(error) => {
-            service.desk.refuse_everybody(&ending(&error));
+            service.desk.refuse_everybody(&reply_to(&error));
             Err(error)
         }
     }
@@ -65,7 +46,7 @@ pub fn serve_decisions(
 struct Service {
     desk: Desk,
     decider: Decider,
-    keeper: Option<WatchedProcess>,
+    exit_with: Option<WatchedProcess>,
     waiter: Waiter,
     last_look: Instant,
 }
@@ -77,30 +58,17 @@ struct Desk {
     answered: Vec<ActiveControl>,
 }
 
-/// What came of waiting.
-enum Found {
-    Request(ActiveControl),
-    /// A wake-up without a request, or a death.
-    Event,
-}
-
-/// How a request is answered.
-enum Answer {
-    Reply(Reply),
-    Shutdown,
-}
-
 impl Service {
     fn start(
         task: &Assignment,
         model: Option<&Model>,
-        keeper: Option<WatchedProcess>,
-    ) -> Result<Self, DecisionsError> {
+        exit_with: Option<WatchedProcess>,
+    ) -> Result<Self> {
         // What takes long is done before anybody can ask and before the lease begins to run.
         let (info, model) = prepare(&task.instance, task.world, model)?;
-        let shape = shape_of(&info).map_err(RunError::from)?;
+        let shape = shape_of(&info)?;
         let prior = task.config.prior(info.burn_in);
-        let prior = first_belief(prior, &model, shape, task.config.seed).map_err(RunError::from)?;
+        let prior = first_belief(prior, &model, shape, task.config.seed)?;
         let responder = Responder::open(&task.instance, task.world)?;
         let decider = Decider::attach(task, model, prior)?;
         let (instance, pid) = (task.instance.name(), std::process::id());
@@ -119,24 +87,24 @@ impl Service {
                 answered: Vec::new(),
             },
             decider,
-            keeper,
+            exit_with,
             waiter: Waiter::default(),
             last_look: Instant::now(),
         })
     }
 
     /// Serves to the end; returns the request that asked for it, if it was one.
-    fn serve(&mut self, stop: &AtomicBool) -> Result<Option<ActiveControl>, DecisionsError> {
-        while !stop.load(Ordering::Relaxed) && !self.keeper_has_ended() {
+    fn serve(&mut self, stop: &AtomicBool) -> Result<Option<ActiveControl>> {
+        while !stop.load(Ordering::Relaxed) && !self.watched_has_ended() {
             if let Some(request) = self.wait()? {
                 match self.handle(&request) {
-                    Ok(Answer::Reply(reply)) => self.desk.answer(&request, &reply),
-                    Ok(Answer::Shutdown) => return Ok(Some(request)),
+                    Ok(Some(reply)) => self.desk.answer(&request, &reply),
+                    Ok(None) => return Ok(Some(request)),
                     Err(error) => {
-                        self.desk.answer(&request, &refusal(&error));
+                        self.desk.answer(&request, &reply_to(&error));
                         if is_the_end(&error) {
                             self.desk.answered.push(request);
-                            return Err(error.into());
+                            return Err(error);
                         }
                     }
                 }
@@ -151,24 +119,23 @@ impl Service {
     }
 
     /// The next request; `None` after a while or an event.
-    fn wait(&mut self) -> Result<Option<ActiveControl>, DecisionsError> {
+    fn wait(&mut self) -> Result<Option<ActiveControl>> {
         let woken = Cell::new(false);
         let tick = TICK.min(self.decider.until_renewal(Instant::now()));
         let look = || match self.desk.responder.receive() {
-            Some(request) => Ok(Some(Found::Request(request))),
-            None => Ok(woken.get().then_some(Found::Event)),
+            Some(request) => Ok(Some(Some(request))),
+            // A wake-up without a request, or a death.
+            None => Ok(woken.get().then_some(None)),
         };
         let found = self.waiter.wait(tick, look, |limit| {
             woken.set(self.sleep(limit)?);
             Ok::<_, ChannelError>(())
         })?;
-        match found {
-            Some(Found::Request(request)) => Ok(Some(request)),
-            Some(Found::Event) | None => {
-                self.decider.keep_alive(Instant::now())?;
-                Ok(None)
-            }
+        let request = found.flatten();
+        if request.is_none() {
+            self.decider.keep_alive(Instant::now())?;
         }
+        Ok(request)
     }
 
     /// Sleeps until a wake-up, a signal or a death; returns whether there was one.
@@ -180,15 +147,16 @@ impl Service {
             self.desk.responder.descriptor(),
             self.decider.server_process(),
         ];
-        let keeper = self.keeper.iter().map(WatchedProcess::descriptor);
-        let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(keeper).collect();
+        let exit_with = self.exit_with.iter().map(WatchedProcess::descriptor);
+        let descriptors: Vec<BorrowedFd<'_>> = own.into_iter().chain(exit_with).collect();
         sleep_until_event(&descriptors, limit).map_err(ipc_error("sleep"))
     }
 
-    fn handle(&mut self, request: &ActiveControl) -> Result<Answer, RunError> {
+    /// The reply; `None` to a request to shut down.
+    fn handle(&mut self, request: &ActiveControl) -> Result<Option<Reply>> {
         let version = request.user_header().version;
         if version != VERSION {
-            return Ok(Answer::Reply(mismatch(version)));
+            return Ok(Some(mismatch(version)));
         }
         let reply = match parse(request.payload()) {
             Err(message) => error_reply(Status::Malformed, 0, message),
@@ -204,12 +172,12 @@ impl Service {
             }
             Ok(Request::Decide { objective }) => self.decide(objective)?,
             Ok(Request::Last {}) => Reply::Decision(self.decider.last().clone()),
-            Ok(Request::Shutdown {}) => return Ok(Answer::Shutdown),
+            Ok(Request::Shutdown {}) => return Ok(None),
         };
-        Ok(Answer::Reply(reply))
+        Ok(Some(reply))
     }
 
-    fn decide(&mut self, objective: u64) -> Result<Reply, RunError> {
+    fn decide(&mut self, objective: u64) -> Result<Reply> {
         if let Some(decision) = self.decider.decide(objective)? {
             let decision = decision.clone();
             tracing::debug!(
@@ -227,7 +195,7 @@ impl Service {
     }
 
     /// Releases the world, then answers the client that asked for it.
-    fn stop(self, asked: Option<ActiveControl>) -> Result<(), DecisionsError> {
+    fn stop(self, asked: Option<ActiveControl>) -> Result<()> {
         let Self {
             mut desk, decider, ..
         } = self;
@@ -239,13 +207,15 @@ impl Service {
         let told = because("it was told to stop");
         desk.refuse_everybody(&error_reply(Status::AgentEnds, 0, told));
         match released {
-            Err(error) if !is_outage(&error) => Err(error.into()),
+            Err(error) if !is_outage(&error) => Err(error),
             _ => Ok(()),
         }
     }
 
-    fn keeper_has_ended(&self) -> bool {
-        self.keeper.as_ref().is_some_and(WatchedProcess::has_ended)
+    fn watched_has_ended(&self) -> bool {
+        self.exit_with
+            .as_ref()
+            .is_some_and(WatchedProcess::has_ended)
     }
 }
 
@@ -268,32 +238,16 @@ impl Desk {
 }
 
 /// Refusals of the server pass through; whatever else fails ends the agent.
-fn refusal(error: &RunError) -> Reply {
-    match error {
-        RunError::Connection(ConnectionError::Refused {
-            status,
-            detail,
-            message,
-        }) => error_reply(*status, *detail, message.clone()),
-        other => error_reply(Status::AgentEnds, 0, because(other)),
-    }
-}
-
-/// The refusal of everybody who asks when the agent ends early.
-fn ending(error: &DecisionsError) -> Reply {
-    match error {
-        DecisionsError::Run(error) => refusal(error),
-        other => error_reply(Status::AgentEnds, 0, because(other)),
+fn reply_to(error: &anyhow::Error) -> Reply {
+    match refusal(error) {
+        Some((status, detail, message)) => error_reply(status, detail, message.into()),
+        None => error_reply(Status::AgentEnds, 0, because(error)),
     }
 }
 
 /// Whether the agent cannot go on after an error.
-fn is_the_end(error: &RunError) -> bool {
-    !matches!(
-        error,
-        RunError::Connection(ConnectionError::Refused { status, .. })
-            if !matches!(status, Status::LeaseLost | Status::NoLease)
-    )
+fn is_the_end(error: &anyhow::Error) -> bool {
+    refusal(error).is_none_or(|(status, ..)| matches!(status, Status::LeaseLost | Status::NoLease))
 }
 
 fn because(reason: impl Display) -> String {

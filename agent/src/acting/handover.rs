@@ -1,9 +1,9 @@
 //! How an agent goes on with what another believed: from the belief that it left with the server, or
 //! else from the frames that the server keeps.
 
-use crate::acting::error::RunError;
 use crate::rollout::Robot;
 use crate::server::client::Client;
+use anyhow::Result;
 use protocol::connection::ConnectionError;
 use protocol::message::Status;
 
@@ -12,7 +12,7 @@ const RENEW_AFTER: u64 = 500;
 
 /// Gives a robot's agent what is known of its world before the present frame; returns whether that frame is in
 /// it already, and the belief about X_{k+1}.
-pub fn resume(client: &mut Client, robot: &mut Robot) -> Result<bool, RunError> {
+pub fn resume(client: &mut Client, robot: &mut Robot) -> Result<bool> {
     if take_over_left(client, robot)? {
         return Ok(true);
     }

@@ -2,7 +2,6 @@
 
 pub mod decider;
 pub mod decisions;
-pub mod error;
 pub mod handover;
 pub mod registry;
 pub mod run;

@@ -4,28 +4,28 @@ use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
 use crate::estimation::truth::{Clairvoyant, Oracle, Unchanged};
 use crate::estimation::{
-    AutoencoderEstimator, BayesFilter, Correlations, Estimator, EstimatorError, SpatialFilter,
+    AutoencoderEstimator, BayesFilter, Correlations, Estimator, SpatialFilter,
 };
-use crate::learning::checkpoint::Problem;
 use crate::learning::learned::Learned;
 use crate::learning::learner::LearnedModel;
-
 use crate::learning::student::decisions::Decisions;
-use crate::learning::student::network::LearnedNetwork;
+use crate::learning::student::network::Progress;
 use crate::planning::policy::{EstimatorKind, Policy};
 use crate::planning::{BasisKind, Objective, PlanBasis};
-use crate::rollout::agent::{Agent, AgentError, Choice, Decider, Setup, numbered_states};
+use crate::rollout::agent::{Agent, Choice, Decider, Setup, numbered_states};
+use anyhow::{Context, Result, ensure};
 use protocol::{Cell, Model, Shape};
 use std::sync::Arc;
+
+/// What a misfit is told of.
+const CHECKPOINT: &str = "checkpoint";
 
 /// What an agent is built for.
 #[derive(Debug, Clone, Copy)]
 pub struct Task<'a> {
     /// The model, for filters and predictions.
     pub model: &'a Model,
-    /// The grid.
     pub shape: Shape,
-    /// Moves in a path.
     pub n_moves: usize,
     /// The belief before the first frame.
     pub prior: &'a Belief,
@@ -36,11 +36,7 @@ pub struct Task<'a> {
 }
 
 /// A policy's agent, before its first frame.
-///
-/// # Errors
-/// For a model that does not fit the grid, and where what the policy needs to have learned is missing or does
-/// not fit the world.
-pub fn agent(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Agent, AgentError> {
+pub fn agent(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Agent> {
     let estimator = estimator(policy, &task)?;
     let state_names = match policy.estimator {
         kind if kind.is_learned() => numbered_states(estimator.belief().n_states()),
@@ -61,8 +57,7 @@ pub fn agent(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Ag
     Ok(agent.with_target(target).with_decider(decider))
 }
 
-/// Where the belief comes from.
-fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>, AgentError> {
+fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>> {
     let prior = task.prior.clone();
     Ok(match policy.estimator {
         EstimatorKind::None => Box::new(Unchanged(prior)),
@@ -90,7 +85,7 @@ fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>, Age
 
 /// What a policy plans on: what the settings say, but where a DQN decides what it was trained with, as
 /// its values are of such paths. Who is told the state that a path will meet plans on that.
-fn basis(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<BasisKind, AgentError> {
+fn basis(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<BasisKind> {
     let learned = task.learned;
     Ok(match policy.estimator {
         EstimatorKind::NextTruth => BasisKind::Predictor,
@@ -99,22 +94,18 @@ fn basis(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<Basis
         }
         _ if policy.is_decided => {
             let contents = present(policy, &learned.decisions, "decisions")?;
-            contents.settings().map_err(unfit)?.objective.belief
+            contents.settings().context(CHECKPOINT)?.objective.belief
         }
         _ => config.objective.belief,
     })
 }
 
 /// The DQN that chooses: the one learned beside the belief, or that of a known model's.
-fn decider(
-    policy: &Policy,
-    task: &Task<'_>,
-    config: &AgentConfig,
-) -> Result<Box<dyn Decider>, AgentError> {
+fn decider(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<Box<dyn Decider>> {
     if policy.estimator != EstimatorKind::Autoencoder {
         let contents = present(policy, &task.learned.decisions, "decisions")?;
         let mut decisions = Decisions::first(task.model, &config.decisions, config.seed);
-        decisions.load(contents).map_err(unfit)?;
+        decisions.load(contents).context(CHECKPOINT)?;
         return Ok(Box::new(decisions));
     }
     let network = present(policy, &task.learned.network, "an autoencoder")?.clone();
@@ -128,7 +119,7 @@ fn decider(
 
 /// The DQN of Algorithm 1.
 struct NetworkDecider {
-    network: Arc<LearnedNetwork>,
+    network: Arc<Progress>,
     objectives: Vec<Objective>,
 }
 
@@ -148,48 +139,47 @@ impl Decider for Decisions {
     }
 }
 
-fn unfit(problem: Problem) -> AgentError {
-    AgentError::Checkpoint(problem.to_string())
-}
-
-fn learned_filter(policy: &Policy, task: &Task<'_>) -> Result<BayesFilter, AgentError> {
+fn learned_filter(policy: &Policy, task: &Task<'_>) -> Result<BayesFilter> {
     let learned: &LearnedModel = present(policy, &task.learned.filter, "a filter")?;
     same_observations(task, learned.tables.dimensions.n_observations)?;
     let prior = learned.tables.prior(task.shape);
     Ok(BayesFilter::learned(&learned.tables, prior))
 }
 
-fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<AutoencoderEstimator, AgentError> {
+fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<AutoencoderEstimator> {
     let learned = present(policy, &task.learned.network, "an autoencoder")?;
     let shape = learned.autoencoder.shape();
     same_observations(task, shape.n_observations)?;
-    if shape.grid != task.shape {
-        let cells = |(height, width): (usize, usize)| format!("{height} x {width}");
-        return Err(AgentError::OtherGrid {
-            expected: cells(task.shape.dim()),
-            got: cells(shape.grid.dim()),
-        });
-    }
-    Ok(AutoencoderEstimator::new(&learned.autoencoder).map_err(EstimatorError::from)?)
+    ensure!(
+        shape.grid == task.shape,
+        "checkpoint: expected a network for {} cells as the world's, got one for {}",
+        task.shape,
+        shape.grid
+    );
+    AutoencoderEstimator::new(&learned.autoencoder).context(CHECKPOINT)
 }
 
-fn present<'a, T>(
-    policy: &Policy,
-    learned: &'a Option<T>,
-    kind: &'static str,
-) -> Result<&'a T, AgentError> {
-    learned.as_ref().ok_or_else(|| AgentError::NeedsCheckpoint {
-        policy: policy.name.clone(),
-        kind,
-    })
+fn present<'a, T>(policy: &Policy, learned: &'a Option<T>, kind: &'static str) -> Result<&'a T> {
+    learned
+        .as_ref()
+        .with_context(|| needs_checkpoint(policy, kind))
 }
 
-fn same_observations(task: &Task<'_>, got: usize) -> Result<(), AgentError> {
+/// The words for a policy that was not given what was learned.
+pub fn needs_checkpoint(policy: &Policy, kind: &str) -> String {
+    format!(
+        "policy {:?} needs what `train` learned: expected --checkpoint FILE of {kind}",
+        policy.name
+    )
+}
+
+fn same_observations(task: &Task<'_>, got: usize) -> Result<()> {
     let expected = task.model.n_observations();
-    match got == expected {
-        true => Ok(()),
-        false => Err(AgentError::OtherObservations { expected, got }),
-    }
+    ensure!(
+        got == expected,
+        "checkpoint: expected {expected} observations as the world's, got {got}"
+    );
+    Ok(())
 }
 
 #[cfg(test)]

@@ -1,6 +1,5 @@
 //! The agent's life on one world: attach, act, reconnect, leave.
 
-use crate::acting::error::{RunError, is_outage};
 use crate::acting::handover::{leave, resume, take_over_left};
 use crate::acting::registry::{self, Task};
 use crate::config::AgentConfig;
@@ -9,13 +8,13 @@ use crate::estimation::belief::Belief;
 use crate::estimation::first_belief::first_belief;
 use crate::learning::learned::Learned;
 use crate::planning::policy::{EstimatorKind, Policy};
-use crate::rollout::agent::AgentError;
 use crate::rollout::{self, Robot, Seen};
 use crate::server::client::{
-    Claim, Client, Observation, RETRY_INTERVAL, is_belief_left, server_info, shape_of,
+    Client, Observation, RETRY_INTERVAL, is_belief_left, is_outage, refusal, server_info, shape_of,
 };
 use crate::server::feed::{Feed, View};
-use crate::server::truth::{TruthError, TruthFeed};
+use crate::server::truth::TruthFeed;
+use anyhow::{Result, bail, ensure};
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::ServerInfo;
@@ -30,10 +29,8 @@ const REPORT_INTERVAL: Duration = Duration::from_secs(2);
 /// What to do on one world.
 #[derive(Debug, Clone)]
 pub struct Mission {
-    /// The server.
     pub instance: Instance,
     pub world: u32,
-    /// The policy's name.
     pub policy: String,
     /// Steps to act for; 0: until stopped.
     pub steps: u64,
@@ -41,7 +38,6 @@ pub struct Mission {
     pub takeover: bool,
     /// The model, where the server does not reveal its own.
     pub model: Option<Model>,
-    /// Settings of planners and estimators.
     pub config: AgentConfig,
     /// What was learned, for policies that act on it.
     pub learned: Learned,
@@ -50,19 +46,15 @@ pub struct Mission {
 /// What a mission did.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Summary {
-    /// Steps acted.
     pub steps: u64,
     /// Sum of their rewards.
     pub reward: f64,
 }
 
 /// Acts until the steps are done or `stop` is set. Waits for a server that ends, however often.
-///
-/// # Errors
-/// [`RunError`]; a lost lease is one.
-pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
+pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
     let (mut summary, mut is_in_step) = (Summary::default(), true);
-    let mut attached = Attached::attach(mission, mission.takeover)?;
+    let mut attached = Attached::attach(mission)?;
     while !stop.load(Ordering::Relaxed) && (mission.steps == 0 || summary.steps < mission.steps) {
         match attached.step(summary.steps + 1 == mission.steps) {
             Ok(reward) => {
@@ -96,7 +88,7 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary, RunError> {
     };
     let released = left.and_then(|()| client.release());
     feed.end();
-    match released.map_err(RunError::from) {
+    match released.map_err(anyhow::Error::from) {
         Err(error) if !is_outage(&error) => Err(error),
         _ => Ok(summary),
     }
@@ -119,19 +111,19 @@ struct Report {
 
 impl Attached {
     /// Acquires the world where it stands and takes in its last frame.
-    fn attach(mission: &Mission, takeover: bool) -> Result<Self, RunError> {
+    fn attach(mission: &Mission) -> Result<Self> {
         let (info, model) = prepare(&mission.instance, mission.world, mission.model.as_ref())?;
         let policy = Policy::named(&mission.policy, &model)?;
-        if policy.estimator == EstimatorKind::NextTruth {
-            return Err(RunError::Clairvoyant {
-                policy: policy.name,
-            });
-        }
+        ensure!(
+            policy.estimator != EstimatorKind::NextTruth,
+            "policy {:?} needs worlds that run one step ahead: only `compare` has them",
+            policy.name
+        );
         let shape = shape_of(&info)?;
         // What takes long is done before the lease begins to run, and not at all where a belief was left.
         let prior = if policy.estimator.knows_model() {
             let any = Belief::from_initial(&model, shape);
-            if let Some(attached) = Self::go_on(mission, takeover, &model, &policy, &any)? {
+            if let Some(attached) = Self::go_on(mission, &model, &policy, &any)? {
                 return Ok(attached);
             }
             mission.config.prior(info.burn_in)
@@ -139,7 +131,7 @@ impl Attached {
             Prior::Initial
         };
         let prior = first_belief(prior, &model, shape, mission.config.seed)?;
-        let mut attached = Self::acquire(mission, takeover, &model, &policy, &prior)?;
+        let mut attached = Self::acquire(mission, &model, &policy, &prior)?;
         if !resume(&mut attached.client, &mut attached.robot)? {
             attached.begin()?;
         }
@@ -149,11 +141,10 @@ impl Attached {
     /// Acquires the world if a belief was left about it, in the place of `any`.
     fn go_on(
         mission: &Mission,
-        takeover: bool,
         model: &Model,
         policy: &Policy,
         any: &Belief,
-    ) -> Result<Option<Self>, RunError> {
+    ) -> Result<Option<Self>> {
         let task = Task {
             model,
             shape: any.shape(),
@@ -169,7 +160,7 @@ impl Attached {
         if !is_belief_left(&mission.instance, mission.world, &kind)? {
             return Ok(None);
         }
-        let mut attached = Self::acquire(mission, takeover, model, policy, any)?;
+        let mut attached = Self::acquire(mission, model, policy, any)?;
         if take_over_left(&mut attached.client, &mut attached.robot)? {
             return Ok(Some(attached));
         }
@@ -179,21 +170,9 @@ impl Attached {
     }
 
     /// Acquires the world for an agent before its first frame.
-    fn acquire(
-        mission: &Mission,
-        takeover: bool,
-        model: &Model,
-        policy: &Policy,
-        prior: &Belief,
-    ) -> Result<Self, RunError> {
-        let worlds = mission.world..mission.world + 1;
-        let claim = Claim {
-            worlds: worlds.clone(),
-            takeover,
-            time_to_live: None,
-        };
-        let mut client = Client::acquire(&mission.instance, &claim)?;
-        let observation = client.observe(worlds)?.remove(0);
+    fn acquire(mission: &Mission, model: &Model, policy: &Policy, prior: &Belief) -> Result<Self> {
+        let (client, observation) =
+            Client::acquire_one(&mission.instance, mission.world, mission.takeover)?;
         let (seed, step) = (observation.result.seed, observation.result.step);
         tracing::info!(
             world = mission.world,
@@ -202,22 +181,17 @@ impl Attached {
             policy = policy.name,
             "acting"
         );
-        let n_moves = client.info().n_moves;
-        let seed = mission.config.planner_seed(seed);
         let task = Task {
             model,
             shape: client.shape(),
-            n_moves,
+            n_moves: client.info().n_moves,
             prior,
-            seed,
+            seed: mission.config.planner_seed(seed),
             learned: &mission.learned,
         };
         let agent = registry::agent(policy, &mission.config, task)?;
-        let truth = if policy.estimator == EstimatorKind::Truth {
-            Some(open_truth(mission, &client)?)
-        } else {
-            None
-        };
+        let is_told = policy.estimator == EstimatorKind::Truth;
+        let truth = is_told.then(|| open_truth(mission, &client)).transpose()?;
         let feed = Feed::open(&mission.instance, agent.belief());
         let report = Report {
             since: Instant::now(),
@@ -232,16 +206,16 @@ impl Attached {
         })
     }
 
-    fn begin(&mut self) -> Result<(), RunError> {
+    fn begin(&mut self) -> Result<()> {
         let truth = self.truth.as_ref();
         let truth = truth_of(truth, &self.client, self.robot.observation())?;
         let (feed, world) = (&mut self.feed, self.client.worlds().start);
         let look = |robot: &Robot| show(feed, world, robot, false);
-        Ok(self.robot.begin(truth.as_ref(), look)?)
+        self.robot.begin(truth.as_ref(), look)
     }
 
     /// One step of the rollout; returns the reward. The last belief is shown in any case.
-    fn step(&mut self, is_last: bool) -> Result<f64, RunError> {
+    fn step(&mut self, is_last: bool) -> Result<f64> {
         let world = self.client.worlds().start;
         rollout::step(
             std::slice::from_mut(&mut self.robot),
@@ -250,7 +224,7 @@ impl Attached {
             |paths| {
                 let observation = self.client.step(world..world + 1, paths)?.remove(0);
                 let truth = truth_of(self.truth.as_ref(), &self.client, &observation)?;
-                Ok::<_, RunError>(vec![Seen { observation, truth }])
+                anyhow::Ok(vec![Seen { observation, truth }])
             },
             |_, robot, _| {
                 show(&mut self.feed, world, robot, is_last);
@@ -266,7 +240,7 @@ fn truth_of(
     feed: Option<&TruthFeed>,
     client: &Client,
     observation: &Observation,
-) -> Result<Option<Grid<u8>>, TruthError> {
+) -> Result<Option<Grid<u8>>> {
     let Some(feed) = feed else {
         return Ok(None);
     };
@@ -314,7 +288,7 @@ pub fn prepare(
     instance: &Instance,
     world: u32,
     model: Option<&Model>,
-) -> Result<(ServerInfo, Model), RunError> {
+) -> Result<(ServerInfo, Model)> {
     let info = server_info(instance)?;
     if world >= info.n_worlds {
         let (status, detail) = (Status::NoSuchWorld, info.n_worlds.into());
@@ -329,45 +303,47 @@ pub fn prepare(
     let revealed = info.model.as_deref().map(Model::from_toml).transpose()?;
     let model = match (model, revealed) {
         (Some(given), Some(revealed)) if *given != revealed => {
-            return Err(RunError::RevealedModel {
-                expected: revealed.file().name.clone(),
-                got: given.file().name.clone(),
-            });
+            bail!(
+                "model: expected the server's own, {:?}, as it reveals it, got another, {:?}",
+                revealed.file().name,
+                given.file().name
+            );
         }
         (Some(given), _) => given.clone(),
         (None, Some(revealed)) => revealed,
-        (None, None) => {
-            let instance = instance.name().into();
-            return Err(RunError::NoModel { instance });
-        }
+        (None, None) => bail!(
+            "instance {:?} does not reveal its model: expected --model FILE",
+            instance.name()
+        ),
     };
     let (expected, got) = (info.n_observations, model.file().observations.len());
-    if got != expected {
-        return Err(RunError::OtherModel { expected, got });
-    }
+    ensure!(
+        got == expected,
+        "model: expected the server's {expected} observations, got {got}"
+    );
     Ok((info, model))
 }
 
-fn open_truth(mission: &Mission, client: &Client) -> Result<TruthFeed, RunError> {
-    if client.info().publish_truth {
-        return Ok(TruthFeed::open(&mission.instance, client.shape())?);
-    }
-    Err(AgentError::NeedsTruth {
-        policy: mission.policy.clone(),
-    }
-    .into())
+fn open_truth(mission: &Mission, client: &Client) -> Result<TruthFeed> {
+    ensure!(
+        client.info().publish_truth,
+        "policy {:?} needs the truth channel: start the server with --publish-truth",
+        mission.policy
+    );
+    TruthFeed::open(&mission.instance, client.shape())
 }
 
 /// Attaches to a server that has come back; `None` if it is time to stop.
-fn attach_again(mission: &Mission, stop: &AtomicBool) -> Result<Option<Attached>, RunError> {
-    let mut takeover = false;
+fn attach_again(mission: &Mission, stop: &AtomicBool) -> Result<Option<Attached>> {
+    let mut mission = mission.clone();
+    mission.takeover = false;
     while !stop.load(Ordering::Relaxed) {
-        match Attached::attach(mission, takeover) {
+        match Attached::attach(&mission) {
             Ok(attached) => return Ok(Some(attached)),
             // The server did not end, it paused: our former connection holds the world still.
-            Err(error) if is_own_lease(&error) && !takeover => takeover = true,
+            Err(error) if is_own_lease(&error) && !mission.takeover => mission.takeover = true,
             Err(error) if is_outage(&error) => {
-                takeover = false;
+                mission.takeover = false;
                 std::thread::sleep(RETRY_INTERVAL);
             }
             Err(error) => return Err(error),
@@ -377,11 +353,7 @@ fn attach_again(mission: &Mission, stop: &AtomicBool) -> Result<Option<Attached>
 }
 
 /// Whether a world is taken by this very process.
-fn is_own_lease(error: &RunError) -> bool {
+fn is_own_lease(error: &anyhow::Error) -> bool {
     let own_pid = u64::from(std::process::id());
-    matches!(
-        error,
-        RunError::Connection(ConnectionError::Refused { status: Status::Busy, detail, .. })
-            if *detail == own_pid
-    )
+    refusal(error).is_some_and(|(status, detail, _)| (status, detail) == (Status::Busy, own_pid))
 }

@@ -4,17 +4,21 @@
 //! *scouts* of the same seeds, kept one step ahead for clairvoyant policies (a world does not depend
 //! on the path, so a scout shows the future lawfully); and one *spare*, for full observations.
 
+use crate::acting::registry::{self, Task};
+use crate::config::AgentConfig;
+use crate::estimation::belief::Belief;
+use crate::learning::learned::Learned;
+use crate::planning::policy::Policy;
 use crate::rollout::Seen;
+use crate::rollout::agent::Agent;
 use crate::server::client::{Claim, Client, Observation, server_info};
-use crate::server::truth::{TruthError, TruthFeed};
+use crate::server::truth::TruthFeed;
+use anyhow::{Context, Result, ensure};
 use protocol::channels::Instance;
-use protocol::connection::ConnectionError;
 use protocol::control::{CoverageRule, ServerInfo, WorldSeed};
-use protocol::model::ModelError;
 use protocol::{Grid, Model, Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
-use thiserror::Error;
 
 /// Most main worlds of a batch: with scouts and a spare, their hidden states fit a reader's buffer.
 pub const MAX_BATCH: u32 = 32;
@@ -33,45 +37,17 @@ pub struct Arena {
     spare: Option<u32>,
 }
 
-/// Why worlds cannot be used or went wrong.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum ArenaError {
-    /// The server or the way to it.
-    #[error(transparent)]
-    Connection(#[from] ConnectionError),
-    #[error(transparent)]
-    Truth(#[from] TruthError),
-    /// The model that the server reveals.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// The server is not set up for a comparison.
-    #[error("instance {instance:?}: comparing needs {needs}")]
-    Unfit {
-        instance: String,
-        /// What is missing, and the flag that gives it.
-        needs: String,
-    },
-}
-
 impl Arena {
     /// Acquires up to `n_seeds` main worlds, as many scouts if asked, and a spare if there is one.
-    ///
-    /// # Errors
-    /// [`ArenaError::Unfit`] if the server hides its model or its truth or has too few worlds.
-    pub fn open(instance: &Instance, n_seeds: u32, needs_scouts: bool) -> Result<Self, ArenaError> {
-        let unfit = |needs: String| ArenaError::Unfit {
-            instance: instance.name().into(),
-            needs,
-        };
+    pub fn open(instance: &Instance, n_seeds: u32, needs_scouts: bool) -> Result<Self> {
+        let unfit =
+            |needs: &str| format!("instance {:?}: comparing needs {needs}", instance.name());
         let n_worlds = server_info(instance)?.n_worlds;
         let per_main = if needs_scouts { 2 } else { 1 };
         let n_main = (n_worlds / per_main).min(n_seeds).min(MAX_BATCH);
-        if n_main == 0 {
-            return Err(unfit(format!(
-                "{per_main} worlds for these policies, it has {n_worlds}: --worlds {per_main}"
-            )));
-        }
+        let needs =
+            format!("{per_main} worlds for these policies, it has {n_worlds}: --worlds {per_main}");
+        ensure!(n_main > 0, unfit(&needs));
         let used = n_main * per_main;
         let spare = (n_worlds > used).then_some(used);
         let claim = Claim {
@@ -82,15 +58,12 @@ impl Arena {
         };
         let client = Client::acquire(instance, &claim)?;
         let info = client.info();
-        if !info.publish_truth {
-            return Err(unfit(
-                "the hidden states, for scores: --publish-truth".into(),
-            ));
-        }
-        let model = info
-            .model
-            .as_ref()
-            .ok_or_else(|| unfit("the model, for filters: --reveal-model true".into()))?;
+        ensure!(
+            info.publish_truth,
+            unfit("the hidden states, for scores: --publish-truth")
+        );
+        let model = info.model.as_ref();
+        let model = model.with_context(|| unfit("the model, for filters: --reveal-model true"))?;
         let model = Model::from_toml(model)?;
         let truth = TruthFeed::open(instance, client.shape())?;
         Ok(Self {
@@ -104,12 +77,10 @@ impl Arena {
         })
     }
 
-    /// The server's instance.
     pub fn instance(&self) -> &Instance {
         &self.instance
     }
 
-    /// The main worlds.
     pub fn worlds(&self) -> Range<u32> {
         self.main.clone()
     }
@@ -118,7 +89,6 @@ impl Arena {
         &self.model
     }
 
-    /// The grid.
     pub fn shape(&self) -> Shape {
         self.client.shape()
     }
@@ -135,7 +105,7 @@ impl Arena {
 
     /// Starts the main worlds (and scouts) with these seeds; returns observations and hidden states
     /// at k = 0.
-    pub fn reset(&mut self, seeds: &[u64]) -> Result<Vec<Seen>, ArenaError> {
+    pub fn reset(&mut self, seeds: &[u64]) -> Result<Vec<Seen>> {
         let orders = |first: u32| {
             seeds.iter().zip(first..).map(|(&seed, world)| WorldSeed {
                 world,
@@ -154,12 +124,7 @@ impl Arena {
     }
 
     /// Flies a path in each main world; returns observations and hidden states at `step`.
-    pub fn step(
-        &mut self,
-        seeds: &[u64],
-        paths: &[Vec<Move>],
-        step: u64,
-    ) -> Result<Vec<Seen>, ArenaError> {
+    pub fn step(&mut self, seeds: &[u64], paths: &[Vec<Move>], step: u64) -> Result<Vec<Seen>> {
         let worlds = self.range(&self.main, seeds);
         let observations = self.client.step(worlds.clone(), paths)?;
         let truth = self.truth.states(worlds, seeds, step)?;
@@ -167,20 +132,16 @@ impl Arena {
     }
 
     /// The hidden states at `step` before the main worlds get there, from the scouts.
-    pub fn foresee(&mut self, seeds: &[u64], step: u64) -> Result<Vec<Grid<u8>>, ArenaError> {
+    pub fn foresee(&mut self, seeds: &[u64], step: u64) -> Result<Vec<Grid<u8>>> {
         let worlds = self.range(&self.scouts, seeds);
         let paths = vec![self.any_path(); worlds.len()];
         self.client.step(worlds.clone(), &paths)?;
-        Ok(self.truth.states(worlds, seeds, step)?)
+        self.truth.states(worlds, seeds, step)
     }
 
     /// What a robot that sees every cell would have seen of a seed's world at a step, at least 1;
     /// `None` if the server has no spare world or gives no full frames.
-    pub fn full_observation(
-        &mut self,
-        seed: u64,
-        step: u64,
-    ) -> Result<Option<Grid<u8>>, ArenaError> {
+    pub fn full_observation(&mut self, seed: u64, step: u64) -> Result<Option<Grid<u8>>> {
         let Some(spare) = self
             .spare
             .filter(|_| self.info().coverage != CoverageRule::Path)
@@ -199,6 +160,26 @@ impl Arena {
         Ok(seen
             .first()
             .map(|observation| observation.frame.values().to_owned()))
+    }
+
+    /// A policy's agent for the world of a seed.
+    pub fn agent(
+        &self,
+        policy: &Policy,
+        config: &AgentConfig,
+        prior: &Belief,
+        seed: u64,
+        learned: &Learned,
+    ) -> Result<Agent> {
+        let task = Task {
+            model: &self.model,
+            shape: self.shape(),
+            n_moves: self.info().n_moves,
+            prior,
+            seed: config.planner_seed(seed),
+            learned,
+        };
+        registry::agent(policy, config, task)
     }
 
     fn any_path(&self) -> Vec<Move> {

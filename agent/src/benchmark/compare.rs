@@ -1,24 +1,21 @@
 //! The benchmark: every policy on the same worlds, scored against the hidden states.
 
-use crate::acting::registry::{self, Task};
-use crate::benchmark::arena::{Arena, ArenaError};
-use crate::benchmark::report::PolicyRun;
+use crate::benchmark::arena::Arena;
+use crate::benchmark::report::{PolicyRun, Snapshot};
 use crate::config::AgentConfig;
-use crate::estimation::EstimatorError;
 use crate::estimation::belief::Belief;
 use crate::estimation::first_belief::first_belief;
 use crate::learning::learned::Learned;
 use crate::planning::policy::{EstimatorKind, Policy};
-use crate::rollout::agent::{Agent, AgentError};
+use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Seen, Turn};
 use crate::server::client::Observation;
 use crate::server::feed::{Feed, View};
-use protocol::model::ModelError;
+use anyhow::{Context, Result};
+use protocol::Grid;
 use protocol::path::fly;
-use protocol::{Cell, Frame, Grid};
 use std::ops::Range;
 use std::time::Duration;
-use thiserror::Error;
 
 const SHOWS_TRUTH: &str = "invariant: an arena shows hidden states";
 
@@ -27,11 +24,9 @@ const SHOWS_TRUTH: &str = "invariant: an arena shows hidden states";
 pub struct Comparison {
     /// The policies, in the order of the table.
     pub policies: Vec<Policy>,
-    /// The worlds.
     pub seeds: Range<u64>,
     /// Scored steps of each world.
     pub steps: u64,
-    /// Settings of planners and estimators.
     pub config: AgentConfig,
     /// What was learned, for policies that act on it.
     pub learned: Learned,
@@ -45,36 +40,7 @@ pub struct Results {
     /// Cells in the state that pays most, per step, means over worlds: the same for all policies.
     pub fire_cells: Vec<f32>,
     /// The end of the first world's run of the last policy with a belief of its own.
-    pub moment: Option<Moment>,
-}
-
-/// One world at one step, as a policy saw it.
-#[derive(Debug, Clone)]
-pub struct Moment {
-    /// The world's seed.
-    pub seed: u64,
-    /// Step index k.
-    pub step: u64,
-    /// Hidden states, shape `[H, W]`.
-    pub truth: Grid<u8>,
-    /// What the robot saw.
-    pub frame: Frame,
-    /// The cells of the path, its start first.
-    pub path_cells: Vec<Cell>,
-    /// The posterior after the frame.
-    pub belief: Belief,
-}
-
-/// Why a comparison failed.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum CompareError {
-    #[error(transparent)]
-    Arena(#[from] ArenaError),
-    #[error("policy {policy:?}: {problem}")]
-    Agent { policy: String, problem: AgentError },
-    #[error(transparent)]
-    Model(#[from] ModelError),
+    pub snapshot: Option<Snapshot>,
 }
 
 /// One world's run of one policy.
@@ -82,7 +48,7 @@ struct Run {
     robot: Robot,
     seed: u64,
     tally: Tally,
-    moment: Option<Moment>,
+    snapshot: Option<Snapshot>,
 }
 
 /// Sums over the steps of a run.
@@ -103,14 +69,14 @@ pub fn compare(
     arena: &mut Arena,
     comparison: &Comparison,
     progress: &dyn Fn(&str, u64),
-) -> Result<Results, CompareError> {
+) -> Result<Results> {
     let prior = comparison.config.prior(arena.info().burn_in);
     let prior = first_belief(prior, arena.model(), arena.shape(), comparison.config.seed)?;
     let seeds: Vec<u64> = comparison.seeds.clone().collect();
     let mut results = Results {
         runs: Vec::new(),
         fire_cells: Vec::new(),
-        moment: None,
+        snapshot: None,
     };
     let mut feed = Feed::open(arena.instance(), &prior);
     let game = |policy, seeds| Match {
@@ -123,18 +89,19 @@ pub fn compare(
     for policy in &comparison.policies {
         let game = game(policy, &seeds[..1]);
         let agent = game.agent(arena, seeds[0]);
-        agent.map_err(|problem| game.wrong(problem))?;
+        agent.with_context(|| format!("policy {:?}", policy.name))?;
     }
     for policy in &comparison.policies {
         for batch in seeds.chunks(arena.batch_size()) {
             let game = game(policy, batch);
-            let mut runs = game.play(arena, &mut feed, progress)?;
+            let runs = game.play(arena, &mut feed, progress);
+            let mut runs = runs.with_context(|| format!("policy {:?}", policy.name))?;
             if *policy == comparison.policies[0] {
                 let share = 1.0 / seeds.len() as f32;
                 results.add_fire(share, &runs);
             }
             if batch[0] == comparison.seeds.start {
-                results.moment = runs[0].moment.take().or(results.moment);
+                results.snapshot = runs[0].snapshot.take().or(results.snapshot);
             }
             results
                 .runs
@@ -169,7 +136,7 @@ impl Match<'_> {
         arena: &mut Arena,
         feed: &mut Feed,
         progress: &dyn Fn(&str, u64),
-    ) -> Result<Vec<Run>, CompareError> {
+    ) -> Result<Vec<Run>> {
         let mut runs = self.start(arena)?;
         for step in 0..self.comparison.steps {
             self.step(arena, feed, &mut runs, step)?;
@@ -178,7 +145,7 @@ impl Match<'_> {
         Ok(runs)
     }
 
-    fn start(&self, arena: &mut Arena) -> Result<Vec<Run>, CompareError> {
+    fn start(&self, arena: &mut Arena) -> Result<Vec<Run>> {
         let worlds = arena.reset(self.seeds)?;
         let worlds = self.seeds.iter().zip(worlds);
         let run = |(&seed, seen): (&u64, Seen)| {
@@ -186,30 +153,18 @@ impl Match<'_> {
                 robot: Robot::at(self.agent(arena, seed)?, seen)?,
                 seed,
                 tally: Tally::default(),
-                moment: None,
+                snapshot: None,
             })
         };
-        worlds
-            .map(run)
-            .collect::<Result<_, AgentError>>()
-            .map_err(|problem| self.wrong(problem))
+        worlds.map(run).collect()
     }
 
-    fn step(
-        &self,
-        arena: &mut Arena,
-        feed: &mut Feed,
-        runs: &mut [Run],
-        step: u64,
-    ) -> Result<(), CompareError> {
+    fn step(&self, arena: &mut Arena, feed: &mut Feed, runs: &mut [Run], step: u64) -> Result<()> {
         if self.policy.estimator == EstimatorKind::NextTruth {
             let next = arena.foresee(self.seeds, step + 1)?;
-            let foreseen = runs
-                .iter_mut()
-                .zip(&next)
-                .try_for_each(|(run, next)| run.robot.agent.foresee(next))
-                .map_err(EstimatorError::from);
-            foreseen.map_err(|problem| self.wrong(problem.into()))?;
+            for (run, next) in runs.iter_mut().zip(&next) {
+                run.robot.agent.foresee(next)?;
+            }
         }
         let is_last = step + 1 == self.comparison.steps;
         let target = arena.model().target_state();
@@ -218,11 +173,7 @@ impl Match<'_> {
             runs,
             |run| &mut run.robot,
             |run| run.robot.plan(),
-            |paths| {
-                arena
-                    .step(self.seeds, paths, step + 1)
-                    .map_err(StepError::Arena)
-            },
+            |paths| arena.step(self.seeds, paths, step + 1),
             |index, run, turn| {
                 run.look(turn, target, is_last);
                 if shown.contains(&index) {
@@ -231,43 +182,13 @@ impl Match<'_> {
                 Ok(())
             },
         )
-        .map_err(|error| match error {
-            StepError::Arena(error) => error.into(),
-            StepError::Agent(problem) => self.wrong(problem),
-        })
     }
 
-    fn agent(&self, arena: &Arena, seed: u64) -> Result<Agent, AgentError> {
-        let (model, shape, n_moves) = (arena.model(), arena.shape(), arena.info().n_moves);
-        let seed = self.comparison.config.planner_seed(seed);
-        let task = Task {
-            model,
-            shape,
-            n_moves,
-            prior: self.prior,
-            seed,
-            learned: &self.comparison.learned,
-        };
-        registry::agent(self.policy, &self.comparison.config, task)
-    }
-
-    fn wrong(&self, problem: AgentError) -> CompareError {
-        CompareError::Agent {
-            policy: self.policy.name.clone(),
-            problem,
-        }
-    }
-}
-
-/// Why a step failed.
-enum StepError {
-    Arena(ArenaError),
-    Agent(AgentError),
-}
-
-impl From<AgentError> for StepError {
-    fn from(error: AgentError) -> Self {
-        Self::Agent(error)
+    fn agent(&self, arena: &Arena, seed: u64) -> Result<Agent> {
+        let Comparison {
+            config, learned, ..
+        } = self.comparison;
+        arena.agent(self.policy, config, self.prior, seed, learned)
     }
 }
 
@@ -280,7 +201,7 @@ impl Run {
         self.tally.planning += self.robot.planning();
         self.tally.add(self.robot.observation(), brier);
         if is_last && is_known {
-            self.moment = Some(self.moment(turn));
+            self.snapshot = Some(self.snapshot(turn));
         }
     }
 
@@ -293,13 +214,13 @@ impl Run {
         });
     }
 
-    fn moment(&self, turn: Turn) -> Moment {
+    fn snapshot(&self, turn: Turn) -> Snapshot {
         let (agent, observation) = (&self.robot.agent, self.robot.observation());
         let (shape, start) = (agent.belief().shape(), turn.before.robot());
         let moves = &turn.plan.moves;
         let mut path_cells = vec![start];
         path_cells.extend((1..=moves.len()).map(|n| fly(shape, start, &moves[..n]).end));
-        Moment {
+        Snapshot {
             seed: self.seed,
             step: observation.result.step,
             truth: turn.truth.expect(SHOWS_TRUTH),

@@ -3,68 +3,41 @@
 //! All are fed the same frames, of paths that none of them, or the known-model filter, chose. What
 //! is scored is each frame's log-likelihood per visited cell under the prediction made before it.
 
-use crate::acting::registry::{self, Task};
-use crate::benchmark::arena::{Arena, ArenaError};
+use crate::benchmark::arena::Arena;
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
 use crate::estimation::first_belief::first_belief;
 use crate::estimation::scoring::Score;
 use crate::learning::learned::Learned;
-use crate::planning::policy::{EstimatorKind, Policy, UnknownPolicy};
-use crate::rollout::agent::{Agent, AgentError};
+use crate::planning::policy::{EstimatorKind, Policy};
+use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Seen};
-use protocol::model::ModelError;
+use anyhow::Result;
 use rayon::prelude::*;
 use std::ops::Range;
-use thiserror::Error;
 
 /// What is scored.
 #[derive(Debug, Clone)]
 pub struct Examination<'a> {
-    /// Chooses the paths: its name.
     pub guide: &'a str,
-    /// The worlds.
     pub seeds: Range<u64>,
-    /// Steps of each world.
     pub steps: u64,
-    /// Settings of planners and estimators.
     pub config: &'a AgentConfig,
-    /// Whose predictions.
     pub estimators: &'a [EstimatorKind],
-    /// What was learned.
     pub learned: &'a Learned,
 }
 
 /// Scores on one world.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Marks {
-    /// The world.
     pub seed: u64,
-    /// Of each estimator.
     pub scores: Vec<Score>,
     /// How often each value was seen.
     pub counts: Vec<u64>,
 }
 
-/// Why an examination failed.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum ExaminationError {
-    #[error(transparent)]
-    Arena(#[from] ArenaError),
-    #[error(transparent)]
-    Agent(#[from] AgentError),
-    #[error(transparent)]
-    Policy(#[from] UnknownPolicy),
-    #[error(transparent)]
-    Model(#[from] ModelError),
-}
-
 /// Flies the guide's paths and scores each estimator's prediction of every frame.
-pub fn examine(
-    arena: &mut Arena,
-    examination: &Examination<'_>,
-) -> Result<Vec<Marks>, ExaminationError> {
+pub fn examine(arena: &mut Arena, examination: &Examination<'_>) -> Result<Vec<Marks>> {
     let config = examination.config;
     let prior = config.prior(arena.info().burn_in);
     let prior = first_belief(prior, arena.model(), arena.shape(), config.seed)?;
@@ -80,7 +53,7 @@ pub fn examine(
                 &mut examinees,
                 |examinee| &mut examinee.guide,
                 |examinee| examinee.guide.plan(),
-                |paths| Ok::<_, ExaminationError>(arena.step(batch, paths, step)?),
+                |paths| arena.step(batch, paths, step),
                 |_, _, _| Ok(()),
             )?;
             examinees.par_iter_mut().try_for_each(Examinee::look)?;
@@ -118,19 +91,12 @@ impl Examinee {
         prior: &Belief,
         seed: u64,
         seen: Seen,
-    ) -> Result<Self, ExaminationError> {
+    ) -> Result<Self> {
         let model = arena.model();
-        let agent = |name: &str| -> Result<Agent, ExaminationError> {
-            let task = Task {
-                model,
-                shape: arena.shape(),
-                n_moves: arena.info().n_moves,
-                prior,
-                seed: examination.config.planner_seed(seed),
-                learned: examination.learned,
-            };
+        let agent = |name: &str| -> Result<Agent> {
+            let (config, learned) = (examination.config, examination.learned);
             let policy = Policy::named(name, model)?;
-            Ok(registry::agent(&policy, examination.config, task)?)
+            arena.agent(&policy, config, prior, seed, learned)
         };
         let estimator = |kind: &EstimatorKind| match kind {
             EstimatorKind::Spatial => agent("spatial_beam"),
@@ -154,7 +120,7 @@ impl Examinee {
     }
 
     /// Scores each estimator's prediction of the frame that the guide has seen, then feeds them with it.
-    fn look(&mut self) -> Result<(), AgentError> {
+    fn look(&mut self) -> Result<()> {
         let frame = &self.guide.observation().frame;
         let scores = self.marks.scores.iter_mut().zip(&self.estimators);
         for (sum, agent) in scores {
@@ -166,7 +132,7 @@ impl Examinee {
         self.filter()
     }
 
-    fn filter(&mut self) -> Result<(), AgentError> {
+    fn filter(&mut self) -> Result<()> {
         for agent in &mut self.estimators {
             agent.correct(&self.guide.observation().frame, None)?;
             agent.predict();

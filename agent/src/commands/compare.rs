@@ -2,8 +2,9 @@
 
 use super::shared::{make_folder, make_folder_of, write};
 use super::worlds::WorldFlags;
+use agent::acting::registry::needs_checkpoint;
 use agent::benchmark::arena::Arena;
-use agent::benchmark::compare::{Comparison, Moment, Results, compare};
+use agent::benchmark::compare::{Comparison, Results, compare};
 use agent::benchmark::report::{
     Snapshot, draw_ladder, draw_rewards, draw_snapshot, figures::FIRE_CELLS_PER_STEP, render_table,
     write_csv, write_events,
@@ -11,9 +12,8 @@ use agent::benchmark::report::{
 use agent::config::AgentFlags;
 use agent::learning::learned::Learned;
 use agent::planning::policy::{EstimatorKind, OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, Policy};
-use agent::rollout::agent::AgentError;
 use agent::server::launch::OwnDashboard;
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use network::DeviceKind;
@@ -109,8 +109,8 @@ impl CompareCommand {
             let fire_cells = Some(&*results.fire_cells);
             draw_rewards(&path("rewards"), &results.runs, &label, fire_cells)?;
         }
-        match &results.moment {
-            Some(moment) => draw_moment(&directory.join("snapshot.png"), arena, moment)?,
+        match &results.snapshot {
+            Some(snapshot) => draw_step(&directory.join("snapshot.png"), arena, snapshot)?,
             None => tracing::warn!("no snapshot: no policy among these has a belief of its own"),
         }
         let settings = toml::to_string(&comparison.config)?;
@@ -161,8 +161,7 @@ impl CompareCommand {
                 }
                 _ => continue,
             };
-            let policy = policy.name.clone();
-            return Err(AgentError::NeedsCheckpoint { policy, kind }.into());
+            bail!(needs_checkpoint(policy, kind));
         }
         Ok(policies)
     }
@@ -215,28 +214,17 @@ pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Resu
         bar.inc(steps);
     });
     bar.finish_and_clear();
-    Ok(results?)
+    results
 }
 
-fn draw_moment(path: &Path, arena: &mut Arena, moment: &Moment) -> Result<()> {
-    let Some(observation) = arena.full_observation(moment.seed, moment.step)? else {
+fn draw_step(path: &Path, arena: &mut Arena, snapshot: &Snapshot) -> Result<()> {
+    let Some(observation) = arena.full_observation(snapshot.seed, snapshot.step)? else {
         tracing::warn!(
             "no snapshot: it needs one world more than the seeds and a server with --coverage client"
         );
         return Ok(());
     };
-    let model = arena.model().clone();
-    let snapshot = Snapshot {
-        model: &model,
-        truth: moment.truth.clone(),
-        observation,
-        frame: moment.frame.clone(),
-        path_cells: moment.path_cells.clone(),
-        belief: moment.belief.probabilities(),
-        step: moment.step,
-        seed: moment.seed,
-    };
-    Ok(draw_snapshot(path, &snapshot)?)
+    draw_snapshot(path, arena.model(), snapshot, &observation)
 }
 
 fn axis_label(model: &Model) -> String {

@@ -9,6 +9,7 @@ use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
 use protocol::channels::Instance;
 use protocol::program::{WatchedProcess, stop_on_signals};
+use std::sync::atomic::Ordering::Relaxed;
 
 /// Take decisions for one world from a learner outside.
 #[derive(Args)]
@@ -60,12 +61,14 @@ impl ServeDecisionsCommand {
             },
             config: self.settings.effective()?,
         };
-        let keeper = self.exit_with.map(WatchedProcess::watch).transpose()?;
+        let exit_with = self.exit_with.map(WatchedProcess::watch).transpose()?;
         let stop = stop_on_signals().context("handle signals")?;
-        if !self.wait.for_server(&task.instance, &stop)? {
+        let is_over =
+            || stop.load(Relaxed) || exit_with.as_ref().is_some_and(WatchedProcess::has_ended);
+        if !self.wait.for_server(&task.instance, is_over)? {
             return Ok(());
         }
-        serve_decisions(&task, model.as_ref(), keeper, &stop)?;
+        serve_decisions(&task, model.as_ref(), exit_with, &stop)?;
         tracing::info!("done");
         Ok(())
     }

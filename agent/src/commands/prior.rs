@@ -1,16 +1,14 @@
 //! `prior`: a filter's first belief as a file, for filters in other languages.
 
 use super::shared::model_named;
-use agent::Belief;
 use agent::estimation::Prior;
 use agent::estimation::first_belief::first_belief;
-use anyhow::{Context, Result, ensure};
+use agent::file::{Readers, replace_file};
+use anyhow::{Result, ensure};
 use clap::Args;
 use ndarray_npy::WriteNpyExt;
 use protocol::Shape;
 use rustix::fs::{Access, access};
-use std::ffi::OsString;
-use std::fs::File;
 use std::path::{Path, PathBuf};
 
 /// Write a filter's first belief to a file.
@@ -50,7 +48,9 @@ impl PriorCommand {
             burn_in: self.burn_in,
         };
         let belief = first_belief(prior, &model, shape, self.seed)?;
-        write_whole(&self.out, &belief)?;
+        let mut bytes = Vec::new();
+        belief.probabilities().write_npy(&mut bytes)?;
+        replace_file(&self.out, &bytes, Readers::Any)?;
         let shape = belief.probabilities().shape();
         tracing::info!(?shape, file = %self.out.display(), "written");
         Ok(())
@@ -72,25 +72,6 @@ fn check_place(path: &Path) -> Result<()> {
         "--out: expected a file in a folder that can be written to, got {place}"
     );
     Ok(())
-}
-
-/// Writes to a file beside it, then renames: readers find all or nothing.
-fn write_whole(path: &Path, belief: &Belief) -> Result<()> {
-    let mut name = path.file_name().map_or_else(OsString::new, OsString::from);
-    name.push(format!(".{}", std::process::id()));
-    let beside = folder_of(path).join(name);
-    let written = File::create(&beside)
-        .context("create it")
-        .and_then(|file| {
-            belief.probabilities().write_npy(&file)?;
-            file.sync_all().context("write it")
-        })
-        .and_then(|()| std::fs::rename(&beside, path).context("rename it"));
-    if written.is_err() {
-        // The first error is the one to tell.
-        let _ = std::fs::remove_file(&beside);
-    }
-    written.with_context(|| format!("write {}", path.display()))
 }
 
 fn folder_of(path: &Path) -> &Path {

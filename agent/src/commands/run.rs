@@ -10,6 +10,7 @@ use network::DeviceKind;
 use protocol::channels::Instance;
 use protocol::program::stop_on_signals;
 use std::path::PathBuf;
+use std::sync::atomic::Ordering::Relaxed;
 
 /// Act on one world of a running server.
 #[derive(Args)]
@@ -59,7 +60,10 @@ impl RunCommand {
             learned: Learned::read(self.checkpoint.as_deref(), &self.device.open()?)?,
         };
         let stop = stop_on_signals().context("handle signals")?;
-        if !self.wait.for_server(&mission.instance, &stop)? {
+        if !self
+            .wait
+            .for_server(&mission.instance, || stop.load(Relaxed))?
+        {
             return Ok(());
         }
         let summary = run(&mission, &stop)?;

@@ -8,7 +8,6 @@ use protocol::channels::Instance;
 use protocol::program::read_text;
 use std::io::Write;
 use std::path::Path;
-use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 /// How long to wait for a server.
@@ -20,9 +19,9 @@ pub struct WaitFlag {
 }
 
 impl WaitFlag {
-    /// Waits for the instance's server; returns whether to go on: not if `stop` was set meanwhile.
-    pub fn for_server(&self, instance: &Instance, stop: &AtomicBool) -> Result<bool> {
-        Ok(wait_for_server(instance, self.wait, stop)?)
+    /// Waits for the instance's server; returns whether to go on: not once `is_over`.
+    pub fn for_server(&self, instance: &Instance, is_over: impl Fn() -> bool) -> Result<bool> {
+        Ok(wait_for_server(instance, self.wait, is_over)?)
     }
 }
 

@@ -12,6 +12,7 @@ use network::DeviceKind;
 use protocol::channels::Instance;
 use protocol::program::stop_on_signals;
 use std::path::PathBuf;
+use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
 /// First seed of the worlds to train on; those below are for tests.
@@ -98,7 +99,7 @@ impl TrainCommand {
         };
         let contents = training.check()?;
         let (instance, own) = self.server(n_worlds, learner)?;
-        if own.is_none() && !self.wait.for_server(&instance, &stop)? {
+        if own.is_none() && !self.wait.for_server(&instance, || stop.load(Relaxed))? {
             return Ok(());
         }
         let summary = train(&instance, &training, contents, &stop)?;

@@ -9,7 +9,6 @@ use protocol::channels::Instance;
 use protocol::{Model, Shape};
 use std::ops::Range;
 use std::path::PathBuf;
-use std::sync::atomic::AtomicBool;
 
 /// Most worlds of a comparison.
 const MAX_SEEDS: u64 = 100_000;
@@ -71,7 +70,7 @@ impl WorldFlags {
         let (instance, own) = match &self.instance {
             Some(name) => {
                 let instance = Instance::new(name)?;
-                self.wait.for_server(&instance, &AtomicBool::new(false))?;
+                self.wait.for_server(&instance, || false)?;
                 (instance, None)
             }
             None => {

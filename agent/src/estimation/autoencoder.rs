@@ -20,14 +20,10 @@ pub struct AutoencoderEstimator {
 
 impl AutoencoderEstimator {
     /// Before the first frame.
-    ///
-    /// # Errors
-    /// Where the network's device fails.
     pub fn new(network: &Autoencoder) -> Result<Self, NetworkError> {
         Ok(Self::at(network, Follower::new(network)?))
     }
 
-    /// Where another follower was.
     pub fn at(network: &Autoencoder, follower: Follower) -> Self {
         Self {
             network: network.shared(),
@@ -78,9 +74,6 @@ fn estimate(
 }
 
 /// `P(y | x)` of a network, shape `[S, O]`.
-///
-/// # Errors
-/// As the network's device.
 pub fn likelihood(autoencoder: &Autoencoder) -> Result<Array2<f64>, NetworkError> {
     let shape = autoencoder.shape();
     let matrix = autoencoder.observation_matrix()?;

@@ -11,9 +11,7 @@ use thiserror::Error;
     "frame: cell {cell}: expected an observation that the belief {belief:?} allows, got {observed}"
 )]
 pub struct ZeroEvidence {
-    /// The first such cell.
     pub cell: Cell,
-    /// The value observed there.
     pub observed: u8,
     /// The belief about the cell, one probability per state.
     pub belief: Vec<f32>,

@@ -63,9 +63,6 @@ impl Belief {
     }
 
     /// Certainty about given states, shape `[H, W]`: what an oracle believes.
-    ///
-    /// # Errors
-    /// [`BeliefError`] for a state that is not below `n_states`.
     pub fn from_states(states: &Grid<u8>, n_states: usize) -> Result<Self, BeliefError> {
         let (height, width) = states.dim();
         let shape = Shape::new(height, width)?;
@@ -90,9 +87,6 @@ impl Belief {
     }
 
     /// Checks probabilities of shape `[S, H, W]`, such as a network's.
-    ///
-    /// # Errors
-    /// [`BeliefError`] names the first cell that is no distribution.
     pub fn from_probabilities(probabilities: Probabilities) -> Result<Self, BeliefError> {
         let (_, height, width) = probabilities.dim();
         let shape = Shape::new(height, width)?;
@@ -138,12 +132,10 @@ impl Belief {
         Self::from_probabilities(probabilities).ok()
     }
 
-    /// The grid.
     pub fn shape(&self) -> Shape {
         self.shape
     }
 
-    /// Number of states S.
     pub fn n_states(&self) -> usize {
         self.probabilities.dim().0
     }

@@ -16,7 +16,6 @@ pub enum DqnInput {
 }
 
 impl DqnInput {
-    /// Its name in settings.
     pub fn label(self) -> &'static str {
         match self {
             Self::AfterFrame => "after_frame",

@@ -26,9 +26,6 @@ pub trait Estimator: Send {
     fn belief(&self) -> &Belief;
 
     /// Takes in the state X_{k+1} that the next path will meet, where somebody knows it.
-    ///
-    /// # Errors
-    /// [`BeliefError`] for states that the model does not have.
     fn foresee(&mut self, _next: &Grid<u8>) -> Result<(), BeliefError> {
         Ok(())
     }
@@ -56,9 +53,6 @@ pub trait Estimator: Send {
     }
 
     /// How well the belief predicts a frame; `None` of estimators that predict none.
-    ///
-    /// # Errors
-    /// Where a network's device fails.
     fn score(&self, _frame: &Frame) -> Result<Option<Score>, EstimatorError> {
         Ok(None)
     }
@@ -85,6 +79,6 @@ pub enum EstimatorError {
     #[error("hidden states: {0}")]
     Belief(#[from] BeliefError),
     /// An upper bound that is not told the hidden states.
-    #[error("expected the hidden states, got none")]
+    #[error("the policy needs the truth channel: start the server with --publish-truth")]
     NoTruth,
 }

@@ -31,9 +31,6 @@ pub struct BayesFilter {
 impl BayesFilter {
     /// A filter of a known model with the predictor `u_0`.
     ///
-    /// # Errors
-    /// [`ModelError`] where the transition could divide by zero on the prior's grid.
-    ///
     /// # Panics
     /// If the prior has another number of states than the model.
     pub fn known(model: &Model, prior: Belief) -> Result<Self, ModelError> {

@@ -9,9 +9,6 @@ use protocol::{Model, Shape};
 const CELLS_PER_SECOND: f64 = 1.2e9;
 
 /// The belief before the first frame, see [`Prior::belief`].
-///
-/// # Errors
-/// [`ModelError`] for a model that cannot be simulated on the grid.
 pub fn first_belief(
     prior: Prior,
     model: &Model,

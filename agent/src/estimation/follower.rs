@@ -16,21 +16,16 @@ pub struct Follower {
 
 impl Follower {
     /// Before the first frame: `h ~ N(0, I)`, the same for a network's seed.
-    ///
-    /// # Errors
-    /// As the network's device.
     pub fn new(network: &Autoencoder) -> Result<Self, NetworkError> {
         let hidden = network.first_hidden();
         let prediction = accepted(network.predict(&hidden)?);
         Ok(Self { hidden, prediction })
     }
 
-    /// Where another follower was.
     pub fn at(hidden: Vec<f32>, prediction: Belief) -> Self {
         Self { hidden, prediction }
     }
 
-    /// The hidden vector.
     pub fn hidden(&self) -> &[f32] {
         &self.hidden
     }

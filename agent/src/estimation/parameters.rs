@@ -5,12 +5,12 @@
 //! by zero.
 
 use crate::estimation::belief::Belief;
+use anyhow::{Result, bail};
 use ndarray::{Array2, NdFloat};
 use protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
 use protocol::randomness::split_mix;
 use protocol::{Model, Shape};
 use serde::{Deserialize, Serialize};
-use thiserror::Error;
 
 /// Largest size of a free number: weights from 1e-7, probabilities from 1e-14 on.
 pub const BOUND: f32 = 16.0;
@@ -30,27 +30,24 @@ const NOISE: f32 = 0.1;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Dimensions {
-    /// Number of states S.
     pub n_states: usize,
-    /// Number of observations O.
     pub n_observations: usize,
     /// Rows and columns of the kernel, odd.
     pub kernel: (usize, usize),
 }
 
 /// The three tensors, in the order of [`Parameters::NAMES`]: free numbers, gradients or moments.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Parameters {
-    /// Their shapes.
     pub dimensions: Dimensions,
     /// `[S, S, KH, KW]`, `[S, O]` and `[S]`, row-major.
+    #[serde(skip)]
     pub tensors: [Vec<f32>; 3],
 }
 
 /// What the free numbers stand for.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tables<T = f32> {
-    /// Their shapes.
     pub dimensions: Dimensions,
     /// `w[to, from, row, col]`.
     pub kernel: Vec<T>,
@@ -60,27 +57,14 @@ pub struct Tables<T = f32> {
     pub initial: Vec<T>,
 }
 
-/// Dimensions that no filter has.
-#[derive(Debug, Error, PartialEq, Eq)]
-#[error("learned filter: {what}: expected {expected}, got {got}")]
-pub struct DimensionsError {
-    what: &'static str,
-    expected: String,
-    got: String,
-}
-
 impl Dimensions {
     /// Checks them against the limits of a model.
-    pub fn check(self) -> Result<Self, DimensionsError> {
+    pub fn check(self) -> Result<Self> {
         let values = 2..=MAX_VALUES;
         let side = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
         let (height, width) = self.kernel;
         let wrong = |what, expected: String, got: String| {
-            Err(DimensionsError {
-                what,
-                expected,
-                got,
-            })
+            bail!("learned filter: {what}: expected {expected}, got {got}")
         };
         let range = format!("2 to {MAX_VALUES}");
         if !values.contains(&self.n_states) {
@@ -107,7 +91,6 @@ impl Dimensions {
         ]
     }
 
-    /// Numbers in each tensor.
     pub fn lengths(&self) -> [usize; 3] {
         self.shapes().map(|shape| shape.iter().product())
     }
@@ -148,7 +131,6 @@ impl Parameters {
         }
     }
 
-    /// Zeros of the same shapes.
     pub fn zeros(dimensions: Dimensions) -> Self {
         let tensors = dimensions.lengths().map(|length| vec![0.0; length]);
         Self {
@@ -157,7 +139,6 @@ impl Parameters {
         }
     }
 
-    /// What these numbers stand for.
     pub fn tables<T: NdFloat>(&self) -> Tables<T> {
         let cast = |value: f64| T::from(value).expect("invariant: f64 casts to T");
         let [kernel, likelihood, initial] = &self.tensors;

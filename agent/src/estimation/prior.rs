@@ -20,7 +20,6 @@ pub enum Prior {
     /// How often each cell of simulated worlds is in each state after burn-in: the best that can be
     /// known before the first frame.
     Simulated {
-        /// Worlds to simulate.
         n_worlds: usize,
         /// Steps from the initial distribution.
         burn_in: u64,
@@ -36,9 +35,6 @@ impl Prior {
     pub const N_WORLDS: usize = 64;
 
     /// The belief before the first frame; `seed` only matters to [`Prior::Simulated`].
-    ///
-    /// # Errors
-    /// [`ModelError`] for a model that cannot be simulated on the grid.
     pub fn belief(self, model: &Model, shape: Shape, seed: u64) -> Result<Belief, ModelError> {
         match self {
             Self::Simulated { n_worlds, burn_in } => {

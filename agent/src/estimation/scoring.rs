@@ -10,7 +10,6 @@ use std::ops::AddAssign;
 pub struct Score {
     /// Sum of `ln P(y)`.
     pub log_likelihood: f64,
-    /// Number of cells.
     pub n_seen: u64,
 }
 

@@ -19,9 +19,6 @@ pub struct Clairvoyant(pub Belief);
 
 impl Oracle {
     /// Before it is told anything.
-    ///
-    /// # Errors
-    /// [`ModelError`] for a model that does not fit the prior's grid.
     pub fn new(model: &Model, prior: Belief) -> Result<Self, ModelError> {
         Ok(Self {
             transition: Transition::new(model, prior.shape())?,

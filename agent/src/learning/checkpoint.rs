@@ -4,25 +4,23 @@
 //! Written beside the file and renamed, so that a reader finds all or nothing. Read whole or refused: the file says
 //! which learner and which format it is of, and a digest tells damage that keeps its form.
 
-mod problem;
-
-pub use self::problem::{
-    CheckpointError, Problem, check, check_belief, check_counts, check_numbers,
-};
-
-use self::problem::MAX_BYTES;
 use crate::config::AgentConfig;
+use crate::estimation::belief::Belief;
+use crate::file::{Readers, replace_file};
 use ::network::NamedTensor;
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use bincode::config::{Configuration, Fixint, LittleEndian};
+use protocol::Shape;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensorError, SafeTensors};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::collections::{BTreeMap, HashMap};
-use std::fs::{File, OpenOptions};
-use std::io::{Read, Write};
-use std::os::unix::fs::OpenOptionsExt;
-use std::path::{Path, PathBuf};
+use std::fmt::Display;
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+use thiserror::Error;
 
 /// Entries of the metadata.
 const KIND: &str = "emberwatch.kind";
@@ -31,7 +29,7 @@ const DIGEST: &str = "emberwatch.digest";
 const SETTINGS: &str = "settings";
 
 /// Changes with what any state holds.
-const VERSION: &str = "1";
+const VERSION: &str = "2";
 
 /// The tensor of bytes.
 const STATE: &str = "state";
@@ -40,10 +38,26 @@ const STATE: &str = "state";
 const FORM: Configuration<LittleEndian, Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
 
+/// Largest file that is written or read, bytes: 200 times what a full replay of 64 x 64 cells and 3
+/// states needs.
+const MAX_BYTES: u64 = 1 << 32;
+
+/// Largest count: far from where one more would not fit.
+const MAX_COUNT: u64 = 1 << 53;
+
+/// The form is right and the numbers are not those that were written.
+#[derive(Debug, Error)]
+#[error("expected contents with digest {expected}, got {got}: the file is damaged")]
+pub struct WrongDigest {
+    /// What the file says.
+    pub expected: String,
+    /// What its contents give.
+    pub got: String,
+}
+
 /// One tensor.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor {
-    /// Its shape.
     pub shape: Vec<usize>,
     /// Its numbers, row-major.
     pub numbers: Vec<f32>,
@@ -52,11 +66,8 @@ pub struct Tensor {
 /// The contents of a checkpoint.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Contents {
-    /// By name.
     pub tensors: BTreeMap<String, Tensor>,
-    /// A learner's other values, encoded.
     pub state: Vec<u8>,
-    /// The effective settings, TOML.
     pub settings: String,
 }
 
@@ -74,17 +85,13 @@ impl Contents {
         contents
     }
 
-    /// Replaces the state.
     pub fn set_state(&mut self, state: &impl Serialize) {
         let state = bincode::serde::encode_to_vec(state, FORM);
         self.state = state.expect("invariant: states hold values and sequences of known length");
     }
 
     /// The state, as a learner's type.
-    ///
-    /// # Errors
-    /// For bytes that are no such state. What its values mean is not checked.
-    pub fn state<S: DeserializeOwned>(&self) -> Result<S, Problem> {
+    pub fn state<S: DeserializeOwned>(&self) -> Result<S> {
         use bincode::serde::decode_from_slice as decode;
         // The limit is part of a type: the smallest one, so that a small file cannot ask for much memory.
         let decoded = match self.state.len() {
@@ -93,31 +100,25 @@ impl Contents {
             _ => decode(&self.state, FORM.with_limit::<{ MAX_BYTES as usize }>()),
         };
         let (state, length) =
-            decoded.map_err(|error| Problem::value(STATE, "that of its learner", error))?;
+            decoded.map_err(|error| wrong(STATE, "that of its learner", error))?;
         let got = self.state.len();
         check(length == got, STATE, format!("{length} bytes"), got)?;
         Ok(state)
     }
 
     /// A tensor's numbers; it must be there, in this shape, with finite numbers.
-    ///
-    /// # Errors
-    /// Names what is wrong with it.
-    pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>, Problem> {
-        let wrong = |got: &str| Problem::value(name, format_args!("shape {expected:?}"), got);
-        let tensor = self.tensors.get(name).ok_or_else(|| wrong("none"))?;
-        if tensor.shape != expected {
-            return Err(wrong(&format!("{:?}", tensor.shape)));
-        }
+    pub fn tensor(&self, name: &str, expected: &[usize]) -> Result<Vec<f32>> {
+        let tensor = self.tensors.get(name);
+        let tensor =
+            tensor.with_context(|| format!("{name}: expected shape {expected:?}, got none"))?;
+        let (shape, got) = (format!("shape {expected:?}"), format!("{:?}", tensor.shape));
+        check(tensor.shape == expected, name, shape, got)?;
         check_numbers(name, &tensor.numbers, expected.iter().product())?;
         Ok(tensor.numbers.clone())
     }
 
     /// Refuses means of squares, whose roots are taken, that are negative.
-    ///
-    /// # Errors
-    /// Names the tensor.
-    pub fn check_squares(&self) -> Result<(), Problem> {
+    pub fn check_squares(&self) -> Result<()> {
         let ends = [".second_moment", "running_var"];
         let is_square = |name: &str| {
             name.contains("adam.second.") || ends.iter().any(|end| name.ends_with(end))
@@ -130,17 +131,11 @@ impl Contents {
     }
 
     /// The settings that it was trained with.
-    ///
-    /// # Errors
-    /// For none, or others than an agent's.
-    pub fn settings(&self) -> Result<AgentConfig, Problem> {
-        let wrong = |got: String| Problem::value(SETTINGS, "those of an agent", got);
-        if self.settings.is_empty() {
-            return Err(wrong("none".into()));
-        }
-        let config: Result<AgentConfig, _> = toml::from_str(&self.settings);
-        let config = config.map_err(|error| wrong(error.to_string()))?;
-        config.check().map_err(|error| wrong(error.to_string()))
+    pub fn settings(&self) -> Result<AgentConfig> {
+        let is_there = !self.settings.is_empty();
+        check(is_there, SETTINGS, "those of an agent", "none")?;
+        let config = AgentConfig::from_toml(&self.settings);
+        config.map_err(|error| wrong(SETTINGS, "those of an agent", error))
     }
 
     /// Against damage, not malice.
@@ -160,54 +155,32 @@ impl Contents {
 ///
 /// # Errors
 /// Where the system refuses; the file is then as it was.
-pub fn write(path: &Path, kind: &'static str, contents: &Contents) -> Result<(), CheckpointError> {
-    let bytes = encode(kind, contents).map_err(|problem| problem.of(path))?;
-    let mut beside = path.as_os_str().to_owned();
-    beside.push(format!(".{}", std::process::id()));
-    let beside = PathBuf::from(beside);
+pub fn write(path: &Path, kind: &'static str, contents: &Contents) -> Result<()> {
+    let of_file = || format!("checkpoint {}", path.display());
+    let bytes = encode(kind, contents).with_context(of_file)?;
     // It holds beliefs about worlds, which are their owner's.
-    let _ = std::fs::remove_file(&beside);
-    let mut options = OpenOptions::new();
-    options.write(true).create_new(true).mode(0o600);
-    let written = options.open(&beside).and_then(|mut file| {
-        file.write_all(&bytes)?;
-        file.sync_all()?;
-        std::fs::rename(&beside, path)
-    });
-    if written.is_err() {
-        // The first error is the one to tell.
-        let _ = std::fs::remove_file(&beside);
-    }
-    written.map_err(|error| Problem::Io(error).of(path))
+    replace_file(path, &bytes, Readers::Owner).with_context(of_file)
 }
 
 /// Reads a checkpoint of one of some kinds, and tells which.
-///
-/// # Errors
-/// Names the file and what is wrong with it.
-pub fn read(
-    path: &Path,
-    kinds: &[&'static str],
-) -> Result<(&'static str, Contents), CheckpointError> {
+pub fn read(path: &Path, kinds: &[&'static str]) -> Result<(&'static str, Contents)> {
     let bytes = || {
         let found = std::fs::metadata(path)?;
-        if !found.is_file() {
-            return Err(Problem::whole("a regular file", "something else"));
-        }
+        ensure!(
+            found.is_file(),
+            "expected a regular file, got something else"
+        );
         check_size(found.len())?;
         let mut bytes = Vec::new();
         File::open(path)?.take(MAX_BYTES).read_to_end(&mut bytes)?;
         Ok(bytes)
     };
     let contents = bytes().and_then(|bytes| decode(kinds, &bytes));
-    contents.map_err(|problem| problem.of(path))
+    contents.with_context(|| format!("checkpoint {}", path.display()))
 }
 
 /// A checkpoint of a kind of learner as bytes.
-///
-/// # Errors
-/// For one that is too large.
-pub fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>, Problem> {
+pub fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>> {
     let tensors = contents.tensors.iter();
     let tensor = |(name, tensor): (&String, &Tensor)| {
         let bytes = little_endian(&tensor.numbers);
@@ -234,10 +207,7 @@ pub fn encode(kind: &'static str, contents: &Contents) -> Result<Vec<u8>, Proble
 }
 
 /// The checkpoint of one of some kinds that bytes are, and which.
-///
-/// # Errors
-/// Names what is wrong with it.
-pub fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Contents), Problem> {
+pub fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Contents)> {
     let file = SafeTensors::deserialize(bytes).map_err(damaged)?;
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(damaged)?;
     let mut texts = metadata.metadata().clone().unwrap_or_default();
@@ -245,8 +215,8 @@ pub fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Con
         .remove(KIND)
         .unwrap_or_else(|| "something else".into());
     let Some(&kind) = kinds.iter().find(|kind| **kind == got) else {
-        let expected = format!("a checkpoint of {}", kinds.join(" or "));
-        return Err(Problem::whole(expected, format_args!("one of {got}")));
+        let kinds = kinds.join(" or ");
+        bail!("expected a checkpoint of {kinds}, got one of {got}");
     };
     let got = texts.remove(FORMAT).unwrap_or_else(|| "none".into());
     check(got == VERSION, FORMAT, VERSION, got)?;
@@ -262,14 +232,12 @@ pub fn decode(kinds: &[&'static str], bytes: &[u8]) -> Result<(&'static str, Con
                 let tensor = Tensor { shape, numbers };
                 contents.tensors.insert(name.into(), tensor);
             }
-            (_, other) => return Err(Problem::value(name, "F32", other)),
+            (_, other) => return Err(wrong(name, "F32", other)),
         }
     }
     let (expected, got) = (texts.remove(DIGEST).unwrap_or_default(), contents.digest());
-    match got == expected {
-        true => Ok((kind, contents)),
-        false => Err(Problem::Digest { expected, got }),
-    }
+    ensure!(got == expected, WrongDigest { expected, got });
+    Ok((kind, contents))
 }
 
 fn little_endian(numbers: &[f32]) -> Vec<u8> {
@@ -277,20 +245,53 @@ fn little_endian(numbers: &[f32]) -> Vec<u8> {
     numbers.flat_map(|number| number.to_le_bytes()).collect()
 }
 
-fn check_size(n_bytes: u64) -> Result<(), Problem> {
+fn check_size(n_bytes: u64) -> Result<()> {
     let expected = format!("at most {MAX_BYTES} bytes");
     check(n_bytes <= MAX_BYTES, "file", expected, n_bytes)
 }
 
-fn damaged(error: SafeTensorError) -> Problem {
-    let got = format!("one that is damaged or cut off: {error}");
-    Problem::whole("a whole safetensors file", got)
+fn damaged(error: SafeTensorError) -> anyhow::Error {
+    anyhow!("expected a whole safetensors file, got one that is damaged or cut off: {error}")
+}
+
+/// Refuses a field that does not fit.
+pub fn check(fits: bool, name: &str, expected: impl Display, got: impl Display) -> Result<()> {
+    ensure!(fits, wrong(name, expected, got));
+    Ok(())
+}
+
+/// What is wrong with a tensor or a field of the state.
+pub fn wrong(name: &str, expected: impl Display, got: impl Display) -> anyhow::Error {
+    anyhow!("{name}: expected {expected}, got {got:#}")
+}
+
+pub fn check_counts(counts: &[(&str, u64)]) -> Result<()> {
+    let expected = format!("at most {MAX_COUNT}");
+    let mut counts = counts.iter();
+    counts.try_for_each(|&(name, count)| check(count <= MAX_COUNT, name, &expected, count))
+}
+
+/// Refuses other than so many finite numbers.
+pub fn check_numbers<T: Copy + Into<f64>>(name: &str, numbers: &[T], length: usize) -> Result<()> {
+    let mut floats = numbers.iter().map(|&number| number.into());
+    let wrong = floats.find(|number: &f64| !number.is_finite());
+    let got = wrong.unwrap_or(numbers.len() as f64);
+    let fits = wrong.is_none() && numbers.len() == length;
+    check(fits, name, format!("{length} finite numbers"), got)
+}
+
+/// Refuses a belief about other states or on another grid.
+pub fn check_belief(name: &str, belief: &Belief, n_states: usize, shape: Shape) -> Result<()> {
+    let expected = format!("{n_states} states on {shape}");
+    let got = format!("{} states on {}", belief.n_states(), belief.shape());
+    check(got == expected, name, &expected, &got)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use std::os::unix::fs::PermissionsExt;
+    use std::path::PathBuf;
 
     type State = (Vec<u64>, Option<String>);
 
@@ -335,7 +336,7 @@ mod tests {
         let read = |bytes: &[u8]| {
             std::fs::write(&path, bytes).expect("written");
             let read = read(&path, &["tests"]).map(|(_, contents)| contents);
-            read.map_err(|error| error.to_string())
+            read.map_err(|error| format!("{error:#}"))
         };
         let check = |bytes: &[u8], what: String| match read(bytes) {
             // Space that pads the header may change without a change of meaning.
@@ -366,9 +367,9 @@ mod tests {
         };
         let words = "expected a checkpoint of others, got one of tests";
         assert_eq!(refused("others", "kernel", "kernel"), words);
-        for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"1""#, "none")] {
-            let words = format!("emberwatch.format: expected 1, got {got}");
-            assert_eq!(refused("tests", r#"format":"1""#, to), words);
+        for (to, got) in [(r#"format":"9""#, "9"), (r#"formar":"2""#, "none")] {
+            let words = format!("emberwatch.format: expected 2, got {got}");
+            assert_eq!(refused("tests", r#"format":"2""#, to), words);
         }
         let got = contents();
         let error = |name, shape: &[usize]| got.tensor(name, shape).expect_err(name).to_string();
@@ -389,12 +390,8 @@ mod tests {
             "{error}"
         );
         let endless = read(Path::new("/dev/zero"), &["tests"]).expect_err("no file");
-        assert!(endless.to_string().contains("expected a regular file"));
+        assert!(format!("{endless:#}").contains("expected a regular file"));
         let missing = read(Path::new("no/such"), &["tests"]).expect_err("none");
-        assert!(
-            missing
-                .to_string()
-                .starts_with("checkpoint no/such: No such file")
-        );
+        assert!(format!("{missing:#}").starts_with("checkpoint no/such: No such file"));
     }
 }

@@ -16,4 +16,4 @@ pub mod vector;
 pub mod window;
 
 pub use adam::Adam;
-pub use trainer::{Iterates, Laps, NotFinite, Trainer, Update};
+pub use trainer::{Trainer, Update};

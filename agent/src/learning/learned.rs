@@ -1,12 +1,12 @@
 //! What checkpoints hold, by kind: all that policies on a learned belief need.
 
-use crate::learning::checkpoint::{self, CheckpointError, Contents, Problem};
+use crate::learning::checkpoint::{self, Contents, wrong};
 use crate::learning::learner::{self, LearnedModel};
 use crate::learning::student::filter::SavedFilter;
-use crate::learning::student::network::LearnedNetwork;
 use crate::learning::student::{decisions, network};
 use crate::planning::policy::EstimatorKind;
 use ::network::Device;
+use anyhow::{Context, Result, ensure};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -19,67 +19,49 @@ pub struct Learned {
     /// A filter, for policies `learned_*`.
     pub filter: Option<LearnedModel>,
     /// An autoencoder and a DQN, for policies `autoencoder_*`.
-    pub network: Option<Arc<LearnedNetwork>>,
+    pub network: Option<Arc<network::Progress>>,
     /// Decisions, for `dqn_beam`; they fit a model or not.
     pub decisions: Option<Arc<Contents>>,
 }
 
 impl Learned {
     /// What some checkpoints hold, of each kind one at most; networks compute on `device`.
-    ///
-    /// # Errors
-    /// [`CheckpointError`] names the file that cannot be read, or is the second of its kind.
-    pub fn read<'a>(
-        paths: impl IntoIterator<Item = &'a Path>,
-        device: &Device,
-    ) -> Result<Self, CheckpointError> {
+    pub fn read<'a>(paths: impl IntoIterator<Item = &'a Path>, device: &Device) -> Result<Self> {
         let mut learned = Self::default();
         for path in paths {
             let (kind, contents) = checkpoint::read(path, &KINDS)?;
             let added = learned.add(kind, contents, device);
-            added.map_err(|problem| problem.of(path))?;
+            added.with_context(|| format!("checkpoint {}", path.display()))?;
         }
         Ok(learned)
     }
 
     /// What one checkpoint holds, of whatever kind.
-    ///
-    /// # Errors
-    /// [`Problem`].
-    pub fn from_bytes(bytes: &[u8]) -> Result<Self, Problem> {
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self> {
         let (kind, contents) = checkpoint::decode(&KINDS, bytes)?;
         let mut learned = Self::default();
         learned.add(kind, contents, &Device::Cpu)?;
         Ok(learned)
     }
 
-    fn add(
-        &mut self,
-        kind: &'static str,
-        contents: Contents,
-        device: &Device,
-    ) -> Result<(), Problem> {
+    fn add(&mut self, kind: &'static str, contents: Contents, device: &Device) -> Result<()> {
         let twice = match kind {
             learner::KIND => {
-                let saved = contents.state::<SavedFilter>()?.learner;
-                let dimensions = saved.dimensions.check();
-                let dimensions = dimensions
-                    .map_err(|error| Problem::value("dimensions", "those of a filter", error))?;
-                let model = saved.progress(&contents, dimensions)?.learned();
-                self.filter.replace(model).is_some()
+                let mut saved = contents.state::<SavedFilter>()?.learner;
+                let dimensions = saved.trainer.dimensions().check();
+                let dimensions =
+                    dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
+                saved.load(&contents, dimensions)?;
+                self.filter.replace(saved.learned()).is_some()
             }
             decisions::KIND => self.decisions.replace(Arc::new(contents)).is_some(),
             _ => {
-                let network = network::Progress::read(&contents, device)?.learned();
+                let network = network::Progress::read(&contents, device)?;
                 self.network.replace(Arc::new(network)).is_some()
             }
         };
-        if twice {
-            let expected = format!("one checkpoint of {kind}");
-            Err(Problem::whole(expected, "two"))
-        } else {
-            Ok(())
-        }
+        ensure!(!twice, "expected one checkpoint of {kind}, got two");
+        Ok(())
     }
 }
 
@@ -90,7 +72,7 @@ impl Learned {
             EstimatorKind::Learned | EstimatorKind::LearnedSpatial => {
                 self.filter.as_ref().map(|filter| filter.target)
             }
-            EstimatorKind::Autoencoder => self.network.as_ref().map(|network| network.target),
+            EstimatorKind::Autoencoder => self.network.as_ref().map(|network| network.target()),
             _ => None,
         }
     }

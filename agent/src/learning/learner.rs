@@ -1,9 +1,348 @@
 //! What learns a model while an agent acts: replay in, parameters out. Pure.
 
 mod neighbours;
-mod online;
-mod saved;
 
 pub use self::neighbours::Neighbours;
-pub use self::online::{KIND, LearnedModel, Learner, Progress};
-pub use self::saved::SavedLearner;
+
+use crate::config::{AgentConfig, LearningConfig};
+use crate::estimation::Correlations;
+use crate::estimation::belief::Belief;
+use crate::estimation::parameters::{Dimensions, Parameters, Tables};
+use crate::learning::checkpoint::{Contents, check, check_counts};
+use crate::learning::filter::{Trainer, Update};
+use crate::learning::replay::Replay;
+use crate::learning::reward::{RewardEstimate, met};
+use ::network::NamedTensor;
+use anyhow::Result;
+use protocol::{Frame, Shape};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// How checkpoints of this learner call it.
+pub const KIND: &str = "learned_filter";
+
+/// Names of tensors end so: parameters, means and means of squares.
+const SUFFIXES: [&str; 3] = ["", ".first_moment", ".second_moment"];
+
+/// More updates than a step of all worlds earns.
+const MAX_OWED: f64 = 2e6;
+
+/// What was learned: all that acting on it needs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LearnedModel {
+    pub tables: Tables,
+    /// The state that pays most.
+    pub target: usize,
+    /// How much that state of one cell says of its neighbours'.
+    pub correlations: Correlations,
+}
+
+/// Learns from frames as they come. A checkpoint holds it as it is, its tensors apart.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Learner {
+    pub trainer: Trainer,
+    /// Which state pays.
+    pub reward: RewardEstimate,
+    /// World steps seen, of all worlds together.
+    pub world_steps: u64,
+    /// Updates that steps have earned and that are not made yet.
+    pub owed: f64,
+    replay: Replay,
+    neighbours: Neighbours,
+    /// Beliefs before the next frames, by world.
+    #[serde(skip)]
+    predictors: BTreeMap<u32, Belief>,
+}
+
+impl Learner {
+    /// Before the first frame.
+    pub fn new(dimensions: Dimensions, shape: Shape, config: &AgentConfig) -> Self {
+        let parameters = Parameters::first(dimensions, config.seed);
+        Self {
+            trainer: Trainer::new(parameters, shape, config.learning, config.seed),
+            reward: RewardEstimate::new(dimensions.n_states),
+            world_steps: 0,
+            owed: 0.0,
+            replay: replay(&config.learning),
+            neighbours: Neighbours::default(),
+            predictors: BTreeMap::new(),
+        }
+    }
+
+    /// A world's track begins, for the first time or again.
+    pub fn begin(&mut self, world: u32) {
+        self.replay.begin(world);
+        self.neighbours.begin(world, self.trainer.cut().0.n_cells());
+    }
+
+    /// Whether a world's track was begun.
+    pub fn has_track(&self, world: u32) -> bool {
+        self.replay.has_track(world)
+    }
+
+    /// The belief before a world's next frame.
+    pub fn expect(&mut self, world: u32, predictor: &Belief) {
+        if self.replay.wants_belief(world) {
+            self.replay.give_belief(world, predictor.as_slice());
+        }
+        self.predictors.insert(world, predictor.clone());
+    }
+
+    pub fn see(&mut self, world: u32, frame: &Frame) {
+        self.replay.push(world, frame);
+        let LearnedModel { tables, target, .. } = self.learned();
+        let learned = (&tables.likelihood_array(), target);
+        let predictor = self.predictors.remove(&world);
+        self.neighbours
+            .see(world, frame, predictor.as_ref(), learned);
+    }
+
+    /// The reward of a path that visited some cells, with the belief after its frame.
+    pub fn reward(&mut self, posterior: &Belief, visited: &[usize], reward: f64) {
+        let met = met(posterior, visited.iter().copied());
+        self.reward.add(&met, reward);
+        self.world_steps += 1;
+        self.owed += self.trainer.config().updates_per_step;
+    }
+
+    /// Makes the updates that the steps since the last call have earned.
+    ///
+    /// # Errors
+    /// For numbers that are not finite; the parameters are those before.
+    pub fn learn(&mut self) -> Result<Vec<Update>> {
+        let mut updates = Vec::new();
+        let target = self.reward.target();
+        while self.owed >= 1.0 {
+            self.owed -= 1.0;
+            updates.extend(self.trainer.update(&mut self.replay, target)?);
+        }
+        Ok(updates)
+    }
+
+    /// Forgets all frames, and every world's track; what was learned from them stays.
+    pub fn forget(&mut self) {
+        self.replay = replay(self.trainer.config());
+        self.trainer.leave_replay();
+        self.owed = 0.0;
+        self.neighbours.forget_worlds();
+    }
+
+    pub fn learned(&self) -> LearnedModel {
+        let parameters = self.trainer.parameters();
+        let last = parameters.dimensions.n_states - 1;
+        LearnedModel {
+            tables: parameters.tables(),
+            target: self.reward.target().unwrap_or(last),
+            correlations: self.neighbours.correlations().clone(),
+        }
+    }
+
+    pub fn n_updates(&self) -> u64 {
+        self.trainer.adam.n_steps
+    }
+
+    /// Parameters and moments by name.
+    pub fn named_tensors(&self) -> Vec<NamedTensor> {
+        let adam = &self.trainer.adam;
+        let parts = [self.trainer.parameters(), &adam.first, &adam.second];
+        let named = |(suffix, part): (&str, &Parameters)| {
+            let shapes = part.dimensions.shapes();
+            [0, 1, 2].map(|at| {
+                let name = format!("{}{suffix}", Parameters::NAMES[at]);
+                (name, shapes[at].clone(), part.tensors[at].clone())
+            })
+        };
+        SUFFIXES.into_iter().zip(parts).flat_map(named).collect()
+    }
+
+    /// Takes the tensors of a checkpoint that it is of, as those of given dimensions.
+    ///
+    /// # Errors
+    /// Names what is missing or of another form.
+    pub fn load(&mut self, contents: &Contents, dimensions: Dimensions) -> Result<()> {
+        let counts = [
+            ("n_updates", self.n_updates()),
+            ("world_steps", self.world_steps),
+        ];
+        check_counts(&counts)?;
+        let part = |suffix: &str| -> Result<Parameters> {
+            let mut part = Parameters::zeros(dimensions);
+            for (at, shape) in dimensions.shapes().iter().enumerate() {
+                let name = format!("{}{suffix}", Parameters::NAMES[at]);
+                part.tensors[at] = contents.tensor(&name, shape)?;
+            }
+            Ok(part)
+        };
+        let [parameters, first, second] = SUFFIXES.map(part);
+        self.trainer.set_parameters(parameters?);
+        (self.trainer.adam.first, self.trainer.adam.second) = (first?, second?);
+        contents.check_squares()?;
+        self.reward.check(dimensions.n_states)
+    }
+
+    /// From a checkpoint; with an empty replay if it was of another grid or cut into other windows
+    /// than the settings say.
+    ///
+    /// # Errors
+    /// Names what is missing or of another form.
+    pub fn resume(
+        mut saved: Self,
+        contents: &Contents,
+        dimensions: Dimensions,
+        shape: Shape,
+        config: &AgentConfig,
+    ) -> Result<Self> {
+        saved.load(contents, dimensions)?;
+        let mut learner = Self::new(dimensions, shape, config);
+        if saved.trainer.cut() == learner.trainer.cut() {
+            let fits = (0.0..MAX_OWED).contains(&saved.owed);
+            check(fits, "owed", format!("0 to {MAX_OWED}"), saved.owed)?;
+            learner.owed = saved.owed;
+            let (n_states, n_observations) = (dimensions.n_states, dimensions.n_observations);
+            let replay = &mut learner.replay;
+            replay.resume(saved.replay, shape, n_states, n_observations)?;
+            let n_cells = shape.n_cells();
+            let (name, expected) = ("neighbours.ages", format!("those of {n_cells} cells"));
+            check(saved.neighbours.are_of(n_cells), name, expected, "others")?;
+        } else {
+            saved.neighbours.forget_worlds();
+        }
+        learner.trainer.resume(saved.trainer)?;
+        learner.reward = saved.reward;
+        learner.neighbours = saved.neighbours;
+        learner.world_steps = saved.world_steps;
+        Ok(learner)
+    }
+}
+
+fn replay(config: &LearningConfig) -> Replay {
+    Replay::new(config.window * config.block_windows, config.replay_frames)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimation::belief::Belief;
+
+    const DIMENSIONS: Dimensions = Dimensions {
+        n_states: 3,
+        n_observations: 2,
+        kernel: (1, 3),
+    };
+
+    fn shape() -> Shape {
+        Shape::new(1, 3).expect("test shape")
+    }
+
+    fn config() -> AgentConfig {
+        let mut config = AgentConfig::default();
+        config.learning.window = 2;
+        config.learning.block_windows = 1;
+        config.learning.streams = 2;
+        config
+    }
+
+    fn see(learner: &mut Learner, values: &[u8]) {
+        let belief = Belief::uniform(3, shape());
+        for &value in values {
+            let frame = Frame::from_bytes(shape(), 2, &[value, 255, 1]).expect("a frame");
+            learner.expect(4, &belief);
+            learner.see(4, &frame);
+            let visited: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
+            learner.reward(&belief, &visited, 0.3);
+            learner.learn().expect("finite");
+        }
+    }
+
+    fn learner() -> Learner {
+        let mut learner = Learner::new(DIMENSIONS, shape(), &config());
+        learner.begin(4);
+        see(&mut learner, &[0, 1, 1, 0, 1, 1, 0]);
+        learner
+    }
+
+    fn contents(learner: &Learner) -> Contents {
+        Contents::new(learner.named_tensors(), learner)
+    }
+
+    fn resume(
+        contents: &Contents,
+        dimensions: Dimensions,
+        config: &AgentConfig,
+    ) -> Result<Learner, String> {
+        let learner = contents
+            .state()
+            .and_then(|saved| Learner::resume(saved, contents, dimensions, shape(), config));
+        learner.map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn a_learner_resumes_alike_unless_its_replay_is_cut_otherwise() {
+        let mut learner = learner();
+        assert!(learner.n_updates() > 0);
+        let stored = contents(&learner);
+        let mut same = resume(&stored, DIMENSIONS, &config()).expect("whole");
+        assert!(same.has_track(4) && contents(&same) == stored);
+        let later = |learner: &mut Learner| see(learner, &[1, 0, 0, 1, 1]);
+        later(&mut learner);
+        later(&mut same);
+        assert!(contents(&same) == contents(&learner) && contents(&same) != stored);
+        let mut config = config();
+        config.learning.streams = 3;
+        let other = resume(&stored, DIMENSIONS, &config).expect("whole");
+        assert!(!other.has_track(4), "an empty replay");
+        assert_eq!(contents(&other).tensors, stored.tensors);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_refused_by_name() {
+        let other = |change: fn(&mut Dimensions), words: &str| {
+            let mut dimensions = DIMENSIONS;
+            change(&mut dimensions);
+            let error = resume(&contents(&learner()), dimensions, &config()).expect_err(words);
+            assert_eq!(error, words);
+        };
+        other(
+            |dimensions| dimensions.kernel = (3, 3),
+            "kernel: expected shape [3, 3, 3, 3], got [3, 3, 1, 3]",
+        );
+        other(
+            |dimensions| dimensions.n_observations = 4,
+            "likelihood: expected shape [3, 4], got [3, 2]",
+        );
+        let forged = |change: fn(&mut Contents, &mut Learner), words: &str| {
+            let (mut contents, mut saved) = (contents(&learner()), learner());
+            change(&mut contents, &mut saved);
+            contents.set_state(&saved);
+            let error = resume(&contents, DIMENSIONS, &config()).expect_err(words);
+            assert!(error.starts_with(words), "{error}");
+        };
+        forged(
+            |contents, _| drop(contents.tensors.remove("initial.first_moment")),
+            "initial.first_moment: expected shape [3], got none",
+        );
+        forged(
+            |contents, _| {
+                let tensor = contents.tensors.get_mut("kernel.second_moment");
+                tensor.expect("a moment").numbers[2] = -0.5;
+            },
+            "kernel.second_moment: expected numbers from 0 on, got -0.5",
+        );
+        forged(
+            |_, saved| saved.owed = 1e300,
+            "owed: expected 0 to 2000000, got 1",
+        );
+        forged(
+            |_, saved| saved.reward.rewards[1] = f64::NAN,
+            "reward.rewards: expected 3 finite numbers, got NaN",
+        );
+        forged(
+            |_, saved| saved.trainer.adam.n_steps = u64::MAX,
+            "n_updates: expected at most",
+        );
+        forged(
+            |_, saved| saved.trainer.streams.clear(),
+            "streams: expected 2, got 0",
+        );
+    }
+}

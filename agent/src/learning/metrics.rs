@@ -1,8 +1,10 @@
 //! Metrics of a training as CSV: one row per update, and one per step without any.
 
 use crate::estimation::scoring::Score;
+use anyhow::{Context, Result, ensure};
+use csv::StringRecord;
+use std::fs::File;
 use std::path::{Path, PathBuf};
-use thiserror::Error;
 
 /// The file's name in the folder of a training.
 pub const METRICS: &str = "metrics.csv";
@@ -24,7 +26,6 @@ const HEADER: [&str; 6] = [
 pub struct Tick {
     /// World steps so far, of all worlds together.
     pub world_steps: u64,
-    /// Worlds that made the step.
     pub n_worlds: u64,
     /// Sum of their rewards.
     pub reward: f64,
@@ -57,93 +58,43 @@ impl ModelUpdate {
     }
 }
 
-/// A file that cannot be written or read, or is another learner's.
-#[derive(Debug, Error)]
-#[error("metrics {}: {problem}", path.display())]
-pub struct MetricsError {
-    path: PathBuf,
-    problem: Box<dyn std::error::Error + Send + Sync>,
-}
-
-impl MetricsError {
-    fn new(path: &Path, problem: csv::Error) -> Self {
-        let (path, problem) = (path.to_owned(), problem.into());
-        Self { path, problem }
-    }
-
-    fn columns(path: &Path, expected: &csv::StringRecord, got: &csv::StringRecord) -> Self {
-        let names = |record: &csv::StringRecord| record.iter().collect::<Vec<_>>().join(",");
-        let problem = format!(
-            "expected the columns {}, got {}",
-            names(expected),
-            names(got)
-        );
-        let (path, problem) = (path.to_owned(), problem.into());
-        Self { path, problem }
-    }
-}
-
 /// The open file.
 pub struct Metrics {
     path: PathBuf,
-    writer: csv::Writer<std::fs::File>,
-    /// Columns of the learner's own.
+    writer: csv::Writer<File>,
     n_more: usize,
 }
 
 impl Metrics {
     /// Begins a file. `more`: columns of the learner's own.
-    ///
-    /// # Errors
-    /// [`MetricsError`].
-    pub fn begin(path: &Path, more: &[&str]) -> Result<Self, MetricsError> {
-        Self::write(path, more, &[])
+    pub fn begin(path: &Path, more: &[&str]) -> Result<Self> {
+        Self::write(path, more, &[]).with_context(|| of_file(path))
     }
 
     /// Goes on with a file, from which rows after some world step go, as they came after what is gone on
-    /// from, and rows that a kill cut off; begins it if it is not there.
-    ///
-    /// # Errors
-    /// [`MetricsError`], also for a file with other columns.
-    pub fn go_on(path: &Path, more: &[&str], world_steps: u64) -> Result<Self, MetricsError> {
-        if !path.exists() {
-            return Self::begin(path, more);
-        }
-        let fail = |problem: csv::Error| MetricsError::new(path, problem);
-        let reader = csv::ReaderBuilder::new().flexible(true).from_path(path);
-        let mut reader = reader.map_err(fail)?;
-        let got = reader.headers().map_err(fail)?;
-        let expected = csv::StringRecord::from_iter(HEADER.iter().chain(more));
-        if *got != expected {
-            return Err(MetricsError::columns(path, &expected, got));
-        }
-        let is_kept = |row: &csv::StringRecord| {
-            let step = row.get(1).and_then(|step| step.parse().ok());
-            row.len() == expected.len() && step.is_some_and(|step: u64| step <= world_steps)
+    /// from, and rows that a kill cut off; begins it if it is not there. Refuses one with other columns.
+    pub fn go_on(path: &Path, more: &[&str], world_steps: u64) -> Result<Self> {
+        let go_on = || {
+            let rows = kept_rows(path, more, world_steps)?;
+            let beside = path.with_extension("csv.new");
+            let written = Self::write(&beside, more, &rows)?;
+            std::fs::rename(&beside, path)?;
+            anyhow::Ok(Self {
+                path: path.to_owned(),
+                ..written
+            })
         };
-        let rows = reader
-            .records()
-            .collect::<Result<Vec<_>, _>>()
-            .map_err(fail)?;
-        let rows: Vec<_> = rows.into_iter().filter(is_kept).collect();
-        let beside = path.with_extension("csv.new");
-        let written = Self::write(&beside, more, &rows)?;
-        std::fs::rename(&beside, path).map_err(|error| fail(error.into()))?;
-        Ok(Self {
-            path: path.to_owned(),
-            ..written
-        })
+        match path.exists() {
+            true => go_on().with_context(|| of_file(path)),
+            false => Self::begin(path, more),
+        }
     }
 
-    fn write(path: &Path, more: &[&str], rows: &[csv::StringRecord]) -> Result<Self, MetricsError> {
-        let fail = |problem: csv::Error| MetricsError::new(path, problem);
-        let mut writer = csv::Writer::from_path(path).map_err(fail)?;
-        let header = HEADER.iter().chain(more);
-        writer.write_record(header).map_err(fail)?;
-        for row in rows {
-            writer.write_record(row).map_err(fail)?;
-        }
-        writer.flush().map_err(|error| fail(error.into()))?;
+    fn write(path: &Path, more: &[&str], rows: &[StringRecord]) -> Result<Self> {
+        let mut writer = csv::Writer::from_path(path)?;
+        writer.write_record(HEADER.iter().chain(more))?;
+        rows.iter().try_for_each(|row| writer.write_record(row))?;
+        writer.flush()?;
         let (path, n_more) = (path.to_owned(), more.len());
         Ok(Self {
             path,
@@ -153,36 +104,47 @@ impl Metrics {
     }
 
     /// Adds a step's rows.
-    ///
-    /// # Errors
-    /// [`MetricsError`].
-    pub fn add(
-        &mut self,
-        tick: &Tick,
-        updates: &[ModelUpdate],
-        n_updates: u64,
-    ) -> Result<(), MetricsError> {
+    pub fn add(&mut self, tick: &Tick, updates: &[ModelUpdate], n_updates: u64) -> Result<()> {
         let nothing = ModelUpdate::nothing(n_updates, self.n_more);
         let nothing = updates.is_empty().then_some(&nothing);
-        for update in updates.iter().chain(nothing) {
-            let written = self.writer.write_record(row(tick, update));
-            written.map_err(|problem| self.fail(problem))?;
-        }
-        Ok(())
+        let mut rows = updates.iter().chain(nothing);
+        rows.try_for_each(|update| self.writer.write_record(row(tick, update)))
+            .with_context(|| of_file(&self.path))
     }
 
     /// Writes what is still in memory.
-    ///
-    /// # Errors
-    /// [`MetricsError`].
-    pub fn flush(&mut self) -> Result<(), MetricsError> {
+    pub fn flush(&mut self) -> Result<()> {
         let flushed = self.writer.flush();
-        flushed.map_err(|problem| self.fail(problem.into()))
+        flushed.with_context(|| of_file(&self.path))
     }
+}
 
-    fn fail(&self, problem: csv::Error) -> MetricsError {
-        MetricsError::new(&self.path, problem)
-    }
+fn of_file(path: &Path) -> String {
+    format!("metrics {}", path.display())
+}
+
+fn reader(path: &Path) -> csv::Result<csv::Reader<File>> {
+    csv::ReaderBuilder::new().flexible(true).from_path(path)
+}
+
+/// The whole rows of a file up to a world step.
+fn kept_rows(path: &Path, more: &[&str], world_steps: u64) -> Result<Vec<StringRecord>> {
+    let mut reader = reader(path)?;
+    let got = reader.headers()?;
+    let expected = StringRecord::from_iter(HEADER.iter().chain(more));
+    let names = |record: &StringRecord| record.iter().collect::<Vec<_>>().join(",");
+    ensure!(
+        *got == expected,
+        "expected the columns {}, got {}",
+        names(&expected),
+        names(got)
+    );
+    let is_kept = |row: &StringRecord| {
+        let step = row.get(1).and_then(|step| step.parse().ok());
+        row.len() == expected.len() && step.is_some_and(|step: u64| step <= world_steps)
+    };
+    let rows: Vec<_> = reader.records().collect::<Result<_, _>>()?;
+    Ok(rows.into_iter().filter(is_kept).collect())
 }
 
 fn row(tick: &Tick, update: &ModelUpdate) -> Vec<String> {
@@ -238,30 +200,27 @@ pub struct Rows {
 
 impl Rows {
     /// Reads the file of a folder. What is no number is as if it were not there.
-    ///
-    /// # Errors
-    /// [`MetricsError`].
-    pub fn read(folder: &Path) -> Result<Self, MetricsError> {
+    pub fn read(folder: &Path) -> Result<Self> {
         let path = folder.join(METRICS);
-        let fail = |problem: csv::Error| MetricsError::new(&path, problem);
-        let reader = csv::ReaderBuilder::new().flexible(true).from_path(&path);
-        let mut reader = reader.map_err(fail)?;
-        let names = reader.headers().map_err(fail)?;
-        let names = names.iter().map(String::from).collect();
-        let mut rows = Vec::new();
-        for record in reader.records() {
-            let record = record.map_err(fail)?;
-            rows.push(record.iter().map(|field| field.parse().ok()).collect());
-        }
-        Ok(Self { names, rows })
+        let read = || {
+            let mut reader = reader(&path)?;
+            let names = reader.headers()?.iter().map(String::from).collect();
+            let numbers = |row: StringRecord| {
+                row.iter()
+                    .map(|field| field.parse().ok())
+                    .collect::<Vec<_>>()
+            };
+            let rows = reader.records().map(|row| row.map(numbers));
+            let rows = rows.collect::<Result<_, _>>()?;
+            anyhow::Ok(Self { names, rows })
+        };
+        read().with_context(|| of_file(&path))
     }
 
-    /// Number of rows.
     pub fn len(&self) -> usize {
         self.rows.len()
     }
 
-    /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.rows.is_empty()
     }

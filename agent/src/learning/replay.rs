@@ -6,7 +6,8 @@
 //! when there is no room.
 
 use crate::estimation::belief::Belief;
-use crate::learning::checkpoint::{Problem, check, check_counts, check_numbers};
+use crate::learning::checkpoint::{check, check_counts, check_numbers, wrong};
+use anyhow::Result;
 use protocol::{Frame, Probabilities, Shape};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -23,7 +24,6 @@ pub struct Sighting {
 /// Consecutive frames of one track.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Block {
-    /// What each frame shows.
     pub frames: Vec<Vec<Sighting>>,
     /// The belief before the first frame, shape `[S, H, W]`; `None` at the start of a track.
     pub start: Option<Vec<f32>>,
@@ -104,7 +104,6 @@ impl Replay {
         }
     }
 
-    /// Number of full blocks.
     pub fn n_blocks(&self) -> usize {
         self.full.len()
     }
@@ -130,16 +129,13 @@ impl Replay {
     }
 
     /// Goes on from another replay with blocks of the same length; of more blocks than fit, the newest stay.
-    ///
-    /// # Errors
-    /// Names what cannot have been seen of such worlds.
     pub fn resume(
         &mut self,
         other: Self,
         shape: Shape,
         n_states: usize,
         n_observations: usize,
-    ) -> Result<(), Problem> {
+    ) -> Result<()> {
         let full = other
             .full
             .iter()
@@ -184,7 +180,7 @@ impl Replay {
 }
 
 impl Block {
-    fn check(&self, shape: Shape, n_states: usize, n_observations: usize) -> Result<(), Problem> {
+    fn check(&self, shape: Shape, n_states: usize, n_observations: usize) -> Result<()> {
         for Sighting { cell, value } in self.frames.iter().flatten().copied() {
             let fits = (cell as usize) < shape.n_cells();
             check(fits, "replay.cell", format_args!("cells of {shape}"), cell)?;
@@ -205,8 +201,8 @@ impl Block {
                 check_numbers("replay.start", start, n_states * shape.n_cells())?;
                 let start = Probabilities::from_shape_vec(dim, start.to_vec());
                 let start = start.expect("invariant: as many numbers");
-                let wrong = |error| Problem::value("replay.start", "a belief", error);
-                Belief::from_probabilities(start).map(drop).map_err(wrong)
+                let start = Belief::from_probabilities(start).map(drop);
+                start.map_err(|error| wrong("replay.start", "a belief", error))
             }
         }
     }
@@ -221,20 +217,28 @@ mod tests {
         Frame::from_bytes(shape, 9, &[255, value, 255]).expect("test frame")
     }
 
+    /// About two states of three cells, another for each number.
+    fn belief(number: u8) -> Vec<f32> {
+        let p = f32::from(number) / 16.0;
+        vec![p, p, p, 1.0 - p, 1.0 - p, 1.0 - p]
+    }
+
     /// A replay with blocks of 2 and room for 3, and two worlds' frames in turn.
     fn replay(n_frames: u8) -> Replay {
         let mut replay = Replay::new(2, 7);
         replay.begin(0);
         replay.begin(5);
-        for value in 0..n_frames {
-            for world in [0, 5] {
-                if replay.wants_belief(world) {
-                    replay.give_belief(world, &[f32::from(value)]);
-                }
-                replay.push(world, &frame(value));
-            }
-        }
+        (0..n_frames).for_each(|value| see(&mut replay, value));
         replay
+    }
+
+    fn see(replay: &mut Replay, value: u8) {
+        for world in [0, 5] {
+            if replay.wants_belief(world) {
+                replay.give_belief(world, &belief(value));
+            }
+            replay.push(world, &frame(value));
+        }
     }
 
     #[test]
@@ -257,16 +261,11 @@ mod tests {
     #[test]
     fn beliefs_are_handed_on_along_a_track() {
         let mut replay = replay(4);
-        assert_eq!(replay.block(2).expect("kept").start, Some(vec![2.0]));
+        let start = |replay: &Replay, number| replay.block(number).and_then(|it| it.start.clone());
+        assert_eq!(start(&replay, 2), Some(belief(2)));
         replay.hand_on(1, &[9.0]);
-        assert_eq!(
-            replay.block(2).map(|block| block.start.clone()),
-            Some(Some(vec![2.0]))
-        );
-        assert_eq!(
-            replay.block(3).map(|block| block.start.clone()),
-            Some(Some(vec![9.0]))
-        );
+        assert_eq!(start(&replay, 2), Some(belief(2)));
+        assert_eq!(start(&replay, 3), Some(vec![9.0]));
         replay.hand_on(2, &[8.0]); // the block after it is not full: nobody to hand on to
         replay.hand_on(77, &[8.0]);
     }
@@ -285,25 +284,7 @@ mod tests {
         );
     }
 
-    /// Blocks of 2, room for 3.
-    fn seen(n_frames: u8) -> Replay {
-        let mut replay = Replay::new(2, 7);
-        replay.begin(0);
-        replay.begin(5);
-        (0..n_frames).for_each(|value| see(&mut replay, value));
-        replay
-    }
-
-    fn see(replay: &mut Replay, value: u8) {
-        for world in [0, 5] {
-            if replay.wants_belief(world) {
-                replay.give_belief(world, &[0.25, 0.5, 1.0, 0.75, 0.5, 0.0]);
-            }
-            replay.push(world, &frame(value));
-        }
-    }
-
-    fn resumed(other: Replay) -> Result<Replay, Problem> {
+    fn resumed(other: Replay) -> Result<Replay> {
         let mut replay = Replay::new(2, 7);
         let shape = Shape::new(1, 3).expect("test shape");
         replay.resume(other, shape, 2, 9).map(|()| replay)
@@ -312,7 +293,7 @@ mod tests {
     #[test]
     fn a_replay_goes_on_alike_and_the_newest_blocks_stay() {
         for n_frames in 0..9 {
-            let mut before = seen(n_frames);
+            let mut before = replay(n_frames);
             let mut after = resumed(before.clone()).expect("whole");
             for value in 0..4 {
                 assert_eq!(before, after, "{n_frames} frames, then {value}");
@@ -320,7 +301,7 @@ mod tests {
                 see(&mut after, value);
             }
         }
-        let mut longer = seen(1);
+        let mut longer = replay(1);
         longer.max_blocks = 9;
         (1..8).for_each(|value| see(&mut longer, value));
         assert_eq!(longer.n_blocks(), 8);
@@ -331,7 +312,7 @@ mod tests {
     #[test]
     fn what_no_replay_holds_is_named() {
         let check = |change: fn(&mut Replay), words: &str| {
-            let mut other = seen(5);
+            let mut other = replay(5);
             change(&mut other);
             assert_eq!(resumed(other).expect_err(words).to_string(), words);
         };

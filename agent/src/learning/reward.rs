@@ -6,7 +6,8 @@
 //! other way to know which of its states is the fire.
 
 use crate::estimation::belief::Belief;
-use crate::learning::checkpoint::{Problem, check_numbers};
+use crate::learning::checkpoint::check_numbers;
+use anyhow::Result;
 use serde::{Deserialize, Serialize};
 
 /// Share of what was known that is kept at each path: a memory of 2,000 paths.
@@ -33,7 +34,6 @@ pub struct RewardEstimate {
 }
 
 impl RewardEstimate {
-    /// Before the first path.
     pub fn new(n_states: usize) -> Self {
         Self {
             products: vec![0.0; n_states * n_states],
@@ -42,10 +42,7 @@ impl RewardEstimate {
     }
 
     /// Refuses one from a checkpoint that is not of so many states.
-    ///
-    /// # Errors
-    /// Names the field.
-    pub fn check(&self, n_states: usize) -> Result<(), Problem> {
+    pub fn check(&self, n_states: usize) -> Result<()> {
         check_numbers("reward.products", &self.products, n_states * n_states)?;
         check_numbers("reward.rewards", &self.rewards, n_states)
     }

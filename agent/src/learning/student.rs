@@ -7,4 +7,4 @@ pub mod network;
 #[cfg(test)]
 mod tests;
 
-pub use self::base::{Fly, Look, NotFinite, Student, StudentError, Worlds};
+pub use self::base::{Fly, Look, Student, Worlds};

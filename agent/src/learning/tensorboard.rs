@@ -5,12 +5,12 @@
 //! are written here: the crate that does it (`tensorboard-rs`) brings protobuf 2 and image 0.23, long out of
 //! support. Steps of one file should rise: TensorBoard drops what comes again.
 
+use anyhow::{Context, Result};
 use crc::{CRC_32_ISCSI, Crc};
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
-use thiserror::Error;
 
 /// The checksum of records.
 const CASTAGNOLI: Crc<u32> = Crc::<u32>::new(&CRC_32_ISCSI);
@@ -27,25 +27,14 @@ const RGB: u64 = 3;
 /// What is told of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Value<'a> {
-    /// A number.
     Scalar(f64),
-    /// A picture.
     Image {
         /// Height in pixels.
         height: usize,
         /// Width in pixels.
         width: usize,
-        /// The file.
         png: &'a [u8],
     },
-}
-
-/// An event file that cannot be written.
-#[derive(Debug, Error)]
-#[error("TensorBoard events {}: {problem}", path.display())]
-pub struct EventsError {
-    path: PathBuf,
-    problem: std::io::Error,
 }
 
 /// A file that grows.
@@ -58,16 +47,9 @@ pub struct EventFile {
 impl EventFile {
     /// Begins a file in a folder, which is made where it is not there. What other files of the folder hold
     /// for `next_step` and later steps counts no more.
-    ///
-    /// # Errors
-    /// [`EventsError`].
-    pub fn begin(folder: &Path, next_step: u64) -> Result<Self, EventsError> {
-        let fail = |problem| EventsError {
-            path: folder.to_owned(),
-            problem,
-        };
-        std::fs::create_dir_all(folder).map_err(fail)?;
-        let (path, file) = create(folder).map_err(fail)?;
+    pub fn begin(folder: &Path, next_step: u64) -> Result<Self> {
+        let created = std::fs::create_dir_all(folder).and_then(|()| create(folder));
+        let (path, file) = created.with_context(|| of_file(folder))?;
         let file = BufWriter::new(file);
         let mut events = Self { path, file };
         events.write(&event(0).text(3, FILE_VERSION))?;
@@ -78,37 +60,30 @@ impl EventFile {
     }
 
     /// Adds what is told of a step, by name.
-    ///
-    /// # Errors
-    /// [`EventsError`].
     pub fn add<'a>(
         &mut self,
         step: u64,
         values: impl IntoIterator<Item = (&'a str, Value<'a>)>,
-    ) -> Result<(), EventsError> {
+    ) -> Result<()> {
         let add = |summary: Message, (name, value)| summary.message(1, &named(name, value));
         let summary = values.into_iter().fold(Message::default(), add);
         self.write(&event(step).message(5, &summary))
     }
 
     /// Writes what is still in memory.
-    ///
-    /// # Errors
-    /// [`EventsError`].
-    pub fn flush(&mut self) -> Result<(), EventsError> {
+    pub fn flush(&mut self) -> Result<()> {
         let flushed = self.file.flush();
-        flushed.map_err(|problem| self.fail(problem))
+        flushed.with_context(|| of_file(&self.path))
     }
 
-    fn write(&mut self, event: &Message) -> Result<(), EventsError> {
+    fn write(&mut self, event: &Message) -> Result<()> {
         let written = self.file.write_all(&record(&event.0));
-        written.map_err(|problem| self.fail(problem))
+        written.with_context(|| of_file(&self.path))
     }
+}
 
-    fn fail(&self, problem: std::io::Error) -> EventsError {
-        let path = self.path.clone();
-        EventsError { path, problem }
-    }
+fn of_file(path: &Path) -> String {
+    format!("TensorBoard events {}", path.display())
 }
 
 /// A new file whose name sorts behind those of the files before it.

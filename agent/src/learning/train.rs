@@ -8,18 +8,18 @@ mod events;
 mod students;
 mod training;
 
-pub use self::training::{CHECKPOINT, TrainError, Training};
+pub use self::training::{CHECKPOINT, Training};
 
 use self::events::Events;
 use self::students::student;
 use crate::estimation::scoring::Score;
 use crate::learning::checkpoint::{self, Contents};
-use crate::learning::metrics::{FROZEN, METRICS, Metrics, MetricsError, Tick};
-use crate::learning::student::{Student, StudentError};
-use crate::learning::tensorboard::EventsError;
+use crate::learning::metrics::{FROZEN, METRICS, Metrics, Tick};
+use crate::learning::student::Student;
 use crate::rollout::Robot;
 use crate::server::client::{Claim, Client, Observation};
 use crate::server::feed::{Feed, View};
+use anyhow::{Result, bail};
 use protocol::Move;
 use protocol::agent_belief::Intent;
 use protocol::channels::Instance;
@@ -47,23 +47,18 @@ pub struct TrainSummary {
     pub steps: u64,
     /// Updates made, with those before a resume.
     pub updates: u64,
-    /// Sum of rewards.
     pub reward: f64,
-    /// Time spent, by part.
     pub times: Vec<(&'static str, Duration)>,
 }
 
 /// Trains on a server until the steps are done, the time is over or `stop` is set; saves in any case.
 /// `contents`: what [`Training::check`] gave.
-///
-/// # Errors
-/// [`TrainError`].
 pub fn train(
     instance: &Instance,
     training: &Training,
     contents: Option<Contents>,
     stop: &AtomicBool,
-) -> Result<TrainSummary, TrainError> {
+) -> Result<TrainSummary> {
     let mut trainer = Trainer::attach(instance, training, contents)?;
     let deadline = training.time_limit.map(|limit| Instant::now() + limit);
     let outcome = trainer.act(training, stop, deadline);
@@ -73,8 +68,7 @@ pub fn train(
         (Ok(()), saved) => saved?,
         (Err(problem), Ok(())) => return Err(problem),
         (Err(problem), Err(also)) => {
-            let [problem, also] = [problem, also].map(Box::new);
-            return Err(TrainError::NotSaved { problem, also });
+            bail!("{problem:#}; what was learned is lost: {also:#}");
         }
     }
     trainer.client.release()?;
@@ -109,7 +103,7 @@ impl Trainer {
         instance: &Instance,
         training: &Training,
         contents: Option<Contents>,
-    ) -> Result<Self, TrainError> {
+    ) -> Result<Self> {
         let place = training.out.join(CHECKPOINT);
         let claim = Claim {
             worlds: training.worlds.clone(),
@@ -159,7 +153,7 @@ impl Trainer {
         training: &Training,
         stop: &AtomicBool,
         deadline: Option<Instant>,
-    ) -> Result<(), TrainError> {
+    ) -> Result<()> {
         let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
         let is_done = |steps: u64| training.steps > 0 && steps >= training.steps;
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
@@ -169,8 +163,7 @@ impl Trainer {
                 true => Ok(Vec::new()),
                 false => self.student.learn(),
             };
-            let updates =
-                updates.map_err(|problem| training.stopped(problem.into(), &*self.student))?;
+            let updates = updates.map_err(|problem| training.stopped(problem, &*self.student))?;
             self.summary.updates = self.student.n_updates();
             let n_updates = self.student.n_updates();
             self.metrics.add(&tick, &updates, n_updates)?;
@@ -184,7 +177,7 @@ impl Trainer {
     }
 
     /// One step of each world; worlds at the end of their episodes begin again.
-    fn step(&mut self) -> Result<Tick, StudentError> {
+    fn step(&mut self) -> Result<Tick> {
         let Self {
             client,
             student,
@@ -230,7 +223,7 @@ impl Trainer {
     }
 
     /// Writes the checkpoint, unless nothing is learned, and the metrics.
-    fn save(&mut self, training: &Training) -> Result<(), TrainError> {
+    fn save(&mut self, training: &Training) -> Result<()> {
         self.saved = Instant::now();
         if !training.freeze {
             let contents = self.student.contents();
@@ -240,7 +233,7 @@ impl Trainer {
             checkpoint::write(&place, self.student.kind(), &contents)?;
         }
         self.metrics.flush()?;
-        Ok(self.events.flush()?)
+        self.events.flush()
     }
 
     fn report(&mut self, tick: &Tick) {
@@ -276,14 +269,13 @@ fn is_over(seen: &Observation) -> bool {
     seen.result.truncated != 0 || seen.result.terminated != 0
 }
 
-/// Starts a world's next episode.
 fn reset(client: &mut Client, world: u32) -> Result<Observation, ConnectionError> {
     client.reset(&[WorldSeed { world, seed: None }])?;
     Ok(client.observe(world..world + 1)?.remove(0))
 }
 
 /// The file of metrics: a run without learning has one of its own.
-fn metrics(training: &Training, student: &dyn Student) -> Result<Metrics, MetricsError> {
+fn metrics(training: &Training, student: &dyn Student) -> Result<Metrics> {
     let (columns, world_steps) = (student.columns(), student.world_steps());
     match (training.freeze, training.resume) {
         (true, _) => Metrics::begin(&training.out.join(FROZEN), columns),
@@ -293,7 +285,7 @@ fn metrics(training: &Training, student: &dyn Student) -> Result<Metrics, Metric
 }
 
 /// The file of TensorBoard's events: a run without learning has a folder of its own, and begins again.
-fn events(training: &Training, student: &dyn Student) -> Result<Events, EventsError> {
+fn events(training: &Training, student: &dyn Student) -> Result<Events> {
     match (training.freeze, training.resume) {
         (true, _) => Events::begin(&training.out.join(FROZEN_EVENTS), 0),
         (false, true) => Events::begin(&training.out, student.world_steps()),

@@ -17,7 +17,6 @@ pub const REGION_SLOPE: f32 = 0.3;
 pub struct Action {
     /// Its name in tables and files, unique in its set.
     pub name: String,
-    /// What a cell is worth.
     pub objective: Objective,
     /// Weight of each cell's entropy, as a share of the greatest, beside that; 0 or more.
     pub exploration: f32,
@@ -95,7 +94,6 @@ impl Action {
 }
 
 impl Region {
-    /// Every block, row by row.
     pub fn all() -> impl Iterator<Item = Self> {
         let region = |index| Self {
             row: index / N_BLOCKS,
@@ -172,7 +170,6 @@ impl ActionSet {
         &self.actions
     }
 
-    /// Their names.
     pub fn names(&self) -> Vec<String> {
         self.actions
             .iter()

@@ -22,7 +22,6 @@ pub struct PlanBasis {
 }
 
 impl PlanBasis {
-    /// Before the first estimate.
     pub fn new(kind: BasisKind) -> Self {
         Self {
             kind,
@@ -30,7 +29,6 @@ impl PlanBasis {
         }
     }
 
-    /// Which belief it is.
     pub fn kind(&self) -> BasisKind {
         self.kind
     }

@@ -176,7 +176,6 @@ impl BeamSearch {
         (Candidate { state, origin }, key)
     }
 
-    /// Finds the best candidates.
     fn rank(&mut self, width: usize) {
         let rank = |(index, candidate): (usize, &Candidate)| {
             let State { score, hash, .. } = candidate.state;

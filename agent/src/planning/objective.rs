@@ -43,7 +43,6 @@ impl Target {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Objective {
-    /// The value of a cell.
     pub target: Target,
     /// Added once for each distinct cell.
     pub coverage_bonus: f32,
@@ -102,7 +101,6 @@ impl Objective {
 }
 
 impl CellValues {
-    /// The grid.
     pub fn shape(&self) -> Shape {
         self.shape
     }

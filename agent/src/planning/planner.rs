@@ -11,7 +11,6 @@ pub struct PlanningProblem<'a> {
     pub start: Cell,
     /// Number of moves T of the path.
     pub n_moves: usize,
-    /// What the cells are worth.
     pub values: &'a CellValues,
     /// Seed of the planner's random stream.
     pub seed: u64,

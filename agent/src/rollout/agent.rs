@@ -1,19 +1,18 @@
 //! One agent on one world: plan, then correct and predict. Pure; the wire is elsewhere.
 
 use crate::config::AgentConfig;
+use crate::estimation::Estimator;
 use crate::estimation::belief::{Belief, BeliefError};
 use crate::estimation::scoring::Score;
-use crate::estimation::{Estimator, EstimatorError};
 use crate::planning::action::Action;
 use crate::planning::policy::{PlannerKind, Policy};
 use crate::planning::{
     CellValues, Objective, Plan, PlanBasis, Planner, PlanningProblem, RandomWalk, Target,
 };
+use anyhow::Result;
 use protocol::agent_belief::Intent;
-use protocol::model::ModelError;
 use protocol::{Cell, Frame, Grid};
 use std::time::Duration;
-use thiserror::Error;
 
 /// What a path that was not planned was for.
 pub const RANDOM_MOVES: &str = "random moves";
@@ -30,7 +29,6 @@ pub struct Agent {
     target: Option<usize>,
     /// What the last path was for.
     pub(crate) aim: Aim,
-    /// Names of the belief's states.
     state_names: Vec<String>,
     n_moves: usize,
     seed: u64,
@@ -61,42 +59,11 @@ pub enum Choice {
 /// What an agent has beside its estimator and its policy.
 #[derive(Debug, Clone)]
 pub struct Setup {
-    /// What paths are planned on.
     pub basis: PlanBasis,
-    /// Names of the belief's states.
     pub state_names: Vec<String>,
-    /// Moves in a path.
     pub n_moves: usize,
     /// Seed of the planner's random numbers: the agent's and the world's.
     pub seed: u64,
-}
-
-/// Why an agent cannot go on.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum AgentError {
-    /// What was seen does not fit the belief.
-    #[error(transparent)]
-    Estimator(#[from] EstimatorError),
-    /// The model does not fit the grid.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// A policy that needs a learned model was not given it.
-    #[error("policy {policy:?} needs what `train` learned: expected --checkpoint FILE of {kind}")]
-    NeedsCheckpoint { policy: String, kind: &'static str },
-    #[error(
-        "checkpoint: expected a network for {expected} cells as the world's, got one for {got}"
-    )]
-    OtherGrid { expected: String, got: String },
-    /// A checkpoint that does not fit the model.
-    #[error("checkpoint: {0}")]
-    Checkpoint(String),
-    /// A learned model of other observations.
-    #[error("checkpoint: expected {expected} observations as the world's, got {got}")]
-    OtherObservations { expected: usize, got: usize },
-    /// A policy that needs the hidden state was not given it.
-    #[error("policy {policy:?} needs the truth channel: start the server with --publish-truth")]
-    NeedsTruth { policy: String },
 }
 
 impl Agent {
@@ -191,26 +158,16 @@ impl Agent {
     }
 
     /// How well the belief predicts a frame; `None` of an estimator that predicts none.
-    ///
-    /// # Errors
-    /// Where a network's device fails.
-    pub fn score(&self, frame: &Frame) -> Result<Option<Score>, AgentError> {
+    pub fn score(&self, frame: &Frame) -> Result<Option<Score>> {
         Ok(self.estimator.score(frame)?)
     }
 
     /// Takes in a frame of X_k (paper eq. 5); `truth` is X_k, for policies that are fed with it.
     ///
     /// # Errors
-    /// [`AgentError`]; the belief is then as it was.
-    pub fn correct(&mut self, frame: &Frame, truth: Option<&Grid<u8>>) -> Result<(), AgentError> {
-        self.estimator
-            .correct(frame, truth)
-            .map_err(|error| match error {
-                EstimatorError::NoTruth => AgentError::NeedsTruth {
-                    policy: self.policy.name.clone(),
-                },
-                error => error.into(),
-            })
+    /// The belief is then as it was.
+    pub fn correct(&mut self, frame: &Frame, truth: Option<&Grid<u8>>) -> Result<()> {
+        Ok(self.estimator.correct(frame, truth)?)
     }
 
     /// Moves the belief from X_k to X_{k+1} (paper eq. 6).
@@ -220,9 +177,6 @@ impl Agent {
     }
 
     /// Tells a clairvoyant agent the state X_{k+1} that its next path will meet; others ignore it.
-    ///
-    /// # Errors
-    /// [`BeliefError`] for states that the model does not have.
     pub fn foresee(&mut self, next: &Grid<u8>) -> Result<(), BeliefError> {
         self.estimator.foresee(next)
     }
@@ -232,17 +186,14 @@ impl Agent {
         self.estimator.belief()
     }
 
-    /// Where its belief comes from.
     pub fn estimator(&self) -> &dyn Estimator {
         &*self.estimator
     }
 
-    /// The same, to be changed.
     pub fn estimator_mut(&mut self) -> &mut dyn Estimator {
         &mut *self.estimator
     }
 
-    /// What paths are planned on.
     pub fn basis_mut(&mut self) -> &mut PlanBasis {
         &mut self.basis
     }

@@ -4,8 +4,9 @@
 
 use crate::estimation::scoring::Score;
 use crate::planning::Plan;
-use crate::rollout::agent::{Agent, AgentError};
+use crate::rollout::agent::Agent;
 use crate::server::client::Observation;
+use anyhow::Result;
 use protocol::agent_belief::Intent;
 use protocol::{Cell, Grid, Move};
 use rayon::prelude::*;
@@ -13,7 +14,6 @@ use std::time::{Duration, Instant};
 
 /// An agent at its world.
 pub struct Robot {
-    /// What estimates and plans.
     pub agent: Agent,
     observation: Observation,
     planning: Duration,
@@ -22,7 +22,6 @@ pub struct Robot {
 /// What a world shows after a step.
 #[derive(Debug, Clone)]
 pub struct Seen {
-    /// Result and frame.
     pub observation: Observation,
     /// The hidden states X_k, shape `[H, W]`, where they are published.
     pub truth: Option<Grid<u8>>,
@@ -30,9 +29,7 @@ pub struct Seen {
 
 /// What a step did to one robot. Between correction and prediction: its agent's belief is the posterior.
 pub struct Turn {
-    /// What the world showed before.
     pub before: Observation,
-    /// The path that was flown.
     pub plan: Plan,
     /// The hidden states X_{k+1}, where they are published.
     pub truth: Option<Grid<u8>>,
@@ -51,14 +48,7 @@ impl Robot {
     }
 
     /// Takes in what the world shows; `look` finds the posterior. The belief is then about X_{k+1}.
-    ///
-    /// # Errors
-    /// If the frame is impossible or the hidden states are missing.
-    pub fn begin(
-        &mut self,
-        truth: Option<&Grid<u8>>,
-        look: impl FnOnce(&Self),
-    ) -> Result<(), AgentError> {
+    pub fn begin(&mut self, truth: Option<&Grid<u8>>, look: impl FnOnce(&Self)) -> Result<()> {
         self.correct(truth)?;
         look(self);
         self.agent.predict();
@@ -66,10 +56,7 @@ impl Robot {
     }
 
     /// [`Self::new`] and [`Self::begin`].
-    ///
-    /// # Errors
-    /// As [`Self::begin`].
-    pub fn at(agent: Agent, seen: Seen) -> Result<Self, AgentError> {
+    pub fn at(agent: Agent, seen: Seen) -> Result<Self> {
         let mut robot = Self::new(agent, seen.observation);
         robot.begin(seen.truth.as_ref(), |_| ())?;
         Ok(robot)
@@ -80,7 +67,6 @@ impl Robot {
         self.agent.intent(self.planning)
     }
 
-    /// What its world shows.
     pub fn observation(&self) -> &Observation {
         &self.observation
     }
@@ -104,7 +90,7 @@ impl Robot {
         plan
     }
 
-    fn see(&mut self, plan: Plan, seen: Seen) -> Result<Turn, AgentError> {
+    fn see(&mut self, plan: Plan, seen: Seen) -> Result<Turn> {
         let Seen { observation, truth } = seen;
         let score = self.agent.score(&observation.frame)?;
         let before = std::mem::replace(&mut self.observation, observation);
@@ -117,23 +103,20 @@ impl Robot {
         })
     }
 
-    fn correct(&mut self, truth: Option<&Grid<u8>>) -> Result<(), AgentError> {
+    fn correct(&mut self, truth: Option<&Grid<u8>>) -> Result<()> {
         self.agent.correct(&self.observation.frame, truth)
     }
 }
 
 /// One step of all robots. `robot` finds a run's own; `plan` chooses its path; `fly` flies all paths and gives what
 /// each world shows then, in order; `look` is told of each run's turn, by its index, one after the other.
-///
-/// # Errors
-/// Those of `fly` and `look`, and that of the first agent that cannot take in what it sees.
-pub fn step<R: Send, E: From<AgentError>>(
+pub fn step<R: Send>(
     runs: &mut [R],
     robot: impl Fn(&mut R) -> &mut Robot + Sync,
     plan: impl Fn(&mut R) -> Plan + Sync,
-    fly: impl FnOnce(&[Vec<Move>]) -> Result<Vec<Seen>, E>,
-    mut look: impl FnMut(usize, &mut R, Turn) -> Result<(), E>,
-) -> Result<(), E> {
+    fly: impl FnOnce(&[Vec<Move>]) -> Result<Vec<Seen>>,
+    mut look: impl FnMut(usize, &mut R, Turn) -> Result<()>,
+) -> Result<()> {
     let plans = in_parallel(runs.iter_mut(), plan);
     let paths: Vec<Vec<Move>> = plans.iter().map(|plan| plan.moves.clone()).collect();
     let seen = runs.iter_mut().zip(plans).zip(fly(&paths)?);

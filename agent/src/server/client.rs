@@ -5,14 +5,14 @@ use base64::engine::general_purpose::STANDARD as BASE64;
 use protocol::channels::{ChannelError, Instance};
 use protocol::connection::{ConnectionError, StepAnswer, unexpected};
 use protocol::control::{
-    LeaseInfo, LeftPart, MAX_BELIEF_PART, Reply, Request, ServerInfo, WorldInfo, WorldSeed,
+    LeftPart, MAX_BELIEF_PART, Reply, Request, ServerInfo, WorldInfo, WorldSeed,
 };
-use protocol::message::{FLAG_FULL_COVERAGE, Operation, StepRequest, StepResult};
+use protocol::message::{FLAG_FULL_COVERAGE, Operation, Status, StepRequest, StepResult};
 use protocol::path::path_to_bytes;
 use protocol::{Cell, Connection, Frame, Move, Shape};
+use std::fmt::Display;
 use std::ops::Range;
 use std::os::fd::BorrowedFd;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// How this program names itself to servers.
@@ -30,9 +30,7 @@ pub const CONTROL_TIMEOUT: Duration = Duration::from_secs(120);
 /// What a world shows after a step, or when it is taken over.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Observation {
-    /// Step index, reward, counts, robot.
     pub result: StepResult,
-    /// What the robot saw.
     pub frame: Frame,
 }
 
@@ -71,7 +69,6 @@ impl Observation {
         ]
     }
 
-    /// The robot's cell.
     pub fn robot(&self) -> Cell {
         Cell {
             row: self.result.row as usize,
@@ -81,6 +78,24 @@ impl Observation {
 }
 
 impl Client {
+    /// Acquires one world, which stays as it is, and observes it.
+    pub fn acquire_one(
+        instance: &Instance,
+        world: u32,
+        takeover: bool,
+    ) -> Result<(Self, Observation), ConnectionError> {
+        let mut client = Self::acquire(
+            instance,
+            &Claim {
+                worlds: world..world + 1,
+                takeover,
+                time_to_live: None,
+            },
+        )?;
+        let observation = client.observe(client.worlds())?.remove(0);
+        Ok((client, observation))
+    }
+
     /// Connects and acquires worlds; they stay where they are.
     ///
     /// # Errors
@@ -88,7 +103,16 @@ impl Client {
     pub fn acquire(instance: &Instance, claim: &Claim) -> Result<Self, ConnectionError> {
         let mut connection = Connection::open(instance, CLIENT_NAME, CONTROL_TIMEOUT)?;
         let shape = shape_of(connection.info())?;
-        let lease = acquire(&mut connection, claim)?.lease;
+        let request = Request::Acquire {
+            first_world: claim.worlds.start,
+            n_worlds: claim.worlds.len() as u32,
+            takeover: claim.takeover,
+            ttl_millis: claim.time_to_live.map(|time| time.as_millis() as u64),
+        };
+        let lease = match connection.control(&request, CONTROL_TIMEOUT)? {
+            Reply::Lease(lease) => lease.lease,
+            other => return Err(unexpected("acquire", &other)),
+        };
         Ok(Self {
             connection,
             lease,
@@ -102,12 +126,10 @@ impl Client {
         self.connection.info()
     }
 
-    /// The grid.
     pub fn shape(&self) -> Shape {
         self.shape
     }
 
-    /// The worlds held.
     pub fn worlds(&self) -> Range<u32> {
         self.worlds.clone()
     }
@@ -192,7 +214,9 @@ impl Client {
             let request = Request::Belief { world, offset };
             match self.connection.control(&request, STEP_TIMEOUT) {
                 Ok(Reply::Belief { info, data, .. }) if info.kind == kind => {
-                    let part = BASE64.decode(data).map_err(|error| garbled(&error))?;
+                    let part = BASE64
+                        .decode(data)
+                        .map_err(|error| garbled("belief", &error))?;
                     bytes.extend_from_slice(&part);
                     let (is_last, is_whole) = (part.is_empty(), bytes.len() as u64 == info.length);
                     if *first.get_or_insert_with(|| info.clone()) != info {
@@ -238,7 +262,6 @@ impl Client {
         self.connection.check_server()
     }
 
-    /// Gives the worlds back.
     pub fn release(mut self) -> Result<(), ConnectionError> {
         let request = Request::Release { lease: self.lease };
         self.connection.control(&request, STEP_TIMEOUT).map(|_| ())
@@ -276,22 +299,18 @@ impl Client {
         let frames = answer.frames.chunks_exact(self.shape.n_cells());
         let observation = |(result, bytes): (&StepResult, &[u8])| {
             let frame = Frame::from_bytes(self.shape, n_observations, bytes);
-            let frame = frame.map_err(|error| ConnectionError::Garbled {
-                what: "step",
-                problem: error.to_string(),
-            })?;
             Ok(Observation {
                 result: *result,
-                frame,
+                frame: frame.map_err(|error| garbled("step", &error))?,
             })
         };
         answer.results.iter().zip(frames).map(observation).collect()
     }
 }
 
-fn garbled(problem: &dyn std::fmt::Display) -> ConnectionError {
+fn garbled(what: &'static str, problem: &dyn Display) -> ConnectionError {
     ConnectionError::Garbled {
-        what: "belief",
+        what,
         problem: problem.to_string(),
     }
 }
@@ -303,17 +322,14 @@ pub fn server_info(instance: &Instance) -> Result<ServerInfo, ConnectionError> {
 }
 
 /// Waits until an instance has a server, and says so once if that is not at once; returns whether it has
-/// one: not if `stop` was set meanwhile.
-///
-/// # Errors
-/// [`ConnectionError`], that of the last try, if there is none within `limit`.
+/// one: not once `is_over`.
 pub fn wait_for_server(
     instance: &Instance,
     limit: Duration,
-    stop: &AtomicBool,
+    is_over: impl Fn() -> bool,
 ) -> Result<bool, ConnectionError> {
     let (start, mut is_told) = (Instant::now(), false);
-    while !stop.load(Ordering::Relaxed) {
+    while !is_over() {
         match server_info(instance) {
             Ok(_) => return Ok(true),
             Err(error) if is_away(&error) && start.elapsed() < limit => {
@@ -339,6 +355,23 @@ pub fn is_away(error: &ConnectionError) -> bool {
     }
 }
 
+/// Whether something failed because a server is away that may come back.
+pub fn is_outage(error: &anyhow::Error) -> bool {
+    error.downcast_ref().is_some_and(is_away)
+}
+
+/// Status, detail and message, if something failed because a server refused.
+pub fn refusal(error: &anyhow::Error) -> Option<(Status, u64, &str)> {
+    match error.downcast_ref()? {
+        ConnectionError::Refused {
+            status,
+            detail,
+            message,
+        } => Some((*status, *detail, message)),
+        _ => None,
+    }
+}
+
 /// Whether a belief of a kind was left about a world as it stands; needs no lease.
 pub fn is_belief_left(
     instance: &Instance,
@@ -356,26 +389,7 @@ pub fn is_belief_left(
 }
 
 /// A server's grid.
-///
-/// # Errors
-/// [`ConnectionError::Garbled`] if it is none.
 pub fn shape_of(info: &ServerInfo) -> Result<Shape, ConnectionError> {
     let shape = Shape::new(info.height, info.width);
-    shape.map_err(|error| ConnectionError::Garbled {
-        what: "hello",
-        problem: error.to_string(),
-    })
-}
-
-fn acquire(connection: &mut Connection, claim: &Claim) -> Result<LeaseInfo, ConnectionError> {
-    let request = Request::Acquire {
-        first_world: claim.worlds.start,
-        n_worlds: claim.worlds.len() as u32,
-        takeover: claim.takeover,
-        ttl_millis: claim.time_to_live.map(|time| time.as_millis() as u64),
-    };
-    match connection.control(&request, CONTROL_TIMEOUT)? {
-        Reply::Lease(lease) => Ok(lease),
-        other => Err(unexpected("acquire", &other)),
-    }
+    shape.map_err(|error| garbled("hello", &error))
 }

@@ -24,16 +24,13 @@ pub struct Feed {
 struct Turns {
     /// When a world was shown last.
     shown: Option<Instant>,
-    /// Worlds that were shown.
     n_shown: usize,
 }
 
 /// One world's belief, the posterior after the frame of `result`.
 pub struct View<'a> {
     pub world: u32,
-    /// Where it stands.
     pub result: &'a StepResult,
-    /// What is believed of it.
     pub belief: &'a Belief,
     /// Who believes it, and what the path was for.
     pub intent: Intent,
@@ -83,7 +80,6 @@ impl Feed {
         }
     }
 
-    /// Shows a world's belief.
     pub fn show(&mut self, view: &View<'_>) {
         let Some(publisher) = &mut self.publisher else {
             return;

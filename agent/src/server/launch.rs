@@ -1,35 +1,20 @@
 //! A server or a dashboard of our own: found, started, waited for, and stopped whatever happens.
 
-use protocol::channels::{ChannelError, Instance};
-use protocol::connection::{Connection, ConnectionError};
+use anyhow::{Context, Result, bail};
+use protocol::channels::Instance;
+use protocol::connection::Connection;
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
-use thiserror::Error;
 
 /// How long a server may take to answer its first hello.
 const START_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// How long it may take to stop before it is killed.
 const STOP_TIMEOUT: Duration = Duration::from_secs(3);
-
-/// Why there is no server.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum LaunchError {
-    #[error("start {program}: {problem}")]
-    Start { program: String, problem: String },
-    /// It ended at once; its own words stand above.
-    #[error("the {what} ended with {status} before it served")]
-    Ended { what: &'static str, status: String },
-    #[error(transparent)]
-    Connection(#[from] ConnectionError),
-    #[error(transparent)]
-    Channel(#[from] ChannelError),
-}
 
 /// A running server of ours; dropping it stops it.
 pub struct OwnServer {
@@ -49,7 +34,7 @@ struct OwnProgram(Child);
 impl OwnServer {
     /// Starts `emberwatch-server` with the given arguments on an instance of its own, and waits until
     /// it answers. It ends with this process, however that ends.
-    pub fn start(program: Option<PathBuf>, arguments: &[String]) -> Result<Self, LaunchError> {
+    pub fn start(program: Option<PathBuf>, arguments: &[String]) -> Result<Self> {
         let instance = Instance::new(&format!("private-{}", std::process::id()))?;
         let mut command = private(program.unwrap_or_else(|| beside_this("emberwatch-server")));
         command
@@ -65,7 +50,7 @@ impl OwnServer {
         &self.instance
     }
 
-    fn wait_until_it_answers(&mut self) -> Result<(), LaunchError> {
+    fn wait_until_it_answers(&mut self) -> Result<()> {
         let deadline = Instant::now() + START_TIMEOUT;
         loop {
             match Connection::open(
@@ -78,10 +63,7 @@ impl OwnServer {
                 Err(_) => std::thread::sleep(Duration::from_millis(10)),
             }
             if let Ok(Some(status)) = self.program.0.try_wait() {
-                return Err(LaunchError::Ended {
-                    what: "server",
-                    status: status.to_string(),
-                });
+                bail!("the server ended with {status} before it served");
             }
         }
     }
@@ -90,10 +72,7 @@ impl OwnServer {
 impl OwnDashboard {
     /// Starts `emberwatch-dashboard` for an instance; browsers reach its page at `address`. It ends with this
     /// process, however that ends.
-    ///
-    /// # Errors
-    /// [`LaunchError`], also when the address is taken: its own words stand above.
-    pub fn start(instance: &Instance, address: SocketAddr) -> Result<Self, LaunchError> {
+    pub fn start(instance: &Instance, address: SocketAddr) -> Result<Self> {
         let mut command = private(beside_this("emberwatch-dashboard"));
         let address = address.to_string();
         command
@@ -108,13 +87,10 @@ impl OwnDashboard {
         let mut program = OwnProgram::start(&mut command)?;
         let url = program.first_line(START_TIMEOUT);
         match url.trim() {
-            "" => Err(LaunchError::Ended {
-                what: "dashboard",
-                status: match program.0.try_wait() {
-                    Ok(Some(status)) => status.to_string(),
-                    _ => format!("nothing to say for {START_TIMEOUT:?}"),
-                },
-            }),
+            "" => match program.0.try_wait() {
+                Ok(Some(status)) => bail!("the dashboard ended with {status} before it served"),
+                _ => bail!("the dashboard: nothing to say for {START_TIMEOUT:?}"),
+            },
             url => Ok(Self {
                 url: url.into(),
                 _program: program,
@@ -122,19 +98,16 @@ impl OwnDashboard {
         }
     }
 
-    /// Where its page is.
     pub fn url(&self) -> &str {
         &self.url
     }
 }
 
 impl OwnProgram {
-    fn start(command: &mut Command) -> Result<Self, LaunchError> {
-        let child = command.spawn().map_err(|error| LaunchError::Start {
-            program: command.get_program().display().to_string(),
-            problem: error.to_string(),
-        })?;
-        Ok(Self(child))
+    fn start(command: &mut Command) -> Result<Self> {
+        let child = command.spawn();
+        let program = command.get_program().display();
+        Ok(Self(child.with_context(|| format!("start {program}"))?))
     }
 
     /// The first line that it writes to its standard output; empty if it ends or takes too long.

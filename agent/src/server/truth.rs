@@ -1,31 +1,15 @@
 //! The hidden states of a batch of worlds, for evaluation: never for anything that learns.
 
-use protocol::channels::{ChannelError, Instance};
+use anyhow::{Context, Result, bail};
+use protocol::channels::Instance;
 use protocol::message::TruthHeader;
 use protocol::observer::{Observer, Sample};
 use protocol::{Grid, Shape};
 use std::ops::Range;
 use std::time::{Duration, Instant};
-use thiserror::Error;
 
 /// How long the hidden state may take to follow its step.
 const TIMEOUT: Duration = Duration::from_secs(5);
-
-/// Why hidden states could not be had.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum TruthError {
-    #[error(transparent)]
-    Channel(#[from] ChannelError),
-    #[error("truth of world {world} at step {step}: not published within {TIMEOUT:?}")]
-    Missing { world: u32, step: u64 },
-    #[error("truth of world {world}: expected {expected} bytes, got {got}")]
-    Length {
-        world: u32,
-        expected: usize,
-        got: usize,
-    },
-}
 
 /// Reads `truth` in step with a client that acts.
 pub struct TruthFeed {
@@ -34,8 +18,7 @@ pub struct TruthFeed {
 }
 
 impl TruthFeed {
-    /// Attaches to the truth channel.
-    pub fn open(instance: &Instance, shape: Shape) -> Result<Self, TruthError> {
+    pub fn open(instance: &Instance, shape: Shape) -> Result<Self> {
         Ok(Self {
             observer: Observer::truth(instance)?,
             shape,
@@ -45,15 +28,7 @@ impl TruthFeed {
     /// The states of consecutive worlds at a step of the episodes with these seeds.
     ///
     /// Samples of other worlds, steps and episodes are passed over, so read each step once, in order.
-    ///
-    /// # Errors
-    /// [`TruthError::Missing`] names the first world whose state did not come.
-    pub fn states(
-        &self,
-        worlds: Range<u32>,
-        seeds: &[u64],
-        step: u64,
-    ) -> Result<Vec<Grid<u8>>, TruthError> {
+    pub fn states(&self, worlds: Range<u32>, seeds: &[u64], step: u64) -> Result<Vec<Grid<u8>>> {
         let mut states: Vec<Option<Grid<u8>>> = vec![None; worlds.len()];
         let deadline = Instant::now() + TIMEOUT;
         while let Some(missing) = states.iter().position(Option::is_none) {
@@ -63,10 +38,8 @@ impl TruthFeed {
                 left => self.observer.receive(left)?,
             };
             let Some(sample) = sample else {
-                return Err(TruthError::Missing {
-                    world: worlds.start + missing as u32,
-                    step,
-                });
+                let world = worlds.start + missing as u32;
+                bail!("truth of world {world} at step {step}: not published within {TIMEOUT:?}");
             };
             let Sample { header, payload } = sample;
             let wanted = |index: usize| header.step == step && header.seed == seeds[index];
@@ -83,12 +56,11 @@ impl TruthFeed {
         Ok(states.into_iter().flatten().collect())
     }
 
-    fn grid(&self, world: u32, bytes: Vec<u8>) -> Result<Grid<u8>, TruthError> {
+    fn grid(&self, world: u32, bytes: Vec<u8>) -> Result<Grid<u8>> {
         let (expected, got) = (self.shape.n_cells(), bytes.len());
-        Grid::from_shape_vec(self.shape.dim(), bytes).map_err(|_| TruthError::Length {
-            world,
-            expected,
-            got,
+        let grid = Grid::from_shape_vec(self.shape.dim(), bytes);
+        grid.with_context(|| {
+            format!("truth of world {world}: expected {expected} bytes, got {got}")
         })
     }
 }

@@ -1,6 +1,7 @@
 //! Results and worlds made up for the tests.
 
-use agent::benchmark::report::PolicyRun;
+use agent::Belief;
+use agent::benchmark::report::{PolicyRun, Snapshot};
 use protocol::model::{ModelFile, ObservationEntry, StateEntry};
 use protocol::{Cell, Frame, Grid, Model, Probabilities, Shape, UNOBSERVED};
 
@@ -103,14 +104,10 @@ pub fn model(n: usize) -> Model {
     Model::new(file).expect("test model")
 }
 
-/// What a [`agent::benchmark::report::Snapshot`] borrows or owns.
 pub struct Scene {
     pub model: Model,
-    pub truth: Grid<u8>,
+    pub snapshot: Snapshot,
     pub observation: Grid<u8>,
-    pub frame: Frame,
-    pub path_cells: Vec<Cell>,
-    pub belief: Probabilities,
 }
 
 /// A blob of the last state within the one before it, and a path that wanders over both.
@@ -140,13 +137,18 @@ pub fn scene(model: Model, height: usize, width: usize) -> Scene {
     }
     let frame = Frame::from_bytes(shape, model.n_observations(), &seen).expect("test frame");
     let belief = belief(&truth, last + 1);
-    Scene {
-        model,
+    let snapshot = Snapshot {
+        seed: 100,
+        step: 1234,
         truth,
-        observation,
         frame,
         path_cells,
-        belief,
+        belief: Belief::from_probabilities(belief).expect("test belief"),
+    };
+    Scene {
+        model,
+        snapshot,
+        observation,
     }
 }
 

@@ -1,5 +1,5 @@
 use crate::synthetic::{ladder, run};
-use agent::benchmark::report::{PolicyRun, ReportError, render_table, write_csv};
+use agent::benchmark::report::{PolicyRun, render_table, write_csv};
 
 /// Rewards 1, 3, 5 and 2, 5, 8 on worlds 1, 2, 3; the oracle earns 4, 8, 8.
 fn three_policies() -> Vec<PolicyRun> {
@@ -150,6 +150,5 @@ fn a_csv_that_cannot_be_written_is_named() {
     let directory = tempfile::tempdir().expect("a directory");
     let path = directory.path().join("missing").join("runs.csv");
     let error = write_csv(&path, &three_policies()).expect_err("no such directory");
-    assert!(matches!(&error, ReportError::Write { path: named, .. } if *named == path));
     assert!(error.to_string().contains("runs.csv"), "{error}");
 }

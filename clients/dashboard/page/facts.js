@@ -128,10 +128,12 @@ function drawAgent(picture, isNewest) {
 
 // Before anything is known there is nothing to lay out: a word on how to begin.
 function drawEmpty(picture) {
-  const { instance, source, info, shown, world } = picture;
+  const { instance, source, info, shown, world, player } = picture;
   const isEmpty = !info || !shown;
   byId("empty").hidden = !isEmpty;
-  for (const id of ["facts", "stage", "transport"]) byId(id).hidden = isEmpty;
+  for (const id of ["facts", "stage"]) byId(id).hidden = isEmpty;
+  // A recording can begin with a long time of nothing, which a faster speed shortens.
+  byId("transport").hidden = isEmpty && !player;
   byId("server").hidden = !info;
   if (!isEmpty) return;
   const isAwaited = !info && source === "live";

@@ -61,7 +61,7 @@ fn run(cli: &Cli) -> Result<()> {
     if let Err(error) = rustix::process::nice(NICENESS) {
         tracing::warn!("priority not lowered: {error}");
     }
-    let keeper = cli.exit_with.map(WatchedProcess::watch).transpose()?;
+    let exit_with = cli.exit_with.map(WatchedProcess::watch).transpose()?;
     let stop = stop_on_signals().context("handle signals")?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -79,7 +79,7 @@ fn run(cli: &Cli) -> Result<()> {
     announce(address, cli.open)?;
     let end = async {
         while !stop.load(Ordering::Relaxed)
-            && !keeper.as_ref().is_some_and(WatchedProcess::has_ended)
+            && !exit_with.as_ref().is_some_and(WatchedProcess::has_ended)
         {
             tokio::time::sleep(TICK).await;
         }

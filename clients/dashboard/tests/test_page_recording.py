@@ -1,5 +1,8 @@
 """A recording: it plays, waits, goes fast, ends, and begins again."""
 
+import zlib
+
+from emberwatch.recording import FILE_HEADER, RECORD_HEADER
 from running import eventually
 
 
@@ -45,3 +48,33 @@ def scrub_at_rest(look) -> None:
     look.page.keyboard.press("Space")
     last = look.picture(".kept.last")
     look.eventually(lambda: look.picture(".shown.serial") == last, "the newest")
+
+
+def test_a_recording_that_begins_with_nothing_can_be_played_faster(programs, open_page, tmp_path):
+    server = programs.server()
+    eventually(lambda: programs.is_serving(server.instance), "a server")
+    file = tmp_path / "late.recording"
+    recorder = programs.record(server.instance, file, steps=20)
+    programs.agent(server.instance)
+    assert recorder.wait() == 0
+    file.write_bytes(delayed(file.read_bytes(), nanos=3600 * 10**9))
+    look = open_page(programs.dashboard(recording=file))
+    look.eventually(lambda: look.picture(".player.playing") is True, "it plays")
+    assert look.picture(".shown") is None
+    look.at("speed").select_option("0")
+    look.eventually(lambda: look.text("clock") == "ended", "its end")
+
+
+def delayed(recording: bytes, *, nanos: int) -> bytes:
+    """A recording whose records come later, but for the first, which tells of the server."""
+    parts = [recording[: FILE_HEADER.size]]
+    rest = recording[FILE_HEADER.size :]
+    while rest:
+        time, kind, length, n_lost, _ = RECORD_HEADER.unpack_from(rest)
+        body = rest[RECORD_HEADER.size : RECORD_HEADER.size + length]
+        time += nanos if len(parts) > 1 else 0
+        head = RECORD_HEADER.pack(time, kind, length, n_lost, 0)[:-4]
+        checksum = zlib.crc32(body, zlib.crc32(head))
+        parts.append(head + checksum.to_bytes(4, "little") + body)
+        rest = rest[RECORD_HEADER.size + length :]
+    return b"".join(parts)

@@ -1,25 +1,21 @@
 //! Removes the files of dead processes, which may have died at any instruction, also while they started or ended.
 //!
-//! During a [`Turn`] no other process makes or removes anything, so every file is one of three: part of a node whose process
-//! lives, of a service that such a node uses, or left over. iceoryx2 itself removes dead nodes from services that
+//! During a [`Turn`] no other process makes or removes anything, so every file is one of three: part of a node whose
+//! process lives, of a service that such a node uses, or left over. iceoryx2 itself removes dead nodes from services that
 //! live on; it cannot remove what was never finished, and it waits without end for an empty segment to become larger.
 
-use super::directory::{SHARED_MEMORY, channel_directory, directory_error, node_config, prefix};
-use super::error::{ChannelError, Ipc};
-use super::process::{if_there, process_state};
+use super::channel_files::{
+    ChannelFiles, Used, any, entries, is_in_the_making, is_writable, metadata, nodes,
+};
+use super::directory::{SHARED_MEMORY, channel_directory, directory_error, node_config};
+use super::error::ChannelError;
 use super::turn::{SHORT_WAIT, Turn};
-use iceoryx2::node::{DeadNodeView, Node, NodeState, NodeView};
-use iceoryx2::prelude::{CallbackProgression, Config};
-use rustix::time::{ClockId, clock_gettime};
+use iceoryx2::node::NodeView;
+use iceoryx2::prelude::Config;
 use std::collections::HashSet;
-use std::fs::Metadata;
 use std::io::Error;
-use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
-
-/// What is younger and of a living process may be in the making, by a client that takes no turns.
-const MAKING: Duration = Duration::from_secs(1);
 
 /// How long to wait for a segment to be finished, or to be left over.
 const UNFINISHED: Duration = Duration::from_millis(1500);
@@ -61,29 +57,7 @@ pub(crate) fn make_way() -> Result<(), ChannelError> {
     }
 }
 
-/// Where channels' files are, and what their names begin with.
-struct ChannelFiles {
-    root: PathBuf,
-    shared: PathBuf,
-    prefix: String,
-}
-
-/// What living nodes use: ids of their ports and services, hashes of the services' names.
-#[derive(Debug, Default)]
-struct Used {
-    ids: HashSet<u128>,
-    hashes: HashSet<String>,
-}
-
 impl ChannelFiles {
-    fn of_user() -> Self {
-        Self {
-            root: channel_directory(),
-            shared: SHARED_MEMORY.into(),
-            prefix: prefix(),
-        }
-    }
-
     /// The first error ends it: what cannot be read may belong to a process that lives.
     fn remove_leftovers(&self, config: &Config) -> Result<usize, Error> {
         // Files before nodes and their tags: what a client without turns makes meanwhile is not among them.
@@ -122,34 +96,10 @@ impl ChannelFiles {
         })
     }
 
-    fn unfinished_segment(&self) -> Result<Option<PathBuf>, Error> {
-        for path in self.segments()? {
-            if self.is_unfinished(&path)? {
-                return Ok(Some(path));
-            }
-        }
-        Ok(None)
-    }
-
-    /// A segment can be read only when it is finished. A living port's memory grows without a turn, and is not opened
-    /// before.
-    fn is_unfinished(&self, segment: &Path) -> Result<bool, Error> {
-        let unfinished = |found: Metadata| found.len() == 0 || found.mode() & 0o400 == 0;
-        let grows =
-            || Ok::<_, Error>(name(segment).ends_with(".data") && any(&self.ids(segment), lives)?);
-        Ok(metadata(segment)?.is_some_and(unfinished) && !grows()?)
-    }
-
     fn remove_nodes(&self, files: Vec<PathBuf>, living: &HashSet<u128>) -> Result<usize, Error> {
-        remove_if(files, |path| {
-            let name = name(path);
-            let monitor = name
-                .strip_prefix(&self.prefix)
-                .and_then(|name| name.split_once(".node_monitor"));
-            let id = monitor.map_or(&*name, |(id, _)| id).parse();
-            id.map_or(Ok(false), |id| {
-                Ok(!living.contains(&id) && !is_in_the_making(id)?)
-            })
+        remove_if(files, |path| match self.node(path) {
+            Some(id) => Ok(!living.contains(&id) && !is_in_the_making(id)?),
+            None => Ok(false),
         })
     }
 
@@ -167,163 +117,6 @@ impl ChannelFiles {
             Ok(!ids.is_empty() && !ids.iter().any(is_used) && !any(&ids, is_in_the_making)?)
         })
     }
-
-    fn used(&self, living: &HashSet<u128>) -> Result<Used, Error> {
-        let mut used = Used::default();
-        for &node in living {
-            let ports = self.tags(node, ".port_tag")?;
-            used.ids
-                .extend(ports.iter().filter_map(|id| id.parse::<u128>().ok()));
-            used.hashes.extend(self.tags(node, ".service_tag")?);
-        }
-        Ok(used)
-    }
-
-    fn folder(&self, node: u128) -> PathBuf {
-        self.root.join("nodes").join(node.to_string())
-    }
-
-    /// What a node's folder has finished tags of one kind for.
-    fn tags(&self, node: u128, suffix: &str) -> Result<HashSet<String>, Error> {
-        let mut tags = HashSet::new();
-        for path in entries(&self.folder(node))? {
-            let name = name(&path);
-            let tag = name
-                .strip_prefix(&self.prefix)
-                .and_then(|name| name.strip_suffix(suffix));
-            if let Some(tag) = tag
-                && !is_writable(&path)?
-            {
-                tags.insert(tag.to_owned());
-            }
-        }
-        Ok(tags)
-    }
-
-    /// The ids of services in use, as their files say.
-    fn service_ids(&self, used: &Used) -> Result<HashSet<u128>, Error> {
-        let mut ids = HashSet::new();
-        for path in entries(&self.root.join("services"))? {
-            if self
-                .hash(&path)
-                .is_some_and(|hash| used.hashes.contains(&hash))
-                && let Some(text) = if_there(std::fs::read_to_string(&path))?
-            {
-                let unread = || Error::other(format!("{}: expected an id", path.display()));
-                ids.insert(service_id(&text).ok_or_else(unread)?);
-            }
-        }
-        Ok(ids)
-    }
-
-    fn hash(&self, service: &Path) -> Option<String> {
-        let name = name(service);
-        let hash = name.strip_prefix(&self.prefix)?.strip_suffix(".service")?;
-        Some(hash.to_owned())
-    }
-
-    /// The ids in the name of a segment, `<prefix><hash>_<id>[_<id>].<kind>`, or a socket, `<prefix><id>.event`.
-    fn ids(&self, path: &Path) -> Vec<u128> {
-        let name = name(path);
-        let stem = name
-            .strip_prefix(&self.prefix)
-            .and_then(|name| name.split_once('.'));
-        let words = stem.map_or("", |(stem, _)| stem).split('_');
-        // The segments of one port are numbered.
-        let ids = words.filter(|word| word.len() > 10);
-        ids.filter_map(|word| word.parse().ok()).collect()
-    }
-
-    fn segments(&self) -> Result<Vec<PathBuf>, Error> {
-        self.of_prefix(&self.shared)
-    }
-
-    fn of_prefix(&self, folder: &Path) -> Result<Vec<PathBuf>, Error> {
-        let mut paths = entries(folder)?;
-        paths.retain(|path| name(path).starts_with(&self.prefix));
-        Ok(paths)
-    }
-}
-
-/// Ids of living nodes, and dead nodes.
-fn nodes(config: &Config) -> Result<(HashSet<u128>, Vec<DeadNodeView<Ipc>>), Error> {
-    let (mut living, mut unclear, mut dead) = (HashSet::new(), Vec::new(), Vec::new());
-    let sort = |state| {
-        match state {
-            NodeState::Alive(node) => _ = living.insert(node.id().value()),
-            NodeState::Inaccessible(id) => _ = living.insert(id.value()),
-            NodeState::Dead(node) => dead.push(node),
-            // It died in its start, or it could not be read.
-            NodeState::Undefined(id) => unclear.push(id.value()),
-        }
-        CallbackProgression::Continue
-    };
-    Node::<Ipc>::list(config, sort)
-        .map_err(|error| Error::other(format!("list nodes: {error:?}")))?;
-    for id in unclear {
-        if lives(id)? {
-            living.insert(id);
-        }
-    }
-    Ok((living, dead))
-}
-
-fn service_id(text: &str) -> Option<u128> {
-    let table = text.parse::<toml::Table>().ok()?;
-    let id = table.get("unique_service_id")?;
-    let half = |name| Some(id.get(name)?.as_integer()? as u128);
-    Some(half("unique_value")? << 64 | half("payload_value")?)
-}
-
-/// Whether what an id stands for may be in the making: an id has the time when, and the process that, began it.
-fn is_in_the_making(id: u128) -> Result<bool, Error> {
-    let (seconds, nanos) = (id as u32, (id >> 32) as u32);
-    let age = since_boot().saturating_sub(Duration::new(seconds.into(), nanos));
-    Ok(age < MAKING && lives(id)?)
-}
-
-/// Whether the process that began an id lives, or another one of its number.
-fn lives(id: u128) -> Result<bool, Error> {
-    Ok(!matches!(
-        process_state((id >> 64) as i32)?,
-        None | Some('Z' | 'X')
-    ))
-}
-
-/// The clock of ids.
-fn since_boot() -> Duration {
-    let now = clock_gettime(ClockId::Monotonic);
-    Duration::new(now.tv_sec as u64, now.tv_nsec as u32)
-}
-
-/// A tag, or a node's details, can be written to until it is finished.
-fn is_writable(file: &Path) -> Result<bool, Error> {
-    Ok(metadata(file)?.is_some_and(|found| found.mode() & 0o200 != 0))
-}
-
-fn metadata(path: &Path) -> Result<Option<Metadata>, Error> {
-    if_there(path.symlink_metadata())
-}
-
-fn entries(folder: &Path) -> Result<Vec<PathBuf>, Error> {
-    match if_there(std::fs::read_dir(folder))? {
-        Some(entries) => entries.map(|entry| Ok(entry?.path())).collect(),
-        None => Ok(Vec::new()),
-    }
-}
-
-fn name(path: &Path) -> String {
-    let name = path.file_name().unwrap_or_default();
-    name.to_string_lossy().into_owned()
-}
-
-fn any(ids: &[u128], is: fn(u128) -> Result<bool, Error>) -> Result<bool, Error> {
-    for &id in ids {
-        if is(id)? {
-            return Ok(true);
-        }
-    }
-    Ok(false)
 }
 
 /// Removes files and folders of files; returns how many.
@@ -347,6 +140,8 @@ fn remove_if(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::wire::channel_files::since_boot;
+    use crate::wire::error::Ipc;
     use iceoryx2::node::NodeBuilder;
     use iceoryx2::prelude::{FileName, Path as IpcPath, SemanticString};
     use std::fs::{Permissions, create_dir, remove_dir_all, set_permissions};

@@ -5,6 +5,7 @@
 //! and [`cleanup`] create and remove channels; [`wait`] is the bounded wait. [`recording`] keeps samples in a file.
 
 pub mod agent_belief;
+mod channel_files;
 pub mod channels;
 pub mod cleanup;
 mod codes;

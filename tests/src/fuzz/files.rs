@@ -1,13 +1,13 @@
 //! What the programs read from files: models, checkpoints.
 
 use super::target::Seed;
-use agent::config::{AgentConfig, DecisionsConfig};
+use agent::config::AgentConfig;
 use agent::estimation::Follower;
 use agent::estimation::belief::Belief;
 use agent::estimation::parameters::Dimensions;
-use agent::learning::checkpoint::{Contents, Problem, decode, encode};
+use agent::learning::checkpoint::{Contents, WrongDigest, decode, encode};
 use agent::learning::learned::Learned;
-use agent::learning::learner::{self, Learner, Progress};
+use agent::learning::learner::{self, Learner};
 use agent::learning::reward::RewardEstimate;
 use agent::learning::student::decisions::{self, Decisions};
 use agent::learning::student::filter::{FilterStudent, SavedFilter};
@@ -87,7 +87,8 @@ fn states_stay_states(model: &Model, mut dynamics: Dynamics) {
 pub fn checkpoint(bytes: &[u8]) -> bool {
     let mut bytes = bytes.to_vec();
     let mut learned = Learned::from_bytes(&bytes);
-    if let Err(Problem::Digest { expected, got }) = &learned
+    if let Err(error) = &learned
+        && let Some(WrongDigest { expected, got }) = error.downcast_ref()
         && expected.len() == got.len()
     {
         let mut words = bytes.windows(got.len());
@@ -143,7 +144,7 @@ fn config() -> AgentConfig {
 }
 
 fn decisions() -> Decisions {
-    Decisions::first(&Model::wildfire(), &DecisionsConfig::default(), 0)
+    Decisions::first(&Model::wildfire(), &AgentConfig::default().decisions, 0)
 }
 
 pub fn model_seeds() -> Vec<Seed> {
@@ -195,7 +196,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
 /// A learner that has seen some frames.
 fn filter() -> Contents {
     let (shape, config) = (worlds().shape, config());
-    let mut learner = Learner::new(Progress::first(DIMENSIONS, 5), shape, &config);
+    let mut learner = Learner::new(DIMENSIONS, shape, &config);
     let belief = Belief::uniform(2, shape);
     learner.begin(0);
     for value in [0, 1, 1, 0, 1] {
@@ -205,11 +206,12 @@ fn filter() -> Contents {
         learner.reward(&belief, &[0, 2], 0.5);
         learner.learn().expect("finite");
     }
+    let tensors = learner.named_tensors();
     let state = SavedFilter {
-        learner: learner.saved(),
+        learner,
         worlds: BTreeMap::new(),
     };
-    Contents::new(learner.named_tensors(), &state)
+    Contents::new(tensors, &state)
 }
 
 /// As far as the sizes that it asks for.

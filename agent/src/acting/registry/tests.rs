@@ -2,9 +2,12 @@
 
 use super::*;
 use crate::estimation::dqn_input::DqnInput;
+use crate::learning::learner::Learner;
+use crate::learning::student::Worlds;
 use crate::planning::PlanningProblem;
 use crate::rollout::agent::Aim;
-use ::network::{Autoencoder, AutoencoderSettings, Device, Dqn, DqnSettings, NetworkShape};
+use ::network::{Device, Dqn, DqnSettings};
+use anyhow::Result;
 use protocol::randomness::split_mix;
 use protocol::{Frame, Grid};
 
@@ -40,28 +43,23 @@ fn world(step: u64) -> (Grid<u8>, Frame) {
 }
 
 /// A network that never learned, with the first seed whose DQN suits.
-fn network(input: DqnInput, basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> LearnedNetwork {
-    let settings = AutoencoderSettings::paper();
-    let sizes = NetworkShape {
-        grid: shape(),
-        n_states: 3,
+fn network(input: DqnInput, basis: BasisKind, suits: impl Fn(&Dqn) -> bool) -> Progress {
+    let worlds = Worlds {
+        shape: shape(),
         n_observations: 3,
-        encoding: settings.encoding,
-        hidden: settings.hidden,
+        n_moves: N_MOVES,
+        numbers: 0..1,
     };
-    let autoencoder = Autoencoder::new(settings, sizes, 1, &Device::Cpu).expect("a network");
-    let n_inputs = input.length(settings.hidden, 3);
+    let mut config = config(basis);
+    (config.dqn.input, config.seed) = (input, 1);
+    let mut network = Progress::first(&worlds, &config, &Device::Cpu).expect("a network");
+    let n_inputs = input.length(network.autoencoder.shape().hidden, 3);
     let dqn = |seed| Dqn::new(DqnSettings::paper(), n_inputs, 4, seed);
-    LearnedNetwork {
-        autoencoder,
-        dqn: (0..1000).map(dqn).find(suits).expect("a seed that suits"),
-        input,
-        basis,
-        target: 2,
-    }
+    network.dqn = (0..1000).map(dqn).find(suits).expect("a seed that suits");
+    network
 }
 
-fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent, AgentError> {
+fn agent(policy: &str, config: &AgentConfig, learned: &Learned) -> Result<Agent> {
     let model = Model::wildfire();
     let task = Task {
         model: &model,
@@ -120,7 +118,7 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
         kernel: (3, 3),
     };
     let learned = Learned {
-        filter: Some(crate::learning::learner::Progress::first(dimensions, 0).learned()),
+        filter: Some(Learner::new(dimensions, shape(), &AgentConfig::default()).learned()),
         network: Some(Arc::new(network)),
         decisions: None,
     };
@@ -163,7 +161,10 @@ fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
         let error = agent("dqn_beam", &other, &learned)
             .err()
             .expect("no settings");
-        assert!(error.to_string().contains("settings: expected"), "{error}");
+        assert!(
+            format!("{error:#}").contains("settings: expected"),
+            "{error}"
+        );
         contents.settings = toml::to_string(&config(basis)).expect("TOML");
         learned.decisions = Some(Arc::new(contents));
         let agent = agent("dqn_beam", &other, &learned).expect("an agent");

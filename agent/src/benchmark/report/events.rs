@@ -2,12 +2,13 @@
 
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::Estimate;
-use crate::learning::tensorboard::{EventFile, EventsError, Value};
+use crate::learning::tensorboard::{EventFile, Value};
+use anyhow::Result;
 use std::path::Path;
 
 /// Writes the reward of each step, mean and standard error over worlds, into a folder of each policy's
 /// own; steps are counted from 1.
-pub fn write_events(folder: &Path, runs: &[PolicyRun]) -> Result<(), EventsError> {
+pub fn write_events(folder: &Path, runs: &[PolicyRun]) -> Result<()> {
     let groups = groups(runs);
     for group in &groups {
         let twins = groups.iter().filter(|other| other.policy == group.policy);

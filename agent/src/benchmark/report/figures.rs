@@ -1,13 +1,15 @@
 //! The figures of a comparison: results in, files out. The crate `figures` draws them.
 
-use crate::benchmark::report::file::{ReportError, replace_file};
 use crate::benchmark::report::number::{decimals, readable, with_error};
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::rewards::rewards;
 use crate::benchmark::report::statistics::Estimate;
+use crate::estimation::belief::Belief;
+use crate::file::{Readers, replace_file};
+use anyhow::{Context, Result, bail, ensure};
 use figures::{Bar, Color, Ladder, Named};
 use protocol::model::parse_color;
-use protocol::{Cell, Frame, Grid, Model, Probabilities};
+use protocol::{Cell, Frame, Grid, Model};
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -23,50 +25,37 @@ const FAMILIES: [(&str, Color); 5] = [
     ("fed with the truth", Color(0xe6, 0x9f, 0x00)),
 ];
 
-/// One step of one world, with hindsight.
-pub struct Snapshot<'a> {
-    /// Names and colours of states and observations.
-    pub model: &'a Model,
-    /// The hidden state of each cell.
+/// One step of one world, as a policy saw it.
+#[derive(Debug, Clone)]
+pub struct Snapshot {
+    pub seed: u64,
+    /// Step index k.
+    pub step: u64,
+    /// Hidden states, shape `[H, W]`.
     pub truth: Grid<u8>,
-    /// What the sensor would have shown of each cell.
-    pub observation: Grid<u8>,
-    /// What the robot saw.
     pub frame: Frame,
     /// The robot's cells, the start first.
     pub path_cells: Vec<Cell>,
-    /// The belief after the frame, shape `[S, H, W]`.
-    pub belief: &'a Probabilities,
-    /// The step k.
-    pub step: u64,
-    /// Seed of the world.
-    pub seed: u64,
+    /// The posterior after the frame.
+    pub belief: Belief,
 }
 
 /// Puts a page at `path`: as SVG where the path ends so, else as PNG.
-///
-/// # Errors
-/// [`ReportError::Write`] names `path`.
-pub fn save(path: &Path, svg: &str) -> Result<(), ReportError> {
+pub fn save(path: &Path, svg: &str) -> Result<()> {
     let is_svg = path.extension().is_some_and(|extension| extension == "svg");
-    replace_file(path, if is_svg { "svg" } else { "png" }, |temporary| {
-        let file = match is_svg {
-            true => svg.as_bytes().to_vec(),
-            false => figures::png(svg).map_err(|error| error.to_string())?,
-        };
-        std::fs::write(temporary, file).map_err(|error| error.to_string())
-    })
+    match is_svg {
+        true => replace_file(path, svg.as_bytes(), Readers::Any),
+        false => replace_file(path, &figures::png(svg)?, Readers::Any),
+    }
 }
 
 /// Draws mean reward per policy, the best at the top. `axis_label` says what the reward counts, see
 /// [`FIRE_CELLS_PER_STEP`].
-///
-/// # Errors
-/// [`ReportError::Empty`] without runs; a reward that is not finite, or a file that cannot be written.
-pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<(), ReportError> {
-    if runs.is_empty() {
-        return Err(ReportError::Empty { what: "ladder" });
-    }
+pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<()> {
+    ensure!(
+        !runs.is_empty(),
+        "ladder: expected at least one policy run, got none"
+    );
     for run in runs {
         check_finite(run, "mean reward", std::iter::once(run.mean_reward))?;
     }
@@ -138,15 +127,12 @@ fn ladder_note(runs: &[PolicyRun]) -> String {
 
 /// Draws the rewards over time of up to eight policies (those with the highest mean), means over worlds;
 /// `fire_cells` is the number of burning cells per step, shaded in the background.
-///
-/// # Errors
-/// [`ReportError::Empty`] without rewards; a reward that is not finite, or a file that cannot be written.
 pub fn draw_rewards(
     path: &Path,
     runs: &[PolicyRun],
     axis_label: &str,
     fire_cells: Option<&[f32]>,
-) -> Result<(), ReportError> {
+) -> Result<()> {
     let recorded: Vec<PolicyRun> = runs
         .iter()
         .filter(|run| !run.rewards.is_empty())
@@ -156,24 +142,27 @@ pub fn draw_rewards(
         check_finite(run, "reward", run.rewards.iter().copied().map(f64::from))?;
     }
     let page = rewards(&recorded, axis_label, fire_cells.unwrap_or_default());
-    let svg = page.svg().ok_or(ReportError::Empty { what: "rewards" })?;
+    let svg = page.svg();
+    let svg = svg.context("rewards: expected at least one policy run, got none")?;
     save(path, &svg)
 }
 
-/// Draws a step; the picture grows in height with the number of states.
-///
-/// # Errors
-/// [`ReportError::Snapshot`] names the part that does not fit the grid or the model; a file that cannot be
-/// written.
-pub fn draw_snapshot(path: &Path, snapshot: &Snapshot<'_>) -> Result<(), ReportError> {
-    let (file, shape) = (snapshot.model.file(), snapshot.truth.dim());
+/// Draws a step; the picture grows in height with the number of states. `observation`: what the sensor would
+/// have shown of each cell.
+pub fn draw_snapshot(
+    path: &Path,
+    model: &Model,
+    snapshot: &Snapshot,
+    observation: &Grid<u8>,
+) -> Result<()> {
+    let (file, shape) = (model.file(), snapshot.truth.dim());
     let states = file.states.iter().map(|it| named(&it.name, &it.color));
     let observations = file
         .observations
         .iter()
         .map(|it| named(&it.name, &it.color));
     let page = figures::Snapshot {
-        title: format!("{}, step k = {}", snapshot.model.name(), snapshot.step),
+        title: format!("{}, step k = {}", model.name(), snapshot.step),
         note: format!(
             "world seed {}, {} x {} cells",
             snapshot.seed, shape.0, shape.1
@@ -181,7 +170,7 @@ pub fn draw_snapshot(path: &Path, snapshot: &Snapshot<'_>) -> Result<(), ReportE
         states: states.collect(),
         observations: observations.collect(),
         truth: snapshot.truth.view(),
-        observation: snapshot.observation.view(),
+        observation: observation.view(),
         frame: snapshot.frame.values(),
         path: snapshot
             .path_cells
@@ -190,7 +179,7 @@ pub fn draw_snapshot(path: &Path, snapshot: &Snapshot<'_>) -> Result<(), ReportE
             .collect(),
         belief: snapshot.belief.view(),
     };
-    save(path, &page.svg()?)
+    save(path, &page.svg())
 }
 
 fn named(name: &str, color: &str) -> Named {
@@ -201,18 +190,12 @@ fn named(name: &str, color: &str) -> Named {
     }
 }
 
-fn check_finite(
-    run: &PolicyRun,
-    what: &'static str,
-    mut values: impl Iterator<Item = f64>,
-) -> Result<(), ReportError> {
+fn check_finite(run: &PolicyRun, what: &str, mut values: impl Iterator<Item = f64>) -> Result<()> {
+    let (policy, seed) = (&run.policy, run.world_seed);
     match values.find(|value| !value.is_finite()) {
-        Some(got) => Err(ReportError::NotFinite {
-            policy: run.policy.clone(),
-            world_seed: run.world_seed,
-            what,
-            got,
-        }),
+        Some(got) => bail!(
+            "policy {policy:?} on world seed {seed}: {what}: expected a finite number, got {got}"
+        ),
         None => Ok(()),
     }
 }

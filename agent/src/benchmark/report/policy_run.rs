@@ -1,18 +1,20 @@
 //! What a comparison measured, and its groups.
 
+use crate::file::{Readers, replace_file};
+use anyhow::Result;
+use serde::Serialize;
 use std::collections::BTreeMap;
+use std::path::Path;
 
-/// One policy on one world: what `emberwatch-agent compare` measured.
-#[derive(Debug, Clone, PartialEq)]
+/// One policy on one world: what `emberwatch-agent compare` measured, and a row of its CSV.
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PolicyRun {
     /// Name of the policy, such as `beam`.
     pub policy: String,
     /// Where the belief came from: `none`, `known_model`, `truth`, `next_truth` or a learned one.
     pub estimator: String,
     pub world_seed: u64,
-    /// Number of scored steps.
     pub steps: u64,
-    /// Mean reward of a step.
     pub mean_reward: f64,
     /// Mean number of distinct cells visited in a step.
     pub mean_distinct_cells: f64,
@@ -25,7 +27,19 @@ pub struct PolicyRun {
     /// Mean Brier score of the belief, where there is a belief.
     pub brier: Option<f64>,
     /// Reward of each step, in order.
+    #[serde(skip)]
     pub rewards: Vec<f32>,
+}
+
+/// Writes one row per run, ordered by policy, then seed; a missing Brier score is an empty field.
+///
+/// Numbers are the shortest that read back as the same `f64`.
+pub fn write_csv(path: &Path, runs: &[PolicyRun]) -> Result<()> {
+    let mut sorted: Vec<&PolicyRun> = runs.iter().collect();
+    sorted.sort_by_key(|run| (&run.policy, run.world_seed, &run.estimator));
+    let mut writer = csv::Writer::from_writer(Vec::new());
+    sorted.iter().try_for_each(|run| writer.serialize(run))?;
+    replace_file(path, &writer.into_inner()?, Readers::Any)
 }
 
 /// The runs of one policy with one estimator, in the order given.

@@ -1,12 +1,11 @@
 //! A training's metrics as curves: the paper's figure of improvement over iterations, and step sizes.
 
 use crate::benchmark::report::figures::save;
-use crate::benchmark::report::file::ReportError;
 use crate::benchmark::report::statistics::Estimate;
-use crate::learning::metrics::{MetricsError, Rows};
+use crate::learning::metrics::Rows;
+use anyhow::{Context, Result};
 use figures::{Curve, Lines, Panel, Scale};
 use std::path::Path;
-use thiserror::Error;
 
 /// The figure's names in the folder of a training.
 pub const FIGURES: [&str; 2] = ["training.png", "training.svg"];
@@ -14,18 +13,8 @@ pub const FIGURES: [&str; 2] = ["training.png", "training.svg"];
 /// Points of a curve: each is the mean over a part of the rows.
 const POINTS: usize = 200;
 
-/// A figure that cannot be drawn.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum TrainingFigureError {
-    #[error(transparent)]
-    Metrics(#[from] MetricsError),
-    #[error(transparent)]
-    Report(#[from] ReportError),
-}
-
 /// Draws a training's metrics into its folder.
-pub fn draw_training(folder: &Path) -> Result<(), TrainingFigureError> {
+pub fn draw_training(folder: &Path) -> Result<()> {
     let rows = Rows::read(folder)?;
     let curve = |column: &str, name: &str| averages(&rows, column, name);
     let panel = |title: &str, scale, curves| Panel {
@@ -74,7 +63,7 @@ pub fn draw_training(folder: &Path) -> Result<(), TrainingFigureError> {
         axis: "world steps, of all worlds together".into(),
         panels,
     };
-    let svg = page.svg().ok_or(ReportError::Empty { what: "curves" })?;
+    let svg = page.svg().context("curves: expected metrics, got none")?;
     for name in FIGURES {
         save(&folder.join(name), &svg)?;
     }

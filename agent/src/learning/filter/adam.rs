@@ -1,25 +1,24 @@
 //! Adam (Kingma and Ba, 2015, algorithm 1) on the filter's three tensors.
 
 use crate::estimation::parameters::{Dimensions, Parameters};
+use serde::{Deserialize, Serialize};
 
 /// Added to the root of the second moment: the paper's.
 const EPSILON: f64 = 1e-8;
 
 /// The optimiser's state.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Adam {
     /// Decaying mean of gradients.
     pub first: Parameters,
     /// Decaying mean of their squares.
     pub second: Parameters,
-    /// Steps made.
     pub n_steps: u64,
 }
 
 /// How far and how steadily to step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepSize {
-    /// Of each tensor.
     pub rates: [f64; 3],
     /// Decay of the mean of gradients.
     pub beta1: f64,
@@ -28,7 +27,6 @@ pub struct StepSize {
 }
 
 impl Adam {
-    /// Before the first step.
     pub fn new(dimensions: Dimensions) -> Self {
         Self {
             first: Parameters::zeros(dimensions),
@@ -37,7 +35,6 @@ impl Adam {
         }
     }
 
-    /// Moves parameters against a gradient.
     pub fn step(&mut self, parameters: &mut Parameters, gradient: &Parameters, size: StepSize) {
         self.n_steps += 1;
         let steps = self.n_steps.min(1 << 30) as i32;

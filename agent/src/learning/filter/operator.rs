@@ -290,7 +290,6 @@ pub(super) struct Region {
 }
 
 impl Region {
-    /// Takes in a cell.
     pub(super) fn add(&mut self, row: usize, col: usize) {
         self.rows = widened(&self.rows, row..row + 1);
         let col = col / LANES * LANES;
@@ -340,7 +339,6 @@ fn store<T, V: Lanes<T>>(numbers: V, planes: &mut [T], at: usize) {
     numbers.store(lanes.expect("invariant: the layout has room for whole vectors"));
 }
 
-/// The sum of the lanes.
 #[inline(always)]
 fn total<T: Real, V: Lanes<T>>(numbers: V) -> f64 {
     let mut lanes = [T::zero(); LANES];

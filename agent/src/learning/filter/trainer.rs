@@ -7,48 +7,35 @@
 
 use crate::config::LearningConfig;
 use crate::estimation::parameters::{Dimensions, Parameters, Tables};
-use crate::learning::checkpoint::{Problem, check, check_counts, check_numbers};
+use crate::learning::checkpoint::{check, check_counts, check_numbers};
 use crate::learning::filter::adam::{Adam, StepSize};
 use crate::learning::filter::window::{Outcome, Start, Window};
 use crate::learning::replay::{Block, Replay};
+use anyhow::{Result, anyhow};
 use protocol::Shape;
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use thiserror::Error;
 
 /// Parts that the streams are dealt into, each with its own work space: as many threads are of use.
 /// The parts do not depend on the number of threads, nor does the order in which gradients are added.
 const N_PARTS: usize = 8;
 
 /// Learns the parameters; holds all that a later update depends on but the replay.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Trainer {
-    iterates: Iterates,
+    parameters: Parameters,
+    pub adam: Adam,
     config: LearningConfig,
     seed: u64,
-    shape: Shape,
-    laps: Laps,
-    windows: Vec<Window<f32>>,
-}
-
-/// Where the streams are in the replay.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Laps {
-    streams: Vec<Stream>,
+    pub shape: Shape,
+    pub(crate) streams: Vec<Stream>,
     /// Blocks still to be run through in this lap.
     lap: Vec<u64>,
     n_laps: u64,
-}
-
-/// Where the updates have come to.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Iterates {
-    /// The parameters.
-    pub parameters: Parameters,
-    /// The optimiser.
-    pub adam: Adam,
+    #[serde(skip)]
+    windows: Vec<Window<f32>>,
 }
 
 /// What one update did.
@@ -58,25 +45,12 @@ pub struct Update {
     pub number: u64,
     /// Minus the mean log-likelihood of a visited cell, before the update.
     pub loss: f64,
-    /// The kernel's step size.
     pub rate: f64,
-}
-
-/// A number that is not finite: nothing was changed by the update that met it.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("update {update}: {tensor}: expected finite numbers, got {what}")]
-pub struct NotFinite {
-    /// The update.
-    pub update: u64,
-    /// The tensor.
-    pub tensor: &'static str,
-    /// Which number of it.
-    pub what: &'static str,
 }
 
 /// A place in the replay, and the belief before the frame there.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct Stream {
+pub(crate) struct Stream {
     block: Option<u64>,
     n_done: usize,
     belief: Vec<f32>,
@@ -85,25 +59,9 @@ struct Stream {
     end: Vec<f32>,
 }
 
-impl Iterates {
-    /// Before the first update.
-    pub fn first(parameters: Parameters) -> Self {
-        Self {
-            adam: Adam::new(parameters.dimensions),
-            parameters,
-        }
-    }
-}
-
 impl Trainer {
-    /// Before the first update.
+    /// Before the first update; the streams are not yet in any block.
     pub fn new(parameters: Parameters, shape: Shape, config: LearningConfig, seed: u64) -> Self {
-        Self::resume(Iterates::first(parameters), shape, config, seed)
-    }
-
-    /// After some updates; the streams are not yet in any block.
-    pub fn resume(iterates: Iterates, shape: Shape, config: LearningConfig, seed: u64) -> Self {
-        let parameters = &iterates.parameters;
         let tables: Tables = parameters.tables();
         let numbers = vec![0.0; parameters.dimensions.n_states * shape.n_cells()];
         let stream = Stream {
@@ -112,75 +70,83 @@ impl Trainer {
             belief: numbers.clone(),
             end: numbers,
         };
-        let laps = Laps {
-            streams: vec![stream; config.streams],
-            lap: Vec::new(),
-            n_laps: iterates.adam.n_steps,
-        };
         Self {
-            iterates,
+            adam: Adam::new(parameters.dimensions),
+            parameters,
             config,
             seed,
             shape,
-            laps,
+            streams: vec![stream; config.streams],
+            lap: Vec::new(),
+            n_laps: 0,
             windows: vec![Window::new(tables, shape, config.window); N_PARTS],
         }
     }
 
-    /// Where the updates have come to.
-    pub fn iterates(&self) -> &Iterates {
-        &self.iterates
-    }
-
-    /// Where the streams are.
-    pub fn laps(&self) -> &Laps {
-        &self.laps
-    }
-
-    /// Puts the streams where others were, with the same settings.
+    /// Goes on from another's parameters; where its streams were if it was cut the same way.
     ///
     /// # Errors
-    /// Names what no such streams have; nothing was changed then.
-    pub fn resume_laps(&mut self, mut laps: Laps) -> Result<(), Problem> {
-        let (expected, got) = (self.laps.streams.len(), laps.streams.len());
+    /// Names what no such streams have.
+    pub fn resume(&mut self, other: Self) -> Result<()> {
+        if self.cut() == other.cut() {
+            self.resume_streams(other.streams)?;
+            check_counts(&[("n_laps", other.n_laps)])?;
+            (self.lap, self.n_laps) = (other.lap, other.n_laps);
+        } else {
+            self.n_laps = other.adam.n_steps;
+        }
+        (self.parameters, self.adam) = (other.parameters, other.adam);
+        Ok(())
+    }
+
+    fn resume_streams(&mut self, mut streams: Vec<Stream>) -> Result<()> {
+        let (expected, got) = (self.streams.len(), streams.len());
         check(got == expected, "streams", expected, got)?;
-        check_counts(&[("n_laps", laps.n_laps)])?;
         let length = self.dimensions().n_states * self.shape.n_cells();
-        for stream in &mut laps.streams {
+        for stream in &mut streams {
             let (most, got) = (self.config.block_windows, stream.n_done);
             let expected = format!("at most {most} windows of a block");
             check(got <= most, "streams.n_done", expected, got)?;
             check_numbers("streams.belief", &stream.belief, length)?;
             stream.end = vec![0.0; length];
         }
-        self.laps = laps;
+        self.streams = streams;
         Ok(())
     }
 
-    /// The parameters.
-    pub fn parameters(&self) -> &Parameters {
-        &self.iterates.parameters
+    /// Grid, window, windows of a block, streams: what places in a replay depend on.
+    pub fn cut(&self) -> (Shape, [usize; 3]) {
+        let config = &self.config;
+        let cut = [config.window, config.block_windows, config.streams];
+        (self.shape, cut)
     }
 
-    /// Their dimensions.
+    pub fn config(&self) -> &LearningConfig {
+        &self.config
+    }
+
+    pub fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
+    pub fn set_parameters(&mut self, parameters: Parameters) {
+        self.parameters = parameters;
+    }
+
     pub fn dimensions(&self) -> Dimensions {
-        self.iterates.parameters.dimensions
+        self.parameters.dimensions
     }
 
     /// One update; `None` while the replay has no block for each stream, or nothing was seen.
     /// `sure`: the state to be seen almost surely.
     ///
     /// # Errors
-    /// [`NotFinite`]; the parameters are then as they were.
-    pub fn update(
-        &mut self,
-        replay: &mut Replay,
-        sure: Option<usize>,
-    ) -> Result<Option<Update>, NotFinite> {
-        if replay.n_blocks() < self.laps.streams.len() {
+    /// For numbers that are not finite; the parameters are then as they were.
+    pub fn update(&mut self, replay: &mut Replay, sure: Option<usize>) -> Result<Option<Update>> {
+        if replay.n_blocks() < self.streams.len() {
             return Ok(None);
         }
-        if let Some(tensor) = self.iterates.parameters.not_finite() {
+        if let Some(tensor) = self.parameters.not_finite() {
             return Err(self.wrong(tensor, "a parameter that is not"));
         }
         self.place_streams(replay);
@@ -207,9 +173,8 @@ impl Trainer {
 
     /// Takes the streams out of their blocks: the replay is another.
     pub fn leave_replay(&mut self) {
-        self.laps.lap.clear();
-        self.laps
-            .streams
+        self.lap.clear();
+        self.streams
             .iter_mut()
             .for_each(|stream| stream.block = None);
     }
@@ -217,12 +182,12 @@ impl Trainer {
     /// Gives streams at the end of a block, or whose block is gone, another one.
     fn place_streams(&mut self, replay: &Replay) {
         let n_windows = self.config.block_windows;
-        for index in 0..self.laps.streams.len() {
-            let stream = &self.laps.streams[index];
+        for index in 0..self.streams.len() {
+            let stream = &self.streams[index];
             let block = stream.block.filter(|_| stream.n_done < n_windows);
             if block.is_none_or(|number| replay.block(number).is_none()) {
                 let (number, block) = self.next_block(replay);
-                let stream = &mut self.laps.streams[index];
+                let stream = &mut self.streams[index];
                 (stream.block, stream.n_done) = (Some(number), 0);
                 if let Some(start) = &block.start {
                     stream.belief.clone_from(start);
@@ -234,30 +199,26 @@ impl Trainer {
     /// The next block of the lap, or the first of a new lap through all blocks.
     fn next_block<'a>(&mut self, replay: &'a Replay) -> (u64, &'a Block) {
         loop {
-            match self.laps.lap.pop() {
+            match self.lap.pop() {
                 Some(number) => {
                     if let Some(block) = replay.block(number) {
                         return (number, block);
                     }
                 }
                 None => {
-                    self.laps.lap = replay.blocks().collect();
-                    shuffle(&mut self.laps.lap, self.seed, self.laps.n_laps);
-                    self.laps.n_laps += 1;
+                    self.lap = replay.blocks().collect();
+                    shuffle(&mut self.lap, self.seed, self.n_laps);
+                    self.n_laps += 1;
                 }
             }
         }
     }
 
     fn run_windows(&mut self, replay: &Replay) -> Vec<Outcome> {
-        let tables = self.iterates.parameters.tables();
+        let tables = self.parameters.tables();
         let length = self.config.window;
-        let part = self.laps.streams.len().div_ceil(N_PARTS);
-        let parts = self
-            .laps
-            .streams
-            .par_chunks_mut(part)
-            .zip(&mut self.windows);
+        let part = self.streams.len().div_ceil(N_PARTS);
+        let parts = self.streams.par_chunks_mut(part).zip(&mut self.windows);
         let outcomes = parts.flat_map_iter(|(streams, window)| {
             window.set(&tables);
             streams.iter_mut().filter_map(move |stream| {
@@ -274,7 +235,7 @@ impl Trainer {
     }
 
     fn move_streams(&mut self, replay: &mut Replay) {
-        for stream in &mut self.laps.streams {
+        for stream in &mut self.streams {
             std::mem::swap(&mut stream.belief, &mut stream.end);
             stream.n_done += 1;
             if let Some(block) = stream.block
@@ -289,7 +250,7 @@ impl Trainer {
     /// state which is observable with negligible uncertainties" (paper section III.E, remark).
     fn add_anchor(&self, state: usize, by_likelihood: &mut [f64]) {
         let n_observations = self.dimensions().n_observations;
-        let likelihood = self.iterates.parameters.tables::<f64>().likelihood;
+        let likelihood = self.parameters.tables::<f64>().likelihood;
         let row = &likelihood[state * n_observations..][..n_observations];
         let shown = (0..n_observations).max_by(|&a, &b| row[a].total_cmp(&row[b]));
         if let Some(shown) = shown {
@@ -297,9 +258,9 @@ impl Trainer {
         }
     }
 
-    fn step(&mut self, loss: f64, by_tables: &[Vec<f64>; 3]) -> Result<Update, NotFinite> {
-        let number = self.iterates.adam.n_steps + 1;
-        let gradient = self.iterates.parameters.chain(by_tables);
+    fn step(&mut self, loss: f64, by_tables: &[Vec<f64>; 3]) -> Result<Update> {
+        let number = self.adam.n_steps + 1;
+        let gradient = self.parameters.chain(by_tables);
         if let Some(tensor) = gradient.not_finite() {
             return Err(self.wrong(tensor, "a gradient that is not"));
         }
@@ -310,24 +271,20 @@ impl Trainer {
             beta1: self.config.beta1,
             beta2: self.config.beta2,
         };
-        let mut next = self.iterates.clone();
-        next.adam.step(&mut next.parameters, &gradient, size);
-        if let Some(tensor) = next.parameters.not_finite() {
+        let (mut parameters, mut adam) = (self.parameters.clone(), self.adam.clone());
+        adam.step(&mut parameters, &gradient, size);
+        if let Some(tensor) = parameters.not_finite() {
             return Err(self.wrong(tensor, "a step to a number that is not"));
         }
-        next.parameters.bound();
-        self.iterates = next;
+        parameters.bound();
+        (self.parameters, self.adam) = (parameters, adam);
         Ok(Update { number, loss, rate })
     }
 
     /// What the update under way met.
-    fn wrong(&self, tensor: &'static str, what: &'static str) -> NotFinite {
-        let update = self.iterates.adam.n_steps + 1;
-        NotFinite {
-            update,
-            tensor,
-            what,
-        }
+    fn wrong(&self, tensor: &str, what: &str) -> anyhow::Error {
+        let update = self.adam.n_steps + 1;
+        anyhow!("update {update}: {tensor}: expected finite numbers, got {what}")
     }
 }
 
@@ -345,7 +302,6 @@ fn add_up(outcomes: &[Outcome], dimensions: Dimensions) -> (f64, usize, [Vec<f64
     (log_likelihood, n_seen, gradient)
 }
 
-/// Fisher and Yates's shuffle.
 fn shuffle(numbers: &mut [u64], seed: u64, lap: u64) {
     let mut random = stream(seed, Purpose::Learner, lap);
     for last in (1..numbers.len()).rev() {

@@ -28,9 +28,7 @@ pub trait Wide: Sized {
 pub trait Lanes<T>: Copy {
     /// The same number in each lane.
     fn splat(number: T) -> Self;
-    /// From memory.
     fn load(numbers: &[T; LANES]) -> Self;
-    /// To memory.
     fn store(self, numbers: &mut [T; LANES]);
     /// `self * factor + term`.
     fn multiply_add(self, factor: Self, term: Self) -> Self;
@@ -51,7 +49,6 @@ pub(super) trait Vectorised {
     /// What it gives.
     type Output;
 
-    /// Does the work.
     fn run<V: Lanes<Self::Number>>(self) -> Self::Output;
 }
 

@@ -29,7 +29,6 @@ pub struct Outcome {
     pub gradient: [Vec<f64>; 3],
     /// Sum of `ln P(y)` over visited cells.
     pub log_likelihood: f64,
-    /// Number of visited cells.
     pub n_seen: usize,
 }
 

@@ -1,30 +1,51 @@
 //! What every student does, and what it is told.
 
+use crate::config::AgentConfig;
+use crate::estimation::Estimator;
 use crate::estimation::belief::Belief;
 use crate::learning::checkpoint::Contents;
+use anyhow::Result;
 
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::rollout::agent::AgentError;
+use crate::planning::PlanBasis;
+use crate::planning::policy::Policy;
+use crate::rollout::agent::{Agent, Setup};
 use crate::rollout::{Robot, Seen};
 use crate::server::client::Observation;
-use ::network::NetworkError;
 use protocol::connection::ConnectionError;
 use protocol::{Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
-use thiserror::Error;
 
 /// The worlds to act on, as far as a learner is told.
 #[derive(Debug, Clone)]
 pub struct Worlds {
-    /// The grid.
     pub shape: Shape,
     /// Number of values that an observed cell may show.
     pub n_observations: usize,
-    /// Moves in a path.
     pub n_moves: usize,
-    /// The worlds' numbers.
     pub numbers: Range<u32>,
+}
+
+impl Worlds {
+    /// A robot on one of them before it takes in what that shows.
+    pub(super) fn robot(
+        &self,
+        config: &AgentConfig,
+        policy: &Policy,
+        estimator: Box<dyn Estimator>,
+        state_names: Vec<String>,
+        observation: Observation,
+    ) -> Robot {
+        let setup = Setup {
+            basis: PlanBasis::new(config.objective.belief),
+            state_names,
+            n_moves: self.n_moves,
+            seed: config.planner_seed(observation.result.seed),
+        };
+        let agent = Agent::new(estimator, policy, config, setup);
+        Robot::new(agent, observation)
+    }
 }
 
 /// Flies a path in each world; gives what they show then, in order.
@@ -32,39 +53,6 @@ pub type Fly<'a> = &'a mut dyn FnMut(&[Vec<Move>]) -> Result<Vec<Observation>, C
 
 /// Is told of each robot, by its index, when its belief is the posterior.
 pub type Look<'a> = &'a mut dyn FnMut(usize, &Robot);
-
-/// Why a student cannot go on.
-#[derive(Debug, Error)]
-pub enum StudentError {
-    /// What it sees does not fit what it believes.
-    #[error(transparent)]
-    Agent(#[from] AgentError),
-    /// The worlds cannot be reached.
-    #[error(transparent)]
-    Connection(#[from] ConnectionError),
-    /// A number that is not finite.
-    #[error(transparent)]
-    NotFinite(#[from] NotFinite),
-}
-
-/// A number that is not finite, or a device that fails: learning cannot go on; nothing was changed by the
-/// step or update that met it.
-#[derive(Debug, PartialEq, Error)]
-#[non_exhaustive]
-pub enum NotFinite {
-    /// In the learned filter.
-    #[error(transparent)]
-    Filter(#[from] crate::learning::filter::NotFinite),
-    /// In the autoencoder or the DQN.
-    #[error(transparent)]
-    Network(#[from] NetworkError),
-}
-
-impl From<NetworkError> for StudentError {
-    fn from(error: NetworkError) -> Self {
-        NotFinite::from(error).into()
-    }
-}
 
 /// What learns while it acts.
 pub trait Student {
@@ -81,28 +69,16 @@ pub trait Student {
 
     /// Takes in what the worlds show when it comes to them. Returns in how many of them it goes on where
     /// its checkpoint left it.
-    ///
-    /// # Errors
-    /// [`StudentError`].
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError>;
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize>;
 
     /// A world begins again.
-    ///
-    /// # Errors
-    /// [`StudentError`].
-    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError>;
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<()>;
 
     /// One step of the rollout in all worlds: plans, flies, scores, corrects, remembers, predicts.
-    ///
-    /// # Errors
-    /// [`StudentError`].
-    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError>;
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick>;
 
     /// Makes the updates that the steps since the last call have earned.
-    ///
-    /// # Errors
-    /// [`NotFinite`].
-    fn learn(&mut self) -> Result<Vec<ModelUpdate>, NotFinite>;
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>>;
 
     /// From here on it acts on what was learned, as well as it knows: without random actions.
     fn freeze(&mut self);
@@ -117,10 +93,7 @@ pub trait Student {
     fn belief(&self) -> Option<(&Belief, usize)>;
 
     /// What a later run goes on from.
-    ///
-    /// # Errors
-    /// Where a network's device fails.
-    fn contents(&self) -> Result<Contents, StudentError>;
+    fn contents(&self) -> Result<Contents>;
 
     /// Time spent so far, by part.
     fn times(&self) -> Vec<(&'static str, Duration)>;

@@ -5,18 +5,15 @@ use crate::config::{AgentConfig, DecisionsConfig};
 use crate::estimation::BayesFilter;
 use crate::estimation::belief::Belief;
 use crate::estimation::summary::{spread_summary, summary_length};
-use crate::learning::checkpoint::{Contents, Problem, check, check_counts};
+use crate::learning::checkpoint::{Contents, check, check_counts};
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::learning::student::base::{
-    Fly, Look, NotFinite, Student, StudentError, Worlds, without_truth,
-};
-use crate::planning::PlanBasis;
+use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
 use crate::planning::action::{Action, ActionSet};
 use crate::planning::policy::Policy;
-use crate::rollout::agent::{Agent, Setup};
 use crate::rollout::{self, Robot};
 use crate::server::client::Observation;
 use ::network::{Dqn, SavedDqn, Track, Transition};
+use anyhow::Result;
 use protocol::{Cell, Model};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -28,7 +25,6 @@ pub const KIND: &str = "decisions";
 /// A DQN over the actions of a model.
 #[derive(Debug)]
 pub struct Decisions {
-    /// Values of actions.
     pub dqn: Dqn,
     /// The actions, in the order of the values.
     pub actions: ActionSet,
@@ -40,13 +36,10 @@ pub struct Decisions {
 /// All of a checkpoint of decisions but the tensors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SavedDecisions {
-    /// Of the model.
     pub n_states: usize,
-    /// Their names.
     pub actions: Vec<String>,
     /// World steps that were learned from.
     pub world_steps: u64,
-    /// The DQN without its tensors.
     pub dqn: SavedDqn,
 }
 
@@ -93,7 +86,6 @@ impl Decisions {
         &self.actions.actions()[self.dqn.best(&spread_summary(belief, robot, n_moves))]
     }
 
-    /// As a checkpoint, without settings.
     pub fn to_contents(&self) -> Contents {
         let state = SavedDecisions {
             n_states: self.n_states,
@@ -105,10 +97,7 @@ impl Decisions {
     }
 
     /// Takes over a checkpoint.
-    ///
-    /// # Errors
-    /// Names what is missing, of another form, or of a model with other states or actions.
-    pub fn load(&mut self, contents: &Contents) -> Result<(), Problem> {
+    pub fn load(&mut self, contents: &Contents) -> Result<()> {
         let saved: SavedDecisions = contents.state()?;
         let [expected, got] = [self.n_states, saved.n_states];
         check(got == expected, "states", expected, got)?;
@@ -149,16 +138,12 @@ impl DecisionsStudent {
     }
 
     /// A robot that has taken in what its world shows.
-    fn run(&self, observation: Observation) -> Result<Run, StudentError> {
-        let setup = Setup {
-            basis: PlanBasis::new(self.config.objective.belief),
-            state_names: self.state_names.clone(),
-            n_moves: self.worlds.n_moves,
-            seed: self.config.planner_seed(observation.result.seed),
-        };
-        let (filter, policy) = (Box::new(self.filter.clone()), &self.policy);
-        let agent = Agent::new(filter, policy, &self.config, setup);
-        let mut robot = Robot::new(agent, observation);
+    fn run(&self, observation: Observation) -> Result<Run> {
+        let (filter, names) = (Box::new(self.filter.clone()), self.state_names.clone());
+        let (policy, config) = (&self.policy, &self.config);
+        let mut robot = self
+            .worlds
+            .robot(config, policy, filter, names, observation);
         robot.begin(None, |_| ())?;
         Ok(Run {
             input: input(&robot, self.worlds.n_moves),
@@ -169,7 +154,6 @@ impl DecisionsStudent {
     }
 }
 
-/// What a decision goes by.
 fn input(robot: &Robot, n_moves: usize) -> Vec<f32> {
     spread_summary(robot.agent.belief(), robot.observation().robot(), n_moves)
 }
@@ -196,20 +180,20 @@ impl Student for DecisionsStudent {
         &["dqn_loss", "dqn_rate", "epsilon"]
     }
 
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError> {
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
         let runs = observations.into_iter().map(|seen| self.run(seen));
         self.runs = runs.collect::<Result<_, _>>()?;
         // Beliefs begin again, wherever the worlds stand.
         Ok(0)
     }
 
-    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<()> {
         let run = self.run(observation)?;
         self.runs[(world - self.worlds.numbers.start) as usize] = run;
         Ok(())
     }
 
-    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError> {
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick> {
         let start = Instant::now();
         let (decisions, is_frozen) = (&self.decisions, self.is_frozen);
         for (index, run) in self.runs.iter_mut().enumerate() {
@@ -231,7 +215,7 @@ impl Student for DecisionsStudent {
             },
             |paths| {
                 self.times[0].1 += start.elapsed();
-                Ok::<_, StudentError>(without_truth(fly(paths)?))
+                anyhow::Ok(without_truth(fly(paths)?))
             },
             |index, run, turn| {
                 tick.reward += run.robot.observation().result.reward;
@@ -253,7 +237,7 @@ impl Student for DecisionsStudent {
         Ok(tick)
     }
 
-    fn learn(&mut self) -> Result<Vec<ModelUpdate>, NotFinite> {
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
         let start = Instant::now();
         let settings = self.config.decisions.settings();
         let epsilon = f64::from(settings.epsilon_at(self.decisions.world_steps));
@@ -295,7 +279,7 @@ impl Student for DecisionsStudent {
         Some((run.robot.agent.belief(), self.target))
     }
 
-    fn contents(&self) -> Result<Contents, StudentError> {
+    fn contents(&self) -> Result<Contents> {
         Ok(self.decisions.to_contents())
     }
 
@@ -311,7 +295,7 @@ mod tests {
     #[test]
     fn decisions_survive_a_checkpoint_and_others_are_refused_by_name() {
         let model = Model::wildfire();
-        let config = DecisionsConfig::default();
+        let config = AgentConfig::default().decisions;
         let decisions = Decisions::first(&model, &config, 3);
         let contents = decisions.to_contents();
         let mut again = Decisions::first(&model, &config, 4);

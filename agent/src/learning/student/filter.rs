@@ -10,17 +10,16 @@ use crate::config::AgentConfig;
 use crate::estimation::BayesFilter;
 use crate::estimation::belief::Belief;
 use crate::estimation::parameters::{Dimensions, Tables};
-use crate::learning::checkpoint::{Contents, Problem};
-use crate::learning::learner::{KIND, LearnedModel, Learner, Progress};
+use crate::learning::checkpoint::Contents;
+use crate::learning::learner::{KIND, LearnedModel, Learner};
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::learning::student::base::{
-    Fly, Look, NotFinite, Student, StudentError, Worlds, without_truth,
-};
+use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
 use crate::planning::policy::{PlannerKind, Policy};
-use crate::planning::{Objective, Plan, PlanBasis, Target};
-use crate::rollout::agent::{Agent, Setup, numbered_states};
+use crate::planning::{Objective, Plan, Target};
+use crate::rollout::agent::numbered_states;
 use crate::rollout::{self, Robot};
 use crate::server::client::Observation;
+use anyhow::Result;
 use protocol::path;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -48,26 +47,22 @@ pub struct FilterStudent {
 impl FilterStudent {
     /// A student before its first frame.
     pub fn new(dimensions: Dimensions, worlds: Worlds, config: &AgentConfig) -> Self {
-        let progress = Progress::first(dimensions, config.seed);
-        let learner = Learner::new(progress, worlds.shape, config);
+        let learner = Learner::new(dimensions, worlds.shape, config);
         Self::of(learner, BTreeMap::new(), worlds, config)
     }
 
     /// Goes on from a checkpoint.
-    ///
-    /// # Errors
-    /// Names what is missing or of another form.
     pub fn resume(
         contents: &Contents,
         dimensions: Dimensions,
         worlds: Worlds,
         config: &AgentConfig,
-    ) -> Result<Self, Problem> {
+    ) -> Result<Self> {
         let SavedFilter {
             learner,
             worlds: mut left,
         } = contents.state()?;
-        let shape = learner.shape;
+        let shape = learner.trainer.shape;
         let learner = Learner::resume(learner, contents, dimensions, worlds.shape, config)?;
         let mut all = left.values();
         all.try_for_each(|world| world.check(dimensions.n_states, shape))?;
@@ -100,19 +95,14 @@ impl FilterStudent {
     fn robot(&self, observation: Observation) -> Robot {
         let tables = &self.learned.tables;
         let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape));
-        let setup = Setup {
-            basis: PlanBasis::new(self.config.objective.belief),
-            state_names: numbered_states(tables.dimensions.n_states),
-            n_moves: self.worlds.n_moves,
-            seed: self.config.planner_seed(observation.result.seed),
-        };
-        let policy = Policy::learned(PlannerKind::Beam);
-        let agent = Agent::new(Box::new(filter), &policy, &self.config, setup);
-        Robot::new(agent, observation)
+        let names = numbered_states(tables.dimensions.n_states);
+        let (policy, config) = (Policy::learned(PlannerKind::Beam), &self.config);
+        let worlds = &self.worlds;
+        worlds.robot(config, &policy, Box::new(filter), names, observation)
     }
 
     /// A robot that has taken in what its world shows, with a track that begins there.
-    fn begun(&mut self, world: u32, observation: Observation) -> Result<Run, StudentError> {
+    fn begun(&mut self, world: u32, observation: Observation) -> Result<Run> {
         self.learner.begin(world);
         self.learner.see(world, &observation.frame);
         let mut robot = self.robot(observation);
@@ -129,7 +119,7 @@ impl FilterStudent {
             return 0;
         }
         let learning = &self.config.learning;
-        if self.learner.world_steps() < learning.explore_steps {
+        if self.learner.world_steps < learning.explore_steps {
             return self.runs.len();
         }
         (learning.explore_share * self.runs.len() as f64).round() as usize
@@ -145,7 +135,7 @@ impl Student for FilterStudent {
         &[]
     }
 
-    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize, StudentError> {
+    fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
         let worlds = self.worlds.numbers.clone();
         let mut n_gone_on = 0;
         if !SavedWorld::any_is_of(&self.left, worlds.clone(), &observations) {
@@ -172,13 +162,13 @@ impl Student for FilterStudent {
         Ok(n_gone_on)
     }
 
-    fn begin(&mut self, world: u32, observation: Observation) -> Result<(), StudentError> {
+    fn begin(&mut self, world: u32, observation: Observation) -> Result<()> {
         let run = self.begun(world, observation)?;
         self.runs[(world - self.worlds.numbers.start) as usize] = run;
         Ok(())
     }
 
-    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError> {
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick> {
         let start = Instant::now();
         if !self.is_frozen {
             self.learned = self.learner.learned();
@@ -200,7 +190,7 @@ impl Student for FilterStudent {
             |run| run.plan(&self.learned.tables, objective),
             |paths| {
                 self.planning += start.elapsed();
-                Ok::<_, StudentError>(without_truth(fly(paths)?))
+                anyhow::Ok(without_truth(fly(paths)?))
             },
             |index, run, turn| {
                 let (agent, observation) = (&run.robot.agent, run.robot.observation());
@@ -217,11 +207,11 @@ impl Student for FilterStudent {
             },
         )?;
         tick.n_worlds = self.runs.len() as u64;
-        tick.world_steps = self.learner.world_steps();
+        tick.world_steps = self.learner.world_steps;
         Ok(tick)
     }
 
-    fn learn(&mut self) -> Result<Vec<ModelUpdate>, NotFinite> {
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
         let start = Instant::now();
         let updates = self.learner.learn();
         self.learning += start.elapsed();
@@ -239,7 +229,7 @@ impl Student for FilterStudent {
     }
 
     fn world_steps(&self) -> u64 {
-        self.learner.world_steps()
+        self.learner.world_steps
     }
 
     fn n_updates(&self) -> u64 {
@@ -251,12 +241,11 @@ impl Student for FilterStudent {
         Some((run.robot.agent.belief(), self.learned.target))
     }
 
-    fn contents(&self) -> Result<Contents, StudentError> {
+    fn contents(&self) -> Result<Contents> {
         let saved = self.runs.iter().map(|run| SavedWorld::of(&run.robot));
-        let state = SavedFilter {
-            learner: self.learner.saved(),
-            worlds: self.worlds.numbers.clone().zip(saved).collect(),
-        };
+        let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(saved).collect();
+        // As `SavedFilter`, without a copy of the learner.
+        let state = (&self.learner, worlds);
         Ok(Contents::new(self.learner.named_tensors(), &state))
     }
 

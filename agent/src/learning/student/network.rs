@@ -7,9 +7,10 @@
 
 mod progress;
 
-pub use self::progress::{LearnedNetwork, Position, Progress, SavedNetwork};
+pub use self::progress::{Position, Progress, SavedNetwork};
 
 use self::progress::follower;
+use anyhow::Result;
 
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
@@ -17,12 +18,9 @@ use crate::estimation::{AutoencoderEstimator, Follower};
 use crate::learning::checkpoint::Contents;
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::reward::met;
-use crate::learning::student::base::{
-    Fly, Look, NotFinite, Student, StudentError, Worlds, without_truth,
-};
-use crate::planning::PlanBasis;
+use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
 use crate::planning::policy::Policy;
-use crate::rollout::agent::{Agent, Setup, numbered_states};
+use crate::rollout::agent::numbered_states;
 use crate::rollout::{self, Robot};
 use crate::server::client::Observation;
 use ::network::{Transition, Window};
@@ -73,14 +71,10 @@ impl NetworkStudent {
     fn robot(&self, follower: Follower, observation: Observation) -> Robot {
         let network = &self.progress.autoencoder;
         let estimator = AutoencoderEstimator::at(network, follower);
-        let setup = Setup {
-            basis: PlanBasis::new(self.config.objective.belief),
-            state_names: numbered_states(network.shape().n_states),
-            n_moves: self.worlds.n_moves,
-            seed: self.config.planner_seed(observation.result.seed),
-        };
-        let agent = Agent::new(Box::new(estimator), &self.choices[0], &self.config, setup);
-        Robot::new(agent, observation)
+        let names = numbered_states(network.shape().n_states);
+        let (policy, config) = (&self.choices[0], &self.config);
+        let worlds = &self.worlds;
+        worlds.robot(config, policy, Box::new(estimator), names, observation)
     }
 
     /// What the next action goes by.
@@ -117,7 +111,7 @@ impl NetworkStudent {
         }
     }
 
-    fn update_dqn(&mut self) -> Result<[Option<f64>; 2], NotFinite> {
+    fn update_dqn(&mut self) -> Result<[Option<f64>; 2]> {
         let start = Instant::now();
         let rate = self
             .config
@@ -130,7 +124,7 @@ impl NetworkStudent {
         Ok([loss?.map(f64::from), Some(rate)])
     }
 
-    fn update_autoencoder(&mut self) -> Result<[Option<f64>; 2], NotFinite> {
+    fn update_autoencoder(&mut self) -> Result<[Option<f64>; 2]> {
         let start = Instant::now();
         let number = self.progress.autoencoder.n_updates();
         let config = &self.config.autoencoder;
@@ -147,12 +141,7 @@ impl NetworkStudent {
         Ok([Some(loss?), Some(rate)])
     }
 
-    fn step_with(
-        &mut self,
-        robot: &mut Robot,
-        fly: Fly<'_>,
-        look: Look<'_>,
-    ) -> Result<Tick, StudentError> {
+    fn step_with(&mut self, robot: &mut Robot, fly: Fly<'_>, look: Look<'_>) -> Result<Tick> {
         let start = Instant::now();
         let decision = self.decide(robot);
         let objective = self.config.objective(&self.choices[decision.action]);
@@ -163,7 +152,7 @@ impl NetworkStudent {
             |robot| robot.plan_with(|agent, cell, step| agent.plan_for(objective, cell, step)),
             |paths| {
                 planning = start.elapsed();
-                Ok::<_, StudentError>(without_truth(fly(paths)?))
+                anyhow::Ok(without_truth(fly(paths)?))
             },
             |index, robot, turn| {
                 tick.score = turn.score.unwrap_or_default();
@@ -200,7 +189,7 @@ impl Student for NetworkStudent {
         !self.is_frozen && self.progress.position.iterations < self.config.autoencoder.full_frames
     }
 
-    fn attach(&mut self, mut observations: Vec<Observation>) -> Result<usize, StudentError> {
+    fn attach(&mut self, mut observations: Vec<Observation>) -> Result<usize> {
         let observation = observations.remove(0);
         let shown = self.progress.replay.frames().last();
         let goes_on = self.progress.position.place == Some(observation.place())
@@ -217,7 +206,7 @@ impl Student for NetworkStudent {
         Ok(usize::from(goes_on))
     }
 
-    fn begin(&mut self, _: u32, observation: Observation) -> Result<(), StudentError> {
+    fn begin(&mut self, _: u32, observation: Observation) -> Result<()> {
         self.progress.position.track = self.progress.dqn.track();
         self.progress.replay.begin();
         self.progress.replay.push(observation.frame.clone());
@@ -228,7 +217,7 @@ impl Student for NetworkStudent {
         Ok(())
     }
 
-    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick, StudentError> {
+    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick> {
         let robot = self.robot.take();
         let mut robot = robot.expect("invariant: a world begins before it is acted on");
         let stepped = self.step_with(&mut robot, fly, look);
@@ -236,7 +225,7 @@ impl Student for NetworkStudent {
         stepped
     }
 
-    fn learn(&mut self) -> Result<Vec<ModelUpdate>, NotFinite> {
+    fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
         let epsilon = self
             .config
             .dqn
@@ -278,7 +267,7 @@ impl Student for NetworkStudent {
         Some((belief, self.progress.target()))
     }
 
-    fn contents(&self) -> Result<Contents, StudentError> {
+    fn contents(&self) -> Result<Contents> {
         let robot = self.robot.as_ref();
         let robot = robot.expect("invariant: a world begins before it is saved");
         Ok(self.progress.to_contents(robot)?)

@@ -3,7 +3,8 @@
 use crate::estimation::belief::Belief;
 use crate::learning::metrics::{ModelUpdate, Tick, averages};
 use crate::learning::student::Student;
-use crate::learning::tensorboard::{EventFile, EventsError, Value};
+use crate::learning::tensorboard::{EventFile, Value};
+use anyhow::Result;
 use figures::{Heat, heat};
 use std::path::Path;
 
@@ -18,24 +19,18 @@ pub struct Events {
 
 impl Events {
     /// Begins a file; what the folder's files tell of later world steps counts no more.
-    ///
-    /// # Errors
-    /// [`EventsError`].
-    pub fn begin(folder: &Path, world_steps: u64) -> Result<Self, EventsError> {
+    pub fn begin(folder: &Path, world_steps: u64) -> Result<Self> {
         let file = EventFile::begin(folder, world_steps + 1)?;
         Ok(Self { file, n_ticks: 0 })
     }
 
     /// Adds a step: one number a column, as TensorBoard shows one value a step.
-    ///
-    /// # Errors
-    /// [`EventsError`].
     pub fn add(
         &mut self,
         tick: &Tick,
         updates: &[ModelUpdate],
         student: &dyn Student,
-    ) -> Result<(), EventsError> {
+    ) -> Result<()> {
         let averages = averages(tick, updates, student.n_updates(), student.columns());
         let scalars = averages
             .iter()
@@ -50,14 +45,11 @@ impl Events {
     }
 
     /// Writes what is still in memory.
-    ///
-    /// # Errors
-    /// [`EventsError`].
-    pub fn flush(&mut self) -> Result<(), EventsError> {
+    pub fn flush(&mut self) -> Result<()> {
         self.file.flush()
     }
 
-    fn show(&mut self, step: u64, belief: &Belief, state: usize) -> Result<(), EventsError> {
+    fn show(&mut self, step: u64, belief: &Belief, state: usize) -> Result<()> {
         let picture = heat(belief.probability(state).view());
         let Heat { height, width, png } = picture.expect("invariant: a grid has cells, and fits");
         let png = &png;

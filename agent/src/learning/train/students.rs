@@ -3,14 +3,15 @@
 use crate::config::{AgentConfig, LearnerKind};
 use crate::estimation::BayesFilter;
 use crate::estimation::first_belief::first_belief;
-use crate::estimation::parameters::{Dimensions, DimensionsError};
-use crate::learning::checkpoint::{Contents, Problem};
+use crate::estimation::parameters::Dimensions;
+use crate::learning::checkpoint::Contents;
 use crate::learning::student::decisions::{Decisions, DecisionsStudent};
 use crate::learning::student::filter::FilterStudent;
 use crate::learning::student::network::{self, NetworkStudent};
 use crate::learning::student::{Student, Worlds};
-use crate::learning::train::training::{TrainError, Training};
+use crate::learning::train::training::Training;
 use crate::server::client::Client;
+use anyhow::{Context, Result, bail};
 use protocol::Model;
 use protocol::control::CoverageRule;
 use std::path::Path;
@@ -21,7 +22,7 @@ pub fn student(
     client: &Client,
     contents: Option<&Contents>,
     place: &Path,
-) -> Result<Box<dyn Student>, TrainError> {
+) -> Result<Box<dyn Student>> {
     let (info, config) = (client.info(), &training.config);
     let worlds = Worlds {
         shape: client.shape(),
@@ -29,35 +30,39 @@ pub fn student(
         n_moves: info.n_moves,
         numbers: training.worlds.clone(),
     };
-    let wrong = |problem: Problem| problem.of(place);
+    let of_file = || format!("checkpoint {}", place.display());
     Ok(match config.learner {
         LearnerKind::Filter => {
             let dimensions = dimensions(config, worlds.n_observations)?;
             Box::new(match contents {
-                Some(contents) => {
-                    FilterStudent::resume(contents, dimensions, worlds, config).map_err(wrong)?
-                }
+                Some(contents) => FilterStudent::resume(contents, dimensions, worlds, config)
+                    .with_context(of_file)?,
                 None => FilterStudent::new(dimensions, worlds, config),
             })
         }
         LearnerKind::Autoencoder => {
             let mut progress = network::Progress::first(&worlds, config, &training.device)?;
             if let Some(contents) = contents {
-                progress.load(contents).map_err(wrong)?;
+                progress.load(contents).with_context(of_file)?;
             }
             let full_frames = config.autoencoder.full_frames;
             let wants = progress.position.iterations < full_frames && !training.freeze;
             if wants && info.coverage == CoverageRule::Path {
-                return Err(TrainError::NoFullFrames(full_frames));
+                bail!(
+                    "autoencoder.full_frames: {full_frames} frames that show every cell need a server with \
+                     --coverage client or full, or the setting 0"
+                );
             }
             Box::new(NetworkStudent::new(progress, worlds, config))
         }
         LearnerKind::Decisions => {
-            let model = info.model.as_deref().ok_or(TrainError::NoModel)?;
+            let model = info.model.as_deref().context(
+                "learning decisions needs the server's model: start it with --reveal-model true",
+            )?;
             let model = Model::from_toml(model)?;
             let mut decisions = Decisions::first(&model, &config.decisions, config.seed);
             if let Some(contents) = contents {
-                decisions.load(contents).map_err(wrong)?;
+                decisions.load(contents).with_context(of_file)?;
             }
             let prior = config.prior(info.burn_in);
             let prior = first_belief(prior, &model, worlds.shape, config.seed)?;
@@ -69,7 +74,7 @@ pub fn student(
     })
 }
 
-fn dimensions(config: &AgentConfig, n_observations: usize) -> Result<Dimensions, DimensionsError> {
+fn dimensions(config: &AgentConfig, n_observations: usize) -> Result<Dimensions> {
     let learning = config.learning;
     let n_states = match learning.states {
         0 => n_observations,

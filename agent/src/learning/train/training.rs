@@ -1,19 +1,15 @@
 //! What to train on, and why that ended early.
 
-use crate::config::{AgentConfig, ConfigError, LearnerKind};
-use crate::estimation::parameters::DimensionsError;
-use crate::learning::checkpoint::{self, CheckpointError, Contents};
+use crate::config::{AgentConfig, LearnerKind};
+use crate::learning::checkpoint::{self, Contents};
 use crate::learning::learner;
-use crate::learning::metrics::MetricsError;
-use crate::learning::student::{Student, StudentError, decisions, network};
-use crate::learning::tensorboard::EventsError;
-use ::network::{Device, NetworkError};
+use crate::learning::student::{Student, decisions, network};
+use ::network::Device;
+use anyhow::{Result, anyhow, bail, ensure};
 use protocol::connection::ConnectionError;
-use protocol::model::ModelError;
 use std::ops::Range;
 use std::path::PathBuf;
 use std::time::Duration;
-use thiserror::Error;
 
 /// The checkpoint's name in the folder of a training.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
@@ -21,7 +17,6 @@ pub const CHECKPOINT: &str = "checkpoint.safetensors";
 /// What to train on, for how long.
 #[derive(Debug, Clone)]
 pub struct Training {
-    /// The worlds to act on.
     pub worlds: Range<u32>,
     /// Take the worlds from their holder.
     pub takeover: bool,
@@ -29,100 +24,32 @@ pub struct Training {
     pub steps: u64,
     /// Time to act for; `None`: until stopped.
     pub time_limit: Option<Duration>,
-    /// Folder of checkpoint and metrics.
     pub out: PathBuf,
     /// Go on from the folder's checkpoint.
     pub resume: bool,
     /// Act on the parameters as they are.
     pub freeze: bool,
-    /// Where an autoencoder computes.
     pub device: Device,
-    /// Settings.
     pub config: AgentConfig,
-}
-
-/// Why training ended early.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum TrainError {
-    /// The server refused or is gone; what was learned is saved.
-    #[error(transparent)]
-    Connection(#[from] ConnectionError),
-    /// The checkpoint.
-    #[error(transparent)]
-    Checkpoint(#[from] CheckpointError),
-    /// The metrics.
-    #[error(transparent)]
-    Metrics(#[from] MetricsError),
-    /// The same for TensorBoard.
-    #[error(transparent)]
-    Events(#[from] EventsError),
-    /// The settings.
-    #[error(transparent)]
-    Config(#[from] ConfigError),
-    /// Settings that no filter has with the server's observations.
-    #[error(transparent)]
-    Dimensions(#[from] DimensionsError),
-    /// The learner.
-    #[error("after {world_steps} world steps: {problem}; what was learned before is in {saved}")]
-    Student {
-        /// What is wrong.
-        problem: Box<StudentError>,
-        /// World steps that were learned from.
-        world_steps: u64,
-        /// The checkpoint.
-        saved: String,
-    },
-    /// What was learned could not be saved either.
-    #[error("{problem}; what was learned is lost: {also}")]
-    NotSaved {
-        /// Why training ended.
-        problem: Box<TrainError>,
-        /// Why it is not saved.
-        also: Box<TrainError>,
-    },
-    /// A folder that holds a training already.
-    #[error("--out {0}: expected --resume or a folder without a checkpoint, got one with it")]
-    Taken(String),
-    /// Full frames that the server does not give.
-    #[error(
-        "autoencoder.full_frames: {0} frames that show every cell need a server with --coverage \
-         client or full, or the setting 0"
-    )]
-    NoFullFrames(u64),
-    /// Worlds that one memory cannot follow.
-    #[error("--worlds: expected 1 for the autoencoder, which follows one world, got {0}")]
-    OneWorld(usize),
-    /// The networks, before their first step.
-    #[error(transparent)]
-    Network(#[from] NetworkError),
-    /// The model that a filter needs.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// A server that hides it.
-    #[error("learning decisions needs the server's model: start it with --reveal-model true")]
-    NoModel,
-    /// Settings that cannot be written into a checkpoint.
-    #[error("settings: {0}")]
-    Settings(#[from] toml::ser::Error),
 }
 
 impl Training {
     /// Checks folder and number of worlds, before a server is held or started for them; returns the
     /// contents of the checkpoint to go on from.
-    ///
-    /// # Errors
-    /// [`TrainError`].
-    pub fn check(&self) -> Result<Option<Contents>, TrainError> {
+    pub fn check(&self) -> Result<Option<Contents>> {
         let place = self.out.join(CHECKPOINT);
-        if place.exists() && !self.resume {
-            return Err(TrainError::Taken(self.out.display().to_string()));
-        }
+        ensure!(
+            self.resume || !place.exists(),
+            "--out {}: expected --resume or a folder without a checkpoint, got one with it",
+            self.out.display()
+        );
         let n_worlds = self.worlds.len();
         let kind = match self.config.learner {
             LearnerKind::Filter => learner::KIND,
             LearnerKind::Autoencoder if n_worlds != 1 => {
-                return Err(TrainError::OneWorld(n_worlds));
+                bail!(
+                    "--worlds: expected 1 for the autoencoder, which follows one world, got {n_worlds}"
+                )
             }
             LearnerKind::Autoencoder => network::KIND,
             LearnerKind::Decisions => decisions::KIND,
@@ -140,14 +67,14 @@ impl Training {
     }
 
     /// The error for a student that cannot go on; what it learned is saved when training ends.
-    pub(super) fn stopped(&self, problem: StudentError, student: &dyn Student) -> TrainError {
-        if let StudentError::Connection(problem) = problem {
-            return problem.into();
+    pub(super) fn stopped(&self, problem: anyhow::Error, student: &dyn Student) -> anyhow::Error {
+        if problem.is::<ConnectionError>() {
+            return problem;
         }
-        TrainError::Student {
-            problem: problem.into(),
-            world_steps: student.world_steps(),
-            saved: self.out.join(CHECKPOINT).display().to_string(),
-        }
+        anyhow!(
+            "after {} world steps: {problem:#}; what was learned before is in {}",
+            student.world_steps(),
+            self.out.join(CHECKPOINT).display()
+        )
     }
 }

@@ -9,7 +9,6 @@ use thiserror::Error;
 /// Where a policy's belief comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum EstimatorKind {
-    /// No belief at all.
     None,
     /// The Bayes filter with the true parameters (paper section III.A, masked as in III.C).
     KnownModel,
@@ -34,7 +33,6 @@ pub enum PlannerKind {
     RandomWalk,
     /// The best of many random paths (paper section III.D).
     Shooting,
-    /// Beam search.
     Beam,
 }
 
@@ -43,11 +41,8 @@ pub enum PlannerKind {
 pub struct Policy {
     /// Its name in commands, tables and files.
     pub name: String,
-    /// Where its belief comes from.
     pub estimator: EstimatorKind,
-    /// How it plans.
     pub planner: PlannerKind,
-    /// What it maximises.
     pub objective: Objective,
     /// Whether a DQN chooses what each path is for instead (paper section III.E).
     pub is_decided: bool,
@@ -104,6 +99,22 @@ impl PlannerKind {
 }
 
 impl Policy {
+    fn new(
+        name: &str,
+        estimator: EstimatorKind,
+        planner: PlannerKind,
+        objective: Objective,
+    ) -> Self {
+        Self {
+            name: name.into(),
+            estimator,
+            planner,
+            objective,
+            is_decided: false,
+            action: None,
+        }
+    }
+
     /// The policy of a name under a model.
     ///
     /// Names are `random_walk`, `coverage`, `shooting_*` and `beam_*` with `exploit` (the state that
@@ -112,23 +123,13 @@ impl Policy {
     /// `beam`. On the autoencoder's belief there are `autoencoder_exploit` and `autoencoder_explore`, which shoot,
     /// `autoencoder_policy`, for which the DQN chooses among the paper's objectives, and `autoencoder_beam`.
     /// `dqn_beam` chooses among [`ActionSet::beam`] by a DQN; `act_*` always takes the action of that name.
-    ///
-    /// # Errors
-    /// [`UnknownPolicy`] lists the names that there are.
     pub fn named(name: &str, model: &Model) -> Result<Self, UnknownPolicy> {
         let unknown = || UnknownPolicy {
             name: name.into(),
             expected: known_names(model).join(", "),
         };
         let target = Target::State(model.target_state());
-        let policy = |estimator, planner, objective| Self {
-            name: name.into(),
-            estimator,
-            planner,
-            objective,
-            is_decided: false,
-            action: None,
-        };
+        let policy = |estimator, planner, objective| Self::new(name, estimator, planner, objective);
         Ok(match name {
             "random_walk" => policy(
                 EstimatorKind::None,
@@ -186,13 +187,9 @@ impl Policy {
     /// state in the model's order, then `entropy`; each named by its target, with the bonus of
     /// `shooting_*` and `beam_*`.
     pub fn choices(planner: PlannerKind, model: &Model) -> Vec<Self> {
-        let choice = |name: &str, target| Self {
-            name: name.into(),
-            estimator: EstimatorKind::KnownModel,
-            planner,
-            objective: objective(planner, target),
-            is_decided: false,
-            action: None,
+        let choice = |name: &str, target| {
+            let objective = objective(planner, target);
+            Self::new(name, EstimatorKind::KnownModel, planner, objective)
         };
         let states = model.file().states.iter().enumerate();
         let states = states.map(|(state, entry)| choice(&entry.name, Target::State(state)));
@@ -206,27 +203,21 @@ impl Policy {
             PlannerKind::RandomWalk => Target::Coverage,
             PlannerKind::Shooting | PlannerKind::Beam => Target::State(0),
         };
-        Self {
-            name: format!("learned_{}", planner.label()),
-            estimator: EstimatorKind::Learned,
-            planner,
-            objective: objective(planner, target),
-            is_decided: false,
-            action: None,
-        }
+        let (name, objective) = (
+            format!("learned_{}", planner.label()),
+            objective(planner, target),
+        );
+        Self::new(&name, EstimatorKind::Learned, planner, objective)
     }
 
     /// Beam search on the known model's belief that always takes one action.
     fn always(name: &str, action: &str, model: &Model) -> Option<Self> {
         let actions = ActionSet::beam(model);
         let action = actions.named(action)?;
+        let (estimator, planner) = (EstimatorKind::KnownModel, PlannerKind::Beam);
         Some(Self {
-            name: name.into(),
-            estimator: EstimatorKind::KnownModel,
-            planner: PlannerKind::Beam,
-            objective: action.objective,
-            is_decided: false,
             action: Some(action.clone()),
+            ..Self::new(name, estimator, planner, action.objective)
         })
     }
 
@@ -239,30 +230,23 @@ impl Policy {
             "beam" => (PlannerKind::Beam, Target::State(0)),
             _ => return None,
         };
+        let (full, objective) = (format!("autoencoder_{name}"), objective(planner, target));
         Some(Self {
-            name: format!("autoencoder_{name}"),
-            estimator: EstimatorKind::Autoencoder,
-            planner,
-            objective: objective(planner, target),
             is_decided: name == "policy",
-            action: None,
+            ..Self::new(&full, EstimatorKind::Autoencoder, planner, objective)
         })
     }
 
     /// What the DQN of Algorithm 1 chooses among (paper section IV): the probability of each of the
     /// autoencoder's states, then entropy.
     pub fn network_choices(n_states: usize) -> Vec<Self> {
-        let choice = |name: String, target| Self {
-            name,
-            estimator: EstimatorKind::Autoencoder,
-            planner: PlannerKind::Shooting,
-            objective: objective(PlannerKind::Shooting, target),
-            is_decided: false,
-            action: None,
+        let choice = |name: &str, target| {
+            let (estimator, planner) = (EstimatorKind::Autoencoder, PlannerKind::Shooting);
+            Self::new(name, estimator, planner, objective(planner, target))
         };
-        let states =
-            (0..n_states).map(|state| choice(format!("state_{state}"), Target::State(state)));
-        let entropy = choice("entropy".into(), Target::Entropy);
+        let states = 0..n_states;
+        let states = states.map(|state| choice(&format!("state_{state}"), Target::State(state)));
+        let entropy = choice("entropy", Target::Entropy);
         states.chain([entropy]).collect()
     }
 

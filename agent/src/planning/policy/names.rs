@@ -49,7 +49,6 @@ pub(super) fn ladder_names(model: &Model) -> Vec<String> {
     names
 }
 
-/// All of a model.
 pub(super) fn known_names(model: &Model) -> Vec<String> {
     let mut names = ladder_names(model);
     names.extend(["beam_explore", "beam_exploit_only", "clairvoyant_shooting"].map(String::from));

@@ -1,22 +1,21 @@
 //! A learned filter in a checkpoint: the learner, and where its robots are.
 
 use crate::estimation::belief::Belief;
-use crate::learning::checkpoint::{Problem, check_belief};
-use crate::learning::learner::SavedLearner;
+use crate::learning::checkpoint::check_belief;
+use crate::learning::learner::Learner;
 use crate::rollout::Robot;
 use crate::rollout::agent::Agent;
 use crate::server::client::{Observation, Place};
+use anyhow::Result;
 use protocol::Shape;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::ops::Range;
 
 /// All of a learned filter's checkpoint but the tensors.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct SavedFilter {
-    /// What learns.
-    pub learner: SavedLearner,
-    /// By number.
+    pub learner: Learner,
     pub worlds: BTreeMap<u32, SavedWorld>,
 }
 
@@ -31,7 +30,6 @@ pub struct SavedWorld {
 }
 
 impl SavedWorld {
-    /// Where a robot is.
     pub fn of(robot: &Robot) -> Self {
         let (agent, observation) = (&robot.agent, robot.observation());
         Self {
@@ -70,10 +68,7 @@ impl SavedWorld {
     }
 
     /// Refuses beliefs of another grid or about other states.
-    ///
-    /// # Errors
-    /// Names the belief.
-    pub fn check(&self, n_states: usize, shape: Shape) -> Result<(), Problem> {
+    pub fn check(&self, n_states: usize, shape: Shape) -> Result<()> {
         check_belief("worlds.belief", &self.belief, n_states, shape)?;
         self.estimate
             .iter()

@@ -5,7 +5,7 @@ use crate::estimation::Follower;
 use crate::estimation::belief::Belief;
 use crate::estimation::dqn_input::DqnInput;
 use crate::learning::checkpoint::{
-    Contents, Problem, check, check_belief, check_counts, check_numbers,
+    Contents, check, check_belief, check_counts, check_numbers, wrong,
 };
 use crate::learning::reward::RewardEstimate;
 use crate::learning::student::base::Worlds;
@@ -14,23 +14,22 @@ use crate::planning::policy::Policy;
 use crate::rollout::Robot;
 use crate::server::client::Place;
 use ::network::{Autoencoder, Device, Dqn, NetworkError, NetworkShape, Replay, SavedDqn, Track};
+use anyhow::Result;
 use protocol::model::MAX_VALUES;
 use protocol::{Frame, Shape};
 use serde::{Deserialize, Serialize};
 
-/// What is learned, and where learning stands.
+/// What is learned, and where learning stands. Each world follows the autoencoder with a copy of its own.
+#[derive(Debug)]
 pub struct Progress {
-    /// The model.
     pub autoencoder: Autoencoder,
-    /// The choice of objectives.
     pub dqn: Dqn,
-    /// What that sees.
+    /// What the DQN sees.
     pub input: DqnInput,
-    /// What paths are planned on.
+    /// What the paths are planned on that the DQN values.
     pub basis: BasisKind,
     /// The frames that are learned from.
     pub replay: Replay,
-    /// Where learning stands beside.
     pub position: Position,
 }
 
@@ -43,7 +42,6 @@ pub struct Position {
     pub estimate: Option<Belief>,
     /// The world's latest steps, for the DQN's replay.
     pub track: Track,
-    /// Which state pays.
     pub reward: RewardEstimate,
     /// Iterations of Algorithm 1.
     pub iterations: u64,
@@ -54,42 +52,21 @@ pub struct Position {
 /// All of a checkpoint of Algorithm 1 but the tensors.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct SavedNetwork {
-    /// The grid.
     pub shape: Shape,
     /// Number of values that an observed cell may show.
     pub n_observations: usize,
     /// Steps of the autoencoder's Adam, and its updates.
     pub counters: [u64; 2],
-    /// The DQN.
     pub dqn: SavedDqn,
     /// The replay, the oldest frame first.
     pub frames: Vec<Vec<u8>>,
     /// The places of frames with which tracks begin.
     pub tracks: Vec<u64>,
-    /// Where learning stands beside.
     pub position: Position,
-}
-
-/// What Algorithm 1 learned, with its parameters fixed.
-#[derive(Debug)]
-pub struct LearnedNetwork {
-    /// The model; each world follows it with a copy of its own.
-    pub autoencoder: Autoencoder,
-    /// The choice of objectives.
-    pub dqn: Dqn,
-    /// What that sees.
-    pub input: DqnInput,
-    /// What the paths were planned on that it values.
-    pub basis: BasisKind,
-    /// The state that pays most.
-    pub target: usize,
 }
 
 impl Progress {
     /// Before the first frame; the autoencoder computes on `device`.
-    ///
-    /// # Errors
-    /// As the device.
     pub fn first(
         worlds: &Worlds,
         config: &AgentConfig,
@@ -121,26 +98,12 @@ impl Progress {
     }
 
     /// The state that pays most, as far as rewards tell by now.
-    pub(super) fn target(&self) -> usize {
+    pub fn target(&self) -> usize {
         let reward = &self.position.reward;
         reward.target().unwrap_or(reward.rewards.len() - 1)
     }
 
-    /// What is known by then.
-    pub fn learned(self) -> LearnedNetwork {
-        LearnedNetwork {
-            target: self.target(),
-            autoencoder: self.autoencoder,
-            dqn: self.dqn,
-            input: self.input,
-            basis: self.basis,
-        }
-    }
-
     /// As a checkpoint, without the settings: a robot stands in the world.
-    ///
-    /// # Errors
-    /// As the network's device.
     pub fn to_contents(&self, robot: &Robot) -> Result<Contents, NetworkError> {
         let shape = self.autoencoder.shape();
         let frames = self.replay.frames();
@@ -164,10 +127,7 @@ impl Progress {
     }
 
     /// From a checkpoint, with its own settings; the autoencoder computes on `device`.
-    ///
-    /// # Errors
-    /// Names what is missing or of another form.
-    pub fn read(contents: &Contents, device: &Device) -> Result<Self, Problem> {
+    pub fn read(contents: &Contents, device: &Device) -> Result<Self> {
         let config = contents.settings()?;
         let saved: SavedNetwork = contents.state()?;
         let (shape, n_observations) = (saved.shape, saved.n_observations);
@@ -190,10 +150,7 @@ impl Progress {
     }
 
     /// Takes over a checkpoint of the same sizes.
-    ///
-    /// # Errors
-    /// Names what is missing or of another form; some of it may have been taken over then.
-    pub fn load(&mut self, contents: &Contents) -> Result<(), Problem> {
+    pub fn load(&mut self, contents: &Contents) -> Result<()> {
         let [expected, got] = [self.input, contents.settings()?.dqn.input].map(DqnInput::label);
         check(got == expected, "dqn.input", expected, got)?;
         let saved: SavedNetwork = contents.state()?;
@@ -226,7 +183,7 @@ impl Progress {
         Ok(())
     }
 
-    fn load_replay(&mut self, frames: &[Vec<u8>], tracks: &[u64]) -> Result<(), Problem> {
+    fn load_replay(&mut self, frames: &[Vec<u8>], tracks: &[u64]) -> Result<()> {
         let shape = self.autoencoder.shape();
         let mut tracks = tracks.iter().peekable();
         for (index, bytes) in (0..).zip(frames) {
@@ -234,8 +191,8 @@ impl Progress {
                 self.replay.begin();
             }
             let frame = Frame::from_bytes(shape.grid, shape.n_observations, bytes);
-            let wrong = |error| Problem::value("frames", "frames of these worlds", error);
-            self.replay.push(frame.map_err(wrong)?);
+            let misfit = |error| wrong("frames", "frames of these worlds", error);
+            self.replay.push(frame.map_err(misfit)?);
         }
         Ok(())
     }
@@ -263,7 +220,7 @@ fn network_shape(grid: Shape, n_observations: usize, config: &AgentConfig) -> Ne
 }
 
 /// Refuses sizes whose numbers are not in the file: a few words could ask for all memory otherwise.
-fn check_size(contents: &Contents, shape: &NetworkShape) -> Result<(), Problem> {
+fn check_size(contents: &Contents, shape: &NetworkShape) -> Result<()> {
     let expected = shape.n_numbers();
     let tensors = contents.tensors.values();
     let got: usize = tensors.map(|tensor| tensor.numbers.len()).sum();

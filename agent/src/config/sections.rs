@@ -1,0 +1,328 @@
+//! The sections of `config/agent.toml`, which says what each setting means.
+
+use crate::estimation::belief::EntropyKind;
+use crate::estimation::dqn_input::DqnInput;
+use crate::planning::BasisKind;
+use ::network::{AdamSettings, AutoencoderSettings, DqnSettings};
+use anyhow::{Result, bail};
+use serde::{Deserialize, Serialize};
+
+/// Below 1, so that Adam's means move.
+const MOST_BETA: f64 = 0.999_999;
+
+/// What planners maximise besides the target that a policy's name says (paper eqs. 13 to 15).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ObjectiveConfig {
+    pub shooting_bonus: f32,
+    pub beam_bonus: f32,
+    pub entropy: EntropyKind,
+    pub revisits: bool,
+    pub belief: BasisKind,
+}
+
+/// How the learned filter learns.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct LearningConfig {
+    pub states: usize,
+    pub kernel: [usize; 2],
+    pub window: usize,
+    pub streams: usize,
+    pub block_windows: usize,
+    pub replay_frames: usize,
+    pub rate: f64,
+    pub observation_rate: f64,
+    pub beta1: f64,
+    pub beta2: f64,
+    pub steady_updates: u64,
+    pub falling_updates: u64,
+    pub final_rate: f64,
+    pub updates_per_step: f64,
+    pub anchor: f64,
+    pub explore_steps: u64,
+    pub explore_share: f64,
+}
+
+/// How the dynamic autoencoder learns (paper sections III.B and III.C).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct AutoencoderConfig {
+    pub states: usize,
+    pub encoding: usize,
+    pub hidden: usize,
+    pub window: usize,
+    pub replay_frames: usize,
+    pub full_frames: u64,
+    pub betas: [f32; 2],
+    pub step_size: StepSize,
+}
+
+/// How a DQN learns.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DqnConfig {
+    pub replay: usize,
+    pub batch: usize,
+    pub gamma: f32,
+    pub n_step: usize,
+    pub tau: f32,
+    pub epsilon: f32,
+    pub epsilon_end: f32,
+    pub epsilon_steps: u64,
+    pub double: bool,
+}
+
+/// How the DQN of Algorithm 1 learns (paper section III.E).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct NetworkDqnConfig {
+    pub input: DqnInput,
+    #[serde(flatten)]
+    pub learning: DqnConfig,
+    pub step_size: StepSize,
+}
+
+/// How the DQN of `train --learner decisions` learns.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DecisionsConfig {
+    #[serde(flatten)]
+    pub learning: DqnConfig,
+    pub reward_scale: f32,
+    pub updates_per_step: f64,
+    pub rate: f32,
+}
+
+/// A step size that vanishes: `rate (1 + n / steady)^-power` at iteration n.
+///
+/// With powers of more than one half and at most one, sums of step sizes diverge and those of their
+/// squares do not. The autoencoder's power is larger than the DQN's, so that the quotient of the two
+/// vanishes too (paper eq. 20, `eps_sys / eps_dqn -> 0`). A power of 0 keeps the step size.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct StepSize {
+    pub rate: f64,
+    pub steady: u64,
+    pub power: f64,
+}
+
+/// A setting's name, its value, and the least and the greatest that it may be.
+pub(super) type Range<'a> = (&'a str, f64, f64, f64);
+
+/// Refuses the first setting that is out of its range.
+pub(super) fn check(section: &str, settings: &[Range<'_>]) -> Result<()> {
+    for &(name, got, least, most) in settings {
+        if !(least..=most).contains(&got) {
+            bail!("{section}{name}: expected {least} to {most}, got {got}");
+        }
+    }
+    Ok(())
+}
+
+impl ObjectiveConfig {
+    pub(super) fn check(&self) -> Result<()> {
+        let ranges = [
+            ("shooting_bonus", self.shooting_bonus.into(), 0.0, 1e3),
+            ("beam_bonus", self.beam_bonus.into(), 0.0, 1e3),
+        ];
+        check("objective.", &ranges)
+    }
+}
+
+impl LearningConfig {
+    pub(super) fn check(&self) -> Result<()> {
+        let ranges = [
+            states(self.states),
+            ("window", self.window as f64, 1.0, 1024.0),
+            ("streams", self.streams as f64, 1.0, 1024.0),
+            ("block_windows", self.block_windows as f64, 1.0, 1024.0),
+            ("replay_frames", self.replay_frames as f64, 1.0, 1.6e7),
+            ("rate", self.rate, 0.0, 1.0),
+            ("observation_rate", self.observation_rate, 0.0, 100.0),
+            ("beta1", self.beta1, 0.0, MOST_BETA),
+            ("beta2", self.beta2, 0.0, MOST_BETA),
+            ("final_rate", self.final_rate, 0.0, 1.0),
+            ("updates_per_step", self.updates_per_step, 0.0, 1e3),
+            ("anchor", self.anchor, 0.0, 1e3),
+            ("explore_share", self.explore_share, 0.0, 1.0),
+        ];
+        check("learning.", &ranges)
+    }
+
+    /// Share of the step size at an update: 1, then falling linearly to `final_rate`.
+    pub fn rate_at(&self, update: u64) -> f64 {
+        let fallen = update.saturating_sub(self.steady_updates) as f64;
+        let share = 1.0 - fallen / self.falling_updates.max(1) as f64;
+        share.max(self.final_rate)
+    }
+}
+
+impl AutoencoderConfig {
+    pub(super) fn check(&self) -> Result<()> {
+        let (window, [beta1, beta2]) = (self.window as f64, self.betas.map(f64::from));
+        let ranges = [
+            states(self.states),
+            ("encoding", self.encoding as f64, 1.0, 256.0),
+            ("hidden", self.hidden as f64, 1.0, 256.0),
+            ("window", window, 2.0, 1e4),
+            ("replay_frames", self.replay_frames as f64, window, 1e5),
+            ("betas", beta1, 0.0, MOST_BETA),
+            ("betas", beta2, 0.0, MOST_BETA),
+        ];
+        check("autoencoder.", &ranges)?;
+        check("autoencoder.step_size.", &self.step_size.ranges())
+    }
+
+    /// As the network takes them, with the first step size.
+    pub fn settings(&self) -> AutoencoderSettings {
+        AutoencoderSettings {
+            encoding: self.encoding,
+            hidden: self.hidden,
+            window: self.window,
+            replay: self.replay_frames,
+            adam: AdamSettings {
+                betas: self.betas,
+                ..AdamSettings::paper(self.step_size.rate as f32)
+            },
+        }
+    }
+}
+
+impl DqnConfig {
+    fn check(&self, section: &str, most_kept: f64) -> Result<()> {
+        let batch = self.batch as f64;
+        let ranges = [
+            ("batch", batch, 1.0, 65_536.0),
+            ("n_step", self.n_step as f64, 1.0, 1e3),
+            ("replay", self.replay as f64, batch, most_kept),
+            ("gamma", self.gamma.into(), 0.0, 1.0),
+            ("tau", self.tau.into(), 0.0, 1.0),
+            ("epsilon", self.epsilon.into(), 0.0, 1.0),
+            ("epsilon_end", self.epsilon_end.into(), 0.0, 1.0),
+        ];
+        check(section, &ranges)
+    }
+
+    fn settings(&self, learning_rate: f32) -> DqnSettings {
+        let adam = DqnSettings::paper().adam;
+        DqnSettings {
+            replay: self.replay,
+            batch: self.batch,
+            gamma: self.gamma,
+            n_step: self.n_step,
+            tau: self.tau,
+            epsilon: self.epsilon,
+            epsilon_end: self.epsilon_end,
+            epsilon_steps: self.epsilon_steps,
+            double: self.double,
+            adam: AdamSettings {
+                learning_rate,
+                ..adam
+            },
+        }
+    }
+}
+
+impl NetworkDqnConfig {
+    pub(super) fn check(&self) -> Result<()> {
+        self.learning.check("dqn.", 1e6)?;
+        check("dqn.step_size.", &self.step_size.ranges())
+    }
+
+    /// As the network takes them, with the first step size.
+    pub fn settings(&self) -> DqnSettings {
+        self.learning.settings(self.step_size.rate as f32)
+    }
+}
+
+impl DecisionsConfig {
+    pub(super) fn check(&self) -> Result<()> {
+        self.learning.check("decisions.", 2e5)?;
+        let ranges = [
+            ("reward_scale", self.reward_scale.into(), 0.0, 1e3),
+            ("updates_per_step", self.updates_per_step, 0.0, 16.0),
+            ("rate", self.rate.into(), 0.0, 1.0),
+        ];
+        check("decisions.", &ranges)
+    }
+
+    /// As the network takes them.
+    pub fn settings(&self) -> DqnSettings {
+        self.learning.settings(self.rate)
+    }
+}
+
+impl StepSize {
+    /// The step size of an iteration, counted from 0.
+    pub fn at(&self, iteration: u64) -> f64 {
+        self.rate * (1.0 + iteration as f64 / self.steady.max(1) as f64).powf(-self.power)
+    }
+
+    fn ranges(&self) -> [Range<'static>; 2] {
+        [
+            ("rate", self.rate, 0.0, 1.0),
+            ("power", self.power, 0.0, 1.0),
+        ]
+    }
+}
+
+/// 0 stands for as many states as observations.
+fn states(states: usize) -> Range<'static> {
+    let least = if states == 0 { 0.0 } else { 2.0 };
+    ("states", states as f64, least, 64.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::AgentConfig;
+
+    #[test]
+    fn the_autoencoders_steps_vanish_against_the_dqns() {
+        let AgentConfig {
+            autoencoder, dqn, ..
+        } = AgentConfig::default();
+        let quotient = |n: u64| autoencoder.step_size.at(n) / dqn.step_size.at(n);
+        assert!((quotient(0) - 0.01).abs() < 1e-9);
+        let quotients = [0, 5_000, 50_000, 500_000, 500_000_000].map(quotient);
+        assert!(quotients.is_sorted_by(|a, b| a > b), "{quotients:?}");
+        assert!(quotients[4] < 0.04 * quotients[0]);
+        let constant = AgentConfig::paper().autoencoder.step_size;
+        assert_eq!(constant.at(1_000_000), 1e-4);
+    }
+
+    #[test]
+    fn settings_reach_the_networks() {
+        let config = AgentConfig::paper();
+        assert_eq!(config.autoencoder.settings(), AutoencoderSettings::paper());
+        assert_eq!(config.dqn.settings(), DqnSettings::paper());
+    }
+
+    #[test]
+    fn the_step_size_stays_falls_and_stays() {
+        let config = LearningConfig {
+            steady_updates: 10,
+            falling_updates: 10,
+            final_rate: 0.1,
+            ..AgentConfig::default().learning
+        };
+        let at = [0, 10, 15, 19, 1000].map(|update| config.rate_at(update));
+        assert_eq!(at[..3], [1.0, 1.0, 0.5]);
+        assert!((at[3] - 0.1).abs() < 1e-12 && at[4] == 0.1, "{at:?}");
+    }
+
+    #[test]
+    fn wrong_settings_are_named() {
+        for (setting, expected) in [
+            ("learning.streams = 0", "1 to 1024, got 0"),
+            ("learning.states = 1", "2 to 64, got 1"),
+            ("learning.rate = nan", "0 to 1, got NaN"),
+            ("learning.beta1 = 1.0", "0 to 0.999999, got 1"),
+            ("autoencoder.replay_frames = 999", "1000 to 100000, got 999"),
+            ("autoencoder.step_size.rate = 2.0", "0 to 1, got 2"),
+            ("dqn.epsilon = 2.0", "0 to 1, got 2"),
+            ("decisions.n_step = 0", "1 to 1000, got 0"),
+            ("decisions.replay = 8", "64 to 200000, got 8"),
+            ("decisions.gamma = 1.5", "0 to 1, got 1.5"),
+            ("decisions.rate = nan", "0 to 1, got NaN"),
+        ] {
+            let error = AgentConfig::from_toml(setting).expect_err(setting);
+            let name = setting.split(" = ").next().unwrap_or_default();
+            assert_eq!(error.to_string(), format!("{name}: expected {expected}"));
+        }
+    }
+}
