@@ -2,7 +2,8 @@
 
 use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly};
 use crate::wire::{RawClient, Wire, step_header};
-use agent::estimation::filter::known_model_kind;
+use agent::estimation::belief::Belief;
+use agent::estimation::{BayesFilter, Estimator};
 use protocol::Model;
 use protocol::Move;
 use protocol::control::{LeftPart, Reply, Request, WorldSeed};
@@ -51,6 +52,7 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
     for policy in [
         ["--policy", "beam_exploit"],
         ["--policy", "shooting_explore"],
+        ["--policy", "spatial_beam"],
     ] {
         let server = Server::start(&format!("{FLAGS} {ALL}"));
         let observer = Observer::frames(&server.instance).expect("observe");
@@ -93,7 +95,9 @@ fn an_agent_that_finds_a_damaged_belief_begins_with_its_own() {
     let observer = Observer::frames(&server.instance).expect("observe");
     let mut client = server.acquire(0..1);
     let at = client.observe(0..1).expect("observe")[0].result;
-    let kind = known_model_kind(&Model::wildfire());
+    let model = Model::wildfire();
+    let filter = BayesFilter::known(&model, Belief::from_initial(&model, server.shape()));
+    let kind = filter.expect("a filter").kind().expect("its kind");
     client
         .leave_belief(&at, &kind, b"not whole")
         .expect("leave");

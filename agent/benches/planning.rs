@@ -2,8 +2,8 @@
 //!
 //! The authors' PyTorch code, one CPU thread: planner with 2048 samples 1.5 s, Bayes update 0.12 ms.
 
-use agent::estimation::BayesFilter;
 use agent::estimation::belief::{Belief, EntropyKind};
+use agent::estimation::{BayesFilter, Correlations, Estimator, SpatialFilter};
 use agent::planning::{
     BeamSearch, CellValues, Objective, Planner, PlanningProblem, RandomWalk, Shooting, Target,
 };
@@ -27,6 +27,17 @@ fn filter() -> BayesFilter {
         BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape())).expect("valid model");
     for step in 0..40 {
         filter.correct(&frame(step)).expect("possible frame");
+        filter.predict();
+    }
+    filter
+}
+
+/// The same, with neighbours.
+fn spatial_filter() -> SpatialFilter {
+    let known = BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape()));
+    let mut filter = SpatialFilter::new(known.expect("valid model"), 2, Correlations::default());
+    for step in 0..40 {
+        filter.correct(&frame(step), None).expect("possible frame");
         filter.predict();
     }
     filter
@@ -85,6 +96,17 @@ fn estimators(c: &mut Criterion) {
         b.iter(|| {
             filter.correct(black_box(&frame)).expect("possible frame");
             filter.predict();
+        });
+    });
+    let mut spatial = spatial_filter();
+    let frames: Vec<Frame> = (40..104).map(self::frame).collect();
+    let mut frames = frames.iter().cycle();
+    c.bench_function("spatial filter: correct + predict", |b| {
+        b.iter(|| {
+            let frame = frames.next().expect("a circle");
+            let corrected = spatial.correct(black_box(frame), None);
+            corrected.expect("possible frame");
+            spatial.predict();
         });
     });
     c.bench_function("entropy", |b| {

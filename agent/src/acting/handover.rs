@@ -1,11 +1,9 @@
 //! How an agent goes on with what another believed: from the belief that it left with the server, or
 //! else from the frames that the server keeps.
 
-use crate::estimation::belief::Belief;
 use crate::rollout::Robot;
 use crate::server::client::Client;
 use anyhow::Result;
-use protocol::Probabilities;
 use protocol::connection::ConnectionError;
 use protocol::message::Status;
 
@@ -46,16 +44,18 @@ pub fn resume(client: &mut Client, robot: &mut Robot) -> Result<bool> {
 /// forgotten.
 pub fn take_over_left(client: &mut Client, robot: &mut Robot) -> Result<bool, ConnectionError> {
     let step = robot.observation().result.step;
-    let agent = &mut robot.agent;
-    let Some(kind) = agent.estimator().kind() else {
+    let estimator = robot.agent.estimator_mut();
+    let Some(kind) = estimator.kind() else {
         return Ok(false);
     };
-    let Some(belief) = belief_left(client, &kind, agent.belief())? else {
+    let Some(memory) = client.belief(&kind)? else {
         return Ok(false);
     };
-    tracing::info!(step, "going on from the belief that was left");
-    agent.take_over(belief);
-    Ok(true)
+    let is_taken = estimator.remember(&memory);
+    if is_taken {
+        tracing::info!(step, "going on from the belief that was left");
+    }
+    Ok(is_taken)
 }
 
 /// Leaves an agent's belief about X_{k+1}, after its last observation, to the next one.
@@ -64,9 +64,7 @@ pub fn leave(client: &mut Client, robot: &Robot) -> Result<(), ConnectionError> 
     let Some(kind) = agent.estimator().kind() else {
         return Ok(());
     };
-    let numbers = agent.belief().as_slice();
-    let bytes: Vec<u8> = numbers.iter().flat_map(|p| p.to_le_bytes()).collect();
-    match client.leave_belief(&present.result, &kind, &bytes) {
+    match client.leave_belief(&present.result, &kind, &agent.estimator().memory()) {
         // A server that keeps no beliefs.
         Err(ConnectionError::Refused {
             status: Status::Malformed,
@@ -74,22 +72,6 @@ pub fn leave(client: &mut Client, robot: &Robot) -> Result<(), ConnectionError> 
         }) => Ok(()),
         left => left,
     }
-}
-
-/// The belief that was left about the world as it stands, if it is of a kind and of the shape of one's
-/// own.
-fn belief_left(
-    client: &mut Client,
-    kind: &str,
-    own: &Belief,
-) -> Result<Option<Belief>, ConnectionError> {
-    let Some(bytes) = client.belief(kind)? else {
-        return Ok(None);
-    };
-    let (numbers, _) = bytes.as_chunks::<4>();
-    let numbers = numbers.iter().map(|&p| f32::from_le_bytes(p)).collect();
-    let belief = Probabilities::from_shape_vec(own.probabilities().dim(), numbers).ok();
-    Ok(belief.and_then(|belief| Belief::from_probabilities(belief).ok()))
 }
 
 /// The first step from which on all frames are kept; the present one where a server keeps none.

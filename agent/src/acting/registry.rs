@@ -3,7 +3,9 @@
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
 use crate::estimation::truth::{Clairvoyant, Oracle, Unchanged};
-use crate::estimation::{AutoencoderEstimator, BayesFilter, Estimator};
+use crate::estimation::{
+    AutoencoderEstimator, BayesFilter, Correlations, Estimator, SpatialFilter,
+};
 use crate::learning::learned::Learned;
 use crate::learning::learner::LearnedModel;
 use crate::learning::student::decisions::Decisions;
@@ -37,9 +39,7 @@ pub struct Task<'a> {
 pub fn agent(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Agent> {
     let estimator = estimator(policy, &task)?;
     let state_names = match policy.estimator {
-        EstimatorKind::Learned | EstimatorKind::Autoencoder => {
-            numbered_states(estimator.belief().n_states())
-        }
+        kind if kind.is_learned() => numbered_states(estimator.belief().n_states()),
         _ => task.model.state_names(),
     };
     let setup = Setup {
@@ -62,7 +62,21 @@ fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>> {
     Ok(match policy.estimator {
         EstimatorKind::None => Box::new(Unchanged(prior)),
         EstimatorKind::KnownModel => Box::new(BayesFilter::known(task.model, prior)?),
+        EstimatorKind::Spatial => {
+            let filter = BayesFilter::known(task.model, prior)?;
+            let (state, nothing) = (task.model.target_state(), Correlations::default());
+            Box::new(SpatialFilter::new(filter, state, nothing))
+        }
         EstimatorKind::Learned => Box::new(learned_filter(policy, task)?),
+        EstimatorKind::LearnedSpatial => {
+            let filter = learned_filter(policy, task)?;
+            let learned: &LearnedModel = present(policy, &task.learned.filter, "a filter")?;
+            Box::new(SpatialFilter::new(
+                filter,
+                learned.target,
+                learned.correlations.clone(),
+            ))
+        }
         EstimatorKind::Autoencoder => Box::new(autoencoder(policy, task)?),
         EstimatorKind::Truth => Box::new(Oracle::new(task.model, prior)?),
         EstimatorKind::NextTruth => Box::new(Clairvoyant(prior)),

@@ -5,7 +5,6 @@ use crate::acting::registry::{self, Task};
 use crate::config::AgentConfig;
 use crate::estimation::Prior;
 use crate::estimation::belief::Belief;
-use crate::estimation::filter::known_model_kind;
 use crate::estimation::first_belief::first_belief;
 use crate::learning::learned::Learned;
 use crate::planning::policy::{EstimatorKind, Policy};
@@ -122,15 +121,14 @@ impl Attached {
         );
         let shape = shape_of(&info)?;
         // What takes long is done before the lease begins to run, and not at all where a belief was left.
-        let prior = match policy.estimator {
-            EstimatorKind::KnownModel => {
-                let any = Belief::from_initial(&model, shape);
-                if let Some(attached) = Self::go_on(mission, &model, &policy, &any)? {
-                    return Ok(attached);
-                }
-                mission.config.prior(info.burn_in)
+        let prior = if policy.estimator.knows_model() {
+            let any = Belief::from_initial(&model, shape);
+            if let Some(attached) = Self::go_on(mission, &model, &policy, &any)? {
+                return Ok(attached);
             }
-            _ => Prior::Initial,
+            mission.config.prior(info.burn_in)
+        } else {
+            Prior::Initial
         };
         let prior = first_belief(prior, &model, shape, mission.config.seed)?;
         let mut attached = Self::acquire(mission, &model, &policy, &prior)?;
@@ -147,7 +145,18 @@ impl Attached {
         policy: &Policy,
         any: &Belief,
     ) -> Result<Option<Self>> {
-        let kind = known_model_kind(model);
+        let task = Task {
+            model,
+            shape: any.shape(),
+            n_moves: 1,
+            prior: any,
+            seed: 0,
+            learned: &mission.learned,
+        };
+        let agent = registry::agent(policy, &mission.config, task)?;
+        let Some(kind) = agent.estimator().kind() else {
+            return Ok(None);
+        };
         if !is_belief_left(&mission.instance, mission.world, &kind)? {
             return Ok(None);
         }

@@ -198,7 +198,7 @@ impl Run {
         let agent = &self.robot.agent;
         let truth = turn.truth.as_ref().expect(SHOWS_TRUTH);
         let brier = brier_score(agent.belief(), truth, target, agent.target(target));
-        let is_known = agent.policy().estimator == EstimatorKind::KnownModel;
+        let is_known = agent.policy().estimator.knows_model();
         self.tally.planning += self.robot.planning();
         self.tally.add(self.robot.observation(), brier);
         if is_last && is_known {

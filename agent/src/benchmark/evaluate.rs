@@ -99,7 +99,9 @@ impl Examinee {
             arena.agent(&policy, config, prior, seed, learned)
         };
         let estimator = |kind: &EstimatorKind| match kind {
+            EstimatorKind::Spatial => agent("spatial_beam"),
             EstimatorKind::Learned => agent("learned_beam"),
+            EstimatorKind::LearnedSpatial => agent("learned_spatial_beam"),
             EstimatorKind::Autoencoder => agent("autoencoder_beam"),
             _ => agent("beam_exploit"),
         };

@@ -172,7 +172,11 @@ impl CompareCommand {
         named(&self.baseline).context("--baseline")?;
         for policy in &policies {
             let kind = match policy.estimator {
-                EstimatorKind::Learned if learned.filter.is_none() => "a filter",
+                EstimatorKind::Learned | EstimatorKind::LearnedSpatial
+                    if learned.filter.is_none() =>
+                {
+                    "a filter"
+                }
                 EstimatorKind::Autoencoder if learned.network.is_none() => "an autoencoder",
                 EstimatorKind::KnownModel if policy.is_decided && learned.decisions.is_none() => {
                     "decisions"
@@ -201,7 +205,7 @@ fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
         let at = ladder.iter().rposition(after).map_or(0, |last| last + 1);
         ladder.splice(at..at, names.iter().map(named));
     };
-    let is_known = |policy: &Policy| policy.estimator == EstimatorKind::KnownModel;
+    let is_known = |policy: &Policy| policy.estimator.knows_model();
     if learned.decisions.is_some() {
         insert(is_known, &OF_DECISIONS);
     }

@@ -109,12 +109,16 @@ impl EvaluateCommand {
     }
 }
 
-/// The known-model filter, and what was learned.
+/// The filters of the known model, and what was learned.
 fn estimators(learned: &Learned) -> Vec<EstimatorKind> {
-    let filter = learned.filter.as_ref().map(|_| EstimatorKind::Learned);
-    let network = learned.network.as_ref().map(|_| EstimatorKind::Autoencoder);
-    let known = [EstimatorKind::KnownModel];
-    known.into_iter().chain(filter).chain(network).collect()
+    let mut kinds = vec![EstimatorKind::KnownModel, EstimatorKind::Spatial];
+    if learned.filter.is_some() {
+        kinds.extend([EstimatorKind::Learned, EstimatorKind::LearnedSpatial]);
+    }
+    if learned.network.is_some() {
+        kinds.push(EstimatorKind::Autoencoder);
+    }
+    kinds
 }
 
 /// Log-likelihood per visited cell, ± one standard error over worlds; differences are paired.

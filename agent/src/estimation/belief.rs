@@ -109,6 +109,29 @@ impl Belief {
         })
     }
 
+    /// The probabilities of one cell's states, by its row-major index.
+    pub fn states(&self, index: usize) -> Vec<f64> {
+        let states = self.as_slice()[index..].iter();
+        let states = states.step_by(self.shape.n_cells());
+        states.map(|&p| f64::from(p)).collect()
+    }
+
+    /// All probabilities as little-endian `f32`.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let numbers = self.as_slice().iter();
+        numbers.flat_map(|p| p.to_le_bytes()).collect()
+    }
+
+    /// A belief of such bytes; `None` if they are not one of the shape `[S, H, W]`.
+    pub fn from_bytes(bytes: &[u8], dim: (usize, usize, usize)) -> Option<Self> {
+        let (numbers, []) = bytes.as_chunks::<4>() else {
+            return None;
+        };
+        let numbers = numbers.iter().map(|&p| f32::from_le_bytes(p)).collect();
+        let probabilities = Probabilities::from_shape_vec(dim, numbers).ok()?;
+        Self::from_probabilities(probabilities).ok()
+    }
+
     pub fn shape(&self) -> Shape {
         self.shape
     }

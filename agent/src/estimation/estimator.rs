@@ -35,14 +35,22 @@ pub trait Estimator: Send {
         true
     }
 
-    /// Tells what kind of belief this is, where it is all that the estimator remembers: another estimator of
-    /// the same kind may go on from it.
+    /// Tells what [`Self::memory`] means, where that is all that the estimator remembers: another estimator of the
+    /// same kind may go on from it.
     fn kind(&self) -> Option<String> {
         None
     }
 
-    /// Goes on from a belief about X_{k+1} of its own [`Self::kind`] and shape. Others ignore it.
-    fn set_belief(&mut self, _belief: Belief) {}
+    /// All that it remembers of its world before X_{k+1}: the belief, `[S, H, W]` as `f32`, then what its kind adds.
+    fn memory(&self) -> Vec<u8> {
+        self.belief().to_bytes()
+    }
+
+    /// Goes on from the memory of an estimator of its own [`Self::kind`]; returns whether it could. If not, it
+    /// is as it was.
+    fn remember(&mut self, _memory: &[u8]) -> bool {
+        false
+    }
 
     /// How well the belief predicts a frame; `None` of estimators that predict none.
     fn score(&self, _frame: &Frame) -> Result<Option<Score>, EstimatorError> {

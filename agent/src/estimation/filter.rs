@@ -71,14 +71,8 @@ impl BayesFilter {
         &self.belief
     }
 
-    /// Believes something else of the same shape.
-    ///
-    /// # Panics
-    /// If the shape is another.
-    pub fn set_belief(&mut self, belief: Belief) {
-        let dim = |belief: &Belief| belief.probabilities().dim();
-        assert_eq!(dim(&belief), dim(&self.belief), "belief: another shape");
-        self.belief = belief;
+    pub(super) fn belief_mut(&mut self) -> &mut Belief {
+        &mut self.belief
     }
 
     /// Bayes' rule on the visited cells ([`correct`]).
@@ -125,14 +119,10 @@ impl Estimator for BayesFilter {
         Some(kind(self.checksum))
     }
 
-    fn set_belief(&mut self, belief: Belief) {
-        BayesFilter::set_belief(self, belief);
+    fn remember(&mut self, memory: &[u8]) -> bool {
+        let belief = Belief::from_bytes(memory, self.belief.probabilities().dim());
+        belief.map(|belief| self.belief = belief).is_some()
     }
-}
-
-/// What [`Estimator::kind`] says of a known model's filter.
-pub fn known_model_kind(model: &Model) -> String {
-    kind(known_checksum(model))
 }
 
 fn kind(checksum: u32) -> String {

@@ -69,7 +69,9 @@ impl Learned {
     /// The state that pays most, as the one who learned an estimator's model found it.
     pub fn target(&self, estimator: EstimatorKind) -> Option<usize> {
         match estimator {
-            EstimatorKind::Learned => self.filter.as_ref().map(|filter| filter.target),
+            EstimatorKind::Learned | EstimatorKind::LearnedSpatial => {
+                self.filter.as_ref().map(|filter| filter.target)
+            }
             EstimatorKind::Autoencoder => self.network.as_ref().map(|network| network.target()),
             _ => None,
         }

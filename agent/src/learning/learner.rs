@@ -1,6 +1,11 @@
 //! What learns a model while an agent acts: replay in, parameters out. Pure.
 
+mod neighbours;
+
+pub use self::neighbours::Neighbours;
+
 use crate::config::{AgentConfig, LearningConfig};
+use crate::estimation::Correlations;
 use crate::estimation::belief::Belief;
 use crate::estimation::parameters::{Dimensions, Parameters, Tables};
 use crate::learning::checkpoint::{Contents, check, check_counts};
@@ -11,6 +16,7 @@ use ::network::NamedTensor;
 use anyhow::Result;
 use protocol::{Frame, Shape};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// How checkpoints of this learner call it.
 pub const KIND: &str = "learned_filter";
@@ -27,6 +33,8 @@ pub struct LearnedModel {
     pub tables: Tables,
     /// The state that pays most.
     pub target: usize,
+    /// How much that state of one cell says of its neighbours'.
+    pub correlations: Correlations,
 }
 
 /// Learns from frames as they come. A checkpoint holds it as it is, its tensors apart.
@@ -40,6 +48,10 @@ pub struct Learner {
     /// Updates that steps have earned and that are not made yet.
     pub owed: f64,
     replay: Replay,
+    neighbours: Neighbours,
+    /// Beliefs before the next frames, by world.
+    #[serde(skip)]
+    predictors: BTreeMap<u32, Belief>,
 }
 
 impl Learner {
@@ -52,12 +64,15 @@ impl Learner {
             world_steps: 0,
             owed: 0.0,
             replay: replay(&config.learning),
+            neighbours: Neighbours::default(),
+            predictors: BTreeMap::new(),
         }
     }
 
     /// A world's track begins, for the first time or again.
     pub fn begin(&mut self, world: u32) {
         self.replay.begin(world);
+        self.neighbours.begin(world, self.trainer.cut().0.n_cells());
     }
 
     /// Whether a world's track was begun.
@@ -70,10 +85,16 @@ impl Learner {
         if self.replay.wants_belief(world) {
             self.replay.give_belief(world, predictor.as_slice());
         }
+        self.predictors.insert(world, predictor.clone());
     }
 
     pub fn see(&mut self, world: u32, frame: &Frame) {
         self.replay.push(world, frame);
+        let LearnedModel { tables, target, .. } = self.learned();
+        let learned = (&tables.likelihood_array(), target);
+        let predictor = self.predictors.remove(&world);
+        self.neighbours
+            .see(world, frame, predictor.as_ref(), learned);
     }
 
     /// The reward of a path that visited some cells, with the belief after its frame.
@@ -103,6 +124,7 @@ impl Learner {
         self.replay = replay(self.trainer.config());
         self.trainer.leave_replay();
         self.owed = 0.0;
+        self.neighbours.forget_worlds();
     }
 
     pub fn learned(&self) -> LearnedModel {
@@ -111,6 +133,7 @@ impl Learner {
         LearnedModel {
             tables: parameters.tables(),
             target: self.reward.target().unwrap_or(last),
+            correlations: self.neighbours.correlations().clone(),
         }
     }
 
@@ -178,9 +201,15 @@ impl Learner {
             let (n_states, n_observations) = (dimensions.n_states, dimensions.n_observations);
             let replay = &mut learner.replay;
             replay.resume(saved.replay, shape, n_states, n_observations)?;
+            let n_cells = shape.n_cells();
+            let (name, expected) = ("neighbours.ages", format!("those of {n_cells} cells"));
+            check(saved.neighbours.are_of(n_cells), name, expected, "others")?;
+        } else {
+            saved.neighbours.forget_worlds();
         }
         learner.trainer.resume(saved.trainer)?;
         learner.reward = saved.reward;
+        learner.neighbours = saved.neighbours;
         learner.world_steps = saved.world_steps;
         Ok(learner)
     }

@@ -203,11 +203,6 @@ impl Agent {
         self.basis.estimate()
     }
 
-    /// Goes on from a belief about X_{k+1} of its own kind and shape.
-    pub fn take_over(&mut self, belief: Belief) {
-        self.estimator.set_belief(belief);
-    }
-
     /// What the last path was for, in a word or two.
     fn aim(&self) -> String {
         match &self.aim {

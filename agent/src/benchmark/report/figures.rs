@@ -108,8 +108,8 @@ fn family(group: &Group<'_>) -> usize {
         _ if group.runs.iter().any(|run| run.is_added) => 5,
         "truth" | "next_truth" => 4,
         "none" => 0,
-        "known_model" if policy.contains("beam") => 2,
-        "known_model" if !policy.contains("learn") => 1,
+        "known_model" | "spatial_filter" if policy.contains("beam") => 2,
+        "known_model" | "spatial_filter" if !policy.contains("learn") => 1,
         _ => 3,
     }
 }

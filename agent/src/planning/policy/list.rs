@@ -29,7 +29,11 @@ fn description(policy: &Policy, model: &Model) -> String {
     let belief = match policy.estimator {
         EstimatorKind::KnownModel if policy.is_decided => ", needs --checkpoint",
         EstimatorKind::None | EstimatorKind::KnownModel => "",
+        EstimatorKind::Spatial => "; corrections reach neighbours",
         EstimatorKind::Learned => "; learned filter, needs --checkpoint",
+        EstimatorKind::LearnedSpatial => {
+            "; learned filter, corrections reach neighbours, needs --checkpoint"
+        }
         EstimatorKind::Autoencoder => "; learned autoencoder, needs --checkpoint",
         EstimatorKind::Truth => "; told the hidden states, needs --publish-truth",
         EstimatorKind::NextTruth => "; told the next states, only in `compare`",
@@ -44,10 +48,7 @@ fn goal(policy: &Policy, model: &Model) -> String {
     if let Some(action) = &policy.action {
         return format!("the action {:?} of dqn_beam, always", action.name);
     }
-    let is_learned = matches!(
-        policy.estimator,
-        EstimatorKind::Learned | EstimatorKind::Autoencoder
-    );
+    let is_learned = policy.estimator.is_learned();
     let goal = match policy.objective.target {
         Target::Coverage => return "new cells".into(),
         Target::Entropy => "the belief's entropy".into(),

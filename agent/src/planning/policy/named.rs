@@ -12,8 +12,12 @@ pub enum EstimatorKind {
     None,
     /// The Bayes filter with the true parameters (paper section III.A, masked as in III.C).
     KnownModel,
+    /// The same, whose corrections reach the neighbours of visited cells.
+    Spatial,
     /// A Bayes filter with learned parameters.
     Learned,
+    /// The same, whose corrections reach the neighbours of visited cells.
+    LearnedSpatial,
     /// The paper's dynamic autoencoder (sections III.B and III.C).
     Autoencoder,
     /// The hidden state X_k, predicted one step ahead: an upper bound on estimation.
@@ -55,12 +59,27 @@ pub struct UnknownPolicy {
 }
 
 impl EstimatorKind {
+    /// Whether it filters with the true parameters.
+    pub fn knows_model(self) -> bool {
+        matches!(self, Self::KnownModel | Self::Spatial)
+    }
+
+    /// Whether its parameters, and so the meaning of its states, were learned.
+    pub fn is_learned(self) -> bool {
+        matches!(
+            self,
+            Self::Learned | Self::LearnedSpatial | Self::Autoencoder
+        )
+    }
+
     /// Its name in tables and files.
     pub fn label(self) -> &'static str {
         match self {
             Self::None => "none",
             Self::KnownModel => "known_model",
+            Self::Spatial => "spatial_filter",
             Self::Learned => "learned_filter",
+            Self::LearnedSpatial => "learned_spatial_filter",
             Self::Autoencoder => "autoencoder",
             Self::Truth => "truth",
             Self::NextTruth => "next_truth",
@@ -100,8 +119,8 @@ impl Policy {
     ///
     /// Names are `random_walk`, `coverage`, `shooting_*` and `beam_*` with `exploit` (the state that
     /// pays most), `exploit_only` (the same without the coverage bonus), `explore` (entropy) or the name
-    /// of a state, and `oracle_*`, `clairvoyant_*` and `learned_*` with `shooting` or `beam`. On the
-    /// autoencoder's belief there are `autoencoder_exploit` and `autoencoder_explore`, which shoot,
+    /// of a state, and `spatial_*`, `oracle_*`, `clairvoyant_*`, `learned_*` and `learned_spatial_*` with `shooting` or
+    /// `beam`. On the autoencoder's belief there are `autoencoder_exploit` and `autoencoder_explore`, which shoot,
     /// `autoencoder_policy`, for which the DQN chooses among the paper's objectives, and `autoencoder_beam`.
     /// `dqn_beam` chooses among [`ActionSet::beam`] by a DQN; `act_*` always takes the action of that name.
     pub fn named(name: &str, model: &Model) -> Result<Self, UnknownPolicy> {
@@ -135,13 +154,15 @@ impl Policy {
                     },
                     "act" => Self::always(name, rest, model).ok_or_else(unknown)?,
                     "autoencoder" => Self::of_autoencoder(rest).ok_or_else(unknown)?,
-                    "oracle" | "clairvoyant" | "learned" => {
-                        let planner = planner_named(rest).ok_or_else(unknown)?;
-                        let estimator = match family {
-                            "oracle" => EstimatorKind::Truth,
-                            "learned" => EstimatorKind::Learned,
-                            _ => EstimatorKind::NextTruth,
+                    "spatial" | "oracle" | "clairvoyant" | "learned" => {
+                        let (estimator, planner) = match (family, rest.strip_prefix("spatial_")) {
+                            ("learned", Some(planner)) => (EstimatorKind::LearnedSpatial, planner),
+                            ("learned", None) => (EstimatorKind::Learned, rest),
+                            ("spatial", _) => (EstimatorKind::Spatial, rest),
+                            ("oracle", _) => (EstimatorKind::Truth, rest),
+                            _ => (EstimatorKind::NextTruth, rest),
                         };
+                        let planner = planner_named(planner).ok_or_else(unknown)?;
                         policy(estimator, planner, objective(planner, target))
                     }
                     _ => {

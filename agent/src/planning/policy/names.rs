@@ -7,7 +7,12 @@ use protocol::Model;
 pub const OF_DECISIONS: [&str; 1] = ["dqn_beam"];
 
 /// The names that need the checkpoint of a learned filter.
-pub const OF_FILTER: [&str; 2] = ["learned_shooting", "learned_beam"];
+pub const OF_FILTER: [&str; 4] = [
+    "learned_shooting",
+    "learned_beam",
+    "learned_spatial_shooting",
+    "learned_spatial_beam",
+];
 
 /// The names that need the checkpoint of an autoencoder.
 pub const OF_AUTOENCODER: [&str; 4] = [
@@ -34,6 +39,8 @@ pub(super) fn ladder_names(model: &Model) -> Vec<String> {
         "shooting_exploit",
         "shooting_exploit_only",
         "beam_exploit",
+        "spatial_shooting",
+        "spatial_beam",
         "oracle_shooting",
         "oracle_beam",
         "clairvoyant_beam",

@@ -60,7 +60,8 @@ impl SavedWorld {
 
     /// Gives an agent the belief, and the estimate if its paths are planned on that.
     pub fn restore(&self, agent: &mut Agent) {
-        agent.take_over(self.belief.clone());
+        let is_taken = agent.estimator_mut().remember(&self.belief.to_bytes());
+        debug_assert!(is_taken, "invariant: the belief was checked");
         if let Some(estimate) = &self.estimate {
             agent.basis_mut().see(estimate);
         }

@@ -1,0 +1,138 @@
+//! A Bayes filter whose corrections reach the neighbours of visited cells.
+//!
+//! The filter of eqs. 5 and 6 takes cells as independent given the frames, and corrects visited cells only. States are
+//! strongly correlated in space. Here the innovation of each visited cell is spread to its neighbourhood with learned
+//! [`Correlations`], as optimal interpolation does (Gandin 1963); the prediction stays eq. 6, and no covariance is
+//! kept from step to step.
+
+use crate::estimation::bayes::ZeroEvidence;
+use crate::estimation::belief::Belief;
+use crate::estimation::correlations::{Ages, Correlations, Evidence};
+use crate::estimation::estimator::{Estimator, EstimatorError};
+use crate::estimation::filter::BayesFilter;
+use crate::estimation::innovation::Innovation;
+use crate::estimation::parameters::Tables;
+use crate::estimation::scoring::Score;
+use crate::estimation::spread::Spread;
+use protocol::{Frame, Grid};
+
+/// A filter of one world whose cells inform each other.
+#[derive(Debug, Clone)]
+pub struct SpatialFilter {
+    filter: BayesFilter,
+    state: usize,
+    correlations: Correlations,
+    ages: Ages,
+    spread: Spread,
+}
+
+impl SpatialFilter {
+    /// Spreads the probability of `state`, the one that pays, with correlations learned before, or from nothing.
+    ///
+    /// # Panics
+    /// If there is no such state.
+    pub fn new(filter: BayesFilter, state: usize, correlations: Correlations) -> Self {
+        let n_states = filter.belief().n_states();
+        assert!(state < n_states, "state: expected less than {n_states}");
+        Self {
+            state,
+            correlations,
+            ages: Ages::new(filter.belief().shape().n_cells()),
+            spread: Spread::new(filter.belief().shape(), state),
+            filter,
+        }
+    }
+
+    /// Takes in what was seen at some cells, by index, one after the other; each cell once.
+    ///
+    /// # Errors
+    /// [`ZeroEvidence`]; the belief is then as it was.
+    pub fn correct_in_order(
+        &mut self,
+        seen: impl Iterator<Item = (usize, u8)>,
+    ) -> Result<(), ZeroEvidence> {
+        let (belief, likelihood) = (self.filter.belief(), self.filter.likelihood());
+        self.spread
+            .begin(belief, &self.ages, seen, &self.correlations);
+        for index in 0..self.spread.n_seen() {
+            let (cell, observed, mut states) = self.spread.prior(index, belief);
+            let innovation = Innovation::of(&states, likelihood, self.state, observed);
+            let innovation = innovation.ok_or_else(|| ZeroEvidence {
+                cell,
+                observed,
+                belief: states.iter().map(|&p| p as f32).collect(),
+            })?;
+            let seen_as = likelihood.column(usize::from(observed));
+            let all = states.iter_mut().zip(seen_as);
+            all.for_each(|(p, b)| *p *= b / innovation.evidence);
+            self.spread.spread(index, &innovation, states);
+        }
+        self.spread.end(self.filter.belief_mut(), &mut self.ages);
+        Ok(())
+    }
+}
+
+impl Estimator for SpatialFilter {
+    fn correct(&mut self, frame: &Frame, _: Option<&Grid<u8>>) -> Result<(), EstimatorError> {
+        let (belief, likelihood) = (self.filter.belief(), self.filter.likelihood());
+        let evidence = Evidence::of(frame, belief, likelihood, self.state, &self.ages);
+        self.correct_in_order(frame.observed())?;
+        self.correlations.learn(&evidence);
+        Ok(())
+    }
+
+    fn predict(&mut self) {
+        self.filter.predict();
+        self.ages.grow();
+    }
+
+    fn belief(&self) -> &Belief {
+        self.filter.belief()
+    }
+
+    fn score(&self, frame: &Frame) -> Result<Option<Score>, EstimatorError> {
+        self.filter.score(frame)
+    }
+
+    fn set_tables(&mut self, tables: &Tables) {
+        self.filter.set_tables(tables);
+    }
+
+    fn kind(&self) -> Option<String> {
+        let filter = self.filter.kind()?;
+        let state = self.state;
+        Some(format!(
+            "spatial {filter}, ages [H, W] as u8, sums of state {state} [8, 8, 15, 2] as f64"
+        ))
+    }
+
+    fn memory(&self) -> Vec<u8> {
+        let mut memory = self.filter.memory();
+        memory.extend(self.ages.as_slice());
+        memory.extend(self.correlations.to_bytes());
+        memory
+    }
+
+    fn remember(&mut self, memory: &[u8]) -> bool {
+        let n_cells = self.belief().shape().n_cells();
+        let n_bytes = 4 * self.belief().as_slice().len();
+        let Some((belief, rest)) = memory.split_at_checked(n_bytes) else {
+            return false;
+        };
+        let Some((ages, sums)) = rest.split_at_checked(n_cells) else {
+            return false;
+        };
+        let parts = Ages::from_bytes(ages, n_cells).zip(Correlations::from_bytes(sums));
+        let Some((ages, correlations)) = parts else {
+            return false;
+        };
+        let is_taken = self.filter.remember(belief);
+        if is_taken {
+            (self.ages, self.correlations) = (ages, correlations);
+        }
+        is_taken
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,180 @@
+//! Vectors of an independent implementation (numpy, 64 bits), which spreads with a given table:
+//!
+//! ```python
+//! np.savez(name, table=table, cells=cells, obs=obs, first_predictor=u_1, post=posteriors, pred=predictors)
+//! ```
+//!
+//! Cells are in order of their first visit, -1 where a path visits fewer.
+
+use super::*;
+use crate::estimation::correlations::N_AGES;
+use ndarray::{Array2, Array3, Array4, ArrayView3, Axis};
+use ndarray_npy::NpzReader;
+use proptest::prelude::*;
+use protocol::Model;
+use protocol::randomness::split_mix;
+use protocol::{Cell, Shape};
+use std::fs::File;
+
+const FIRE: usize = 2;
+
+fn wildfire(prior: Belief, correlations: Correlations) -> SpatialFilter {
+    let filter = BayesFilter::known(&Model::wildfire(), prior).expect("valid");
+    SpatialFilter::new(filter, FIRE, correlations)
+}
+
+fn worst(belief: &Belief, expected: ArrayView3<'_, f64>) -> f64 {
+    let differences = belief.view().mapv(f64::from) - expected;
+    differences.iter().fold(0.0, |worst, d| worst.max(d.abs()))
+}
+
+fn numbers(npz: &mut NpzReader<File>, name: &str) -> Array4<f64> {
+    let name = format!("{name}.npy");
+    match npz.by_name::<ndarray::OwnedRepr<f64>, _>(&name) {
+        Ok(numbers) => numbers,
+        Err(_) => {
+            let numbers: Array4<f32> = npz.by_name(&name).expect("numbers");
+            numbers.mapv(f64::from)
+        }
+    }
+}
+
+fn check_golden(side: usize) {
+    let path = format!(
+        "{}/tests/data/spatial_{side}.npz",
+        env!("CARGO_MANIFEST_DIR")
+    );
+    let mut npz = NpzReader::new(File::open(path).expect("a file")).expect("npz");
+    let table = numbers(&mut npz, "table");
+    let cells: Array2<i16> = npz.by_name("cells.npy").expect("cells");
+    let observed: Array2<i8> = npz.by_name("obs.npy").expect("observations");
+    let first: Array3<f64> = npz.by_name("first_predictor.npy").expect("a predictor");
+    let (posteriors, predictors) = (numbers(&mut npz, "post"), numbers(&mut npz, "pred"));
+    let prior = Belief::from_probabilities(first.mapv(|p| p as f32)).expect("a belief");
+    let mut filter = wildfire(prior, Correlations::of_table(&table));
+    // The first prediction was made already.
+    filter.ages.grow();
+    for (step, (cells, observed)) in cells.outer_iter().zip(observed.outer_iter()).enumerate() {
+        let seen = cells.iter().zip(observed).filter(|(cell, _)| **cell >= 0);
+        let seen = seen.map(|(&cell, &value)| (cell as usize, value as u8));
+        filter.correct_in_order(seen).expect("possible");
+        let off = worst(filter.belief(), posteriors.index_axis(Axis(0), step));
+        assert!(off < 1e-5, "{side}: posterior {step} is off by {off}");
+        filter.predict();
+        let off = worst(filter.belief(), predictors.index_axis(Axis(0), step));
+        assert!(off < 1e-5, "{side}: predictor {step} is off by {off}");
+    }
+}
+
+#[test]
+fn corrections_are_those_of_an_independent_implementation() {
+    check_golden(16);
+    check_golden(64);
+}
+
+#[test]
+fn an_impossible_frame_is_rejected_whole() {
+    let mut file = Model::wildfire().file().clone();
+    file.states[0].observed_as = vec![1.0, 0.0, 0.0];
+    let model = Model::new(file).expect("a model");
+    let shape = Shape::new(2, 2).expect("a grid");
+    let mut states = Grid::from_elem((2, 2), 2);
+    states[[1, 0]] = 0;
+    let prior = Belief::from_states(&states, 3).expect("states");
+    let filter = BayesFilter::known(&model, prior.clone()).expect("valid");
+    let mut filter = SpatialFilter::new(filter, FIRE, Correlations::default());
+    let frame = Frame::from_bytes(shape, 3, &[2, 255, 2, 2]).expect("a frame");
+    let error = filter
+        .correct(&frame, None)
+        .expect_err("a normal cell seen as fire");
+    let EstimatorError::ZeroEvidence(error) = error else {
+        panic!("{error}");
+    };
+    assert_eq!((error.cell, error.observed), (Cell { row: 1, col: 0 }, 2));
+    assert_eq!(filter.belief(), &prior);
+}
+
+/// A model of three states, any of which can pay.
+fn model(paying: usize) -> Model {
+    let mut file = Model::wildfire().file().clone();
+    for (state, entry) in file.states.iter_mut().enumerate() {
+        entry.reward = f64::from(u8::from(state == paying));
+    }
+    Model::new(file).expect("a model")
+}
+
+proptest! {
+    #[test]
+    fn beliefs_stay_distributions_and_memory_is_all_there_is(
+        (height, width) in (1_usize..12, 1_usize..12),
+        frames in prop::collection::vec(prop::collection::vec(0_u8..6, 144), 1..12),
+        paying in 0_usize..3,
+    ) {
+        let shape = Shape::new(height, width).expect("a grid");
+        let model = model(paying);
+        let new = || {
+            let filter = BayesFilter::known(&model, Belief::uniform(3, shape)).expect("valid");
+            SpatialFilter::new(filter, model.target_state(), Correlations::default())
+        };
+        let mut filter = new();
+        for values in frames {
+            let seen = values[..shape.n_cells()].iter();
+            let bytes: Vec<u8> = seen.map(|&value| if value < 3 { value } else { 255 }).collect();
+            let frame = Frame::from_bytes(shape, 3, &bytes).expect("a frame");
+            let mut other = new();
+            prop_assert!(other.remember(&filter.memory()));
+            for filter in [&mut filter, &mut other] {
+                filter.correct(&frame, None).expect("possible");
+                let belief = filter.belief().probabilities().clone();
+                prop_assert!(Belief::from_probabilities(belief).is_ok());
+                filter.predict();
+            }
+            prop_assert_eq!(filter.memory(), other.memory());
+        }
+        let memory = filter.memory();
+        prop_assert!(!filter.remember(&memory[1..]));
+        prop_assert_eq!(filter.memory(), memory);
+    }
+}
+
+/// Frames of a grid whose cells all look the same, by the number of the frame.
+fn alike(shape: Shape, number: u64) -> Frame {
+    let observed = if split_mix(number, 0) % 3 == 0 { 2 } else { 0 };
+    Frame::from_bytes(shape, 3, &vec![observed; shape.n_cells()]).expect("a frame")
+}
+
+/// Frames of cells that each look as they like.
+fn apart(shape: Shape, number: u64) -> Frame {
+    let look = |cell| {
+        if split_mix(number, cell) % 3 == 0 {
+            2
+        } else {
+            0
+        }
+    };
+    let bytes: Vec<u8> = (0..shape.n_cells() as u64).map(look).collect();
+    Frame::from_bytes(shape, 3, &bytes).expect("a frame")
+}
+
+#[test]
+fn cells_that_look_alike_inform_each_other_and_others_do_not() {
+    let shape = Shape::new(5, 5).expect("a grid");
+    let belief = Belief::everywhere(&[0.5, 0.17, 0.33], shape);
+    let model = Model::wildfire();
+    let of = |frame: &dyn Fn(Shape, u64) -> Frame| {
+        let mut correlations = Correlations::default();
+        let ages = Ages::new(shape.n_cells());
+        for number in 0..100 {
+            let frame = frame(shape, number);
+            let evidence = Evidence::of(&frame, &belief, model.likelihood(), FIRE, &ages);
+            correlations.learn(&evidence);
+        }
+        correlations
+    };
+    let oldest = N_AGES - 1;
+    let (alike, apart) = (of(&alike), of(&apart));
+    for class in 1..15 {
+        assert!(alike.of(oldest)[oldest][class] > 0.7, "{class}");
+        assert!(apart.of(oldest)[oldest][class] < 0.1, "{class}");
+    }
+}

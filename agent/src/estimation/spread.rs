@@ -1,0 +1,247 @@
+//! How what is seen at one cell changes what is believed of the cells around it: the arithmetic of one correction.
+
+use crate::estimation::belief::Belief;
+use crate::estimation::correlations::{AGE_RANGES, Ages, Correlations, RADIUS, SIDE, class};
+use crate::estimation::innovation::Innovation;
+use protocol::{Cell, Shape};
+
+/// Nothing that neighbours say is certain: after that, the paying state of a cell has at least this probability, and at
+/// most one minus it.
+const LEAST: f32 = 1e-5;
+
+/// Where a patch has the seen cell itself.
+const CENTRE: usize = RADIUS * WIDTH + 2 * RADIUS;
+
+/// The class of each offset, from the upper left one.
+const CLASSES: [[usize; SIDE]; SIDE] = {
+    let mut classes = [[0; SIDE]; SIDE];
+    let mut at = 0;
+    while at < SIDE * SIDE {
+        let (row, col) = (at / SIDE, at % SIDE);
+        classes[row][col] = class(row.abs_diff(RADIUS), col.abs_diff(RADIUS));
+        at += 1;
+    }
+    classes
+};
+
+/// Cells of a row of a [`Patch`]: a neighbourhood's, between margins.
+const WIDTH: usize = SIDE + 2 * RADIUS;
+
+/// Covariances of one seen cell with those around it, row by row. Thanks to the margins, two of them that lie some rows
+/// and columns apart are laid over each other by a single offset.
+type Patch = [f32; WIDTH * SIDE];
+
+/// The paying state of all cells during a correction, with a margin of [`RADIUS`] cells that vary with no others.
+#[derive(Debug, Clone)]
+pub struct Spread {
+    shape: Shape,
+    /// The state whose probability is spread.
+    state: usize,
+    /// Cells of a row with its margins.
+    stride: usize,
+    probability: Vec<f32>,
+    /// Of the paying state, before the frame.
+    deviation: Vec<f32>,
+    /// Steps since each cell was seen.
+    ages: Vec<u8>,
+    seen: Vec<Seen>,
+    patches: Vec<Patch>,
+}
+
+/// A seen cell.
+#[derive(Debug, Clone)]
+struct Seen {
+    cell: Cell,
+    observed: u8,
+    posterior: Vec<f64>,
+}
+
+impl Spread {
+    /// No cell has been seen.
+    pub fn new(shape: Shape, state: usize) -> Self {
+        let stride = shape.width() + 2 * RADIUS;
+        let n_cells = stride * (shape.height() + 2 * RADIUS);
+        Self {
+            shape,
+            state,
+            stride,
+            probability: vec![0.0; n_cells],
+            deviation: vec![0.0; n_cells],
+            ages: vec![0; n_cells],
+            seen: Vec::new(),
+            patches: Vec::new(),
+        }
+    }
+
+    /// Begins a correction of a belief with what is seen at some cells, by index.
+    pub fn begin(
+        &mut self,
+        belief: &Belief,
+        ages: &Ages,
+        seen: impl Iterator<Item = (usize, u8)>,
+        correlations: &Correlations,
+    ) {
+        let shape = self.shape;
+        let probability = belief.probability(self.state);
+        let ages = ages.as_slice().chunks_exact(shape.width());
+        for (row, (numbers, ages)) in probability.rows().into_iter().zip(ages).enumerate() {
+            let start = self.place(Cell { row, col: 0 });
+            self.ages[start..start + ages.len()].copy_from_slice(ages);
+            let cells = start..start + ages.len();
+            let deviations = self.deviation[cells.clone()].iter_mut();
+            let cells = self.probability[cells].iter_mut().zip(deviations);
+            for ((probability, deviation), &p) in cells.zip(numbers) {
+                *probability = p;
+                *deviation = (p * (1.0 - p)).max(0.0).sqrt();
+            }
+        }
+        let seen = seen.map(|(index, observed)| Seen {
+            cell: shape.cell(index),
+            observed,
+            posterior: Vec::new(),
+        });
+        self.seen.clear();
+        self.seen.extend(seen);
+        let patches = self
+            .seen
+            .iter()
+            .map(|seen| self.patch(seen.cell, correlations));
+        self.patches = patches.collect();
+    }
+
+    /// The covariances of a cell before the frame.
+    fn patch(&self, cell: Cell, correlations: &Correlations) -> Patch {
+        let own = self.deviation[self.place(cell)];
+        let age = self.ages[self.place(cell)];
+        let table = correlations.of(AGE_RANGES[usize::from(age)]);
+        let mut patch = [0.0; WIDTH * SIDE];
+        let rows = patch.chunks_exact_mut(WIDTH);
+        for (offset, (row, classes)) in rows.zip(&CLASSES).enumerate() {
+            let start = self.corner(cell) + offset * self.stride;
+            let others = start..start + SIDE;
+            let deviations = &self.deviation[others.clone()];
+            let ages = &self.ages[others];
+            for (((to, class), deviation), &age) in row[RADIUS..]
+                .iter_mut()
+                .zip(classes)
+                .zip(deviations)
+                .zip(ages)
+            {
+                *to = table[AGE_RANGES[usize::from(age)]][*class] * deviation * own;
+            }
+        }
+        patch
+    }
+
+    /// How many cells are seen.
+    pub fn n_seen(&self) -> usize {
+        self.seen.len()
+    }
+
+    /// A seen cell, what is seen there, and what is believed of it by now.
+    pub fn prior(&self, index: usize, belief: &Belief) -> (Cell, u8, Vec<f64>) {
+        let Seen { cell, observed, .. } = self.seen[index];
+        let now = f64::from(self.probability[self.place(cell)]);
+        let mut states = belief.states(self.shape.index(cell));
+        let rest: f64 = states.iter().sum::<f64>() - states[self.state];
+        if rest > 0.0 {
+            states.iter_mut().for_each(|p| *p *= (1.0 - now) / rest);
+            states[self.state] = now;
+        }
+        (cell, observed, states)
+    }
+
+    /// Corrects a seen cell and those around it, and the covariances of those that are still to come.
+    pub fn spread(&mut self, index: usize, innovation: &Innovation, posterior: Vec<f64>) {
+        let cell = self.seen[index].cell;
+        let (corner, place) = (self.corner(cell), self.place(cell));
+        let (done, to_come) = self.patches.split_at_mut(index + 1);
+        let patch = &mut done[index];
+        let own = self.probability[place];
+        let gain = (innovation.value / innovation.variance) as f32;
+        let own_variance = patch[CENTRE];
+        for (offset, row) in patch.chunks_exact_mut(WIDTH).enumerate() {
+            // What others left there is of no cell.
+            row[..RADIUS].fill(0.0);
+            row[RADIUS + SIDE..].fill(0.0);
+            let start = corner + offset * self.stride;
+            let others = &mut self.probability[start..start + SIDE];
+            for (covariance, p) in row[RADIUS..].iter_mut().zip(others) {
+                // Both paying is at most as likely as either, and at least what their sum exceeds one by.
+                let both = *p * own;
+                let least = (*p + own - 1.0).max(0.0) - both;
+                *covariance = covariance.max(least).min(p.min(own) - both);
+                let moved = (*p + *covariance * gain).clamp(LEAST, 1.0 - LEAST);
+                *p = if *covariance == 0.0 { *p } else { moved };
+            }
+        }
+        patch[CENTRE] = own_variance;
+        self.probability[place] = posterior[self.state] as f32;
+        let share = -innovation.reduction / innovation.variance.powi(2);
+        for (seen, other) in self.seen[index + 1..].iter().zip(to_come) {
+            let down = seen.cell.row as isize - cell.row as isize;
+            let across = seen.cell.col as isize - cell.col as isize;
+            if down.unsigned_abs().max(across.unsigned_abs()) <= RADIUS {
+                reduce(other, patch, share, (down, across));
+            }
+        }
+        self.seen[index].posterior = posterior;
+    }
+
+    /// Ends a correction: writes it into the belief and the ages that it began with.
+    pub fn end(&self, belief: &mut Belief, ages: &mut Ages) {
+        let n_cells = self.shape.n_cells();
+        let numbers = belief.as_mut_slice();
+        for Seen {
+            cell, posterior, ..
+        } in &self.seen
+        {
+            let index = self.shape.index(*cell);
+            let states = numbers[index..].iter_mut().step_by(n_cells);
+            states.zip(posterior).for_each(|(to, &p)| *to = p as f32);
+            ages.see(index);
+        }
+        let width = self.shape.width();
+        for row in 0..self.shape.height() {
+            let start = self.place(Cell { row, col: 0 });
+            for (col, &now) in self.probability[start..start + width].iter().enumerate() {
+                let index = row * width + col;
+                if now != numbers[self.state * n_cells + index] {
+                    set_state(&mut numbers[index..], n_cells, self.state, now);
+                }
+            }
+        }
+    }
+
+    fn place(&self, cell: Cell) -> usize {
+        (cell.row + RADIUS) * self.stride + cell.col + RADIUS
+    }
+
+    /// Where the neighbourhood of a cell begins.
+    fn corner(&self, cell: Cell) -> usize {
+        cell.row * self.stride + cell.col
+    }
+}
+
+/// Gives one state of a cell a probability; the others keep their proportions. Where they have none, nothing changes.
+fn set_state(cell: &mut [f32], n_cells: usize, state: usize, probability: f32) {
+    let states = cell.iter().step_by(n_cells).enumerate();
+    let others = states.filter(|(other, _)| *other != state);
+    let rest: f32 = others.map(|(_, p)| p).sum();
+    if rest > 0.0 {
+        let scale = (1.0 - probability) / rest;
+        cell.iter_mut().step_by(n_cells).for_each(|p| *p *= scale);
+        cell[state * n_cells] = probability;
+    }
+}
+
+/// Takes off a patch what was learned of its cells from another one, which lies `down` and `across` before it.
+fn reduce(patch: &mut Patch, seen: &Patch, share: f64, (down, across): (isize, isize)) {
+    let offset = down * WIDTH as isize + across;
+    let covariance = seen[CENTRE.wrapping_add_signed(offset)];
+    let factor = (share * f64::from(covariance)) as f32;
+    let (skip, skip_seen) = ((-offset).max(0) as usize, offset.max(0) as usize);
+    for (to, from) in patch[skip..].iter_mut().zip(&seen[skip_seen..]) {
+        *to += factor * from;
+    }
+}

@@ -1,0 +1,70 @@
+//! What the frames of all worlds say of correlations between neighbours, while the filter is learned.
+
+use crate::estimation::Correlations;
+use crate::estimation::belief::Belief;
+use crate::estimation::correlations::{Ages, Evidence};
+use ndarray::Array2;
+use protocol::Frame;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// What a frame said counts this much less with each later one: parameters were worse then.
+const FADING: f64 = 1.0 - 1.0 / 4000.0;
+
+/// Learns the correlations of the state that pays most. `learned` below: `P(y | x)` of shape `[S, O]`, and that state.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Neighbours {
+    correlations: Correlations,
+    /// The state that paid most when they were learned.
+    state: Option<usize>,
+    /// By world.
+    ages: BTreeMap<u32, Ages>,
+}
+
+impl Neighbours {
+    /// What was learned so far.
+    pub fn correlations(&self) -> &Correlations {
+        &self.correlations
+    }
+
+    /// A world of so many cells begins, for the first time or again.
+    pub fn begin(&mut self, world: u32, n_cells: usize) {
+        self.ages.insert(world, Ages::new(n_cells));
+    }
+
+    /// Forgets all worlds; what was learned in them stays.
+    pub fn forget_worlds(&mut self) {
+        self.ages.clear();
+    }
+
+    /// A world's next frame, with the belief before it, unless it is the first.
+    pub fn see(
+        &mut self,
+        world: u32,
+        frame: &Frame,
+        predictor: Option<&Belief>,
+        learned: (&Array2<f64>, usize),
+    ) {
+        let Some(ages) = self.ages.get_mut(&world) else {
+            return;
+        };
+        ages.grow();
+        if let Some(predictor) = predictor {
+            let (likelihood, state) = learned;
+            if self.state != Some(state) {
+                (self.state, self.correlations) = (Some(state), Correlations::default());
+            }
+            let evidence = Evidence::of(frame, predictor, likelihood, state, ages);
+            self.correlations.fade(FADING);
+            self.correlations.learn(&evidence);
+        }
+        frame.observed().for_each(|(index, _)| ages.see(index));
+    }
+
+    /// Whether these are worlds of so many cells.
+    pub fn are_of(&self, n_cells: usize) -> bool {
+        self.ages
+            .values()
+            .all(|ages| ages.as_slice().len() == n_cells)
+    }
+}
