@@ -96,7 +96,8 @@ fn an_agent_that_finds_a_damaged_belief_begins_with_its_own() {
     let mut client = server.acquire(0..1);
     let at = client.observe(0..1).expect("observe")[0].result;
     let model = Model::wildfire();
-    let filter = BayesFilter::known(&model, Belief::from_initial(&model, server.shape()));
+    let shape = client.shape();
+    let filter = BayesFilter::known(&model, Belief::from_initial(&model, shape));
     let kind = filter.expect("a filter").kind().expect("its kind");
     client
         .leave_belief(&at, &kind, b"not whole")

@@ -129,7 +129,7 @@ impl CompareCommand {
     fn read_added(&self, comparison: &Comparison, n_moves: usize) -> Result<Vec<PolicyRun>> {
         let read = |path: &PathBuf| {
             let expected = "expected a CSV file of `compare --csv` or emberwatch.benchmark";
-            read_csv(path).with_context(|| format!("--add {}: {expected}", path.display()))
+            read_csv(path).with_context(|| format!("--add: {}: {expected}", path.display()))
         };
         let files = self.add.iter().map(read);
         let added = files.collect::<Result<Vec<_>>>()?.concat();

@@ -81,7 +81,7 @@ mod tests {
         assert_eq!(
             line("clairvoyant_beam").map(str::trim),
             Some(
-                "clairvoyant_beam         beam search for fire, which pays most; told the next \
+                "clairvoyant_beam          beam search for fire, which pays most; told the next \
                  states, only in `compare`"
             )
         );
