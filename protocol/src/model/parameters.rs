@@ -222,7 +222,7 @@ mod tests {
             assert_eq!(model.check_on(shape), Ok(()), "{name}");
             n_models += 1;
         }
-        assert_eq!(n_models, 3);
+        assert_eq!(n_models, 4);
         assert_eq!(Model::built_in("wildfire-dense"), None);
     }
 

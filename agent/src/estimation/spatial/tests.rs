@@ -139,14 +139,18 @@ proptest! {
 
 /// Frames of a grid whose cells all look the same, by the number of the frame.
 fn alike(shape: Shape, number: u64) -> Frame {
-    let observed = if split_mix(number, 0) % 3 == 0 { 2 } else { 0 };
+    let observed = if split_mix(number, 0).is_multiple_of(3) {
+        2
+    } else {
+        0
+    };
     Frame::from_bytes(shape, 3, &vec![observed; shape.n_cells()]).expect("a frame")
 }
 
 /// Frames of cells that each look as they like.
 fn apart(shape: Shape, number: u64) -> Frame {
     let look = |cell| {
-        if split_mix(number, cell) % 3 == 0 {
+        if split_mix(number, cell).is_multiple_of(3) {
             2
         } else {
             0

@@ -31,9 +31,7 @@ fn description(policy: &Policy, model: &Model) -> String {
         EstimatorKind::None | EstimatorKind::KnownModel => "",
         EstimatorKind::Spatial => "; corrections reach neighbours",
         EstimatorKind::Learned => "; learned filter, needs --checkpoint",
-        EstimatorKind::LearnedSpatial => {
-            "; learned filter, corrections reach neighbours, needs --checkpoint"
-        }
+        EstimatorKind::LearnedSpatial => "; learned, reaching neighbours, needs --checkpoint",
         EstimatorKind::Autoencoder => "; learned autoencoder, needs --checkpoint",
         EstimatorKind::Truth => "; told the hidden states, needs --publish-truth",
         EstimatorKind::NextTruth => "; told the next states, only in `compare`",
