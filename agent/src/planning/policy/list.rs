@@ -33,7 +33,7 @@ fn description(policy: &Policy, model: &Model) -> String {
         EstimatorKind::Learned => "; learned filter, needs --checkpoint",
         EstimatorKind::LearnedSpatial => "; learned, reaching neighbours, needs --checkpoint",
         EstimatorKind::Autoencoder => "; learned autoencoder, needs --checkpoint",
-        EstimatorKind::Truth => "; told the hidden states, needs --publish-truth",
+        EstimatorKind::Truth => "; told hidden states, needs --publish-truth",
         EstimatorKind::NextTruth => "; told the next states, only in `compare`",
     };
     format!("{planner} for {}{belief}", goal(policy, model))
