@@ -57,8 +57,8 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
     let places = format!("--csv {} --figures {}", csv.display(), figures.display());
     let ended = agent(&[WHAT, WORLDS, &places]);
     let rows = rows(&csv);
-    // Eleven policies of the wildfire's ladder, two seeds each.
-    assert_eq!(rows.len(), 11 * 2, "{rows:?}");
+    // Thirteen policies of the wildfire's ladder, two seeds each.
+    assert_eq!(rows.len(), 13 * 2, "{rows:?}");
     for [first, second] in rows.as_chunks::<2>().0 {
         assert!(ended.stdout.contains(&first[0]), "{}", ended.stdout);
         assert_eq!((&first[0], &*first[2], &*second[2]), (&second[0], "3", "4"));
@@ -152,8 +152,8 @@ fn a_second_model_runs_from_end_to_end() {
     assert_eq!(server.observe(0).0.step, 40);
     let figures = format!("--figures {}", folder.path().join("figures").display());
     let rows = compare_to(&folder.path().join("ice.csv"), &[&flags, &figures]);
-    // Twelve policies: the ladder has one for each of three states beside the one that pays.
-    assert_eq!(rows.len(), 12 * 2, "{rows:?}");
+    // Fourteen policies: the ladder has one for each of three states beside the one that pays.
+    assert_eq!(rows.len(), 14 * 2, "{rows:?}");
     assert!(folder.path().join("figures/snapshot.png").exists());
     let hidden = Server::start(&format!("{flags} --reveal-model false"));
     agent(&[

@@ -33,6 +33,8 @@ pub struct Kills {
     pub ends: usize,
     /// Clients and observers of a running server, 1 to 30 ms after they were started.
     pub connects: usize,
+    /// Whether some of these are Python's, which needs what `scripts/test` makes.
+    pub with_python: bool,
 }
 
 /// What such loops left: all instances are of processes that have ended.
@@ -85,7 +87,9 @@ fn kill_in_loop(seed: u64, kills: Kills) -> Left {
             killed.insert(kill_after(server.program, &mut rng, 0..20_000));
         } else {
             connects -= 1;
-            let program = connect(&running.instance, &folder, rng.random_range(0..4));
+            let n_kinds = if kills.with_python { 4 } else { 3 };
+            let kind = rng.random_range(0..n_kinds);
+            let program = connect(&running.instance, &folder, kind);
             killed.insert(kill_after(program, &mut rng, 1..longest / 2));
         }
     }
@@ -179,6 +183,7 @@ fn programs_that_are_killed_at_any_moment_leave_nothing_in_the_way_of_others() {
         starts: 40,
         ends: 10,
         connects: 10,
+        with_python: false,
     };
     let left = kill_in_loops(3, kills);
     look_up_nobody();

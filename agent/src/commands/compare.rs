@@ -88,12 +88,15 @@ impl CompareCommand {
         };
         let added = self.read_added(&comparison, arena.info().n_moves)?;
         let results = run_comparison(arena, &comparison)?;
-        check_worlds(&added, &results.runs)?;
+        let fits = check_worlds(&added, &results.runs);
+        // What was measured is kept in any case.
+        let added = if fits.is_ok() { added } else { Vec::new() };
         let all = [&*results.runs, &*added].concat();
         write(&render_table(&all, &self.baseline))?;
         if let Some(path) = &self.csv {
             write_csv(path, &all)?;
         }
+        fits?;
         if let Some(directory) = &self.tensorboard {
             write_events(directory, &results.runs)?;
         }

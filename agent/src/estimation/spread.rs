@@ -172,6 +172,7 @@ impl Spread {
                 let least = (*p + own - 1.0).max(0.0) - both;
                 *covariance = covariance.max(least).min(p.min(own) - both);
                 let moved = (*p + *covariance * gain).clamp(LEAST, 1.0 - LEAST);
+                // Without correlations this is the plain filter.
                 *p = if *covariance == 0.0 { *p } else { moved };
             }
         }
@@ -227,10 +228,11 @@ impl Spread {
 fn set_state(cell: &mut [f32], n_cells: usize, state: usize, probability: f32) {
     let states = cell.iter().step_by(n_cells).enumerate();
     let others = states.filter(|(other, _)| *other != state);
-    let rest: f32 = others.map(|(_, p)| p).sum();
+    let rest: f64 = others.map(|(_, &p)| f64::from(p)).sum();
     if rest > 0.0 {
-        let scale = (1.0 - probability) / rest;
-        cell.iter_mut().step_by(n_cells).for_each(|p| *p *= scale);
+        let scale = (1.0 - f64::from(probability)) / rest;
+        let states = cell.iter_mut().step_by(n_cells);
+        states.for_each(|p| *p = (f64::from(*p) * scale) as f32);
         cell[state * n_cells] = probability;
     }
 }

@@ -72,6 +72,7 @@ impl Learner {
     /// A world's track begins, for the first time or again.
     pub fn begin(&mut self, world: u32) {
         self.replay.begin(world);
+        self.predictors.remove(&world);
         self.neighbours.begin(world, self.trainer.cut().0.n_cells());
     }
 
@@ -88,10 +89,9 @@ impl Learner {
         self.predictors.insert(world, predictor.clone());
     }
 
-    pub fn see(&mut self, world: u32, frame: &Frame) {
+    /// A world's next frame, and what was known before it.
+    pub fn see(&mut self, world: u32, frame: &Frame, learned: &LearnedModel) {
         self.replay.push(world, frame);
-        let LearnedModel { tables, target, .. } = self.learned();
-        let learned = (&tables.likelihood_array(), target);
         let predictor = self.predictors.remove(&world);
         self.neighbours
             .see(world, frame, predictor.as_ref(), learned);
@@ -124,16 +124,18 @@ impl Learner {
         self.replay = replay(self.trainer.config());
         self.trainer.leave_replay();
         self.owed = 0.0;
+        self.predictors.clear();
         self.neighbours.forget_worlds();
     }
 
     pub fn learned(&self) -> LearnedModel {
         let parameters = self.trainer.parameters();
         let last = parameters.dimensions.n_states - 1;
+        let target = self.reward.target().unwrap_or(last);
         LearnedModel {
             tables: parameters.tables(),
-            target: self.reward.target().unwrap_or(last),
-            correlations: self.neighbours.correlations().clone(),
+            target,
+            correlations: self.neighbours.correlations_of(target),
         }
     }
 
@@ -247,7 +249,8 @@ mod tests {
         for &value in values {
             let frame = Frame::from_bytes(shape(), 2, &[value, 255, 1]).expect("a frame");
             learner.expect(4, &belief);
-            learner.see(4, &frame);
+            let learned = learner.learned();
+            learner.see(4, &frame, &learned);
             let visited: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
             learner.reward(&belief, &visited, 0.3);
             learner.learn().expect("finite");

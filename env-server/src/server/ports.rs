@@ -113,7 +113,10 @@ impl Ports {
             let opened = Self::open_once(config);
             let owner = opened.as_ref().err().and_then(|error| error.downcast_ref());
             // What a dead process left is removed in a turn of one's own, which another one may hold for a while.
-            let is_left = |owner: &Taken| WatchedProcess::watch(owner.pid).is_err();
+            let is_left = |owner: &Taken| {
+                let watched = WatchedProcess::watch(owner.pid);
+                watched.map_or(true, |process| process.has_ended())
+            };
             if !owner.is_some_and(is_left) || start.elapsed() > LEFT_WAIT {
                 return opened;
             }

@@ -3,8 +3,11 @@
 use protocol::control::{BeliefInfo, MAX_BELIEF_PART};
 use protocol::message::StepResult;
 
-/// Most bytes of a belief per cell of the grid: sixteen 32-bit numbers.
-const BYTES_PER_CELL: u64 = 64;
+/// Most bytes of a belief per cell of the grid: eighteen 32-bit numbers.
+const BYTES_PER_CELL: u64 = 72;
+
+/// Most bytes beside these.
+const MORE_BYTES: u64 = 32 << 10;
 
 /// The beliefs left, one per world at most.
 #[derive(Debug)]
@@ -49,7 +52,7 @@ impl Beliefs {
         at: &StepResult,
         part: &BeliefPart<'_>,
     ) -> Result<(), String> {
-        let longest = BYTES_PER_CELL * self.n_cells as u64;
+        let longest = BYTES_PER_CELL * self.n_cells as u64 + MORE_BYTES;
         if part.length > longest {
             let got = part.length;
             return Err(format!(

@@ -24,6 +24,7 @@ pub fn kill(n_starts: usize) {
         starts: n_starts / N_LOOPS,
         ends: n_starts / N_LOOPS / 4,
         connects: n_starts / N_LOOPS / 4,
+        with_python: true,
     };
     let started = Instant::now();
     let left = kill_in_loops(N_LOOPS as u64, each);

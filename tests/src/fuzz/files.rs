@@ -202,7 +202,8 @@ fn filter() -> Contents {
     for value in [0, 1, 1, 0, 1] {
         let frame = Frame::from_bytes(shape, 2, &[value, 255, 1]).expect("a frame");
         learner.expect(0, &belief);
-        learner.see(0, &frame);
+        let learned = learner.learned();
+        learner.see(0, &frame, &learned);
         learner.reward(&belief, &[0, 2], 0.5);
         learner.learn().expect("finite");
     }

@@ -13,7 +13,16 @@ pub fn read_csv(path: &Path) -> Result<Vec<PolicyRun>> {
     let mut runs = reader
         .deserialize()
         .collect::<Result<Vec<PolicyRun>, _>>()?;
-    runs.iter_mut().for_each(|run| run.is_added = true);
+    ensure!(!runs.is_empty(), "expected rows, got none");
+    for run in &mut runs {
+        run.is_added = true;
+        let numbers = [run.mean_reward, run.hit_rate, run.mean_fire_cells];
+        ensure!(
+            numbers.iter().all(|number| number.is_finite()),
+            "policy {:?}: expected finite numbers, got {numbers:?}",
+            run.policy
+        );
+    }
     Ok(runs)
 }
 

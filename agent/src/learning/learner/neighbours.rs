@@ -3,15 +3,15 @@
 use crate::estimation::Correlations;
 use crate::estimation::belief::Belief;
 use crate::estimation::correlations::{Ages, Evidence};
-use ndarray::Array2;
+use crate::learning::learner::LearnedModel;
 use protocol::Frame;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// What a frame said counts this much less with each later one: parameters were worse then.
-const FADING: f64 = 1.0 - 1.0 / 4000.0;
+/// What is kept of earlier sums with each frame of any world: parameters were worse then.
+const KEPT: f64 = 1.0 - 1.0 / 4000.0;
 
-/// Learns the correlations of the state that pays most. `learned` below: `P(y | x)` of shape `[S, O]`, and that state.
+/// Learns the correlations of the state that pays most.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Neighbours {
     correlations: Correlations,
@@ -22,9 +22,12 @@ pub struct Neighbours {
 }
 
 impl Neighbours {
-    /// What was learned so far.
-    pub fn correlations(&self) -> &Correlations {
-        &self.correlations
+    /// What was learned of a state so far.
+    pub fn correlations_of(&self, state: usize) -> Correlations {
+        match self.state == Some(state) {
+            true => self.correlations.clone(),
+            false => Correlations::default(),
+        }
     }
 
     /// A world of so many cells begins, for the first time or again.
@@ -43,19 +46,19 @@ impl Neighbours {
         world: u32,
         frame: &Frame,
         predictor: Option<&Belief>,
-        learned: (&Array2<f64>, usize),
+        learned: &LearnedModel,
     ) {
         let Some(ages) = self.ages.get_mut(&world) else {
             return;
         };
         ages.grow();
         if let Some(predictor) = predictor {
-            let (likelihood, state) = learned;
+            let (likelihood, state) = (learned.tables.likelihood_array(), learned.target);
             if self.state != Some(state) {
                 (self.state, self.correlations) = (Some(state), Correlations::default());
             }
-            let evidence = Evidence::of(frame, predictor, likelihood, state, ages);
-            self.correlations.fade(FADING);
+            let evidence = Evidence::of(frame, predictor, &likelihood, state, ages);
+            self.correlations.fade(KEPT);
             self.correlations.learn(&evidence);
         }
         frame.observed().for_each(|(index, _)| ages.see(index));

@@ -104,7 +104,7 @@ impl FilterStudent {
     /// A robot that has taken in what its world shows, with a track that begins there.
     fn begun(&mut self, world: u32, observation: Observation) -> Result<Run> {
         self.learner.begin(world);
-        self.learner.see(world, &observation.frame);
+        self.learner.see(world, &observation.frame, &self.learned);
         let mut robot = self.robot(observation);
         robot.begin(None, |_| ())?;
         Ok(Run {
@@ -196,8 +196,11 @@ impl Student for FilterStudent {
                 let (agent, observation) = (&run.robot.agent, run.robot.observation());
                 let visited = path::fly(self.worlds.shape, turn.before.robot(), &turn.plan.moves);
                 let reward = observation.result.reward;
-                self.learner
-                    .see(first_world + index as u32, &observation.frame);
+                self.learner.see(
+                    first_world + index as u32,
+                    &observation.frame,
+                    &self.learned,
+                );
                 self.learner
                     .reward(agent.belief(), &visited.visited, reward);
                 tick.reward += reward;

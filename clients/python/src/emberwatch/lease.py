@@ -150,7 +150,7 @@ class Lease:
         Args:
             result: The world's last result; another step is refused.
             kind: Says to other agents what the bytes are, in at most 256 bytes.
-            data: At most 64 bytes per cell.
+            data: At most 72 bytes per cell and 32,768.
             world: Which world; None: the first of the lease.
         """
         for offset in range(0, max(len(data), 1), _BELIEF_PART):
