@@ -363,7 +363,6 @@ def main() -> None:
     rows = evaluate(
         acting(training.network, sampled=args.sampled),
         name=args.name,
-        estimator="known_model",
         seeds=range(first, end),
         steps=args.steps,
         csv=args.out / "rows.csv",

@@ -171,6 +171,52 @@ def test_an_evaluation_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert list(file.parent.iterdir()) == [file]
 
 
+@pytest.mark.parametrize("change", [{"steps": 13}, {"n_moves": 5}], ids=str)
+def test_an_evaluation_of_other_settings_does_not_go_on(
+    tmp_path: Path, change: dict[str, Any]
+) -> None:
+    file = tmp_path / "mine.csv"
+    score(file, seeds=[3])
+    expected = {"steps": 12, "n_moves": 6, **change}
+    problem = (
+        "has 12 steps of 6 moves of 'mine' on world 3, "
+        f"expected {expected['steps']} of {expected['n_moves']}: choose another file or name"
+    )
+    with pytest.raises(InvalidArgumentError, match=problem):
+        score(file, **change)
+    assert len(read(file)) == 1
+
+
+@pytest.mark.parametrize("change", [{"burn_in": 61}, {"width": 8}], ids=str)
+def test_rows_of_other_worlds_are_not_added(tmp_path: Path, change: dict[str, Any]) -> None:
+    file = tmp_path / "mine.csv"
+    score(file, seeds=[3])
+    kept = file.read_bytes()
+    with pytest.raises(InvalidArgumentError, match=r"burning cells of world 3 \('mine'\), got"):
+        score(file, name="other", seeds=[3], **change)
+    assert file.read_bytes() == kept
+    # Other worlds, or other steps of the same, may burn otherwise.
+    score(file, name="other", seeds=[4])
+    score(file, name="another", seeds=[3], steps=11)
+    assert len(read(file)) == 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"observation": "frame"}, "none"),
+        ({"observation": "local"}, "known_model"),
+        ({"observation": ["frame", "belief"]}, "known_model"),
+        ({"observation": "local", "estimator": "mine"}, "mine"),
+    ],
+    ids=str,
+)
+def test_a_row_says_where_the_belief_came_from(changes: dict[str, Any], expected: str) -> None:
+    keywords = {**WORLDS, **SCALE, "seeds": [3], "steps": 1, **changes}
+    rows = evaluate(lambda _: np.zeros(1, int), name="mine", **keywords)
+    assert rows[0].estimator == expected
+
+
 def test_a_summary_says_which_worlds_are_for_tests() -> None:
     rows = score(seeds=[3, 5000], steps=2)
     assert summary(rows).endswith("a step on 2 (1 test) worlds")
@@ -184,6 +230,12 @@ def test_a_summary_says_which_worlds_are_for_tests() -> None:
         ({"name": ""}, "name: expected a name for the table, got ''"),
         ({"seeds": []}, "seeds: expected some, each once"),
         ({"seeds": [4, 4]}, "seeds: expected some, each once"),
+        ({"seeds": 8}, r"seeds: expected some, such as range\(8\), got 8"),
+        ({"reward": "move"}, "reward: expected none, as evaluate sets it"),
+        ({"num_envs": 2}, "num_envs: expected none, as evaluate sets it"),
+        ({"max_episode_steps": 9}, "max_episode_steps: expected none, as evaluate sets it"),
+        ({"autoreset_mode": "SameStep"}, "autoreset_mode: expected none, as evaluate sets it"),
+        ({"observation": None}, "observation: expected one or several of"),
         ({"seeds": [-1]}, "seed: expected an integer"),
         ({"steps": 0}, "steps: expected at least 1, got 0"),
         ({"batch": 0}, "batch: expected at least 1, got 0"),

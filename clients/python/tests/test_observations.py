@@ -91,6 +91,13 @@ def test_an_impossible_window_is_named(window: Any) -> None:
         make(MOVES, window=window)
 
 
+@pytest.mark.parametrize("parts", [None, 3, [["frame"]], ["frame", None], []], ids=repr)
+def test_what_is_no_part_is_named(parts: Any) -> None:
+    for name in (WILDFIRE, MOVES):
+        with pytest.raises(InvalidArgumentError, match="observation: expected one or several of"):
+            make(name, observation=parts)
+
+
 def test_a_belief_needs_a_model() -> None:
     with serving(reveal_model=False) as instance:
         for part in ("belief", "local"):

@@ -112,9 +112,42 @@ def test_what_is_no_vector_for_it_is_named() -> None:
         WildfireVecEnv(gymnasium.make_vec(MOVES, num_envs=2, **IMAGE))
     vector = make_vec_env(MOVES, 2, **IMAGE)
     assert vector.get_attr("n_moves") == [4, 4] and vector.env_is_wrapped(VecMonitor) == [False] * 2
-    for call in (lambda: vector.set_attr("n_moves", 3), lambda: vector.env_method("render")):
+    for call in (lambda: vector.set_attr("n_moves", 3), lambda: vector.env_method("step")):
         with pytest.raises(InvalidArgumentError, match="the worlds share one environment"):
             call()
+    for options in ({"resume": True}, [{}, {"resume": True}]):
+        with pytest.raises(InvalidArgumentError, match="set_options: expected none, got"):
+            vector.set_options(options)
+    for options in (None, {}, [{}, {}]):
+        vector.set_options(options)
+    vector.close()
+
+
+def test_the_vector_environment_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    with no_warnings():
+        vector = make_vec_env(MOVES, 2, **IMAGE, render_mode="human")
+        vector.reset()
+        assert vector.render() is None
+        vector.close()
+    vector = make_vec_env(MOVES, 2, **IMAGE, render_mode="rgb_array")
+    vector.reset()
+    vector.step(np.array([0, 3]))
+    pictures = vector.get_images()
+    assert_same(vector.env_method("render"), pictures)
+    assert_same(vector.env_method("render", indices=1), pictures[1:])
+    assert not np.array_equal(pictures[0], pictures[1])
+    vector.close()
+
+
+def test_a_wrapped_vector_has_the_wrappers_spaces() -> None:
+    envs = gymnasium.make_vec(MOVES, num_envs=2, autoreset_mode="SameStep", **IMAGE)
+    wrapped = gymnasium.vector.VectorWrapper(envs)
+    wrapped.single_observation_space = gymnasium.spaces.Box(0, 1, (5,))
+    wrapped.single_action_space = gymnasium.spaces.Discrete(2)
+    vector = WildfireVecEnv(wrapped)
+    assert vector.observation_space == wrapped.single_observation_space
+    assert vector.action_space == wrapped.single_action_space
     vector.close()
 
 

@@ -272,6 +272,17 @@ def test_a_wrong_number_of_seeds_is_named(seed: list[int]) -> None:
     env.close()
 
 
+@pytest.mark.parametrize("seed", [-1, 2**64 - 1], ids=str)
+def test_an_impossible_seed_is_named_and_changes_nothing(seed: int) -> None:
+    ours, theirs = pair(2, AutoresetMode.NEXT_STEP, truth=True)
+    assert_same(ours.reset(seed=1), theirs.reset(seed=1))
+    with pytest.raises(InvalidArgumentError, match="seed: expected an integer within 0 to"):
+        ours.reset(seed=seed)
+    assert_same(ours.reset(), theirs.reset())
+    ours.close()
+    theirs.close()
+
+
 def test_resume_goes_on_where_the_worlds_stand() -> None:
     with serving(worlds=3) as instance:
         first = make_vec(3, instance=instance, observation=PARTS)
@@ -287,6 +298,20 @@ def test_resume_goes_on_where_the_worlds_stand() -> None:
         assert (observations["age"] == expected).all()
         truncations = [second.step(action)[3] for action in actions(second, 2)]
         assert np.array(truncations).tolist() == [[False] * 3, [True] * 3]
+        second.close()
+
+
+def test_an_episode_that_ended_before_does_not_end_at_a_move() -> None:
+    with serving(worlds=2, max_steps=1) as instance:
+        first = make_vec(2, MOVES, instance=instance, autoreset_mode="Disabled")
+        first.reset(seed=1)
+        ends = [first.step(np.zeros(2, int))[3].tolist() for _ in range(4)]
+        assert ends == [[False] * 2] * 3 + [[True] * 2]
+        first.close()
+        second = make_vec(2, MOVES, instance=instance, autoreset_mode="Disabled")
+        second.reset(options={"resume": True})
+        for _ in range(3):
+            assert not second.step(np.zeros(2, int))[3].any()
         second.close()
 
 

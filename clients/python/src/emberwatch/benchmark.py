@@ -9,6 +9,7 @@ own policies, paired by world.
 from __future__ import annotations
 
 import csv as csv_files
+import itertools
 import math
 import os
 import sys
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 
 from emberwatch.arguments import as_seed
 from emberwatch.errors import InvalidArgumentError
+from emberwatch.observations import OF_BELIEF, names_of
 
 #: Takes the stacked observations of some worlds; returns an action for each.
 Policy = Callable[[Any], Any]
@@ -34,6 +36,9 @@ FIRST_TRAINING_SEED: Final = 1000
 
 _MOVES: Final = "emberwatch/WildfireMoves-v0"
 _PATHS: Final = "emberwatch/Wildfire-v0"
+
+#: Keywords of the environment that an evaluation sets itself.
+_SET: Final = ("reward", "num_envs", "max_episode_steps", "autoreset_mode")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +97,7 @@ def evaluate(
     steps: int = 1500,
     burn_in: int = 25_000,
     env: str = _MOVES,
-    estimator: str = "none",
+    estimator: str | None = None,
     deterministic: bool = True,
     batch: int = 32,
     csv: str | os.PathLike[str] | None = None,
@@ -110,24 +115,28 @@ def evaluate(
         steps: Scored steps, thus paths, of each world.
         burn_in: Steps before the first scored one.
         env: What it acts in: `"emberwatch/WildfireMoves-v0"` or `"emberwatch/Wildfire-v0"`.
-        estimator: What the table says of its belief.
+        estimator: What the table says of its belief; None: `known_model` where `observation` has
+            a belief, else `none`.
         deterministic: Passed on to Stable-Baselines3.
         batch: Worlds at a time, in the order of the seeds.
         csv: A file to write rows to. Rows of this policy that it has already are kept, and not
-            run again; those of other policies are kept.
+            run again; those of other policies are kept. A changed policy needs another name.
         progress: Where to write how far it is; None: nowhere.
         keywords: Of the environment: `model`, `height`, `width`, `n_moves`, `observation`, ...
 
     Returns:
         A row for each seed, in order.
     """
-    chosen = _check(name, seeds, steps, batch, env)
+    chosen = _check(name, seeds, steps, batch, env, keywords)
     act = _acting(policy, deterministic)
+    keywords["burn_in"] = burn_in
+    if estimator is None:
+        has_belief = OF_BELIEF & set(names_of(keywords.get("observation")))
+        estimator = "known_model" if has_belief else "none"
     file = None if csv is None else _File(Path(csv))
-    done = {} if file is None else file.done(name, estimator, steps)
+    done = {} if file is None else file.done(name, estimator, steps, _n_moves(env, keywords))
     missing = [seed for seed in chosen if seed not in done]
     report = _Progress(progress, name, chosen, len(missing) * steps)
-    keywords |= {"burn_in": burn_in} | ({"reward": "path"} if env == _MOVES else {})
     for first in range(0, len(missing), batch):
         part = missing[first : first + batch]
         getattr(policy, "begin", _nothing)(len(part))
@@ -140,6 +149,18 @@ def evaluate(
     return [done[seed] for seed in chosen]
 
 
+def _make(env: str, keywords: dict[str, Any], n_worlds: int) -> Any:
+    make: Any = {"num_envs": n_worlds, "max_episode_steps": -1, **keywords}
+    return gymnasium.make_vec(env, autoreset_mode=AutoresetMode.DISABLED, **make)
+
+
+def _n_moves(env: str, keywords: dict[str, Any]) -> int:
+    """Moves of a path; starts no server."""
+    worlds = _make(env, keywords, 1)
+    worlds.close()
+    return worlds.unwrapped.n_moves
+
+
 def _play(
     env: str,
     keywords: dict[str, Any],
@@ -149,11 +170,10 @@ def _play(
     report: _Progress,
 ) -> _Tally:
     """Flies so many paths in some worlds."""
-    make: Any = {"num_envs": len(seeds), "max_episode_steps": -1, **keywords}
-    worlds = gymnasium.make_vec(env, autoreset_mode=AutoresetMode.DISABLED, **make)
+    worlds = _make(env, keywords, len(seeds))
     try:
-        tally = _Tally(cast("int", getattr(worlds.unwrapped, "n_moves")), len(seeds))  # noqa: B009
-        seen, _ = worlds.reset(seed=cast("Any", list(seeds)))
+        tally = _Tally(worlds.unwrapped.n_moves, len(seeds))
+        seen, _ = worlds.reset(seed=list(seeds))
         n_actions = tally.n_moves if env == _MOVES else 1
         for _ in range(steps):
             for _ in range(n_actions - 1):
@@ -187,7 +207,14 @@ def _rows(tally: _Tally, seeds: Sequence[int], steps: int, name: str, estimator:
     ]
 
 
-def _check(name: str, seeds: Iterable[int], steps: int, batch: int, env: str) -> list[int]:
+def _check(
+    name: str,
+    seeds: Iterable[int],
+    steps: int,
+    batch: int,
+    env: str,
+    keywords: dict[str, Any],
+) -> list[int]:
     """The seeds as a list; refuses what no worlds can be made of."""
     if not isinstance(name, str) or not name or not name.isprintable():  # pyright: ignore[reportUnnecessaryIsInstance]
         raise InvalidArgumentError(f"name: expected a name for the table, got {name!r}")
@@ -196,6 +223,11 @@ def _check(name: str, seeds: Iterable[int], steps: int, batch: int, env: str) ->
     for what, number in (("steps", steps), ("batch", batch)):
         if not isinstance(number, int | np.integer) or number < 1:  # pyright: ignore[reportUnnecessaryIsInstance]
             raise InvalidArgumentError(f"{what}: expected at least 1, got {number!r}")
+    for what in _SET:
+        if what in keywords:
+            raise InvalidArgumentError(f"{what}: expected none, as evaluate sets it")
+    if not isinstance(seeds, Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise InvalidArgumentError(f"seeds: expected some, such as range(8), got {seeds!r}")
     chosen = [as_seed(seed) for seed in seeds]
     if not chosen or len(set(chosen)) < len(chosen):
         raise InvalidArgumentError(f"seeds: expected some, each once, got {chosen}")
@@ -228,18 +260,27 @@ class _File:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._rows = read(path) if path.exists() else []
 
-    def done(self, name: str, estimator: str, steps: int) -> dict[int, Row]:
+    def done(self, name: str, estimator: str, steps: int, n_moves: int) -> dict[int, Row]:
         """What a policy has done already, by seed."""
         own = [row for row in self._rows if (row.policy, row.estimator) == (name, estimator)]
         for row in own:
-            if row.steps != steps:
+            if (row.steps, row.moves) != (steps, n_moves):
                 raise InvalidArgumentError(
-                    f"csv: {self._path} has {row.steps} steps of {name!r} on world "
-                    f"{row.world_seed}, expected {steps}: choose another file or name"
+                    f"csv: {self._path} has {row.steps} steps of {row.moves} moves of {name!r} on "
+                    f"world {row.world_seed}, expected {steps} of {n_moves}: choose another file "
+                    "or name"
                 )
         return {row.world_seed: row for row in own}
 
-    def add(self, rows: Iterable[Row]) -> None:
+    def add(self, rows: Sequence[Row]) -> None:
+        for row, other in itertools.product(rows, self._rows):
+            same = (row.world_seed, row.steps) == (other.world_seed, other.steps)
+            if same and row.mean_fire_cells != other.mean_fire_cells:
+                raise InvalidArgumentError(
+                    f"csv: {self._path} has {other.mean_fire_cells} burning cells of world "
+                    f"{row.world_seed} ({other.policy!r}), got {row.mean_fire_cells} (another "
+                    "model, grid or burn-in): choose another file"
+                )
         self._rows += rows
         self._rows.sort(key=lambda row: (row.policy, row.world_seed, row.estimator))
         temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}.tmp")

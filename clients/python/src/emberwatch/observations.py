@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final, Literal, TypeAlias, cast
 
 import numpy as np
@@ -31,7 +31,7 @@ MAX_AGE: Final = 255
 WINDOW: Final = 15
 
 #: Parts that a filter is needed for.
-_OF_BELIEF: Final = frozenset(("belief", "local"))
+OF_BELIEF: Final = frozenset(("belief", "local"))
 
 
 class Observations:
@@ -47,7 +47,7 @@ class Observations:
     ) -> None:
         """With `flights`, there are the parts of a path that is not complete."""
         known = _spaces(spec, None if flights is None else window)
-        names = (parts,) if isinstance(parts, str) else tuple(parts)
+        names = names_of(parts)
         if not names or len(set(names)) < len(names) or not known.keys() >= set(names):
             raise InvalidArgumentError(
                 f"observation: expected one or several of {', '.join(known)}, got {parts!r}"
@@ -55,7 +55,7 @@ class Observations:
         self._names, self._is_plain = names, isinstance(parts, str)
         self._spec, self._n_worlds, self._flights = spec, n_worlds, flights
         self._side = window
-        if _OF_BELIEF & set(names) and spec.model is None:
+        if OF_BELIEF & set(names) and spec.model is None:
             raise InvalidArgumentError(
                 "observation: expected a server that reveals its model, for the belief"
             )
@@ -82,7 +82,7 @@ class Observations:
         if self._ages is not None:
             is_seen = frames[begun] != wire.UNOBSERVED
             self._ages[begun] = np.where(is_seen, np.uint8(0), np.uint8(MAX_AGE))
-        if _OF_BELIEF & set(self._names):
+        if OF_BELIEF & set(self._names):
             filters = self._filters = self._filters or self._first_beliefs()
             filters.reset(np.flatnonzero(begun).tolist(), frames)
             self._show(filters, begun)
@@ -144,6 +144,13 @@ class Observations:
             self._beliefs = beliefs.astype(np.uint8)
         if self._windows is not None:
             self._windows.begin(filters, worlds)
+
+
+def names_of(parts: object) -> tuple[str, ...]:
+    """The names of parts that a caller asks for, as given; unchecked."""
+    if isinstance(parts, str):
+        return (parts,)
+    return tuple(map(str, cast("Iterable[object]", parts))) if isinstance(parts, Iterable) else ()
 
 
 def of_world(observations: Any, index: int) -> Any:

@@ -6,7 +6,8 @@ model = PPO("MultiInputPolicy", make_vec_env("emberwatch/WildfireMoves-v0", 64, 
 
 # Stable-Baselines3 need not be installed where types are checked.
 # pyright: reportMissingImports=false, reportMissingModuleSource=false, reportUnknownMemberType=false
-# pyright: reportUnknownVariableType=false, reportUntypedBaseClass=false
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false
+# pyright: reportUntypedBaseClass=false
 
 from __future__ import annotations
 
@@ -34,8 +35,8 @@ def make_vec_env(name: str, n_envs: int = 1, **keywords: Any) -> WildfireVecEnv:
 class WildfireVecEnv(VecEnv):
     """A native vector environment in autoreset mode `SAME_STEP`.
 
-    The info of a world is empty, but at the end of its episode: it has `terminal_observation`,
-    `TimeLimit.truncated` and what the last complete path's info had.
+    The info of a world is empty, except at the end of its episode: then it has
+    `terminal_observation`, `TimeLimit.truncated` and what the last complete path's info had.
     """
 
     def __init__(self, env: gymnasium.vector.VectorEnv[Any, Any, Any]) -> None:
@@ -50,17 +51,18 @@ class WildfireVecEnv(VecEnv):
         self._worlds = worlds
         self._actions: Any = None
         self.render_mode = worlds.render_mode
-        super().__init__(
-            worlds.num_envs, worlds.single_observation_space, worlds.single_action_space
-        )
+        super().__init__(worlds.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> Any:
         seeds = [None if seed is None else int(seed) for seed in self._seeds]
         observations, _ = self._env.reset(seed=seeds if any(s is not None for s in seeds) else None)
         self._reset_seeds()
-        self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
         return observations
+
+    def set_options(self, options: Any = None) -> None:
+        if any([options] if options is None or isinstance(options, dict) else options):
+            raise InvalidArgumentError(f"set_options: expected none, got {options!r}")
 
     def step_async(self, actions: NDArray[Any]) -> None:
         self._actions = actions
@@ -92,8 +94,12 @@ class WildfireVecEnv(VecEnv):
         )
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
+        if method_name == "render":
+            pictures = self.get_images()
+            return [pictures[index] for index in self._get_indices(indices)]
         raise InvalidArgumentError(
-            f"env_method: expected none, as the worlds share one environment, got {method_name!r}"
+            "env_method: expected 'render' alone, as the worlds share one environment, "
+            f"got {method_name!r}"
         )
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:

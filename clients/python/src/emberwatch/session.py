@@ -6,6 +6,7 @@ process and used in a forked child, as Gymnasium's `AsyncVectorEnv` does.
 
 from __future__ import annotations
 
+import inspect
 import warnings
 import weakref
 from collections.abc import Sequence
@@ -69,10 +70,9 @@ class Session:
                 self.spec = running_spec(settings, n_worlds, client.info)
         model = self.spec.model
         if model is not None and not model.reward.any():
-            warnings.warn(
+            _warn(
                 f"model {model.name!r}: no state pays: every reward will be 0; give a state "
-                "a `reward` in the model file",
-                stacklevel=2,
+                "a `reward` in the model file"
             )
 
     @property
@@ -211,11 +211,10 @@ class Session:
         if self._has_warned or not len(barren):
             return
         self._has_warned = True
-        warnings.warn(
+        _warn(
             f"no cell of world {barren[0]} (of {len(barren)} of {len(results)} worlds) is in the "
             "state that pays most: give it a burn_in, a larger grid, or a model for small ones, "
-            "model='wildfire-small'",
-            stacklevel=2,
+            "model='wildfire-small'"
         )
 
     def _lose(self, error: EmberwatchError) -> None:
@@ -283,6 +282,14 @@ class SessionOwner:
                 "gymnasium.make(env.spec); Client.snapshot and Lease.fork copy worlds"
             )
         return vars(self).copy()
+
+
+def _warn(message: str) -> None:
+    """Warns at the caller's line: the first outside this package and Gymnasium."""
+    frame, level = inspect.currentframe(), 1
+    while frame and frame.f_globals["__name__"].partition(".")[0] in ("emberwatch", "gymnasium"):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)
 
 
 def not_reset() -> EmberwatchError:

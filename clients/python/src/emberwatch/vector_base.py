@@ -65,6 +65,8 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         self._results = np.zeros(num_envs, RESULT_DTYPE)
         self._elapsed = np.zeros(num_envs, np.int64)
         self._over = np.zeros(num_envs, np.bool_)
+        # Worlds that completed a path in this step.
+        self._exchanged = np.zeros(num_envs, np.bool_)
         self._truths: NDArray[np.uint8] | None = None
         self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
         self.closed = False
@@ -115,6 +117,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
                 "options={'reset_mask': ...}"
             )
         flown = ~over
+        self._exchanged = np.zeros_like(flown)
         rewards = self._fly(chosen, flown)
         self._elapsed += flown
         if over.any():
@@ -157,6 +160,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
             self._frames = self._frames.copy()  # the learner has the others
             for run in _runs(moved):
                 self._exchange_run(paths, run)
+        self._exchanged = moved
         self._observations.update(moved, self._frames)
 
     def _exchange_run(self, paths: NDArray[np.uint8], run: range) -> None:
@@ -199,8 +203,8 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
     ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """What `step` returns; worlds that began an episode in this step earned nothing."""
         rewards = np.where(flown, rewards, 0.0)
-        terminations = flown & (self._results["terminated"] != 0)
-        truncations = flown & (self._results["truncated"] != 0)
+        terminations = self._exchanged & (self._results["terminated"] != 0)
+        truncations = self._exchanged & (self._results["truncated"] != 0)
         if self._max_steps is not None:
             truncations |= flown & (self._elapsed >= self._max_steps)
         over = terminations | truncations
@@ -254,13 +258,13 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
     def _check_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
         if seed is None:
             return [None] * self.num_envs
+        # Checked before any world's generator is replaced.
         if isinstance(seed, int | np.integer):
-            return [int(seed) + index for index in range(self.num_envs)]
+            return [as_seed(int(seed) + index) for index in range(self.num_envs)]
         if not hasattr(seed, "__len__") or len(seed) != self.num_envs:
             raise InvalidArgumentError(
                 f"seed: expected an integer, None or {self.num_envs} of them, got {seed!r}"
             )
-        # Checked before any world's generator is replaced.
         return [None if one is None else as_seed(one) for one in seed]
 
     def _check_mask(self, mask: Any) -> NDArray[np.bool_]:
