@@ -93,8 +93,9 @@ impl Learner {
     pub fn see(&mut self, world: u32, frame: &Frame, learned: &LearnedModel) {
         self.replay.push(world, frame);
         let predictor = self.predictors.remove(&world);
-        self.neighbours
-            .see(world, frame, predictor.as_ref(), learned);
+        let (tables, target) = (&learned.tables, learned.target);
+        let predictor = predictor.as_ref();
+        self.neighbours.see(world, frame, predictor, tables, target);
     }
 
     /// The reward of a path that visited some cells, with the belief after its frame.

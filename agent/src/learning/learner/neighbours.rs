@@ -3,7 +3,7 @@
 use crate::estimation::Correlations;
 use crate::estimation::belief::Belief;
 use crate::estimation::correlations::{Ages, Evidence};
-use crate::learning::learner::LearnedModel;
+use crate::estimation::parameters::Tables;
 use protocol::Frame;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -46,18 +46,18 @@ impl Neighbours {
         world: u32,
         frame: &Frame,
         predictor: Option<&Belief>,
-        learned: &LearnedModel,
+        tables: &Tables,
+        state: usize,
     ) {
         let Some(ages) = self.ages.get_mut(&world) else {
             return;
         };
         ages.grow();
         if let Some(predictor) = predictor {
-            let (likelihood, state) = (learned.tables.likelihood_array(), learned.target);
             if self.state != Some(state) {
                 (self.state, self.correlations) = (Some(state), Correlations::default());
             }
-            let evidence = Evidence::of(frame, predictor, &likelihood, state, ages);
+            let evidence = Evidence::of(frame, predictor, &tables.likelihood_array(), state, ages);
             self.correlations.fade(KEPT);
             self.correlations.learn(&evidence);
         }
