@@ -3,8 +3,7 @@
 mod sections;
 
 pub use sections::{
-    AutoencoderConfig, DecisionsConfig, DqnConfig, LearningConfig, NetworkDqnConfig,
-    ObjectiveConfig, StepSize,
+    AutoencoderConfig, DecisionsConfig, LearningConfig, NetworkDqnConfig, ObjectiveConfig, StepSize,
 };
 
 use self::sections::check;

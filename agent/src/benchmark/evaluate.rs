@@ -9,7 +9,7 @@ use crate::estimation::belief::Belief;
 use crate::estimation::first_belief::first_belief;
 use crate::estimation::scoring::Score;
 use crate::learning::learned::Learned;
-use crate::planning::policy::{EstimatorKind, Policy};
+use crate::planning::policy::Policy;
 use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Seen};
 use anyhow::Result;
@@ -23,7 +23,8 @@ pub struct Examination<'a> {
     pub seeds: Range<u64>,
     pub steps: u64,
     pub config: &'a AgentConfig,
-    pub estimators: &'a [EstimatorKind],
+    /// Only their estimators count.
+    pub policies: &'a [Policy],
     pub learned: &'a Learned,
 }
 
@@ -93,25 +94,16 @@ impl Examinee {
         seen: Seen,
     ) -> Result<Self> {
         let model = arena.model();
-        let agent = |name: &str| -> Result<Agent> {
-            let (config, learned) = (examination.config, examination.learned);
-            let policy = Policy::named(name, model)?;
-            arena.agent(&policy, config, prior, seed, learned)
-        };
-        let estimator = |kind: &EstimatorKind| match kind {
-            EstimatorKind::Spatial => agent("spatial_beam"),
-            EstimatorKind::Learned => agent("learned_beam"),
-            EstimatorKind::LearnedSpatial => agent("learned_spatial_beam"),
-            EstimatorKind::Autoencoder => agent("autoencoder_beam"),
-            _ => agent("beam_exploit"),
-        };
-        let estimators = examination.estimators.iter().map(estimator);
+        let (config, learned) = (examination.config, examination.learned);
+        let agent = |policy: &Policy| arena.agent(policy, config, prior, seed, learned);
+        let guide = Policy::named(examination.guide, model)?;
+        let estimators = examination.policies.iter().map(agent);
         let mut examinee = Self {
-            guide: Robot::at(agent(examination.guide)?, seen)?,
+            guide: Robot::at(agent(&guide)?, seen)?,
             estimators: estimators.collect::<Result<_, _>>()?,
             marks: Marks {
                 seed,
-                scores: vec![Score::default(); examination.estimators.len()],
+                scores: vec![Score::default(); examination.policies.len()],
                 counts: vec![0; model.n_observations()],
             },
         };

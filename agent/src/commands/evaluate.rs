@@ -10,7 +10,7 @@ use agent::benchmark::report::{render_table, statistics::Estimate, write_csv};
 use agent::config::{AgentConfig, AgentFlags};
 use agent::estimation::scoring::Score;
 use agent::learning::learned::Learned;
-use agent::planning::policy::{EstimatorKind, OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, Policy};
+use agent::planning::policy::{OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, Policy};
 use anyhow::Result;
 use clap::Args;
 use network::DeviceKind;
@@ -60,20 +60,22 @@ impl EvaluateCommand {
         }
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
         let learned = Learned::read(checkpoints, &self.device.open()?)?;
-        let estimators = estimators(&learned);
         let mut worlds = self.worlds.open(false, |_| Ok(()))?;
         let arena = &mut worlds.arena;
+        let policies = examined(&learned).into_iter();
+        let policies = policies.map(|name| Policy::named(name, arena.model()));
+        let policies = policies.collect::<Result<Vec<_>, _>>()?;
         for guide in GUIDES {
             let examination = Examination {
                 guide,
                 seeds: self.worlds.seeds.clone(),
                 steps: self.worlds.steps,
                 config: &config,
-                estimators: &estimators,
+                policies: &policies,
                 learned: &learned,
             };
             let marks = examine(arena, &examination)?;
-            write(&predictions(guide, &estimators, &marks))?;
+            write(&predictions(guide, &policies, &marks))?;
         }
         if !self.predictions_only {
             self.policies(arena, config, learned)?;
@@ -109,20 +111,20 @@ impl EvaluateCommand {
     }
 }
 
-/// The filters of the known model, and what was learned.
-fn estimators(learned: &Learned) -> Vec<EstimatorKind> {
-    let mut kinds = vec![EstimatorKind::KnownModel, EstimatorKind::Spatial];
+/// Policies on the known model, and on what was learned.
+fn examined(learned: &Learned) -> Vec<&'static str> {
+    let mut names = vec!["beam_exploit", "spatial_beam"];
     if learned.filter.is_some() {
-        kinds.extend([EstimatorKind::Learned, EstimatorKind::LearnedSpatial]);
+        names.extend(["learned_beam", "learned_spatial_beam"]);
     }
     if learned.network.is_some() {
-        kinds.push(EstimatorKind::Autoencoder);
+        names.push("autoencoder_beam");
     }
-    kinds
+    names
 }
 
 /// Log-likelihood per visited cell, ± one standard error over worlds; differences are paired.
-fn predictions(guide: &str, estimators: &[EstimatorKind], marks: &[Marks]) -> String {
+fn predictions(guide: &str, policies: &[Policy], marks: &[Marks]) -> String {
     let column = |of: &dyn Fn(&Marks) -> Score| -> Vec<f64> {
         marks.iter().map(|marks| of(marks).mean()).collect()
     };
@@ -131,11 +133,11 @@ fn predictions(guide: &str, estimators: &[EstimatorKind], marks: &[Marks]) -> St
     let scores = |index: usize| column(&|marks| marks.scores[index]);
     let known = scores(0);
     let mut rows = vec![("class frequencies".to_owned(), frequencies)];
-    for (index, estimator) in estimators.iter().enumerate() {
-        rows.push((estimator.label().into(), scores(index)));
+    for (index, policy) in policies.iter().enumerate() {
+        rows.push((policy.estimator.label().into(), scores(index)));
     }
-    for (index, estimator) in estimators.iter().enumerate().skip(1) {
-        let name = format!("{} - known_model", estimator.label());
+    for (index, policy) in policies.iter().enumerate().skip(1) {
+        let name = format!("{} - known_model", policy.estimator.label());
         rows.push((name, difference(&scores(index), &known)));
     }
     let mut text = format!("log-likelihood per visited cell on the paths of {guide}:\n");

@@ -55,26 +55,12 @@ pub struct AutoencoderConfig {
     pub step_size: StepSize,
 }
 
-/// How a DQN learns.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct DqnConfig {
-    pub replay: usize,
-    pub batch: usize,
-    pub gamma: f32,
-    pub n_step: usize,
-    pub tau: f32,
-    pub epsilon: f32,
-    pub epsilon_end: f32,
-    pub epsilon_steps: u64,
-    pub double: bool,
-}
-
 /// How the DQN of Algorithm 1 learns (paper section III.E).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct NetworkDqnConfig {
     pub input: DqnInput,
     #[serde(flatten)]
-    pub learning: DqnConfig,
+    pub learning: DqnSettings,
     pub step_size: StepSize,
 }
 
@@ -82,7 +68,7 @@ pub struct NetworkDqnConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DecisionsConfig {
     #[serde(flatten)]
-    pub learning: DqnConfig,
+    pub learning: DqnSettings,
     pub reward_scale: f32,
     pub updates_per_step: f64,
     pub rate: f32,
@@ -182,56 +168,36 @@ impl AutoencoderConfig {
     }
 }
 
-impl DqnConfig {
-    fn check(&self, section: &str, most_kept: f64) -> Result<()> {
-        let batch = self.batch as f64;
-        let ranges = [
-            ("batch", batch, 1.0, 65_536.0),
-            ("n_step", self.n_step as f64, 1.0, 1e3),
-            ("replay", self.replay as f64, batch, most_kept),
-            ("gamma", self.gamma.into(), 0.0, 1.0),
-            ("tau", self.tau.into(), 0.0, 1.0),
-            ("epsilon", self.epsilon.into(), 0.0, 1.0),
-            ("epsilon_end", self.epsilon_end.into(), 0.0, 1.0),
-        ];
-        check(section, &ranges)
-    }
-
-    fn settings(&self, learning_rate: f32) -> DqnSettings {
-        let adam = DqnSettings::paper().adam;
-        DqnSettings {
-            replay: self.replay,
-            batch: self.batch,
-            gamma: self.gamma,
-            n_step: self.n_step,
-            tau: self.tau,
-            epsilon: self.epsilon,
-            epsilon_end: self.epsilon_end,
-            epsilon_steps: self.epsilon_steps,
-            double: self.double,
-            adam: AdamSettings {
-                learning_rate,
-                ..adam
-            },
-        }
-    }
+/// `most_kept`: of the replay.
+fn check_dqn(section: &str, dqn: &DqnSettings, most_kept: f64) -> Result<()> {
+    let batch = dqn.batch as f64;
+    let ranges = [
+        ("batch", batch, 1.0, 65_536.0),
+        ("n_step", dqn.n_step as f64, 1.0, 1e3),
+        ("replay", dqn.replay as f64, batch, most_kept),
+        ("gamma", dqn.gamma.into(), 0.0, 1.0),
+        ("tau", dqn.tau.into(), 0.0, 1.0),
+        ("epsilon", dqn.epsilon.into(), 0.0, 1.0),
+        ("epsilon_end", dqn.epsilon_end.into(), 0.0, 1.0),
+    ];
+    check(section, &ranges)
 }
 
 impl NetworkDqnConfig {
     pub(super) fn check(&self) -> Result<()> {
-        self.learning.check("dqn.", 1e6)?;
+        check_dqn("dqn.", &self.learning, 1e6)?;
         check("dqn.step_size.", &self.step_size.ranges())
     }
 
     /// As the network takes them, with the first step size.
     pub fn settings(&self) -> DqnSettings {
-        self.learning.settings(self.step_size.rate as f32)
+        self.learning.with_rate(self.step_size.rate as f32)
     }
 }
 
 impl DecisionsConfig {
     pub(super) fn check(&self) -> Result<()> {
-        self.learning.check("decisions.", 2e5)?;
+        check_dqn("decisions.", &self.learning, 2e5)?;
         let ranges = [
             ("reward_scale", self.reward_scale.into(), 0.0, 1e3),
             ("updates_per_step", self.updates_per_step, 0.0, 16.0),
@@ -242,7 +208,7 @@ impl DecisionsConfig {
 
     /// As the network takes them.
     pub fn settings(&self) -> DqnSettings {
-        self.learning.settings(self.rate)
+        self.learning.with_rate(self.rate)
     }
 }
 

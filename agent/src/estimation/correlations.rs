@@ -94,11 +94,6 @@ impl Ages {
         &self.0
     }
 
-    /// Such ages; `None` if they are of another number of cells.
-    pub fn from_bytes(bytes: &[u8], n_cells: usize) -> Option<Self> {
-        (bytes.len() == n_cells).then(|| Self(bytes.to_vec()))
-    }
-
     /// The next step.
     pub fn grow(&mut self) {
         for age in &mut self.0 {
@@ -196,11 +191,11 @@ impl Correlations {
 
     /// As in a table by age ranges and offsets, of shape `[N_AGES, N_AGES, SIDE, SIDE]`.
     #[cfg(test)]
-    pub fn of_table(table: &ndarray::Array4<f64>) -> Self {
+    pub fn of_table(table: &ndarray::Array4<f32>) -> Self {
         let mut correlations = Self::default();
         for ((one, other, row, col), &number) in table.indexed_iter() {
             let class = class(row.abs_diff(RADIUS), col.abs_diff(RADIUS));
-            correlations.table[one][other][class] = number as f32;
+            correlations.table[one][other][class] = number;
         }
         correlations
     }
@@ -223,33 +218,6 @@ impl Correlations {
             sum.products *= factor;
             sum.largest *= factor;
         }
-    }
-
-    /// The sums as little-endian `f64`, shape `[8, 8, 15, 2]`.
-    pub fn to_bytes(&self) -> Vec<u8> {
-        let sums = self.sums.0.as_flattened().as_flattened().iter();
-        let numbers = sums.flat_map(|sum| [sum.products, sum.largest]);
-        numbers.flat_map(f64::to_le_bytes).collect()
-    }
-
-    /// Correlations of such bytes; `None` if they are not so many sums that are possible.
-    pub fn from_bytes(bytes: &[u8]) -> Option<Self> {
-        let (numbers, []) = bytes.as_chunks::<8>() else {
-            return None;
-        };
-        let mut sums = Self::default().sums;
-        let all = sums.0.as_flattened_mut().as_flattened_mut();
-        let (pairs, []) = numbers.as_chunks::<2>() else {
-            return None;
-        };
-        if pairs.len() != all.len() {
-            return None;
-        }
-        for (sum, pair) in all.iter_mut().zip(pairs) {
-            let [products, largest] = pair.map(f64::from_le_bytes);
-            *sum = Sum { products, largest };
-        }
-        sums.try_into().ok()
     }
 
     /// The table of the sums.

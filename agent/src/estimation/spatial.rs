@@ -14,7 +14,13 @@ use crate::estimation::innovation::Innovation;
 use crate::estimation::parameters::Tables;
 use crate::estimation::scoring::Score;
 use crate::estimation::spread::Spread;
+use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
 use protocol::{Frame, Grid};
+
+/// How ages and sums are written. The limit is more than any grid's.
+const FORM: Configuration<LittleEndian, Fixint, Limit<{ 1 << 25 }>> = bincode::config::standard()
+    .with_fixed_int_encoding()
+    .with_limit();
 
 /// A filter of one world whose cells inform each other.
 #[derive(Debug, Clone)]
@@ -102,31 +108,27 @@ impl Estimator for SpatialFilter {
         let filter = self.filter.kind()?;
         let state = self.state;
         Some(format!(
-            "spatial {filter}, ages [H, W] as u8, sums of state {state} [8, 8, 15, 2] as f64"
+            "spatial {filter}, ages and sums of state {state} as bincode"
         ))
     }
 
     fn memory(&self) -> Vec<u8> {
-        let mut memory = self.filter.memory();
-        memory.extend(self.ages.as_slice());
-        memory.extend(self.correlations.to_bytes());
-        memory
+        let own = bincode::serde::encode_to_vec((&self.ages, &self.correlations), FORM);
+        let own = own.expect("invariant: numbers can be encoded");
+        [self.filter.memory(), own].concat()
     }
 
     fn remember(&mut self, memory: &[u8]) -> bool {
-        let n_cells = self.belief().shape().n_cells();
         let n_bytes = 4 * self.belief().as_slice().len();
-        let Some((belief, rest)) = memory.split_at_checked(n_bytes) else {
+        let Some((belief, own)) = memory.split_at_checked(n_bytes) else {
             return false;
         };
-        let Some((ages, sums)) = rest.split_at_checked(n_cells) else {
+        let decoded = bincode::serde::decode_from_slice::<(Ages, Correlations), _>(own, FORM);
+        let Ok(((ages, correlations), n_read)) = decoded else {
             return false;
         };
-        let parts = Ages::from_bytes(ages, n_cells).zip(Correlations::from_bytes(sums));
-        let Some((ages, correlations)) = parts else {
-            return false;
-        };
-        let is_taken = self.filter.remember(belief);
+        let fits = n_read == own.len() && ages.as_slice().len() == self.ages.as_slice().len();
+        let is_taken = fits && self.filter.remember(belief);
         if is_taken {
             (self.ages, self.correlations) = (ages, correlations);
         }

@@ -11,6 +11,7 @@ mod publications;
 mod resets;
 mod serve;
 mod state;
+mod taken;
 
 pub use liveness::Clients;
 pub use ports::{PortConfig, Ports};

@@ -1,6 +1,7 @@
 //! The server's ends of the channels.
 
 use super::descriptors::raise_limit;
+use super::taken::{Taken, once_free};
 use crate::config::Checked;
 use anyhow::{Result, ensure};
 use iceoryx2::node::Node;
@@ -19,7 +20,6 @@ use protocol::channels::{
 };
 use protocol::failed_connections::FailedConnections;
 use protocol::message::{FrameHeader, Header, RESULT_BYTES, StepReply, StepRequest, TruthHeader};
-use protocol::program::WatchedProcess;
 use protocol::responder::{
     Active, ActiveControl, Answers, ControlServer, control_server, port_owner, received,
 };
@@ -29,18 +29,13 @@ use protocol::wait::{descriptor, drain};
 use std::cell::RefCell;
 use std::collections::HashSet;
 use std::os::fd::BorrowedFd;
-use std::time::{Duration, Instant};
-use thiserror::Error;
+use std::time::Instant;
 
 /// A request on `step` that waits for its answer.
 pub type ActiveStep = Active<StepRequest, StepReply>;
 
 /// Bytes that iceoryx2 adds to each message, at most.
 const MESSAGE_OVERHEAD: usize = 512;
-
-/// How long to try while a dead process still has the instance, and how often.
-const LEFT_WAIT: Duration = Duration::from_secs(10);
-const LEFT_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Shared memory for everything of fixed size: control messages, events, tables.
 const FIXED_BYTES: u64 = 8 << 20;
@@ -108,20 +103,7 @@ impl Ports {
     pub fn open_with(config: &PortConfig) -> Result<Self> {
         check_shared_memory(config)?;
         raise_limit()?;
-        let start = Instant::now();
-        loop {
-            let opened = Self::open_once(config);
-            let owner = opened.as_ref().err().and_then(|error| error.downcast_ref());
-            // What a dead process left is removed in a turn of one's own, which another one may hold for a while.
-            let is_left = |owner: &Taken| {
-                let watched = WatchedProcess::watch(owner.pid);
-                watched.map_or(true, |process| process.has_ended())
-            };
-            if !owner.is_some_and(is_left) || start.elapsed() > LEFT_WAIT {
-                return opened;
-            }
-            std::thread::sleep(LEFT_INTERVAL);
-        }
+        once_free(|| Self::open_once(config))
     }
 
     fn open_once(config: &PortConfig) -> Result<Self> {
@@ -339,14 +321,6 @@ impl Ports {
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         descriptor(&self.listener)
     }
-}
-
-/// Another server has the instance.
-#[derive(Debug, Error)]
-#[error("instance {instance:?} is already running, as pid {pid}")]
-struct Taken {
-    instance: String,
-    pid: i32,
 }
 
 fn taken<Q: Header, R: Header>(

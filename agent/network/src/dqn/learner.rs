@@ -17,9 +17,8 @@ use std::fmt;
 /// Width of both hidden layers, as in the authors' code.
 const WIDTH: usize = 128;
 
-/// Settings of the learner.
+/// Settings of the learner, as in files; there the optimiser has none.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct DqnSettings {
     /// Transitions remembered.
     pub replay: usize,
@@ -39,7 +38,8 @@ pub struct DqnSettings {
     pub epsilon_steps: u64,
     /// Whether the network, and not its target, picks the action whose value the target gives.
     pub double: bool,
-    /// The optimiser.
+    /// The optimiser: by default the authors'.
+    #[serde(skip, default = "adam")]
     pub adam: AdamSettings,
 }
 
@@ -56,17 +56,27 @@ impl DqnSettings {
             epsilon_end: 0.1,
             epsilon_steps: 0,
             double: false,
-            adam: AdamSettings {
-                betas: [0.9, 0.999],
-                ..AdamSettings::paper(0.01)
-            },
+            adam: adam(),
         }
+    }
+
+    /// The same with another step size.
+    pub fn with_rate(mut self, learning_rate: f32) -> Self {
+        self.adam.learning_rate = learning_rate;
+        self
     }
 
     /// Chance of a random action at a step.
     pub fn epsilon_at(&self, step: u64) -> f32 {
         let share = (step as f32 / self.epsilon_steps.max(1) as f32).min(1.0);
         self.epsilon + (self.epsilon_end - self.epsilon) * share
+    }
+}
+
+fn adam() -> AdamSettings {
+    AdamSettings {
+        betas: [0.9, 0.999],
+        ..AdamSettings::paper(0.01)
     }
 }
 

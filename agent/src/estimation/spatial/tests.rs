@@ -1,14 +1,14 @@
 //! Vectors of an independent implementation (numpy, 64 bits), which spreads with a given table:
 //!
 //! ```python
-//! np.savez(name, table=table, cells=cells, obs=obs, first_predictor=u_1, post=posteriors, pred=predictors)
+//! np.savez(name, table=table, cells=cells, obs=obs, first_predictor=u_1, post=posteriors[2::3])  # 32 bits
 //! ```
 //!
 //! Cells are in order of their first visit, -1 where a path visits fewer.
 
 use super::*;
 use crate::estimation::correlations::N_AGES;
-use ndarray::{Array2, Array3, Array4, ArrayView3, Axis};
+use ndarray::{Array2, Array3, Array4, Axis};
 use ndarray_npy::NpzReader;
 use proptest::prelude::*;
 use protocol::Model;
@@ -23,34 +23,16 @@ fn wildfire(prior: Belief, correlations: Correlations) -> SpatialFilter {
     SpatialFilter::new(filter, FIRE, correlations)
 }
 
-fn worst(belief: &Belief, expected: ArrayView3<'_, f64>) -> f64 {
-    let differences = belief.view().mapv(f64::from) - expected;
-    differences.iter().fold(0.0, |worst, d| worst.max(d.abs()))
-}
-
-fn numbers(npz: &mut NpzReader<File>, name: &str) -> Array4<f64> {
-    let name = format!("{name}.npy");
-    match npz.by_name::<ndarray::OwnedRepr<f64>, _>(&name) {
-        Ok(numbers) => numbers,
-        Err(_) => {
-            let numbers: Array4<f32> = npz.by_name(&name).expect("numbers");
-            numbers.mapv(f64::from)
-        }
-    }
-}
-
 fn check_golden(side: usize) {
-    let path = format!(
-        "{}/tests/data/spatial_{side}.npz",
-        env!("CARGO_MANIFEST_DIR")
-    );
+    let root = env!("CARGO_MANIFEST_DIR");
+    let path = format!("{root}/tests/data/spatial_{side}.npz");
     let mut npz = NpzReader::new(File::open(path).expect("a file")).expect("npz");
-    let table = numbers(&mut npz, "table");
+    let table: Array4<f32> = npz.by_name("table.npy").expect("a table");
     let cells: Array2<i16> = npz.by_name("cells.npy").expect("cells");
     let observed: Array2<i8> = npz.by_name("obs.npy").expect("observations");
-    let first: Array3<f64> = npz.by_name("first_predictor.npy").expect("a predictor");
-    let (posteriors, predictors) = (numbers(&mut npz, "post"), numbers(&mut npz, "pred"));
-    let prior = Belief::from_probabilities(first.mapv(|p| p as f32)).expect("a belief");
+    let first: Array3<f32> = npz.by_name("first_predictor.npy").expect("a predictor");
+    let posteriors: Array4<f32> = npz.by_name("post.npy").expect("posteriors");
+    let prior = Belief::from_probabilities(first).expect("a belief");
     let mut filter = wildfire(prior, Correlations::of_table(&table));
     // The first prediction was made already.
     filter.ages.grow();
@@ -58,11 +40,12 @@ fn check_golden(side: usize) {
         let seen = cells.iter().zip(observed).filter(|(cell, _)| **cell >= 0);
         let seen = seen.map(|(&cell, &value)| (cell as usize, value as u8));
         filter.correct_in_order(seen).expect("possible");
-        let off = worst(filter.belief(), posteriors.index_axis(Axis(0), step));
-        assert!(off < 1e-5, "{side}: posterior {step} is off by {off}");
+        if step % 3 == 2 {
+            let off = &filter.belief().view() - &posteriors.index_axis(Axis(0), step / 3);
+            let off = off.iter().fold(0.0_f32, |worst, d| worst.max(d.abs()));
+            assert!(off < 1e-5, "{side}: posterior {step} is off by {off}");
+        }
         filter.predict();
-        let off = worst(filter.belief(), predictors.index_axis(Axis(0), step));
-        assert!(off < 1e-5, "{side}: predictor {step} is off by {off}");
     }
 }
 
@@ -73,7 +56,7 @@ fn corrections_are_those_of_an_independent_implementation() {
 }
 
 #[test]
-fn an_impossible_frame_is_rejected_whole() {
+fn an_impossible_frame_is_rejected_whole_with_neighbours_or_without() {
     let mut file = Model::wildfire().file().clone();
     file.states[0].observed_as = vec![1.0, 0.0, 0.0];
     let model = Model::new(file).expect("a model");
@@ -81,17 +64,20 @@ fn an_impossible_frame_is_rejected_whole() {
     let mut states = Grid::from_elem((2, 2), 2);
     states[[1, 0]] = 0;
     let prior = Belief::from_states(&states, 3).expect("states");
-    let filter = BayesFilter::known(&model, prior.clone()).expect("valid");
-    let mut filter = SpatialFilter::new(filter, FIRE, Correlations::default());
+    // Cell 0 could be corrected, cell 2 is certainly normal and never looks like fire.
     let frame = Frame::from_bytes(shape, 3, &[2, 255, 2, 2]).expect("a frame");
-    let error = filter
-        .correct(&frame, None)
-        .expect_err("a normal cell seen as fire");
-    let EstimatorError::ZeroEvidence(error) = error else {
-        panic!("{error}");
-    };
-    assert_eq!((error.cell, error.observed), (Cell { row: 1, col: 0 }, 2));
-    assert_eq!(filter.belief(), &prior);
+    let filter = BayesFilter::known(&model, prior.clone()).expect("valid");
+    let spatial = SpatialFilter::new(filter.clone(), FIRE, Correlations::default());
+    let filters: [Box<dyn Estimator>; 2] = [Box::new(filter), Box::new(spatial)];
+    for mut filter in filters {
+        let error = filter.correct(&frame, None);
+        let error = error.expect_err("a normal cell seen as fire");
+        let EstimatorError::ZeroEvidence(error) = error else {
+            panic!("{error}");
+        };
+        assert_eq!((error.cell, error.observed), (Cell { row: 1, col: 0 }, 2));
+        assert_eq!(filter.belief(), &prior);
+    }
 }
 
 /// A model of three states, any of which can pay.

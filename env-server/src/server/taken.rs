@@ -1,0 +1,72 @@
+//! An instance that another server has, or that a dead one left.
+//!
+//! What a dead process left is removed in a turn of one's own, which another process may hold for a while. Until then
+//! the dead one seems to have the instance.
+
+use anyhow::Result;
+use protocol::program::WatchedProcess;
+use std::time::{Duration, Instant};
+use thiserror::Error;
+
+/// How long to try while a dead process has the instance.
+const LIMIT: Duration = Duration::from_secs(10);
+
+/// How long to wait between two tries.
+const INTERVAL: Duration = Duration::from_millis(100);
+
+/// Another server has the instance.
+#[derive(Debug, Error)]
+#[error("instance {instance:?} is already running, as pid {pid}")]
+pub struct Taken {
+    pub instance: String,
+    pub pid: i32,
+}
+
+impl Taken {
+    fn is_left_over(&self) -> bool {
+        let watched = WatchedProcess::watch(self.pid);
+        watched.map_or(true, |process| process.has_ended())
+    }
+}
+
+/// Opens something, as soon as no dead process has it.
+pub fn once_free<T>(mut open: impl FnMut() -> Result<T>) -> Result<T> {
+    let start = Instant::now();
+    loop {
+        let opened = open();
+        let owner = opened.as_ref().err().and_then(|error| error.downcast_ref());
+        if !owner.is_some_and(Taken::is_left_over) || start.elapsed() > LIMIT {
+            return opened;
+        }
+        std::thread::sleep(INTERVAL);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::process::Command;
+
+    /// Tries until opened, at most twice; returns how often.
+    fn tries(pid: u32) -> usize {
+        let mut n_tries = 0;
+        let opened = once_free(|| {
+            n_tries += 1;
+            let (instance, pid) = ("lab".into(), pid as i32);
+            match n_tries {
+                1 => Err(Taken { instance, pid }.into()),
+                _ => Ok(()),
+            }
+        });
+        assert_eq!(opened.is_ok(), n_tries == 2);
+        n_tries
+    }
+
+    #[test]
+    fn what_a_dead_process_has_is_tried_again_and_what_a_living_one_has_is_not() {
+        let mut child = Command::new("true").spawn().expect("a process");
+        child.wait().expect("its end");
+        assert_eq!(tries(child.id()), 2);
+        assert_eq!(tries(std::process::id()), 1);
+    }
+}
