@@ -78,6 +78,7 @@ serve-decisions --instance a/b => instance name | "a/b"
 serve-decisions --world x => --world | 'x'
 serve-decisions --planner random_walk => --planner | beam, shooting
 serve-decisions --planner => --planner | beam, shooting
+serve-decisions --estimator truth => --estimator | known_model, spatial_filter
 serve-decisions --model no.toml => model file no.toml | No such file
 serve-decisions --config no.toml => config file no.toml | No such file
 serve-decisions --preset paper --config config/agent.toml => expected no file beside --preset paper

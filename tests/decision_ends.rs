@@ -6,7 +6,7 @@ use crate::wire::control_header;
 use agent::acting::decider::{Assignment, Decider};
 use agent::acting::run::prepare;
 use agent::config::AgentConfig;
-use agent::planning::policy::PlannerKind;
+use agent::planning::policy::{EstimatorKind, PlannerKind};
 use agent::server::client::{self, Claim, Client, shape_of};
 use protocol::channels::{ChannelError, Instance};
 use protocol::decisions::{Reply, Request};
@@ -67,6 +67,7 @@ fn attach(server: &Server) -> Decider {
         instance: server.instance.clone(),
         world: 0,
         takeover: false,
+        estimator: EstimatorKind::KnownModel,
         planner: PlannerKind::Beam,
         config: AgentConfig::default(),
     };

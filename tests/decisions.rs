@@ -45,19 +45,29 @@ fn hello_tells_what_can_be_decided() {
     );
     assert_eq!(info.states, ["normal", "latent", "fire"]);
     assert_eq!(info.objectives, ["normal", "latent", "fire", "entropy"]);
-    assert_eq!(info.planner, "beam");
+    assert_eq!((&*info.estimator, &*info.planner), ("known_model", "beam"));
     assert_eq!(info.summary.len(), learner.last().summary.len());
     assert_eq!(server.status().worlds[0].holder_pid, Some(agent.pid()));
 }
 
 #[test]
 fn a_decision_is_the_step_that_an_agent_of_that_objective_makes() {
+    assert_the_same_steps("beam_fire", "known_model");
+}
+
+#[test]
+fn decisions_are_made_on_the_spatial_belief() {
+    assert_the_same_steps("spatial_beam", "spatial_filter");
+}
+
+/// A policy that plans for fire makes the steps of decisions for fire with an estimator.
+fn assert_the_same_steps(policy: &str, estimator: &str) {
     let flags = format!("{BURNING} --seed 2");
     let (server, other) = (Server::start(&flags), Server::start(&flags));
     let observer = Observer::frames(&server.instance).expect("observe");
     frames_until(&observer, 0, 0);
     let name = server.instance.name();
-    let policy = ["--policy", "beam_fire", "--steps", "30"];
+    let policy = ["--policy", policy, "--steps", "30"];
     let ran = run(
         "emberwatch-agent",
         &[&["run", "--instance", name], &policy[..]].concat(),
@@ -70,7 +80,9 @@ fn a_decision_is_the_step_that_an_agent_of_that_objective_makes() {
         .map(|sample| sample.header.result)
         .collect();
     assert!(flown.iter().any(|result| result.reward > 0.0));
-    let (_agent, learner) = start_with_learner(&other.instance, "");
+    let flags = format!("--estimator {estimator}");
+    let (_agent, learner) = start_with_learner(&other.instance, &flags);
+    assert_eq!(learner.hello().estimator, estimator);
     for seed in [None, Some(2)] {
         if let Some(seed) = seed {
             learner.reset(seed);

@@ -10,7 +10,7 @@ use crate::estimation::belief::Belief;
 use crate::estimation::summary::{summarise, summary_names};
 use crate::learning::learned::Learned;
 use crate::planning::Objective;
-use crate::planning::policy::{PlannerKind, Policy};
+use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Seen};
 use crate::server::client::{Client, Observation};
@@ -34,6 +34,8 @@ pub struct Assignment {
     pub world: u32,
     /// Take the world from its holder.
     pub takeover: bool,
+    /// What keeps the belief: the known model's filter, or the spatial one.
+    pub estimator: EstimatorKind,
     /// What plans: beam search or shooting.
     pub planner: PlannerKind,
     pub config: AgentConfig,
@@ -59,7 +61,7 @@ impl Decider {
         let (mut client, observation) =
             Client::acquire_one(&task.instance, task.world, task.takeover)?;
         let last_use = Instant::now();
-        let choices = Policy::choices(task.planner, &model);
+        let choices = Policy::choices(task.estimator, task.planner, &model);
         let agent = agent(
             &client,
             &model,
@@ -241,6 +243,7 @@ fn agent_info(task: &Assignment, model: &Model, choices: &[Policy], client: &Cli
         max_steps: server.max_steps,
         states: model.state_names(),
         objectives: choices.iter().map(|choice| choice.name.clone()).collect(),
+        estimator: task.estimator.label().into(),
         planner: task.planner.label().into(),
         summary: summary_names(model),
     }

@@ -4,7 +4,7 @@ use super::shared::{WaitFlag, model_named};
 use agent::acting::decider::Assignment;
 use agent::acting::decisions::serve_decisions;
 use agent::config::AgentFlags;
-use agent::planning::policy::PlannerKind;
+use agent::planning::policy::{EstimatorKind, PlannerKind};
 use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
 use protocol::channels::Instance;
@@ -25,6 +25,9 @@ pub struct ServeDecisionsCommand {
     /// Take the world from its holder
     #[arg(long)]
     takeover: bool,
+    /// What keeps the belief
+    #[arg(long, default_value = "known_model")]
+    estimator: EstimatorName,
     /// What plans a path for the objective decided
     #[arg(long, default_value = "beam")]
     planner: PlannerName,
@@ -36,6 +39,16 @@ pub struct ServeDecisionsCommand {
     exit_with: Option<i32>,
     #[command(flatten)]
     settings: AgentFlags,
+}
+
+/// The estimators that know the model.
+#[derive(Clone, Copy, ValueEnum)]
+#[value(rename_all = "snake_case")]
+enum EstimatorName {
+    /// The paper's Bayes filter: cells are independent
+    KnownModel,
+    /// One whose corrections reach neighbouring cells, by correlations that it learns
+    SpatialFilter,
 }
 
 /// The planners that have an objective.
@@ -55,6 +68,10 @@ impl ServeDecisionsCommand {
             instance: Instance::new(&self.instance)?,
             world: self.world,
             takeover: self.takeover,
+            estimator: match self.estimator {
+                EstimatorName::KnownModel => EstimatorKind::KnownModel,
+                EstimatorName::SpatialFilter => EstimatorKind::Spatial,
+            },
             planner: match self.planner {
                 PlannerName::Beam => PlannerKind::Beam,
                 PlannerName::Shooting => PlannerKind::Shooting,

@@ -34,7 +34,9 @@ def env() -> Iterator[Any]:
     made.close()
 
 
-@pytest.mark.parametrize("keywords", [{}, {"truth": True}, {"planner": "shooting"}])
+@pytest.mark.parametrize(
+    "keywords", [{}, {"truth": True}, {"planner": "shooting"}, {"estimator": "spatial_filter"}]
+)
 def test_gymnasium_accepts_it(keywords: dict[str, Any]) -> None:
     env = make(render_mode="rgb_array", **keywords)
     check_env(env, skip_render_check=True)
@@ -154,6 +156,7 @@ def test_a_wrong_action_is_refused_and_nothing_is_sent(env: Any, action: object)
     ("keywords", "words"),
     [
         ({"planner": "magic"}, "expected one of beam, shooting, got 'magic'"),
+        ({"estimator": "truth"}, "expected one of known_model, spatial_filter, got 'truth'"),
         ({"prior": "none"}, "expected one of simulated, initial, uniform"),
         ({"agent": "other"}, "expected one of own, running"),
         ({"agent": "running"}, "expected instance="),

@@ -79,6 +79,8 @@ pub struct AgentInfo {
     pub states: Vec<String>,
     /// Names of the objectives: each state's probability, then `entropy`.
     pub objectives: Vec<String>,
+    /// The estimator: `known_model` or `spatial_filter`.
+    pub estimator: String,
     /// The planner: `beam` or `shooting`.
     pub planner: String,
     /// Names of the numbers in [`Decision::summary`].

@@ -186,10 +186,10 @@ impl Policy {
     /// What a high-level decision chooses among (the paper's actions `a_k`): the probability of each
     /// state in the model's order, then `entropy`; each named by its target, with the bonus of
     /// `shooting_*` and `beam_*`.
-    pub fn choices(planner: PlannerKind, model: &Model) -> Vec<Self> {
+    pub fn choices(estimator: EstimatorKind, planner: PlannerKind, model: &Model) -> Vec<Self> {
         let choice = |name: &str, target| {
             let objective = objective(planner, target);
-            Self::new(name, EstimatorKind::KnownModel, planner, objective)
+            Self::new(name, estimator, planner, objective)
         };
         let states = model.file().states.iter().enumerate();
         let states = states.map(|(state, entry)| choice(&entry.name, Target::State(state)));
@@ -314,7 +314,7 @@ mod tests {
             ("beam", PlannerKind::Beam),
             ("shooting", PlannerKind::Shooting),
         ] {
-            let choices = Policy::choices(planner, &model);
+            let choices = Policy::choices(EstimatorKind::KnownModel, planner, &model);
             let names = ["normal", "latent", "fire", "explore"];
             assert_eq!(choices.len(), names.len());
             for (choice, name) in choices.iter().zip(names) {

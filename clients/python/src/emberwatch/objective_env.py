@@ -68,6 +68,8 @@ class WildfireObjectiveEnv(WorldEnv):
 
     As `WildfireEnv` without `observation`, and
 
+    * `estimator`: `"known_model"` (the paper's Bayes filter, the default) or `"spatial_filter"`
+      (what is seen also changes the belief about neighbouring cells).
     * `planner`: `"beam"` (beam search, the default) or `"shooting"` (the paper's).
     * `prior`: `"simulated"` (the default; takes a second to start), `"initial"` or `"uniform"`.
     * `agent`: `"own"` starts an agent on the world; `"running"` uses one that serves decisions
@@ -81,6 +83,7 @@ class WildfireObjectiveEnv(WorldEnv):
     def __init__(
         self,
         *,
+        estimator: Literal["known_model", "spatial_filter"] = "known_model",
         planner: Literal["beam", "shooting"] = "beam",
         prior: Literal["simulated", "initial", "uniform"] = "simulated",
         agent: Literal["own", "running"] = "own",
@@ -88,6 +91,7 @@ class WildfireObjectiveEnv(WorldEnv):
     ) -> None:
         """See the class. No server of its own runs before the first reset."""
         for name, value, choices in (
+            ("estimator", estimator, ("known_model", "spatial_filter")),
             ("planner", planner, ("beam", "shooting")),
             ("prior", prior, ("simulated", "initial", "uniform")),
             ("agent", agent, ("own", "running")),
@@ -101,7 +105,7 @@ class WildfireObjectiveEnv(WorldEnv):
         super().__init__(settings, reveals=settings.truth)
         if self.model is None:
             raise InvalidArgumentError("model: expected one, as the server does not reveal its own")
-        self._arguments = {"planner": planner, "prior": prior}
+        self._arguments = {"estimator": estimator, "planner": planner, "prior": prior}
         self._agent: Program | None = None
         self._owns_agent = agent == "own"
         self._decisions: Decisions | None = None

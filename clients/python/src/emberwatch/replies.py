@@ -120,6 +120,7 @@ class DecisionsInfo:
     states: tuple[str, ...]
     #: What can be decided, by position: each state, then "entropy".
     objectives: tuple[str, ...]
+    estimator: str
     planner: str
     #: Names of the numbers in a decision's summary.
     summary: tuple[str, ...]
