@@ -21,26 +21,21 @@ fn shape() -> Shape {
     Shape::new(64, 64).expect("valid shape")
 }
 
-/// What 40 random walks saw, so that the belief has bumps like those of a running filter.
 fn filter() -> BayesFilter {
-    let mut filter =
-        BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape())).expect("valid model");
-    for step in 0..40 {
-        filter.correct(&frame(step)).expect("possible frame");
-        filter.predict();
-    }
-    filter
+    BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape())).expect("valid model")
 }
 
-/// The same, with neighbours.
-fn spatial_filter() -> SpatialFilter {
-    let known = BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape()));
-    let mut filter = SpatialFilter::new(known.expect("valid model"), 2, Correlations::default());
+/// An estimator that knows what 40 random walks saw, so that its belief has bumps like those of a running one.
+fn settled<E: Estimator>(mut estimator: E) -> E {
     for step in 0..40 {
-        filter.correct(&frame(step), None).expect("possible frame");
-        filter.predict();
+        take_in(&mut estimator, &frame(step));
     }
-    filter
+    estimator
+}
+
+fn take_in(estimator: &mut dyn Estimator, frame: &Frame) {
+    estimator.correct(frame, None).expect("possible frame");
+    estimator.predict();
 }
 
 /// Observations of one of three values along a random walk from the centre.
@@ -59,7 +54,7 @@ fn frame(step: u64) -> Frame {
 }
 
 fn planners(c: &mut Criterion) {
-    let values: CellValues = Objective::new(Target::State(2)).values(filter().belief());
+    let values: CellValues = Objective::new(Target::State(2)).values(settled(filter()).belief());
     let mut bench = |name: &str, planner: &mut dyn Planner| {
         let mut step = 0;
         c.bench_function(name, |b| {
@@ -90,25 +85,20 @@ fn planners(c: &mut Criterion) {
 }
 
 fn estimators(c: &mut Criterion) {
-    let mut filter = filter();
-    let frame = frame(41);
-    c.bench_function("filter: correct + predict (authors: 120 us)", |b| {
-        b.iter(|| {
-            filter.correct(black_box(&frame)).expect("possible frame");
-            filter.predict();
+    let mut filter = settled(filter());
+    let spatial = SpatialFilter::new(self::filter(), 2, Correlations::default());
+    let mut spatial = settled(spatial);
+    let estimators: [(&str, &mut dyn Estimator); 2] = [
+        ("filter: correct + predict (authors: 120 us)", &mut filter),
+        ("spatial filter: correct + predict", &mut spatial),
+    ];
+    let frames: Vec<Frame> = (40..104).map(frame).collect();
+    for (name, estimator) in estimators {
+        let mut frames = frames.iter().cycle();
+        c.bench_function(name, |b| {
+            b.iter(|| take_in(estimator, black_box(frames.next().expect("a circle"))));
         });
-    });
-    let mut spatial = spatial_filter();
-    let frames: Vec<Frame> = (40..104).map(self::frame).collect();
-    let mut frames = frames.iter().cycle();
-    c.bench_function("spatial filter: correct + predict", |b| {
-        b.iter(|| {
-            let frame = frames.next().expect("a circle");
-            let corrected = spatial.correct(black_box(frame), None);
-            corrected.expect("possible frame");
-            spatial.predict();
-        });
-    });
+    }
     c.bench_function("entropy", |b| {
         b.iter(|| filter.belief().entropy(EntropyKind::Sum))
     });

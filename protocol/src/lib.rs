@@ -14,7 +14,7 @@ pub use model::frame::{self, Coverage, Frame, UNOBSERVED};
 pub use model::grid::{self, Cell, Grid, Probabilities, Shape};
 pub use model::path::{self, Move};
 pub use model::transition::{self, Transition};
-pub use model::{Model, randomness};
+pub use model::{Model, randomness, vectors};
 pub use wire::connection::{self, Connection};
 pub use wire::{
     agent_belief, channels, cleanup, control, decisions, failed_connections, message, observer,

@@ -3,6 +3,7 @@
 use crate::estimation::belief::Belief;
 use crate::estimation::correlations::{AGE_RANGES, Ages, Correlations, RADIUS, SIDE, class};
 use crate::estimation::innovation::Innovation;
+use protocol::vectors::vectorised;
 use protocol::{Cell, Shape};
 
 /// Nothing that neighbours say is certain: after that, the paying state of a cell has at least this probability, and at
@@ -153,6 +154,17 @@ impl Spread {
 
     /// Corrects a seen cell and those around it, and the covariances of those that are still to come.
     pub fn spread(&mut self, index: usize, innovation: &Innovation, posterior: Vec<f64>) {
+        let own = posterior[self.state] as f32;
+        vectorised(
+            #[inline(always)]
+            || self.correct(index, innovation, own),
+        );
+        self.seen[index].posterior = posterior;
+    }
+
+    /// [`Self::spread`], given the probability of the paying state after it.
+    #[inline(always)] // As is its part, to be compiled for the vectors of this processor.
+    fn correct(&mut self, index: usize, innovation: &Innovation, posterior: f32) {
         let cell = self.seen[index].cell;
         let (corner, place) = (self.corner(cell), self.place(cell));
         let (done, to_come) = self.patches.split_at_mut(index + 1);
@@ -177,7 +189,7 @@ impl Spread {
             }
         }
         patch[CENTRE] = own_variance;
-        self.probability[place] = posterior[self.state] as f32;
+        self.probability[place] = posterior;
         let share = -innovation.reduction / innovation.variance.powi(2);
         for (seen, other) in self.seen[index + 1..].iter().zip(to_come) {
             let down = seen.cell.row as isize - cell.row as isize;
@@ -186,7 +198,6 @@ impl Spread {
                 reduce(other, patch, share, (down, across));
             }
         }
-        self.seen[index].posterior = posterior;
     }
 
     /// Ends a correction: writes it into the belief and the ages that it began with.
@@ -203,15 +214,16 @@ impl Spread {
             ages.see(index);
         }
         let width = self.shape.width();
-        for row in 0..self.shape.height() {
-            let start = self.place(Cell { row, col: 0 });
-            for (col, &now) in self.probability[start..start + width].iter().enumerate() {
-                let index = row * width + col;
-                if now != numbers[self.state * n_cells + index] {
-                    set_state(&mut numbers[index..], n_cells, self.state, now);
+        vectorised(
+            #[inline(always)]
+            || {
+                for row in 0..self.shape.height() {
+                    let start = self.place(Cell { row, col: 0 });
+                    let now = &self.probability[start..start + width];
+                    set_state(&mut numbers[row * width..], n_cells, self.state, now);
                 }
-            }
-        }
+            },
+        );
     }
 
     fn place(&self, cell: Cell) -> usize {
@@ -224,20 +236,36 @@ impl Spread {
     }
 }
 
-/// Gives one state of a cell a probability; the others keep their proportions. Where they have none, nothing changes.
-fn set_state(cell: &mut [f32], n_cells: usize, state: usize, probability: f32) {
-    let states = cell.iter().step_by(n_cells).enumerate();
-    let others = states.filter(|(other, _)| *other != state);
-    let rest: f64 = others.map(|(_, &p)| f64::from(p)).sum();
-    if rest > 0.0 {
-        let scale = (1.0 - f64::from(probability)) / rest;
-        let states = cell.iter_mut().step_by(n_cells);
-        states.for_each(|p| *p = (f64::from(*p) * scale) as f32);
-        cell[state * n_cells] = probability;
+/// Gives one state of some cells, the first of each state's `n_cells`, the probabilities `now`; the others keep their
+/// proportions. Where they have none, nothing changes.
+#[inline(always)]
+fn set_state(numbers: &mut [f32], n_cells: usize, state: usize, now: &[f32]) {
+    let own = state * n_cells;
+    if numbers[own..].starts_with(now) {
+        return;
+    }
+    let n_states = numbers.len().div_ceil(n_cells);
+    let others = (0..n_states).filter(|&other| other != state);
+    let mut scales = vec![0.0_f64; now.len()];
+    for other in others.clone() {
+        let cells = scales.iter_mut().zip(&numbers[other * n_cells..]);
+        cells.for_each(|(rest, &p)| *rest += f64::from(p));
+    }
+    let cells = scales.iter_mut().zip(&mut numbers[own..]).zip(now);
+    cells.for_each(|((scale, own), &now)| {
+        let (rest, is_new) = (*scale, now != *own);
+        *own = if rest > 0.0 { now } else { *own };
+        let kept = (1.0 - f64::from(now)) / rest;
+        *scale = if rest > 0.0 && is_new { kept } else { 1.0 };
+    });
+    for other in others {
+        let cells = numbers[other * n_cells..].iter_mut().zip(&scales);
+        cells.for_each(|(p, scale)| *p = (f64::from(*p) * scale) as f32);
     }
 }
 
 /// Takes off a patch what was learned of its cells from another one, which lies `down` and `across` before it.
+#[inline(always)]
 fn reduce(patch: &mut Patch, seen: &Patch, share: f64, (down, across): (isize, isize)) {
     let offset = down * WIDTH as isize + across;
     let covariance = seen[CENTRE.wrapping_add_signed(offset)];

@@ -38,6 +38,7 @@ use super::lanes::{FastTap, LANES, blend, fast_taps, fill, high_bits, list_lanes
 use super::mixture::{Draw, Mixture, REJECTED, invert, uniform};
 use super::parameters::Model;
 use super::randomness::{Purpose, split_mix, stream};
+use super::vectors::vectorised;
 use rand::Rng;
 use std::sync::Arc;
 
@@ -128,26 +129,13 @@ impl Dynamics {
         assert_eq!(states.dim(), self.shape.dim(), "states: expected [H, W]");
         let cells = states.as_slice_mut().expect("states: expected row-major");
         let keys = keys(seed, n);
-        #[cfg(target_arch = "x86_64")]
-        if is_x86_feature_detected!("avx2") {
-            #[expect(unsafe_code, reason = "sound on a CPU with AVX2, which this one has")]
-            unsafe {
-                self.advance_with_avx2(keys, cells);
-            }
-            return;
-        }
-        self.advance(keys, cells);
+        vectorised(
+            #[inline(always)]
+            || self.advance(keys, cells),
+        );
     }
 
-    /// [`Self::advance`] compiled for wider vectors: the same integers in 3.2 instead of 4.3 us
-    /// on a 64 x 64 grid.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2")]
-    fn advance_with_avx2(&mut self, keys: [u64; 2], cells: &mut [u8]) {
-        self.advance(keys, cells);
-    }
-
-    #[inline(always)] // As are its parts, to be compiled for the caller's vectors.
+    #[inline(always)] // As are its parts, to be compiled for the vectors of this processor.
     fn advance(&mut self, [byte_key, draw_key]: [u64; 2], cells: &mut [u8]) {
         self.load(cells);
         let mut n_words = 0;

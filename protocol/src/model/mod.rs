@@ -14,6 +14,7 @@ mod parameters;
 pub mod path;
 pub mod randomness;
 pub mod transition;
+pub mod vectors;
 
 pub use file::{
     KernelEntry, MAX_KERNEL_SIDE, MAX_VALUES, ModelError, ModelFile, ObservationEntry, StateEntry,

@@ -15,10 +15,11 @@
 use super::file::ModelError;
 use super::grid::Shape;
 use super::parameters::Model;
+use super::vectors::vectorised;
 use ndarray::{Array3, Array4, NdFloat};
 
-/// Cells computed at once, four SSE registers of `f32`. Independent sums hide the latency of adds.
-const LANES: usize = 16;
+/// Cells computed at once, four AVX2 registers of `f32`. Independent sums hide the latency of adds.
+const LANES: usize = 32;
 
 /// `Phi` for one model on one grid, with its work space: give each thread its own clone.
 ///
@@ -113,12 +114,17 @@ impl<T: NdFloat> Transition<T> {
         assert_eq!(out.dim(), dim, "predictor: expected [S, H, W]");
         self.load(belief.as_slice().expect("belief: expected row-major"));
         let out = out.as_slice_mut().expect("predictor: expected row-major");
-        for row in 0..self.shape.height() {
-            for col in (0..self.shape.width()).step_by(LANES) {
-                self.weigh(row * self.layout.stride + col);
-                self.store(row, col, out);
-            }
-        }
+        vectorised(
+            #[inline(always)]
+            || {
+                for row in 0..self.shape.height() {
+                    for col in (0..self.shape.width()).step_by(LANES) {
+                        self.weigh(row * self.layout.stride + col);
+                        self.store(row, col, out);
+                    }
+                }
+            },
+        );
     }
 
     /// Copies the belief inside the margins.
@@ -134,6 +140,7 @@ impl<T: NdFloat> Transition<T> {
     }
 
     /// Eq. 2 for the [`LANES`] cells from place `at` on.
+    #[inline(always)] // As are its parts, to be compiled for the vectors of this processor.
     fn weigh(&mut self, at: usize) {
         for (sum, offsets) in self.sums.iter_mut().zip(&self.groups) {
             *sum = add_up(&self.planes[at..], offsets);
@@ -144,6 +151,7 @@ impl<T: NdFloat> Transition<T> {
     }
 
     /// Eq. 3 for the cells from `(row, col)` on, as far as the grid goes.
+    #[inline(always)]
     fn store(&self, row: usize, col: usize, out: &mut [T]) {
         let mut total = [T::zero(); LANES];
         for weight in &self.weights {
@@ -184,6 +192,7 @@ impl Layout {
 }
 
 impl<T: NdFloat> Row<T> {
+    #[inline(always)]
     fn weigh(&self, sums: &[[T; LANES]]) -> [T; LANES] {
         let mut weight = [self.bias; LANES];
         for &(group, factor) in &self.terms {
@@ -196,6 +205,7 @@ impl<T: NdFloat> Row<T> {
 }
 
 /// The sum of the [`LANES`] values at each of the offsets.
+#[inline(always)]
 fn add_up<T: NdFloat>(planes: &[T], offsets: &[usize]) -> [T; LANES] {
     let mut sum = [T::zero(); LANES];
     for &offset in offsets {

@@ -39,12 +39,19 @@ pub fn remove_leftovers() -> Result<usize, ChannelError> {
 /// Removes what dead processes left, and waits for what processes without turns are making: iceoryx2 waits without
 /// end for an unfinished segment.
 pub(crate) fn make_way() -> Result<(), ChannelError> {
-    let start = Instant::now();
-    loop {
+    await_finished(&ChannelFiles::of_user(), || {
         if let Err(error) = remove_leftovers() {
             tracing::debug!("not removed what dead processes left: {error}");
         }
-        let unfinished = ChannelFiles::of_user().unfinished_segment();
+    })
+}
+
+/// Waits until no segment is unfinished; `remove` those of dead processes.
+fn await_finished(files: &ChannelFiles, remove: impl Fn()) -> Result<(), ChannelError> {
+    let start = Instant::now();
+    loop {
+        remove();
+        let unfinished = files.unfinished_segment();
         let wrong = |error: Error| directory_error(SHARED_MEMORY.as_ref(), error.to_string());
         let Some(segment) = unfinished.map_err(wrong)? else {
             return Ok(());
@@ -178,14 +185,38 @@ mod tests {
         all
     }
 
+    fn files_of_test(name: &str) -> ChannelFiles {
+        let name = format!("emberwatch-{name}-{}", std::process::id());
+        ChannelFiles {
+            root: std::env::temp_dir().join(&name),
+            shared: SHARED_MEMORY.into(),
+            prefix: format!("{name}_"),
+        }
+    }
+
+    #[test]
+    fn an_unfinished_segment_is_waited_for_but_not_without_end() {
+        let files = files_of_test("unfinished");
+        let young = id(std::process::id(), Duration::ZERO);
+        let segment = files
+            .shared
+            .join(format!("{}{young}.dynamic", files.prefix));
+        make(segment.clone(), 0o200);
+        let refused = await_finished(&files, || ()).expect_err("nobody finishes it");
+        let (words, name) = (refused.to_string(), segment.display().to_string());
+        assert!(words.contains(&name), "{words}");
+        let finish = || {
+            std::fs::write(&segment, "finished").expect("write");
+            set_permissions(&segment, Permissions::from_mode(0o600)).expect("chmod");
+        };
+        await_finished(&files, finish).expect("it is finished");
+        std::fs::remove_file(&segment).expect("clean up");
+    }
+
     #[test]
     fn what_no_living_process_uses_is_removed_and_nothing_else() {
         let me = std::process::id();
-        let files = ChannelFiles {
-            root: std::env::temp_dir().join(format!("emberwatch-leftovers-{me}")),
-            shared: SHARED_MEMORY.into(),
-            prefix: format!("emberwatch-leftovers-{me}_"),
-        };
+        let files = files_of_test("leftovers");
         let (root, prefix) = (&files.root, &files.prefix);
         create_dir(root).expect("a new folder");
         let mut config = node_config().expect("the usual configuration");

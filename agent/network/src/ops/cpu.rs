@@ -1,6 +1,7 @@
 //! What the operators share: tensors as slices, frames in parallel, sums.
 
 use candle_core::{CpuStorage, Device, Layout, Result, Shape, Storage, Tensor};
+use protocol::vectors::vectorised;
 use rayon::prelude::*;
 use std::mem::take;
 use std::ops::{AddAssign, Deref, Range};
@@ -67,11 +68,10 @@ pub(super) fn frames<A: Send>(
     }
     let run = |(frames, mut part): (Range<usize>, &mut [f32])| {
         let mut sums = new();
-        // Compiles the loop, and what is always inlined into it, for AVX2 and AVX-512 as well.
-        pulp::Arch::new().dispatch(
+        vectorised(
             #[inline(always)]
             || {
-                for frame in frames {
+                for frame in frames.clone() {
                     let (own, rest) = take(&mut part).split_at_mut(start(frame + 1) - start(frame));
                     f(&mut sums, frame, own);
                     part = rest;

@@ -2,6 +2,7 @@
 
 use super::cpu::{add, add_scaled, dot, numbers, slice, tensor};
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor};
+use protocol::vectors::vectorised;
 
 /// Arguments: `W_ih x + b_ih` of all steps `[steps, 3 n]`, `W_hh [3 n, n]` and `b_hh [3 n]`, gates in torch's
 /// order (r, z, n). The result is `h` of all steps, `[steps, n]`.
@@ -117,7 +118,7 @@ impl CustomOp3 for GruSequence {
             w: slice(w, w_layout)?,
             b: slice(b, b_layout)?,
         };
-        let out = pulp::Arch::new().dispatch(
+        let out = vectorised(
             #[inline(always)]
             || self.forward(inputs, weights),
         );
@@ -140,8 +141,7 @@ impl CustomOp3 for GruSequence {
             w: &arguments[0],
             b: &arguments[1],
         };
-        let arch = pulp::Arch::new();
-        let [d_inputs, dw, db] = arch.dispatch(
+        let [d_inputs, dw, db] = vectorised(
             #[inline(always)]
             || self.backward(&x, weights, &out, &d_out),
         );

@@ -1,0 +1,23 @@
+//! Loops compiled for the vectors that a processor has.
+
+use pulp::{Arch, Simd, WithSimd};
+
+/// Does `work`, compiled for AVX-512, AVX2 and plain vectors. No operation is fused, so the results are the same.
+///
+/// Only what is inlined is compiled so: write `#[inline(always)]` before the closure and the functions that it calls.
+#[inline(always)]
+pub fn vectorised<R>(work: impl FnMut() -> R) -> R {
+    Arch::new().dispatch(Work(work))
+}
+
+struct Work<F>(F);
+
+// For what is called by reference: calls of a closure by value are not inlined in any case.
+impl<R, F: FnMut() -> R> WithSimd for Work<F> {
+    type Output = R;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(mut self, _: S) -> R {
+        (self.0)()
+    }
+}
