@@ -49,9 +49,11 @@ export function connect({ ask, show, superseded, up, failed }) {
     const picture = attempt(() => decode(buffer));
     const from = socket;
     requestAnimationFrame(() => {
+      // It has closed meanwhile: that is told, and no picture of it takes the place of that.
+      if (from.readyState !== WebSocket.OPEN) return;
       const isOvertaken = asked > 0;
       if (picture && !(isOvertaken && superseded(picture))) attempt(() => show(picture));
-      if (from.readyState === WebSocket.OPEN && asked === 0) send();
+      if (asked === 0) send();
     });
   }
 

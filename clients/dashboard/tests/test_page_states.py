@@ -42,6 +42,20 @@ def test_pause_scrub_and_live(watched, programs):
     look.wait_for_steps()
 
 
+def test_a_picture_drawn_late_does_not_hide_that_the_dashboard_is_gone(watched):
+    look = watched.look
+    look.allowed.append("WebSocket connection to .* failed")
+    look.page.evaluate("""() => {
+        window.held = [];
+        window.requestAnimationFrame = (draw) => held.push(draw);
+    }""")
+    look.eventually(lambda: look.page.evaluate("held.length > 0"), "a picture to draw")
+    watched.dashboard.kill()
+    look.eventually(lambda: "dashboard gone" in look.text("state"), "gone")
+    draw = "() => { held.splice(0).forEach(draw => draw()); return state.textContent; }"
+    assert "dashboard gone" in look.page.evaluate(draw)
+
+
 def settled_serial(look) -> int:
     """The serial looked at, once the page has it on the slider as well."""
     look.eventually(
