@@ -1,6 +1,7 @@
 //! What agents show of their beliefs, to readers of their channel.
 
 use crate::harness::{PATIENCE, Program, Server, eventually};
+use crate::learner::start_at;
 use protocol::agent_belief::AgentBelief;
 use protocol::message::AgentHeader;
 use protocol::observer::Observer;
@@ -153,5 +154,31 @@ fn a_training_shows_what_it_believes_of_all_its_worlds() {
         assert_eq!(intent.belief_from, "learned_filter");
         assert_eq!(intent.states, ["state 0", "state 1", "state 2"]);
         assert_eq!(intent.objective, "random moves");
+    }
+}
+
+#[test]
+fn an_agent_shows_what_it_believes_of_the_worlds_that_are_decided_for() {
+    let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 500 --worlds 3");
+    let observer = Observer::agents(&server.instance).expect("observe");
+    let (agent, learner) = start_at(&server.instance, 1, "--worlds 2");
+    for (objectives, expected) in [
+        ([Some(2), Some(3)], vec![(1, "fire"), (2, "entropy")]),
+        ([None, Some(0)], vec![(2, "normal")]),
+    ] {
+        let mut shown = BTreeSet::new();
+        let are_shown = eventually(PATIENCE, || {
+            learner.decide_all(&objectives);
+            while let Some(AgentBelief { header, intent, .. }) = next(&observer, Duration::ZERO) {
+                assert_eq!(
+                    (header.pid, &*intent.belief_from),
+                    (agent.pid(), "known_model")
+                );
+                shown.insert((header.world, intent.objective));
+            }
+            let is_shown = |&(world, aim): &(u32, &str)| shown.contains(&(world, aim.to_owned()));
+            expected.iter().all(is_shown)
+        });
+        assert!(are_shown, "{shown:?}");
     }
 }

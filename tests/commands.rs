@@ -76,6 +76,7 @@ run --shooting-samples 0 => shooting_samples: expected 1 to 1000000, got 0
 serve-decisions --instance nobody --wait 0 => no server on instance "nobody"
 serve-decisions --instance a/b => instance name | "a/b"
 serve-decisions --world x => --world | 'x'
+serve-decisions --worlds 0 => --worlds | 1..=1024
 serve-decisions --planner random_walk => --planner | beam, shooting
 serve-decisions --planner => --planner | beam, shooting
 serve-decisions --estimator truth => --estimator | known_model, spatial_filter

@@ -1,7 +1,9 @@
 //! How agents that serve decisions begin, keep their world and end; and learners that are killed.
 
 use crate::harness::{PATIENCE, Program, SMALL, Server, eventually, new_instance, takeover};
-use crate::learner::{Learner, refusal, reply_to, start_agent, start_with_learner};
+use crate::learner::{
+    Learner, decide, refusal, reply_to, start_agent, start_at, start_with_learner,
+};
 use crate::wire::control_header;
 use agent::acting::decider::{Assignment, Decider};
 use agent::acting::run::prepare;
@@ -65,13 +67,13 @@ fn an_agent_renews_its_lease_when_a_third_of_it_has_passed_without_use() {
 fn attach(server: &Server) -> Decider {
     let task = Assignment {
         instance: server.instance.clone(),
-        world: 0,
+        worlds: 0..1,
         takeover: false,
         estimator: EstimatorKind::KnownModel,
         planner: PlannerKind::Beam,
         config: AgentConfig::default(),
     };
-    let (info, model) = prepare(&task.instance, 0, None).expect("a server");
+    let (info, model) = prepare(&task.instance, &task.worlds, None).expect("a server");
     let shape = shape_of(&info).expect("a grid");
     let prior = task.config.prior(info.burn_in).belief(&model, shape, 0);
     Decider::attach(&task, model, prior.expect("a belief")).expect("attach")
@@ -133,7 +135,7 @@ fn an_agent_whose_server_is_killed_says_so_and_ends() {
         if decides {
             server.program.signal(Signal::STOP);
             let header = control_header(1);
-            let pending = learner.send(header, br#"{"op":"decide","objective":2}"#);
+            let pending = learner.send(header, br#"{"op":"decide","objectives":[2]}"#);
             server.kill();
             let (status, _, message) = refusal(reply_to(&pending, header));
             assert_eq!(status, Status::AgentEnds);
@@ -164,7 +166,7 @@ fn an_agent_whose_world_is_taken_says_so_and_ends_with_code_3() {
         let before = server.observe(0).0;
         let _thief = Client::acquire(&server.instance, &theft).expect("take over");
         if decides {
-            let (status, detail, _) = learner.refused(&Request::Decide { objective: 2 });
+            let (status, detail, _) = learner.refused(&decide(&[Some(2)]));
             assert_eq!(status, Status::LeaseLost);
             assert_eq!(detail, u64::from(std::process::id()));
         }
@@ -194,6 +196,33 @@ fn a_world_goes_from_agent_to_agent_in_the_middle_of_an_episode() {
     assert_eq!((last.step, last.reward), (result.step, result.reward));
     assert_eq!(last.objective, None);
     assert_eq!(learner.decide(3).step, result.step + 1);
+}
+
+#[test]
+fn each_world_goes_on_from_what_is_known_about_it() {
+    let flags = "--height 16 --width 16 --moves 12 --burn-in 3000 --seed 3 --worlds 4 --history 99";
+    let (server, other) = (Server::start(flags), Server::start(flags));
+    let (_undisturbed, expected) = start_at(&other.instance, 1, "--worlds 3");
+    let objectives = [Some(2), Some(3), Some(0)];
+    for known in ["", "the belief that was left", "the frames that were kept"] {
+        let (agent, learner) = start_at(&server.instance, 1, "--worlds 3");
+        assert_eq!(
+            learner.decide_all(&objectives),
+            expected.decide_all(&objectives)
+        );
+        let words = agent.stderr();
+        assert!(
+            known.is_empty() || words.matches(known).count() == 3,
+            "{words}"
+        );
+        if known.is_empty() {
+            assert_eq!(learner.ask(&Request::Shutdown {}), Reply::Done);
+            drop(learner);
+            assert_eq!(agent.wait(PATIENCE).code, Some(0));
+        } else {
+            agent.kill();
+        }
+    }
 }
 
 #[test]

@@ -1,9 +1,12 @@
 //! Agents that take decisions from a learner outside: same worlds, same plans, clear refusals.
 
 use crate::harness::{PATIENCE, SMALL, Server, frames_until, new_instance, run};
-use crate::learner::{Learner, decision, refusal, start_agent, start_with_learner};
+use crate::learner::{
+    Learner, decide, decisions, refusal, reset, start_agent, start_at, start_with_learner,
+};
 use crate::wire::control_header;
 use protocol::channels::ChannelError;
+use protocol::control::WorldSeed;
 use protocol::decisions::{Decision, Reply, Request};
 use protocol::message::{ControlRequest, Status};
 use protocol::observer::Observer;
@@ -38,7 +41,8 @@ fn hello_tells_what_can_be_decided() {
     let (agent, learner) = start_with_learner(&server.instance, "");
     let info = learner.hello();
     assert_eq!((info.height, info.width, info.n_moves), (5, 7, 6));
-    assert_eq!((info.protocol, info.world, info.max_steps), (1, 0, 9));
+    assert_eq!((info.protocol, info.max_steps), (1, 9));
+    assert_eq!((info.first_world, info.n_worlds), (0, 1));
     assert_eq!(
         (info.pid, &*info.instance),
         (agent.pid(), server.instance.name())
@@ -129,8 +133,114 @@ fn the_same_seed_and_objectives_give_the_same_decisions() {
     }
     let (_agent, learner) = start_with_learner(&server.instance, "--agent-seed 1");
     learner.reset(1);
-    let unseeded = decision(learner.ask(&Request::Reset { seed: None }));
-    assert_ne!(unseeded.seed, 1);
+    let (world, seed) = (0, None);
+    let worlds = vec![WorldSeed { world, seed }];
+    let unseeded = decisions(learner.ask(&Request::Reset { worlds }));
+    assert_ne!(unseeded[0].seed, 1);
+}
+
+#[test]
+fn many_worlds_are_decided_for_as_each_alone() {
+    let server = || Server::start(&format!("{BURNING} --worlds 4"));
+    let (together, alone) = (server(), server());
+    let (agent, learner) = start_at(&together.instance, 1, "--worlds 3");
+    let info = learner.hello();
+    assert_eq!((info.first_world, info.n_worlds), (1, 3));
+    let holders = together.status().worlds.into_iter();
+    let holders: Vec<_> = holders.map(|world| world.holder_pid).collect();
+    let held = Some(agent.pid());
+    assert_eq!(holders, [None, held, held, held]);
+    let mut rows = vec![
+        learner.last_of_all(),
+        learner.reset_some(&[(3, 7), (1, 9)]),
+        learner.decide_all(&[Some(2), Some(3), Some(0)]),
+        learner.decide_all(&[Some(2), None, Some(3)]),
+        learner.decide_all(&[None; 3]),
+        learner.reset_some(&[(2, 5)]),
+    ];
+    rows.extend((0..5).map(|_| learner.decide_all(&[None, Some(2), Some(1)])));
+    rows.push(learner.decide_all(&[Some(2); 3]));
+    for (index, world) in (1..4).enumerate() {
+        let (_agent, learner) = start_at(&alone.instance, world, "");
+        let mut before = None;
+        for row in &rows {
+            let wanted = &row[index];
+            let moves = before != Some(wanted);
+            let made = match wanted.objective.filter(|_| moves) {
+                Some(objective) => learner.decide(objective),
+                None if moves && before.is_some() => {
+                    learner.reset_some(&[(world, wanted.seed)]).remove(0)
+                }
+                None => learner.last(),
+            };
+            assert_eq!(made, *wanted, "world {world}");
+            before = Some(wanted);
+        }
+        let steps = [3, 6, 8][index];
+        assert_eq!(rows.last().map(|row| row[index].step), Some(steps));
+    }
+}
+
+#[test]
+fn what_some_worlds_cannot_do_is_refused_for_all() {
+    use Status::{BadObjective, EpisodeOver, Malformed, NoSuchWorld};
+    let server = Server::start(&format!("{SMALL} --worlds 4 --max-steps 2"));
+    let (_agent, learner) = start_at(&server.instance, 1, "--worlds 3");
+    (0..2).for_each(|_| _ = learner.decide_all(&[None, None, Some(2)]));
+    let before = learner.last_of_all();
+    let malformed = "malformed control message: ";
+    let count = format!("{malformed}objectives: expected 3, one a world, got");
+    let objective = "objective: expected 0 to 3, got";
+    let no_world = "no such world: the agent has worlds 1 to 3, got";
+    let twice = format!("{malformed}reset: expected each world once, got world 2 twice");
+    let over = "world 3 was truncated: reset it first";
+    for (request, status, detail, words) in [
+        (decide(&[]), Malformed, 0, format!("{count} 0")),
+        (decide(&[Some(2); 4]), Malformed, 0, format!("{count} 4")),
+        (
+            decide(&[Some(2), Some(4), None]),
+            BadObjective,
+            4,
+            format!("{objective} 4 for world 2"),
+        ),
+        (
+            decide(&[Some(2), None, Some(u64::MAX)]),
+            BadObjective,
+            4,
+            format!("{objective} {} for world 3", u64::MAX),
+        ),
+        (decide(&[Some(2); 3]), EpisodeOver, 3, over.into()),
+        (
+            decide(&[Some(2), None, Some(2)]),
+            EpisodeOver,
+            3,
+            over.into(),
+        ),
+        (
+            reset(&[(1, 5), (0, 5)]),
+            NoSuchWorld,
+            3,
+            format!("{no_world} 0"),
+        ),
+        (
+            reset(&[(1, 5), (4, 5)]),
+            NoSuchWorld,
+            3,
+            format!("{no_world} 4"),
+        ),
+        (reset(&[(1, 5), (2, 5), (2, 6)]), Malformed, 0, twice),
+    ] {
+        assert_eq!(learner.refused(&request), (status, detail, words));
+        assert_eq!(learner.last_of_all(), before, "{request:?}");
+    }
+    let steps = [1, 2, 3].map(|world| server.observe(world).0.step);
+    assert_eq!(steps, [0, 0, 2]);
+    assert_eq!(learner.reset_some(&[]), before);
+    let after = learner.decide_all(&[Some(2), Some(2), None]);
+    assert_eq!(
+        after.iter().map(|made| made.step).collect::<Vec<_>>(),
+        [1, 1, 2]
+    );
 }
 
 #[test]
@@ -139,13 +249,6 @@ fn what_is_no_decision_is_refused_and_changes_nothing() {
     let (_agent, learner) = start_with_learner(&server.instance, "");
     learner.reset(3);
     let before = learner.decide(2);
-    let (status, detail, message) = learner.refused(&Request::Decide { objective: 4 });
-    assert_eq!((status, detail), (Status::BadObjective, 4));
-    assert_eq!(message, "objective: expected 0 to 3, got 4");
-    let most = Request::Decide {
-        objective: u64::MAX,
-    };
-    assert_eq!(learner.refused(&most).0, Status::BadObjective);
     for text in [
         "",
         "{}",
@@ -153,15 +256,20 @@ fn what_is_no_decision_is_refused_and_changes_nothing() {
         "null",
         r#"{"op":"dance"}"#,
         r#"{"op":"decide"}"#,
-        r#"{"op":"decide","objective":-1}"#,
-        r#"{"op":"decide","objective":1.5}"#,
-        r#"{"op":"decide","objective":"fire"}"#,
-        r#"{"op":"decide","objective":2,"objective":2}"#,
-        r#"{"op":"decide","objective":2,"more":1}"#,
+        r#"{"op":"decide","objectives":2}"#,
+        r#"{"op":"decide","objectives":[-1]}"#,
+        r#"{"op":"decide","objectives":[1.5]}"#,
+        r#"{"op":"decide","objectives":["fire"]}"#,
+        r#"{"op":"decide","objectives":[[2]]}"#,
+        r#"{"op":"decide","objectives":[2],"objectives":[2]}"#,
+        r#"{"op":"decide","objectives":[2],"more":1}"#,
         r#"{"op":"last","more":1}"#,
         r#"{"op":"shutdown","now":true}"#,
-        r#"{"op":"reset","seed":-1}"#,
-        r#"{"op":"reset","seed":18446744073709551616}"#,
+        r#"{"op":"reset"}"#,
+        r#"{"op":"reset","worlds":[0]}"#,
+        r#"{"op":"reset","worlds":[{"world":0,"seed":-1}]}"#,
+        r#"{"op":"reset","worlds":[{"world":0,"seed":18446744073709551616}]}"#,
+        r#"{"op":"reset","worlds":[{"world":0},{"world":0}]}"#,
         r#"{"op":"hello","protocol":1}"#,
         r#"{"op":"hello","protocol":"1","client":"x"}"#,
     ] {
@@ -231,7 +339,7 @@ fn after_a_timeout_last_tells_whether_the_decision_was_made() {
     let (_agent, learner) = start_with_learner(&server.instance, "");
     let before = learner.reset(3);
     server.program.signal(Signal::STOP);
-    drop(learner.send(control_header(1), br#"{"op":"decide","objective":2}"#));
+    drop(learner.send(control_header(1), br#"{"op":"decide","objectives":[2]}"#));
     server.program.signal(Signal::CONT);
     let last = learner.last();
     // Given up before or after the agent took it.
@@ -252,7 +360,7 @@ fn a_truncated_episode_is_over_until_the_next_reset() {
     assert!(!learner.decide(2).truncated);
     let last = learner.decide(2);
     assert!(last.truncated && !last.terminated);
-    let (status, detail, message) = learner.refused(&Request::Decide { objective: 2 });
+    let (status, detail, message) = learner.refused(&decide(&[Some(2)]));
     assert_eq!((status, detail), (Status::EpisodeOver, 0), "{message}");
     assert_eq!(learner.last(), last);
     assert_eq!(learner.reset(3).step, 0);
@@ -268,7 +376,13 @@ fn a_model_that_is_not_the_servers_is_refused() {
         assert!(ended.stderr.contains(words), "{}", ended.stderr);
     };
     check("", "does not reveal its model: expected --model FILE");
-    check("--world 1", "no such world: the server has worlds 0 to 0");
+    for worlds in [
+        "--world 1",
+        "--worlds 2",
+        "--world 4294967295 --worlds 1024",
+    ] {
+        check(worlds, "no such world: the server has worlds 0 to 0");
+    }
     let folder = tempfile::TempDir::new().expect("a folder");
     let path = folder.path().join("blind.toml");
     std::fs::write(&path, model_of_two_observations()).expect("write a model");

@@ -100,7 +100,7 @@ fn an_agent_that_finds_a_damaged_belief_begins_with_its_own() {
     let filter = BayesFilter::known(&model, Belief::from_initial(&model, shape));
     let kind = filter.expect("a filter").kind().expect("its kind");
     client
-        .leave_belief(&at, &kind, b"not whole")
+        .leave_belief(0, &at, &kind, b"not whole")
         .expect("leave");
     client.release().expect("release");
     let ended = run(&server, &[&policy[..], &["--steps", "10"]].concat()).wait(PATIENCE);
@@ -182,12 +182,15 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_world_alone() 
     let server = Server::start("--height 5 --width 7 --moves 6 --burn-in 20 --worlds 2");
     let mut client = server.acquire(0..1);
     fly(&mut client, Paths::new(0).next(6));
-    assert_eq!(client.belief("kind").expect("none yet"), None);
+    assert_eq!(client.belief(0, "kind").expect("none yet"), None);
     let bytes: Vec<u8> = (0..35 * 72 + 32_768).map(|n| n as u8).collect();
     let at = client.observe(0..1).expect("observe")[0].result;
-    client.leave_belief(&at, "kind", &bytes).expect("leave");
-    assert_eq!(client.belief("kind").expect("belief"), Some(bytes.clone()));
-    assert_eq!(client.belief("another kind").expect("belief"), None);
+    client.leave_belief(0, &at, "kind", &bytes).expect("leave");
+    assert_eq!(
+        client.belief(0, "kind").expect("belief"),
+        Some(bytes.clone())
+    );
+    assert_eq!(client.belief(0, "another kind").expect("belief"), None);
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(1, 1).lease;
     let part = |lease, world, step, offset, length, data: &str| {
@@ -233,7 +236,7 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_world_alone() 
     assert_eq!(wire.ask(&leave(lease, 1, 1, 2, "AQ==")), Reply::Done);
     assert!(matches!(wire.ask(&ask), Reply::Belief { data, .. } if data == "AAE="));
     fly(&mut client, Paths::new(1).next(6));
-    assert_eq!(client.belief("kind").expect("another step"), None);
+    assert_eq!(client.belief(0, "kind").expect("another step"), None);
 }
 
 #[test]

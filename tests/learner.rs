@@ -5,6 +5,7 @@ use crate::wire::{Pending, Requests, answer, client, control_header, send};
 use iceoryx2::node::Node;
 use iceoryx2::port::notifier::Notifier;
 use protocol::channels::{Channel, ChannelError, Instance, Ipc, Services, create_node, ipc_error};
+use protocol::control::WorldSeed;
 use protocol::decisions::{AgentInfo, Decision, Reply, Request};
 use protocol::message::{ControlReply, ControlRequest, Status};
 use std::time::Duration;
@@ -16,7 +17,7 @@ pub struct Learner {
     _node: Node<Ipc>,
 }
 
-/// Starts an agent that serves decisions of world 0; `flags` are separated by spaces.
+/// Starts an agent that serves decisions, of world 0 unless told otherwise; `flags` are separated by spaces.
 pub fn start_agent(instance: &Instance, flags: &str) -> Program {
     let name = ["serve-decisions", "--instance", instance.name()];
     let flags: Vec<&str> = name.into_iter().chain(flags.split_whitespace()).collect();
@@ -25,18 +26,23 @@ pub fn start_agent(instance: &Instance, flags: &str) -> Program {
 
 /// Starts an agent and waits until it answers.
 pub fn start_with_learner(instance: &Instance, flags: &str) -> (Program, Learner) {
-    let agent = start_agent(instance, flags);
-    let learner = Learner::connect(instance, &agent);
+    start_at(instance, 0, flags)
+}
+
+/// The same for an agent whose first world is another.
+pub fn start_at(instance: &Instance, world: u32, flags: &str) -> (Program, Learner) {
+    let agent = start_agent(instance, &format!("--world {world} {flags}"));
+    let learner = Learner::connect(instance, world, &agent);
     (agent, learner)
 }
 
 impl Learner {
     /// Waits for an agent and shakes hands.
-    pub fn connect(instance: &Instance, agent: &Program) -> Self {
+    fn connect(instance: &Instance, world: u32, agent: &Program) -> Self {
         let mut learner = None;
         let answers = eventually(PATIENCE, || {
             // One that was killed may have left its port.
-            learner = Self::try_open(instance).ok();
+            learner = Self::try_open_at(instance, world).ok();
             learner.as_ref().and_then(Self::pid) == Some(agent.pid())
         });
         assert!(answers, "{}", agent.stderr());
@@ -49,20 +55,24 @@ impl Learner {
         let pending = self.send(control_header(7), &text);
         let (_, reply) = answer(&pending, Duration::from_secs(1))?;
         match serde_json::from_slice(&reply).expect("a reply") {
-            Reply::Decisions(info) => Some(info.pid),
+            Reply::Hello(info) => Some(info.pid),
             _ => None,
         }
     }
 
     /// Opens the channel of world 0, without a handshake.
     pub fn try_open(instance: &Instance) -> Result<Self, ChannelError> {
+        Self::try_open_at(instance, 0)
+    }
+
+    fn try_open_at(instance: &Instance, world: u32) -> Result<Self, ChannelError> {
         let node = create_node()?;
         let services = Services {
             node: &node,
             instance,
         };
-        let port = client(&services.open_decisions(0)?)?;
-        let wake = services.wake(Channel::WakeAgent(0))?;
+        let port = client(&services.open_decisions(world)?)?;
+        let wake = services.wake(Channel::WakeAgent(world))?;
         let agent = wake.notifier_builder().create();
         Ok(Self {
             port,
@@ -96,29 +106,62 @@ impl Learner {
     /// What the agent says of itself.
     pub fn hello(&self) -> AgentInfo {
         match self.ask(&hello()) {
-            Reply::Decisions(info) => *info,
+            Reply::Hello(info) => *info,
             other => panic!("expected a handshake, got {other:?}"),
         }
     }
 
-    /// Starts an episode.
+    /// Starts an episode in the one world.
     pub fn reset(&self, seed: u64) -> Decision {
-        decision(self.ask(&Request::Reset { seed: Some(seed) }))
+        one(self.reset_some(&[(0, seed)]))
     }
 
-    /// Decides for an objective.
+    /// Starts episodes in some worlds.
+    pub fn reset_some(&self, seeds: &[(u32, u64)]) -> Vec<Decision> {
+        decisions(self.ask(&reset(seeds)))
+    }
+
+    /// Decides for an objective in the one world.
     pub fn decide(&self, objective: u64) -> Decision {
-        decision(self.ask(&Request::Decide { objective }))
+        one(self.decide_all(&[Some(objective)]))
     }
 
-    /// The last decision again.
+    /// Decides for an objective in each world that has one.
+    pub fn decide_all(&self, objectives: &[Option<u64>]) -> Vec<Decision> {
+        decisions(self.ask(&decide(objectives)))
+    }
+
+    /// The last decision of the one world again.
     pub fn last(&self) -> Decision {
-        decision(self.ask(&Request::Last {}))
+        one(self.last_of_all())
+    }
+
+    /// The last decision of each world again.
+    pub fn last_of_all(&self) -> Vec<Decision> {
+        decisions(self.ask(&Request::Last {}))
     }
 
     /// Decides, and expects to be refused: status, detail and message.
     pub fn refused(&self, request: &Request) -> (Status, u64, String) {
         refusal(self.ask(request))
+    }
+}
+
+/// A request to start episodes.
+pub fn reset(seeds: &[(u32, u64)]) -> Request {
+    let seeds = seeds.iter().map(|&(world, seed)| WorldSeed {
+        world,
+        seed: Some(seed),
+    });
+    Request::Reset {
+        worlds: seeds.collect(),
+    }
+}
+
+/// A request to decide.
+pub fn decide(objectives: &[Option<u64>]) -> Request {
+    Request::Decide {
+        objectives: objectives.to_vec(),
     }
 }
 
@@ -138,12 +181,17 @@ pub fn reply_to(pending: &Pending<ControlRequest, ControlReply>, header: Control
     reply
 }
 
-/// The decision of a reply.
-pub fn decision(reply: Reply) -> Decision {
+/// The decisions of a reply.
+pub fn decisions(reply: Reply) -> Vec<Decision> {
     match reply {
-        Reply::Decision(decision) => decision,
-        other => panic!("expected a decision, got {other:?}"),
+        Reply::Decisions { worlds } => worlds,
+        other => panic!("expected decisions, got {other:?}"),
     }
+}
+
+fn one(mut decisions: Vec<Decision>) -> Decision {
+    assert_eq!(decisions.len(), 1);
+    decisions.remove(0)
 }
 
 /// Status, detail and message of a refusal.

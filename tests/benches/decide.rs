@@ -9,6 +9,7 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::prelude::AllocationStrategy;
 use protocol::channels::{Channel, ChannelError, Instance, Ipc, Services, create_node};
+use protocol::control::WorldSeed;
 use protocol::decisions::{Reply, Request};
 use protocol::message::{ControlReply, ControlRequest, VERSION};
 use protocol::wait::{Waiter, descriptor, drain, sleep_until_readable};
@@ -101,9 +102,10 @@ impl Learner {
     /// Microseconds of one decision.
     fn decide(&self, objective: u64) -> f64 {
         let start = Instant::now();
-        let reply = self.ask(&Request::Decide { objective });
+        let objectives = vec![Some(objective)];
+        let reply = self.ask(&Request::Decide { objectives });
         let micros = start.elapsed().as_secs_f64() * 1e6;
-        assert!(matches!(reply, Reply::Decision(_)), "{reply:?}");
+        assert!(matches!(reply, Reply::Decisions { .. }), "{reply:?}");
         micros
     }
 }
@@ -122,7 +124,9 @@ fn main() {
     arguments.extend(more.iter().map(String::as_str));
     let _agent = Running::start("emberwatch-agent", &arguments);
     let learner = eventually(|| Learner::open(&instance).ok());
-    learner.ask(&Request::Reset { seed: Some(1) });
+    let (world, seed) = (0, Some(1));
+    let worlds = vec![WorldSeed { world, seed }];
+    learner.ask(&Request::Reset { worlds });
     (0..N_DECISIONS / 10).for_each(|_| _ = learner.decide(2));
     for (objective, what) in [(2, "a state"), (3, "entropy")] {
         let mut times: Vec<f64> = (0..N_DECISIONS)

@@ -1,156 +1,169 @@
-//! The agent's side of one decision: plan for the objective asked, step, correct, predict.
+//! The agent's side of decisions: plan for the objectives asked, step, correct, predict.
 //!
-//! What [`crate::acting::run`] does with an objective of its own, one step at a time.
+//! What [`crate::acting::run`] does with an objective of its own, one step at a time and in many worlds.
 
 use crate::acting::handover::{leave, resume};
 use crate::acting::registry::{self, Task};
-use crate::acting::run::show;
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
 use crate::estimation::summary::{summarise, summary_names};
 use crate::learning::learned::Learned;
-use crate::planning::Objective;
 use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
+use crate::planning::{Objective, Plan};
 use crate::rollout::agent::Agent;
-use crate::rollout::{self, Robot, Seen};
-use crate::server::client::{Client, Observation};
+use crate::rollout::{self, Robot, Seen, in_parallel};
+use crate::server::client::{Client, Observation, refused};
 use crate::server::feed::Feed;
 use anyhow::Result;
 use protocol::Model;
 use protocol::channels::Instance;
-use protocol::control::WorldSeed;
+use protocol::connection::ConnectionError;
+use protocol::control::{ServerInfo, WorldSeed};
 use protocol::decisions::{AgentInfo, Decision};
-use protocol::message::VERSION;
+use protocol::message::{Status, VERSION};
+use std::ops::Range;
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
 /// A lease is renewed when this part of its life has passed without use.
 const RENEW_AFTER: u32 = 3;
 
-/// Which world to decide for, and how.
+/// Which worlds to decide for, and how.
 #[derive(Debug, Clone)]
 pub struct Assignment {
     pub instance: Instance,
-    pub world: u32,
-    /// Take the world from its holder.
+    pub worlds: Range<u32>,
+    /// Take the worlds from their holders.
     pub takeover: bool,
-    /// What keeps the belief: the known model's filter, or the spatial one.
+    /// What keeps the beliefs: the known model's filter, or the spatial one.
     pub estimator: EstimatorKind,
     /// What plans: beam search or shooting.
     pub planner: PlannerKind,
     pub config: AgentConfig,
 }
 
-/// A world, the belief about it, and the objectives that a decision chooses among.
+/// Worlds, the beliefs about them, and the objectives that a decision chooses among.
 pub struct Decider {
     client: Client,
     model: Model,
     prior: Belief,
     config: AgentConfig,
     choices: Vec<Policy>,
-    robot: Robot,
-    last: Decision,
+    robots: Vec<Robot>,
+    last: Vec<Decision>,
     last_use: Instant,
     info: AgentInfo,
     feed: Feed,
 }
 
+/// A world that moves.
+struct Moving<'a> {
+    world: u32,
+    robot: &'a mut Robot,
+    last: &'a mut Decision,
+    /// What was asked, and what that is.
+    objective: (u64, Objective),
+}
+
 impl Decider {
-    /// Acquires the world where it stands and takes in its last frame.
+    /// Acquires the worlds where they stand and takes in their last frames.
     pub fn attach(task: &Assignment, model: Model, prior: Belief) -> Result<Self> {
-        let (mut client, observation) =
-            Client::acquire_one(&task.instance, task.world, task.takeover)?;
-        let last_use = Instant::now();
+        let (client, observations) =
+            Client::acquire_and_observe(&task.instance, task.worlds.clone(), task.takeover)?;
         let choices = Policy::choices(task.estimator, task.planner, &model);
-        let agent = agent(
-            &client,
-            &model,
-            &prior,
-            &task.config,
-            &choices,
-            &observation,
-        )?;
-        let mut robot = Robot::new(agent, observation);
-        if !resume(&mut client, &mut robot)? {
-            robot.begin(None, |_| ())?;
-        }
-        let feed = Feed::open(&task.instance, robot.agent.belief());
-        let info = agent_info(task, &model, &choices, &client);
-        let last = decision(&robot, &client, None);
-        Ok(Self {
+        let mut decider = Self {
+            last_use: Instant::now(),
+            info: agent_info(task, &model, &choices, client.info()),
+            feed: Feed::open(&task.instance, &prior),
             client,
             model,
             prior,
             config: task.config.clone(),
             choices,
-            robot,
-            last,
-            last_use,
-            info,
-            feed,
-        })
+            robots: Vec::new(),
+            last: Vec::new(),
+        };
+        for (world, observation) in task.worlds.clone().zip(observations) {
+            let mut robot = decider.robot(observation)?;
+            if !resume(&mut decider.client, world, &mut robot)? {
+                robot.begin(None, |_| ())?;
+            }
+            decider.last.push(decision(&robot, decider.n_moves(), None));
+            decider.robots.push(robot);
+        }
+        Ok(decider)
     }
 
     pub fn info(&self) -> &AgentInfo {
         &self.info
     }
 
-    /// Where the world and the belief stand.
-    pub fn last(&self) -> &Decision {
+    /// Where each world and the belief about it stand.
+    pub fn last(&self) -> &[Decision] {
         &self.last
     }
 
-    /// Starts a new episode with a new belief.
+    /// Starts new episodes with new beliefs in some worlds; the others stay as they are.
     ///
     /// # Errors
     /// After a refusal everything is as it was.
-    pub fn reset(&mut self, seed: Option<u64>) -> Result<&Decision> {
-        let world = self.client.worlds().start;
-        self.client.reset(&[WorldSeed { world, seed }])?;
+    pub fn reset(&mut self, seeds: &[WorldSeed]) -> Result<&[Decision]> {
+        let worlds = self.client.worlds();
+        if let Some(other) = seeds.iter().find(|seed| !worlds.contains(&seed.world)) {
+            return Err(no_such_world(&worlds, other.world).into());
+        }
+        self.client.reset(seeds)?;
         self.last_use = Instant::now();
-        let observation = self.client.observe(self.client.worlds())?.remove(0);
-        let agent = agent(
-            &self.client,
-            &self.model,
-            &self.prior,
-            &self.config,
-            &self.choices,
-            &observation,
-        )?;
-        self.robot = Robot::new(agent, observation);
-        let feed = &mut self.feed;
-        let look = |robot: &Robot| show(feed, world, robot, false);
-        self.robot.begin(None, look)?;
-        self.last = decision(&self.robot, &self.client, None);
+        let observations = self.client.observe(worlds.clone())?;
+        let shown = self.feed.turn(seeds.len());
+        for (turn, &WorldSeed { world, .. }) in seeds.iter().enumerate() {
+            let index = (world - worlds.start) as usize;
+            let mut robot = self.robot(observations[index].clone())?;
+            robot.begin(None, |robot| {
+                if shown.contains(&turn) {
+                    self.feed.show(&robot.view(world));
+                }
+            })?;
+            self.last[index] = decision(&robot, self.n_moves(), None);
+            self.robots[index] = robot;
+        }
         Ok(&self.last)
     }
 
-    /// One step of the rollout, for an objective; `None` if there is no such objective.
+    /// One step of the rollout in each world that has an objective; the others stay as they are.
     ///
     /// # Errors
     /// After a refusal everything is as it was.
-    pub fn decide(&mut self, objective: u64) -> Result<Option<&Decision>> {
-        let Some(target) = self.objective(objective) else {
-            return Ok(None);
-        };
-        let world = self.client.worlds().start;
+    pub fn decide(&mut self, objectives: &[Option<u64>]) -> Result<&[Decision]> {
+        let targets = self.targets(objectives)?;
+        if targets.iter().all(Option::is_none) {
+            return Ok(&self.last);
+        }
+        let n_moves = self.n_moves();
+        let worlds = self.client.worlds();
+        let mut runs = moving(worlds, &mut self.robots, &mut self.last, targets);
+        let worlds: Vec<u32> = runs.iter().map(|run| run.world).collect();
+        let shown = self.feed.turn(runs.len());
         rollout::step(
-            std::slice::from_mut(&mut self.robot),
-            |robot| robot,
-            |robot| robot.plan_with(|agent, cell, step| agent.plan_for(target, cell, step)),
+            &mut runs,
+            |run| &mut *run.robot,
+            Moving::plan,
             |paths| {
-                let observation = self.client.step(world..world + 1, paths)?.remove(0);
+                let observations = self.client.step_some(&worlds, paths)?;
                 self.last_use = Instant::now();
-                let truth = None;
-                anyhow::Ok(vec![Seen { observation, truth }])
+                Ok(observations.into_iter().map(unrevealed).collect())
             },
-            |_, robot, _| {
-                show(&mut self.feed, world, robot, false);
+            |turn, run, _| {
+                if shown.contains(&turn) {
+                    self.feed.show(&run.robot.view(run.world));
+                }
                 Ok(())
             },
         )?;
-        self.last = decision(&self.robot, &self.client, Some(objective));
-        Ok(Some(&self.last))
+        in_parallel(runs.into_iter(), |run| {
+            *run.last = decision(run.robot, n_moves, Some(run.objective.0));
+        });
+        Ok(&self.last)
     }
 
     /// How long until the lease wants to be renewed.
@@ -175,38 +188,101 @@ impl Decider {
     }
 
     pub fn release(mut self) -> Result<()> {
-        leave(&mut self.client, &self.robot)?;
+        for (world, robot) in self.client.worlds().zip(&self.robots) {
+            leave(&mut self.client, world, robot)?;
+        }
         Ok(self.client.release()?)
     }
 
-    fn objective(&self, index: u64) -> Option<Objective> {
-        let choice = self.choices.get(usize::try_from(index).ok()?)?;
-        Some(self.config.objective(choice))
+    fn n_moves(&self) -> usize {
+        self.client.info().n_moves
+    }
+
+    /// A robot before it takes in what its world shows.
+    fn robot(&self, observation: Observation) -> Result<Robot> {
+        let task = Task {
+            model: &self.model,
+            shape: self.client.shape(),
+            n_moves: self.n_moves(),
+            prior: &self.prior,
+            seed: self.config.planner_seed(observation.result.seed),
+            learned: &Learned::default(),
+        };
+        // Any choice will do: each has the same estimator and planner.
+        let agent = registry::agent(&self.choices[0], &self.config, task)?;
+        Ok(Robot::new(agent, observation))
+    }
+
+    /// What each world is to move for, if at all; all are checked before any moves.
+    fn targets(&self, asked: &[Option<u64>]) -> Result<Vec<Option<(u64, Objective)>>> {
+        let (expected, got) = (self.robots.len(), asked.len());
+        if got != expected {
+            let problem = format!("objectives: expected {expected}, one a world, got {got}");
+            let message = format!("{}: {problem}", Status::Malformed.explain(0));
+            return Err(refused(Status::Malformed, 0, message).into());
+        }
+        let places = self.client.worlds().zip(&self.robots).zip(asked);
+        let targets = places.map(|((world, robot), objective)| {
+            let target = |index| Ok((index, self.target(world, robot, index)?));
+            objective.map(target).transpose()
+        });
+        targets.collect()
+    }
+
+    fn target(&self, world: u32, robot: &Robot, index: u64) -> Result<Objective, ConnectionError> {
+        let choice = usize::try_from(index).ok();
+        let Some(choice) = choice.and_then(|index| self.choices.get(index)) else {
+            let (status, detail) = (Status::BadObjective, self.choices.len() as u64);
+            let expected = status.explain(detail);
+            let message = format!("{expected}, got {index} for world {world}");
+            return Err(refused(status, detail, message));
+        };
+        if robot.observation().result.truncated != 0 {
+            let (status, detail) = (Status::EpisodeOver, world.into());
+            return Err(refused(status, detail, status.explain(detail)));
+        }
+        Ok(self.config.objective(choice))
     }
 }
 
-/// An agent before its first frame.
-fn agent(
-    client: &Client,
-    model: &Model,
-    prior: &Belief,
-    config: &AgentConfig,
-    choices: &[Policy],
-    observation: &Observation,
-) -> Result<Agent> {
-    let task = Task {
-        model,
-        shape: client.shape(),
-        n_moves: client.info().n_moves,
-        prior,
-        seed: config.planner_seed(observation.result.seed),
-        learned: &Learned::default(),
-    };
-    // Any choice will do: each has the same estimator and planner.
-    registry::agent(&choices[0], config, task)
+impl Moving<'_> {
+    fn plan(&mut self) -> Plan {
+        let (_, objective) = self.objective;
+        let plan = |agent: &mut Agent, cell, step| agent.plan_for(objective, cell, step);
+        self.robot.plan_with(plan)
+    }
 }
 
-fn decision(robot: &Robot, client: &Client, objective: Option<u64>) -> Decision {
+fn moving<'a>(
+    worlds: Range<u32>,
+    robots: &'a mut [Robot],
+    last: &'a mut [Decision],
+    targets: Vec<Option<(u64, Objective)>>,
+) -> Vec<Moving<'a>> {
+    let places = worlds.zip(robots).zip(last).zip(targets);
+    let run = |(((world, robot), last), objective)| {
+        Some(Moving {
+            world,
+            robot,
+            last,
+            objective: objective?,
+        })
+    };
+    places.filter_map(run).collect()
+}
+
+fn unrevealed(observation: Observation) -> Seen {
+    let truth = None;
+    Seen { observation, truth }
+}
+
+fn no_such_world(worlds: &Range<u32>, got: u32) -> ConnectionError {
+    let (first, last) = (worlds.start, worlds.end - 1);
+    let message = format!("no such world: the agent has worlds {first} to {last}, got {got}");
+    refused(Status::NoSuchWorld, worlds.len() as u64, message)
+}
+
+fn decision(robot: &Robot, n_moves: usize, objective: Option<u64>) -> Decision {
     let observation = robot.observation();
     let result = &observation.result;
     Decision {
@@ -221,22 +297,23 @@ fn decision(robot: &Robot, client: &Client, objective: Option<u64>) -> Decision 
         seed: result.seed,
         episode: result.episode,
         objective,
-        summary: summarise(
-            robot.agent.belief(),
-            observation.robot(),
-            client.info().n_moves,
-        ),
+        summary: summarise(robot.agent.belief(), observation.robot(), n_moves),
     }
 }
 
-fn agent_info(task: &Assignment, model: &Model, choices: &[Policy], client: &Client) -> AgentInfo {
-    let server = client.info();
+fn agent_info(
+    task: &Assignment,
+    model: &Model,
+    choices: &[Policy],
+    server: &ServerInfo,
+) -> AgentInfo {
     AgentInfo {
         protocol: VERSION,
         build: env!("CARGO_PKG_VERSION").into(),
         pid: std::process::id(),
         instance: task.instance.name().into(),
-        world: task.world,
+        first_world: task.worlds.start,
+        n_worlds: task.worlds.len() as u32,
         height: server.height,
         width: server.width,
         n_moves: server.n_moves,

@@ -1,7 +1,7 @@
 //! Serves decisions: a learner outside says what each path is for, this program does the rest.
 //!
 //! One request after the other, each answered before the next is taken; between them the lease is kept
-//! alive. Without the world there is nothing to serve, so a lost lease or a server that ends is the end.
+//! alive. Without the worlds there is nothing to serve, so a lost lease or a server that ends is the end.
 
 use crate::acting::decider::{Assignment, Decider};
 use crate::acting::run::prepare;
@@ -26,7 +26,7 @@ use std::time::{Duration, Instant};
 const TICK: Duration = Duration::from_millis(250);
 
 /// Serves until `stop` is set, a client asks to shut down, or the process `exit_with` ends; then
-/// releases the world. `model` is for servers that do not reveal theirs.
+/// releases the worlds. `model` is for servers that do not reveal theirs.
 pub fn serve_decisions(
     task: &Assignment,
     model: Option<&Model>,
@@ -65,20 +65,17 @@ impl Service {
         exit_with: Option<WatchedProcess>,
     ) -> Result<Self> {
         // What takes long is done before anybody can ask and before the lease begins to run.
-        let (info, model) = prepare(&task.instance, task.world, model)?;
+        let (info, model) = prepare(&task.instance, &task.worlds, model)?;
         let shape = shape_of(&info)?;
         let prior = task.config.prior(info.burn_in);
         let prior = first_belief(prior, &model, shape, task.config.seed)?;
-        let responder = Responder::open(&task.instance, task.world)?;
+        let responder = Responder::open(&task.instance, task.worlds.start)?;
         let decider = Decider::attach(task, model, prior)?;
-        let (instance, pid) = (task.instance.name(), std::process::id());
-        let (seed, step) = (decider.last().seed, decider.last().step);
         tracing::info!(
-            instance,
-            pid,
-            world = task.world,
-            seed,
-            step,
+            instance = task.instance.name(),
+            pid = std::process::id(),
+            world = task.worlds.start,
+            n_worlds = task.worlds.len(),
             "serving decisions"
         );
         Ok(Self {
@@ -163,38 +160,27 @@ impl Service {
             Ok(Request::Hello { protocol, .. }) if protocol != VERSION => mismatch(protocol),
             Ok(Request::Hello { client, .. }) => {
                 tracing::info!(client, "hello");
-                Reply::Decisions(Box::new(self.decider.info().clone()))
+                Reply::Hello(Box::new(self.decider.info().clone()))
             }
-            Ok(Request::Reset { seed }) => {
-                let decision = self.decider.reset(seed)?.clone();
-                tracing::info!(seed = decision.seed, episode = decision.episode, "reset");
-                Reply::Decision(decision)
+            Ok(Request::Reset { worlds }) => {
+                let decisions = self.decider.reset(&worlds)?.to_vec();
+                tracing::info!(n_worlds = worlds.len(), "reset");
+                Reply::Decisions { worlds: decisions }
             }
-            Ok(Request::Decide { objective }) => self.decide(objective)?,
-            Ok(Request::Last {}) => Reply::Decision(self.decider.last().clone()),
+            Ok(Request::Decide { objectives }) => {
+                let worlds = self.decider.decide(&objectives)?.to_vec();
+                tracing::debug!(?objectives, "decided");
+                Reply::Decisions { worlds }
+            }
+            Ok(Request::Last {}) => Reply::Decisions {
+                worlds: self.decider.last().to_vec(),
+            },
             Ok(Request::Shutdown {}) => return Ok(None),
         };
         Ok(Some(reply))
     }
 
-    fn decide(&mut self, objective: u64) -> Result<Reply> {
-        if let Some(decision) = self.decider.decide(objective)? {
-            let decision = decision.clone();
-            tracing::debug!(
-                step = decision.step,
-                objective,
-                reward = decision.reward,
-                "decision"
-            );
-            return Ok(Reply::Decision(decision));
-        }
-        let n_objectives = self.decider.info().objectives.len() as u64;
-        let expected = Status::BadObjective.explain(n_objectives);
-        let message = format!("{expected}, got {objective}");
-        Ok(error_reply(Status::BadObjective, n_objectives, message))
-    }
-
-    /// Releases the world, then answers the client that asked for it.
+    /// Releases the worlds, then answers the client that asked for it.
     fn stop(self, asked: Option<ActiveControl>) -> Result<()> {
         let Self {
             mut desk, decider, ..
@@ -237,7 +223,7 @@ impl Desk {
     }
 }
 
-/// Refusals of the server pass through; whatever else fails ends the agent.
+/// A refusal passes through; whatever else fails ends the agent.
 fn reply_to(error: &anyhow::Error) -> Reply {
     match refusal(error) {
         Some((status, detail, message)) => error_reply(status, detail, message.into()),

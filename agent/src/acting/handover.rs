@@ -12,8 +12,8 @@ const RENEW_AFTER: u64 = 500;
 
 /// Gives a robot's agent what is known of its world before the present frame; returns whether that frame is in
 /// it already, and the belief about X_{k+1}.
-pub fn resume(client: &mut Client, robot: &mut Robot) -> Result<bool> {
-    if take_over_left(client, robot)? {
+pub fn resume(client: &mut Client, world: u32, robot: &mut Robot) -> Result<bool> {
+    if take_over_left(client, world, robot)? {
         return Ok(true);
     }
     let step = robot.observation().result.step;
@@ -21,12 +21,12 @@ pub fn resume(client: &mut Client, robot: &mut Robot) -> Result<bool> {
     if !agent.estimator().sees_frames() {
         return Ok(false);
     }
-    let first = first_kept(client, step)?;
+    let first = first_kept(client, world, step)?;
     for past in first..step {
-        if past % RENEW_AFTER == RENEW_AFTER - 1 {
+        if (past - first) % RENEW_AFTER == 0 {
             client.renew()?; // Recalling is no use of the lease.
         }
-        let Ok(mut seen) = client.recall(client.worlds(), past) else {
+        let Ok(mut seen) = client.recall(world..world + 1, past) else {
             client.renew()?; // Says so if the world is another's by now.
             break;
         };
@@ -35,36 +35,45 @@ pub fn resume(client: &mut Client, robot: &mut Robot) -> Result<bool> {
         agent.predict();
     }
     if first < step {
-        tracing::info!(first, step, "going on from the frames that were kept");
+        tracing::info!(
+            world,
+            first,
+            step,
+            "going on from the frames that were kept"
+        );
     }
     Ok(false)
 }
 
 /// Gives an agent the belief that was left for it, if there is one; whatever it believed before is
 /// forgotten.
-pub fn take_over_left(client: &mut Client, robot: &mut Robot) -> Result<bool, ConnectionError> {
+pub fn take_over_left(
+    client: &mut Client,
+    world: u32,
+    robot: &mut Robot,
+) -> Result<bool, ConnectionError> {
     let step = robot.observation().result.step;
     let estimator = robot.agent.estimator_mut();
     let Some(kind) = estimator.kind() else {
         return Ok(false);
     };
-    let Some(memory) = client.belief(&kind)? else {
+    let Some(memory) = client.belief(world, &kind)? else {
         return Ok(false);
     };
     let is_taken = estimator.remember(&memory);
     if is_taken {
-        tracing::info!(step, "going on from the belief that was left");
+        tracing::info!(world, step, "going on from the belief that was left");
     }
     Ok(is_taken)
 }
 
 /// Leaves an agent's belief about X_{k+1}, after its last observation, to the next one.
-pub fn leave(client: &mut Client, robot: &Robot) -> Result<(), ConnectionError> {
+pub fn leave(client: &mut Client, world: u32, robot: &Robot) -> Result<(), ConnectionError> {
     let (agent, present) = (&robot.agent, robot.observation());
     let Some(kind) = agent.estimator().kind() else {
         return Ok(());
     };
-    match client.leave_belief(&present.result, &kind, &agent.estimator().memory()) {
+    match client.leave_belief(world, &present.result, &kind, &agent.estimator().memory()) {
         // A server that keeps no beliefs.
         Err(ConnectionError::Refused {
             status: Status::Malformed,
@@ -75,8 +84,8 @@ pub fn leave(client: &mut Client, robot: &Robot) -> Result<(), ConnectionError> 
 }
 
 /// The first step from which on all frames are kept; the present one where a server keeps none.
-fn first_kept(client: &mut Client, step: u64) -> Result<u64, ConnectionError> {
-    match client.recall(client.worlds(), 0) {
+fn first_kept(client: &mut Client, world: u32, step: u64) -> Result<u64, ConnectionError> {
+    match client.recall(world..world + 1, 0) {
         Ok(_) => Ok(0),
         Err(ConnectionError::Refused { status, detail, .. }) => match status {
             Status::NotKept => Ok(detail.min(step)),

@@ -10,16 +10,17 @@ use crate::learning::learned::Learned;
 use crate::planning::policy::{EstimatorKind, Policy};
 use crate::rollout::{self, Robot, Seen};
 use crate::server::client::{
-    Client, Observation, RETRY_INTERVAL, is_belief_left, is_outage, refusal, server_info, shape_of,
+    Client, Observation, RETRY_INTERVAL, is_belief_left, is_outage, refusal, refused, server_info,
+    shape_of,
 };
-use crate::server::feed::{Feed, View};
+use crate::server::feed::Feed;
 use crate::server::truth::TruthFeed;
 use anyhow::{Result, bail, ensure};
 use protocol::channels::Instance;
-use protocol::connection::ConnectionError;
 use protocol::control::ServerInfo;
 use protocol::message::Status;
 use protocol::{Grid, Model};
+use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -83,7 +84,7 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
     } = attached;
     // After an outage nobody knows where the world stands.
     let left = match is_in_step {
-        true => leave(&mut client, &robot),
+        true => leave(&mut client, mission.world, &robot),
         false => Ok(()),
     };
     let released = left.and_then(|()| client.release());
@@ -91,6 +92,12 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
     match released.map_err(anyhow::Error::from) {
         Err(error) if !is_outage(&error) => Err(error),
         _ => Ok(summary),
+    }
+}
+
+impl Mission {
+    fn worlds(&self) -> Range<u32> {
+        self.world..self.world.saturating_add(1)
     }
 }
 
@@ -112,7 +119,7 @@ struct Report {
 impl Attached {
     /// Acquires the world where it stands and takes in its last frame.
     fn attach(mission: &Mission) -> Result<Self> {
-        let (info, model) = prepare(&mission.instance, mission.world, mission.model.as_ref())?;
+        let (info, model) = prepare(&mission.instance, &mission.worlds(), mission.model.as_ref())?;
         let policy = Policy::named(&mission.policy, &model)?;
         ensure!(
             policy.estimator != EstimatorKind::NextTruth,
@@ -132,7 +139,7 @@ impl Attached {
         };
         let prior = first_belief(prior, &model, shape, mission.config.seed)?;
         let mut attached = Self::acquire(mission, &model, &policy, &prior)?;
-        if !resume(&mut attached.client, &mut attached.robot)? {
+        if !resume(&mut attached.client, mission.world, &mut attached.robot)? {
             attached.begin()?;
         }
         Ok(attached)
@@ -161,7 +168,7 @@ impl Attached {
             return Ok(None);
         }
         let mut attached = Self::acquire(mission, model, policy, any)?;
-        if take_over_left(&mut attached.client, &mut attached.robot)? {
+        if take_over_left(&mut attached.client, mission.world, &mut attached.robot)? {
             return Ok(Some(attached));
         }
         // Another agent acted since.
@@ -171,8 +178,9 @@ impl Attached {
 
     /// Acquires the world for an agent before its first frame.
     fn acquire(mission: &Mission, model: &Model, policy: &Policy, prior: &Belief) -> Result<Self> {
-        let (client, observation) =
-            Client::acquire_one(&mission.instance, mission.world, mission.takeover)?;
+        let (client, mut observations) =
+            Client::acquire_and_observe(&mission.instance, mission.worlds(), mission.takeover)?;
+        let observation = observations.remove(0);
         let (seed, step) = (observation.result.seed, observation.result.step);
         tracing::info!(
             world = mission.world,
@@ -250,14 +258,9 @@ fn truth_of(
 }
 
 /// Shows a robot's posterior to those who look on, if it is time or in any case.
-pub fn show(feed: &mut Feed, world: u32, robot: &Robot, in_any_case: bool) {
+fn show(feed: &mut Feed, world: u32, robot: &Robot, in_any_case: bool) {
     if feed.is_due() || in_any_case {
-        feed.show(&View {
-            world,
-            result: &robot.observation().result,
-            belief: robot.agent.belief(),
-            intent: robot.intent(),
-        });
+        feed.show(&robot.view(world));
     }
 }
 
@@ -283,22 +286,16 @@ impl Report {
     }
 }
 
-/// What a server says of itself, and its model, or the one given; checks that it has the world.
+/// What a server says of itself, and its model, or the one given; checks that it has the worlds.
 pub fn prepare(
     instance: &Instance,
-    world: u32,
+    worlds: &Range<u32>,
     model: Option<&Model>,
 ) -> Result<(ServerInfo, Model)> {
     let info = server_info(instance)?;
-    if world >= info.n_worlds {
+    if worlds.end > info.n_worlds {
         let (status, detail) = (Status::NoSuchWorld, info.n_worlds.into());
-        let message = status.explain(detail);
-        return Err(ConnectionError::Refused {
-            status,
-            detail,
-            message,
-        }
-        .into());
+        return Err(refused(status, detail, status.explain(detail)).into());
     }
     let revealed = info.model.as_deref().map(Model::from_toml).transpose()?;
     let model = match (model, revealed) {

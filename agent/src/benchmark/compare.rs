@@ -10,7 +10,7 @@ use crate::planning::policy::{EstimatorKind, Policy};
 use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Seen, Turn};
 use crate::server::client::Observation;
-use crate::server::feed::{Feed, View};
+use crate::server::feed::Feed;
 use anyhow::{Context, Result};
 use protocol::Grid;
 use protocol::path::fly;
@@ -178,7 +178,7 @@ impl Match<'_> {
             |index, run, turn| {
                 run.look(turn, target, is_last);
                 if shown.contains(&index) {
-                    run.show(feed, first_world + index as u32);
+                    feed.show(&run.robot.view(first_world + index as u32));
                 }
                 Ok(())
             },
@@ -204,15 +204,6 @@ impl Run {
         if is_last && is_known {
             self.snapshot = Some(self.snapshot(turn));
         }
-    }
-
-    fn show(&self, feed: &mut Feed, world: u32) {
-        feed.show(&View {
-            world,
-            result: &self.robot.observation().result,
-            belief: self.robot.agent.belief(),
-            intent: self.robot.intent(),
-        });
     }
 
     fn snapshot(&self, turn: Turn) -> Snapshot {

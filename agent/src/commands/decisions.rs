@@ -11,7 +11,7 @@ use protocol::channels::Instance;
 use protocol::program::{WatchedProcess, stop_on_signals};
 use std::sync::atomic::Ordering::Relaxed;
 
-/// Take decisions for one world from a learner outside.
+/// Take decisions for worlds from a learner outside.
 #[derive(Args)]
 pub struct ServeDecisionsCommand {
     /// The server's instance name
@@ -19,13 +19,16 @@ pub struct ServeDecisionsCommand {
     instance: String,
     #[command(flatten)]
     wait: WaitFlag,
-    /// The world to act on
+    /// The first world to act on
     #[arg(long, default_value_t = 0)]
     world: u32,
-    /// Take the world from its holder
+    /// Number of worlds to act on at once
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    worlds: u32,
+    /// Take the worlds from their holders
     #[arg(long)]
     takeover: bool,
-    /// What keeps the belief
+    /// What keeps the beliefs
     #[arg(long, default_value = "known_model")]
     estimator: EstimatorName,
     /// What plans a path for the objective decided
@@ -66,7 +69,7 @@ impl ServeDecisionsCommand {
         let model = self.model.as_deref().map(model_named).transpose()?;
         let task = Assignment {
             instance: Instance::new(&self.instance)?,
-            world: self.world,
+            worlds: self.world..self.world.saturating_add(self.worlds),
             takeover: self.takeover,
             estimator: match self.estimator {
                 EstimatorName::KnownModel => EstimatorKind::KnownModel,

@@ -18,10 +18,9 @@ use crate::learning::metrics::{FROZEN, METRICS, Metrics, Tick};
 use crate::learning::student::Student;
 use crate::rollout::Robot;
 use crate::server::client::{Claim, Client, Observation};
-use crate::server::feed::{Feed, View};
+use crate::server::feed::Feed;
 use anyhow::{Result, bail};
 use protocol::Move;
-use protocol::agent_belief::Intent;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::WorldSeed;
@@ -201,15 +200,9 @@ impl Trainer {
         };
         let mut look = |index: usize, robot: &Robot| {
             if let Some(feed) = feed.as_mut().filter(|_| shown.contains(&index)) {
-                feed.show(&View {
-                    world: worlds.start + index as u32,
-                    result: &robot.observation().result,
-                    belief: robot.agent.belief(),
-                    intent: Intent {
-                        policy: policy.clone(),
-                        ..robot.intent()
-                    },
-                });
+                let mut view = robot.view(worlds.start + index as u32);
+                view.intent.policy.clone_from(&policy);
+                feed.show(&view);
             }
         };
         let tick = student.step(&mut fly, &mut look)?;

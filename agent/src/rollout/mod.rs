@@ -3,4 +3,4 @@
 pub mod agent;
 mod robot;
 
-pub use robot::{Robot, Seen, Turn, step};
+pub use robot::{Robot, Seen, Turn, in_parallel, step};

@@ -6,8 +6,8 @@ use crate::estimation::scoring::Score;
 use crate::planning::Plan;
 use crate::rollout::agent::Agent;
 use crate::server::client::Observation;
+use crate::server::feed::View;
 use anyhow::Result;
-use protocol::agent_belief::Intent;
 use protocol::{Cell, Grid, Move};
 use rayon::prelude::*;
 use std::time::{Duration, Instant};
@@ -62,9 +62,14 @@ impl Robot {
         Ok(robot)
     }
 
-    /// What it tells those who look on.
-    pub fn intent(&self) -> Intent {
-        self.agent.intent(self.planning)
+    /// What it tells those who look on at its world.
+    pub fn view(&self, world: u32) -> View<'_> {
+        View {
+            world,
+            result: &self.observation.result,
+            belief: self.agent.belief(),
+            intent: self.agent.intent(self.planning),
+        }
     }
 
     pub fn observation(&self) -> &Observation {
@@ -129,7 +134,7 @@ pub fn step<R: Send>(
 }
 
 /// The results in order. One alone is worked on here: handing it to another thread costs more than it gains.
-fn in_parallel<T: Send, U: Send>(
+pub fn in_parallel<T: Send, U: Send>(
     tasks: impl Iterator<Item = T>,
     work: impl Fn(T) -> U + Sync,
 ) -> Vec<U> {

@@ -78,22 +78,22 @@ impl Observation {
 }
 
 impl Client {
-    /// Acquires one world, which stays as it is, and observes it.
-    pub fn acquire_one(
+    /// Acquires worlds, which stay where they are, and observes them.
+    pub fn acquire_and_observe(
         instance: &Instance,
-        world: u32,
+        worlds: Range<u32>,
         takeover: bool,
-    ) -> Result<(Self, Observation), ConnectionError> {
+    ) -> Result<(Self, Vec<Observation>), ConnectionError> {
         let mut client = Self::acquire(
             instance,
             &Claim {
-                worlds: world..world + 1,
+                worlds,
                 takeover,
                 time_to_live: None,
             },
         )?;
-        let observation = client.observe(client.worlds())?.remove(0);
-        Ok((client, observation))
+        let observations = client.observe(client.worlds())?;
+        Ok((client, observations))
     }
 
     /// Connects and acquires worlds; they stay where they are.
@@ -146,6 +146,21 @@ impl Client {
         self.step_with_flags(worlds, paths, 0)
     }
 
+    /// As [`Self::step`], in worlds in ascending order: one message for all that are consecutive.
+    pub fn step_some(
+        &mut self,
+        worlds: &[u32],
+        paths: &[Vec<Move>],
+    ) -> Result<Vec<Observation>, ConnectionError> {
+        let mut observations = Vec::with_capacity(worlds.len());
+        for run in worlds.chunk_by(|world, next| world + 1 == *next) {
+            let (first, n_worlds) = (run[0], run.len());
+            let paths = &paths[observations.len()..][..n_worlds];
+            observations.extend(self.step(first..first + n_worlds as u32, paths)?);
+        }
+        Ok(observations)
+    }
+
     /// As [`Self::step`], asking for full frames.
     ///
     /// # Errors
@@ -182,9 +197,10 @@ impl Client {
         self.observations(&answer)
     }
 
-    /// Leaves a belief about the first world, as it stands after a result, for the next agent.
+    /// Leaves a belief about a world, as it stands after a result, for the next agent.
     pub fn leave_belief(
         &mut self,
+        world: u32,
         at: &StepResult,
         kind: &str,
         bytes: &[u8],
@@ -192,7 +208,7 @@ impl Client {
         for (index, part) in bytes.chunks(MAX_BELIEF_PART).enumerate() {
             let request = Request::LeaveBelief(LeftPart {
                 lease: self.lease,
-                world: self.worlds.start,
+                world,
                 episode: at.episode,
                 step: at.step,
                 kind: kind.into(),
@@ -205,9 +221,8 @@ impl Client {
         Ok(())
     }
 
-    /// The belief that was left about the first world as it stands, if it is of a kind.
-    pub fn belief(&mut self, kind: &str) -> Result<Option<Vec<u8>>, ConnectionError> {
-        let world = self.worlds.start;
+    /// The belief that was left about a world as it stands, if it is of a kind.
+    pub fn belief(&mut self, world: u32, kind: &str) -> Result<Option<Vec<u8>>, ConnectionError> {
         let (mut first, mut bytes) = (None, Vec::new());
         loop {
             let offset = bytes.len() as u64;
@@ -369,6 +384,15 @@ pub fn refusal(error: &anyhow::Error) -> Option<(Status, u64, &str)> {
             message,
         } => Some((*status, *detail, message)),
         _ => None,
+    }
+}
+
+/// The error of what is refused before a server is asked.
+pub fn refused(status: Status, detail: u64, message: String) -> ConnectionError {
+    ConnectionError::Refused {
+        status,
+        detail,
+        message,
     }
 }
 

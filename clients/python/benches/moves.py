@@ -1,4 +1,4 @@
-"""Moves a second of many worlds of `WildfireMoves-v0`, beside peers in the same run.
+"""Moves a second of many worlds of `WildfireMoves-v0`, and decisions of `WildfireObjective-v0`.
 
 Peers: Gymnasium's `SyncVectorEnv` of the single environments, and of an environment with the same
 spaces that simulates nothing. Rounds take turns, so that a noisy machine is noisy for all. Prints
@@ -20,7 +20,8 @@ from gymnasium.vector import SyncVectorEnv
 import emberwatch
 from emberwatch.programs import Program, unused_instance
 
-ENV = "emberwatch:emberwatch/WildfireMoves-v0"
+MOVES = "emberwatch:emberwatch/WildfireMoves-v0"
+OBJECTIVE = "emberwatch:emberwatch/WildfireObjective-v0"
 NO_END = 2**31 - 1
 #: Of one server.
 CLIENTS = 16
@@ -52,7 +53,7 @@ def serve(model: str) -> tuple[Program, str]:
 
 
 def main() -> None:
-    """Steps each in turn."""
+    """Races moves, then decisions."""
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--worlds", type=int, default=64)
     parser.add_argument("--moves", type=int, default=160, help="of each world, a round")
@@ -60,41 +61,60 @@ def main() -> None:
     parser.add_argument("--model", default="wildfire-small")
     args = parser.parse_args()
     world: dict[str, Any] = {"height": 16, "width": 16, "n_moves": 16, "burn_in": 3000}
-    world |= {"model": args.model, "observation": "local", "max_episode_steps": NO_END}
-    one = gymnasium.make(ENV, **world).unwrapped
+    world |= {"model": args.model, "max_episode_steps": NO_END}
     servers = [serve(args.model) for _ in range(0, args.worlds, CLIENTS)]
-    there = {"observation": "local", "max_episode_steps": NO_END}
-    places = [divmod(index, CLIENTS) for index in range(args.worlds)]
-    peers: dict[str, Any] = {
-        "native vector": gymnasium.make_vec(ENV, args.worlds, **world),
-        "native vector, reward='move'": gymnasium.make_vec(
-            ENV, args.worlds, reward="move", **world
-        ),
-        "SyncVectorEnv": SyncVectorEnv(
-            [
-                partial(gymnasium.make, ENV, instance=servers[server][1], world=number, **there)
-                for server, number in places
-            ]
-        ),
-        "SyncVectorEnv, simulates nothing": SyncVectorEnv([lambda: Trivial(one)] * args.worlds),
-    }
     actions = np.random.default_rng(0).integers(0, 4, (args.moves, args.worlds))
+    instances = [instance for _, instance in servers]
+    race(moves(world, instances, args.worlds), actions, args.rounds, "moves/s")
+    n_agents = min(args.worlds, CLIENTS)
+    peers = decisions(world, instances[0], n_agents)
+    race(peers, actions[:, :n_agents], args.rounds, "decisions/s")
+    for server, _ in servers:
+        server.stop()
+
+
+def moves(world: dict[str, Any], instances: list[str], n_worlds: int) -> dict[str, Any]:
+    """Environments whose steps are moves."""
+    world = {"observation": "local", **world}
+    there = {"observation": "local", "max_episode_steps": NO_END}
+    one = gymnasium.make(MOVES, **world).unwrapped
+    places = [divmod(index, CLIENTS) for index in range(n_worlds)]
+    single = [
+        partial(gymnasium.make, MOVES, instance=instances[server], world=number, **there)
+        for server, number in places
+    ]
+    return {
+        "native vector": gymnasium.make_vec(MOVES, n_worlds, **world),
+        "native vector, reward='move'": gymnasium.make_vec(MOVES, n_worlds, reward="move", **world),
+        "SyncVectorEnv": SyncVectorEnv(single),
+        "SyncVectorEnv, simulates nothing": SyncVectorEnv([lambda: Trivial(one)] * n_worlds),
+    }
+
+
+def decisions(world: dict[str, Any], instance: str, n_worlds: int) -> dict[str, Any]:
+    """Environments whose steps are decisions, each single one with an agent of its own."""
+    there = {"instance": instance, "prior": "initial", "max_episode_steps": NO_END}
+    single = [partial(gymnasium.make, OBJECTIVE, world=n, **there) for n in range(n_worlds)]
+    native = gymnasium.make_vec(OBJECTIVE, n_worlds, prior="initial", **world)
+    return {f"native vector, {n_worlds} worlds": native, "SyncVectorEnv": SyncVectorEnv(single)}
+
+
+def race(peers: dict[str, Any], actions: Any, rounds: int, unit: str) -> None:
+    """Steps each in turn, prints how fast, and closes it."""
     rates: dict[str, list[tuple[float, float]]] = {name: [] for name in peers}
     for envs in peers.values():
         envs.reset(seed=1000)
-    for _ in range(args.rounds):
+    for _ in range(rounds):
         for name, envs in peers.items():
             wall, cpu = time.perf_counter(), time.process_time()
-            for moves in actions:
-                envs.step(moves)
+            for chosen in actions:
+                envs.step(chosen)
             used = (time.perf_counter() - wall, time.process_time() - cpu)
             rates[name].append((actions.size / used[0], actions.size / used[1]))
     for name, envs in peers.items():
         wall, cpu = (statistics.median(rate) for rate in zip(*rates[name], strict=True))
-        print(f"{name:34} {wall:9.0f} moves/s, {cpu:9.0f} a processor second")
+        print(f"{name:34} {wall:9.0f} {unit}, {cpu:9.0f} a processor second")
         envs.close()
-    for server, _ in servers:
-        server.stop()
 
 
 if __name__ == "__main__":

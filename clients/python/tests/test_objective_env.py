@@ -17,6 +17,7 @@ from processes import Server, eventually, stopped
 
 import emberwatch
 from emberwatch import errors
+from emberwatch.programs import Program
 from emberwatch.wrappers import BeliefObservation
 
 SMALL = {"height": 9, "width": 7, "n_moves": 5, "burn_in": 50}
@@ -27,11 +28,34 @@ def make(**keywords: Any) -> Any:
     return gymnasium.make("emberwatch/WildfireObjective-v0", **arguments).unwrapped
 
 
+def make_vec(**keywords: Any) -> Any:
+    arguments = SMALL | {"prior": "initial", "num_envs": 3} | keywords
+    return gymnasium.make_vec("emberwatch/WildfireObjective-v0", **arguments)
+
+
 @pytest.fixture
 def env() -> Iterator[Any]:
     made = make()
     yield made
     made.close()
+
+
+@pytest.fixture(params=[make, make_vec])
+def any_env(request: pytest.FixtureRequest) -> Iterator[Any]:
+    """One of one world, and one of many."""
+    made = request.param()
+    made.reset(seed=1000)
+    yield made
+    made.close()
+
+
+def decide(env: Any) -> Any:
+    """Steps for the first state; returns k, of one world or many."""
+    return env.step(np.zeros(env.action_space.shape, int))[4]["step"]
+
+
+def agent_pid(env: Any) -> int:
+    return env.unwrapped._agent._own_agent.pid
 
 
 @pytest.mark.parametrize(
@@ -92,20 +116,17 @@ def test_two_agents_of_their_own_do_not_share_a_world(env: Any) -> None:
     assert env.step(2)[4]["step"] == 2
 
 
-def test_a_stopped_agent_is_a_timeout_and_the_next_step_asks_for_a_reset() -> None:
-    env = make()
-    env.reset(seed=1000)
+def test_a_stopped_agent_is_a_timeout_and_the_next_step_asks_for_a_reset(any_env: Any) -> None:
     with (
-        stopped(env._agent.pid),
-        impatient(env, 0.5),
+        stopped(agent_pid(any_env)),
+        impatient(any_env, 0.5),
         pytest.raises(errors.RequestTimeoutError, match=r"within 0\.5 s"),
     ):
-        env.step(0)
+        decide(any_env)
     with fails("closed", match="an earlier step timed out"):
-        env.step(0)
-    _, info = env.reset(options={"resume": True})
-    assert env.step(0)[4]["step"] == info["step"] + 1
-    env.close()
+        decide(any_env)
+    _, info = any_env.reset(options={"resume": True})
+    assert np.all(decide(any_env) == info["step"] + 1)
 
 
 def test_a_lease_lost_between_steps_is_told_as_that(server: Callable[..., Server]) -> None:
@@ -116,7 +137,7 @@ def test_a_lease_lost_between_steps_is_told_as_that(server: Callable[..., Server
     env.reset(seed=1000)
     started.connect().acquire(takeover=True, ttl=3600)
     # The agent finds out when it renews its lease, and ends.
-    assert eventually(lambda: env._agent.exit_code() is not None)
+    assert eventually(lambda: env._agent._own_agent.exit_code() is not None)
     with pytest.raises(errors.LeaseLostError, match="lease lost"):
         env.step(0)
     env.close()
@@ -130,7 +151,7 @@ def test_truth_is_not_waited_for_longer_than_the_timeout(server: Callable[..., S
     _, info = env.reset(seed=1000)
     assert info["truth"].shape == (5, 7)
     with pytest.raises(errors.RequestTimeoutError):
-        env._truths.at([(9, 9, 9)], 0.2)
+        env._session._truth.at([(9, 9, 9)], 0.2)
     env.close()
 
 
@@ -162,9 +183,25 @@ def test_a_wrong_action_is_refused_and_nothing_is_sent(env: Any, action: object)
         ({"agent": "running"}, "expected instance="),
     ],
 )
-def test_a_wrong_keyword_is_refused(keywords: dict[str, Any], words: str) -> None:
+@pytest.mark.parametrize("maker", [make, make_vec])
+def test_a_wrong_keyword_is_refused(maker: Any, keywords: dict[str, Any], words: str) -> None:
     with pytest.raises(errors.InvalidArgumentError, match=words):
-        make(**keywords)
+        maker(**keywords)
+
+
+@pytest.mark.parametrize("action", [[0, 1], [0, 1, 4], [0, -1, 0], [0.0] * 3, [[0], [1, 2], 3]])
+def test_wrong_actions_are_refused_and_nothing_is_sent(action: object) -> None:
+    envs = make_vec()
+    envs.reset(seed=1000)
+    with pytest.raises(errors.InvalidArgumentError, match="action: expected"):
+        envs.step(action)
+    assert decide(envs).tolist() == [1, 1, 1]
+    envs.close()
+
+
+def test_more_worlds_than_frames_are_kept_of_are_not_drawn() -> None:
+    with pytest.raises(errors.InvalidArgumentError, match="expected at most 64 worlds, got 65"):
+        make_vec(num_envs=65, render_mode="rgb_array")
 
 
 def test_before_a_reset_and_after_closing_there_is_nothing(env: Any) -> None:
@@ -181,33 +218,31 @@ def test_a_seed_that_does_not_fit_is_refused(env: Any) -> None:
         env.reset(seed=2**64)
 
 
-def test_a_reset_that_finds_agent_or_server_dead_starts_others(env: Any) -> None:
-    expected = env.reset(seed=1000)
+def test_a_reset_that_finds_agent_or_server_dead_starts_others(any_env: Any) -> None:
+    expected = any_env.reset(seed=1000)
     for _ in range(2):
-        os.kill(env._agent.pid, signal.SIGKILL)
-        assert np.array_equal(env.reset(seed=1000)[0], expected[0])
-        os.kill(env._session._program.pid, signal.SIGKILL)
-        assert np.array_equal(env.reset(seed=1000)[0], expected[0])
-    os.kill(env._agent.pid, signal.SIGKILL)
+        os.kill(agent_pid(any_env), signal.SIGKILL)
+        assert np.array_equal(any_env.reset(seed=1000)[0], expected[0])
+        os.kill(any_env.unwrapped._session._program.pid, signal.SIGKILL)
+        assert np.array_equal(any_env.reset(seed=1000)[0], expected[0])
+    os.kill(agent_pid(any_env), signal.SIGKILL)
     with pytest.raises(errors.ServerGoneError):
-        env.reset(options={"resume": True})
+        any_env.reset(options={"resume": True})
 
 
-def test_an_agent_that_is_killed_is_noticed_and_a_reset_starts_another(env: Any) -> None:
-    env.reset(seed=1000)
-    os.kill(env._agent.pid, signal.SIGKILL)
+def test_an_agent_that_is_killed_is_noticed_and_a_reset_starts_another(any_env: Any) -> None:
+    os.kill(agent_pid(any_env), signal.SIGKILL)
     with pytest.raises(errors.ServerGoneError, match="the agent on instance"):
-        env.step(0)
-    env.reset(seed=1000)
-    assert env.step(0)[4]["step"] == 1
+        decide(any_env)
+    any_env.reset(seed=1000)
+    assert np.all(decide(any_env) == 1)
 
 
-def test_a_server_that_is_killed_ends_the_agent_with_a_word(env: Any) -> None:
-    env.reset(seed=1000)
-    os.kill(env._session._program.pid, signal.SIGKILL)
+def test_a_server_that_is_killed_ends_the_agent_with_a_word(any_env: Any) -> None:
+    os.kill(any_env.unwrapped._session._program.pid, signal.SIGKILL)
     with pytest.raises(errors.ServerGoneError, match="the server on instance"):
-        env.step(0)
-    env.reset(seed=1000)
+        decide(any_env)
+    any_env.reset(seed=1000)
 
 
 def test_it_attaches_to_a_running_server_and_to_a_running_agent(env: Any) -> None:
@@ -220,13 +255,46 @@ def test_it_attaches_to_a_running_server_and_to_a_running_agent(env: Any) -> Non
     assert info["step"] == 1
     guest.step(2)
     guest.close()
-    with emberwatch.Decisions(env.instance) as decisions:
-        assert decisions.last().step == 2
-        assert decisions.info.planner == "beam"
-        with fails("bad_objective") as refused:
-            decisions.decide(9)
-        assert refused.value.detail == 4
     assert env.step(3)[4]["step"] == 3
+
+
+def test_many_worlds_attach_to_a_running_agent_of_theirs(server: Callable[..., Server]) -> None:
+    started = server(worlds=4)
+    flags = ["--instance", started.instance, "--world", "1", "--worlds", "3", "--prior", "initial"]
+    agent = Program("emberwatch-agent", ["serve-decisions", *flags])
+    arguments = {"instance": started.instance, "world": 1, "agent": "running"}
+    envs = gymnasium.make_vec("emberwatch/WildfireObjective-v0", num_envs=3, **arguments)
+    envs.reset(seed=1000)
+    decide(envs)
+    with emberwatch.Decisions(started.instance, 1) as decisions:
+        assert (decisions.worlds, decisions.info.planner) == (range(1, 4), "beam")
+        assert [made.step for made in decisions.decide([2, None, np.int64(1)])] == [2, 1, 2]
+        assert [made.objective for made in decisions.reset([7], worlds=[3])] == [2, 0, None]
+        assert [made.seed for made in decisions.last()] == [1000, 1001, 7]
+        with fails("bad_objective", match="expected 0 to 3, got 9 for world 2") as refused:
+            decisions.decide([2, 9, 2])
+        assert refused.value.detail == 4
+        with fails("malformed", match="objectives: expected 3, one a world, got 1"):
+            decisions.decide([2])
+        for wrong in (1.5, -1, "fire", True, 2**64, [0, 1]):
+            with fails("invalid_argument", match="expected one integer, 0 to"):
+                decisions.decide([2, wrong, 2])
+        with fails("invalid_argument", match="seeds: expected 3, got 2"):
+            decisions.reset([7, 8])
+        with fails("no_such_world", match="the agent has worlds 1 to 3, got 0"):
+            decisions.reset([7], worlds=[0])
+        assert [made.step for made in decisions.last()] == [2, 1, 0]
+    _, info = envs.reset(options={"resume": True})
+    assert info["step"].tolist() == [2, 1, 0]
+    envs.close()
+    for n_worlds in (2, 1):
+        other = gymnasium.make_vec(
+            "emberwatch/WildfireObjective-v0", num_envs=n_worlds, **arguments
+        )
+        words = f"expected one of worlds 1 to {n_worlds}, got one of 1 to 3"
+        with pytest.raises(errors.InvalidArgumentError, match=words):
+            other.reset(seed=1000)
+    agent.stop()
 
 
 def test_another_world_has_no_agent(env: Any) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from environments import (
     MOVES,
+    OBJECTIVE,
     WILDFIRE,
     actions,
     assert_same,
@@ -37,10 +38,13 @@ from emberwatch.errors import (
 
 PARTS = ("frame", "robot", "age")
 
-#: Every part of an environment.
-ALL = {
-    WILDFIRE: ("frame", "image", "robot", "age", "belief"),
-    MOVES: ("frame", "image", "robot", "age", "belief", "local", "visited", "move"),
+#: Keywords of an environment that shows all it can.
+ALL: dict[str, dict[str, Any]] = {
+    WILDFIRE: {"observation": ("frame", "image", "robot", "age", "belief")},
+    MOVES: {
+        "observation": ("frame", "image", "robot", "age", "belief", "local", "visited", "move")
+    },
+    OBJECTIVE: {"prior": "initial"},
 }
 
 by_name = pytest.mark.parametrize("name", ALL)
@@ -89,18 +93,20 @@ def assert_same_steps(ours: Vector, theirs: Vector, n_steps: int) -> int:
 
 
 @pytest.mark.parametrize(
-    ("name", "observation"),
+    ("name", "keywords"),
     [
-        *((WILDFIRE, parts) for parts in (*PARTS, ("frame", "robot"), ALL[WILDFIRE])),
-        *((MOVES, parts) for parts in ("local", "move", ALL[MOVES])),
+        *((WILDFIRE, {"observation": parts}) for parts in (*PARTS, ("frame", "robot"))),
+        *((MOVES, {"observation": part}) for part in ("local", "move")),
+        (OBJECTIVE, {"prior": "uniform", "planner": "shooting", "estimator": "spatial_filter"}),
+        *ALL.items(),
     ],
     ids=str,
 )
 @pytest.mark.parametrize("mode", AutoresetMode, ids=str)
 def test_every_field_is_that_of_single_environments(
-    mode: AutoresetMode, name: str, observation: Any
+    mode: AutoresetMode, name: str, keywords: dict[str, Any]
 ) -> None:
-    ours, theirs = pair(3, mode, name=name, observation=observation, truth=True)
+    ours, theirs = pair(3, mode, name=name, truth=True, **keywords)
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     assert ours.single_observation_space == theirs.single_observation_space
@@ -119,10 +125,9 @@ def test_every_field_is_that_of_single_environments(
 def test_episodes_end_and_begin_again_as_in_single_environments(
     mode: AutoresetMode, truth: bool, name: str
 ) -> None:
-    n_steps = {WILDFIRE: 3, MOVES: 10}[name]
-    ours, theirs = pair(
-        4, mode, name=name, observation=ALL[name], truth=truth, max_episode_steps=n_steps
-    )
+    n_steps = 10 if name == MOVES else 3
+    keywords = {**ALL[name], "truth": truth, "max_episode_steps": n_steps}
+    ours, theirs = pair(4, mode, name=name, **keywords)
     assert_same_flight(ours, theirs, 2, seed=0)
     # Some are reset in between, so that episodes end at different times.
     for mask in ([True, False, True, False], [False, False, True, False]):
@@ -138,9 +143,8 @@ def test_episodes_end_and_begin_again_as_in_single_environments(
 
 @by_name
 def test_disabled_autoreset_leaves_resets_to_the_caller(name: str) -> None:
-    ours, theirs = pair(
-        3, AutoresetMode.DISABLED, name=name, observation=ALL[name], max_episode_steps=2
-    )
+    keywords = {**ALL[name], "max_episode_steps": 2}
+    ours, theirs = pair(3, AutoresetMode.DISABLED, name=name, **keywords)
     assert_same_flight(ours, theirs, 1, seed=3)
     mask = np.array([False, True, False])
     assert_same(
@@ -168,16 +172,18 @@ def test_worlds_of_running_servers_are_the_same_too(mode: AutoresetMode, name: s
     # The servers truncate by themselves, and the vector's worlds begin at 2 of theirs.
     flags = {"publish_truth": True, "max_steps": 3}
     with serving(worlds=5, seed=40, **flags) as one, serving(worlds=3, seed=9, **flags) as other:
-        ours = make_vec(3, name, instance=one, world=2, truth=True, autoreset_mode=mode)
-        theirs = sync_of(3, mode, name=name, instance=other, truth=True)
+        keywords = {"truth": True} | ({"prior": "initial"} if name == OBJECTIVE else {})
+        ours = make_vec(3, name, instance=one, world=2, autoreset_mode=mode, **keywords)
+        theirs = sync_of(3, mode, name=name, instance=other, **keywords)
         assert_same_flight(ours, theirs, 2, seed=6)
         mask = np.array([False, True, False])
         options = [{"reset_mask": mask}, {"reset_mask": mask}]
         assert_same(ours.reset(options=options[0]), theirs.reset(options=options[1]))
-        assert assert_same_steps(ours, theirs, {WILDFIRE: 8, MOVES: 32}[name]) > 4
+        assert assert_same_steps(ours, theirs, 32 if name == MOVES else 8) > 4
         with emberwatch.connect(one) as client:
             holders = [world.holder_pid for world in client.status().worlds]
-        assert holders == [None, None, os.getpid(), os.getpid(), os.getpid()]
+        pid = agent_pid(ours) if name == OBJECTIVE else os.getpid()
+        assert holders == [None, None, pid, pid, pid]
         ours.close()
         theirs.close()
 
@@ -341,7 +347,7 @@ def test_wrong_actions_are_named_and_not_sent(action: Any, message: str) -> None
 @by_name
 @pytest.mark.parametrize("mode", AutoresetMode, ids=str)
 def test_what_was_returned_is_never_changed(mode: AutoresetMode, name: str) -> None:
-    keywords = {"observation": ALL[name], "truth": True, "max_episode_steps": 3}
+    keywords = {**ALL[name], "truth": True, "max_episode_steps": 3}
     env = make_vec(3, name, autoreset_mode=mode, **keywords)
     returned = [env.reset(seed=1)]
     kept: list[Any] = []
@@ -358,7 +364,7 @@ def test_what_was_returned_is_never_changed(mode: AutoresetMode, name: str) -> N
 
 @by_name
 def test_what_was_returned_may_be_written_to(name: str) -> None:
-    keywords = {"observation": ALL[name], "max_episode_steps": 2}
+    keywords = {**ALL[name], "max_episode_steps": 2}
     ours, theirs = pair(2, AutoresetMode.NEXT_STEP, name=name, **keywords)
     _spoil(ours.reset(seed=4))
     theirs.reset(seed=4)
@@ -538,11 +544,10 @@ def test_vector_wrappers_work() -> None:
 # Pictures
 
 
-def test_pictures_are_those_of_single_environments() -> None:
-    ours = make_vec(3, render_mode="rgb_array", truth=True, max_episode_steps=3)
-    theirs = sync_of(
-        3, AutoresetMode.NEXT_STEP, render_mode="rgb_array", truth=True, max_episode_steps=3
-    )
+@pytest.mark.parametrize("name", [WILDFIRE, OBJECTIVE])
+def test_pictures_are_those_of_single_environments(name: str) -> None:
+    keywords = {**ALL[name], "render_mode": "rgb_array", "truth": True, "max_episode_steps": 3}
+    ours, theirs = pair(3, AutoresetMode.NEXT_STEP, name=name, **keywords)
     ours.reset(seed=1)
     theirs.reset(seed=1)
     assert_same(ours.render(), theirs.render())
@@ -599,13 +604,22 @@ def test_without_a_render_mode_nothing_is_drawn_with_a_word() -> None:
 # Life and death
 
 
-@pytest.fixture
-def flying() -> Iterator[Vector]:
-    env = make_vec(2)
+@pytest.fixture(params=[WILDFIRE, OBJECTIVE])
+def flying(request: pytest.FixtureRequest) -> Iterator[Vector]:
+    env = make_vec(2, request.param, **ALL[request.param])
     env.reset(seed=1)
-    env.step(np.ones((2, 4), int))
+    step_still(env)
     yield env
     env.close()
+
+
+def step_still(env: Vector) -> dict[str, Any]:
+    """The infos of a step of zeros."""
+    return env.step(np.zeros(env.action_space.shape, int))[4]
+
+
+def agent_pid(env: Any) -> int:
+    return env.unwrapped._agent._own_agent.pid
 
 
 def private_pid(env: Any) -> int:
@@ -625,13 +639,15 @@ def test_close_twice_is_fine_and_reset_opens_again() -> None:
         assert not is_running(pid)
 
 
-def test_a_private_server_ends_with_its_forgotten_environment() -> None:
-    env = make_vec(2)
+@by_name
+def test_private_programs_end_with_their_forgotten_environment(name: str) -> None:
+    env = make_vec(2, name, **ALL[name])
     env.reset(seed=1)
-    pid = private_pid(env)
+    pids = [private_pid(env)] + ([agent_pid(env)] if name == OBJECTIVE else [])
+    assert all(map(is_running, pids))
     del env
     gc.collect()
-    assert not is_running(pid)
+    assert not any(map(is_running, pids))
 
 
 def test_a_killed_private_server_is_replaced_by_the_next_reset(flying: Vector) -> None:
@@ -640,9 +656,9 @@ def test_a_killed_private_server_is_replaced_by_the_next_reset(flying: Vector) -
     os.kill(pid, signal.SIGKILL)
     assert eventually(lambda: not is_running(pid))
     with pytest.raises(ServerGoneError):
-        flying.step(np.zeros((2, 4), int))
+        step_still(flying)
     assert_same(flying.reset(seed=5), expected)
-    assert flying.step(np.zeros((2, 4), int))[4]["step"].tolist() == [1, 1]
+    assert step_still(flying)["step"].tolist() == [1, 1]
 
 
 def test_a_reset_that_finds_the_server_dead_starts_another(flying: Vector) -> None:
@@ -652,7 +668,7 @@ def test_a_reset_that_finds_the_server_dead_starts_another(flying: Vector) -> No
         os.kill(pid, signal.SIGSTOP)
         if times_out:
             with impatient(flying), pytest.raises(RequestTimeoutError):
-                flying.step(np.zeros((2, 4), int))
+                step_still(flying)
         os.kill(pid, signal.SIGKILL)
         assert_same(flying.reset(seed=5), expected)
 
@@ -666,7 +682,8 @@ def test_a_reset_of_some_worlds_needs_the_others(flying: Vector) -> None:
 
 def test_live_worlds_are_not_copied(flying: Vector) -> None:
     for copying in (copy.deepcopy, pickle.dumps):
-        with pytest.raises(TypeError, match="expected a closed environment, got a WildfireVector"):
+        words = f"expected a closed environment, got a {type(flying.unwrapped).__name__}"
+        with pytest.raises(TypeError, match=words):
             copying(flying)
     flying.close()
     again = copy.deepcopy(flying)
@@ -683,22 +700,24 @@ def test_an_unknown_keyword_is_named() -> None:
 def test_a_stopped_server_times_out_and_resume_goes_on(flying: Vector) -> None:
     pid = private_pid(flying)
     with stopped(pid), impatient(flying), pytest.raises(RequestTimeoutError):
-        flying.step(np.zeros((2, 4), int))
+        step_still(flying)
     with fails("closed", match="timed out"):
-        flying.step(np.zeros((2, 4), int))
+        step_still(flying)
     infos = flying.reset(options={"resume": True})[1]
-    after = flying.step(np.zeros((2, 4), int))[4]
-    assert (after["step"] == infos["step"] + 1).all()
+    assert (step_still(flying)["step"] == infos["step"] + 1).all()
 
 
-def test_a_takeover_of_one_world_is_told_to_all() -> None:
+@by_name
+def test_a_takeover_of_one_world_is_told_to_all(name: str) -> None:
     with serving(worlds=3) as instance:
-        env = make_vec(3, instance=instance)
+        keywords = {"prior": "initial"} if name == OBJECTIVE else {}
+        env = make_vec(3, name, instance=instance, **keywords)
         env.reset(seed=1)
         thief = make(instance=instance, world=1, takeover=True)
         thief.reset(options={"resume": True})
         with pytest.raises(LeaseLostError) as caught:
-            env.step(np.zeros((3, 4), int))
+            for _ in range(4):  # moves of a path
+                step_still(env)
         assert caught.value.detail == os.getpid()
         thief.close()
         assert env.reset(seed=1)[1]["step"].tolist() == [0, 0, 0]

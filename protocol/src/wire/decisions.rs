@@ -1,6 +1,7 @@
-//! The messages of a world's decisions: an external learner decides the objective of the next path, the agent
+//! The messages of decisions: an external learner decides the objective of the next path in each world, the agent
 //! estimates, plans and steps. JSON text both ways, behind the headers of `control`.
 
+use super::control::WorldSeed;
 use super::message::Status;
 use serde::{Deserialize, Serialize};
 
@@ -15,21 +16,20 @@ pub enum Request {
         /// The learner's name and version, for the agent's log.
         client: String,
     },
-    /// Start a new episode with a new belief; answered when burn-in is done.
+    /// Start new episodes with new beliefs in some worlds; answered when burn-in is done.
     Reset {
-        /// The world's seed; `None` lets the server derive one from the world's last.
-        #[serde(default)]
-        seed: Option<u64>,
+        /// The worlds and their seeds.
+        worlds: Vec<WorldSeed>,
     },
-    /// Plan for an objective, fly the path, correct the belief with the frame.
+    /// Plan for objectives, fly the paths, correct the beliefs with the frames.
     Decide {
-        /// Its position among [`AgentInfo::objectives`].
-        objective: u64,
+        /// One for each world: its position among [`AgentInfo::objectives`], or `None` to leave the world as it is.
+        objectives: Vec<Option<u64>>,
     },
-    /// What did the last decision give? Changes nothing.
+    /// What did the last decisions give? Changes nothing.
     // Braces, so that unknown keys are refused here too.
     Last {},
-    /// Release the world and end the agent.
+    /// Release the worlds and end the agent.
     Shutdown {},
 }
 
@@ -38,9 +38,12 @@ pub enum Request {
 #[serde(tag = "reply", rename_all = "snake_case")]
 pub enum Reply {
     /// To `hello`.
-    Decisions(Box<AgentInfo>),
+    Hello(Box<AgentInfo>),
     /// To `reset`, `decide` and `last`.
-    Decision(Decision),
+    Decisions {
+        /// Every world of the agent, in order.
+        worlds: Vec<Decision>,
+    },
     /// To `shutdown`.
     Done,
     /// To anything that was refused.
@@ -65,8 +68,10 @@ pub struct AgentInfo {
     pub pid: u32,
     /// The instance of its server.
     pub instance: String,
-    /// The world it acts on.
-    pub world: u32,
+    /// The first world it acts on.
+    pub first_world: u32,
+    /// Number of worlds it acts on.
+    pub n_worlds: u32,
     /// Grid height H.
     pub height: usize,
     /// Grid width W.
@@ -87,7 +92,7 @@ pub struct AgentInfo {
     pub summary: Vec<String>,
 }
 
-/// The world and the agent's belief after a decision or a reset.
+/// A world and the agent's belief after its last decision or reset.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Decision {
     /// Step index k; 0 after a reset.

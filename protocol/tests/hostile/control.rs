@@ -22,8 +22,8 @@ proptest! {
     }
 
     #[test]
-    fn decisions_survive_json(decision in decision()) {
-        let reply = decisions::Reply::Decision(decision);
+    fn decisions_survive_json(worlds in vec(decision(), 0..4)) {
+        let reply = decisions::Reply::Decisions { worlds };
         let text = serde_json::to_string(&reply).expect("replies serialise");
         prop_assert_eq!(serde_json::from_str::<decisions::Reply>(&text).ok(), Some(reply));
     }

@@ -3,7 +3,7 @@
 use super::target::Seed;
 use bytemuck::{Pod, bytes_of};
 use protocol::agent_belief::{AgentBelief, Intent};
-use protocol::control::{LeaseInfo, Reply, ServerStatus, WorldInfo, WorldStatus, parse};
+use protocol::control::{LeaseInfo, Reply, ServerStatus, WorldInfo, WorldSeed, WorldStatus, parse};
 use protocol::decisions;
 use protocol::message::{
     AgentHeader, FrameHeader, RESULT_BYTES, Status, StepReply, StepResult, VERSION,
@@ -121,8 +121,11 @@ pub fn control_reply(bytes: &[u8]) -> bool {
 /// A request or a reply of a learner's `decisions`.
 pub fn decision(bytes: &[u8]) -> bool {
     // Beyond the largest 32-bit float a number is read as infinite, which JSON cannot write.
-    if let Ok(decisions::Reply::Decision(decision)) = parse(bytes)
-        && !decision.summary.iter().all(|number| number.is_finite())
+    if let Ok(decisions::Reply::Decisions { worlds }) = parse(bytes)
+        && !worlds
+            .iter()
+            .flat_map(|decision| &decision.summary)
+            .all(|number| number.is_finite())
     {
         return false;
     }
@@ -263,14 +266,22 @@ pub fn decision_seeds() -> Vec<Seed> {
         objective: Some(2),
         summary: vec![0.25, 0.5],
     };
+    let unmoved = decisions::Decision {
+        objective: None,
+        ..decision.clone()
+    };
+    let worlds = vec![decision, unmoved];
+    let objectives = vec![Some(1), None];
+    let seeds = [(0, Some(1)), (1, None)].map(|(world, seed)| WorldSeed { world, seed });
+    let seeds = seeds.to_vec();
     vec![
-        ("decision", json(&decisions::Reply::Decision(decision))),
+        ("decisions", json(&decisions::Reply::Decisions { worlds })),
         (
             "error",
             json(&decisions::Reply::refusal(Status::BadObjective, 4)),
         ),
-        ("decide", json(&decisions::Request::Decide { objective: 1 })),
-        ("reset", json(&decisions::Request::Reset { seed: Some(1) })),
+        ("decide", json(&decisions::Request::Decide { objectives })),
+        ("reset", json(&decisions::Request::Reset { worlds: seeds })),
     ]
 }
 

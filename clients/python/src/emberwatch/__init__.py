@@ -19,6 +19,7 @@ from emberwatch.lease import Lease
 from emberwatch.moves_env import WildfireMovesEnv
 from emberwatch.moves_vector_env import WildfireMovesVectorEnv
 from emberwatch.objective_env import WildfireObjectiveEnv
+from emberwatch.objective_vector_env import WildfireObjectiveVectorEnv
 from emberwatch.observer import Frame, Observer, Outlook, OutlookReader, Truth, TruthReader, observe
 from emberwatch.release import VERSION
 from emberwatch.replies import Decision, DecisionsInfo, ServerInfo, ServerStatus, WorldInfo
@@ -46,6 +47,7 @@ __all__ = [
     "WildfireMovesEnv",
     "WildfireMovesVectorEnv",
     "WildfireObjectiveEnv",
+    "WildfireObjectiveVectorEnv",
     "WildfireVectorEnv",
     "WorldInfo",
     "connect",
@@ -73,5 +75,6 @@ gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
 gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
     "emberwatch/WildfireObjective-v0",
     entry_point="emberwatch.objective_env:WildfireObjectiveEnv",
+    vector_entry_point="emberwatch.objective_vector_env:WildfireObjectiveVectorEnv",
     max_episode_steps=MAX_EPISODE_STEPS,
 )

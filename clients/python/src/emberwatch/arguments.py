@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import cast
 
 import numpy as np
@@ -18,6 +19,20 @@ def as_seed(seed: object) -> int:
         if 0 <= number < 2**64:
             return number
     raise InvalidArgumentError(f"seed: expected an integer within 0 to 2**64 - 1, got {seed!r}")
+
+
+def as_seeds(
+    seeds: Iterable[int | None] | None, worlds: Iterable[int]
+) -> list[dict[str, int | None]]:
+    """Checks the seeds of a reset, one for each world, and names them as its request does."""
+    chosen = list(worlds)
+    given = [None] * len(chosen) if seeds is None else list(seeds)
+    if len(given) != len(chosen):
+        raise InvalidArgumentError(f"seeds: expected {len(chosen)}, got {len(given)}")
+    return [
+        {"world": world, "seed": None if seed is None else as_seed(seed)}
+        for world, seed in zip(chosen, given, strict=True)
+    ]
 
 
 def as_choice(action: object, n_choices: int) -> int:

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.replies import Decision
 from emberwatch.session import Session, SessionOwner
-from emberwatch.settings import Settings, draw_seed
+from emberwatch.settings import draw_seed
 from emberwatch.view import RENDER_FPS, RENDER_MODES, View
 from emberwatch.wire import StepAnswer, StepResult
 
@@ -34,12 +33,12 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
         "render_fps": RENDER_FPS,
     }
 
-    def __init__(self, settings: Settings, *, reveals: bool) -> None:
+    def __init__(self, session: Session, *, reveals: bool) -> None:
         """`reveals` puts the hidden states into infos and pictures."""
-        self._session = Session(settings)
-        self._spec: Final = self._session.spec
-        self._view = View(settings.render_mode, self._spec)
-        self.render_mode = settings.render_mode
+        self._session = session
+        self._spec: Final = session.spec
+        self.render_mode = session.settings.render_mode
+        self._view = View(self.render_mode, self._spec)
         self._reveals = reveals
         self._truth: NDArray[np.uint8] | None = None
         self._path: NDArray[np.intp] | None = None
@@ -67,7 +66,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
         return answer
 
     def _describe(self, answer: StepAnswer, result: StepResult) -> dict[str, Any]:
-        info = reported(result)
+        info: dict[str, Any] = {name: getattr(result, name) for name in REPORTED}
         if self._reveals:
             self._truth = truth = self._session.truth(answer)[0]
             info["truth"] = truth.copy()
@@ -75,11 +74,6 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
 
     def _draw(self) -> Any:
         raise NotImplementedError
-
-
-def reported(result: StepResult | Decision) -> dict[str, Any]:
-    """The `info` of a result."""
-    return {name: getattr(result, name) for name in REPORTED}
 
 
 def wants_to_resume(options: dict[str, Any] | None, seed: object) -> bool:

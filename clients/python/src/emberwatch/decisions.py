@@ -1,24 +1,30 @@
-"""An agent that serves decisions: it estimates and plans, its client chooses the objective.
+"""An agent that serves decisions: it estimates and plans, its client chooses the objectives.
 
 PROTOCOL.md section 13. `WildfireObjectiveEnv` makes an environment of it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
+from emberwatch.arguments import as_choice, as_seeds
 from emberwatch.connection import Connection
 from emberwatch.errors import NoServerError
 from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
-from emberwatch.replies import Decision, DecisionsInfo, record
+from emberwatch.replies import Decision, DecisionsInfo, records
 
 
 class Decisions(Connection):
-    """A connection to the agent of one world. Close it, or use it in a `with`."""
+    """A connection to the agent of some worlds. Close it, or use it in a `with`.
+
+    `reset`, `decide` and `last` return the last decision of each world.
+    """
 
     def __init__(
         self, instance: str = "default", world: int = 0, *, timeout: float = STEP_TIMEOUT
     ) -> None:
+        """`world` is the first of its worlds."""
         names = (f"decisions-{world}", f"wake-agent-{world}", "agent")
         try:
             super().__init__(instance, *names, timeout)
@@ -29,27 +35,47 @@ class Decisions(Connection):
             ) from None
         with self._closed_on_error():
             self.info: Final = self._shake_hands(DecisionsInfo)
+        #: The worlds it acts on.
+        self.worlds: Final = range(world, world + self.info.n_worlds)
 
-    def reset(self, seed: int | None = None, *, timeout: float = RESET_TIMEOUT) -> Decision:
-        """Begins an episode with a new belief; without a seed, the server chooses one."""
-        return self._ask({"op": "reset", "seed": seed}, timeout)
+    def reset(
+        self,
+        seeds: Iterable[int | None] | None = None,
+        *,
+        worlds: Sequence[int] | None = None,
+        timeout: float = RESET_TIMEOUT,
+    ) -> tuple[Decision, ...]:
+        """Begins episodes with new beliefs.
 
-    def decide(self, objective: int, *, timeout: float = 2 * STEP_TIMEOUT) -> Decision:
-        """Plans and flies a path for an objective, and takes in what was seen.
+        Args:
+            seeds: One per world; None: the server derives the next from the world's last.
+            worlds: Only these worlds; None: all.
+        """
+        pairs = as_seeds(seeds, self.worlds if worlds is None else worlds)
+        return self._ask({"op": "reset", "worlds": pairs}, timeout)
+
+    def decide(
+        self, objectives: Iterable[int | None], *, timeout: float = 2 * STEP_TIMEOUT
+    ) -> tuple[Decision, ...]:
+        """Plans and flies a path for an objective in each world, and takes in what was seen.
+
+        Args:
+            objectives: One per world; None: the world stays as it is.
 
         Raises:
-            LeaseLostError: If another client took the world over; the agent ends.
+            LeaseLostError: If another client took a world over; the agent ends.
             EmberwatchError: With code `"bad_objective"` or `"episode_over"`. Nothing is done.
         """
-        return self._ask({"op": "decide", "objective": int(objective)}, timeout)
+        asked = [None if one is None else as_choice(one, 2**64) for one in objectives]
+        return self._ask({"op": "decide", "objectives": asked}, timeout)
 
-    def last(self, *, timeout: float = STEP_TIMEOUT) -> Decision:
-        """The last decision again; changes nothing."""
+    def last(self, *, timeout: float = STEP_TIMEOUT) -> tuple[Decision, ...]:
+        """The last decisions again; changes nothing."""
         return self._ask({"op": "last"}, timeout)
 
     def shutdown(self, *, timeout: float = STEP_TIMEOUT) -> None:
-        """Releases the world and ends the agent."""
+        """Releases the worlds and ends the agent."""
         self.control({"op": "shutdown"}, timeout=timeout)
 
-    def _ask(self, request: dict[str, Any], timeout: float) -> Decision:
-        return record(Decision, self.control(request, timeout=timeout))
+    def _ask(self, request: dict[str, Any], timeout: float) -> tuple[Decision, ...]:
+        return records(Decision, self.control(request, timeout=timeout))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from emberwatch.arguments import as_moves
 from emberwatch.base import ONE_WORLD, WorldEnv
 from emberwatch.observations import Observations, Parts, of_world
+from emberwatch.session import Session
 from emberwatch.settings import Settings, WorldArguments
 from emberwatch.view import fly
 from emberwatch.wire import StepAnswer, StepResult
@@ -109,7 +110,7 @@ class WildfireEnv(WorldEnv):
     ) -> None:
         """See the class. No server of its own runs before the first reset."""
         settings = Settings.of(WildfireEnv, world)
-        super().__init__(settings, reveals=settings.truth)
+        super().__init__(Session(settings), reveals=settings.truth)
         self._observations = Observations(observation, self._spec)
         self.observation_space = self._observations.space
         self.action_space = spaces.MultiDiscrete([4] * self._spec.n_moves)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
-from emberwatch.arguments import as_moves, as_seed
+from emberwatch.arguments import as_moves, as_seeds
 from emberwatch.connection import ServerConnection
 from emberwatch.errors import InvalidArgumentError
 from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
@@ -100,14 +100,7 @@ class Lease:
         Returns:
             Where the worlds stand, in the order asked.
         """
-        chosen = list(self.worlds if worlds is None else worlds)
-        given = [None] * len(chosen) if seeds is None else list(seeds)
-        if len(given) != len(chosen):
-            raise InvalidArgumentError(f"seeds: expected {len(chosen)}, got {len(given)}")
-        pairs = [
-            {"world": world, "seed": None if seed is None else as_seed(seed)}
-            for world, seed in zip(chosen, given, strict=True)
-        ]
+        pairs = as_seeds(seeds, self.worlds if worlds is None else worlds)
         return records(WorldInfo, self._ask("reset", timeout, worlds=pairs))
 
     def restore(

@@ -13,7 +13,7 @@ from emberwatch.base import ONE_WORLD, WorldEnv
 from emberwatch.errors import InvalidArgumentError
 from emberwatch.flights import Flights
 from emberwatch.observations import WINDOW, MovesParts, Observations, of_world
-from emberwatch.session import not_reset
+from emberwatch.session import Session, not_reset
 from emberwatch.settings import Settings, WorldArguments, WorldSpec
 from emberwatch.view import fly
 from emberwatch.wire import StepAnswer
@@ -94,7 +94,8 @@ class WildfireMovesEnv(WorldEnv):
     ) -> None:
         """See the class. No server of its own runs before the first reset."""
         reveals = world.get("truth", False)
-        super().__init__(moves_settings(WildfireMovesEnv, reward, world), reveals=reveals)
+        settings = moves_settings(WildfireMovesEnv, reward, world)
+        super().__init__(Session(settings), reveals=reveals)
         self._flights = flights = moves_flights(self._spec, 1, reward)
         self._observations = Observations(observation, self._spec, 1, flights, window)
         self.observation_space = self._observations.space

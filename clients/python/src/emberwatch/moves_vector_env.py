@@ -42,9 +42,10 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         settings = moves_settings(WildfireMovesVectorEnv, reward, world)
         session = Session(settings, num_envs)
         self._flights = flights = moves_flights(session.spec, num_envs, reward)
+        self._parts = Observations(observation, session.spec, num_envs, flights, window)
         super().__init__(
             session,
-            Observations(observation, session.spec, num_envs, flights, window),
+            self._parts,
             spaces.Discrete(wire.N_MOVES),
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
@@ -78,7 +79,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         indices = np.flatnonzero(moved)
         rewards = np.zeros(self.num_envs)
         rewards[indices] = self._flights.move(indices, actions)
-        self._observations.visit(indices)
+        self._parts.visit(indices)
         return rewards
 
     def _begin(self, begun: NDArray[np.bool_]) -> None:

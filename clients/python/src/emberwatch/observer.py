@@ -46,6 +46,11 @@ class Frame:
     #: Samples that this observer missed since the last one it got.
     n_lost: int
 
+    @property
+    def moment(self) -> tuple[int, int, int]:
+        """Seed, episode and step."""
+        return self.result.moment
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Truth:
@@ -61,6 +66,11 @@ class Truth:
     states: NDArray[np.uint8]
     #: Samples that this reader missed since the last one it got.
     n_lost: int
+
+    @property
+    def moment(self) -> tuple[int, int, int]:
+        """Seed, episode and step."""
+        return self.seed, self.episode, self.step
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -86,7 +96,7 @@ class Outlook:
     n_lost: int
 
 
-class _Reader(Closable, Generic[_Sample]):
+class Reader(Closable, Generic[_Sample]):
     """A subscriber of one channel."""
 
     def __init__(
@@ -182,7 +192,7 @@ class _Reader(Closable, Generic[_Sample]):
         return _BUSY_SLEEP if now - self._busy_at < _BUSY else _CALM_SLEEP
 
 
-class Observer(_Reader[Frame]):
+class Observer(Reader[Frame]):
     """Reads the frames of an instance; iterate over it. Never slows the server."""
 
     def __init__(
@@ -209,7 +219,7 @@ class Observer(_Reader[Frame]):
                 return
 
 
-class TruthReader(_Reader[Truth]):
+class TruthReader(Reader[Truth]):
     """Reads the hidden states of an instance whose server publishes them."""
 
     def __init__(self, instance: str = "default") -> None:
@@ -217,7 +227,7 @@ class TruthReader(_Reader[Truth]):
         super().__init__(instance, "truth", wire.TruthHeader, truth_from_sample, **limits)
 
 
-class OutlookReader(_Reader[Outlook]):
+class OutlookReader(Reader[Outlook]):
     """Reads what agents believe, which they publish while there is a reader."""
 
     def __init__(self, instance: str = "default") -> None:

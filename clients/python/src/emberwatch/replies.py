@@ -112,7 +112,9 @@ class DecisionsInfo:
     build: str
     pid: int
     instance: str
-    world: int
+    #: The first of its worlds.
+    first_world: int
+    n_worlds: int
     height: int
     width: int
     n_moves: int
@@ -128,7 +130,7 @@ class DecisionsInfo:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decision:
-    """What came of a decision: the step's result, and a summary of the belief about the next.
+    """What came of a world's last decision: the step's result, and the belief about the next.
 
     `seed` and `n_target_cells` are not for learners.
     """

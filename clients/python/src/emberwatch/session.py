@@ -11,6 +11,7 @@ import warnings
 import weakref
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -28,10 +29,11 @@ from emberwatch.errors import (
 )
 from emberwatch.lease import Lease
 from emberwatch.model import Model
+from emberwatch.newest import Newest
+from emberwatch.observer import Truth, TruthReader
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program, unused_instance
 from emberwatch.settings import Settings, private_spec, running_spec
-from emberwatch.truth import HiddenStates
 from emberwatch.wire import StepAnswer
 
 # Seconds after its last use that a lease ends: learners may think long, and a dead holder is
@@ -43,7 +45,7 @@ _PRIVATE_LEASE: Final = 86400.0
 _SHUTDOWN_TIMEOUT: Final = 0.5
 
 #: After these the worlds are no longer held, or stand elsewhere than expected.
-_LOST: Final = (LeaseLostError, RequestTimeoutError, ServerGoneError)
+LOST: Final = (LeaseLostError, RequestTimeoutError, ServerGoneError)
 
 
 class Session:
@@ -52,10 +54,11 @@ class Session:
     def __init__(self, settings: Settings, n_worlds: int = 1) -> None:
         self.settings: Final = settings
         self.n_worlds: Final = n_worlds
+        self._worlds: Final = range(settings.world, settings.world + n_worlds)
         self._client: Client | None = None
         self._lease: Lease | None = None
         self._program: Program | None = None
-        self._truth: HiddenStates | None = None
+        self._truth: Newest[Truth] | None = None
         self._has_warned = False
         #: Whether a step has timed out, so that the worlds may stand elsewhere than expected.
         self._is_lost = False
@@ -93,9 +96,8 @@ class Session:
         self._open(0)
         try:
             return self._observe()
-        except _LOST as error:
-            self._lose(error)
-            raise
+        except LOST as error:
+            raise self._lost(error) from None
 
     def reset(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
         """Begins new episodes in some of the worlds, counted from 0; returns how all stand.
@@ -119,9 +121,8 @@ class Session:
         worlds = lease.worlds if indices is None else lease.worlds[indices.start : indices.stop]
         try:
             return lease.step_moves(moves, worlds, full=False, timeout=self.settings.timeout)
-        except _LOST as error:
-            self._lose(error)
-            raise
+        except LOST as error:
+            raise self._lost(error) from None
 
     def truth(self, answer: StepAnswer) -> NDArray[np.uint8]:
         """The hidden states that belong to an answer, `(n_worlds, H, W)`; a copy."""
@@ -129,8 +130,9 @@ class Session:
             raise EmberwatchError("truth: expected an open session made with truth=True", "closed")
         first = answer.first_world - self.settings.world
         results = [answer.result(index) for index in range(len(answer.frames))]
-        moments = [(result.seed, result.episode, result.step) for result in results]
-        return self._truth.at(moments, self.settings.timeout, first)
+        moments = [result.moment for result in results]
+        truths = self._truth.at(moments, self.settings.timeout, first)
+        return np.stack([truth.states for truth in truths])
 
     def launch(self, seed: int) -> Client:
         """Starts the private server, with this seed for world 0; `close` stops it."""
@@ -165,8 +167,8 @@ class Session:
             program.stop()
 
     def _open(self, seed: int) -> None:
-        """Connects and acquires the worlds; a private server starts with `seed` for world 0."""
-        if self._lease is not None:
+        """Connects and holds the worlds; a private server starts with `seed` for world 0."""
+        if self.is_open:
             return
         settings = self.settings
         try:
@@ -175,34 +177,38 @@ class Session:
             else:
                 self._client = client = self._connect(settings.instance)
                 self._check_unchanged(client)
-            self._lease = client.acquire(
-                settings.world,
-                self.n_worlds,
-                takeover=settings.takeover,
-                ttl=_PRIVATE_LEASE if settings.instance is None else _LEASE,
-                timeout=RESET_TIMEOUT,
-            )
+            self._hold(client)
             if settings.truth:
-                shape = (self.n_worlds, self.spec.height, self.spec.width)
-                self._truth = HiddenStates(client.instance, settings.world, shape)
+                self._truth = Newest(partial(TruthReader, client.instance), self._worlds)
         except BaseException:
             self.close()
             raise
+
+    def _hold(self, client: Client) -> None:
+        """Gets the right to act on the worlds."""
+        self._lease = client.acquire(
+            self.settings.world,
+            self.n_worlds,
+            takeover=self.settings.takeover,
+            ttl=_PRIVATE_LEASE if self.settings.instance is None else _LEASE,
+            timeout=RESET_TIMEOUT,
+        )
 
     def _connect(self, instance: str) -> Client:
         return connect(instance, timeout=self.settings.timeout, wait=self.settings.timeout)
 
     def _begin(self, indices: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
         self._open((seeds[0] - indices[0]) % 2**64)
-        lease = self._opened()
         try:
-            lease.reset(seeds, worlds=[lease.worlds[index] for index in indices])
-            answer = self._observe()
-            self._warn_of_barren(answer)
-            return answer
-        except _LOST as error:
-            self._lose(error)
-            raise
+            answer = self._restart([self._worlds[index] for index in indices], seeds)
+        except LOST as error:
+            raise self._lost(error) from None
+        self._warn_of_barren(answer)
+        return answer
+
+    def _restart(self, worlds: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
+        self._opened().reset(seeds, worlds=worlds)
+        return self._observe()
 
     def _warn_of_barren(self, answer: StepAnswer) -> None:
         """Warns once of worlds in which there is nothing to find."""
@@ -217,11 +223,13 @@ class Session:
             "model='wildfire-small'"
         )
 
-    def _lose(self, error: EmberwatchError) -> None:
+    def _lost(self, error: EmberwatchError) -> EmberwatchError:
+        """Closes what is gone, a reset opens it again; remembers what timed out."""
         if isinstance(error, RequestTimeoutError):
             self._is_lost = True
         else:
             self.close()
+        return error
 
     def _opened(self) -> Lease:
         if self._lease is None:

@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from emberwatch.agent_session import Summaries
 from emberwatch.arguments import as_seed
 from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, wants_to_resume
 from emberwatch.errors import InvalidArgumentError
@@ -32,7 +33,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
     def __init__(
         self,
         session: Session,
-        observations: Observations,
+        observations: Observations | Summaries,
         action_space: spaces.Space[Any],
         *,
         max_episode_steps: int | None,

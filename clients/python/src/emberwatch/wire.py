@@ -152,6 +152,11 @@ class StepResult(NamedTuple):
     #: 1 if the server's `max_steps` ended it.
     truncated: int
 
+    @property
+    def moment(self) -> tuple[int, int, int]:
+        """Seed, episode and step."""
+        return self.seed, self.episode, self.step
+
 
 #: One `StepResult` as bytes; the last four are reserved.
 RESULT: Final = struct.Struct("=QQQdIIIIIIHH4x")

@@ -1,0 +1,265 @@
+"""Worlds that an agent estimates, plans and steps in: its client chooses what each path is for."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Final
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from emberwatch import wire
+from emberwatch.client import Client, connect_with_retry
+from emberwatch.decisions import Decisions
+from emberwatch.errors import (
+    EmberwatchError,
+    InvalidArgumentError,
+    LeaseLostError,
+    NoServerError,
+    RequestTimeoutError,
+    ServerGoneError,
+)
+from emberwatch.newest import Newest
+from emberwatch.observer import Frame, Observer
+from emberwatch.ports import RESET_TIMEOUT
+from emberwatch.programs import Program
+from emberwatch.replies import Decision, DecisionsInfo
+from emberwatch.session import LOST, Session, not_reset, timed_out_before
+from emberwatch.settings import Settings
+from emberwatch.view import fly
+from emberwatch.wire import StepAnswer
+
+#: Exit code of an agent whose lease was lost.
+_LEASE_LOST: Final = 3
+
+_CHOICES: Final = {
+    "estimator": ("known_model", "spatial_filter"),
+    "planner": ("beam", "shooting"),
+    "prior": ("simulated", "initial", "uniform"),
+    "agent": ("own", "running"),
+}
+
+
+class AgentSession(Session):
+    """Consecutive worlds that an agent holds the lease of. Opens itself at the first reset.
+
+    Its answers' frames are empty unless there is a render mode.
+    """
+
+    def __init__(self, settings: Settings, arguments: Mapping[str, str], n_worlds: int = 1) -> None:
+        """`arguments` are `estimator`, `planner`, `prior` and `agent` of the environment."""
+        for name, choices in _CHOICES.items():
+            if arguments[name] not in choices:
+                expected = f"one of {', '.join(choices)}"
+                raise InvalidArgumentError(f"{name}: expected {expected}, got {arguments[name]!r}")
+        if arguments["agent"] == "running" and settings.instance is None:
+            raise InvalidArgumentError("agent='running': expected instance=..., where it runs")
+        if settings.render_mode is not None and n_worlds > wire.FRAME_BUFFER:
+            raise InvalidArgumentError(
+                f"render_mode: expected at most {wire.FRAME_BUFFER} worlds, got {n_worlds}"
+            )
+        super().__init__(settings, n_worlds)
+        if self.spec.model is None:
+            raise InvalidArgumentError("model: expected one, as the server does not reveal its own")
+        n_objectives = self.spec.model.n_states + 1
+        #: Of one world.
+        self.action_space: Final = spaces.Discrete(n_objectives)
+        self.space: Final = spaces.Box(0.0, 1.0, (18 * n_objectives + 2,), np.float32)
+        self._arguments = arguments
+        self._own_agent: Program | None = None
+        self._decisions: Decisions | None = None
+        self._frames: Newest[Frame] | None = None
+        #: What the agent believes of each world, in a few numbers; new after each answer.
+        self.summaries = np.zeros((n_worlds, *self.space.shape), np.float32)
+        #: The cells of each world's last path, where there is a render mode.
+        self.paths: list[NDArray[np.intp]] = []
+
+    @property
+    def info(self) -> DecisionsInfo:
+        """The agent's description of itself, once there has been a reset."""
+        return self._asked().info
+
+    @property
+    def instance(self) -> str:
+        return self.info.instance
+
+    @property
+    def is_open(self) -> bool:
+        return self._decisions is not None
+
+    def decide(self, objectives: NDArray[np.uint8], moved: NDArray[np.bool_]) -> StepAnswer:
+        """One step of the worlds `moved`, each for its objective; returns how all stand."""
+        agent = self._asked()
+        if self._is_lost:
+            raise timed_out_before()
+        worlds = zip(objectives.tolist(), moved.tolist(), strict=True)
+        asked = [objective if moves else None for objective, moves in worlds]
+        try:
+            decisions = agent.decide(asked, timeout=self.settings.timeout)
+        except LOST as error:
+            raise self._lost(error) from None
+        return self._answer(decisions)
+
+    def close(self) -> None:
+        """Ends the agent and the private server, if they are its own. May be called again."""
+        for part in (self._frames, self._decisions):
+            if part is not None:
+                part.close()
+        self._frames = self._decisions = None
+        agent, self._own_agent = self._own_agent, None
+        if agent is not None:
+            agent.stop()
+        super().close()
+
+    def _hold(self, client: Client) -> None:
+        """Starts the agent, which acquires the worlds."""
+        instance = client.instance
+        if self.settings.instance is not None:
+            client.close()  # a server has few places for clients, and the agent needs one
+            self._client = None
+        if self.settings.render_mode is not None:
+            self._frames = Newest(partial(Observer, instance), self._worlds)
+        if self._arguments["agent"] == "own":
+            self._decisions = self._start_agent(instance)
+            return
+        self._decisions = decisions = connect_with_retry(
+            self.settings.timeout, partial(self._connect_to_agent, instance)
+        )
+        if decisions.worlds != self._worlds:
+            first, last = decisions.worlds[0], decisions.worlds[-1]
+            raise InvalidArgumentError(
+                f"agent='running': expected one of worlds {self._worlds[0]} to {self._worlds[-1]}, "
+                f"got one of {first} to {last}"
+            )
+
+    def _start_agent(self, instance: str) -> Decisions:
+        settings = self.settings
+        flags = {"instance": instance, "world": settings.world, "worlds": self.n_worlds, "wait": 0}
+        flags |= {name: self._arguments[name] for name in ("estimator", "planner", "prior")}
+        if settings.instance is not None and settings.model is not None:
+            flags["model"] = str(settings.model)
+        command = ["serve-decisions", *(f"--{flag}={value}" for flag, value in flags.items())]
+        self._own_agent = agent = Program(
+            "emberwatch-agent", command + ["--takeover"] * settings.takeover
+        )
+        # For environments that nobody closes. Does nothing where it has been stopped before.
+        weakref.finalize(self, agent.stop)
+
+        def connect_to_own() -> Decisions:
+            decisions = self._connect_to_agent(instance)
+            if decisions.info.pid == agent.pid:
+                return decisions
+            # Another agent serves the worlds; the own one will end with an error about it.
+            decisions.close()
+            raise NoServerError(f"world {settings.world} has another agent")
+
+        return agent.wait_for(connect_to_own, RESET_TIMEOUT)
+
+    def _asked(self) -> Decisions:
+        if self._decisions is None:
+            raise not_reset()
+        return self._decisions
+
+    def _connect_to_agent(self, instance: str) -> Decisions:
+        return Decisions(instance, self.settings.world, timeout=self.settings.timeout)
+
+    def _restart(self, worlds: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
+        return self._began(self._asked().reset(seeds, worlds=worlds))
+
+    def _observe(self) -> StepAnswer:
+        return self._began(self._asked().last(timeout=self.settings.timeout))
+
+    def _began(self, decisions: tuple[Decision, ...]) -> StepAnswer:
+        self._is_lost = False
+        return self._answer(decisions)
+
+    def _answer(self, decisions: tuple[Decision, ...]) -> StepAnswer:
+        """Takes in the summaries; the rest as the server would tell it."""
+        spec, expected = self.spec, self.summaries.shape
+        self.summaries = np.array([made.summary for made in decisions], np.float32)
+        if self.summaries.shape != expected:
+            got = self.summaries.shape
+            raise wire.bad_answer(f"decisions: expected summaries of shape {expected}, got {got}")
+        header = wire.StepReply(
+            first_world=self.settings.world,
+            n_worlds=len(decisions),
+            height=spec.height,
+            width=spec.width,
+        )
+        results = b"".join(map(_result, decisions))
+        frames = self._seen([(made.seed, made.episode, made.step) for made in decisions])
+        return StepAnswer(header, bytearray(results + frames), spec.n_observations)
+
+    def _seen(self, moments: list[tuple[int, int, int]]) -> bytes:
+        spec = self.spec
+        if self._frames is None:
+            return bytes([wire.UNOBSERVED]) * (len(moments) * spec.height * spec.width)
+        seen = self._frames.at(moments, self.settings.timeout)
+        self.paths = [fly(one.start, one.path, spec) for one in seen]
+        return b"".join(one.frame.tobytes() for one in seen)
+
+    def _lost(self, error: EmberwatchError) -> EmberwatchError:
+        """The error in the agent's own words, if it has ended."""
+        agent = self._own_agent
+        code = (
+            None if agent is None or isinstance(error, RequestTimeoutError) else agent.exit_code()
+        )
+        words = "" if agent is None or code is None else agent.output()
+        super()._lost(error)
+        if code is None or isinstance(error, LeaseLostError):
+            return error
+        kind = LeaseLostError if code == _LEASE_LOST else ServerGoneError
+        return kind(f"{error}: {words}")
+
+
+def _result(made: Decision) -> bytes:
+    return wire.RESULT.pack(
+        made.step,
+        made.seed,
+        made.episode,
+        made.reward,
+        made.n_target_cells,
+        made.n_visited,
+        made.n_hits,
+        *made.robot,
+        0,
+        made.terminated,
+        made.truncated,
+    )
+
+
+class Summaries:
+    """Observations of worlds that an agent acts on: its summaries of the beliefs."""
+
+    def __init__(self, session: AgentSession) -> None:
+        self._session = session
+        self.space: Final = session.space
+
+    def reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
+        """The agent forgets by itself."""
+
+    def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
+        """The agent sees by itself."""
+
+    def all(self, frames: NDArray[np.uint8], robots: NDArray[np.int64]) -> NDArray[np.float32]:
+        """The observations of all worlds, stacked."""
+        return self._session.summaries
+
+
+class AgentSessionOwner:
+    """What environments of one world and of many tell of their agent."""
+
+    _agent: AgentSession
+
+    @property
+    def objectives(self) -> tuple[str, ...]:
+        """What each action plans for, once the environment has been reset."""
+        return self._agent.info.objectives
+
+    @property
+    def summary_names(self) -> tuple[str, ...]:
+        """What each number of an observation is, once the environment has been reset."""
+        return self._agent.info.summary
