@@ -74,11 +74,15 @@ pub fn leave(client: &mut Client, world: u32, robot: &Robot) -> Result<(), Conne
         return Ok(());
     };
     match client.leave_belief(world, &present.result, &kind, &agent.estimator().memory()) {
-        // A server that keeps no beliefs.
+        // A server that keeps no beliefs, or none that is so long.
         Err(ConnectionError::Refused {
             status: Status::Malformed,
+            message,
             ..
-        }) => Ok(()),
+        }) => {
+            tracing::debug!("the belief is not left: {message}");
+            Ok(())
+        }
         left => left,
     }
 }

@@ -79,7 +79,11 @@ impl SpatialFilter {
 }
 
 impl Estimator for SpatialFilter {
+    /// # Panics
+    /// If the frame is of another grid.
     fn correct(&mut self, frame: &Frame, _: Option<&Grid<u8>>) -> Result<(), EstimatorError> {
+        let (dim, expected) = (frame.values().dim(), self.belief().shape().dim());
+        assert_eq!(dim, expected, "frame: expected the belief's grid");
         let (belief, likelihood) = (self.filter.belief(), self.filter.likelihood());
         let evidence = Evidence::of(frame, belief, likelihood, self.state, &self.ages);
         self.correct_in_order(frame.observed())?;

@@ -145,7 +145,8 @@ impl Spread {
         let now = f64::from(self.probability[self.place(cell)]);
         let mut states = belief.states(self.shape.index(cell));
         let rest: f64 = states.iter().sum::<f64>() - states[self.state];
-        if rest > 0.0 {
+        // What no neighbour changed stays as it is: the rest of one may be less than 32 bits tell.
+        if rest > 0.0 && now != states[self.state] {
             states.iter_mut().for_each(|p| *p *= (1.0 - now) / rest);
             states[self.state] = now;
         }

@@ -3,16 +3,17 @@
 use protocol::control::{BeliefInfo, MAX_BELIEF_PART};
 use protocol::message::StepResult;
 
-/// Most bytes of a belief per cell of the grid: eighteen 32-bit numbers.
-const BYTES_PER_CELL: u64 = 72;
+/// States of a belief that is kept for any model; it may have as many as its model, too.
+const N_STATES: usize = 18;
 
-/// Most bytes beside these.
+/// Most bytes beside a 32-bit number for each state and cell, and as much again for each cell.
 const MORE_BYTES: u64 = 32 << 10;
 
 /// The beliefs left, one per world at most.
 #[derive(Debug)]
 pub struct Beliefs {
-    n_cells: usize,
+    /// Most bytes of one.
+    longest: u64,
     left: Vec<Option<StoredBelief>>,
 }
 
@@ -35,9 +36,11 @@ pub struct BeliefPart<'a> {
 }
 
 impl Beliefs {
-    pub fn new(n_worlds: usize, n_cells: usize) -> Self {
+    /// None yet, for worlds of so many cells and states.
+    pub fn new(n_worlds: usize, n_cells: usize, n_states: usize) -> Self {
+        let numbers = n_cells * (n_states.max(N_STATES) + 1);
         Self {
-            n_cells,
+            longest: (numbers * size_of::<f32>()) as u64 + MORE_BYTES,
             left: (0..n_worlds).map(|_| None).collect(),
         }
     }
@@ -52,7 +55,7 @@ impl Beliefs {
         at: &StepResult,
         part: &BeliefPart<'_>,
     ) -> Result<(), String> {
-        let longest = BYTES_PER_CELL * self.n_cells as u64 + MORE_BYTES;
+        let longest = self.longest;
         if part.length > longest {
             let got = part.length;
             return Err(format!(

@@ -59,7 +59,11 @@ impl Simulator {
     ) -> Result<(Self, Vec<ResetJob>), ModelError> {
         let config = &checked.config;
         let spec = WorldSpec::of(&checked)?;
-        let beliefs = Beliefs::new(config.worlds as usize, checked.shape.n_cells());
+        let beliefs = Beliefs::new(
+            config.worlds as usize,
+            checked.shape.n_cells(),
+            checked.model.n_states(),
+        );
         let (n_worlds, first_seed) = (config.worlds as usize, config.seed);
         let start = |world: usize| ResetJob {
             world,

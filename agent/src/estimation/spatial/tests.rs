@@ -11,9 +11,8 @@ use crate::estimation::correlations::N_AGES;
 use ndarray::{Array2, Array3, Array4, Axis};
 use ndarray_npy::NpzReader;
 use proptest::prelude::*;
-use protocol::Model;
 use protocol::randomness::split_mix;
-use protocol::{Cell, Shape};
+use protocol::{Cell, Model, Probabilities, Shape};
 use std::fs::File;
 
 const FIRE: usize = 2;
@@ -70,19 +69,41 @@ fn an_impossible_frame_is_rejected_whole_with_neighbours_or_without() {
     let spatial = SpatialFilter::new(filter.clone(), FIRE, Correlations::default());
     let filters: [Box<dyn Estimator>; 2] = [Box::new(filter), Box::new(spatial)];
     for mut filter in filters {
+        let before = filter.memory();
         let error = filter.correct(&frame, None);
         let error = error.expect_err("a normal cell seen as fire");
         let EstimatorError::ZeroEvidence(error) = error else {
             panic!("{error}");
         };
         assert_eq!((error.cell, error.observed), (Cell { row: 1, col: 0 }, 2));
-        assert_eq!(filter.belief(), &prior);
+        assert_eq!(filter.memory(), before);
     }
 }
 
-/// A model of three states, any of which can pay.
-fn model(paying: usize) -> Model {
+#[test]
+fn a_tiny_probability_is_evidence_with_neighbours_too() {
     let mut file = Model::wildfire().file().clone();
+    file.states[FIRE].observed_as = vec![0.0, 0.02, 0.98];
+    let numbers = [1e-9, 0.0, 1.0];
+    let prior = Probabilities::from_shape_fn((3, 1, 1), |(state, _, _)| numbers[state]);
+    let prior = Belief::from_probabilities(prior).expect("a belief");
+    let model = Model::new(file).expect("a model");
+    let filter = BayesFilter::known(&model, prior).expect("valid");
+    let mut filter = SpatialFilter::new(filter, FIRE, Correlations::default());
+    let shape = Shape::new(1, 1).expect("a grid");
+    let frame = Frame::from_bytes(shape, 3, &[0]).expect("a frame");
+    filter.correct(&frame, None).expect("possible");
+    assert_eq!(filter.belief().as_slice(), [1.0, 0.0, 0.0]);
+}
+
+/// A model of three or four states, any of which can pay.
+fn model(paying: usize) -> Model {
+    let road = include_str!("../../../../config/models/road-ice.toml");
+    let (model, paying) = match paying.checked_sub(3) {
+        Some(paying) => (Model::from_toml(road).expect("a model"), paying),
+        None => (Model::wildfire(), paying),
+    };
+    let mut file = model.file().clone();
     for (state, entry) in file.states.iter_mut().enumerate() {
         entry.reward = f64::from(u8::from(state == paying));
     }
@@ -94,12 +115,12 @@ proptest! {
     fn beliefs_stay_distributions_and_memory_is_all_there_is(
         (height, width) in (1_usize..12, 1_usize..12),
         frames in prop::collection::vec(prop::collection::vec(0_u8..6, 144), 1..12),
-        paying in 0_usize..3,
+        paying in 0_usize..7,
     ) {
         let shape = Shape::new(height, width).expect("a grid");
         let model = model(paying);
         let new = || {
-            let filter = BayesFilter::known(&model, Belief::uniform(3, shape)).expect("valid");
+            let filter = BayesFilter::known(&model, Belief::uniform(model.n_states(), shape)).expect("valid");
             SpatialFilter::new(filter, model.target_state(), Correlations::default())
         };
         let mut filter = new();

@@ -143,7 +143,7 @@ class Lease:
         Args:
             result: The world's last result; another step is refused.
             kind: Says to other agents what the bytes are, in at most 256 bytes.
-            data: At most 72 bytes per cell and 32,768.
+            data: At most 32,768 bytes and 76 per cell; more if the model has over 18 states.
             world: Which world; None: the first of the lease.
         """
         for offset in range(0, max(len(data), 1), _BELIEF_PART):

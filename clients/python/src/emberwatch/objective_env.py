@@ -47,7 +47,8 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
     As `WildfireEnv` without `observation`, and
 
     * `estimator`: `"known_model"` (the paper's Bayes filter, the default) or `"spatial_filter"`
-      (what is seen also changes the belief about neighbouring cells).
+      (what is seen also changes the belief about neighbouring cells, by correlations that each
+      episode learns for itself, so that the same seed and actions give the same episode).
     * `planner`: `"beam"` (beam search, the default) or `"shooting"` (the paper's).
     * `prior`: `"simulated"` (the default; takes a second to start), `"initial"` or `"uniform"`.
     * `agent`: `"own"` starts an agent on the world; `"running"` uses one that serves decisions
