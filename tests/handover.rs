@@ -183,7 +183,7 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_world_alone() 
     let mut client = server.acquire(0..1);
     fly(&mut client, Paths::new(0).next(6));
     assert_eq!(client.belief(0, "kind").expect("none yet"), None);
-    let bytes: Vec<u8> = (0..35 * 72 + 32_768).map(|n| n as u8).collect();
+    let bytes: Vec<u8> = (0..35 * 76 + 32_768).map(|n| n as u8).collect();
     let at = client.observe(0..1).expect("observe")[0].result;
     client.leave_belief(0, &at, "kind", &bytes).expect("leave");
     assert_eq!(
@@ -212,7 +212,7 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_world_alone() 
         (leave(lease, 7, 0, 1, "AA=="), Status::NoSuchWorld),
         (leave(lease, 1, 0, 1, "A"), Status::Malformed),
         (leave(lease, 1, 1, 2, "AA=="), Status::Malformed),
-        (leave(lease, 1, 0, 35_289, "AA=="), Status::Malformed),
+        (leave(lease, 1, 0, 35_429, "AA=="), Status::Malformed),
         (leave(lease, 1, 0, 0, "AA=="), Status::Malformed),
         (part(lease, 1, 1, 0, 1, "AA=="), Status::Malformed),
         (
