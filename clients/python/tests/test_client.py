@@ -480,5 +480,5 @@ def test_a_belief_that_is_left_is_found_at_its_step_alone(server: Start) -> None
     past = lease.observe().result()
     result = lease.step(paths(1)).result()
     assert client.belief() is None
-    for at, size in ((past, 1), (result, 35 * 72 + 32_768 + 1)):
+    for at, size in ((past, 1), (result, 35 * 76 + 32_768 + 1)):
         refused(lambda: lease.leave_belief(at, "numbers", bytes(size)), "malformed", 0)  # noqa: B023
