@@ -3,10 +3,10 @@
 use protocol::control::{BeliefInfo, MAX_BELIEF_PART};
 use protocol::message::StepResult;
 
-/// States of a belief that is kept for any model; it may have as many as its model, too.
+/// States that a belief may have under any model, as learned ones have their own; it may have as many as the model, too.
 const N_STATES: usize = 18;
 
-/// Most bytes beside a 32-bit number for each state and cell, and as much again for each cell.
+/// Most bytes beside 32-bit numbers: one for each state and cell, and one more for each cell.
 const MORE_BYTES: u64 = 32 << 10;
 
 /// The beliefs left, one per world at most.

@@ -120,7 +120,8 @@ proptest! {
         let shape = Shape::new(height, width).expect("a grid");
         let model = model(paying);
         let new = || {
-            let filter = BayesFilter::known(&model, Belief::uniform(model.n_states(), shape)).expect("valid");
+            let prior = Belief::uniform(model.n_states(), shape);
+            let filter = BayesFilter::known(&model, prior).expect("valid");
             SpatialFilter::new(filter, model.target_state(), Correlations::default())
         };
         let mut filter = new();
