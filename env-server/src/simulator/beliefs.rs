@@ -3,7 +3,7 @@
 use protocol::control::{BeliefInfo, MAX_BELIEF_PART};
 use protocol::message::StepResult;
 
-/// States that a belief may have under any model, as learned ones have their own; it may have as many as the model, too.
+/// States that a belief may have under any model, as learned ones have their own. It may have as many as the model.
 const N_STATES: usize = 18;
 
 /// Most bytes beside 32-bit numbers: one for each state and cell, and one more for each cell.
