@@ -5,10 +5,9 @@
 //! Numbers are little-endian.
 
 use crate::album::Strip;
-use crate::entry::{Entry, Robot};
+use crate::entry::Entry;
 use crate::memory::Memory;
 use crate::scene::{Info, Lost, Player, Scene};
-use protocol::Shape;
 use protocol::control::ServerStatus;
 use protocol::frame::UNOBSERVED;
 use serde::{Deserialize, Serialize};
@@ -315,12 +314,8 @@ impl Shown {
             n_visited: result.n_visited,
             n_hits: result.n_hits,
             n_target_cells: result.n_target_cells,
-            robots: (entry.robots.iter().enumerate())
-                .map(|(index, robot)| {
-                    let did = |robots: u64| robots >> index & 1 == 1;
-                    let stayed = (did(result.hovered), did(result.late));
-                    ShownRobot::of(robot, entry.shape, stayed)
-                })
+            robots: (0..entry.robots.len())
+                .map(|index| ShownRobot::of(entry, index))
                 .collect(),
             terminated: result.terminated != 0,
             truncated: result.truncated != 0,
@@ -331,14 +326,16 @@ impl Shown {
 }
 
 impl ShownRobot {
-    fn of(robot: &Robot, shape: Shape, stayed: (bool, bool)) -> Self {
-        let path = robot.path(shape).into_iter();
+    fn of(entry: &Entry, index: usize) -> Self {
+        let robot = &entry.robots[index];
+        let is_among = |robots: u64| robots >> index & 1 == 1;
+        let path = robot.path(entry.shape).into_iter();
         Self {
-            state: match stayed {
-                (true, _) => "hovered",
-                (_, true) => "late",
-                _ if robot.moves.is_empty() => "new",
-                _ => "flew",
+            state: match robot.moves.is_empty() {
+                _ if is_among(entry.result.hovered) => "hovered",
+                _ if is_among(entry.result.late) => "late",
+                true => "new",
+                false => "flew",
             },
             cell: [robot.result.row, robot.result.col],
             path: path.map(|cell| [cell.row, cell.col]).collect(),
