@@ -137,7 +137,7 @@ function drawAgent(picture, isNewest) {
 function flownBy(agent) {
   if (!agent) return "";
   const { first_robot: first, n_robots: count } = agent;
-  return count > 1 ? `of robots ${first} to ${first + count - 1}` : `of robot ${first}`;
+  return count > 1 ? `robots ${first}–${first + count - 1}` : `robot ${first}`;
 }
 
 // Before anything is known there is nothing to lay out: a word on how to begin.

@@ -2,7 +2,7 @@
 
 import { make, swatch } from "/elements.js";
 import { rampStops } from "/palette.js";
-import { beliefNames, isTeam, observationNames, stateNames } from "/words.js";
+import { beliefNames, observationNames, stateNames } from "/words.js";
 
 // More names than this would leave no room for what they explain.
 const MOST_NAMES = 16;
@@ -16,12 +16,11 @@ export function createLegend(list, ramps) {
       const observations = observationNames(picture);
       const believed = beliefNames(picture).length;
       const { theme } = palette;
-      const team = isTeam(picture.shown);
       const { state_colours: ofStates, observation_colours: ofObservations } = picture.info;
-      const key = JSON.stringify([states, observations, believed, theme, team, ofStates, ofObservations]);
+      const key = JSON.stringify([states, observations, believed, theme, ofStates, ofObservations]);
       if (key === drawn) return false;
       drawn = key;
-      list.replaceChildren(...values(states, observations, palette), ...marks(palette, team));
+      list.replaceChildren(...values(states, observations, palette), ...marks(palette));
       ramps.replaceChildren(...(believed ? [
         ramp("belief", theme, "belief: probability of the state", ["0", "0.25", "0.5", "0.75", "1"]),
         ramp("entropy", theme, "entropy of a cell, nats", entropyTicks(believed)),
@@ -52,9 +51,8 @@ function word(text) {
   return make("li", "word", {}, text);
 }
 
-function marks(palette, isTeam) {
-  const names = ["path", "start", "robot", ...(isTeam ? ["hovered", "late"] : [])];
-  return [value("not observed", palette.unseen), ...names.map(mark)];
+function marks(palette) {
+  return [value("not observed", palette.unseen), mark("path"), mark("start"), mark("robot")];
 }
 
 function mark(name) {

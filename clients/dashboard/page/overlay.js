@@ -48,7 +48,7 @@ function drawPath(frame, { path, color }) {
   const width = Math.min(Math.max(cell.x * 0.26, ratio), 3 * ratio);
   // Over cells of a pixel or two there is more background than cells around the line.
   const dark = cell.x < 2 * ratio ? ink : DARK;
-  stroke(context, color ? width + 2 * ratio : width, dark);
+  stroke(context, color ? width + ratio : width, dark);
   if (color) stroke(context, width, color);
 }
 
