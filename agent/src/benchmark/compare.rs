@@ -1,7 +1,7 @@
 //! The benchmark: every policy on the same worlds, scored against the hidden states.
 
 use crate::benchmark::arena::Arena;
-use crate::benchmark::report::{PolicyRun, Snapshot};
+use crate::benchmark::report::{ALONE, PolicyRun, Snapshot};
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
 use crate::estimation::first_belief::first_belief;
@@ -239,6 +239,9 @@ impl Run {
             mean_plan_millis: mean(tally.planning.as_secs_f64() * 1e3),
             brier: (policy.estimator != EstimatorKind::None).then(|| mean(tally.brier)),
             moves,
+            robots: 1,
+            team: ALONE.into(),
+            mean_repeated: 0.0,
             is_added: false,
             rewards: tally.rewards,
         }
