@@ -1,7 +1,8 @@
 //! `run`: act on one world of a running server.
 
-use super::shared::{WaitFlag, model_named};
-use agent::acting::run::{Mission, run};
+use super::shared::{WaitFlag, model_named, parse_range};
+use agent::acting::mission::{Company, Mission};
+use agent::acting::run::run;
 use agent::config::AgentFlags;
 use agent::learning::learned::Learned;
 use anyhow::{Context, Result};
@@ -9,6 +10,7 @@ use clap::Args;
 use network::DeviceKind;
 use protocol::channels::Instance;
 use protocol::program::stop_on_signals;
+use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -23,13 +25,26 @@ pub struct RunCommand {
     /// The world to act on
     #[arg(long, default_value_t = 0)]
     world: u32,
+    /// The robot of that world to fly
+    #[arg(long, default_value_t = 0, conflicts_with = "robots")]
+    robot: u32,
+    /// Several robots of that world to fly: needs --team
+    #[arg(long, value_name = "FIRST..END", value_parser = parse_range::<u32>, requires = "team")]
+    robots: Option<Range<u32>>,
+    /// Plan for all robots of the world that fly, on what all see; agents with the same policy and settings make the
+    /// same plan, of which each flies its own part
+    #[arg(long)]
+    team: bool,
+    /// See what all robots of the world see, but plan without regard to the others
+    #[arg(long, conflicts_with = "team")]
+    share: bool,
     /// The policy
     #[arg(long, default_value = "beam_exploit")]
     policy: String,
     /// Steps to act for; 0: until stopped
     #[arg(long, default_value_t = 0)]
     steps: u64,
-    /// Take the world from its holder
+    /// Take the robot from its holder
     #[arg(long)]
     takeover: bool,
     /// A built-in model or a model file, where the server does not reveal its model
@@ -52,6 +67,15 @@ impl RunCommand {
         let mission = Mission {
             instance: Instance::new(&self.instance)?,
             world: self.world,
+            robots: self
+                .robots
+                .clone()
+                .unwrap_or(self.robot..self.robot.saturating_add(1)),
+            company: match (self.team, self.share) {
+                (true, _) => Company::Team,
+                (_, true) => Company::Shared,
+                _ => Company::Alone,
+            },
             policy: self.policy.clone(),
             steps: self.steps,
             takeover: self.takeover,
