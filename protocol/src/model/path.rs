@@ -76,27 +76,23 @@ impl TryFrom<u8> for Move {
 /// # Errors
 /// [`MoveError`] names the first byte that is no move.
 pub fn path_from_bytes(bytes: &[u8]) -> Result<Vec<Move>, MoveError> {
-    let mut path = vec![Move::Up; bytes.len()];
-    decode_moves(bytes, &mut path)?;
-    Ok(path)
+    check_moves(bytes)?;
+    let moves = bytes.iter().map(|&byte| Move::from_low_bits(byte.into()));
+    Ok(moves.collect())
 }
 
-/// Decodes moves into a slice of the same length, all or none.
+/// Checks that each byte is a move.
 ///
 /// # Errors
-/// [`MoveError`] names the first byte that is no move; `moves` is as it was.
-pub fn decode_moves(bytes: &[u8], moves: &mut [Move]) -> Result<(), MoveError> {
-    debug_assert_eq!(bytes.len(), moves.len());
+/// [`MoveError`] names the first that is none.
+pub fn check_moves(bytes: &[u8]) -> Result<(), MoveError> {
+    let is_wrong = |byte: &u8| usize::from(*byte) >= Move::ALL.len();
     // One pass without branches, which the compiler makes vector code of.
-    let highest = bytes.iter().fold(0, |highest, &byte| byte.max(highest));
-    if usize::from(highest) >= Move::ALL.len() {
-        let is_wrong = |(_, byte): &(usize, &u8)| usize::from(**byte) >= Move::ALL.len();
-        if let Some((index, &value)) = bytes.iter().enumerate().find(is_wrong) {
-            return Err(MoveError { index, value });
-        }
-    }
-    for (to, &byte) in moves.iter_mut().zip(bytes) {
-        *to = Move::from_low_bits(byte.into());
+    if bytes.iter().fold(false, |any, byte| any | is_wrong(byte))
+        && let Some(index) = bytes.iter().position(|byte| is_wrong(byte))
+    {
+        let value = bytes[index];
+        return Err(MoveError { index, value });
     }
     Ok(())
 }

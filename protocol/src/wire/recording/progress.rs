@@ -3,6 +3,7 @@
 use super::format::{Event, Record, Totals};
 use crate::model::grid::Shape;
 use crate::model::path::MAX_MOVES;
+use crate::wire::channels::{MAX_ROBOTS, MAX_TEAM_CELLS};
 use crate::wire::control::ServerInfo;
 use crate::wire::message::VERSION;
 use crate::wire::observer::Sample;
@@ -82,7 +83,14 @@ fn limits(server: Option<&Limits>) -> Result<&Limits, String> {
 
 impl Limits {
     fn of(info: &ServerInfo) -> Result<Self, String> {
-        Shape::new(info.height, info.width).map_err(|error| error.to_string())?;
+        let shape = Shape::new(info.height, info.width).map_err(|error| error.to_string())?;
+        let n_robots = info.n_robots as usize;
+        if !(1..=MAX_ROBOTS).contains(&n_robots) || n_robots * shape.n_cells() > MAX_TEAM_CELLS {
+            return Err(format!(
+                "robots: expected 1 to {MAX_ROBOTS}, and at most {MAX_TEAM_CELLS} cells of all their frames, \
+                 got {n_robots}"
+            ));
+        }
         if info.n_moves > MAX_MOVES {
             let got = info.n_moves;
             return Err(format!(
