@@ -119,7 +119,7 @@ fn runs_with_one_seed_act_alike() {
             let server = Server::start(&format!("{WORLDS} --publish-truth"));
             let name = server.instance.name();
             agent(&["run --instance", name, "--policy", policy, flags]);
-            (server.observe(0), server.status().worlds[0].holder_pid)
+            (server.observe(0), server.status().worlds[0].holder_pids[0])
         };
         let (first, holder) = act();
         assert_eq!((first.0.step, holder), (20, None), "{policy}");

@@ -21,7 +21,7 @@ use std::time::{Duration, Instant};
 const CHILD: &str = "EMBERWATCH_TEST_CHILD";
 
 fn holder(server: &Server) -> Option<u32> {
-    server.status().worlds[0].holder_pid
+    server.status().worlds[0].holder_pids[0]
 }
 
 #[test]

@@ -9,6 +9,7 @@ use protocol::Connection;
 use protocol::channels::Instance;
 use protocol::control::{Reply, Request};
 use protocol::message::{Operation, StepRequest};
+use protocol::payload::write_step_body;
 use std::process::{Child, Command};
 use std::time::{Duration, Instant};
 
@@ -35,19 +36,24 @@ impl Drop for Running {
     }
 }
 
-/// A connection with a lease on `n_worlds` worlds, and the request and paths of their step.
+/// A connection with a lease on all robots of `n_worlds` worlds, and the request and paths of their step.
 struct Stepper {
     connection: Connection,
     request: StepRequest,
+    n_worlds: usize,
     paths: Vec<u8>,
+    /// Steps so far.
+    k: u64,
+    body: Vec<u8>,
 }
 
 impl Stepper {
     fn new(instance: &Instance, n_worlds: u32) -> Self {
         let mut connection = connect(instance);
+        let n_robots = n_worlds * connection.info().n_robots;
         let acquire = Request::Acquire {
-            first_world: 0,
-            n_worlds,
+            first_robot: 0,
+            n_robots,
             takeover: true,
             ttl_millis: None,
         };
@@ -60,26 +66,32 @@ impl Stepper {
         let request = StepRequest {
             operation,
             lease,
-            n_worlds,
+            n_robots,
             n_moves: n_moves as u32,
             ..StepRequest::default()
         };
-        let paths = (0..n_moves * n_worlds as usize)
+        let paths = (0..n_moves * n_robots as usize)
             .map(|at| (at * 7 % 4) as u8)
             .collect();
         Self {
             connection,
             request,
+            n_worlds: n_worlds as usize,
             paths,
+            k: 0,
+            body: Vec::new(),
         }
     }
 
     /// Nanoseconds of one round trip: all of it, and the simulation's share.
     fn step(&mut self) -> (u64, u64) {
         let start = Instant::now();
+        self.body.clear();
+        write_step_body(&vec![self.k; self.n_worlds], &self.paths, &mut self.body);
+        self.k += 1;
         let answer = self
             .connection
-            .step(self.request, &self.paths, TIMEOUT)
+            .step(self.request, &self.body, TIMEOUT)
             .expect("a step");
         let total = start.elapsed().as_nanos() as u64;
         (total, answer.reply.simulation_nanos.min(total))
@@ -89,8 +101,7 @@ impl Stepper {
         (0..n_steps / 10).for_each(|_| _ = self.step());
         let start = Instant::now();
         let times: Vec<(u64, u64)> = (0..n_steps).map(|_| self.step()).collect();
-        let per_second =
-            n_steps as f64 * f64::from(self.request.n_worlds) / start.elapsed().as_secs_f64();
+        let per_second = n_steps as f64 * self.n_worlds as f64 / start.elapsed().as_secs_f64();
         let wire = Spread::of(times.iter().map(|(total, simulation)| total - simulation));
         let simulation = Spread::of(times.iter().map(|(_, simulation)| *simulation));
         say(&format!(
