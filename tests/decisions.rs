@@ -270,7 +270,7 @@ fn what_is_no_decision_is_refused_and_changes_nothing() {
         r#"{"op":"reset","worlds":[{"world":0,"seed":-1}]}"#,
         r#"{"op":"reset","worlds":[{"world":0,"seed":18446744073709551616}]}"#,
         r#"{"op":"reset","worlds":[{"world":0},{"world":0}]}"#,
-        r#"{"op":"hello","protocol":1}"#,
+        r#"{"op":"hello","protocol":2}"#,
         r#"{"op":"hello","protocol":"1","client":"x"}"#,
     ] {
         let (status, detail, message) =
@@ -281,7 +281,7 @@ fn what_is_no_decision_is_refused_and_changes_nothing() {
             "{message}"
         );
     }
-    let hello = br#"{"op":"hello","protocol":2,"client":"x"}"#;
+    let hello = br#"{"op":"hello","protocol":3,"client":"x"}"#;
     assert_mismatch(learner.exchange(control_header(1), hello));
     let header = ControlRequest {
         version: 9,

@@ -127,7 +127,7 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     let nowhere = ["restore", text(&file), "--first-world", "2", "--takeover"];
     refused(
         &server_command(&server, &nowhere),
-        "the server has worlds 0 to 2",
+        "the server has robots 0 to 2",
     );
 }
 
@@ -152,7 +152,7 @@ fn a_fork_has_the_future_of_its_world_and_a_life_of_its_own() {
     );
     refused(
         &server_command(&server, &["fork", "0", "3"]),
-        "no such world",
+        "no such robot",
     );
     refused(
         &server_command(&server, &["fork", "7", "1"]),
