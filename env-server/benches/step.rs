@@ -6,30 +6,36 @@
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use env_server::config::ServerConfig;
-use env_server::simulator::{ClientId, Outcome, ServerStats, Simulator};
+use env_server::simulator::{ClientId, Outcome, ServerStats, Simulator, Stepped};
 use env_server::snapshot::decode;
 use protocol::control::{Reply, Request};
-use protocol::message::{Operation, Status, StepRequest, VERSION};
+use protocol::message::{Operation, Status, StepReply, StepRequest, VERSION};
+use protocol::payload::write_step_body;
 use protocol::randomness::split_mix;
 use rayon::ThreadPoolBuilder;
 use std::time::Instant;
 
 const CLIENT: ClientId = ClientId { node: 1, pid: 1 };
 
-/// A client's view of a simulator: a lease on every world, and the next request.
+/// A client's view of a simulator: a lease on every robot, and the next request.
 struct Session {
     simulator: Simulator,
     request: StepRequest,
     /// Many random paths: a robot that flew the same ever again would be easy to predict.
     paths: Vec<Vec<u8>>,
+    /// The step of each world.
+    steps: Vec<u64>,
+    body: Vec<u8>,
     payload: Vec<u8>,
 }
 
 impl Session {
     /// Worlds at k = 0, on grids of 64 x 64, with paths of 64 moves.
-    fn new(n_worlds: u32) -> Self {
+    fn new(n_worlds: u32, team: u32) -> Self {
+        let n_robots = n_worlds * team;
         let config = ServerConfig {
             worlds: n_worlds,
+            robots: team,
             burn_in: 2_000,
             ..ServerConfig::default()
         };
@@ -46,17 +52,19 @@ impl Session {
         let request = StepRequest {
             version: VERSION,
             operation: Operation::Step as u32,
-            lease: acquire(&mut simulator, n_worlds),
-            n_worlds,
+            lease: acquire(&mut simulator, n_robots),
+            n_robots,
             n_moves,
             ..StepRequest::default()
         };
-        let n_bytes = u64::from(n_worlds * n_moves);
+        let n_bytes = u64::from(n_robots * n_moves);
         let path = |key| (0..n_bytes).map(move |at| (split_mix(key, at) >> 62) as u8);
         Self {
             simulator,
             request,
             paths: (0..256).map(|key| path(key).collect()).collect(),
+            steps: vec![0; n_worlds as usize],
+            body: Vec::new(),
             payload: Vec::new(),
         }
     }
@@ -64,21 +72,25 @@ impl Session {
     /// One request; returns the size of the answer's payload.
     fn step(&mut self) -> usize {
         let path = &self.paths[self.request.sequence as usize % self.paths.len()];
-        let now = Instant::now();
-        let reply = self
+        self.body.clear();
+        write_step_body(&self.steps, path, &mut self.body);
+        let (now, request) = (Instant::now(), &self.request);
+        let stepped = self
             .simulator
-            .step(now, CLIENT, &self.request, path, &mut self.payload);
-        assert_eq!(reply.status, Status::Ok as u32);
+            .step(now, CLIENT, request, &self.body, &mut self.payload);
+        let is_ok = |reply: StepReply| reply.status == Status::Ok as u32;
+        assert!(matches!(stepped, Stepped::Reply(reply) if is_ok(reply)));
         self.request.sequence += 1;
+        self.steps.iter_mut().for_each(|step| *step += 1);
         self.payload.len()
     }
 }
 
-/// A lease on every world.
-fn acquire(simulator: &mut Simulator, n_worlds: u32) -> u64 {
+/// A lease on every robot.
+fn acquire(simulator: &mut Simulator, n_robots: u32) -> u64 {
     let request = Request::Acquire {
-        first_world: 0,
-        n_worlds,
+        first_robot: 0,
+        n_robots,
         takeover: false,
         ttl_millis: Some(3_600_000),
     };
@@ -97,10 +109,10 @@ fn acquire(simulator: &mut Simulator, n_worlds: u32) -> u64 {
 
 fn simulator_step(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("simulator_step");
-    for n_worlds in [1, 64] {
-        let mut session = Session::new(n_worlds);
+    for (n_worlds, team) in [(1, 1), (64, 1), (1, 8)] {
+        let mut session = Session::new(n_worlds, team);
         group.throughput(Throughput::Elements(n_worlds.into()));
-        group.bench_function(format!("{n_worlds}"), |bencher| {
+        group.bench_function(format!("{n_worlds} x {team}"), |bencher| {
             bencher.iter(|| session.step());
         });
     }
@@ -109,7 +121,7 @@ fn simulator_step(criterion: &mut Criterion) {
 
 fn snapshot(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("snapshot (target: 100 us each)");
-    let mut session = Session::new(1);
+    let mut session = Session::new(1, 1);
     // As many as are kept.
     (0..300).for_each(|_| _ = session.step());
     let simulator = &session.simulator;

@@ -1,7 +1,7 @@
 //! The server's settings and their checks.
 
 use crate::world::Start;
-use protocol::channels::{ChannelError, Instance};
+use protocol::channels::{ChannelError, Instance, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS};
 use protocol::control::CoverageRule;
 use protocol::grid::ShapeError;
 use protocol::model::ModelError;
@@ -27,6 +27,11 @@ pub struct ServerConfig {
     pub instance: String,
     /// Number of independent worlds, 1 to 1024; world i starts from `seed + i`.
     pub worlds: u32,
+    /// Robots of each world, 1 to 64; at most 4096 in all worlds together.
+    pub robots: u32,
+    /// How long a world waits for the paths of its other held robots from the first path on, milliseconds; 0: no
+    /// deadline.
+    pub deadline_millis: u64,
     /// A built-in model (`wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`), or the path of
     /// a model file.
     pub model: String,
@@ -44,7 +49,7 @@ pub struct ServerConfig {
     pub max_steps: u64,
     /// What a step observes: `path`, `full`, or `client` (a step may ask for a full frame).
     pub coverage: CoverageRule,
-    /// The robot's first cell: `corner`, `centre`, `random`, or `{ row = R, col = C }`.
+    /// The robots' first cells: `corner` (each in the next), `centre`, `random`, or `{ row = R, col = C }`.
     pub start: Start,
     /// Publish the hidden states, for evaluation and pictures.
     pub publish_truth: bool,
@@ -106,6 +111,8 @@ impl Default for ServerConfig {
         Self {
             instance: "default".into(),
             worlds: 1,
+            robots: 1,
+            deadline_millis: 0,
             model: WILDFIRE.into(),
             height: 64,
             width: 64,
@@ -137,6 +144,7 @@ impl ServerConfig {
         let instance = Instance::new(&self.instance)?;
         let shape = Shape::new(self.height, self.width)?;
         in_range("worlds", u64::from(self.worlds), 1, u64::from(MAX_WORLDS))?;
+        self.check_robots(shape)?;
         in_range("moves", self.moves as u64, 1, MAX_MOVES as u64)?;
         in_range("lease_millis", self.lease_millis, 100, 86_400_000)?;
         in_range("threads", self.threads as u64, 0, 256)?;
@@ -169,6 +177,16 @@ impl ServerConfig {
             model,
             shape,
         })
+    }
+
+    fn check_robots(&self, shape: Shape) -> Result<(), ConfigError> {
+        in_range("robots", self.robots.into(), 1, MAX_ROBOTS as u64)?;
+        in_range("deadline_millis", self.deadline_millis, 0, 86_400_000)?;
+        let (n_robots, n_cells) = (self.robots as u64, shape.n_cells() as u64);
+        let n_all = u64::from(self.worlds) * n_robots;
+        in_range("worlds times robots", n_all, 1, MAX_ROBOT_NUMBERS as u64)?;
+        let most = MAX_TEAM_CELLS as u64;
+        in_range("cells times robots", n_cells * n_robots, 1, most)
     }
 
     /// The settings of a TOML file.
@@ -249,6 +267,11 @@ mod tests {
     #[test]
     fn wrong_settings_are_named() {
         check(|c| c.worlds = 0, "worlds: expected 1 to 1024, got 0");
+        check(|c| c.robots = 65, "robots: expected 1 to 64, got 65");
+        check(
+            |c| (c.worlds, c.robots) = (1024, 5),
+            "worlds times robots: expected 1 to 4096, got 5120",
+        );
         check(|c| c.moves = 4097, "moves: expected 1 to 4096, got 4097");
         check(|c| c.height = 0, "height and width in 1..=4096, got 0 x 64");
         check(|c| c.instance = "a b".into(), "instance name");

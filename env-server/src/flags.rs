@@ -19,6 +19,13 @@ pub struct ServerFlags {
     /// Number of independent worlds [default: 1]
     #[arg(long)]
     pub worlds: Option<u32>,
+    /// Robots of each world [default: 1]
+    #[arg(long)]
+    pub robots: Option<u32>,
+    /// How long a world waits for the paths of its other held robots from the first path on, in milliseconds, 0 for
+    /// no deadline [default: 0]
+    #[arg(long, value_name = "MILLIS")]
+    pub deadline_ms: Option<u64>,
     /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small` or the path of a model file
     /// [default: wildfire]
     #[arg(long)]
@@ -44,7 +51,7 @@ pub struct ServerFlags {
     /// What a step observes [default: path]
     #[arg(long)]
     pub coverage: Option<CoverageFlag>,
-    /// The robot's first cell: corner, centre, random or ROW,COL [default: corner]
+    /// The robots' first cells: corner (each in the next), centre, random or ROW,COL [default: corner]
     #[arg(long, value_parser = parse_start)]
     pub start: Option<Start>,
     /// Publish the hidden states, for evaluation and pictures
@@ -104,6 +111,8 @@ impl ServerFlags {
         }
         set(&mut config.instance, &self.instance);
         set(&mut config.worlds, &self.worlds);
+        set(&mut config.robots, &self.robots);
+        set(&mut config.deadline_millis, &self.deadline_ms);
         set(&mut config.model, &self.model);
         set(&mut config.height, &self.height);
         set(&mut config.width, &self.width);

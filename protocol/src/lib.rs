@@ -2,7 +2,8 @@
 //! messages and channels. `wire` depends on `model`, never the other way.
 //!
 //! PROTOCOL.md describes the wire for other languages. Words: a *world* is the hidden state of one grid; a *step* `k`
-//! flies one path and moves the world once; a *frame* holds the observations of a step; a *lease* is the right to act.
+//! flies one path with each robot and moves the world once; a *frame* holds the observations of a step; a *lease* is the
+//! right to fly robots.
 
 pub mod model;
 pub mod program;
@@ -18,5 +19,5 @@ pub use model::{Model, randomness, vectors};
 pub use wire::connection::{self, Connection};
 pub use wire::{
     agent_belief, channels, cleanup, control, decisions, failed_connections, message, observer,
-    recording, responder, turn, wait,
+    payload, recording, responder, turn, wait,
 };

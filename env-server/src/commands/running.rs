@@ -74,19 +74,21 @@ fn describe(instance: &str, status: &ServerStatus) -> String {
         status.n_clients,
         status.n_observers
     );
-    text += "world  step        seed                  episode  robot         holder\n";
+    text += "world  step        seed                  episode  robot  cell          holder\n";
     for world in &status.worlds {
-        let holder = match (world.resetting, world.holder_pid) {
-            (true, _) => "(resetting)".into(),
-            (false, Some(pid)) => format!("pid {pid}"),
-            (false, None) => "-".into(),
-        };
         let info = &world.info;
-        let robot = format!("({}, {})", info.robot[0], info.robot[1]);
-        text += &format!(
-            "{:<6} {:<11} {:<21} {:<8} {robot:<13} {holder}\n",
-            info.world, info.step, info.seed, info.episode
-        );
+        for (robot, cell) in info.robots.iter().enumerate() {
+            let holder = match (world.resetting, world.holder_pids.get(robot)) {
+                (true, _) => "(resetting)".into(),
+                (false, Some(Some(pid))) => format!("pid {pid}"),
+                (false, _) => "-".into(),
+            };
+            let cell = format!("({}, {})", cell[0], cell[1]);
+            text += &format!(
+                "{:<6} {:<11} {:<21} {:<8} {robot:<6} {cell:<13} {holder}\n",
+                info.world, info.step, info.seed, info.episode
+            );
+        }
     }
     text
 }

@@ -45,7 +45,7 @@ pub struct RestoreCommand {
     /// How many worlds to read [default: all of the file's from the first]
     #[arg(long)]
     worlds: Option<u32>,
-    /// Take worlds that are held from their holders
+    /// Take robots that are held from their holders
     #[arg(long)]
     takeover: bool,
 }
@@ -60,7 +60,7 @@ pub struct ForkCommand {
     /// The server's instance name
     #[arg(long, default_value = "default")]
     instance: String,
-    /// Take the world to replace from its holder
+    /// Take robots of the world to replace from their holders
     #[arg(long)]
     takeover: bool,
 }
@@ -91,7 +91,7 @@ impl SnapshotCommand {
 }
 
 impl RestoreCommand {
-    /// Acquires the worlds, has them replaced, and releases them.
+    /// Acquires the robots of the worlds, has the worlds replaced, and releases the robots.
     pub fn run(&self) -> Result<()> {
         // A wrong file is refused before any lease is taken over.
         let in_file = read(&self.file)?.worlds.len() as u32;
@@ -120,7 +120,7 @@ impl RestoreCommand {
 }
 
 impl ForkCommand {
-    /// Acquires the world to replace, has it replaced, and releases it.
+    /// Acquires the robots of the world to replace, has it replaced, and releases them.
     pub fn run(&self) -> Result<()> {
         let mut server = connect(&self.instance)?;
         let (from, to) = (self.from, self.to);
@@ -133,16 +133,17 @@ impl ForkCommand {
     }
 }
 
-/// Replaces worlds under a lease.
+/// Replaces worlds under a lease on all their robots.
 fn replace(
     server: &mut Connection,
     worlds: std::ops::Range<u32>,
     takeover: bool,
     request: impl FnOnce(u64) -> Request,
 ) -> Result<()> {
+    let team = server.info().n_robots;
     let acquire = Request::Acquire {
-        first_world: worlds.start,
-        n_worlds: worlds.len() as u32,
+        first_robot: worlds.start.saturating_mul(team),
+        n_robots: (worlds.len() as u32).saturating_mul(team),
         takeover,
         ttl_millis: Some(TIMEOUT.as_millis() as u64),
     };

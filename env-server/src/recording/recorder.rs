@@ -170,7 +170,7 @@ impl Recorder<'_> {
         let n_lost = self.frames.count(sequence, self.wants(world));
         let result = &sample.header.result;
         let now = (result.episode, result.step);
-        let is_step = sample.header.n_moves > 0 && self.wants(world);
+        let is_step = result.step > 0 && self.wants(world);
         if self.steps.insert(world, now) != Some(now) && is_step {
             self.n_steps += 1;
         }

@@ -4,7 +4,7 @@
 
 use super::pace::Pace;
 use super::replies::{ConnectionCounts, Next, ReplayState};
-use crate::server::{Clients, PortConfig, Ports};
+use crate::server::{Clients, PortConfig, Ports, frame_bytes};
 use anyhow::{Context, Error, Result, bail};
 use protocol::channels::{Instance, ipc_error};
 use protocol::control::{Reply, ServerInfo};
@@ -97,7 +97,7 @@ impl RecordingSummary {
         let mut config = PortConfig {
             instance: options.instance.clone(),
             n_cells: 0,
-            n_moves: 0,
+            frame_bytes: 0,
             answer_bytes: 0,
             publish_truth: false,
         };
@@ -115,7 +115,9 @@ impl RecordingSummary {
             match record.event {
                 Event::Server(info) => {
                     config.n_cells = config.n_cells.max(info.height * info.width);
-                    config.n_moves = config.n_moves.max(info.n_moves);
+                    let n_bytes =
+                        frame_bytes(info.n_robots, info.height * info.width, info.n_moves);
+                    config.frame_bytes = config.frame_bytes.max(n_bytes);
                     first.get_or_insert(*info);
                 }
                 _ => is_empty &= Duration::from_nanos(record.nanos) < options.from,
@@ -205,9 +207,7 @@ impl Replay<'_> {
         self.pace.publish(Instant::now());
         self.state.record(&record.event);
         match record.event {
-            Event::Frame(sample) => self
-                .ports
-                .publish_frame(sample.header, &sample.payload, &[]),
+            Event::Frame(sample) => self.ports.publish_frame(sample.header, &sample.payload),
             Event::Truth(sample) => self.ports.publish_truth(sample.header, &sample.payload),
             Event::Server(_) => {}
         }
@@ -227,7 +227,7 @@ impl Replay<'_> {
                     version: VERSION,
                     status: self.state.refuse_step(asked.version) as u32,
                     sequence: asked.sequence,
-                    first_world: asked.first_world,
+                    first_robot: asked.first_robot,
                     detail: if asked.version == VERSION {
                         0
                     } else {

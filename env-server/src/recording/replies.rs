@@ -2,6 +2,7 @@
 
 use protocol::control::{Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldStatus, parse};
 use protocol::message::{Status, VERSION};
+use protocol::payload::split_frame_payload;
 use protocol::recording::Event;
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -60,13 +61,17 @@ impl ReplayState {
             }
             Event::Frame(sample) => {
                 let (header, result) = (&sample.header, &sample.header.result);
-                self.n_steps += u64::from(header.n_moves > 0);
+                self.n_steps += u64::from(result.step > 0);
+                let robots = split_frame_payload(header, &sample.payload).unwrap_or_default();
+                let cells = robots
+                    .iter()
+                    .map(|robot| [robot.result.row, robot.result.col]);
                 let info = WorldInfo {
                     world: header.world,
                     step: result.step,
                     seed: result.seed,
                     episode: result.episode,
-                    robot: [result.row, result.col],
+                    robots: cells.collect(),
                 };
                 self.worlds.insert(header.world, info);
             }
@@ -123,8 +128,9 @@ impl ReplayState {
             n_observers: counts.n_observers,
             worlds: shown
                 .map(|info| WorldStatus {
+                    holder_pids: vec![None; info.robots.len()],
                     info,
-                    holder_pid: None,
+                    n_paths: 0,
                     resetting: false,
                 })
                 .collect(),

@@ -102,6 +102,13 @@ impl Server {
     /// Drops requests whose clients no longer wait: until then, iceoryx2 delivers none of the same client's next ones.
     pub(super) fn cancel_abandoned(&mut self, now: Instant) {
         let simulator = &mut self.simulator;
+        self.waiting_steps.retain(|(ticket, request)| {
+            let is_awaited = request.is_connected();
+            if !is_awaited {
+                simulator.cancel_step(now, *ticket);
+            }
+            is_awaited
+        });
         self.pending_replies.retain(|(request, pending)| {
             let is_awaited = request.is_connected();
             if !is_awaited {

@@ -19,7 +19,8 @@ use protocol::channels::{
     StepService, TRUTH_BUFFER, TruthService, create_node, ipc_error,
 };
 use protocol::failed_connections::FailedConnections;
-use protocol::message::{FrameHeader, Header, RESULT_BYTES, StepReply, StepRequest, TruthHeader};
+use protocol::message::{FrameHeader, Header, StepReply, StepRequest, TruthHeader};
+use protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
 use protocol::responder::{
     Active, ActiveControl, Answers, ControlServer, control_server, port_owner, received,
 };
@@ -46,8 +47,8 @@ pub struct PortConfig {
     pub instance: Instance,
     /// Most cells of a frame, or of hidden states.
     pub n_cells: usize,
-    /// Most moves in a path.
-    pub n_moves: usize,
+    /// Longest sample on `frames`, bytes.
+    pub frame_bytes: usize,
     /// Longest answer on `step`, bytes.
     pub answer_bytes: usize,
     /// Whether to publish hidden states.
@@ -86,12 +87,13 @@ impl Ports {
     /// # Errors
     /// If another server has them, or the system has too little memory or descriptors.
     pub fn open(checked: &Checked) -> Result<Self> {
-        let n_cells = checked.shape.n_cells();
+        let (n_cells, config) = (checked.shape.n_cells(), &checked.config);
+        let of_robots = config.robots as usize * (ROBOT_BYTES + n_cells);
         Self::open_with(&PortConfig {
             instance: checked.instance.clone(),
             n_cells,
-            n_moves: checked.config.moves,
-            answer_bytes: checked.config.worlds as usize * (RESULT_BYTES + n_cells),
+            frame_bytes: frame_bytes(config.robots, n_cells, config.moves),
+            answer_bytes: config.worlds as usize * (WORLD_BYTES + of_robots),
             publish_truth: checked.config.publish_truth,
         })
     }
@@ -127,7 +129,7 @@ impl Ports {
         let frame_service = services.frames()?;
         let frames = frame_service
             .publisher_builder()
-            .initial_max_slice_len(config.n_cells + config.n_moves)
+            .initial_max_slice_len(config.frame_bytes)
             .set_degradation_handler(failed_connections.counter())
             .max_loaned_samples(1);
         let frames = frames.create().map_err(ipc_error("publish frames"))?;
@@ -199,9 +201,8 @@ impl Ports {
         &mut self.answers
     }
 
-    /// Publishes a frame and the path that was flown, if anybody observes.
-    pub fn publish_frame(&self, header: FrameHeader, frame: &[u8], path: &[u8]) {
-        let bytes = [frame, path].concat();
+    /// Publishes a step of a world, if anybody observes.
+    pub fn publish_frame(&self, header: FrameHeader, bytes: &[u8]) {
         let sent = self
             .frames
             .loan_slice_uninit(bytes.len())
@@ -209,7 +210,7 @@ impl Ports {
             .and_then(|mut sample| {
                 *sample.user_header_mut() = header;
                 sample
-                    .write_from_slice(&bytes)
+                    .write_from_slice(bytes)
                     .send()
                     .map_err(|error| format!("{error:?}"))
             });
@@ -323,6 +324,11 @@ impl Ports {
     }
 }
 
+/// The longest payload of a sample on `frames`.
+pub fn frame_bytes(n_robots: u32, n_cells: usize, n_moves: usize) -> usize {
+    n_robots as usize * (ROBOT_BYTES + n_cells + n_moves)
+}
+
 fn taken<Q: Header, R: Header>(
     config: &PortConfig,
     service: &RequestResponse<Q, R>,
@@ -341,10 +347,7 @@ fn check_shared_memory(config: &PortConfig) -> Result<()> {
         |n_messages: usize, length: usize| (n_messages * (length + MESSAGE_OVERHEAD)) as u64;
     // Chunks as iceoryx2 counts them: 2 requests in flight x (buffered + borrowed + loaned).
     let answers = bytes(MAX_CLIENTS * 2 * 3, config.answer_bytes);
-    let frames = bytes(
-        MAX_OBSERVERS * (FRAME_BUFFER + 1) + 2,
-        config.n_cells + config.n_moves,
-    );
+    let frames = bytes(MAX_OBSERVERS * (FRAME_BUFFER + 1) + 2, config.frame_bytes);
     let truth = bytes(MAX_TRUTH_READERS * (TRUTH_BUFFER + 1) + 2, config.n_cells);
     let needed = FIXED_BYTES + answers + frames + if config.publish_truth { truth } else { 0 };
     let Ok(status) = rustix::fs::statvfs(SHARED_MEMORY) else {
@@ -354,7 +357,8 @@ fn check_shared_memory(config: &PortConfig) -> Result<()> {
     ensure!(
         needed <= free,
         "shared memory: expected {} MiB free in {SHARED_MEMORY}, got {} MiB; free some, give the container more \
-         (docker: --shm-size), or serve fewer worlds or a smaller grid",
+         (docker: --shm-size), or serve fewer worlds, fewer \
+         robots or a smaller grid",
         needed.div_ceil(1 << 20),
         free >> 20
     );

@@ -5,7 +5,6 @@ use crate::simulator::Simulator;
 use crate::world::Episode;
 use protocol::channels::FRAME_BUFFER;
 use protocol::message::{FrameHeader, TruthHeader, VERSION};
-use protocol::path::path_to_bytes;
 use std::ops::Range;
 
 /// What has been published, and to whom.
@@ -16,6 +15,7 @@ pub struct Publications {
     for_new: Range<usize>,
     n_frames: u64,
     n_truths: u64,
+    payload: Vec<u8>,
 }
 
 impl Publications {
@@ -63,20 +63,29 @@ impl Publications {
 
     fn publish_frame(&mut self, ports: &Ports, world: usize, episode: &Episode) {
         let (height, width) = episode.states().dim();
-        let (start, path) = episode.path();
+        let robots = episode.robots();
         let header = FrameHeader {
             version: VERSION,
             world: world as u32,
             sequence: self.n_frames,
+            first_robot: (world * robots.len()) as u32,
+            n_robots: robots.len() as u32,
             height: height as u32,
             width: width as u32,
-            n_moves: path.len() as u32,
-            start_row: start.row as u32,
-            start_col: start.col as u32,
-            reserved: 0,
             result: *episode.result(),
         };
-        ports.publish_frame(header, episode.frame().as_bytes(), &path_to_bytes(path));
+        self.payload.clear();
+        for robot in robots {
+            self.payload
+                .extend_from_slice(bytemuck::bytes_of(robot.result()));
+        }
+        for robot in robots {
+            self.payload.extend_from_slice(robot.frame().as_bytes());
+        }
+        for robot in robots {
+            self.payload.extend(robot.path().iter().map(|&m| m as u8));
+        }
+        ports.publish_frame(header, &self.payload);
         self.n_frames += 1;
     }
 

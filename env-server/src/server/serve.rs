@@ -3,12 +3,12 @@
 use super::ports::ActiveStep;
 use super::state::Server;
 use crate::config::Checked;
-use crate::simulator::{Outcome, ServerStats};
+use crate::simulator::{Outcome, ServerStats, Stepped};
 use anyhow::Result;
 use iceoryx2::prelude::PayloadHeader;
 use protocol::channels::ipc_error;
 use protocol::control::Reply;
-use protocol::message::Operation;
+use protocol::message::{Operation, StepReply};
 use protocol::program::WatchedProcess;
 use protocol::responder::{ActiveControl, listener_id, wait_until_taken};
 use protocol::wait::sleep_until_event;
@@ -64,6 +64,10 @@ impl Server {
         } else {
             IDLE_TICK
         };
+        let deadline = self.simulator.next_deadline();
+        let tick = deadline.map_or(tick, |at| {
+            tick.min(at.saturating_duration_since(Instant::now()))
+        });
         // Sometimes control comes first, so that endless steps cannot block it.
         self.n_rounds = self.n_rounds.wrapping_add(1);
         if self.n_rounds.is_multiple_of(CONTROL_FIRST)
@@ -82,11 +86,11 @@ impl Server {
         )?;
         let now = Instant::now();
         match found {
-            Some(Found::Step(request)) => self.answer_step(now, &request),
+            Some(Found::Step(request)) => self.answer_step(now, request),
             Some(Found::Control(request)) => self.answer_control(now, request),
             Some(Found::Event) | None => self.check_everything(now)?,
         }
-        if now - self.last_tick > BUSY_TICK {
+        if now - self.last_tick > BUSY_TICK || deadline.is_some_and(|at| at <= now) {
             self.check_everything(now)?;
         }
         Ok(())
@@ -118,27 +122,58 @@ impl Server {
         Ok(woken)
     }
 
-    fn answer_step(&mut self, now: Instant, request: &ActiveStep) {
+    fn answer_step(&mut self, now: Instant, request: ActiveStep) {
         let client = self.clients.identify(request.header().node_id().value());
-        let header = *request.user_header();
-        let mut reply =
-            self.simulator
-                .step(now, client, &header, request.payload(), &mut self.payload);
-        reply.simulation_nanos = now.elapsed().as_nanos() as u64;
-        let listener = listener_id(header.listener_low, header.listener_high);
-        self.ports
-            .answers()
-            .send(request, reply, &self.payload, listener);
-        if header.operation == Operation::Step as u32 {
-            let worlds = self.simulator.worlds_of(&reply);
-            self.publish(worlds);
+        let (header, body) = (*request.user_header(), request.payload());
+        match self
+            .simulator
+            .step(now, client, &header, body, &mut self.payload)
+        {
+            Stepped::Waits(ticket) => self.waiting_steps.push((ticket, request)),
+            Stepped::Reply(reply) => {
+                self.send_step(now, &request, reply);
+                self.answer_settled(now);
+                if header.operation == Operation::Step as u32 {
+                    let first = reply.first_robot as usize;
+                    let robots = first..first + reply.n_robots as usize;
+                    self.publish(self.simulator.worlds_of(&robots));
+                    self.save_if_due();
+                }
+            }
+        }
+    }
+
+    /// Answers the requests whose world has moved, or that have lost a robot.
+    pub(super) fn answer_settled(&mut self, now: Instant) {
+        while let Some((ticket, reply)) = self.simulator.next_answer(&mut self.payload) {
+            let mut waiting = self.waiting_steps.iter();
+            if let Some(index) = waiting.position(|(own, _)| *own == ticket) {
+                let (_, request) = self.waiting_steps.swap_remove(index);
+                self.send_step(now, &request, reply);
+            }
+        }
+        let moved = self.simulator.take_moved();
+        for &world in &moved {
+            self.publish(world..world + 1);
+        }
+        if !moved.is_empty() {
             self.save_if_due();
         }
     }
 
+    /// Sends the answer that is in `payload`.
+    fn send_step(&mut self, now: Instant, request: &ActiveStep, mut reply: StepReply) {
+        reply.simulation_nanos = now.elapsed().as_nanos() as u64;
+        let header = request.user_header();
+        let listener = listener_id(header.listener_low, header.listener_high);
+        self.ports
+            .answers()
+            .send(request, reply, &self.payload, listener);
+    }
+
     fn answer_control(&mut self, now: Instant, request: ActiveControl) {
         // The worlds of a holder that died a moment ago must be free.
-        self.forget_ended_clients();
+        self.forget_ended_clients(now);
         let client = self.clients.identify(request.header().node_id().value());
         let stats = ServerStats {
             uptime: self.started.elapsed(),
@@ -169,24 +204,26 @@ impl Server {
                 self.is_over = true;
             }
         }
+        self.answer_settled(now);
     }
 
     /// What no request asks for: ended clients, finished work, expired leases, new observers.
     fn check_everything(&mut self, now: Instant) -> Result<()> {
         self.last_tick = now;
         self.cancel_abandoned(now);
-        self.forget_ended_clients();
+        self.forget_ended_clients(now);
         self.take_resets(now);
         self.take_files(now);
         self.is_over |= self
             .exit_with
             .as_ref()
             .is_some_and(WatchedProcess::has_ended);
-        for pid in self.simulator.expire(now) {
+        for pid in self.simulator.tick(now) {
             if let Some(n_unsaid) = self.expired_leases.pass(now) {
                 tracing::warn!(pid, n_unsaid, "a lease expired");
             }
         }
+        self.answer_settled(now);
         self.ports.warn_of_descriptors(now);
         self.publications
             .publish_to_new(&self.ports, &self.simulator);
@@ -194,14 +231,14 @@ impl Server {
         Ok(self.ports.check_entries()?)
     }
 
-    fn forget_ended_clients(&mut self) {
+    fn forget_ended_clients(&mut self, now: Instant) {
         for pid in self.clients.take_dead(&self.ports.nodes()) {
-            let n_leases = self.simulator.end_of_process(pid);
+            let n_leases = self.simulator.end_of_process(now, pid);
             tracing::info!(pid, n_leases, "a client or observer ended");
         }
         let n_leases = self
             .simulator
-            .end_of_connections(&self.ports.client_nodes());
+            .end_of_connections(now, &self.ports.client_nodes());
         if n_leases > 0 {
             tracing::info!(n_leases, "a connection was closed without a release");
         }

@@ -3,11 +3,11 @@
 use super::autosave::{Autosave, FirstWorlds, first_worlds};
 use super::files::Files;
 use super::liveness::Clients;
-use super::ports::Ports;
+use super::ports::{ActiveStep, Ports};
 use super::publications::Publications;
 use super::resets::Resets;
 use crate::config::Checked;
-use crate::simulator::{PendingFile, PendingReply, Simulator};
+use crate::simulator::{PendingFile, PendingReply, Simulator, Ticket};
 use anyhow::{Context, Result};
 use protocol::control::Reply;
 use protocol::message::Status;
@@ -37,6 +37,8 @@ pub(super) struct Server {
     pub(super) clients: Clients,
     pub(super) exit_with: Option<WatchedProcess>,
     pub(super) resets: Resets,
+    /// Step requests that wait for the paths of other clients.
+    pub(super) waiting_steps: Vec<(Ticket, ActiveStep)>,
     pub(super) pending_replies: Vec<(ActiveControl, PendingReply)>,
     pub(super) files: Files,
     /// Requests that wait for a file, by the number of its job.
@@ -104,6 +106,7 @@ impl Server {
             clients: Clients::default(),
             exit_with,
             resets,
+            waiting_steps: Vec::new(),
             pending_replies: Vec::new(),
             files,
             pending_files: HashMap::new(),

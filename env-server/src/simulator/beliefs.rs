@@ -1,7 +1,8 @@
 //! Beliefs that agents leave for the next agents: bytes that the server does not interpret.
 
 use protocol::control::{BeliefInfo, MAX_BELIEF_PART};
-use protocol::message::StepResult;
+use protocol::message::WorldResult;
+use std::ops::Range;
 
 /// States that a belief may have under any model, as learned ones have their own. It may have as many as the model.
 const N_STATES: usize = 18;
@@ -9,7 +10,7 @@ const N_STATES: usize = 18;
 /// Most bytes beside 32-bit numbers: one for each state and cell, and one more for each cell.
 const MORE_BYTES: u64 = 32 << 10;
 
-/// The beliefs left, one per world at most.
+/// The beliefs left, one for each robot at most.
 #[derive(Debug)]
 pub struct Beliefs {
     /// Most bytes of one.
@@ -36,23 +37,23 @@ pub struct BeliefPart<'a> {
 }
 
 impl Beliefs {
-    /// None yet, for worlds of so many cells and states.
-    pub fn new(n_worlds: usize, n_cells: usize, n_states: usize) -> Self {
+    /// None yet, for robots in worlds of so many cells and states.
+    pub fn new(n_robots: usize, n_cells: usize, n_states: usize) -> Self {
         let numbers = n_cells * (n_states.max(N_STATES) + 1);
         Self {
             longest: (numbers * size_of::<f32>()) as u64 + MORE_BYTES,
-            left: (0..n_worlds).map(|_| None).collect(),
+            left: (0..n_robots).map(|_| None).collect(),
         }
     }
 
-    /// Adds the next part of a belief about a world at the step of a result; the first starts a new one.
+    /// Adds the next part of a belief for who flies a robot, at the step of its world; the first starts a new one.
     ///
     /// # Errors
     /// If it is too long or does not follow the part before; the error says what was expected.
     pub fn add(
         &mut self,
-        world: usize,
-        at: &StepResult,
+        robot: usize,
+        at: &WorldResult,
         part: &BeliefPart<'_>,
     ) -> Result<(), String> {
         let longest = self.longest;
@@ -75,7 +76,7 @@ impl Beliefs {
             step: at.step,
             length: part.length,
         };
-        let left = &mut self.left[world];
+        let left = &mut self.left[robot];
         let so_far = left
             .as_ref()
             .filter(|left| left.info == info && part.offset > 0);
@@ -97,16 +98,16 @@ impl Beliefs {
         Ok(())
     }
 
-    /// The whole belief about a world at the step of a result.
-    pub fn of(&self, world: usize, at: &StepResult) -> Option<(&BeliefInfo, &[u8])> {
-        let StoredBelief { info, bytes } = self.left[world].as_ref()?;
+    /// The whole belief for a robot at the step of its world.
+    pub fn of(&self, robot: usize, at: &WorldResult) -> Option<(&BeliefInfo, &[u8])> {
+        let StoredBelief { info, bytes } = self.left[robot].as_ref()?;
         let is_there = (info.seed, info.episode, info.step) == (at.seed, at.episode, at.step);
         let is_whole = bytes.len() as u64 == info.length;
         (is_there && is_whole).then_some((info, bytes))
     }
 
-    /// Drops the belief about a world that was replaced.
-    pub fn forget(&mut self, world: usize) {
-        self.left[world] = None;
+    /// Drops the beliefs for the robots of a world that was replaced.
+    pub fn forget(&mut self, robots: Range<usize>) {
+        self.left[robots].fill_with(|| None);
     }
 }

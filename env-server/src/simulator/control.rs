@@ -2,12 +2,12 @@
 
 use super::lease::{Claim, ClientId};
 use super::outcome::{Outcome, PendingReply, ServerStats, malformed, refusal};
-use super::state::{ResetJob, Simulator, Slot};
+use super::state::{ResetJob, Simulator, Slot, cells};
 use protocol::channels::MAX_CLIENTS;
 use protocol::control::{
     LeaseInfo, Reply, Request, ServerInfo, ServerStatus, WorldSeed, WorldStatus, parse,
 };
-use protocol::message::{Status, StepResult, VERSION};
+use protocol::message::{Status, VERSION, WorldResult};
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use std::time::{Duration, Instant};
@@ -49,16 +49,22 @@ impl Simulator {
             .iter()
             .map(|&world| self.world_info(world))
             .collect();
+        let held = self.leases.robots_held(pending.lease);
         // A burn-in longer than the lease must not end it.
         self.leases.end_wait(now, pending.lease);
         if !pending.tells_lease {
             return Some(Reply::Reset { worlds });
         }
         Some(
-            match self.leases.renew(now, pending.lease, pending.client) {
+            match self
+                .leases
+                .renew(now, pending.lease, pending.client)
+                .cloned()
+            {
                 Ok(lease) => Reply::Lease(LeaseInfo {
                     lease: pending.lease,
                     ttl_millis: lease.time_to_live.as_millis() as u64,
+                    robots: held.iter().map(|&robot| robot as u32).collect(),
                     worlds,
                 }),
                 Err(lost) => refusal(lost),
@@ -89,18 +95,18 @@ impl Simulator {
                 }
                 Request::Hello { .. } => Outcome::Answer(Reply::Hello(Box::new(self.info()))),
                 Request::Acquire {
-                    first_world,
-                    n_worlds,
+                    first_robot,
+                    n_robots,
                     takeover,
                     ttl_millis,
                 } => {
-                    let worlds = self.range(first_world, n_worlds).map_err(refusal)?;
+                    let robots = self.robot_range(first_robot, n_robots).map_err(refusal)?;
                     let time_to_live = self.time_to_live(ttl_millis);
                     self.acquire(
                         now,
                         Claim {
                             client,
-                            worlds,
+                            robots,
                             takeover,
                             time_to_live,
                         },
@@ -112,6 +118,7 @@ impl Simulator {
                 }
                 Request::Release { lease } => {
                     self.leases.release(now, lease, client).map_err(refusal)?;
+                    self.settle(now);
                     Outcome::Answer(Reply::Done)
                 }
                 Request::Reset { lease, worlds } => self.reset(now, client, lease, &worlds)?,
@@ -129,7 +136,7 @@ impl Simulator {
                 } => self.restore_job(now, client, lease, (first_world, n_worlds, from), path)?,
                 Request::Fork { lease, from, to } => self.fork(now, client, lease, (from, to))?,
                 Request::LeaveBelief(part) => self.leave_belief(now, client, &part)?,
-                Request::Belief { world, offset } => self.belief(world, offset)?,
+                Request::Belief { robot, offset } => self.belief(robot, offset)?,
                 Request::Status {} => Outcome::Answer(Reply::Status(self.status(stats))),
                 Request::Shutdown {} => Outcome::Shutdown,
             },
@@ -144,6 +151,7 @@ impl Simulator {
     fn acquire(&mut self, now: Instant, claim: Claim) -> Result<Outcome, Reply> {
         let (token, client) = ((self.next_token)(), claim.client);
         self.leases.acquire(now, claim, token).map_err(refusal)?;
+        self.settle(now);
         Ok(self.tell_lease(token, client))
     }
 
@@ -153,10 +161,16 @@ impl Simulator {
         Outcome::Pending(jobs, pending)
     }
 
-    /// The worlds of a lease, once they are ready.
+    /// The robots of a lease, once their worlds are ready.
     fn tell_lease(&mut self, lease: u64, client: ClientId) -> Outcome {
+        let robots = self.leases.robots_held(lease);
+        let mut worlds: Vec<usize> = robots
+            .iter()
+            .map(|robot| robot / self.spec.rules.n_robots)
+            .collect();
+        worlds.dedup();
         let pending = PendingReply {
-            worlds: self.leases.worlds_held(lease),
+            worlds,
             lease,
             client,
             tells_lease: true,
@@ -177,7 +191,7 @@ impl Simulator {
         for (index, WorldSeed { world, .. }) in worlds.iter().enumerate() {
             let range = self.range(*world, 1).map_err(refusal)?;
             self.leases
-                .use_lease(now, lease, client, &range)
+                .use_world(now, lease, client, self.robots_of(range.start))
                 .map_err(refusal)?;
             if self.episode(range.start).is_none() {
                 return Err(Reply::refusal(Status::Resetting, (*world).into()));
@@ -192,7 +206,7 @@ impl Simulator {
         }
         let jobs = worlds
             .iter()
-            .filter_map(|world| self.take_for_reset(world))
+            .filter_map(|world| self.take_for_reset(now, world))
             .collect();
         let worlds = worlds.iter().map(|world| world.world as usize).collect();
         let pending = PendingReply {
@@ -204,17 +218,20 @@ impl Simulator {
         Ok(self.pending(jobs, pending))
     }
 
-    fn take_for_reset(&mut self, to: &WorldSeed) -> Option<ResetJob> {
+    fn take_for_reset(&mut self, now: Instant, to: &WorldSeed) -> Option<ResetJob> {
         let world = to.world as usize;
-        let last = *self.episode(world)?.result();
+        let before = self.episode(world)?;
+        let (last, cells) = (*before.result(), cells(before));
         let seed = to.seed.unwrap_or_else(|| next_seed(&last));
         let episode = last.episode.wrapping_add(1);
         let slot = Slot::Resetting {
             last,
+            cells,
             seed,
             episode,
         };
-        match std::mem::replace(&mut self.slots[world], slot) {
+        self.refuse_waiting(now, world);
+        match std::mem::replace(&mut self.places[world].slot, slot) {
             Slot::Ready(before) => Some(ResetJob {
                 world,
                 before: Some(before),
@@ -235,6 +252,7 @@ impl Simulator {
             width: config.width,
             n_moves: config.moves,
             n_worlds: config.worlds,
+            n_robots: config.robots,
             n_observations: file.observations.len(),
             observations: file
                 .observations
@@ -250,13 +268,16 @@ impl Simulator {
             coverage: config.coverage,
             publish_truth: config.publish_truth,
             lease_millis: config.lease_millis,
+            deadline_millis: config.deadline_millis,
         }
     }
 
     fn status(&self, stats: &ServerStats) -> ServerStatus {
-        let world_status = |world| WorldStatus {
+        let holder_pid = |robot| self.leases.holder(robot).map(|lease| lease.client.pid);
+        let world_status = |world: usize| WorldStatus {
             info: self.world_info(world),
-            holder_pid: self.leases.holder(world).map(|lease| lease.client.pid),
+            holder_pids: self.robots_of(world).map(holder_pid).collect(),
+            n_paths: self.places[world].barrier.ready.count_ones(),
             resetting: self.episode(world).is_none(),
         };
         ServerStatus {
@@ -267,12 +288,12 @@ impl Simulator {
             n_refused: self.n_refused,
             n_clients: stats.n_clients,
             n_observers: stats.n_observers,
-            worlds: (0..self.slots.len()).map(world_status).collect(),
+            worlds: self.worlds().map(world_status).collect(),
         }
     }
 }
 
 /// The seed after an episode whose reset names none; below 2^53, which every JSON reader holds.
-fn next_seed(last: &StepResult) -> u64 {
+fn next_seed(last: &WorldResult) -> u64 {
     stream(last.seed, Purpose::Episode, last.episode).next_u64() >> 11
 }

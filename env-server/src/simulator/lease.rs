@@ -1,7 +1,7 @@
-//! Which client may act on which worlds, and until when. Pure: time and tokens are arguments.
+//! Which client may fly which robots, and until when. Pure: time and tokens are arguments.
 //!
-//! A lease covers consecutive worlds. It ends by release, by expiry, with its client's connection or
-//! process, or by a takeover; a world taken from a lease stays lost to that lease, also when it
+//! A lease covers consecutive robots, by their numbers. It ends by release, by expiry, with its client's connection or
+//! process, or by a takeover; a robot taken from a lease stays lost to that lease, also when it
 //! is free again.
 
 use protocol::message::Status;
@@ -27,14 +27,14 @@ pub struct Lease {
     /// Identifies the lease in requests.
     pub token: u64,
     pub client: ClientId,
-    /// The worlds it was given for.
-    pub worlds: Range<usize>,
+    /// The robots it was given for.
+    pub robots: Range<usize>,
     /// It ends this long after its last use.
     pub time_to_live: Duration,
     expires: Instant,
-    /// The process that last took a world from it.
+    /// The process that last took a robot from it.
     taken_by: Option<u32>,
-    /// Requests that wait for worlds to be reset; it cannot expire meanwhile.
+    /// Requests that wait for resets or for the paths of other clients; it cannot expire meanwhile.
     n_waiting: u32,
 }
 
@@ -48,7 +48,7 @@ pub struct Refusal {
 /// All leases of a server.
 #[derive(Debug)]
 pub struct Leases {
-    /// The token that holds each world.
+    /// The token that holds each robot.
     holders: Vec<Option<u64>>,
     live: HashMap<u64, Lease>,
     ended: VecDeque<Ended>,
@@ -58,8 +58,8 @@ pub struct Leases {
 #[derive(Debug)]
 struct Ended {
     token: u64,
-    first_world: usize,
-    /// The process that took its last world, if that was its end.
+    first_robot: usize,
+    /// The process that took its last robot, if that was its end.
     taken_by: Option<u32>,
 }
 
@@ -67,8 +67,8 @@ struct Ended {
 #[derive(Debug, Clone)]
 pub struct Claim {
     pub client: ClientId,
-    pub worlds: Range<usize>,
-    /// Whether to take worlds from their holders.
+    pub robots: Range<usize>,
+    /// Whether to take robots from their holders.
     pub takeover: bool,
     /// How long the lease lives without use.
     pub time_to_live: Duration,
@@ -87,10 +87,10 @@ impl Lease {
 }
 
 impl Leases {
-    /// No leases on `n_worlds` worlds.
-    pub fn new(n_worlds: usize) -> Self {
+    /// No leases on `n_robots` robots.
+    pub fn new(n_robots: usize) -> Self {
         Self {
-            holders: vec![None; n_worlds],
+            holders: vec![None; n_robots],
             live: HashMap::new(),
             ended: VecDeque::new(),
         }
@@ -98,22 +98,22 @@ impl Leases {
 
     /// Gives a lease under a new token.
     ///
-    /// A client that claims worlds it holds already gets them again, under the new token.
+    /// A client that claims robots it holds already gets them again, under the new token.
     ///
     /// # Errors
-    /// If there is no such world, or another client holds one and it is no takeover.
+    /// If there is no such robot, or another client holds one and it is no takeover.
     pub fn acquire(&mut self, now: Instant, claim: Claim, token: u64) -> Result<&Lease, Refusal> {
-        self.check_worlds(&claim.worlds)?;
+        self.check_robots(&claim.robots)?;
         self.expire(now);
-        let others = claim.worlds.clone().filter_map(|world| self.holder(world));
+        let others = claim.robots.clone().filter_map(|robot| self.holder(robot));
         let other = others
             .into_iter()
             .find(|holder| holder.client != claim.client);
         if let Some(holder) = other.filter(|_| !claim.takeover) {
             return Err(Refusal::new(Status::Busy, holder.client.pid.into()));
         }
-        for world in claim.worlds.clone() {
-            let former = self.holders[world].replace(token);
+        for robot in claim.robots.clone() {
+            let former = self.holders[robot].replace(token);
             if let Some(former) = former.and_then(|token| self.live.get_mut(&token)) {
                 former.taken_by = Some(claim.client.pid);
             }
@@ -121,14 +121,14 @@ impl Leases {
         self.forget_empty_leases();
         let Claim {
             client,
-            worlds,
+            robots,
             time_to_live,
             ..
         } = claim;
         let lease = Lease {
             token,
             client,
-            worlds,
+            robots,
             time_to_live,
             expires: now + time_to_live,
             taken_by: None,
@@ -137,23 +137,23 @@ impl Leases {
         Ok(self.live.entry(token).or_insert(lease))
     }
 
-    /// Checks that a client may act on worlds under a lease, and extends the lease.
+    /// Checks that a client may fly robots under a lease, and extends the lease.
     ///
     /// # Errors
-    /// If there is no such world, or the client does not hold one under this lease.
+    /// If there is no such robot, or the client does not hold one under this lease.
     pub fn use_lease(
         &mut self,
         now: Instant,
         token: u64,
         client: ClientId,
-        worlds: &Range<usize>,
+        robots: &Range<usize>,
     ) -> Result<(), Refusal> {
-        self.check_worlds(worlds)?;
-        let held = self.holders[worlds.clone()]
+        self.check_robots(robots)?;
+        let held = self.holders[robots.clone()]
             .iter()
             .position(|holder| *holder != Some(token));
         if let Some(first) = held {
-            return Err(self.not_held(token, client, worlds.start + first));
+            return Err(self.not_held(token, client, robots.start + first));
         }
         self.renew(now, token, client).map(|_| ())
     }
@@ -165,15 +165,39 @@ impl Leases {
     pub fn renew(&mut self, now: Instant, token: u64, client: ClientId) -> Result<&Lease, Refusal> {
         let is_live = |lease: &&mut Lease| lease.client == client && !lease.has_expired(now);
         if self.live.get_mut(&token).filter(is_live).is_none() {
-            let world = self.first_world(token).unwrap_or(0);
-            return Err(self.not_held(token, client, world));
+            let robot = self.first_robot(token).unwrap_or(0);
+            return Err(self.not_held(token, client, robot));
         }
         let lease = self.live.get_mut(&token).expect("invariant: found above");
         lease.expires = now + lease.time_to_live;
         Ok(lease)
     }
 
-    /// Keeps a lease from expiring while one more request waits for worlds to be reset.
+    /// Checks that a client may replace the world of some robots under a lease, which holds one of them, and extends
+    /// the lease.
+    ///
+    /// # Errors
+    /// If the client holds none of them under this lease, or another client holds one.
+    pub fn use_world(
+        &mut self,
+        now: Instant,
+        token: u64,
+        client: ClientId,
+        robots: Range<usize>,
+    ) -> Result<(), Refusal> {
+        let own = robots
+            .clone()
+            .find(|&robot| self.holders[robot] == Some(token));
+        let own = own.unwrap_or(robots.start);
+        self.use_lease(now, token, client, &(own..own + 1))?;
+        let mut holders = robots.filter_map(|robot| self.holder(robot));
+        match holders.find(|holder| holder.client != client) {
+            Some(other) => Err(Refusal::new(Status::Busy, other.client.pid.into())),
+            None => Ok(()),
+        }
+    }
+
+    /// Keeps a lease from expiring while one more request waits.
     pub fn begin_wait(&mut self, token: u64) {
         if let Some(lease) = self.live.get_mut(&token) {
             lease.n_waiting += 1;
@@ -188,7 +212,7 @@ impl Leases {
         }
     }
 
-    /// Ends a lease; its worlds are free.
+    /// Ends a lease; its robots are free.
     ///
     /// # Errors
     /// If the client does not have this lease, or has lost it.
@@ -213,44 +237,57 @@ impl Leases {
         self.end_where(|lease| !nodes.contains(&lease.client.node))
     }
 
-    /// The worlds of a lease that were not taken over.
-    pub fn worlds_held(&self, token: u64) -> Vec<usize> {
-        let held = |world: &usize| self.holders[*world] == Some(token);
+    /// The robots of a lease that were not taken over.
+    pub fn robots_held(&self, token: u64) -> Vec<usize> {
+        let held = |robot: &usize| self.holders[*robot] == Some(token);
         let lease = self.live.get(&token);
         lease.map_or_else(Vec::new, |lease| {
-            lease.worlds.clone().filter(held).collect()
+            lease.robots.clone().filter(held).collect()
         })
     }
 
-    /// The lease that holds a world.
-    pub fn holder(&self, world: usize) -> Option<&Lease> {
-        self.holders[world].and_then(|token| self.live.get(&token))
+    /// The lease that holds a robot.
+    pub fn holder(&self, robot: usize) -> Option<&Lease> {
+        self.holders[robot].and_then(|token| self.live.get(&token))
     }
 
-    fn check_worlds(&self, worlds: &Range<usize>) -> Result<(), Refusal> {
-        if worlds.start < worlds.end && worlds.end <= self.holders.len() {
+    /// Which of at most 64 robots are held, bit by bit.
+    pub fn held(&self, robots: Range<usize>) -> u64 {
+        let holders = self.holders[robots].iter();
+        mask(holders.map(Option::is_some))
+    }
+
+    /// Which of at most 64 robots a lease holds, bit by bit.
+    pub fn held_under(&self, token: u64, robots: Range<usize>) -> u64 {
+        let holders = self.holders[robots].iter();
+        mask(holders.map(|holder| *holder == Some(token)))
+    }
+
+    fn check_robots(&self, robots: &Range<usize>) -> Result<(), Refusal> {
+        if robots.start < robots.end && robots.end <= self.holders.len() {
             return Ok(());
         }
-        Err(Refusal::new(Status::NoSuchWorld, self.holders.len() as u64))
+        Err(Refusal::new(Status::NoSuchRobot, self.holders.len() as u64))
     }
 
-    fn first_world(&self, token: u64) -> Option<usize> {
-        let live = self.live.get(&token).map(|lease| lease.worlds.start);
-        live.or_else(|| self.ended(token).map(|ended| ended.first_world))
+    fn first_robot(&self, token: u64) -> Option<usize> {
+        let live = self.live.get(&token).map(|lease| lease.robots.start);
+        live.or_else(|| self.ended(token).map(|ended| ended.first_robot))
     }
 
     fn ended(&self, token: u64) -> Option<&Ended> {
         self.ended.iter().find(|ended| ended.token == token)
     }
 
-    fn not_held(&self, token: u64, client: ClientId, world: usize) -> Refusal {
-        let is_own = |lease: &&Lease| lease.client == client && lease.worlds.contains(&world);
-        let holder = self.holder(world).map(|holder| holder.client.pid);
+    /// Why a client does not hold a robot under a lease.
+    pub fn not_held(&self, token: u64, client: ClientId, robot: usize) -> Refusal {
+        let is_own = |lease: &&Lease| lease.client == client && lease.robots.contains(&robot);
+        let holder = self.holder(robot).map(|holder| holder.client.pid);
         let taken_by = match (self.live.get(&token).filter(is_own), self.ended(token)) {
-            (Some(_), _) if self.holders[world] == Some(token) => None, // It has expired.
+            (Some(_), _) if self.holders[robot] == Some(token) => None, // It has expired.
             (Some(lease), _) => holder.or(lease.taken_by),
             (None, Some(ended)) => ended.taken_by.or(holder),
-            (None, None) => return Refusal::new(Status::NoLease, world as u64),
+            (None, None) => return Refusal::new(Status::NoLease, robot as u64),
         };
         Refusal::new(Status::LeaseLost, taken_by.map_or(0, u64::from))
     }
@@ -270,7 +307,7 @@ impl Leases {
     fn end(&mut self, token: u64) -> Option<Lease> {
         let lease = self.live.remove(&token)?;
         let mut held = false;
-        for holder in &mut self.holders[lease.worlds.clone()] {
+        for holder in &mut self.holders[lease.robots.clone()] {
             held |= *holder == Some(token);
             holder.take_if(|holder| *holder == token);
         }
@@ -279,20 +316,25 @@ impl Leases {
         }
         self.ended.push_back(Ended {
             token,
-            first_world: lease.worlds.start,
+            first_robot: lease.robots.start,
             taken_by: lease.taken_by.filter(|_| !held),
         });
         Some(lease)
     }
 
-    /// Ends leases all of whose worlds were taken.
+    /// Ends leases all of whose robots were taken.
     fn forget_empty_leases(&mut self) {
         let holders = self.holders.clone();
         let is_empty = |lease: &Lease| {
-            holders[lease.worlds.clone()]
+            holders[lease.robots.clone()]
                 .iter()
                 .all(|holder| *holder != Some(lease.token))
         };
         self.end_where(is_empty);
     }
+}
+
+fn mask(bits: impl Iterator<Item = bool>) -> u64 {
+    bits.enumerate()
+        .fold(0, |mask, (index, bit)| mask | u64::from(bit) << index)
 }

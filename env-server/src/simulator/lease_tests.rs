@@ -15,17 +15,17 @@ fn client(pid: u32) -> ClientId {
     }
 }
 
-fn claim(pid: u32, worlds: Range<usize>, takeover: bool) -> Claim {
+fn claim(pid: u32, robots: Range<usize>, takeover: bool) -> Claim {
     Claim {
         client: client(pid),
-        worlds,
+        robots,
         takeover,
         time_to_live: TTL,
     }
 }
 
 #[test]
-fn a_world_has_one_holder() {
+fn a_robot_has_one_holder() {
     let (mut leases, now) = (Leases::new(4), Instant::now());
     leases
         .acquire(now, claim(1, 0..2, false), 11)
@@ -46,7 +46,7 @@ fn a_world_has_one_holder() {
 }
 
 #[test]
-fn a_takeover_costs_the_holder_the_worlds_taken() {
+fn a_takeover_costs_the_holder_the_robots_taken() {
     let (mut leases, now) = (Leases::new(2), Instant::now());
     leases
         .acquire(now, claim(1, 0..2, false), 11)
@@ -107,7 +107,7 @@ fn a_lease_does_not_expire_while_its_client_waits() {
 }
 
 #[test]
-fn a_lost_lease_names_who_holds_its_own_worlds_now() {
+fn a_lost_lease_names_who_holds_its_own_robots_now() {
     let (mut leases, now) = (Leases::new(2), Instant::now());
     leases
         .acquire(now, claim(1, 0..1, false), 11)
@@ -127,8 +127,8 @@ fn a_lost_lease_names_who_holds_its_own_worlds_now() {
 #[test]
 fn a_lost_lease_names_who_took_it_over_also_when_that_client_has_left() {
     let (mut leases, now) = (Leases::new(3), Instant::now());
-    let lost = |leases: &mut Leases, worlds: Range<usize>| {
-        let refusal = leases.use_lease(now, 11, client(1), &worlds);
+    let lost = |leases: &mut Leases, robots: Range<usize>| {
+        let refusal = leases.use_lease(now, 11, client(1), &robots);
         refusal.expect_err("lost").detail
     };
     leases
@@ -197,16 +197,53 @@ fn a_dead_process_holds_nothing() {
 }
 
 #[test]
-fn worlds_outside_the_server_are_refused() {
+fn robots_outside_the_server_are_refused() {
     let (mut leases, now) = (Leases::new(2), Instant::now());
     #[expect(
         clippy::reversed_empty_ranges,
         reason = "what a hostile client may send"
     )]
-    for worlds in [0..3, 2..2, 5..7, 1..0] {
+    for robots in [0..3, 2..2, 5..7, 1..0] {
         let refused = leases
-            .acquire(now, claim(1, worlds, true), 11)
-            .expect_err("no such world");
-        assert_eq!(refused, Refusal::new(Status::NoSuchWorld, 2));
+            .acquire(now, claim(1, robots, true), 11)
+            .expect_err("no such robot");
+        assert_eq!(refused, Refusal::new(Status::NoSuchRobot, 2));
     }
+}
+
+#[test]
+fn a_world_is_replaced_by_who_holds_all_its_robots_that_are_held() {
+    let (mut leases, now) = (Leases::new(6), Instant::now());
+    leases
+        .acquire(now, claim(1, 1..2, false), 11)
+        .expect("free");
+    assert_eq!(leases.use_world(now, 11, client(1), 0..3), Ok(()));
+    assert_eq!(
+        leases.use_world(now, 11, client(1), 3..6),
+        Err(Refusal::new(Status::NoLease, 3))
+    );
+    leases
+        .acquire(now, claim(2, 2..4, false), 12)
+        .expect("free");
+    let busy = Err(Refusal::new(Status::Busy, 2));
+    assert_eq!(leases.use_world(now, 11, client(1), 0..3), busy);
+    leases
+        .acquire(now, claim(1, 2..3, true), 13)
+        .expect("takeover");
+    assert_eq!(leases.use_world(now, 11, client(1), 0..3), Ok(()));
+    assert_eq!(leases.use_world(now, 13, client(1), 0..3), Ok(()));
+}
+
+#[test]
+fn held_robots_are_told_bit_by_bit() {
+    let (mut leases, now) = (Leases::new(128), Instant::now());
+    leases
+        .acquire(now, claim(1, 64..66, false), 11)
+        .expect("free");
+    leases
+        .acquire(now, claim(2, 127..128, false), 12)
+        .expect("free");
+    assert_eq!(leases.held(64..128), 1 << 63 | 0b11);
+    assert_eq!(leases.held_under(12, 64..128), 1 << 63);
+    assert_eq!(leases.held(0..64), 0);
 }

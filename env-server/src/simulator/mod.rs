@@ -1,5 +1,9 @@
 //! All worlds and leases of a server: requests in, answers out, no I/O and no clock.
 
+mod advance;
+mod barrier;
+#[cfg(test)]
+mod barrier_tests;
 mod beliefs;
 mod control;
 mod lease;
@@ -12,6 +16,8 @@ mod step;
 mod tests;
 mod worlds;
 
+pub use barrier::Ticket;
 pub use lease::ClientId;
 pub use outcome::{Outcome, PendingFile, PendingReply, ServerStats};
 pub use state::{ResetJob, Simulator};
+pub use step::Stepped;

@@ -1,15 +1,16 @@
 //! The worlds and leases of a server.
 
+use super::barrier::{Barrier, Waiter};
 use super::beliefs::Beliefs;
 use super::lease::{Leases, Refusal};
 use crate::config::Checked;
 use crate::snapshot::WorldSpec;
 use crate::world::{Episode, Rules};
 use protocol::control::WorldInfo;
-use protocol::message::{Status, StepResult};
+use protocol::message::{Status, WorldResult};
 use protocol::model::ModelError;
 use rayon::ThreadPool;
-use std::collections::HashSet;
+use std::collections::{HashSet, VecDeque};
 use std::ops::Range;
 use std::time::Instant;
 
@@ -18,20 +19,34 @@ pub struct Simulator {
     pub(super) checked: Checked,
     pub(super) spec: WorldSpec,
     pub(super) beliefs: Beliefs,
-    pub(super) slots: Vec<Slot>,
+    pub(super) places: Vec<Place>,
     pub(super) leases: Leases,
+    /// Worlds for which requests wait.
+    pub(super) waiting_worlds: Vec<usize>,
+    /// Requests that have waited, and why they are refused, if they are.
+    pub(super) settled: VecDeque<(Waiter, Result<(), Refusal>)>,
+    /// Worlds that moved without a request of their own.
+    pub(super) moved: Vec<usize>,
+    pub(super) n_tickets: u64,
     pub(super) threads: ThreadPool,
     pub(super) next_token: Box<dyn FnMut() -> u64>,
     pub(super) n_steps: u64,
     pub(super) n_refused: u64,
 }
 
+/// A world, and the paths for its next step.
+pub(super) struct Place {
+    pub slot: Slot,
+    pub barrier: Barrier,
+}
+
 /// A world, or what is known of it during its burn-in.
 pub(super) enum Slot {
     Ready(Box<Episode>),
-    /// `last` is its result before.
+    /// `last` and `cells` are its result and its robots before.
     Resetting {
-        last: StepResult,
+        last: WorldResult,
+        cells: Vec<[u32; 2]>,
         seed: u64,
         episode: u64,
     },
@@ -59,11 +74,8 @@ impl Simulator {
     ) -> Result<(Self, Vec<ResetJob>), ModelError> {
         let config = &checked.config;
         let spec = WorldSpec::of(&checked)?;
-        let beliefs = Beliefs::new(
-            config.worlds as usize,
-            checked.shape.n_cells(),
-            checked.model.n_states(),
-        );
+        let n_robots = config.worlds as usize * config.robots as usize;
+        let beliefs = Beliefs::new(n_robots, checked.shape.n_cells(), checked.model.n_states());
         let (n_worlds, first_seed) = (config.worlds as usize, config.seed);
         let start = |world: usize| ResetJob {
             world,
@@ -72,15 +84,24 @@ impl Simulator {
             seed: first_seed.wrapping_add(world as u64),
         };
         let jobs: Vec<ResetJob> = (0..n_worlds).map(start).collect();
-        let slots = jobs.iter().map(Slot::resetting).collect();
-        let leases = Leases::new(n_worlds);
+        let (team, n_moves) = (config.robots as usize, config.moves);
+        let place = |job| Place {
+            slot: Slot::resetting(job, team),
+            barrier: Barrier::new(team, n_moves),
+        };
+        let places = jobs.iter().map(place).collect();
+        let leases = Leases::new(n_robots);
         Ok((
             Self {
                 checked,
                 spec,
                 beliefs,
-                slots,
+                places,
                 leases,
+                waiting_worlds: Vec::new(),
+                settled: VecDeque::new(),
+                moved: Vec::new(),
+                n_tickets: 0,
                 threads,
                 next_token,
                 n_steps: 0,
@@ -92,8 +113,8 @@ impl Simulator {
 
     /// Replaces a world, for example by the same one after its reset.
     pub fn put(&mut self, world: usize, episode: Box<Episode>) {
-        self.slots[world] = Slot::Ready(episode);
-        self.beliefs.forget(world);
+        self.places[world].slot = Slot::Ready(episode);
+        self.beliefs.forget(self.robots_of(world));
     }
 
     /// What worlds must fit.
@@ -101,28 +122,30 @@ impl Simulator {
         &self.spec
     }
 
-    /// Ends leases that have expired; returns the pid of each.
-    pub fn expire(&mut self, now: Instant) -> Vec<u32> {
-        self.leases
-            .expire(now)
-            .iter()
-            .map(|lease| lease.client.pid)
-            .collect()
+    /// Ends leases that have expired, and moves worlds whose deadline has passed; returns the pid of each such lease.
+    pub fn tick(&mut self, now: Instant) -> Vec<u32> {
+        let expired = self.leases.expire(now);
+        self.settle(now);
+        expired.iter().map(|lease| lease.client.pid).collect()
     }
 
     /// Ends the leases of a process that has died; returns how many there were.
-    pub fn end_of_process(&mut self, pid: u32) -> usize {
-        self.leases.end_of_process(pid).len()
+    pub fn end_of_process(&mut self, now: Instant, pid: u32) -> usize {
+        let n_leases = self.leases.end_of_process(pid).len();
+        self.settle(now);
+        n_leases
     }
 
     /// Ends the leases of connections that were closed: of nodes that are not among these.
-    pub fn end_of_connections(&mut self, nodes: &HashSet<u128>) -> usize {
-        self.leases.end_of_nodes_except(nodes).len()
+    pub fn end_of_connections(&mut self, now: Instant, nodes: &HashSet<u128>) -> usize {
+        let n_leases = self.leases.end_of_nodes_except(nodes).len();
+        self.settle(now);
+        n_leases
     }
 
     /// The episode of a world that is not being reset.
     pub fn episode(&self, world: usize) -> Option<&Episode> {
-        match self.slots.get(world)? {
+        match &self.places.get(world)?.slot {
             Slot::Ready(episode) => Some(episode),
             Slot::Resetting { .. } => None,
         }
@@ -130,7 +153,7 @@ impl Simulator {
 
     /// Every world.
     pub fn worlds(&self) -> Range<usize> {
-        0..self.slots.len()
+        0..self.places.len()
     }
 
     /// World steps so far.
@@ -138,12 +161,27 @@ impl Simulator {
         self.n_steps
     }
 
+    /// Worlds by their numbers.
     pub(super) fn range(&self, first: u32, n_worlds: u32) -> Result<Range<usize>, Refusal> {
-        let (first, end) = (first as usize, first as usize + n_worlds as usize);
-        if first < end && end <= self.slots.len() {
-            return Ok(first..end);
-        }
-        Err(Refusal::new(Status::NoSuchWorld, self.slots.len() as u64))
+        within(first, n_worlds, self.places.len(), Status::NoSuchWorld)
+    }
+
+    /// Robots by their numbers.
+    pub(super) fn robot_range(&self, first: u32, n_robots: u32) -> Result<Range<usize>, Refusal> {
+        let n_all = self.places.len() * self.spec.rules.n_robots;
+        within(first, n_robots, n_all, Status::NoSuchRobot)
+    }
+
+    /// The worlds of some robots.
+    pub fn worlds_of(&self, robots: &Range<usize>) -> Range<usize> {
+        let team = self.spec.rules.n_robots;
+        robots.start / team..robots.end.div_ceil(team)
+    }
+
+    /// The robots of a world.
+    pub(super) fn robots_of(&self, world: usize) -> Range<usize> {
+        let team = self.spec.rules.n_robots;
+        world * team..(world + 1) * team
     }
 
     pub(super) fn check_present(&self, worlds: &Range<usize>) -> Result<(), Refusal> {
@@ -154,32 +192,40 @@ impl Simulator {
     }
 
     pub(super) fn world_info(&self, world: usize) -> WorldInfo {
-        let result = match &self.slots[world] {
-            Slot::Ready(episode) => episode.result(),
-            Slot::Resetting { last, .. } => last,
+        let (result, robots) = match &self.places[world].slot {
+            Slot::Ready(episode) => (episode.result(), cells(episode)),
+            Slot::Resetting { last, cells, .. } => (last, cells.clone()),
         };
-        let StepResult {
-            step,
-            seed,
-            episode,
-            row,
-            col,
-            ..
-        } = *result;
         WorldInfo {
             world: world as u32,
-            step,
-            seed,
-            episode,
-            robot: [row, col],
+            step: result.step,
+            seed: result.seed,
+            episode: result.episode,
+            robots,
         }
     }
 }
 
+fn within(first: u32, n: u32, n_all: usize, otherwise: Status) -> Result<Range<usize>, Refusal> {
+    let (first, end) = (first as usize, first as usize + n as usize);
+    if first < end && end <= n_all {
+        return Ok(first..end);
+    }
+    Err(Refusal::new(otherwise, n_all as u64))
+}
+
+/// `[row, col]` of each robot.
+pub(super) fn cells(episode: &Episode) -> Vec<[u32; 2]> {
+    let robots = episode.robots().iter();
+    let cell = robots.map(|robot| [robot.result().row, robot.result().col]);
+    cell.collect()
+}
+
 impl Slot {
-    pub(super) fn resetting(job: &ResetJob) -> Self {
+    pub(super) fn resetting(job: &ResetJob, n_robots: usize) -> Self {
         Self::Resetting {
-            last: StepResult::default(),
+            last: WorldResult::default(),
+            cells: vec![[0, 0]; n_robots],
             seed: job.seed,
             episode: job.episode,
         }

@@ -2,208 +2,226 @@
 //!
 //! A refusal changes nothing. What a client sends is bytes and numbers it chose freely: nothing here may panic on them.
 
+use super::barrier::{Ticket, Waiter, mask};
 use super::lease::{ClientId, Refusal};
-use super::state::{Simulator, Slot};
-use crate::world::PastStep;
-use protocol::message::{FLAG_FULL_COVERAGE, Operation, Status, StepReply, StepRequest, VERSION};
-use protocol::path::{MoveError, path_from_bytes};
-use protocol::{Coverage, Move};
-use rayon::iter::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
-use rayon::slice::ParallelSlice;
+use super::state::Simulator;
+use protocol::Coverage;
+use protocol::message::{
+    FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, Status, StepReply, StepRequest, VERSION,
+};
+use protocol::path::{MoveError, check_moves};
 use std::ops::Range;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-/// Cells of a batch from which on it is stepped by several threads: below it, waking them (tens of
-/// microseconds) costs more than it saves at about 1 ns a cell.
-const PARALLEL_CELLS: usize = 1 << 17;
+/// What a step request leads to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Stepped {
+    /// An answer now.
+    Reply(StepReply),
+    /// An answer when the world has moved: [`Simulator::next_answer`] gives it.
+    Waits(Ticket),
+}
 
-/// A step request whose numbers were checked.
-struct Batch {
-    worlds: Range<usize>,
-    coverage: Coverage,
-    /// One path after the other.
-    moves: Vec<Move>,
-    n_moves: usize,
+/// Why a request is answered now.
+enum Granted<'a> {
+    /// With the worlds as they are.
+    Present,
+    /// With the worlds as they were at these steps.
+    Past(&'a [u8]),
+    /// Its world waits for other paths.
+    Waits(Ticket),
 }
 
 impl Simulator {
-    /// Answers a step request; results and frames go to `payload`, which is left empty by a refusal.
+    /// Answers a step request or has it wait; results and frames go to `payload`, which is left empty otherwise.
     pub fn step(
         &mut self,
         now: Instant,
         client: ClientId,
         request: &StepRequest,
-        paths: &[u8],
+        body: &[u8],
         payload: &mut Vec<u8>,
-    ) -> StepReply {
+    ) -> Stepped {
         payload.clear();
-        let outcome = self.try_step(now, client, request, paths);
-        let header = StepReply {
-            version: VERSION,
-            sequence: request.sequence,
-            first_world: request.first_world,
-            height: self.spec.rules.shape.height() as u32,
-            width: self.spec.rules.shape.width() as u32,
-            ..StepReply::default()
-        };
-        match outcome {
-            Ok((operation, worlds)) => {
-                let n_worlds = worlds.len() as u32;
-                match operation {
-                    Operation::Recall => self.write_past(worlds, request.step, payload),
-                    _ => self.write_worlds(worlds, payload),
-                }
-                StepReply {
-                    status: Status::Ok as u32,
-                    n_worlds,
-                    ..header
-                }
-            }
-            Err(refusal) => {
-                self.n_refused += 1;
-                StepReply {
-                    status: refusal.status as u32,
-                    detail: refusal.detail,
-                    ..header
-                }
-            }
+        match self.try_step(now, client, request, body) {
+            Ok(Granted::Waits(ticket)) => Stepped::Waits(ticket),
+            Ok(Granted::Present) => Stepped::Reply(self.write_present(request, payload)),
+            Ok(Granted::Past(steps)) => Stepped::Reply(self.write_past(request, steps, payload)),
+            Err(refusal) => Stepped::Reply(self.refuse(request, refusal)),
         }
     }
 
-    /// The worlds of a step request that was answered with `Ok`.
-    pub fn worlds_of(&self, reply: &StepReply) -> Range<usize> {
-        let first = reply.first_world as usize;
-        first..first + reply.n_worlds as usize
-    }
-
-    fn try_step(
+    fn try_step<'a>(
         &mut self,
         now: Instant,
         client: ClientId,
         request: &StepRequest,
-        paths: &[u8],
-    ) -> Result<(Operation, Range<usize>), Refusal> {
+        body: &'a [u8],
+    ) -> Result<Granted<'a>, Refusal> {
         if request.version != VERSION {
             return Err(Refusal::new(Status::VersionMismatch, VERSION.into()));
         }
         let operation = Operation::try_from(request.operation);
         let operation = operation
             .map_err(|unknown| Refusal::new(Status::UnknownOperation, unknown.value.into()))?;
-        let worlds = self.range(request.first_world, request.n_worlds)?;
+        let robots = self.robot_range(request.first_robot, request.n_robots)?;
+        let allowed = match operation {
+            Operation::Step => FLAG_FULL_COVERAGE | FLAG_TEAM_FRAMES,
+            _ => FLAG_TEAM_FRAMES,
+        };
+        if request.flags & !allowed != 0 {
+            return Err(Refusal::new(Status::UnknownFlags, request.flags.into()));
+        }
         match operation {
-            Operation::Observe => self.check_observation(&worlds, paths)?,
+            Operation::Observe => {
+                check_length(body, 0)?;
+                self.check_present(&self.worlds_of(&robots))?;
+                Ok(Granted::Present)
+            }
             Operation::Recall => {
-                self.check_observation(&worlds, paths)?;
-                self.check_kept(&worlds, request.step)?;
+                let worlds = self.worlds_of(&robots);
+                check_length(body, worlds.len() * size_of::<u64>())?;
+                self.check_present(&worlds)?;
+                self.check_kept(worlds, body)?;
+                Ok(Granted::Past(body))
             }
             Operation::Step => {
-                let batch = self.check_batch(worlds.clone(), request, paths)?;
-                self.leases.use_lease(now, request.lease, client, &worlds)?;
-                self.check_ready(&worlds)?;
-                self.run(batch);
+                let coverage = self.check_paths(&robots, request, body)?;
+                self.leases.use_lease(now, request.lease, client, &robots)?;
+                self.check_whole(client, &robots)?;
+                self.check_ready(&robots, body)?;
+                let waiting = self.fly(now, client, request, body, coverage);
+                Ok(waiting.map_or(Granted::Present, Granted::Waits))
             }
         }
-        Ok((operation, worlds))
     }
 
-    fn check_observation(&self, worlds: &Range<usize>, paths: &[u8]) -> Result<(), Refusal> {
-        if !paths.is_empty() {
-            return Err(Refusal::new(Status::WrongLength, 0));
+    /// Puts the paths of a request that was checked, and moves its worlds, unless the only one waits for other paths.
+    fn fly(
+        &mut self,
+        now: Instant,
+        client: ClientId,
+        request: &StepRequest,
+        body: &[u8],
+        coverage: Coverage,
+    ) -> Option<Ticket> {
+        let (first, n_robots) = (request.first_robot as usize, request.n_robots as usize);
+        let worlds = self.worlds_of(&(first..first + n_robots));
+        let (team, n_moves) = (self.spec.rules.n_robots, self.spec.rules.n_moves);
+        let mut paths = &body[worlds.len() * size_of::<u64>()..];
+        let is_full = coverage == Coverage::Full;
+        for world in worlds.clone() {
+            let from = first.max(world * team);
+            let to = (first + n_robots).min((world + 1) * team);
+            let (own, rest) = paths.split_at((to - from) * n_moves);
+            let barrier = &mut self.places[world].barrier;
+            barrier.put(from - world * team, n_moves, own, is_full);
+            paths = rest;
         }
-        self.check_present(worlds)
+        // Of several worlds nobody else holds a robot, so that none of them waits.
+        if worlds.len() > 1 || self.is_complete(now, worlds.start) {
+            self.advance(now, worlds);
+            return None;
+        }
+        let world = worlds.start;
+        let ticket = self.new_ticket();
+        let barrier = &mut self.places[world].barrier;
+        barrier.waiters.push(Waiter {
+            ticket,
+            client,
+            request: *request,
+            robots: mask(first - world * team, n_robots),
+        });
+        let deadline_millis = self.checked.config.deadline_millis;
+        if barrier.deadline.is_none() && deadline_millis > 0 {
+            barrier.deadline = Some(now + Duration::from_millis(deadline_millis));
+        }
+        if barrier.waiters.len() == 1 {
+            self.waiting_worlds.push(world);
+        }
+        self.leases.begin_wait(request.lease);
+        Some(ticket)
     }
 
-    fn check_kept(&self, worlds: &Range<usize>, step: u64) -> Result<(), Refusal> {
-        let mut episodes = worlds.clone().filter_map(|world| self.episode(world));
-        let missing = episodes.find_map(|episode| episode.recall(step).err());
+    /// Checks that worlds kept what steps showed.
+    fn check_kept(&self, worlds: Range<usize>, steps: &[u8]) -> Result<(), Refusal> {
+        let mut episodes = worlds
+            .filter_map(|world| self.episode(world))
+            .zip(numbers(steps));
+        let missing = episodes.find_map(|(episode, step)| episode.recall(step).err());
         missing.map_or(Ok(()), |nearest| {
             Err(Refusal::new(Status::NotKept, nearest))
         })
     }
 
-    fn check_batch(
+    fn check_paths(
         &self,
-        worlds: Range<usize>,
+        robots: &Range<usize>,
         request: &StepRequest,
-        paths: &[u8],
-    ) -> Result<Batch, Refusal> {
-        let n_moves = self.checked.config.moves;
+        body: &[u8],
+    ) -> Result<Coverage, Refusal> {
+        let n_moves = self.spec.rules.n_moves;
         if request.n_moves as usize != n_moves {
             return Err(Refusal::new(Status::WrongPathLength, n_moves as u64));
         }
-        let expected = worlds.len() * n_moves;
-        if paths.len() != expected {
-            return Err(Refusal::new(Status::WrongLength, expected as u64));
-        }
-        let moves = path_from_bytes(paths);
-        let moves =
-            moves.map_err(|MoveError { index, .. }| Refusal::new(Status::BadMove, index as u64))?;
-        if request.flags & !FLAG_FULL_COVERAGE != 0 {
-            return Err(Refusal::new(Status::UnknownFlags, request.flags.into()));
-        }
+        let n_steps = self.worlds_of(robots).len() * size_of::<u64>();
+        check_length(body, n_steps + robots.len() * n_moves)?;
+        check_moves(&body[n_steps..]).map_err(|MoveError { index, .. }| {
+            Refusal::new(Status::BadMove, (n_steps + index) as u64)
+        })?;
         let asks_full = request.flags & FLAG_FULL_COVERAGE != 0;
         let coverage = self.checked.config.coverage.coverage(asks_full);
-        let coverage = coverage.map_err(|status| Refusal::new(status, 0))?;
-        Ok(Batch {
-            worlds,
-            coverage,
-            moves,
-            n_moves,
-        })
+        coverage.map_err(|status| Refusal::new(status, 0))
     }
 
-    fn check_ready(&self, worlds: &Range<usize>) -> Result<(), Refusal> {
-        for world in worlds.clone() {
-            match self.episode(world) {
-                None => return Err(Refusal::new(Status::Resetting, world as u64)),
-                Some(episode) if episode.is_over() => {
-                    return Err(Refusal::new(Status::EpisodeOver, world as u64));
-                }
-                Some(_) => {}
+    /// Checks that a client leaves out no robot of its own in a world, and that nobody holds another robot of several
+    /// worlds. Only the first and the last world can have other robots.
+    fn check_whole(&self, client: ClientId, robots: &Range<usize>) -> Result<(), Refusal> {
+        let (team, worlds) = (self.spec.rules.n_robots, self.worlds_of(robots));
+        for world in [worlds.start, worlds.end - 1] {
+            let all = world * team..(world + 1) * team;
+            let mut others = all.filter(|robot| !robots.contains(robot));
+            let missing = others.find(|&robot| {
+                let holder = self.leases.holder(robot);
+                holder.is_some_and(|holder| worlds.len() > 1 || holder.client == client)
+            });
+            if let Some(robot) = missing {
+                return Err(Refusal::new(Status::Incomplete, robot as u64));
             }
         }
         Ok(())
     }
 
-    fn run(&mut self, batch: Batch) {
-        let (rules, slots) = (&self.spec.rules, &mut self.slots[batch.worlds.clone()]);
-        let step = |(slot, path): (&mut Slot, &[Move])| {
-            if let Slot::Ready(episode) = slot {
-                episode.step(rules, path, batch.coverage);
+    /// Checks that each world can take a step, and that it is at the step that its paths are meant for.
+    fn check_ready(&self, robots: &Range<usize>, body: &[u8]) -> Result<(), Refusal> {
+        for (world, step) in self.worlds_of(robots).zip(numbers(body)) {
+            let Some(episode) = self.episode(world) else {
+                return Err(Refusal::new(Status::Resetting, world as u64));
+            };
+            if episode.is_over() {
+                return Err(Refusal::new(Status::EpisodeOver, world as u64));
             }
-        };
-        if slots.len() * rules.shape.n_cells() >= PARALLEL_CELLS {
-            let paths = batch.moves.par_chunks(batch.n_moves);
-            self.threads
-                .install(|| slots.par_iter_mut().zip(paths).for_each(step));
-        } else {
-            let paths = batch.moves.chunks(batch.n_moves);
-            slots.iter_mut().zip(paths).for_each(step);
+            let present = episode.result().step;
+            if step < present {
+                return Err(Refusal::new(Status::Late, present));
+            }
+            if step > present {
+                return Err(Refusal::new(Status::Early, present));
+            }
         }
-        self.n_steps += batch.worlds.len() as u64;
+        Ok(())
     }
+}
 
-    fn write_past(&self, worlds: Range<usize>, step: u64, payload: &mut Vec<u8>) {
-        let episodes = worlds.filter_map(|world| self.episode(world));
-        let past: Vec<&PastStep> = episodes
-            .filter_map(|episode| episode.recall(step).ok())
-            .collect();
-        for past in &past {
-            payload.extend_from_slice(bytemuck::bytes_of(&past.result));
-        }
-        for past in &past {
-            let start = payload.len();
-            payload.resize(start + self.spec.rules.shape.n_cells(), 0);
-            past.write_frame(&mut payload[start..]);
-        }
+fn check_length(body: &[u8], expected: usize) -> Result<(), Refusal> {
+    if body.len() == expected {
+        return Ok(());
     }
+    Err(Refusal::new(Status::WrongLength, expected as u64))
+}
 
-    fn write_worlds(&self, worlds: Range<usize>, payload: &mut Vec<u8>) {
-        for episode in worlds.clone().filter_map(|world| self.episode(world)) {
-            payload.extend_from_slice(bytemuck::bytes_of(episode.result()));
-        }
-        for episode in worlds.filter_map(|world| self.episode(world)) {
-            payload.extend_from_slice(episode.frame().as_bytes());
-        }
-    }
+/// The numbers that a payload begins with.
+pub(super) fn numbers(bytes: &[u8]) -> impl Iterator<Item = u64> {
+    let (numbers, _) = bytes.as_chunks::<8>();
+    numbers.iter().map(|&bytes| u64::from_ne_bytes(bytes))
 }

@@ -3,9 +3,11 @@
 use super::lease::ClientId;
 use super::outcome::{Outcome, PendingReply, ServerStats};
 use super::state::{ResetJob, Simulator};
+use super::step::Stepped;
 use crate::config::ServerConfig;
 use protocol::control::{Reply, Request, WorldSeed};
 use protocol::message::{Operation, Status, StepRequest, VERSION};
+use protocol::payload::write_step_body;
 use rayon::ThreadPoolBuilder;
 use std::time::{Duration, Instant};
 
@@ -62,8 +64,8 @@ fn ask_pending(
 /// Asks for both worlds; the first token is 1.
 fn acquire(simulator: &mut Simulator, now: Instant) -> PendingReply {
     let request = Request::Acquire {
-        first_world: 0,
-        n_worlds: 2,
+        first_robot: 0,
+        n_robots: 2,
         takeover: false,
         ttl_millis: None,
     };
@@ -79,18 +81,22 @@ fn reset(seed: u64) -> Request {
     }
 }
 
-/// The status of a step of world 0.
-fn step(simulator: &mut Simulator, now: Instant) -> Status {
+/// The status of a step of world 0 from step k on.
+fn step(simulator: &mut Simulator, now: Instant, k: u64) -> Status {
     let request = StepRequest {
         version: VERSION,
         operation: Operation::Step as u32,
         lease: 1,
-        n_worlds: 1,
+        n_robots: 1,
         n_moves: 2,
         ..StepRequest::default()
     };
-    let reply = simulator.step(now, US, &request, &[1, 3], &mut Vec::new());
-    Status::try_from(reply.status).expect("a known status")
+    let mut body = Vec::new();
+    write_step_body(&[k], &[1, 3], &mut body);
+    match simulator.step(now, US, &request, &body, &mut Vec::new()) {
+        Stepped::Reply(reply) => Status::try_from(reply.status).expect("a known status"),
+        Stepped::Waits(_) => panic!("the only robot waits for nobody"),
+    }
 }
 
 #[test]
@@ -98,15 +104,15 @@ fn a_world_in_burn_in_takes_no_step_and_requests_for_it_wait() {
     let ((mut simulator, jobs), now) = (start(), Instant::now());
     let acquired = acquire(&mut simulator, now);
     assert_eq!(simulator.pending_reply(now, &acquired), None);
-    assert_eq!(step(&mut simulator, now), Status::Resetting);
+    assert_eq!(step(&mut simulator, now, 0), Status::Resetting);
     finish(&mut simulator, jobs);
     let told = simulator.pending_reply(now, &acquired);
     assert!(matches!(told, Some(Reply::Lease(_))), "{told:?}");
-    assert_eq!(step(&mut simulator, now), Status::Ok);
+    assert_eq!(step(&mut simulator, now, 0), Status::Ok);
 
     let (jobs, pending) = ask_pending(&mut simulator, now, &reset(77));
     assert_eq!(simulator.pending_reply(now, &pending), None);
-    assert_eq!(step(&mut simulator, now), Status::Resetting);
+    assert_eq!(step(&mut simulator, now, 0), Status::Resetting);
     let twice = ask(&mut simulator, now, &reset(78));
     let is_refused =
         matches!(&twice, Outcome::Answer(reply) if reply.status() == Status::Resetting);
@@ -117,7 +123,7 @@ fn a_world_in_burn_in_takes_no_step_and_requests_for_it_wait() {
     };
     let begun = (worlds[0].seed, worlds[0].step, worlds[0].episode);
     assert_eq!(begun, (77, 0, 1), "the step before is forgotten");
-    assert_eq!(step(&mut simulator, now), Status::Ok);
+    assert_eq!(step(&mut simulator, now, 0), Status::Ok);
 }
 
 #[test]
@@ -128,13 +134,13 @@ fn a_lease_lasts_from_its_last_use_or_renewal() {
     simulator.pending_reply(now, &acquired).expect("ready");
     let almost = LEASE - Duration::from_millis(1);
     let now = now + almost;
-    assert_eq!(step(&mut simulator, now), Status::Ok);
+    assert_eq!(step(&mut simulator, now, 0), Status::Ok);
     let now = now + almost;
     let (_, pending) = ask_pending(&mut simulator, now, &Request::Renew { lease: 1 });
     simulator.pending_reply(now, &pending).expect("ready");
-    assert!(simulator.expire(now + almost).is_empty());
-    assert_eq!(step(&mut simulator, now + LEASE), Status::LeaseLost);
-    assert_eq!(simulator.expire(now + LEASE), [US.pid]);
+    assert!(simulator.tick(now + almost).is_empty());
+    assert_eq!(step(&mut simulator, now + LEASE, 1), Status::LeaseLost);
+    assert_eq!(simulator.tick(now + LEASE), [US.pid]);
 }
 
 #[test]
@@ -142,14 +148,14 @@ fn a_lease_outlives_the_burn_ins_that_its_client_waits_for() {
     let ((mut simulator, jobs), now) = (start(), Instant::now());
     let acquired = acquire(&mut simulator, now);
     let now = now + 9 * LEASE;
-    assert!(simulator.expire(now).is_empty(), "the first");
+    assert!(simulator.tick(now).is_empty(), "the first");
     finish(&mut simulator, jobs);
     let told = simulator.pending_reply(now, &acquired);
     assert!(matches!(told, Some(Reply::Lease(_))), "{told:?}");
 
     let (jobs, pending) = ask_pending(&mut simulator, now, &reset(77));
     let now = now + 9 * LEASE;
-    assert!(simulator.expire(now).is_empty(), "that of a reset");
+    assert!(simulator.tick(now).is_empty(), "that of a reset");
     finish(&mut simulator, jobs);
     let told = simulator.pending_reply(now, &pending);
     assert!(matches!(told, Some(Reply::Reset { .. })), "{told:?}");
@@ -158,9 +164,9 @@ fn a_lease_outlives_the_burn_ins_that_its_client_waits_for() {
     let now = now + 9 * LEASE;
     simulator.cancel_reply(now, &pending);
     let almost = now + LEASE - Duration::from_millis(1);
-    assert!(simulator.expire(almost).is_empty());
+    assert!(simulator.tick(almost).is_empty());
     assert_eq!(
-        simulator.expire(now + LEASE),
+        simulator.tick(now + LEASE),
         [US.pid],
         "but not one that nobody waits for any more"
     );

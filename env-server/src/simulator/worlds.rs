@@ -1,7 +1,7 @@
 //! Control requests about worlds as a whole: snapshot, restore, fork, and beliefs that are left.
 
 use super::beliefs::BeliefPart;
-use super::lease::ClientId;
+use super::lease::{ClientId, Refusal};
 use super::outcome::{Outcome, PendingFile, malformed, refusal};
 use super::state::{ResetJob, Simulator, Slot};
 use crate::snapshot::{Job, NewEpisode, SnapshotError, SnapshotWorld, encode};
@@ -9,7 +9,7 @@ use crate::world::Episode;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use protocol::control::{LeftPart, MAX_BELIEF_PART, Reply};
-use protocol::message::{Status, StepResult};
+use protocol::message::{Status, WorldResult};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -20,9 +20,9 @@ impl Simulator {
     /// # Errors
     /// If they are more than a file may hold.
     pub fn snapshot(&self, worlds: Range<usize>) -> Result<Vec<u8>, SnapshotError> {
-        let slots = self.slots[worlds].iter();
-        let worlds: Vec<_> = slots
-            .map(|slot| match slot {
+        let places = self.places[worlds].iter();
+        let worlds: Vec<_> = places
+            .map(|place| match &place.slot {
                 Slot::Ready(episode) => SnapshotWorld::Ready(&**episode),
                 &Slot::Resetting { seed, episode, .. } => {
                     SnapshotWorld::New(NewEpisode { seed, episode })
@@ -50,7 +50,8 @@ impl Simulator {
                     episode,
                     seed,
                 };
-                self.slots[world] = Slot::resetting(&job);
+                let n_robots = self.spec.rules.n_robots;
+                self.places[world].slot = Slot::resetting(&job, n_robots);
                 Some(job)
             }
         }
@@ -72,8 +73,8 @@ impl Simulator {
             return malformed("expected worlds to restore");
         };
         self.leases.end_wait(now, *lease);
-        let may = self.leases.use_lease(now, *lease, *client, worlds);
-        if let Err(lost) = may.and_then(|()| self.check_present(worlds)) {
+        let may = self.check_replaceable(now, *lease, *client, worlds);
+        if let Err(lost) = may {
             return refusal(lost);
         }
         let episodes = restored.into_iter().map(|world| match world {
@@ -85,6 +86,7 @@ impl Simulator {
             return Reply::error(Status::BadFile, 0, message.into());
         };
         for (world, episode) in worlds.clone().zip(episodes) {
+            self.refuse_waiting(now, world);
             self.put(world, episode);
         }
         self.restored(worlds.clone())
@@ -130,10 +132,8 @@ impl Simulator {
     ) -> Result<Outcome, Reply> {
         let worlds = self.range(first, n).map_err(refusal)?;
         let path = absolute(path)?;
-        self.leases
-            .use_lease(now, lease, client, &worlds)
+        self.check_replaceable(now, lease, client, &worlds)
             .map_err(refusal)?;
-        self.check_present(&worlds).map_err(refusal)?;
         self.leases.begin_wait(lease);
         let from = from as usize..from as usize + n as usize;
         let pending = PendingFile::Restored {
@@ -153,12 +153,10 @@ impl Simulator {
     ) -> Result<Outcome, Reply> {
         let source = self.range(from, 1).map_err(refusal)?;
         let target = self.range(to, 1).map_err(refusal)?;
-        self.leases
-            .use_lease(now, lease, client, &target)
+        self.check_replaceable(now, lease, client, &target)
             .map_err(refusal)?;
-        for worlds in [&source, &target] {
-            self.check_present(worlds).map_err(refusal)?;
-        }
+        self.check_present(&source).map_err(refusal)?;
+        self.refuse_waiting(now, target.start);
         if let Some(episode) = self.episode(source.start).cloned() {
             self.put(target.start, Box::new(episode));
         }
@@ -172,11 +170,11 @@ impl Simulator {
         client: ClientId,
         left: &LeftPart,
     ) -> Result<Outcome, Reply> {
-        let worlds = self.range(left.world, 1).map_err(refusal)?;
+        let robots = self.robot_range(left.robot, 1).map_err(refusal)?;
         self.leases
-            .use_lease(now, left.lease, client, &worlds)
+            .use_lease(now, left.lease, client, &robots)
             .map_err(refusal)?;
-        let at = self.present(worlds.start)?;
+        let at = self.present(&robots)?;
         if (left.episode, left.step) != (at.episode, at.step) {
             return Err(malformed(&format!(
                 "episode and step: expected {} and {}, as the world is, got {} and {}",
@@ -198,16 +196,16 @@ impl Simulator {
             length: left.length,
             bytes: &bytes,
         };
-        let added = self.beliefs.add(worlds.start, &at, &part);
+        let added = self.beliefs.add(robots.start, &at, &part);
         added.map_err(|problem| malformed(&problem))?;
         Ok(Outcome::Answer(Reply::Done))
     }
 
-    pub(super) fn belief(&self, world: u32, offset: u64) -> Result<Outcome, Reply> {
-        let world = self.range(world, 1).map_err(refusal)?.start;
-        let at = self.present(world)?;
-        let Some((info, bytes)) = self.beliefs.of(world, &at) else {
-            let message = format!("no belief was left about world {world} at step {}", at.step);
+    pub(super) fn belief(&self, robot: u32, offset: u64) -> Result<Outcome, Reply> {
+        let robots = self.robot_range(robot, 1).map_err(refusal)?;
+        let at = self.present(&robots)?;
+        let Some((info, bytes)) = self.beliefs.of(robots.start, &at) else {
+            let message = format!("no belief was left for robot {robot} at step {}", at.step);
             return Err(Reply::error(Status::NotKept, at.step, message));
         };
         let start = usize::try_from(offset).map_or(bytes.len(), |offset| offset.min(bytes.len()));
@@ -219,7 +217,24 @@ impl Simulator {
         }))
     }
 
-    fn present(&self, world: usize) -> Result<StepResult, Reply> {
+    /// Checks that a client may replace worlds under a lease.
+    fn check_replaceable(
+        &mut self,
+        now: Instant,
+        lease: u64,
+        client: ClientId,
+        worlds: &Range<usize>,
+    ) -> Result<(), Refusal> {
+        for world in worlds.clone() {
+            let robots = self.robots_of(world);
+            self.leases.use_world(now, lease, client, robots)?;
+        }
+        self.check_present(worlds)
+    }
+
+    /// The world of a robot at present.
+    fn present(&self, robots: &Range<usize>) -> Result<WorldResult, Reply> {
+        let world = self.worlds_of(robots).start;
         let episode = self.episode(world);
         let result = episode.map(|episode| *episode.result());
         result.ok_or_else(|| Reply::refusal(Status::Resetting, world as u64))

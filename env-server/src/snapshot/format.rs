@@ -6,19 +6,19 @@
 
 use super::error::SnapshotError;
 use super::settings::{Settings, WorldSpec};
-use crate::world::{Episode, InvalidWorld, PastStep, SavedWorld};
+use crate::world::{Episode, InvalidWorld, PastRobot, PastStep, Robot, SavedRobot, SavedWorld};
 use bincode::config::{Configuration, Fixint, LittleEndian};
 use bincode::error::DecodeError;
 use bincode::{Decode, Encode};
-use protocol::message::{RESULT_BYTES, StepResult};
+use bytemuck::AnyBitPattern;
+use protocol::Grid;
 use protocol::path::path_to_bytes;
-use protocol::{Cell, Grid};
 
 /// What every snapshot begins with.
 pub const MAGIC: [u8; 8] = *b"EMBRSNAP";
 
 /// The version of the file's form.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 /// Magic, version, checksum and length.
 pub(super) const HEADER_BYTES: usize = 8 + 4 + 4 + 8;
@@ -59,11 +59,10 @@ struct EncodedWorld<'a> {
     result: &'a [u8],
     states: &'a [u8],
     first_states: &'a [u8],
-    frame: &'a [u8],
-    path: Vec<u8>,
-    path_start: [u32; 2],
-    /// Result, cells and values of each step.
-    history: Vec<(&'a [u8], &'a [u8], &'a [u8])>,
+    /// Result, frame and path of each robot.
+    robots: Vec<(&'a [u8], &'a [u8], Vec<u8>)>,
+    /// Result of each step; result, cells and values of its robots.
+    history: Vec<(&'a [u8], Vec<[&'a [u8]; 3]>)>,
 }
 
 /// The same, out of a file.
@@ -72,10 +71,8 @@ struct DecodedWorld {
     result: Vec<u8>,
     states: Vec<u8>,
     first_states: Vec<u8>,
-    frame: Vec<u8>,
-    path: Vec<u8>,
-    path_start: [u32; 2],
-    history: Vec<(Vec<u8>, Vec<u8>, Vec<u8>)>,
+    robots: Vec<(Vec<u8>, Vec<u8>, Vec<u8>)>,
+    history: Vec<(Vec<u8>, Vec<[Vec<u8>; 3]>)>,
 }
 
 /// Worlds as the bytes of a file.
@@ -225,18 +222,27 @@ impl<'a> EncodedWorld<'a> {
         fn bytes(states: &Grid<u8>) -> &[u8] {
             states.as_slice().expect("invariant: states are row-major")
         }
-        let past = |past: &'a PastStep| {
-            let cells = bytemuck::cast_slice(&past.cells);
-            (bytemuck::bytes_of(&past.result), cells, &past.values[..])
+        let robot = |robot: &'a Robot| {
+            let result = bytemuck::bytes_of(robot.result());
+            (
+                result,
+                robot.frame().as_bytes(),
+                path_to_bytes(robot.path()),
+            )
         };
-        let (start, path) = episode.path();
+        let past_robot = |past: &'a PastRobot| {
+            let cells = bytemuck::cast_slice(&past.cells);
+            [bytemuck::bytes_of(&past.result), cells, &past.values[..]]
+        };
+        let past = |past: &'a PastStep| {
+            let robots = past.robots.iter().map(past_robot);
+            (bytemuck::bytes_of(&past.result), robots.collect())
+        };
         Self {
             result: bytemuck::bytes_of(episode.result()),
             states: bytes(episode.states()),
             first_states: bytes(episode.first_states()),
-            frame: episode.frame().as_bytes(),
-            path: path_to_bytes(path),
-            path_start: [start.row as u32, start.col as u32],
+            robots: episode.robots().iter().map(robot).collect(),
             history: episode.history().map(past).collect(),
         }
     }
@@ -265,31 +271,42 @@ impl Snapshot {
 
 impl DecodedWorld {
     fn into_saved(self) -> Result<SavedWorld, InvalidWorld> {
-        let [row, col] = self.path_start.map(|side| side as usize);
-        let history = self.history.into_iter().map(|(result, cells, values)| {
+        let robots = self.robots.into_iter().map(|(result, frame, path)| {
+            let result = read(&result)?;
+            Ok(SavedRobot {
+                result,
+                frame,
+                path,
+            })
+        });
+        let history = self.history.into_iter().map(|(result, robots)| {
+            let robots = robots.into_iter().map(|[result, cells, values]| {
+                Ok(PastRobot {
+                    result: read(&result)?,
+                    cells: read_cells(&cells)?,
+                    values,
+                })
+            });
             Ok(PastStep {
-                result: read_result(&result)?,
-                cells: read_cells(&cells)?,
-                values,
+                result: read(&result)?,
+                robots: robots.collect::<Result<_, _>>()?,
             })
         });
         Ok(SavedWorld {
-            result: read_result(&self.result)?,
+            result: read(&self.result)?,
             states: self.states,
             first_states: self.first_states,
-            frame: self.frame,
-            path: self.path,
-            path_start: Cell { row, col },
+            robots: robots.collect::<Result<_, _>>()?,
             history: history.collect::<Result<_, _>>()?,
         })
     }
 }
 
-fn read_result(bytes: &[u8]) -> Result<StepResult, InvalidWorld> {
+fn read<T: AnyBitPattern>(bytes: &[u8]) -> Result<T, InvalidWorld> {
     let result = bytemuck::try_pod_read_unaligned(bytes);
     result.map_err(|_| {
-        let got = bytes.len();
-        InvalidWorld(format!("result: expected {RESULT_BYTES} bytes, got {got}"))
+        let (expected, got) = (size_of::<T>(), bytes.len());
+        InvalidWorld(format!("result: expected {expected} bytes, got {got}"))
     })
 }
 

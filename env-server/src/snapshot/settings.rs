@@ -43,6 +43,7 @@ impl WorldSpec {
             config.start,
         )?;
         (rules.history, rules.n_moves) = (config.history as usize, config.moves);
+        rules.n_robots = config.robots as usize;
         let settings = Settings::of(checked);
         Ok(Self { settings, rules })
     }
@@ -54,10 +55,11 @@ impl Settings {
         let config = &checked.config;
         let model = toml::to_string(checked.model.file());
         let text = |value: &dyn Display| value.to_string();
-        let others: [(&str, String); 7] = [
+        let others: [(&str, String); 8] = [
             ("height", text(&checked.shape.height())),
             ("width", text(&checked.shape.width())),
             ("moves", text(&config.moves)),
+            ("robots", text(&config.robots)),
             ("burn_in", text(&config.burn_in)),
             ("max_steps", text(&config.max_steps)),
             ("coverage", format!("{:?}", config.coverage).to_lowercase()),

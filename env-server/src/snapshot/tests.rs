@@ -4,8 +4,8 @@ use super::error::SnapshotError;
 use super::format::{HEADER_BYTES, MAGIC, NewEpisode, SnapshotWorld, VERSION, decode, encode};
 use super::settings::{Settings, WorldSpec};
 use crate::config::ServerConfig;
-use crate::world::{Episode, Rules, SavedWorld};
-use protocol::{Coverage, Move};
+use crate::world::{Episode, Flown, Rules, SavedWorld};
+use protocol::Move;
 
 const NEW: NewEpisode = NewEpisode {
     seed: 7,
@@ -17,6 +17,7 @@ fn spec() -> WorldSpec {
         height: 3,
         width: 5,
         moves: 2,
+        robots: 2,
         burn_in: 300,
         history: 4,
         ..ServerConfig::default()
@@ -28,10 +29,22 @@ fn spec() -> WorldSpec {
 fn episodes(rules: &Rules) -> Vec<Episode> {
     let mut episodes = vec![Episode::new(rules, 1), Episode::new(rules, 2)];
     for _ in 0..6 {
-        episodes[1].step(rules, &[Move::Right, Move::Down], Coverage::Path);
+        step(rules, &mut episodes[1], 0);
     }
-    episodes[1].step(rules, &[Move::Right, Move::Left], Coverage::Full);
+    step(rules, &mut episodes[1], 0b01);
     episodes
+}
+
+/// Both robots fly; those of `full` observe every cell.
+fn step(rules: &Rules, episode: &mut Episode, full: u64) {
+    let flown = Flown {
+        moves: &[Move::Right, Move::Down, Move::Left, Move::Up],
+        ready: 0b11,
+        full,
+        hovered: 0,
+        late: 0,
+    };
+    episode.step(rules, &flown);
 }
 
 fn bytes(settings: &Settings, episodes: &[Episode]) -> Vec<u8> {
@@ -81,7 +94,7 @@ fn a_changed_body_with_a_checksum_that_fits_is_refused_or_a_world_that_can_be() 
             for world in restored.into_iter().flatten() {
                 if let SnapshotWorld::Ready(mut episode) = world {
                     n_restored += 1;
-                    episode.step(&spec.rules, &[Move::Left, Move::Up], Coverage::Path);
+                    step(&spec.rules, &mut episode, 0);
                     episode.reset(&spec.rules, 5);
                 }
             }
@@ -141,24 +154,36 @@ fn a_world_that_cannot_be_is_refused() {
         "first states: expected 15, got 14",
     );
     misfit(
-        |world| world.frame[0] = 3,
+        |world| world.robots[0].frame[0] = 3,
         "expected an observation below 3 or 255",
     );
-    misfit(|world| world.path = vec![4, 0], "move");
+    misfit(|world| world.robots[1].path = vec![4, 0], "move");
     misfit(
-        |world| world.path = vec![0],
+        |world| world.robots[0].path = vec![0],
         "path: expected 0 or 2 moves, got 1",
     );
     misfit(
-        |world| world.result.row = 3,
+        |world| world.robots[0].result.row = 3,
         "robot: expected a cell of 3 x 5, got (3, ",
     );
-    misfit(|world| world.path_start.col = 5, "start of the path");
+    misfit(
+        |world| world.robots[1].result.start_col = 5,
+        "start of the path",
+    );
+    misfit(
+        |world| world.robots[1].result.n_moves = 0,
+        "moves of the path: expected 2, got 0",
+    );
+    misfit(|world| _ = world.robots.pop(), "robots: expected 2, got 1");
+    misfit(
+        |world| world.result.late = 4,
+        "robots that stayed: expected bits below 2, got 4",
+    );
     misfit(
         |world| world.result.step = u64::MAX,
         "step: expected at most",
     );
-    misfit(|world| world.result.coverage = 3, "coverage");
+    misfit(|world| world.robots[0].result.coverage = 3, "coverage");
     misfit(
         |world| world.result.reward = f64::NAN,
         "reward: expected a number",
@@ -180,21 +205,21 @@ fn a_world_that_cannot_be_is_refused() {
         "history: expected seed, episode and step [2, 0, 4], got [2, 0, 9]",
     );
     misfit(
-        |world| world.history[1].cells[0] = 15,
+        |world| world.history[1].robots[1].cells[0] = 15,
         "cells below 15, got 15",
     );
     misfit(
-        |world| world.history[1].values[0] = 3,
+        |world| world.history[1].robots[0].values[0] = 3,
         "observations below 3, got 3",
     );
-    misfit(|world| world.history[1].values.push(0), "values");
+    misfit(|world| world.history[1].robots[0].values.push(0), "values");
 }
 
 #[test]
 fn the_first_other_setting_is_named() {
     let ours = spec().settings;
     let mut theirs = ours.clone();
-    theirs.others[3].1 = "9".into();
+    theirs.others[4].1 = "9".into();
     let error = theirs.check(&ours).expect_err("another burn-in");
     let expected = "burn_in: expected 300 as this server's, got 9";
     assert_eq!(error.to_string(), expected);

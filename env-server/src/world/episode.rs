@@ -1,15 +1,19 @@
-//! One world with a robot in it: reset, step, reward, truncation.
+//! One world with its robots: reset, step, reward, truncation.
 //!
-//! A step flies the path, moves the world from X_k to X_{k+1}, and observes the visited cells of
+//! A step flies the paths, moves the world from X_k to X_{k+1}, and observes the visited cells of
 //! X_{k+1} (paper Algorithm 1; the order is the authors').
 
+use super::flown::Flown;
 use super::hidden::World;
 use super::history::{History, PastStep};
+use super::reward::pay;
+use super::robot::Robot;
 use super::rules::Rules;
-use super::saved::{InvalidWorld, SavedWorld};
-use protocol::message::StepResult;
-use protocol::path::{fly, path_from_bytes};
-use protocol::{Cell, Coverage, Frame, Grid, Move};
+use super::saved::{InvalidWorld, SavedRobot, SavedWorld};
+use super::sensor::Sensor;
+use protocol::message::WorldResult;
+use protocol::path::path_from_bytes;
+use protocol::{Coverage, Frame, Grid};
 
 /// One world's episode.
 #[derive(Debug, Clone)]
@@ -17,12 +21,11 @@ pub struct Episode {
     world: World,
     /// The world at k = 0, so that the next reset to the same seed needs no burn-in.
     beginning: World,
-    frame: Frame,
+    robots: Vec<Robot>,
+    result: WorldResult,
+    /// A 0 for each cell, for [`pay`].
+    counts: Vec<u8>,
     history: History,
-    path: Vec<Move>,
-    path_start: Cell,
-    robot: Cell,
-    result: StepResult,
 }
 
 impl Episode {
@@ -37,7 +40,7 @@ impl Episode {
         Self::beginning(rules, world, episode)
     }
 
-    /// Starts over with a seed: the frame is empty, the robot at its start, k = 0.
+    /// Starts over with a seed: frames are empty, robots at their starts, k = 0.
     pub fn reset(&mut self, rules: &Rules, seed: u64) {
         let world = if self.beginning.seed() == seed {
             self.beginning.clone()
@@ -47,50 +50,43 @@ impl Episode {
         *self = Self::beginning(rules, world, self.result.episode.wrapping_add(1));
     }
 
-    /// Flies a path and moves the world once; `coverage` says what the frame shows.
-    pub fn step(&mut self, rules: &Rules, path: &[Move], coverage: Coverage) {
-        let flight = fly(rules.shape, self.robot, path);
+    /// Flies paths and moves the world once.
+    pub fn step(&mut self, rules: &Rules, flown: &Flown<'_>) {
+        let n_moves = flown.moves.len() / self.robots.len();
+        for (r, robot) in self.robots.iter_mut().enumerate() {
+            let path = match flown.coverage(r) {
+                Coverage::Empty => &[],
+                _ => &flown.moves[r * n_moves..][..n_moves],
+            };
+            robot.fly(rules.shape, path, flown.coverage(r));
+        }
         self.world.advance();
-        self.observe(rules, &flight.visited, coverage);
-        let states = self
-            .world
-            .states()
-            .as_slice()
-            .expect("invariant: states are row-major");
-        let of_visited = || flight.visited.iter().map(|&cell| states[cell]);
-        let step = self.world.step();
-        self.result = StepResult {
-            step,
-            reward: of_visited()
-                .map(|state| rules.reward[usize::from(state)])
-                .sum(),
-            n_target_cells: count(self.world.states(), rules.target_state),
-            n_visited: flight.visited.len() as u32,
-            n_hits: of_visited()
-                .filter(|state| *state == rules.target_state)
-                .count() as u32,
-            row: flight.end.row as u32,
-            col: flight.end.col as u32,
-            coverage: coverage as u32,
-            truncated: u16::from(rules.max_steps > 0 && step >= rules.max_steps),
-            ..self.result
-        };
-        let observed = (coverage != Coverage::Full).then_some(&flight.visited[..]);
-        self.history.push(&self.result, &self.frame, observed);
-        self.path_start = self.robot;
-        self.robot = flight.end;
-        self.path.clear();
-        self.path.extend_from_slice(path);
+        self.observe(rules);
+        let (states, step) = (self.world.states(), self.world.step());
+        self.result.step = step;
+        self.result.hovered = flown.hovered;
+        self.result.late = flown.late;
+        self.result.n_target_cells = count(states, rules.target_state);
+        self.result.truncated = u16::from(rules.max_steps > 0 && step >= rules.max_steps);
+        let states = states.as_slice().expect("invariant: states are row-major");
+        pay(
+            rules,
+            states,
+            &mut self.robots,
+            &mut self.counts,
+            &mut self.result,
+        );
+        self.history.push(&self.result, &self.robots);
     }
 
-    /// The result of the last step or reset.
-    pub fn result(&self) -> &StepResult {
+    /// What the last step gave, or the beginning after a reset.
+    pub fn result(&self) -> &WorldResult {
         &self.result
     }
 
-    /// The frame of the last step or reset.
-    pub fn frame(&self) -> &Frame {
-        &self.frame
+    /// Its robots, in order.
+    pub fn robots(&self) -> &[Robot] {
+        &self.robots
     }
 
     /// What step k showed.
@@ -106,17 +102,14 @@ impl Episode {
 
     /// About how many bytes a snapshot of it takes.
     pub fn n_bytes(&self) -> usize {
-        3 * self.frame.as_bytes().len() + self.history.n_bytes() + self.path.len() + 256
+        let of_robot = |robot: &Robot| robot.frame.as_bytes().len() + robot.path.len() + 128;
+        let robots: usize = self.robots.iter().map(of_robot).sum();
+        2 * self.counts.len() + robots + self.history.n_bytes() + 256
     }
 
     /// The hidden states, shape `[H, W]`.
     pub fn states(&self) -> &Grid<u8> {
         self.world.states()
-    }
-
-    /// The last path and the cell that it began in; empty after a reset.
-    pub fn path(&self) -> (Cell, &[Move]) {
-        (self.path_start, &self.path)
     }
 
     /// Whether the episode was truncated: it takes no step before it is reset.
@@ -144,9 +137,7 @@ impl Episode {
             result,
             states,
             first_states,
-            frame,
-            path,
-            path_start,
+            robots,
             history,
         } = saved;
         let grid = |states| Grid::from_shape_vec(rules.shape.dim(), states);
@@ -160,67 +151,67 @@ impl Episode {
                 states,
             )
         };
-        let mut kept = History::new(rules.history, rules.n_moves);
+        let mut kept = History::new(rules.history, rules.n_robots, rules.n_moves);
         history.into_iter().for_each(|past| kept.keep(past));
-        let n_observations = rules.n_observations;
-        let frame = Frame::from_bytes(rules.shape, n_observations, &frame);
+        let robots = robots.into_iter().map(|robot| restored(rules, &robot));
         Ok(Self {
             world: world(result.step, states),
             beginning: world(0, first_states),
-            frame: frame.map_err(|error| InvalidWorld(error.to_string()))?,
-            history: kept,
-            path: path_from_bytes(&path).map_err(|error| InvalidWorld(error.to_string()))?,
-            path_start,
-            robot: Cell {
-                row: result.row as usize,
-                col: result.col as usize,
-            },
+            robots: robots.collect::<Result<_, _>>()?,
             result,
+            counts: vec![0; rules.shape.n_cells()],
+            history: kept,
         })
     }
 
     fn beginning(rules: &Rules, world: World, episode: u64) -> Self {
-        let robot = rules.start_cell(world.seed());
-        let result = StepResult {
+        let start = |robot| Robot::at(rules.shape, rules.start_cell(world.seed(), robot));
+        let robots: Vec<Robot> = (0..rules.n_robots).map(start).collect();
+        let result = WorldResult {
             seed: world.seed(),
             episode,
             n_target_cells: count(world.states(), rules.target_state),
-            row: robot.row as u32,
-            col: robot.col as u32,
-            coverage: Coverage::Empty as u32,
-            ..StepResult::default()
+            ..WorldResult::default()
         };
-        let (beginning, frame) = (world.clone(), Frame::empty(rules.shape));
-        let mut history = History::new(rules.history, rules.n_moves);
-        history.push(&result, &frame, Some(&[]));
+        let mut history = History::new(rules.history, rules.n_robots, rules.n_moves);
+        history.push(&result, &robots);
         Self {
+            beginning: world.clone(),
             world,
-            beginning,
-            frame,
-            history,
-            path: Vec::new(),
-            path_start: robot,
-            robot,
+            robots,
             result,
+            counts: vec![0; rules.shape.n_cells()],
+            history,
         }
     }
 
-    fn observe(&mut self, rules: &Rules, visited: &[usize], coverage: Coverage) {
+    fn observe(&mut self, rules: &Rules) {
         let (sensor, states) = (&rules.sensor, self.world.states());
-        let (seed, step) = (self.world.seed(), self.world.absolute_step());
-        self.frame.clear();
-        match coverage {
-            Coverage::Empty => {}
-            Coverage::Path => {
-                let cells = visited.iter().copied();
-                sensor.observe(seed, step, states, cells, &mut self.frame);
-            }
-            Coverage::Full => {
-                let cells = 0..rules.shape.n_cells();
-                sensor.observe(seed, step, states, cells, &mut self.frame);
+        let key = Sensor::key(self.world.seed(), self.world.absolute_step());
+        for Robot {
+            result,
+            frame,
+            visited,
+            ..
+        } in &mut self.robots
+        {
+            if result.coverage == Coverage::Full as u32 {
+                sensor.observe(key, states, 0..rules.shape.n_cells(), frame);
+            } else {
+                sensor.observe(key, states, visited.iter().copied(), frame);
             }
         }
     }
+}
+
+fn restored(rules: &Rules, saved: &SavedRobot) -> Result<Robot, InvalidWorld> {
+    let frame = Frame::from_bytes(rules.shape, rules.n_observations, &saved.frame);
+    Ok(Robot {
+        result: saved.result,
+        frame: frame.map_err(|error| InvalidWorld(error.to_string()))?,
+        path: path_from_bytes(&saved.path).map_err(|error| InvalidWorld(error.to_string()))?,
+        visited: Vec::new(),
+    })
 }
 
 fn count(states: &Grid<u8>, wanted: u8) -> u32 {
@@ -241,7 +232,8 @@ fn count(states: &Grid<u8>, wanted: u8) -> u32 {
 mod tests {
     use super::*;
     use crate::world::rules::Start;
-    use protocol::{Model, Shape};
+    use protocol::path::fly;
+    use protocol::{Cell, Model, Move, Shape};
 
     fn rules(max_steps: u64, start: Start) -> Rules {
         let shape = Shape::new(12, 20).expect("test shape");
@@ -252,31 +244,43 @@ mod tests {
         path_from_bytes(bytes).expect("test path")
     }
 
+    /// Flies the only robot.
+    fn step(episode: &mut Episode, rules: &Rules, moves: &[u8], full: u64) {
+        let flown = Flown {
+            moves: &path(moves),
+            ready: 1,
+            full,
+            hovered: 0,
+            late: 0,
+        };
+        episode.step(rules, &flown);
+    }
+
     #[test]
     fn reward_counts_distinct_visited_cells_on_fire_after_the_transition() {
         let rules = rules(0, Start::Centre);
         let mut episode = Episode::new(&rules, 0);
         let mut total = 0;
-        for step in 0..2000 {
-            if step % 50 == 0 {
-                episode.reset(&rules, step);
+        for k in 0..2000 {
+            if k % 50 == 0 {
+                episode.reset(&rules, k);
             }
-            let there_and_back = path(&[3, 3, 0, 1, 2, 2]);
-            let flight = fly(rules.shape, episode.robot, &there_and_back);
-            episode.step(&rules, &there_and_back, Coverage::Path);
-            let states = episode.states();
-            let fires = flight
-                .visited
-                .iter()
-                .filter(|&&cell| states.as_slice().expect("row-major")[cell] == 2)
-                .count();
-            assert_eq!(episode.result().reward, fires as f64);
-            assert_eq!(episode.result().n_hits, fires as u32);
-            assert_eq!(episode.result().n_visited, flight.visited.len() as u32);
-            assert_eq!(
-                episode.result().n_target_cells as usize,
-                states.iter().filter(|s| **s == 2).count()
-            );
+            let there_and_back = [3, 3, 0, 1, 2, 2];
+            let start = episode.robots()[0].cell();
+            let flight = fly(rules.shape, start, &path(&there_and_back));
+            step(&mut episode, &rules, &there_and_back, 0);
+            let states = episode.states().as_slice().expect("row-major");
+            let is_fire = |cell: &&usize| states[**cell] == 2;
+            let fires = flight.visited.iter().filter(is_fire).count();
+            let (world, robot) = (episode.result(), episode.robots()[0].result());
+            for reward in [world.reward, robot.reward, robot.marginal] {
+                assert_eq!(reward, fires as f64);
+            }
+            assert_eq!((world.n_hits, robot.n_hits), (fires as u32, fires as u32));
+            let n_visited = flight.visited.len() as u32;
+            assert_eq!((world.n_visited, robot.n_visited), (n_visited, n_visited));
+            let n_fires = states.iter().filter(|state| **state == 2).count();
+            assert_eq!(world.n_target_cells as usize, n_fires);
             total += fires;
         }
         assert!(total > 0, "the test saw no fire");
@@ -286,16 +290,17 @@ mod tests {
     fn a_frame_shows_the_visited_cells_and_no_others() {
         let rules = rules(0, Start::Corner);
         let mut episode = Episode::new(&rules, 1);
-        episode.step(&rules, &path(&[1, 3, 3]), Coverage::Path);
-        let seen: Vec<usize> = episode.frame().observed().map(|(cell, _)| cell).collect();
-        assert_eq!(seen, [20, 21, 22]);
-        let masked = episode.frame().clone();
+        step(&mut episode, &rules, &[1, 3, 3], 0);
+        let seen = |episode: &Episode| episode.robots()[0].frame().clone();
+        let masked = seen(&episode);
+        let cells: Vec<usize> = masked.observed().map(|(cell, _)| cell).collect();
+        assert_eq!(cells, [20, 21, 22]);
         let mut other = Episode::new(&rules, 1);
-        other.step(&rules, &path(&[0, 0, 0]), Coverage::Full);
-        assert_eq!(other.frame().observed().count(), 240);
+        step(&mut other, &rules, &[0, 0, 0], 1);
+        assert_eq!(seen(&other).observed().count(), 240);
         for (cell, value) in masked.observed() {
             assert_eq!(
-                other.frame().as_bytes()[cell],
+                seen(&other).as_bytes()[cell],
                 value,
                 "a reading depends on the path"
             );
@@ -308,30 +313,57 @@ mod tests {
     }
 
     #[test]
+    fn robots_that_stay_see_nothing_and_do_not_move() {
+        let mut rules = rules(0, Start::Corner);
+        rules.n_robots = 4;
+        let mut episode = Episode::new(&rules, 1);
+        let starts: Vec<Cell> = episode.robots().iter().map(Robot::cell).collect();
+        let corners = [(0, 0), (11, 19), (0, 19), (11, 0)].map(|(row, col)| Cell { row, col });
+        assert_eq!(starts, corners);
+        let flown = Flown {
+            moves: &path(&[1, 1, 0, 0, 2, 2, 3, 3]),
+            ready: 0b0110,
+            full: 0,
+            hovered: 0b0001,
+            late: 0b1000,
+        };
+        episode.step(&rules, &flown);
+        let cells: Vec<Cell> = episode.robots().iter().map(Robot::cell).collect();
+        let moved = [(0, 0), (9, 19), (0, 17), (11, 0)].map(|(row, col)| Cell { row, col });
+        assert_eq!(cells, moved);
+        let n_seen = |robot: &Robot| robot.frame().observed().count();
+        let n_seen: Vec<usize> = episode.robots().iter().map(n_seen).collect();
+        assert_eq!(n_seen, [0, 2, 2, 0]);
+        let n_moves = |robot: &Robot| robot.result().n_moves;
+        let n_moves: Vec<u32> = episode.robots().iter().map(n_moves).collect();
+        assert_eq!(n_moves, [0, 2, 2, 0]);
+        assert_eq!((episode.result().hovered, episode.result().late), (1, 8));
+    }
+
+    #[test]
     fn a_reset_repeats_the_episode_of_its_seed() {
         let rules = rules(0, Start::Random);
         let mut episode = Episode::new(&rules, 9);
         let first = episode.clone();
-        episode.step(&rules, &path(&[1, 1, 1]), Coverage::Path);
+        step(&mut episode, &rules, &[1, 1, 1], 0);
         for seed in [9, 10, 9] {
             episode.reset(&rules, seed);
             assert_eq!(episode.states(), Episode::new(&rules, seed).states());
-            assert_eq!(
-                (episode.result().step, episode.frame().observed().count()),
-                (0, 0)
-            );
+            let n_seen = episode.robots()[0].frame().observed().count();
+            assert_eq!((episode.result().step, n_seen), (0, 0));
         }
-        assert_eq!((episode.robot, episode.result().episode), (first.robot, 3));
+        assert_eq!(episode.robots()[0].cell(), first.robots()[0].cell());
+        assert_eq!(episode.result().episode, 3);
     }
 
     #[test]
     fn an_episode_is_truncated_at_max_steps_and_never_terminated() {
         let rules = rules(3, Start::Corner);
         let mut episode = Episode::new(&rules, 1);
-        for step in 1..=3 {
+        for k in 1..=3 {
             assert!(!episode.is_over());
-            episode.step(&rules, &path(&[1]), Coverage::Path);
-            assert_eq!(episode.result().step, step);
+            step(&mut episode, &rules, &[1], 0);
+            assert_eq!(episode.result().step, k);
             assert_eq!(episode.result().terminated, 0);
         }
         assert!(episode.is_over());

@@ -1,8 +1,8 @@
 //! A world's last frames, kept so that the next agent can compute its belief from them.
 
-use protocol::Frame;
-use protocol::frame::UNOBSERVED;
-use protocol::message::StepResult;
+use super::robot::Robot;
+use protocol::Coverage;
+use protocol::message::{RobotResult, WorldResult};
 use std::collections::VecDeque;
 
 /// Least room for a world's frames, bytes: full frames share it, however many steps are to be kept.
@@ -21,8 +21,17 @@ pub struct History {
 /// What one step showed.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PastStep {
-    /// The step's result.
-    pub result: StepResult,
+    /// The world's result.
+    pub result: WorldResult,
+    /// What its robots saw.
+    pub robots: Vec<PastRobot>,
+}
+
+/// What one robot saw in a step.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct PastRobot {
+    /// The robot's result.
+    pub result: RobotResult,
     /// The observed cells, row-major indices; empty where every cell was observed.
     pub cells: Vec<u32>,
     /// What was observed there.
@@ -30,30 +39,26 @@ pub struct PastStep {
 }
 
 impl History {
-    /// Room for the frames of `n_steps` paths, at least for the present one.
-    pub fn new(n_steps: usize, n_moves: usize) -> Self {
+    /// Room for the frames of `n_steps` steps of `n_robots` paths each, at least for the present one.
+    pub fn new(n_steps: usize, n_robots: usize, n_moves: usize) -> Self {
         let n_steps = n_steps.max(1);
+        let of_robot = size_of::<PastRobot>() + 5 * n_moves;
+        let of_step = size_of::<PastStep>() + n_robots * of_robot;
         Self {
             n_steps,
-            room: LEAST_ROOM.max(n_steps.saturating_mul(size_of::<PastStep>() + 5 * n_moves)),
+            room: LEAST_ROOM.max(n_steps.saturating_mul(of_step)),
             n_bytes: 0,
             steps: VecDeque::new(),
         }
     }
 
     /// Keeps a step; forgets the oldest if there is no room.
-    pub fn push(&mut self, result: &StepResult, frame: &Frame, visited: Option<&[usize]>) {
+    pub fn push(&mut self, result: &WorldResult, robots: &[Robot]) {
         let mut past = self.make_room().unwrap_or_default();
-        let bytes = frame.as_bytes();
         past.result = *result;
-        past.cells.clear();
-        past.values.clear();
-        match visited {
-            Some(cells) => {
-                past.cells.extend(cells.iter().map(|&cell| cell as u32));
-                past.values.extend(cells.iter().map(|&cell| bytes[cell]));
-            }
-            None => past.values.extend_from_slice(bytes),
+        past.robots.resize_with(robots.len(), PastRobot::default);
+        for (past, robot) in past.robots.iter_mut().zip(robots) {
+            past.set(robot);
         }
         self.keep(past);
     }
@@ -99,16 +104,36 @@ impl History {
 
 impl PastStep {
     fn n_bytes(&self) -> usize {
+        let robots = self.robots.iter().map(PastRobot::n_bytes);
+        size_of::<Self>() + robots.sum::<usize>()
+    }
+}
+
+impl PastRobot {
+    fn n_bytes(&self) -> usize {
         size_of::<Self>() + 4 * self.cells.len() + self.values.len()
     }
 
-    /// Writes the frame, one byte per cell of `frame`.
-    pub fn write_frame(&self, frame: &mut [u8]) {
+    fn set(&mut self, robot: &Robot) {
+        let bytes = robot.frame.as_bytes();
+        self.result = robot.result;
+        self.cells.clear();
+        self.values.clear();
+        if robot.result.coverage == Coverage::Full as u32 {
+            self.values.extend_from_slice(bytes);
+            return;
+        }
+        let visited = robot.visited.iter();
+        self.cells.extend(visited.clone().map(|&cell| cell as u32));
+        self.values.extend(visited.map(|&cell| bytes[cell]));
+    }
+
+    /// Writes what was observed over `frame`, one byte per cell; leaves the other cells as they are.
+    pub fn write_over(&self, frame: &mut [u8]) {
         if self.cells.is_empty() && !self.values.is_empty() {
             frame.copy_from_slice(&self.values);
             return;
         }
-        frame.fill(UNOBSERVED);
         for (&cell, &value) in self.cells.iter().zip(&self.values) {
             frame[cell as usize] = value;
         }
@@ -118,53 +143,67 @@ impl PastStep {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::Shape;
+    use crate::world::rules::{Rules, Start};
+    use crate::world::{Episode, Flown};
+    use protocol::frame::UNOBSERVED;
+    use protocol::{Model, Move, Shape};
 
     #[test]
     fn the_last_frames_are_kept_as_they_were() {
-        let shape = Shape::new(2, 3).expect("test shape");
-        let mut history = History::new(3, 6);
+        let shape = Shape::new(4, 6).expect("test shape");
+        let rules = Rules::new(&Model::wildfire(), shape, 100, 0, Start::Corner);
+        let mut rules = rules.expect("valid model");
+        (rules.history, rules.n_moves, rules.n_robots) = (3, 2, 3);
+        let mut episode = Episode::new(&rules, 3);
         let mut frames = Vec::new();
-        for step in 0..5 {
-            let mut frame = Frame::empty(shape);
-            let cells = [step as usize % 6, 5];
-            for cell in cells {
-                frame.observe(cell, (cell % 3) as u8);
-            }
-            let result = StepResult {
-                step,
-                ..StepResult::default()
-            };
-            let visited = (step != 4).then_some(&cells[..]);
-            if visited.is_none() {
-                (0..6).for_each(|cell| frame.observe(cell, 1));
-            }
-            history.push(&result, &frame, visited);
-            frames.push(frame);
+        for step in 1..=5 {
+            let full = u64::from(step == 4);
+            episode.step(
+                &rules,
+                &Flown {
+                    moves: &[Move::Down; 6],
+                    ready: 0b101,
+                    full,
+                    hovered: 0b010,
+                    late: 0,
+                },
+            );
+            let robots = episode.robots().iter();
+            frames.push(
+                robots
+                    .map(|robot| robot.frame().clone())
+                    .collect::<Vec<_>>(),
+            );
         }
-        assert_eq!(history.all().len(), 3);
-        assert!(history.step(1).is_none() && history.step(5).is_none());
-        for step in 2..5 {
-            let mut bytes = [0; 6];
-            let past = history.step(step).expect("kept");
-            past.write_frame(&mut bytes);
+        assert_eq!(episode.history().len(), 3);
+        assert_eq!(episode.recall(2).err(), Some(3));
+        assert_eq!(episode.recall(6).err(), Some(5));
+        for step in 3..=5 {
+            let past = episode.recall(step).expect("kept");
             assert_eq!(past.result.step, step);
-            assert_eq!(bytes, frames[step as usize].as_bytes());
+            for (past, frame) in past.robots.iter().zip(&frames[step as usize - 1]) {
+                let mut bytes = [UNOBSERVED; 24];
+                past.write_over(&mut bytes);
+                assert_eq!(bytes, frame.as_bytes());
+            }
         }
-        // At least the present is kept, and no more than there is room for.
-        let mut present = History::new(0, 6);
-        frames
-            .iter()
-            .for_each(|frame| present.push(&StepResult::default(), frame, None));
+        assert!(frames[4][1].observed().next().is_none(), "one hovers");
+    }
+
+    #[test]
+    fn at_least_the_present_is_kept_and_no_more_than_there_is_room_for() {
+        let past = |n_values| PastStep {
+            result: WorldResult::default(),
+            robots: vec![PastRobot {
+                values: vec![0; n_values],
+                ..PastRobot::default()
+            }],
+        };
+        let mut present = History::new(0, 1, 6);
+        (0..3).for_each(|_| present.keep(past(6)));
         assert_eq!(present.all().len(), 1);
-        let large = Frame::empty(Shape::new(512, 1024).expect("test shape"));
-        let mut few = History::new(256, 64);
-        for _ in 0..5 {
-            few.push(&StepResult::default(), &large, None);
-        }
-        assert_eq!(
-            (few.all().len(), few.n_bytes() / large.as_bytes().len()),
-            (1, 1)
-        );
+        let mut few = History::new(256, 1, 64);
+        (0..5).for_each(|_| few.keep(past(1 << 19)));
+        assert_eq!((few.all().len(), few.n_bytes() >> 19), (1, 1));
     }
 }

@@ -1,14 +1,19 @@
-//! One world with a robot in it; pure.
+//! One world with its robots; pure.
 
 mod episode;
+mod flown;
 mod hidden;
 mod history;
+mod reward;
+mod robot;
 mod rules;
 mod saved;
 mod sensor;
 
 pub use episode::Episode;
+pub use flown::Flown;
 pub use hidden::World;
-pub use history::PastStep;
+pub use history::{PastRobot, PastStep};
+pub use robot::Robot;
 pub use rules::{Rules, Start};
-pub use saved::{InvalidWorld, SavedWorld};
+pub use saved::{InvalidWorld, SavedRobot, SavedWorld};

@@ -7,17 +7,17 @@ use protocol::{Cell, Dynamics, Model, Shape};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
-/// Where the robot stands after a reset.
+/// Where the robots of a world are after a reset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Start {
-    /// The upper left cell, (0, 0).
+    /// The corners, in turn: (0, 0), the opposite one, upper right, lower left.
     Corner,
-    /// The middle.
+    /// All in the middle.
     Centre,
-    /// A cell drawn from the seed.
+    /// Cells drawn from the seed.
     Random,
-    /// This cell.
+    /// All in this cell.
     #[serde(untagged)]
     At(Cell),
 }
@@ -43,12 +43,14 @@ pub struct Rules {
     pub history: usize,
     /// Moves in a path.
     pub n_moves: usize,
+    /// Robots of a world.
+    pub n_robots: usize,
     pub(super) sensor: Sensor,
     pub(super) dynamics: Dynamics,
 }
 
 impl Rules {
-    /// The rules under a model; `history` and `n_moves` are 0.
+    /// The rules under a model, for one robot; `history` and `n_moves` are 0.
     ///
     /// # Errors
     /// If the model does not fit the grid.
@@ -70,18 +72,25 @@ impl Rules {
             start,
             history: 0,
             n_moves: 0,
+            n_robots: 1,
             sensor: Sensor::new(model),
             dynamics: Dynamics::new(model, shape)?,
         })
     }
 
-    pub(super) fn start_cell(&self, seed: u64) -> Cell {
+    pub(super) fn start_cell(&self, seed: u64, robot: usize) -> Cell {
+        let (bottom, right) = (self.shape.height() - 1, self.shape.width() - 1);
         match self.start {
-            Start::Corner => Cell { row: 0, col: 0 },
+            Start::Corner => {
+                let (row, col) = [(0, 0), (bottom, right), (0, right), (bottom, 0)][robot % 4];
+                Cell { row, col }
+            }
             Start::Centre => self.shape.centre(),
-            Start::Random => self
-                .shape
-                .cell(stream(seed, Purpose::Start, 0).random_range(0..self.shape.n_cells())),
+            Start::Random => {
+                let mut stream = stream(seed, Purpose::Start, robot as u64);
+                self.shape
+                    .cell(stream.random_range(0..self.shape.n_cells()))
+            }
             Start::At(cell) => cell,
         }
     }

@@ -1,29 +1,37 @@
 //! A world out of a file, and the checks that an episode relies on.
 
-use super::history::PastStep;
+use super::history::{PastRobot, PastStep};
 use super::rules::Rules;
-use protocol::message::StepResult;
+use protocol::channels::MAX_ROBOTS;
+use protocol::message::{RobotResult, WorldResult};
 use protocol::{Cell, Coverage};
+use std::fmt::Display;
 use thiserror::Error;
 
 /// Largest k and number of an episode: no sum can overflow.
 const MAX_COUNT: u64 = 1 << 62;
 
-/// One world: everything that decides its future, and its present frame.
+/// One world: everything that decides its future, and what its robots saw last.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedWorld {
-    /// The last result: seed, episode, k, robot.
-    pub result: StepResult,
+    /// The last result: seed, episode, k.
+    pub result: WorldResult,
     /// Hidden states, row-major.
     pub states: Vec<u8>,
     /// Hidden states at k = 0.
     pub first_states: Vec<u8>,
-    pub frame: Vec<u8>,
-    pub path: Vec<u8>,
-    /// The robot's cell before the last path.
-    pub path_start: Cell,
+    pub robots: Vec<SavedRobot>,
     /// The last steps, the oldest first.
     pub history: Vec<PastStep>,
+}
+
+/// One robot of a saved world.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SavedRobot {
+    /// What the last step gave it, and where it is.
+    pub result: RobotResult,
+    pub frame: Vec<u8>,
+    pub path: Vec<u8>,
 }
 
 /// Why a saved world cannot continue: what was expected, and what is there.
@@ -38,70 +46,36 @@ impl SavedWorld {
     /// If something cannot be part of an episode under these rules; the error names the first such thing.
     pub fn check(&self, rules: &Rules) -> Result<(), InvalidWorld> {
         let n_cells = rules.shape.n_cells();
-        let expect = |what: &str, holds: bool, expected: String, got: String| {
-            let text = || InvalidWorld(format!("{what}: expected {expected}, got {got}"));
-            if holds { Ok(()) } else { Err(text()) }
-        };
         for (what, states) in [
             ("states", &self.states),
             ("first states", &self.first_states),
         ] {
-            let got = states.len();
-            expect(what, got == n_cells, n_cells.to_string(), got.to_string())?;
+            expect(what, states.len() == n_cells, &n_cells, &states.len())?;
             let most = states.iter().copied().max().unwrap_or(0);
             let n_states = rules.n_states;
             let fine = usize::from(most) < n_states;
-            expect(
-                what,
-                fine,
-                format!("states below {n_states}"),
-                most.to_string(),
-            )?;
+            expect(what, fine, &format!("states below {n_states}"), &most)?;
         }
-        let robot = Cell {
-            row: self.result.row as usize,
-            col: self.result.col as usize,
-        };
-        for (what, cell) in [("robot", robot), ("start of the path", self.path_start)] {
-            let fine = rules.shape.contains(cell);
-            expect(
-                what,
-                fine,
-                format!("a cell of {}", rules.shape),
-                cell.to_string(),
-            )?;
-        }
-        let StepResult { step, episode, .. } = self.result;
+        let WorldResult { step, episode, .. } = self.result;
         for (what, got) in [("step", step), ("episode", episode)] {
             let expected = format!("at most {MAX_COUNT}");
-            expect(what, got <= MAX_COUNT, expected, got.to_string())?;
+            expect(what, got <= MAX_COUNT, &expected, &got)?;
         }
-        let coverage = self.result.coverage;
-        let fine = Coverage::try_from(coverage).is_ok();
-        expect("coverage", fine, "0, 1 or 2".into(), coverage.to_string())?;
-        let (n_moves, got) = (rules.n_moves, self.path.len());
-        let fine = got == 0 || got == n_moves;
-        expect(
-            "path",
-            fine,
-            format!("0 or {n_moves} moves"),
-            got.to_string(),
-        )?;
         let reward = self.result.reward;
-        expect(
-            "reward",
-            reward.is_finite(),
-            "a number".into(),
-            reward.to_string(),
-        )?;
+        expect("reward", reward.is_finite(), &"a number", &reward)?;
+        let (stayed, n_robots) = (self.result.hovered | self.result.late, rules.n_robots);
+        let fine = stayed <= u64::MAX >> (MAX_ROBOTS - n_robots);
+        let expected = format!("bits below {n_robots}");
+        expect("robots that stayed", fine, &expected, &stayed)?;
         let ends = [self.result.terminated, self.result.truncated];
         let expected = [0, u16::from(rules.max_steps > 0 && step >= rules.max_steps)];
-        expect(
-            "ends",
-            ends == expected,
-            format!("{expected:?}"),
-            format!("{ends:?}"),
-        )?;
+        let (expected, got) = (format!("{expected:?}"), format!("{ends:?}"));
+        expect("ends", expected == got, &expected, &got)?;
+        let got = self.robots.len();
+        expect("robots", got == n_robots, &n_robots, &got)?;
+        self.robots
+            .iter()
+            .try_for_each(|robot| robot.check(rules))?;
         self.check_history(rules)
     }
 
@@ -121,13 +95,57 @@ impl SavedWorld {
                     format!("history: expected seed, episode and step {expected:?}, got {got:?}");
                 return Err(InvalidWorld(text));
             }
-            past.check(rules)?;
+            let (n_robots, got) = (rules.n_robots, past.robots.len());
+            expect("history: robots", got == n_robots, &n_robots, &got)?;
+            past.robots
+                .iter()
+                .try_for_each(|robot| robot.check(rules))?;
         }
         Ok(())
     }
 }
 
-impl PastStep {
+impl SavedRobot {
+    fn check(&self, rules: &Rules) -> Result<(), InvalidWorld> {
+        let result = &self.result;
+        for (what, row, col) in [
+            ("robot", result.row, result.col),
+            ("start of the path", result.start_row, result.start_col),
+        ] {
+            let (row, col) = (row as usize, col as usize);
+            let cell = Cell { row, col };
+            let expected = format!("a cell of {}", rules.shape);
+            expect(what, rules.shape.contains(cell), &expected, &cell)?;
+        }
+        let fine = Coverage::try_from(result.coverage).is_ok();
+        expect("coverage", fine, &"0, 1 or 2", &result.coverage)?;
+        let (n_moves, got) = (rules.n_moves, self.path.len());
+        let expected = format!("0 or {n_moves} moves");
+        expect("path", got == 0 || got == n_moves, &expected, &got)?;
+        let fine = result.n_moves as usize == got;
+        expect("moves of the path", fine, &got, &result.n_moves)?;
+        for reward in [result.reward, result.marginal] {
+            expect("reward", reward.is_finite(), &"a number", &reward)?;
+        }
+        Ok(())
+    }
+}
+
+fn expect(
+    what: &str,
+    holds: bool,
+    expected: &dyn Display,
+    got: &dyn Display,
+) -> Result<(), InvalidWorld> {
+    if holds {
+        return Ok(());
+    }
+    Err(InvalidWorld(format!(
+        "{what}: expected {expected}, got {got}"
+    )))
+}
+
+impl PastRobot {
     fn check(&self, rules: &Rules) -> Result<(), InvalidWorld> {
         let n_cells = rules.shape.n_cells();
         let is_whole = self.cells.is_empty() && self.values.len() == n_cells;

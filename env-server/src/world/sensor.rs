@@ -45,16 +45,19 @@ impl Sensor {
         }
     }
 
-    /// Looks at cells (row-major indices) and records the readings in the frame.
+    /// The key of all readings in one step of a world.
+    pub fn key(seed: u64, absolute_step: u64) -> u64 {
+        stream(seed, Purpose::Sensor, absolute_step).next_u64()
+    }
+
+    /// Looks at cells (row-major indices) and records the readings in the frame; `key` is the step's.
     pub fn observe(
         &self,
-        seed: u64,
-        absolute_step: u64,
+        key: u64,
         states: &Grid<u8>,
         cells: impl IntoIterator<Item = usize>,
         frame: &mut Frame,
     ) {
-        let key = stream(seed, Purpose::Sensor, absolute_step).next_u64();
         let states = states.as_slice().expect("invariant: states are row-major");
         for cell in cells {
             let number = split_mix(key, cell as u64) >> 32;
@@ -91,7 +94,12 @@ mod tests {
             let mut counts = [0.0_f64; 3];
             for step in 0..20 {
                 let mut frame = Frame::empty(shape);
-                sensor.observe(7, step, &states, 0..shape.n_cells(), &mut frame);
+                sensor.observe(
+                    Sensor::key(7, step),
+                    &states,
+                    0..shape.n_cells(),
+                    &mut frame,
+                );
                 frame
                     .as_bytes()
                     .iter()
@@ -115,7 +123,12 @@ mod tests {
         let states = Grid::from_elem(shape.dim(), 1);
         let look = |cells: &[usize]| {
             let mut frame = Frame::empty(shape);
-            sensor.observe(1, 2, &states, cells.iter().copied(), &mut frame);
+            sensor.observe(
+                Sensor::key(1, 2),
+                &states,
+                cells.iter().copied(),
+                &mut frame,
+            );
             frame
         };
         let all: Vec<usize> = (0..64).collect();

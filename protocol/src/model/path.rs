@@ -76,8 +76,25 @@ impl TryFrom<u8> for Move {
 /// # Errors
 /// [`MoveError`] names the first byte that is no move.
 pub fn path_from_bytes(bytes: &[u8]) -> Result<Vec<Move>, MoveError> {
-    let decode = |(index, &byte)| Move::try_from(byte).map_err(|value| MoveError { index, value });
-    bytes.iter().enumerate().map(decode).collect()
+    check_moves(bytes)?;
+    let moves = bytes.iter().map(|&byte| Move::from_low_bits(byte.into()));
+    Ok(moves.collect())
+}
+
+/// Checks that each byte is a move.
+///
+/// # Errors
+/// [`MoveError`] names the first that is none.
+pub fn check_moves(bytes: &[u8]) -> Result<(), MoveError> {
+    let is_wrong = |byte: &u8| usize::from(*byte) >= Move::ALL.len();
+    // One pass without branches, which the compiler makes vector code of.
+    if bytes.iter().fold(false, |any, byte| any | is_wrong(byte))
+        && let Some(index) = bytes.iter().position(|byte| is_wrong(byte))
+    {
+        let value = bytes[index];
+        return Err(MoveError { index, value });
+    }
+    Ok(())
 }
 
 /// Encodes a path, one byte a move.

@@ -1,6 +1,6 @@
 //! The channels of one instance: names, services and their limits.
 //!
-//! All channels of an instance live under `emberwatch/v1/<instance>/`, in a directory and under a
+//! All channels of an instance live under `emberwatch/v2/<instance>/`, in a directory and under a
 //! prefix of the user's own, so that users never meet and no stray configuration file is read.
 
 use super::message::{
@@ -22,6 +22,15 @@ pub use super::node::create_node;
 
 /// Most clients at a time on each of `step` and `control`.
 pub const MAX_CLIENTS: usize = 16;
+
+/// Most robots of a world.
+pub const MAX_ROBOTS: usize = 64;
+
+/// Most robots of a server, over all its worlds.
+pub const MAX_ROBOT_NUMBERS: usize = 4096;
+
+/// Most cells of the frames of one world's robots together.
+pub const MAX_TEAM_CELLS: usize = 1 << 24;
 
 /// Most observers of `frames` at a time.
 pub const MAX_OBSERVERS: usize = 16;
@@ -113,7 +122,7 @@ impl Instance {
 
     /// The service name of a channel.
     pub fn service_name(&self, channel: Channel) -> ServiceName {
-        let name = format!("emberwatch/v1/{}/{}", self.0, channel.name());
+        let name = format!("emberwatch/v2/{}/{}", self.0, channel.name());
         ServiceName::new(&name).expect("invariant: instance names are short and plain")
     }
 

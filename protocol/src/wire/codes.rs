@@ -3,21 +3,26 @@
 use thiserror::Error;
 
 /// Version of the protocol.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 /// Set in [`super::message::StepRequest::flags`]: observe every cell, not only the path (needs a server whose
 /// coverage is `client` or `full`).
 pub const FLAG_FULL_COVERAGE: u32 = 1;
 
+/// Set in [`super::message::StepRequest::flags`]: instead of each robot's frame return one for each world, of all that
+/// its robots saw.
+pub const FLAG_TEAM_FRAMES: u32 = 2;
+
 /// What a step request asks for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Operation {
-    /// Fly one path in each of the worlds and move them from k to k + 1; needs a lease.
+    /// Fly a path with each robot; a world moves from k to k + 1 as soon as all its robots that are held have one.
+    /// Needs a lease.
     Step = 1,
     /// Return the last results and frames again, changing nothing; needs no lease.
     Observe = 2,
-    /// Return the results and frames of an earlier step k; needs no lease.
+    /// Return the results and frames of an earlier step k of each world; needs no lease.
     Recall = 3,
 }
 
@@ -46,18 +51,18 @@ pub enum Status {
     Malformed = 3,
     /// A world outside the server's; detail: number of worlds.
     NoSuchWorld = 4,
-    /// The payload is not `n_worlds * n_moves` bytes; detail: bytes expected.
+    /// The payload is not as long as the header says; detail: bytes expected.
     WrongLength = 5,
     /// Not the server's number of moves in a path; detail: moves expected.
     WrongPathLength = 6,
     /// A byte that is no move; detail: its position in the payload.
     BadMove = 7,
-    /// The lease does not cover these worlds, or was never given; detail: the first such world.
+    /// The lease does not cover these robots, or was never given; detail: the first such robot.
     NoLease = 8,
     /// The lease was taken over, expired or released; detail: pid of who took it over or holds the
-    /// world since, 0 if no client does.
+    /// robot since, 0 if no client does.
     LeaseLost = 9,
-    /// Another client holds a world; detail: its pid.
+    /// Another client holds a robot; detail: its pid.
     Busy = 10,
     /// A world is being reset; detail: the world.
     Resetting = 11,
@@ -75,11 +80,21 @@ pub enum Status {
     BadFile = 17,
     /// A frame or a belief that the server does not keep; detail: the nearest step kept, or the present one.
     NotKept = 18,
+    /// The world has moved on from the step k of a path; detail: its present step. `Observe` tells whether the path
+    /// was flown.
+    Late = 19,
+    /// The step k of a path is ahead of its world; detail: the world's present step.
+    Early = 20,
+    /// A step leaves out a robot that its client holds in the world, or names several worlds in one of which another
+    /// client holds a robot; detail: the first such robot.
+    Incomplete = 21,
+    /// A robot outside the server's; detail: number of robots of all worlds.
+    NoSuchRobot = 22,
 }
 
 impl Status {
     /// Every status, in the order of its code.
-    pub const ALL: [Self; 19] = [
+    pub const ALL: [Self; 23] = [
         Self::Ok,
         Self::VersionMismatch,
         Self::UnknownOperation,
@@ -99,6 +114,10 @@ impl Status {
         Self::AgentEnds,
         Self::BadFile,
         Self::NotKept,
+        Self::Late,
+        Self::Early,
+        Self::Incomplete,
+        Self::NoSuchRobot,
     ];
 
     /// What to tell a client of another version.
@@ -126,13 +145,13 @@ impl Status {
             Self::WrongPathLength => {
                 format!("wrong path length: the server flies {detail} moves a step")
             }
-            Self::BadMove => format!("byte {detail} of the paths: expected a move in 0..=3"),
-            Self::NoLease => format!("no lease on world {detail}: acquire it first"),
+            Self::BadMove => format!("byte {detail} of the payload: expected a move in 0..=3"),
+            Self::NoLease => format!("no lease on robot {detail}: acquire it first"),
             Self::LeaseLost if detail == 0 => {
-                "lease lost: it expired or was released; acquire the worlds again".into()
+                "lease lost: it expired or was released; acquire the robots again".into()
             }
             Self::LeaseLost => format!(
-                "lease lost to pid {detail}, which took the world over or acquired it since"
+                "lease lost to pid {detail}, which took the robot over or acquired it since"
             ),
             Self::Busy => format!(
                 "busy: held by pid {detail}; wait for its release, or acquire with \"takeover\": true"
@@ -147,12 +166,24 @@ impl Status {
                     .into()
             }
             Self::UnknownFlags => {
-                format!("flags: expected 0 or {FLAG_FULL_COVERAGE} (full coverage), got {detail}")
+                format!("flags: expected 1 (full coverage), 2 (team frames), both or 0, got {detail}")
             }
             Self::BadObjective => format!("objective: expected 0 to {}", detail.saturating_sub(1)),
             Self::AgentEnds => "the agent ends".into(),
             Self::BadFile => "the file cannot be used".into(),
             Self::NotKept => format!("not kept: the nearest step that is kept is {detail}"),
+            Self::Late => format!(
+                "late: the world is at step {detail} already; observe it, and send a path for that step"
+            ),
+            Self::Early => format!("early: the world is at step {detail} only"),
+            Self::Incomplete => format!(
+                "incomplete: robot {detail} is missing; a step names all robots that its client holds in a world, and \
+                 a step of several worlds needs them all"
+            ),
+            Self::NoSuchRobot => format!(
+                "no such robot: the server has robots 0 to {}",
+                detail.saturating_sub(1)
+            ),
         }
     }
 }
@@ -196,10 +227,10 @@ mod tests {
             assert_eq!(Status::try_from(code as u32), Ok(status));
         }
         assert_eq!(
-            Status::try_from(19),
+            Status::try_from(23),
             Err(UnknownCode {
                 what: "status",
-                value: 19
+                value: 23
             })
         );
     }

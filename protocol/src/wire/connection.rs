@@ -8,14 +8,16 @@ use super::channels::{
 use super::control::{Reply, Request, ServerInfo};
 use super::exchange::{Exchange, check_answer, check_status};
 use super::message::{
-    ControlReply, ControlRequest, StepReply, StepRequest, StepResult, VERSION, split_step_payload,
+    ControlReply, ControlRequest, RobotResult, StepReply, StepRequest, VERSION, WorldResult,
 };
 use super::node::Opened;
+use super::payload::split_step_payload;
 use super::process::WatchedProcess;
 use super::turn::Turn;
 use super::wait::Waiter;
 use iceoryx2::port::client::Client;
 use iceoryx2::prelude::AllocationStrategy;
+use std::ops::Range;
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
@@ -24,14 +26,16 @@ pub use super::exchange::ConnectionError;
 /// Length that control requests may have before their segment grows, bytes.
 const CONTROL_SLICE: usize = 4096;
 
-/// The answer to a step: results and frames of consecutive worlds.
+/// The answer to a step: results and frames of consecutive robots, and results of their worlds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StepAnswer {
     /// The binary header.
     pub reply: StepReply,
     /// One result per world.
-    pub results: Vec<StepResult>,
-    /// The frames, `H * W` bytes per world.
+    pub worlds: Vec<WorldResult>,
+    /// One result per robot.
+    pub robots: Vec<RobotResult>,
+    /// The frames, `H * W` bytes per robot, or per world if team frames were asked for.
     pub frames: Vec<u8>,
 }
 
@@ -64,7 +68,8 @@ impl Connection {
         let left = || timeout.saturating_sub(start.elapsed());
         let (mut ports, step) = Self::open_ports(instance, left())?;
         let info = shake_hands(&ports.control, &ports.exchange, client, left())?;
-        let longest = info.n_worlds as usize * info.n_moves;
+        let of_world = size_of::<u64>() + info.n_robots as usize * info.n_moves;
+        let longest = info.n_worlds as usize * of_world;
         let _turn = Turn::take_within(left())?;
         let step = step.client_builder().initial_max_slice_len(longest.max(1));
         ports.step = Some(step.create().map_err(ipc_error(
@@ -166,14 +171,15 @@ impl Connection {
         )
     }
 
-    /// Asks on the step channel; version, sequence and listener are filled in here.
+    /// Asks on the step channel; version, sequence and listener are filled in here. The answer is for the robots that
+    /// were asked for, and waits until their world has moved.
     ///
     /// # Errors
     /// If the server refuses, has ended, or gives no good answer in time.
     pub fn step(
         &mut self,
         request: StepRequest,
-        paths: &[u8],
+        body: &[u8],
         timeout: Duration,
     ) -> Result<StepAnswer, ConnectionError> {
         const WHAT: &str = "step";
@@ -191,25 +197,43 @@ impl Connection {
         let (reply, answer) =
             self.ports
                 .exchange
-                .request(step, header, paths, WHAT, timeout, |reply, payload| {
+                .request(step, header, body, WHAT, timeout, |reply, payload| {
                     let parts = split_step_payload(reply, payload);
                     (
                         *reply,
-                        parts.map(|(results, frames)| (results, frames.to_vec())),
+                        parts.map(|parts| (parts.worlds, parts.robots, parts.frames.to_vec())),
                     )
                 })?;
         check_status(WHAT, reply.status, reply.detail, None)?;
         check_answer(WHAT, reply.version, (reply.sequence, self.sequence))?;
-        let (results, frames) = answer.map_err(|expected| ConnectionError::Garbled {
+        let garbled = |problem: String| ConnectionError::Garbled {
             what: WHAT,
-            problem: format!("expected a payload of {expected} bytes"),
-        })?;
+            problem,
+        };
+        let (worlds, robots, frames) = answer
+            .map_err(|expected| garbled(format!("expected a payload of {expected} bytes")))?;
+        let asked = (request.first_robot, request.n_robots, request.flags);
+        let got = (reply.first_robot, reply.n_robots, reply.flags);
+        let expected = worlds_of(request.first_robot, request.n_robots, self.info.n_robots).len();
+        if asked != got || worlds.len() != expected {
+            return Err(garbled(format!(
+                "expected {expected} worlds, and robots and flags {asked:?}, got {} and {got:?}",
+                worlds.len()
+            )));
+        }
         Ok(StepAnswer {
             reply,
-            results,
+            worlds,
+            robots,
             frames,
         })
     }
+}
+
+/// The worlds of consecutive robots, with `team` robots in each world.
+pub fn worlds_of(first_robot: u32, n_robots: u32, team: u32) -> Range<u32> {
+    let (team, end) = (team.max(1), first_robot.saturating_add(n_robots));
+    first_robot / team..end.div_ceil(team)
 }
 
 fn shake_hands(

@@ -20,13 +20,13 @@ pub enum Request {
         /// The client's name and version, for the server's log.
         client: String,
     },
-    /// Acquire the right to act on consecutive worlds.
+    /// Acquire the right to fly consecutive robots.
     Acquire {
-        /// First world.
-        first_world: u32,
-        /// Number of worlds, at least 1.
-        n_worlds: u32,
-        /// Whether to take the worlds from their holders.
+        /// Number of the first robot.
+        first_robot: u32,
+        /// Number of robots, at least 1.
+        n_robots: u32,
+        /// Whether to take the robots from their holders.
         #[serde(default)]
         takeover: bool,
         /// The lease ends this long after its last use; `None` asks for the server's default.
@@ -38,12 +38,13 @@ pub enum Request {
         /// The lease.
         lease: u64,
     },
-    /// Give the worlds of a lease back.
+    /// Give the robots of a lease back.
     Release {
         /// The lease.
         lease: u64,
     },
-    /// Start new episodes; answered when burn-in is done.
+    /// Start new episodes; answered when burn-in is done. Like `Restore` and `Fork` it needs a lease on all robots of
+    /// these worlds that are held, and on at least one.
     Reset {
         /// The lease.
         lease: u64,
@@ -82,12 +83,12 @@ pub enum Request {
         /// The world that is replaced.
         to: u32,
     },
-    /// Leave the next part of a belief about a world to the next client that acts on it.
+    /// Leave the next part of a belief about a robot's world to the next client that flies the robot.
     LeaveBelief(LeftPart),
-    /// What belief was left about a world as it is now?
+    /// What belief was left for who flies a robot in its world as it is now?
     Belief {
-        /// The world.
-        world: u32,
+        /// Number of the robot.
+        robot: u32,
         /// Where the part asked for begins.
         #[serde(default)]
         offset: u64,
@@ -179,6 +180,8 @@ pub struct ServerInfo {
     pub n_moves: usize,
     /// Number of worlds.
     pub n_worlds: u32,
+    /// Robots of each world R.
+    pub n_robots: u32,
     /// Number of observations O; frames hold values below it, or 255.
     pub n_observations: usize,
     /// Names of the observations.
@@ -197,6 +200,8 @@ pub struct ServerInfo {
     pub publish_truth: bool,
     /// How long a lease lives without use, by default.
     pub lease_millis: u64,
+    /// How long a world waits for the paths of its other held robots from the first path on; 0: no deadline.
+    pub deadline_millis: u64,
 }
 
 /// Which cells a server's steps observe.
@@ -218,7 +223,9 @@ pub struct LeaseInfo {
     pub lease: u64,
     /// It ends this long after its last use.
     pub ttl_millis: u64,
-    /// The worlds it covers, as they are now.
+    /// Numbers of the robots that it still holds.
+    pub robots: Vec<u32>,
+    /// The worlds of these, as they are now.
     pub worlds: Vec<WorldInfo>,
 }
 
@@ -228,8 +235,8 @@ pub struct LeaseInfo {
 pub struct LeftPart {
     /// The lease.
     pub lease: u64,
-    /// The world.
-    pub world: u32,
+    /// Number of the robot.
+    pub robot: u32,
     /// The episode.
     pub episode: u64,
     /// Its present step.
@@ -270,8 +277,8 @@ pub struct WorldInfo {
     pub seed: u64,
     /// Number of its resets since the server started.
     pub episode: u64,
-    /// The robot's `[row, col]`.
-    pub robot: [u32; 2],
+    /// `[row, col]` of each of its robots.
+    pub robots: Vec<[u32; 2]>,
 }
 
 /// The answer to `status`.
@@ -301,8 +308,10 @@ pub struct WorldStatus {
     /// Where it stands.
     #[serde(flatten)]
     pub info: WorldInfo,
-    /// Process that holds it.
-    pub holder_pid: Option<u32>,
+    /// The process that holds each of its robots.
+    pub holder_pids: Vec<Option<u32>>,
+    /// Robots that have a path for the next step.
+    pub n_paths: u32,
     /// Whether it is being reset.
     pub resetting: bool,
 }
@@ -357,11 +366,11 @@ mod tests {
 
     #[test]
     fn requests_read_as_protocol_md_shows_them() {
-        let text = r#"{"op":"acquire","first_world":0,"n_worlds":4}"#;
+        let text = r#"{"op":"acquire","first_robot":0,"n_robots":4}"#;
         let request: Request = serde_json::from_str(text).expect("valid");
         let expected = Request::Acquire {
-            first_world: 0,
-            n_worlds: 4,
+            first_robot: 0,
+            n_robots: 4,
             takeover: false,
             ttl_millis: None,
         };

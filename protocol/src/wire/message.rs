@@ -7,17 +7,22 @@
 use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 
-pub use super::codes::{FLAG_FULL_COVERAGE, Operation, Status, UnknownCode, VERSION};
+pub use super::codes::{
+    FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, Status, UnknownCode, VERSION,
+};
 
 /// A header that can lie in shared memory.
 pub trait Header: std::fmt::Debug + Default + Copy + ZeroCopySend {}
 
 impl<T: std::fmt::Debug + Default + Copy + ZeroCopySend> Header for T {}
 
-/// Header of a `step` request; the payload is `n_worlds` paths of `n_moves` bytes each.
+/// Header of a `step` request. The payload of `Step` is the present step k of each world (`u64`), then a path of
+/// `n_moves` bytes for each robot; that of `Recall` is the step of each world; that of `Observe` is empty.
+///
+/// The robots of a server are numbered through: robot r of world w is number `w * R + r`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
-#[type_name("emberwatch.v1.StepRequest")]
+#[type_name("emberwatch.v2.StepRequest")]
 pub struct StepRequest {
     /// [`VERSION`].
     pub version: u32,
@@ -27,27 +32,26 @@ pub struct StepRequest {
     pub lease: u64,
     /// Chosen by the client, returned in the answer.
     pub sequence: u64,
-    /// First world.
-    pub first_world: u32,
-    /// Number of consecutive worlds.
-    pub n_worlds: u32,
+    /// Number of the first robot.
+    pub first_robot: u32,
+    /// Number of consecutive robots, at least 1.
+    pub n_robots: u32,
     /// Moves in each path; 0 for `Observe` and `Recall`.
     pub n_moves: u32,
-    /// [`FLAG_FULL_COVERAGE`] or 0.
+    /// [`FLAG_FULL_COVERAGE`], [`FLAG_TEAM_FRAMES`], both or 0.
     pub flags: u32,
     /// Low half of the id of the client's listener on `wake-client`; both halves 0: no wake-up.
     pub listener_low: u64,
     /// High half of that id.
     pub listener_high: u64,
-    /// The step k to recall; 0 for other operations.
-    pub step: u64,
 }
 
-/// Header of a `step` answer; the payload is `n_worlds` [`StepResult`]s, then `n_worlds` frames
-/// of `height * width` bytes, both empty unless the status is `Ok`.
+/// Header of a `step` answer. The payload is `n_worlds` [`WorldResult`]s, `n_robots` [`RobotResult`]s, then frames of
+/// `height * width` bytes: one for each robot, or with [`FLAG_TEAM_FRAMES`] one for each world. It is empty unless the
+/// status is `Ok`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
-#[type_name("emberwatch.v1.StepReply")]
+#[type_name("emberwatch.v2.StepReply")]
 pub struct StepReply {
     /// [`VERSION`].
     pub version: u32,
@@ -55,59 +59,85 @@ pub struct StepReply {
     pub status: u32,
     /// The request's sequence number.
     pub sequence: u64,
-    /// First world, as asked.
-    pub first_world: u32,
-    /// Number of worlds in the payload; 0 unless the status is `Ok`.
+    /// Number of the first robot, as asked.
+    pub first_robot: u32,
+    /// Number of robots in the payload; 0 unless the status is `Ok`.
+    pub n_robots: u32,
+    /// Number of worlds that these robots are in; 0 unless the status is `Ok`.
     pub n_worlds: u32,
+    /// The request's flags.
+    pub flags: u32,
     /// Grid height H.
     pub height: u32,
     /// Grid width W.
     pub width: u32,
-    /// Time that the server worked on the request, nanoseconds: checks, simulation, copying.
+    /// Time that the server worked on the request, nanoseconds: checks, simulation, copying. The wait for other
+    /// clients' paths does not count.
     pub simulation_nanos: u64,
     /// See [`Status`].
     pub detail: u64,
-    /// 0.
-    pub reserved: [u64; 2],
 }
 
-/// What one world's step gave; also the state of a world after a reset.
+/// A world after a step or a reset, and what the step gave its robots together.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable, ZeroCopySend)]
-#[type_name("emberwatch.v1.StepResult")]
-pub struct StepResult {
+#[type_name("emberwatch.v2.WorldResult")]
+pub struct WorldResult {
     /// Step index k after the step; 0 after a reset.
     pub step: u64,
     /// Seed of the episode.
     pub seed: u64,
     /// Number of resets of this world since the server started.
     pub episode: u64,
-    /// Sum of rewards over the distinct visited cells in `X_{k+1}`.
+    /// Sum of rewards, in `X_{k+1}`, over the distinct cells that any robot visited.
     pub reward: f64,
+    /// Bit r is set if nobody held robot r of the world: it stayed and saw nothing.
+    pub hovered: u64,
+    /// Bit r is set if robot r was held, but its path had not come by the deadline: it stayed and saw nothing.
+    pub late: u64,
     /// Cells of the whole grid in the state that pays most (burning cells).
     pub n_target_cells: u32,
-    /// Distinct cells visited by the path.
+    /// Distinct cells that any robot visited.
     pub n_visited: u32,
     /// Distinct visited cells in the state that pays most.
     pub n_hits: u32,
-    /// The robot's row.
-    pub row: u32,
-    /// The robot's column.
-    pub col: u32,
-    /// A [`crate::model::frame::Coverage`].
-    pub coverage: u32,
     /// 1 if the episode ended by itself (never, in this model), else 0.
     pub terminated: u16,
     /// 1 if the episode reached the server's `max_steps`, else 0.
     pub truncated: u16,
-    /// 0.
-    pub reserved: u32,
+}
+
+/// What a step gave one robot; also its place after a reset.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable, ZeroCopySend)]
+#[type_name("emberwatch.v2.RobotResult")]
+pub struct RobotResult {
+    /// Its share of the team's reward: a cell that v robots visited pays each of them 1/v.
+    pub reward: f64,
+    /// What the team's reward would lack without this robot.
+    pub marginal: f64,
+    /// Distinct cells that it visited.
+    pub n_visited: u32,
+    /// Of these, cells in the state that pays most.
+    pub n_hits: u32,
+    /// Row where its path began, or where it stays.
+    pub start_row: u32,
+    /// Column where its path began, or where it stays.
+    pub start_col: u32,
+    /// Its row.
+    pub row: u32,
+    /// Its column.
+    pub col: u32,
+    /// A [`crate::model::frame::Coverage`].
+    pub coverage: u32,
+    /// Moves that it flew; 0 after a reset, and in a step in which it hovered or was late.
+    pub n_moves: u32,
 }
 
 /// Header of a `control` request; the payload is JSON, a [`crate::wire::control::Request`].
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
-#[type_name("emberwatch.v1.ControlRequest")]
+#[type_name("emberwatch.v2.ControlRequest")]
 pub struct ControlRequest {
     /// [`VERSION`].
     pub version: u32,
@@ -124,7 +154,7 @@ pub struct ControlRequest {
 /// Header of a `control` answer; the payload is JSON, a [`crate::wire::control::Reply`].
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
-#[type_name("emberwatch.v1.ControlReply")]
+#[type_name("emberwatch.v2.ControlReply")]
 pub struct ControlReply {
     /// [`VERSION`].
     pub version: u32,
@@ -134,11 +164,11 @@ pub struct ControlReply {
     pub sequence: u64,
 }
 
-/// Header of a sample on `frames`; the payload is the frame (`height * width` bytes), then the
-/// path that was flown (`n_moves` bytes).
+/// Header of a sample on `frames`: one step of one world. The payload is `n_robots` [`RobotResult`]s, as many frames
+/// of `height * width` bytes, then each robot's path of [`RobotResult::n_moves`] bytes.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable, ZeroCopySend)]
-#[type_name("emberwatch.v1.FrameHeader")]
+#[type_name("emberwatch.v2.FrameHeader")]
 pub struct FrameHeader {
     /// [`VERSION`].
     pub version: u32,
@@ -146,26 +176,22 @@ pub struct FrameHeader {
     pub world: u32,
     /// Number of samples published on this channel before this one: a gap is a loss.
     pub sequence: u64,
+    /// Number of the world's first robot.
+    pub first_robot: u32,
+    /// Robots of the world R.
+    pub n_robots: u32,
     /// Grid height H.
     pub height: u32,
     /// Grid width W.
     pub width: u32,
-    /// Moves in the path; 0 after a reset.
-    pub n_moves: u32,
-    /// Row where the path began.
-    pub start_row: u32,
-    /// Column where the path began.
-    pub start_col: u32,
-    /// 0.
-    pub reserved: u32,
-    /// The step's result.
-    pub result: StepResult,
+    /// The world's result.
+    pub result: WorldResult,
 }
 
 /// Header of a sample on `truth`; the payload is the hidden state (`height * width` bytes).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
-#[type_name("emberwatch.v1.TruthHeader")]
+#[type_name("emberwatch.v2.TruthHeader")]
 pub struct TruthHeader {
     /// [`VERSION`].
     pub version: u32,
@@ -189,7 +215,7 @@ pub struct TruthHeader {
 /// JSON, an [`super::agent_belief::Intent`].
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
-#[type_name("emberwatch.v1.AgentHeader")]
+#[type_name("emberwatch.v2.AgentHeader")]
 pub struct AgentHeader {
     /// [`VERSION`].
     pub version: u32,
@@ -211,56 +237,8 @@ pub struct AgentHeader {
     pub n_states: u32,
     /// The agent's process.
     pub pid: u32,
-}
-
-/// Bytes of one [`StepResult`] in a payload.
-pub const RESULT_BYTES: usize = size_of::<StepResult>();
-
-/// The results and frames in the payload of a successful step answer.
-///
-/// # Errors
-/// The number of bytes expected, if the payload is not as long as its header says.
-pub fn split_step_payload<'a>(
-    reply: &StepReply,
-    payload: &'a [u8],
-) -> Result<(Vec<StepResult>, &'a [u8]), usize> {
-    let n_worlds = reply.n_worlds as usize;
-    let n_cells = (reply.height as usize).saturating_mul(reply.width as usize);
-    let expected = n_cells
-        .saturating_add(RESULT_BYTES)
-        .saturating_mul(n_worlds);
-    if payload.len() != expected {
-        return Err(expected);
-    }
-    let (results, frames) = payload.split_at(n_worlds * RESULT_BYTES);
-    let results = results
-        .chunks_exact(RESULT_BYTES)
-        .map(bytemuck::pod_read_unaligned)
-        .collect();
-    Ok((results, frames))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_step_payload_of_the_wrong_length_is_refused() {
-        let reply = StepReply {
-            n_worlds: 2,
-            height: 3,
-            width: 5,
-            ..StepReply::default()
-        };
-        let expected = 2 * (64 + 15);
-        assert!(split_step_payload(&reply, &vec![0; expected]).is_ok());
-        assert_eq!(split_step_payload(&reply, &[0; 3]), Err(expected));
-        let huge = StepReply {
-            n_worlds: u32::MAX,
-            height: u32::MAX,
-            width: u32::MAX,
-            ..reply
-        };
-        assert!(split_step_payload(&huge, &[]).is_err());
-    }
+    /// Number of the first robot that the agent flies.
+    pub first_robot: u32,
+    /// Number of consecutive robots that it flies, at least 1.
+    pub n_robots: u32,
 }

@@ -1,6 +1,6 @@
 //! The wire: what travels between processes, and how.
 //!
-//! [`message`], [`control`] and [`decisions`] are the messages; [`channels`] the services that carry them;
+//! [`message`], [`payload`], [`control`] and [`decisions`] are the messages; [`channels`] the services that carry them;
 //! [`connection`] a client's side, [`responder`] the answering side, [`observer`] a reader's side. [`node`], [`turn`]
 //! and [`cleanup`] create and remove channels; [`wait`] is the bounded wait. [`recording`] keeps samples in a file.
 
@@ -20,6 +20,7 @@ mod json;
 pub mod message;
 mod node;
 pub mod observer;
+pub mod payload;
 mod poll;
 pub(crate) mod process;
 pub mod recording;

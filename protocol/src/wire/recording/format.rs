@@ -1,10 +1,11 @@
 //! The bytes of a recording: file and record headers, what records hold, and the errors.
 
-use crate::model::grid::MAX_SIDE;
 use crate::model::path::MAX_MOVES;
+use crate::wire::channels::{MAX_ROBOTS, MAX_TEAM_CELLS};
 use crate::wire::control::{MAX_CONTROL_BYTES, ServerInfo};
 use crate::wire::message::{FrameHeader, TruthHeader};
 use crate::wire::observer::Sample;
+use crate::wire::payload::ROBOT_BYTES;
 use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -13,10 +14,11 @@ use thiserror::Error;
 pub const MAGIC: [u8; 8] = *b"EMBERREC";
 
 /// Version of the format. The other byte order's is another number, so such a file is refused.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
-/// Longest body before compression, bytes: a frame of the largest grid with the longest path.
-pub const MAX_BODY_BYTES: usize = size_of::<FrameHeader>() + MAX_SIDE * MAX_SIDE + MAX_MOVES;
+/// Longest body before compression, bytes: the largest frames and the longest paths of the most robots.
+pub const MAX_BODY_BYTES: usize =
+    size_of::<FrameHeader>() + MAX_TEAM_CELLS + MAX_ROBOTS * (ROBOT_BYTES + MAX_MOVES);
 
 /// Longest body in the file, bytes: what deflate may add to one that it cannot compress.
 pub const MAX_STORED_BYTES: usize = MAX_BODY_BYTES + MAX_BODY_BYTES / 1024 + 64;
@@ -79,7 +81,7 @@ pub struct Record {
 pub enum Event {
     /// The samples from here on are from this server.
     Server(Box<ServerInfo>),
-    /// A frame and the path that was flown.
+    /// What the robots of a world saw, and the paths that they flew.
     Frame(Sample<FrameHeader>),
     /// Hidden states; for evaluation and pictures, never for learners.
     Truth(Sample<TruthHeader>),

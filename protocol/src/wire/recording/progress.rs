@@ -3,10 +3,13 @@
 use super::format::{Event, Record, Totals};
 use crate::model::grid::Shape;
 use crate::model::path::MAX_MOVES;
+use crate::wire::channels::{MAX_ROBOTS, MAX_TEAM_CELLS};
 use crate::wire::control::ServerInfo;
 use crate::wire::message::VERSION;
 use crate::wire::observer::Sample;
+use crate::wire::payload::{RobotSample, split_frame_payload};
 use std::collections::HashMap;
+use std::fmt::Display;
 
 /// What the records so far hold. Writer and reader both keep it, so that neither accepts a record that the other
 /// would refuse.
@@ -25,6 +28,7 @@ pub(super) struct Progress {
 #[derive(Debug, Clone)]
 struct Limits {
     n_worlds: u32,
+    n_robots: u32,
     height: usize,
     width: usize,
     n_moves: usize,
@@ -48,24 +52,22 @@ impl Progress {
                 totals.n_servers += 1;
             }
             Event::Frame(Sample { header, payload }) => {
-                let grid = (header.height, header.width);
                 let limits = limits(self.server.as_ref())?;
-                let path = header.n_moves as usize;
-                if path != 0 && path != limits.n_moves {
-                    let expected = limits.n_moves;
-                    return Err(format!("path: expected 0 or {expected} moves, got {path}"));
-                }
-                limits.check(header.version, header.world, grid, payload.len(), path)?;
+                limits.check(header.version, header.world, (header.height, header.width))?;
+                let robots = split_frame_payload(header, payload)?;
+                limits.check_robots(header.world, header.first_robot, &robots)?;
                 totals.n_frames += 1;
                 totals.n_lost_frames += n_lost;
                 let now = (header.result.episode, header.result.step);
                 let is_new = self.last.insert(header.world, now) != Some(now);
-                self.n_steps += u64::from(is_new && path > 0);
+                self.n_steps += u64::from(is_new && header.result.step > 0);
             }
             Event::Truth(Sample { header, payload }) => {
                 let grid = (header.height, header.width);
                 let limits = limits(self.server.as_ref())?;
-                limits.check(header.version, header.world, grid, payload.len(), 0)?;
+                limits.check(header.version, header.world, grid)?;
+                let n_cells = limits.height * limits.width;
+                expect("payload bytes", &n_cells, &payload.len())?;
                 totals.n_truths += 1;
                 totals.n_lost_truths += n_lost;
             }
@@ -81,7 +83,14 @@ fn limits(server: Option<&Limits>) -> Result<&Limits, String> {
 
 impl Limits {
     fn of(info: &ServerInfo) -> Result<Self, String> {
-        Shape::new(info.height, info.width).map_err(|error| error.to_string())?;
+        let shape = Shape::new(info.height, info.width).map_err(|error| error.to_string())?;
+        let n_robots = info.n_robots as usize;
+        if !(1..=MAX_ROBOTS).contains(&n_robots) || n_robots * shape.n_cells() > MAX_TEAM_CELLS {
+            return Err(format!(
+                "robots: expected 1 to {MAX_ROBOTS}, and at most {MAX_TEAM_CELLS} cells of all their frames, \
+                 got {n_robots}"
+            ));
+        }
         if info.n_moves > MAX_MOVES {
             let got = info.n_moves;
             return Err(format!(
@@ -90,37 +99,19 @@ impl Limits {
         }
         Ok(Self {
             n_worlds: info.n_worlds,
+            n_robots: info.n_robots,
             height: info.height,
             width: info.width,
             n_moves: info.n_moves,
         })
     }
 
-    fn check(
-        &self,
-        version: u32,
-        world: u32,
-        (height, width): (u32, u32),
-        length: usize,
-        path: usize,
-    ) -> Result<(), String> {
-        let expect = |what: &str, expected: String, got: String| {
-            if expected == got {
-                Ok(())
-            } else {
-                Err(format!("{what}: expected {expected}, got {got}"))
-            }
-        };
-        expect("sample version", VERSION.to_string(), version.to_string())?;
+    fn check(&self, version: u32, world: u32, (height, width): (u32, u32)) -> Result<(), String> {
+        expect("sample version", &VERSION, &version)?;
         expect(
             "grid",
-            format!("{} x {}", self.height, self.width),
-            format!("{height} x {width}"),
-        )?;
-        expect(
-            "payload bytes",
-            (self.height * self.width + path).to_string(),
-            length.to_string(),
+            &format!("{} x {}", self.height, self.width),
+            &format!("{height} x {width}"),
         )?;
         if world >= self.n_worlds {
             return Err(format!(
@@ -130,4 +121,32 @@ impl Limits {
         }
         Ok(())
     }
+
+    /// Checks that robots are those of a world, and that each flew a whole path or none.
+    fn check_robots(
+        &self,
+        world: u32,
+        first_robot: u32,
+        robots: &[RobotSample<'_>],
+    ) -> Result<(), String> {
+        expect("robots", &self.n_robots, &(robots.len() as u32))?;
+        let first = u64::from(world) * u64::from(self.n_robots);
+        expect("first robot", &first, &u64::from(first_robot))?;
+        let wrong = |robot: &&RobotSample<'_>| ![0, self.n_moves].contains(&robot.path.len());
+        match robots.iter().find(wrong) {
+            None => Ok(()),
+            Some(robot) => Err(format!(
+                "path: expected 0 or {} moves, got {}",
+                self.n_moves,
+                robot.path.len()
+            )),
+        }
+    }
+}
+
+fn expect<T: PartialEq + Display>(what: &str, expected: &T, got: &T) -> Result<(), String> {
+    if expected == got {
+        return Ok(());
+    }
+    Err(format!("{what}: expected {expected}, got {got}"))
 }
