@@ -155,7 +155,7 @@ class Session:
         first = answer.first_robot // self.spec.n_robots - self.settings.world
         moments = [WorldResult(*world.item()).moment for world in answer.worlds]
         truths = self._truth.at(moments, self.settings.timeout, first)
-        return np.stack([truths[world].states for world in answer.world_of.tolist()])
+        return np.stack([truth.states for truth in truths])[answer.world_of]
 
     def teams(self, answer: StepAnswer) -> StepAnswer:
         """Results of all robots in the answer's worlds, and the frame of each world's team."""
