@@ -294,8 +294,8 @@ class _File:
             if (row.steps, row.moves) != (steps, n_moves):
                 raise InvalidArgumentError(
                     f"csv: {self._path} has {row.steps} steps of {row.moves} moves of "
-                    f"{row.policy!r} on world {row.world_seed}, expected {steps} of {n_moves}: choose another file "
-                    "or name"
+                    f"{row.policy!r} on world {row.world_seed}, expected {steps} of "
+                    f"{n_moves}: choose another file or name"
                 )
         return {row.world_seed: row for row in own}
 

@@ -33,7 +33,7 @@ from emberwatch.newest import Newest
 from emberwatch.observer import Truth, TruthReader
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program, unused_instance
-from emberwatch.settings import Settings, private_spec, running_spec
+from emberwatch.settings import Settings, WorldSpec, private_spec, running_spec
 from emberwatch.wire import StepAnswer, WorldResult
 
 # Seconds after its last use that a lease ends: learners may think long, and a dead holder is
@@ -301,6 +301,11 @@ class SessionOwner:
     def model(self) -> Model | None:
         """The model behind the worlds; None if a running server hides it."""
         return self._session.spec.model
+
+    @property
+    def world_spec(self) -> WorldSpec:
+        """What is known of the worlds before the first reset."""
+        return self._session.spec
 
     @property
     def n_moves(self) -> int:

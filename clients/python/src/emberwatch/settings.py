@@ -70,6 +70,8 @@ class Settings:
             is_kind = isinstance(value, int | float if kind is float else kind)
             if not is_kind or (isinstance(value, bool) and kind is not bool):
                 raise InvalidArgumentError(f"{field.name}: expected {field.type}, got {value!r}")
+        if self.robots is not None and self.robots < 1:
+            raise InvalidArgumentError(f"robots: expected at least 1, got {self.robots}")
         if not self.timeout > 0:
             raise InvalidArgumentError(f"timeout: expected seconds above 0, got {self.timeout}")
 
@@ -143,7 +145,7 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
             "takeover, world, robot: expected instance=..., a running server to attach to; a "
             f"private server has its own worlds, got world {settings.world}"
         )
-    robots = _robots(settings, n_rows, 1 if settings.robots is None else settings.robots)
+    robots = _robots(settings, n_rows, settings.robots or 1)
     n_worlds = len(robots) // (settings.robots or 1)
     checked: dict[str, Any] = check_settings(settings.server_flags(n_worlds))
     model = Model.checked(checked["model"])
@@ -207,7 +209,7 @@ def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:
             raise InvalidArgumentError(f"robot: expected 0 to {n_robots - 1}, got {settings.robot}")
         return range(first + settings.robot, first + settings.robot + 1)
     n_rows = n_robots if n_rows is None else n_rows
-    if n_robots > 0 and n_rows % n_robots:
+    if n_rows % n_robots:
         raise InvalidArgumentError(
             f"robots: expected one robot in a world, got {n_robots}: fly one of them with "
             "robot=..., all of a world with emberwatch.parallel_env, or of several worlds with "

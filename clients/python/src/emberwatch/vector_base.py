@@ -141,10 +141,15 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
     def draw(self, rows: slice) -> Any:
         """The picture of some robots of one world, and of what they saw together."""
         row: int = rows.start
-        robots = [(at[0], at[1]) for at in self._robots()[rows].tolist()]
+        frame, cells = self.seen(rows)
+        robots = [(at[0], at[1]) for at in cells.tolist()]
         paths = [path for path in map(self._path, range(self.num_envs)[rows]) if path is not None]
         truth = self._truths[row] if self._truths is not None and self._reveals else None
-        return self._views[row].draw(self._frames[rows].min(axis=0), robots, paths, truth)
+        return self._views[row].draw(frame, robots, paths, truth)
+
+    def seen(self, rows: slice) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+        """What some robots of one world saw together, `(H, W)`, and their cells; new arrays."""
+        return self._frames[rows].min(axis=0), self._robots()[rows]
 
     @property
     def results(self) -> NDArray[np.void]:
@@ -153,6 +158,11 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         `(num_envs,)` of `wire.RESULT_DTYPE`.
         """
         return self._results.copy()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there has been a reset since it was made or closed."""
+        return self._session.is_open
 
     def close_extras(self, **kwargs: Any) -> None:
         self._session.close()
@@ -312,6 +322,15 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
                 "reset_mask: expected all robots of a world or none, got some"
             )
         return mask
+
+
+def info_of(infos: dict[str, Any], row: int) -> dict[str, Any]:
+    """The info of one row among stacked ones, its numbers as Python's own."""
+    shown = {name: values[row] for name, values in infos.items() if not name.startswith("_")}
+    return {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in shown.items()
+    }
 
 
 def vector_session(settings: Settings, num_envs: int | None) -> Session:
