@@ -105,17 +105,17 @@ def test_a_stopped_server_is_a_timeout_and_observing_tells_what_happened(server:
     started = server()
     lease = started.connect().acquire()
     for k in range(5):
-        before = lease.observe().result().step
-        assert before == lease.observe().result().step
+        before = lease.observe().result().world.step
+        assert before == lease.observe().result().world.step
         started.stop()
         with pytest.raises(errors.RequestTimeoutError, match=r"within 0\.3 s"):
             lease.step([k % 4] * 6, timeout=0.3)
         started.wake_up()
         seen = lease.observe()
         # The step was made or not; it is never made later.
-        assert seen.result().step in (before, before + 1)
+        assert seen.result().world.step in (before, before + 1)
         assert lease.observe().result() == seen.result()
-        assert lease.step([1] * 6).result().step == seen.result().step + 1
+        assert lease.step([1] * 6).result().world.step == seen.result().world.step + 1
 
 
 def test_an_answer_that_comes_in_time_after_a_pause_is_the_steps(server: Start) -> None:
@@ -123,7 +123,7 @@ def test_an_answer_that_comes_in_time_after_a_pause_is_the_steps(server: Start) 
     lease = started.connect().acquire()
     started.stop()
     threading.Timer(0.1, started.wake_up).start()
-    assert lease.step([3] * 6, timeout=PATIENCE).result().step == 1
+    assert lease.step([3] * 6, timeout=PATIENCE).result().world.step == 1
 
 
 class Remains:
@@ -223,7 +223,7 @@ def test_a_killed_client_frees_its_worlds_at_once(server: Start, script: Run) ->
     next_client = started.connect()
     holder.signal(signal.SIGKILL)
     holder.end()
-    assert next_client.acquire().step([3] * 6).result().step > 1
+    assert next_client.acquire().step([3] * 6).result().world.step > 1
 
 
 def test_killed_clients_use_up_no_limit(server: Start, script: Run) -> None:
@@ -282,7 +282,7 @@ def test_a_server_refuses_the_header_of_another_version(
     assert channels.Node._name is name
     check_mismatch(raised)
     assert on_step.value.detail == 1 and "one release" in str(on_step.value)
-    assert client.observe().result().step == 0
+    assert client.observe().result().world.step == 0
 
 
 def test_a_server_of_another_version_elsewhere_is_not_meant(

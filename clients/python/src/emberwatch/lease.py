@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from typing import Any, Final, Self
@@ -45,6 +46,7 @@ class Lease:
         self.start: Final = start
         #: k of each world, as far as is known here.
         self._steps = np.zeros(len(self.worlds), np.uint64)
+        self._lock = threading.Lock()
         self._is_over = False
         self._note(start)
 
@@ -92,16 +94,17 @@ class Lease:
         """The same for moves that `as_moves` has checked."""
         steps = self.steps_of(robots)
         flags = full * wire.FULL_COVERAGE | team * wire.TEAM_FRAMES
-        answer = self.client.exchange(
-            wire.STEP,
-            self.number,
-            robots.start,
-            len(robots),
-            flags,
-            steps.tobytes() + moves.tobytes(),
-            timeout=timeout,
-        )
-        steps[:] = answer.worlds["step"]
+        with self._lock:  # each thread's path is for a step of its own
+            answer = self.client.exchange(
+                wire.STEP,
+                self.number,
+                robots.start,
+                len(robots),
+                flags,
+                steps.tobytes() + moves.tobytes(),
+                timeout=timeout,
+            )
+            steps[:] = answer.worlds["step"]
         return answer
 
     def observe(
