@@ -9,6 +9,7 @@ use protocol::Connection;
 use protocol::channels::Instance;
 use protocol::control::{Reply, Request};
 use protocol::message::{Operation, StepRequest};
+use protocol::payload::write_step_body;
 use std::process::{Child, Command};
 use std::time::{Duration, Instant};
 
@@ -35,53 +36,62 @@ impl Drop for Running {
     }
 }
 
-/// A connection with a lease on `n_worlds` worlds, and the request and paths of their step.
+/// A connection with a lease on some robots, and the request and paths of their step.
 struct Stepper {
     connection: Connection,
     request: StepRequest,
     paths: Vec<u8>,
+    /// The step of each world.
+    steps: Vec<u64>,
+    body: Vec<u8>,
 }
 
 impl Stepper {
-    fn new(instance: &Instance, n_worlds: u32) -> Self {
+    fn new(instance: &Instance, first_robot: u32, n_robots: u32) -> Self {
         let mut connection = connect(instance);
         let acquire = Request::Acquire {
-            first_world: 0,
-            n_worlds,
+            first_robot,
+            n_robots,
             takeover: true,
             ttl_millis: None,
         };
         let lease = match connection.control(&acquire, TIMEOUT) {
-            Ok(Reply::Lease(lease)) => lease.lease,
+            Ok(Reply::Lease(lease)) => lease,
             other => panic!("acquire: {other:?}"),
         };
         let n_moves = connection.info().n_moves;
         let operation = Operation::Step as u32;
         let request = StepRequest {
             operation,
-            lease,
-            n_worlds,
+            lease: lease.lease,
+            first_robot,
+            n_robots,
             n_moves: n_moves as u32,
             ..StepRequest::default()
         };
-        let paths = (0..n_moves * n_worlds as usize)
+        let paths = (0..n_moves * n_robots as usize)
             .map(|at| (at * 7 % 4) as u8)
             .collect();
         Self {
             connection,
             request,
             paths,
+            steps: lease.worlds.iter().map(|world| world.step).collect(),
+            body: Vec::new(),
         }
     }
 
     /// Nanoseconds of one round trip: all of it, and the simulation's share.
     fn step(&mut self) -> (u64, u64) {
         let start = Instant::now();
+        self.body.clear();
+        write_step_body(&self.steps, &self.paths, &mut self.body);
         let answer = self
             .connection
-            .step(self.request, &self.paths, TIMEOUT)
+            .step(self.request, &self.body, TIMEOUT)
             .expect("a step");
         let total = start.elapsed().as_nanos() as u64;
+        self.steps.iter_mut().for_each(|step| *step += 1);
         (total, answer.reply.simulation_nanos.min(total))
     }
 
@@ -89,8 +99,7 @@ impl Stepper {
         (0..n_steps / 10).for_each(|_| _ = self.step());
         let start = Instant::now();
         let times: Vec<(u64, u64)> = (0..n_steps).map(|_| self.step()).collect();
-        let per_second =
-            n_steps as f64 * f64::from(self.request.n_worlds) / start.elapsed().as_secs_f64();
+        let per_second = n_steps as f64 * self.steps.len() as f64 / start.elapsed().as_secs_f64();
         let wire = Spread::of(times.iter().map(|(total, simulation)| total - simulation));
         let simulation = Spread::of(times.iter().map(|(_, simulation)| *simulation));
         say(&format!(
@@ -128,34 +137,46 @@ fn main() {
         .skip(1)
         .filter(|argument| argument != "--bench")
         .collect();
-    for n_worlds in [1_u32, 64] {
-        let name = format!("bench-{}-{n_worlds}", std::process::id());
-        let worlds = n_worlds.to_string();
-        let mut arguments = vec![
-            "--instance",
-            &name,
-            "--worlds",
-            &worlds,
-            "--burn-in",
-            "1000",
-        ];
+    for (n_worlds, team) in [(1_u32, 1_u32), (64, 1), (1, 8)] {
+        let name = format!("bench-{}-{n_worlds}-{team}", std::process::id());
+        let (worlds, robots) = (n_worlds.to_string(), team.to_string());
+        let mut arguments = vec!["--instance", &name, "--worlds", &worlds];
+        arguments.extend(["--robots", &robots, "--burn-in", "1000"]);
         arguments.extend(more.iter().map(String::as_str));
         let running = Running::start(&server, &arguments);
         let instance = Instance::new(&name).expect("a plain name");
         let n_steps = N_STEPS / n_worlds.isqrt() as usize;
-        let mut stepper = Stepper::new(&instance, n_worlds);
-        stepper.report(&format!("{n_worlds} world(s), as the machine is"), n_steps);
+        let what = match team {
+            1 => format!("{n_worlds} world(s)"),
+            _ => format!("{team} robots of 1 client"),
+        };
+        let mut stepper = Stepper::new(&instance, 0, n_worlds * team);
+        stepper.report(&format!("{what}, as the machine is"), n_steps);
         {
             let busy = ["-c", "while :; do :; done"];
             let _busy: Vec<Running> = (0..3).map(|_| Running::start("sh", &busy)).collect();
-            stepper.report(
-                &format!("{n_worlds} world(s), 3 busy processes"),
-                n_steps / 10,
-            );
+            stepper.report(&format!("{what}, 3 busy processes"), n_steps / 10);
         }
         drop(stepper);
+        if team > 1 {
+            report_barrier(&instance, team, n_steps / 10);
+        }
         report_idleness(&running);
     }
+}
+
+/// Steps of one world whose robots have a client each.
+fn report_barrier(instance: &Instance, team: u32, n_steps: usize) {
+    let robots = (0..team).map(|robot| Stepper::new(instance, robot, 1));
+    let mut steppers: Vec<Stepper> = robots.collect();
+    let mut last = steppers.pop().expect("robots");
+    std::thread::scope(|scope| {
+        for mut stepper in steppers {
+            let n_steps = n_steps + n_steps / 10;
+            scope.spawn(move || (0..n_steps).for_each(|_| _ = stepper.step()));
+        }
+        last.report(&format!("{team} robots of {team} clients"), n_steps);
+    });
 }
 
 fn report_idleness(server: &Running) {

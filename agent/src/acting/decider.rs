@@ -1,6 +1,7 @@
 //! The agent's side of decisions: plan for the objectives asked, step, correct, predict.
 //!
-//! What [`crate::acting::run`] does with an objective of its own, one step at a time and in many worlds.
+//! What [`crate::acting::run`] does with an objective of its own, one step at a time and in many worlds. Each has one
+//! robot, so that worlds and robots have the same numbers.
 
 use crate::acting::handover::{leave, resume};
 use crate::acting::registry::{self, Task};
@@ -10,7 +11,6 @@ use crate::estimation::summary::{summarise, summary_names};
 use crate::learning::learned::Learned;
 use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::planning::{Objective, Plan};
-use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Seen, in_parallel};
 use crate::server::client::{Client, Observation, refused};
 use crate::server::feed::Feed;
@@ -108,7 +108,7 @@ impl Decider {
     /// # Errors
     /// After a refusal everything is as it was.
     pub fn reset(&mut self, seeds: &[WorldSeed]) -> Result<&[Decision]> {
-        let worlds = self.client.worlds();
+        let worlds = self.client.robots();
         if let Some(other) = seeds.iter().find(|seed| !worlds.contains(&seed.world)) {
             return Err(no_such_world(&worlds, other.world).into());
         }
@@ -121,7 +121,7 @@ impl Decider {
             let mut robot = self.robot(observations[index].clone())?;
             robot.begin(None, |robot| {
                 if shown.contains(&turn) {
-                    self.feed.show(&robot.view(world));
+                    self.feed.show(&robot.view(world, world));
                 }
             })?;
             self.last[index] = decision(&robot, self.n_moves(), None);
@@ -140,7 +140,7 @@ impl Decider {
             return Ok(&self.last);
         }
         let n_moves = self.n_moves();
-        let worlds = self.client.worlds();
+        let worlds = self.client.robots();
         let mut runs = moving(worlds, &mut self.robots, &mut self.last, targets);
         let worlds: Vec<u32> = runs.iter().map(|run| run.world).collect();
         let shown = self.feed.turn(runs.len());
@@ -151,11 +151,12 @@ impl Decider {
             |paths| {
                 let observations = self.client.step_some(&worlds, paths)?;
                 self.last_use = Instant::now();
-                Ok(observations.into_iter().map(unrevealed).collect())
+                let seen = observations.into_iter();
+                Ok(seen.map(|observation| Seen::new([observation])).collect())
             },
             |turn, run, _| {
                 if shown.contains(&turn) {
-                    self.feed.show(&run.robot.view(run.world));
+                    self.feed.show(&run.robot.view(run.world, run.world));
                 }
                 Ok(())
             },
@@ -188,7 +189,7 @@ impl Decider {
     }
 
     pub fn release(mut self) -> Result<()> {
-        for (world, robot) in self.client.worlds().zip(&self.robots) {
+        for (world, robot) in self.client.robots().zip(&self.robots) {
             leave(&mut self.client, world, robot)?;
         }
         Ok(self.client.release()?)
@@ -205,12 +206,12 @@ impl Decider {
             shape: self.client.shape(),
             n_moves: self.n_moves(),
             prior: &self.prior,
-            seed: self.config.planner_seed(observation.result.seed),
+            seed: self.config.planner_seed(observation.world.seed),
             learned: &Learned::default(),
         };
         // Any choice will do: each has the same estimator and planner.
         let agent = registry::agent(&self.choices[0], &self.config, task)?;
-        Ok(Robot::new(agent, observation))
+        Ok(Robot::new(agent, Seen::new([observation])))
     }
 
     /// What each world is to move for, if at all; all are checked before any moves.
@@ -221,7 +222,7 @@ impl Decider {
             let message = format!("{}: {problem}", Status::Malformed.explain(0));
             return Err(refused(Status::Malformed, 0, message).into());
         }
-        let places = self.client.worlds().zip(&self.robots).zip(asked);
+        let places = self.client.robots().zip(&self.robots).zip(asked);
         let targets = places.map(|((world, robot), objective)| {
             let target = |index| Ok((index, self.target(world, robot, index)?));
             objective.map(target).transpose()
@@ -237,7 +238,7 @@ impl Decider {
             let message = format!("{expected}, got {index} for world {world}");
             return Err(refused(status, detail, message));
         };
-        if robot.observation().result.truncated != 0 {
+        if robot.observation().world.truncated != 0 {
             let (status, detail) = (Status::EpisodeOver, world.into());
             return Err(refused(status, detail, status.explain(detail)));
         }
@@ -246,10 +247,10 @@ impl Decider {
 }
 
 impl Moving<'_> {
-    fn plan(&mut self) -> Plan {
+    fn plan(&mut self) -> Vec<Plan> {
         let (_, objective) = self.objective;
-        let plan = |agent: &mut Agent, cell, step| agent.plan_for(objective, cell, step);
-        self.robot.plan_with(plan)
+        self.robot
+            .plan_with(|agent, robots, step| agent.plan_for(objective, robots, step))
     }
 }
 
@@ -271,11 +272,6 @@ fn moving<'a>(
     places.filter_map(run).collect()
 }
 
-fn unrevealed(observation: Observation) -> Seen {
-    let truth = None;
-    Seen { observation, truth }
-}
-
 fn no_such_world(worlds: &Range<u32>, got: u32) -> ConnectionError {
     let (first, last) = (worlds.start, worlds.end - 1);
     let message = format!("no such world: the agent has worlds {first} to {last}, got {got}");
@@ -284,20 +280,20 @@ fn no_such_world(worlds: &Range<u32>, got: u32) -> ConnectionError {
 
 fn decision(robot: &Robot, n_moves: usize, objective: Option<u64>) -> Decision {
     let observation = robot.observation();
-    let result = &observation.result;
+    let (result, cell) = (&observation.world, observation.cell());
     Decision {
         step: result.step,
         reward: result.reward,
         n_target_cells: result.n_target_cells,
         n_visited: result.n_visited,
         n_hits: result.n_hits,
-        robot: [result.row, result.col],
+        robot: [cell.row, cell.col].map(|index| index as u32),
         terminated: result.terminated != 0,
         truncated: result.truncated != 0,
         seed: result.seed,
         episode: result.episode,
         objective,
-        summary: summarise(robot.agent.belief(), observation.robot(), n_moves),
+        summary: summarise(robot.agent.belief(), cell, n_moves),
     }
 }
 

@@ -7,7 +7,7 @@ use crate::acting::decider::{Assignment, Decider};
 use crate::acting::run::prepare;
 use crate::estimation::first_belief::first_belief;
 use crate::server::client::{is_outage, refusal, shape_of};
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use protocol::Model;
 use protocol::channels::{ChannelError, ipc_error};
 use protocol::control::parse;
@@ -66,6 +66,11 @@ impl Service {
     ) -> Result<Self> {
         // What takes long is done before anybody can ask and before the lease begins to run.
         let (info, model) = prepare(&task.instance, &task.worlds, model)?;
+        ensure!(
+            info.n_robots == 1,
+            "serve-decisions flies one robot a world: expected a server with --robots 1, got {}",
+            info.n_robots
+        );
         let shape = shape_of(&info)?;
         let prior = task.config.prior(info.burn_in);
         let prior = first_belief(prior, &model, shape, task.config.seed)?;

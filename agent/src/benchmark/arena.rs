@@ -5,10 +5,12 @@
 //! on the path, so a scout shows the future lawfully); and one *spare*, for full observations.
 
 use crate::acting::registry::{self, Task};
+use crate::benchmark::team::Team;
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
 use crate::learning::learned::Learned;
 use crate::planning::policy::Policy;
+use crate::planning::team::robot_seed;
 use crate::rollout::Seen;
 use crate::rollout::agent::Agent;
 use crate::server::client::{Claim, Client, Observation, server_info};
@@ -35,6 +37,8 @@ pub struct Arena {
     main: Range<u32>,
     scouts: Range<u32>,
     spare: Option<u32>,
+    /// Robots that an agent flies: one, or all of its world.
+    crew: usize,
 }
 
 impl Arena {
@@ -42,7 +46,10 @@ impl Arena {
     pub fn open(instance: &Instance, n_seeds: u32, needs_scouts: bool) -> Result<Self> {
         let unfit =
             |needs: &str| format!("instance {:?}: comparing needs {needs}", instance.name());
-        let n_worlds = server_info(instance)?.n_worlds;
+        let (n_worlds, team) = {
+            let info = server_info(instance)?;
+            (info.n_worlds, info.n_robots)
+        };
         let per_main = if needs_scouts { 2 } else { 1 };
         let n_main = (n_worlds / per_main).min(n_seeds).min(MAX_BATCH);
         let needs =
@@ -51,7 +58,7 @@ impl Arena {
         let used = n_main * per_main;
         let spare = (n_worlds > used).then_some(used);
         let claim = Claim {
-            worlds: 0..used + u32::from(spare.is_some()),
+            robots: 0..(used + u32::from(spare.is_some())) * team,
             takeover: false,
             // Simulating the prior may take long; closing the connection ends the lease all the same.
             time_to_live: Some(LEASE),
@@ -74,6 +81,7 @@ impl Arena {
             main: 0..n_main,
             scouts: n_main..used,
             spare,
+            crew: 1,
         })
     }
 
@@ -103,8 +111,24 @@ impl Arena {
         self.main.len()
     }
 
-    /// Starts the main worlds (and scouts) with these seeds; returns observations and hidden states
-    /// at k = 0.
+    /// Robots of each world.
+    pub fn n_robots(&self) -> usize {
+        self.info().n_robots as usize
+    }
+
+    /// From here on agents fly as members of such a team.
+    pub fn fly_as(&mut self, team: Team) {
+        self.crew = if team.is_joint() { self.n_robots() } else { 1 };
+        // One robot alone sees all that its team sees.
+        self.client.share_frames(team != Team::Alone);
+    }
+
+    /// Agents of each world.
+    pub fn n_agents(&self) -> usize {
+        self.n_robots() / self.crew
+    }
+
+    /// Starts the main worlds (and scouts) with these seeds; returns what their agents see at k = 0, world by world.
     pub fn reset(&mut self, seeds: &[u64]) -> Result<Vec<Seen>> {
         let orders = |first: u32| {
             seeds.iter().zip(first..).map(|(&seed, world)| WorldSeed {
@@ -119,23 +143,25 @@ impl Arena {
             let scouts: Vec<WorldSeed> = orders(self.scouts.start).collect();
             self.client.reset(&scouts)?;
         }
-        let observations = self.client.observe(self.range(&self.main, seeds))?;
-        Ok(seen(observations, truth))
+        let robots = self.robots(&self.range(&self.main, seeds));
+        let observations = self.client.observe(robots)?;
+        Ok(self.seen(observations, &truth))
     }
 
-    /// Flies a path in each main world; returns observations and hidden states at `step`.
+    /// Flies a path with each robot of the main worlds; returns what their agents see at `step`, world by world.
     pub fn step(&mut self, seeds: &[u64], paths: &[Vec<Move>], step: u64) -> Result<Vec<Seen>> {
         let worlds = self.range(&self.main, seeds);
-        let observations = self.client.step(worlds.clone(), paths)?;
+        let observations = self.client.step(self.robots(&worlds), paths)?;
         let truth = self.truth.states(worlds, seeds, step)?;
-        Ok(seen(observations, truth))
+        Ok(self.seen(observations, &truth))
     }
 
     /// The hidden states at `step` before the main worlds get there, from the scouts.
     pub fn foresee(&mut self, seeds: &[u64], step: u64) -> Result<Vec<Grid<u8>>> {
         let worlds = self.range(&self.scouts, seeds);
-        let paths = vec![self.any_path(); worlds.len()];
-        self.client.step(worlds.clone(), &paths)?;
+        let robots = self.robots(&worlds);
+        let paths = vec![self.any_path(); robots.len()];
+        self.client.step(robots, &paths)?;
         self.truth.states(worlds, seeds, step)
     }
 
@@ -152,23 +178,24 @@ impl Arena {
             world: spare,
             seed: Some(seed),
         }])?;
-        let path = [self.any_path()];
+        let robots = self.robots(&(spare..spare + 1));
+        let paths = vec![self.any_path(); robots.len()];
         for _ in 1..step {
-            self.client.step(spare..spare + 1, &path)?;
+            self.client.step(robots.clone(), &paths)?;
         }
-        let seen = self.client.step_full(spare..spare + 1, &path)?;
+        let seen = self.client.step_full(robots, &paths)?;
         Ok(seen
             .first()
             .map(|observation| observation.frame.values().to_owned()))
     }
 
-    /// A policy's agent for the world of a seed.
+    /// A policy's agent for the world of a seed; `number`: which of the world's agents.
     pub fn agent(
         &self,
         policy: &Policy,
         config: &AgentConfig,
         prior: &Belief,
-        seed: u64,
+        (seed, number): (u64, usize),
         learned: &Learned,
     ) -> Result<Agent> {
         let task = Task {
@@ -176,7 +203,7 @@ impl Arena {
             shape: self.shape(),
             n_moves: self.info().n_moves,
             prior,
-            seed: config.planner_seed(seed),
+            seed: robot_seed(config.planner_seed(seed), number),
             learned,
         };
         registry::agent(policy, config, task)
@@ -189,13 +216,19 @@ impl Arena {
     fn range(&self, worlds: &Range<u32>, seeds: &[u64]) -> Range<u32> {
         worlds.start..worlds.start + seeds.len() as u32
     }
-}
 
-fn seen(observations: Vec<Observation>, truths: Vec<Grid<u8>>) -> Vec<Seen> {
-    let both = observations.into_iter().zip(truths);
-    let seen = both.map(|(observation, truth)| Seen {
-        observation,
-        truth: Some(truth),
-    });
-    seen.collect()
+    fn robots(&self, worlds: &Range<u32>) -> Range<u32> {
+        let team = self.info().n_robots;
+        worlds.start * team..worlds.end * team
+    }
+
+    fn seen(&self, observations: Vec<Observation>, truths: &[Grid<u8>]) -> Vec<Seen> {
+        let mut observations = observations.into_iter();
+        let agents = truths.iter().flat_map(|truth| vec![truth; self.n_agents()]);
+        let seen = agents.map(|truth| Seen {
+            truth: Some(truth.clone()),
+            ..Seen::new(observations.by_ref().take(self.crew))
+        });
+        seen.collect()
+    }
 }

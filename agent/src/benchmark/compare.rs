@@ -2,20 +2,25 @@
 
 use crate::benchmark::arena::Arena;
 use crate::benchmark::report::{PolicyRun, Snapshot};
+use crate::benchmark::team::Team;
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
 use crate::estimation::first_belief::first_belief;
 use crate::learning::learned::Learned;
 use crate::planning::policy::{EstimatorKind, Policy};
 use crate::rollout::agent::Agent;
-use crate::rollout::{self, Robot, Seen, Turn};
-use crate::server::client::Observation;
+use crate::rollout::{self, Robot, Turn};
 use crate::server::feed::Feed;
-use anyhow::{Context, Result};
-use protocol::Grid;
+use anyhow::{Context, Result, ensure};
+use protocol::control::ServerInfo;
+use protocol::message::WorldResult;
 use protocol::path::fly;
+use protocol::{Grid, Model};
 use std::ops::Range;
 use std::time::Duration;
+
+/// The policy of the team that is told the true states.
+const ORACLE: &str = "oracle_beam";
 
 const SHOWS_TRUTH: &str = "invariant: an arena shows hidden states";
 
@@ -24,6 +29,8 @@ const SHOWS_TRUTH: &str = "invariant: an arena shows hidden states";
 pub struct Comparison {
     /// The policies, in the order of the table.
     pub policies: Vec<Policy>,
+    /// How the robots of a world act together, each with each policy.
+    pub teams: Vec<Team>,
     pub seeds: Range<u64>,
     /// Scored steps of each world.
     pub steps: u64,
@@ -35,17 +42,30 @@ pub struct Comparison {
 /// What came out.
 #[derive(Debug)]
 pub struct Results {
-    /// One run per policy and world, in the order of the policies.
+    /// One run per policy, team and world, in the order of the policies.
     pub runs: Vec<PolicyRun>,
     /// Cells in the state that pays most, per step, means over worlds: the same for all policies.
     pub fire_cells: Vec<f32>,
-    /// The end of the first world's run of the last policy with a belief of its own.
+    /// The end of the first world's run of the last policy with a belief of its own: of its first robot.
     pub snapshot: Option<Snapshot>,
 }
 
-/// One world's run of one policy.
-struct Run {
-    robot: Robot,
+/// One policy, and how the robots of a world act on it.
+#[derive(Debug, Clone, PartialEq)]
+struct Contestant {
+    policy: Policy,
+    team: Team,
+}
+
+/// One contestant's worlds.
+struct Runs {
+    /// The agents of each world, world by world.
+    robots: Vec<Robot>,
+    worlds: Vec<World>,
+}
+
+/// One world's run of one contestant.
+struct World {
     seed: u64,
     tally: Tally,
     snapshot: Option<Snapshot>,
@@ -59,6 +79,8 @@ struct Tally {
     reward: f64,
     n_visited: u64,
     n_hits: u64,
+    /// Distinct cells of each robot, all together.
+    n_visited_each: u64,
     n_fire: u64,
     planning: Duration,
     brier: f64,
@@ -79,43 +101,71 @@ pub fn compare(
         snapshot: None,
     };
     let mut feed = Feed::open(arena.instance(), &prior);
-    let n_moves = arena.info().n_moves;
-    let game = |policy, seeds| Match {
+    let contestants = comparison.contestants(arena.model());
+    let game = |contestant, seeds| Match {
         comparison,
-        policy,
+        contestant,
         prior: &prior,
         seeds,
     };
     // What does not fit is refused before hours of what does.
-    for policy in &comparison.policies {
-        let game = game(policy, &seeds[..1]);
-        let agent = game.agent(arena, seeds[0]);
-        agent.with_context(|| format!("policy {:?}", policy.name))?;
+    for contestant in &contestants {
+        let checked = game(contestant, &seeds[..1]).check(arena);
+        checked.with_context(|| format!("policy {:?}", contestant.policy.name))?;
     }
-    for policy in &comparison.policies {
+    for contestant in &contestants {
         for batch in seeds.chunks(arena.batch_size()) {
-            let game = game(policy, batch);
+            let game = game(contestant, batch);
             let runs = game.play(arena, &mut feed, progress);
-            let mut runs = runs.with_context(|| format!("policy {:?}", policy.name))?;
-            if *policy == comparison.policies[0] {
+            let mut worlds =
+                runs.with_context(|| format!("policy {:?}", contestant.policy.name))?;
+            if *contestant == contestants[0] {
                 let share = 1.0 / seeds.len() as f32;
-                results.add_fire(share, &runs);
+                results.add_fire(share, &worlds);
             }
             if batch[0] == comparison.seeds.start {
-                results.snapshot = runs[0].snapshot.take().or(results.snapshot);
+                results.snapshot = worlds[0].snapshot.take().or(results.snapshot);
             }
-            results
-                .runs
-                .extend(runs.into_iter().map(|run| run.into_policy_run(n_moves)));
+            let runs = worlds.into_iter();
+            let runs = runs.map(|world| contestant.policy_run(world, arena.info()));
+            results.runs.extend(runs);
         }
     }
     feed.end();
     Ok(results)
 }
 
+impl Comparison {
+    /// Pairs of a policy and a team that are compared.
+    pub fn n_contestants(&self) -> usize {
+        let n_policies = |team: &Team| match team {
+            Team::Oracle => 1,
+            _ => self.policies.len(),
+        };
+        self.teams.iter().map(n_policies).sum()
+    }
+
+    /// Each policy with each team, but the oracle once.
+    fn contestants(&self, model: &Model) -> Vec<Contestant> {
+        let of_team = |&team: &Team| {
+            let policies = match team {
+                Team::Oracle => {
+                    let oracle = Policy::named(ORACLE, model);
+                    vec![oracle.expect("invariant: every model has it")]
+                }
+                _ => self.policies.clone(),
+            };
+            policies
+                .into_iter()
+                .map(move |policy| Contestant { policy, team })
+        };
+        self.teams.iter().flat_map(of_team).collect()
+    }
+}
+
 impl Results {
-    fn add_fire(&mut self, share: f32, runs: &[Run]) {
-        for cells in runs.iter().map(|run| &run.tally.fire_cells) {
+    fn add_fire(&mut self, share: f32, worlds: &[World]) {
+        for cells in worlds.iter().map(|world| &world.tally.fire_cells) {
             self.fire_cells.resize(cells.len(), 0.0);
             let both = self.fire_cells.iter_mut().zip(cells);
             both.for_each(|(mean, cells)| *mean += share * cells);
@@ -123,122 +173,162 @@ impl Results {
     }
 }
 
-/// One policy on one batch of worlds.
+/// One contestant on one batch of worlds.
 struct Match<'a> {
     comparison: &'a Comparison,
-    policy: &'a Policy,
+    contestant: &'a Contestant,
     prior: &'a Belief,
     seeds: &'a [u64],
 }
 
 impl Match<'_> {
+    /// Refuses a contestant that cannot act.
+    fn check(&self, arena: &Arena) -> Result<()> {
+        let Contestant { policy, team } = self.contestant;
+        ensure!(
+            !(policy.is_decided && team.is_joint() && arena.n_robots() > 1),
+            "it decides for one robot: expected --team alone or shared, got {}",
+            team.label()
+        );
+        self.agent(arena, (self.seeds[0], 0)).map(drop)
+    }
+
     fn play(
         &self,
         arena: &mut Arena,
         feed: &mut Feed,
         progress: &dyn Fn(&str, u64),
-    ) -> Result<Vec<Run>> {
+    ) -> Result<Vec<World>> {
+        arena.fly_as(self.contestant.team);
         let mut runs = self.start(arena)?;
         for step in 0..self.comparison.steps {
             self.step(arena, feed, &mut runs, step)?;
-            progress(&self.policy.name, runs.len() as u64);
+            progress(&self.contestant.policy.name, runs.worlds.len() as u64);
         }
-        Ok(runs)
+        Ok(runs.worlds)
     }
 
-    fn start(&self, arena: &mut Arena) -> Result<Vec<Run>> {
-        let worlds = arena.reset(self.seeds)?;
-        let worlds = self.seeds.iter().zip(worlds);
-        let run = |(&seed, seen): (&u64, Seen)| {
-            Ok(Run {
-                robot: Robot::at(self.agent(arena, seed)?, seen)?,
-                seed,
-                tally: Tally::default(),
-                snapshot: None,
-            })
+    fn start(&self, arena: &mut Arena) -> Result<Runs> {
+        let n_agents = arena.n_agents();
+        let agents = self.seeds.iter();
+        let agents = agents.flat_map(|&seed| (0..n_agents).map(move |number| (seed, number)));
+        let seen = arena.reset(self.seeds)?;
+        let robot = |(agent, seen)| Robot::at(self.agent(arena, agent)?, seen);
+        let world = |&seed: &u64| World {
+            seed,
+            tally: Tally::default(),
+            snapshot: None,
         };
-        worlds.map(run).collect()
+        Ok(Runs {
+            robots: agents.zip(seen).map(robot).collect::<Result<_>>()?,
+            worlds: self.seeds.iter().map(world).collect(),
+        })
     }
 
-    fn step(&self, arena: &mut Arena, feed: &mut Feed, runs: &mut [Run], step: u64) -> Result<()> {
-        if self.policy.estimator == EstimatorKind::NextTruth {
+    fn step(&self, arena: &mut Arena, feed: &mut Feed, runs: &mut Runs, step: u64) -> Result<()> {
+        let Runs { robots, worlds } = runs;
+        let n_agents = arena.n_agents();
+        if self.contestant.policy.estimator == EstimatorKind::NextTruth {
             let next = arena.foresee(self.seeds, step + 1)?;
-            for (run, next) in runs.iter_mut().zip(&next) {
-                run.robot.agent.foresee(next)?;
+            for (robots, next) in robots.chunks_mut(n_agents).zip(&next) {
+                for robot in robots {
+                    robot.agent.foresee(next)?;
+                }
             }
         }
         let is_last = step + 1 == self.comparison.steps;
         let target = arena.model().target_state();
-        let (first_world, shown) = (arena.worlds().start, feed.turn(runs.len()));
+        let (first_world, shown) = (arena.worlds().start, feed.turn(robots.len()));
+        let crew = arena.n_robots() / n_agents;
         rollout::step(
-            runs,
-            |run| &mut run.robot,
-            |run| run.robot.plan(),
+            robots,
+            |robot| robot,
+            Robot::plan,
             |paths| arena.step(self.seeds, paths, step + 1),
-            |index, run, turn| {
-                run.look(turn, target, is_last);
+            |index, robot, turn| {
+                let world = &mut worlds[index / n_agents];
+                world.look(robot, turn, target, (index % n_agents == 0, is_last));
                 if shown.contains(&index) {
-                    feed.show(&run.robot.view(first_world + index as u32));
+                    let (world, robots) = (index / n_agents, index * crew);
+                    let first = first_world as usize * n_agents * crew;
+                    let view = robot.view(first_world + world as u32, (first + robots) as u32);
+                    feed.show(&view);
                 }
                 Ok(())
             },
         )
     }
 
-    fn agent(&self, arena: &Arena, seed: u64) -> Result<Agent> {
+    fn agent(&self, arena: &Arena, agent: (u64, usize)) -> Result<Agent> {
         let Comparison {
             config, learned, ..
         } = self.comparison;
-        arena.agent(self.policy, config, self.prior, seed, learned)
+        arena.agent(&self.contestant.policy, config, self.prior, agent, learned)
     }
 }
 
-impl Run {
-    fn look(&mut self, turn: Turn, target: usize, is_last: bool) {
-        let agent = &self.robot.agent;
+impl World {
+    fn look(
+        &mut self,
+        robot: &Robot,
+        turn: Turn,
+        target: usize,
+        (is_first, is_last): (bool, bool),
+    ) {
+        self.tally.planning += robot.planning();
+        let n_visited = robot.results().map(|it| u64::from(it.n_visited));
+        self.tally.n_visited_each += n_visited.sum::<u64>();
+        if !is_first {
+            return;
+        }
+        let agent = &robot.agent;
         let truth = turn.truth.as_ref().expect(SHOWS_TRUTH);
         let brier = brier_score(agent.belief(), truth, target, agent.target(target));
-        let is_known = agent.policy().estimator.knows_model();
-        self.tally.planning += self.robot.planning();
-        self.tally.add(self.robot.observation(), brier);
-        if is_last && is_known {
-            self.snapshot = Some(self.snapshot(turn));
+        self.tally.add(&robot.observation().world, brier);
+        if is_last && agent.policy().estimator.knows_model() {
+            self.snapshot = Some(self.snapshot(robot, turn));
         }
     }
 
-    fn snapshot(&self, turn: Turn) -> Snapshot {
-        let (agent, observation) = (&self.robot.agent, self.robot.observation());
-        let (shape, start) = (agent.belief().shape(), turn.before.robot());
-        let moves = &turn.plan.moves;
+    fn snapshot(&self, robot: &Robot, turn: Turn) -> Snapshot {
+        let (agent, observation) = (&robot.agent, robot.observation());
+        let (shape, start) = (agent.belief().shape(), turn.before.cell());
+        let moves = &turn.plans[0].moves;
         let mut path_cells = vec![start];
         path_cells.extend((1..=moves.len()).map(|n| fly(shape, start, &moves[..n]).end));
         Snapshot {
             seed: self.seed,
-            step: observation.result.step,
+            step: observation.world.step,
             truth: turn.truth.expect(SHOWS_TRUTH),
             frame: observation.frame.clone(),
             path_cells,
             belief: agent.belief().clone(),
         }
     }
+}
 
-    fn into_policy_run(self, moves: usize) -> PolicyRun {
-        let (tally, policy) = (self.tally, self.robot.agent.policy());
+impl Contestant {
+    fn policy_run(&self, world: World, info: &ServerInfo) -> PolicyRun {
+        let (tally, policy) = (world.tally, &self.policy);
         let steps = tally.rewards.len() as u64;
         let mean = |sum: f64| sum / steps.max(1) as f64;
-        let hit_rate = tally.n_hits as f64 / tally.n_visited.max(1) as f64;
+        let share = |n: u64, of: u64| n as f64 / of.max(1) as f64;
+        let n_repeated = tally.n_visited_each - tally.n_visited;
         PolicyRun {
             policy: policy.name.clone(),
             estimator: policy.estimator.label().into(),
-            world_seed: self.seed,
+            world_seed: world.seed,
             steps,
             mean_reward: mean(tally.reward),
             mean_distinct_cells: mean(tally.n_visited as f64),
-            hit_rate,
+            hit_rate: share(tally.n_hits, tally.n_visited),
             mean_fire_cells: mean(tally.n_fire as f64),
             mean_plan_millis: mean(tally.planning.as_secs_f64() * 1e3),
             brier: (policy.estimator != EstimatorKind::None).then(|| mean(tally.brier)),
-            moves,
+            moves: info.n_moves,
+            robots: info.n_robots,
+            team: self.team.label().into(),
+            mean_repeated: share(n_repeated, tally.n_visited_each),
             is_added: false,
             rewards: tally.rewards,
         }
@@ -246,8 +336,7 @@ impl Run {
 }
 
 impl Tally {
-    fn add(&mut self, observation: &Observation, brier: f64) {
-        let result = &observation.result;
+    fn add(&mut self, result: &WorldResult, brier: f64) {
         self.rewards.push(result.reward as f32);
         self.fire_cells.push(result.n_target_cells as f32);
         self.reward += result.reward;

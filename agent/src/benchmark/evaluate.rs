@@ -95,7 +95,7 @@ impl Examinee {
     ) -> Result<Self> {
         let model = arena.model();
         let (config, learned) = (examination.config, examination.learned);
-        let agent = |policy: &Policy| arena.agent(policy, config, prior, seed, learned);
+        let agent = |policy: &Policy| arena.agent(policy, config, prior, (seed, 0), learned);
         let guide = Policy::named(examination.guide, model)?;
         let estimators = examination.policies.iter().map(agent);
         let mut examinee = Self {

@@ -4,3 +4,4 @@ pub mod arena;
 pub mod compare;
 pub mod evaluate;
 pub mod report;
+pub mod team;

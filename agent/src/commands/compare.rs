@@ -7,10 +7,11 @@ use agent::benchmark::arena::Arena;
 use agent::benchmark::compare::{Comparison, Results, compare};
 use agent::benchmark::report::added::{check_settings, check_worlds, read_csv};
 use agent::benchmark::report::{
-    PolicyRun, Snapshot, draw_ladder, draw_rewards, draw_snapshot, figures::FIRE_CELLS_PER_STEP,
+    PolicyRun, draw_ladder, draw_rewards, draw_snapshot, draw_teams, figures::FIRE_CELLS_PER_STEP,
     render_table, write_csv, write_events,
 };
-use agent::config::AgentFlags;
+use agent::benchmark::team::Team;
+use agent::config::{AgentConfig, AgentFlags};
 use agent::learning::learned::Learned;
 use agent::planning::policy::{EstimatorKind, OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, Policy};
 use agent::server::launch::OwnDashboard;
@@ -19,18 +20,28 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use network::DeviceKind;
 use protocol::Model;
+use protocol::channels::MAX_ROBOTS;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+
+/// The policy of teams, unless others are named.
+const OF_TEAMS: &str = "beam_exploit";
 
 /// Compare policies on the same worlds.
 #[derive(Args)]
 pub struct CompareCommand {
-    /// The policies, separated by commas [default: the ladder]
+    /// The policies, separated by commas [default: the ladder; of teams: beam_exploit]
     #[arg(long, value_delimiter = ',')]
     policies: Vec<String>,
-    /// The policy that others are paired against
-    #[arg(long, default_value = "shooting_exploit")]
-    baseline: String,
+    /// The policy that others are paired against [default: shooting_exploit; of teams: the first policy]
+    #[arg(long)]
+    baseline: Option<String>,
+    /// Robots of each world, separated by commas, each on worlds of its own [default: 1, or the running server's]
+    #[arg(long, value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=MAX_ROBOTS as i64))]
+    robots: Vec<u32>,
+    /// How the robots of a world act together, separated by commas
+    #[arg(long, value_delimiter = ',', default_value = "alone")]
+    team: Vec<Team>,
     /// What `train` learned: a filter adds `learned_*` to the ladder, an autoencoder `autoencoder_*`,
     /// decisions `dqn_beam`; may be
     /// given for each
@@ -46,7 +57,7 @@ pub struct CompareCommand {
     /// given for each
     #[arg(long, value_name = "FILE")]
     add: Vec<PathBuf>,
-    /// Draw ladder and rewards as .png and .svg, and snapshot.png, into this directory
+    /// Draw ladder, rewards and teams as .png and .svg, and snapshot.png, into this directory
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
     /// Show it in a browser while it runs, at this address
@@ -68,65 +79,61 @@ impl CompareCommand {
         self.make_places()?;
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
         let learned = Learned::read(checkpoints, &self.device.open()?)?;
-        let mut worlds = self.worlds.open(self.needs_scouts(), |model| {
-            self.policies(model, &learned).map(|_| ())
-        })?;
-        let arena = &mut worlds.arena;
-        let dashboard = self
-            .watch
-            .map(|address| OwnDashboard::start(arena.instance(), address))
-            .transpose()?;
-        if let Some(dashboard) = &dashboard {
-            tracing::info!("watch at {}", dashboard.url());
-        }
-        let comparison = Comparison {
-            policies: self.policies(arena.model(), &learned)?,
-            seeds: self.worlds.seeds.clone(),
-            steps: self.worlds.steps,
-            config,
-            learned,
+        let numbers: Vec<Option<u32>> = match self.robots.as_slice() {
+            [] => vec![None],
+            robots => robots.iter().copied().map(Some).collect(),
         };
-        let added = self.read_added(&comparison, arena.info().n_moves)?;
-        let results = run_comparison(arena, &comparison)?;
-        let fits = check_worlds(&added, &results.runs);
+        let (mut report, mut added) = (Report::default(), None);
+        for n_robots in numbers {
+            let mut worlds = self.worlds.open(self.needs_scouts(), n_robots, |model| {
+                self.policies(model, &learned).map(|_| ())
+            })?;
+            let arena = &mut worlds.arena;
+            let dashboard = self
+                .watch
+                .map(|address| OwnDashboard::start(arena.instance(), address))
+                .transpose()?;
+            if let Some(dashboard) = &dashboard {
+                tracing::info!("watch at {}", dashboard.url());
+            }
+            let comparison = Comparison {
+                policies: self.policies(arena.model(), &learned)?,
+                teams: self.team.clone(),
+                seeds: self.worlds.seeds.clone(),
+                steps: self.worlds.steps,
+                config: config.clone(),
+                learned: learned.clone(),
+            };
+            if added.is_none() {
+                added = Some(self.read_added(&comparison, arena.info().n_moves)?);
+            }
+            let results = run_comparison(arena, &comparison)?;
+            if let Some(directory) = &self.figures {
+                draw_step(directory, arena, &results)?;
+            }
+            report.add(axis_label(arena.model()), results);
+        }
+        self.tell(&report, added.unwrap_or_default(), &config)
+    }
+
+    /// Writes table and files.
+    fn tell(&self, report: &Report, added: Vec<PolicyRun>, config: &AgentConfig) -> Result<()> {
+        let fits = check_worlds(&added, &report.runs);
         // What was measured is kept in any case.
         let added = if fits.is_ok() { added } else { Vec::new() };
-        let all = [&*results.runs, &*added].concat();
-        write(&render_table(&all, &self.baseline))?;
+        let all = [&*report.runs, &*added].concat();
+        write(&render_table(&all, self.baseline()))?;
         if let Some(path) = &self.csv {
             write_csv(path, &all)?;
         }
         fits?;
         if let Some(directory) = &self.tensorboard {
-            write_events(directory, &results.runs)?;
+            write_events(directory, &report.runs)?;
         }
-        if let Some(directory) = &self.figures {
-            self.draw(directory, arena, &comparison, (&results, &all))?;
+        match &self.figures {
+            Some(directory) => draw(directory, report, &all, config),
+            None => Ok(()),
         }
-        Ok(())
-    }
-
-    fn draw(
-        &self,
-        directory: &Path,
-        arena: &mut Arena,
-        comparison: &Comparison,
-        (results, all): (&Results, &[PolicyRun]),
-    ) -> Result<()> {
-        let label = axis_label(arena.model());
-        for kind in ["png", "svg"] {
-            let path = |name: &str| directory.join(name).with_extension(kind);
-            draw_ladder(&path("ladder"), all, &label)?;
-            let fire_cells = Some(&*results.fire_cells);
-            draw_rewards(&path("rewards"), &results.runs, &label, fire_cells)?;
-        }
-        match &results.snapshot {
-            Some(snapshot) => draw_step(&directory.join("snapshot.png"), arena, snapshot)?,
-            None => tracing::warn!("no snapshot: no policy among these has a belief of its own"),
-        }
-        let settings = toml::to_string(&comparison.config)?;
-        let path = directory.join("agent.toml");
-        std::fs::write(&path, settings).with_context(|| format!("write {}", path.display()))
     }
 
     fn read_added(&self, comparison: &Comparison, n_moves: usize) -> Result<Vec<PolicyRun>> {
@@ -160,6 +167,7 @@ impl CompareCommand {
     fn policies(&self, model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
         let named = |name: &String| Policy::named(name, model);
         let policies = match self.policies.as_slice() {
+            [] if self.has_teams() => vec![named(&OF_TEAMS.to_owned())?],
             [] => ladder(model, learned),
             names => names.iter().map(named).collect::<Result<_, _>>()?,
         };
@@ -172,7 +180,7 @@ impl CompareCommand {
             "policies: expected each name once, got {:?} twice",
             twice.map_or("", |(_, policy)| &policy.name)
         );
-        named(&self.baseline).context("--baseline")?;
+        named(&self.baseline().to_owned()).context("--baseline")?;
         for policy in &policies {
             let kind = match policy.estimator {
                 EstimatorKind::Learned | EstimatorKind::LearnedSpatial
@@ -191,13 +199,61 @@ impl CompareCommand {
         Ok(policies)
     }
 
-    fn needs_scouts(&self) -> bool {
-        self.policies.is_empty()
-            || self
-                .policies
-                .iter()
-                .any(|name| name.starts_with("clairvoyant"))
+    /// Whether there is more to compare than policies of a robot alone in its world.
+    fn has_teams(&self) -> bool {
+        self.robots.iter().any(|&robots| robots > 1) || self.team != [Team::Alone]
     }
+
+    fn baseline(&self) -> &str {
+        match (&self.baseline, self.has_teams()) {
+            (Some(name), _) => name,
+            (None, true) => self.policies.first().map_or(OF_TEAMS, String::as_str),
+            (None, false) => "shooting_exploit",
+        }
+    }
+
+    fn needs_scouts(&self) -> bool {
+        let is_clairvoyant = |name: &String| name.starts_with("clairvoyant");
+        match self.policies.as_slice() {
+            [] => !self.has_teams(),
+            names => names.iter().any(is_clairvoyant),
+        }
+    }
+}
+
+/// What came out, for all numbers of robots.
+#[derive(Default)]
+struct Report {
+    runs: Vec<PolicyRun>,
+    /// The same for all numbers of robots.
+    fire_cells: Vec<f32>,
+    axis_label: String,
+}
+
+impl Report {
+    fn add(&mut self, axis_label: String, results: Results) {
+        self.runs.extend(results.runs);
+        self.fire_cells = results.fire_cells;
+        self.axis_label = axis_label;
+    }
+}
+
+fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConfig) -> Result<()> {
+    let label = &*report.axis_label;
+    for kind in ["png", "svg"] {
+        let path = |name: &str| directory.join(name).with_extension(kind);
+        draw_ladder(&path("ladder"), all, label)?;
+        draw_rewards(
+            &path("rewards"),
+            &report.runs,
+            label,
+            Some(&report.fire_cells),
+        )?;
+        draw_teams(&path("teams"), all, label)?;
+    }
+    let settings = toml::to_string(config)?;
+    let path = directory.join("agent.toml");
+    std::fs::write(&path, settings).with_context(|| format!("write {}", path.display()))
 }
 
 /// The ladder, with the policies on learned beliefs beside those on the known model.
@@ -227,7 +283,7 @@ fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
 /// Runs a comparison with a bar that shows how far it is.
 pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Result<Results> {
     let n_seeds = comparison.seeds.end - comparison.seeds.start;
-    let n_steps = comparison.policies.len() as u64 * n_seeds * comparison.steps;
+    let n_steps = comparison.n_contestants() as u64 * n_seeds * comparison.steps;
     let bar = progress_bar(n_steps);
     let results = compare(arena, comparison, &|policy, steps| {
         if bar.message() != policy {
@@ -242,14 +298,23 @@ pub(super) fn run_comparison(arena: &mut Arena, comparison: &Comparison) -> Resu
     results
 }
 
-fn draw_step(path: &Path, arena: &mut Arena, snapshot: &Snapshot) -> Result<()> {
+/// Draws a step of one robot's world; of several robots none is drawn.
+fn draw_step(directory: &Path, arena: &mut Arena, results: &Results) -> Result<()> {
+    if arena.n_robots() > 1 {
+        return Ok(());
+    }
+    let Some(snapshot) = &results.snapshot else {
+        tracing::warn!("no snapshot: no policy among these has a belief of its own");
+        return Ok(());
+    };
     let Some(observation) = arena.full_observation(snapshot.seed, snapshot.step)? else {
         tracing::warn!(
             "no snapshot: it needs one world more than the seeds and a server with --coverage client"
         );
         return Ok(());
     };
-    draw_snapshot(path, arena.model(), snapshot, &observation)
+    let path = directory.join("snapshot.png");
+    draw_snapshot(&path, arena.model(), snapshot, &observation)
 }
 
 fn axis_label(model: &Model) -> String {

@@ -7,6 +7,7 @@ use agent::benchmark::arena::Arena;
 use agent::benchmark::compare::Comparison;
 use agent::benchmark::evaluate::{Examination, Marks, examine, score_of_frequencies};
 use agent::benchmark::report::{render_table, statistics::Estimate, write_csv};
+use agent::benchmark::team::Team;
 use agent::config::{AgentConfig, AgentFlags};
 use agent::estimation::scoring::Score;
 use agent::learning::learned::Learned;
@@ -60,7 +61,7 @@ impl EvaluateCommand {
         }
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
         let learned = Learned::read(checkpoints, &self.device.open()?)?;
-        let mut worlds = self.worlds.open(false, |_| Ok(()))?;
+        let mut worlds = self.worlds.open(false, Some(1), |_| Ok(()))?;
         let arena = &mut worlds.arena;
         let policies = examined(&learned).into_iter();
         let policies = policies.map(|name| Policy::named(name, arena.model()));
@@ -97,6 +98,7 @@ impl EvaluateCommand {
         let named = |name| Policy::named(name, arena.model());
         let comparison = Comparison {
             policies: names.into_iter().map(named).collect::<Result<_, _>>()?,
+            teams: vec![Team::Alone],
             seeds: self.worlds.seeds.clone(),
             steps: self.worlds.steps,
             config,

@@ -1,6 +1,6 @@
 //! `run`: act on one world of a running server.
 
-use super::shared::{WaitFlag, model_named};
+use super::shared::{WaitFlag, model_named, parse_range};
 use agent::acting::run::{Mission, run};
 use agent::config::AgentFlags;
 use agent::learning::learned::Learned;
@@ -9,6 +9,7 @@ use clap::Args;
 use network::DeviceKind;
 use protocol::channels::Instance;
 use protocol::program::stop_on_signals;
+use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
 
@@ -23,13 +24,25 @@ pub struct RunCommand {
     /// The world to act on
     #[arg(long, default_value_t = 0)]
     world: u32,
+    /// The robot of that world to fly
+    #[arg(long, default_value_t = 0, conflicts_with = "robots")]
+    robot: u32,
+    /// Several robots of that world to fly, FIRST..END: needs --team
+    #[arg(long, value_name = "FIRST..END", value_parser = parse_range::<u32>, requires = "team")]
+    robots: Option<Range<u32>>,
+    /// Fly these robots by one plan, on one belief of what all robots of the world see
+    #[arg(long, requires = "robots")]
+    team: bool,
+    /// See what all robots of the world see, whoever flies them
+    #[arg(long)]
+    share: bool,
     /// The policy
     #[arg(long, default_value = "beam_exploit")]
     policy: String,
     /// Steps to act for; 0: until stopped
     #[arg(long, default_value_t = 0)]
     steps: u64,
-    /// Take the world from its holder
+    /// Take the robot from its holder
     #[arg(long)]
     takeover: bool,
     /// A built-in model or a model file, where the server does not reveal its model
@@ -52,6 +65,11 @@ impl RunCommand {
         let mission = Mission {
             instance: Instance::new(&self.instance)?,
             world: self.world,
+            robots: self
+                .robots
+                .clone()
+                .unwrap_or(self.robot..self.robot.saturating_add(1)),
+            shares_frames: self.share,
             policy: self.policy.clone(),
             steps: self.steps,
             takeover: self.takeover,

@@ -7,7 +7,9 @@ use protocol::Model;
 use protocol::channels::Instance;
 use protocol::program::read_text;
 use std::io::Write;
+use std::ops::Range;
 use std::path::Path;
+use std::str::FromStr;
 use std::time::Duration;
 
 /// How long to wait for a server.
@@ -29,6 +31,18 @@ pub fn parse_seconds(text: &str) -> Result<Duration, String> {
     let seconds: f64 = text.parse().map_err(|_| "expected seconds, such as 60")?;
     let limit = Duration::try_from_secs_f64(seconds);
     limit.map_err(|error| format!("expected seconds, such as 60: {error}"))
+}
+
+/// Consecutive numbers, at least one.
+pub fn parse_range<T: FromStr + PartialOrd>(text: &str) -> Result<Range<T>, String> {
+    let parsed = text
+        .split_once("..")
+        .and_then(|(first, end)| Some(first.parse().ok()?..end.parse().ok()?));
+    let range: Range<T> = parsed.ok_or("expected FIRST..END, such as 0..8")?;
+    match range.is_empty() {
+        true => Err("expected FIRST below END".into()),
+        false => Ok(range),
+    }
 }
 
 /// A built-in model, or that of a file.

@@ -1,6 +1,6 @@
 //! The worlds that policies meet: a running server's, or a private one's.
 
-use super::shared::{WaitFlag, model_named};
+use super::shared::{WaitFlag, model_named, parse_range};
 use agent::benchmark::arena::{Arena, MAX_BATCH};
 use agent::server::launch::OwnServer;
 use anyhow::{Result, ensure};
@@ -67,7 +67,14 @@ pub struct Worlds {
 
 impl WorldFlags {
     /// Attaches to the server or starts one. `check` refuses what cannot be right before that.
-    pub fn open(&self, needs_scouts: bool, check: impl Fn(&Model) -> Result<()>) -> Result<Worlds> {
+    ///
+    /// `n_robots`: robots of each world; `None`: one, or the running server's.
+    pub fn open(
+        &self,
+        needs_scouts: bool,
+        n_robots: Option<u32>,
+        check: impl Fn(&Model) -> Result<()>,
+    ) -> Result<Worlds> {
         let (instance, own) = match &self.instance {
             Some(name) => {
                 let instance = Instance::new(name)?;
@@ -76,7 +83,8 @@ impl WorldFlags {
             }
             None => {
                 check(&self.grid.check()?)?;
-                let arguments = self.server_arguments(needs_scouts);
+                let mut arguments = self.server_arguments(needs_scouts);
+                arguments.extend(["--robots".into(), n_robots.unwrap_or(1).to_string()]);
                 let server = OwnServer::start(self.server.clone(), &arguments)?;
                 (server.instance().clone(), Some(server))
             }
@@ -87,6 +95,12 @@ impl WorldFlags {
         ensure!(
             asked == got,
             "--burn-in: expected the running server's {got}, got {asked}"
+        );
+        let got = arena.info().n_robots;
+        let asked = n_robots.unwrap_or(got);
+        ensure!(
+            asked == got,
+            "--robots: expected the running server's {got}, got {asked}"
         );
         Ok(Worlds { arena, _own: own })
     }
@@ -134,12 +148,9 @@ impl GridFlags {
 }
 
 fn parse_seeds(text: &str) -> Result<Range<u64>, String> {
-    let parsed = text
-        .split_once("..")
-        .and_then(|(first, end)| Some(first.parse().ok()?..end.parse().ok()?));
-    let seeds: Range<u64> = parsed.ok_or("expected FIRST..END, such as 0..8")?;
-    if seeds.start < seeds.end && seeds.end - seeds.start <= MAX_SEEDS {
-        return Ok(seeds);
+    let seeds: Range<u64> = parse_range(text)?;
+    match seeds.end - seeds.start {
+        1..=MAX_SEEDS => Ok(seeds),
+        _ => Err(format!("expected 1 to {MAX_SEEDS} seeds")),
     }
-    Err(format!("expected 1 to {MAX_SEEDS} seeds, FIRST below END"))
 }

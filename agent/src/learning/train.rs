@@ -1,7 +1,7 @@
 //! Learns while acting: attach, fly, correct, learn, predict, save.
 //!
 //! The learner is told the grid, the number of observations and each path's reward and frame; the
-//! model that a server may reveal is read only where decisions are learned. One message steps all worlds.
+//! model that a server may reveal is read only where decisions are learned. One message steps all robots.
 //! What is learned, and how it acts meanwhile, is a [`Student`]'s.
 
 mod events;
@@ -17,7 +17,7 @@ use crate::learning::checkpoint::{self, Contents};
 use crate::learning::metrics::{FROZEN, METRICS, Metrics, Tick};
 use crate::learning::student::Student;
 use crate::rollout::Robot;
-use crate::server::client::{Claim, Client, Observation};
+use crate::server::client::{Claim, Client, Observation, server_info};
 use crate::server::feed::Feed;
 use anyhow::{Result, bail};
 use protocol::Move;
@@ -77,7 +77,7 @@ pub fn train(
     Ok(trainer.summary)
 }
 
-/// A learner at its worlds.
+/// A learner and its robots.
 struct Trainer {
     client: Client,
     student: Box<dyn Student>,
@@ -104,8 +104,9 @@ impl Trainer {
         contents: Option<Contents>,
     ) -> Result<Self> {
         let place = training.out.join(CHECKPOINT);
+        let robots = training.robots(&server_info(instance)?)?;
         let claim = Claim {
-            worlds: training.worlds.clone(),
+            robots,
             takeover: training.takeover,
             time_to_live: Some(LEASE),
         };
@@ -116,19 +117,19 @@ impl Trainer {
         if training.freeze {
             student.freeze();
         }
-        let mut observations = client.observe(client.worlds())?;
-        for (world, seen) in client.worlds().zip(&mut observations) {
-            if is_over(seen) {
-                *seen = reset(&mut client, world)?;
+        let mut observations = client.observe(client.robots())?;
+        for world in ended(&client, &observations) {
+            for (robot, seen) in reset(&mut client, world)? {
+                observations[(robot - client.robots().start) as usize] = seen;
             }
         }
         let attached = student.attach(observations);
         let n_gone_on = attached.map_err(|problem| training.stopped(problem, &*student))?;
-        let n_new = training.worlds.len() - n_gone_on;
+        let n_new = client.robots().len() - n_gone_on;
         if training.resume && n_new > 0 {
-            let worlds = n_new;
+            let robots = n_new;
             tracing::info!(
-                worlds,
+                robots,
                 "not where the checkpoint left them: beliefs begin again"
             );
         }
@@ -175,7 +176,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// One step of each world; worlds at the end of their episodes begin again.
+    /// One step of each robot; worlds at the end of their episodes begin again.
     fn step(&mut self) -> Result<Tick> {
         let Self {
             client,
@@ -183,32 +184,33 @@ impl Trainer {
             feed,
             ..
         } = self;
-        let (worlds, wants_full) = (client.worlds(), student.wants_full_frames());
+        let (robots, wants_full) = (client.robots(), student.wants_full_frames());
         let shown = feed
             .as_ref()
-            .map_or_else(Vec::new, |feed| feed.turn(worlds.len()));
-        let (policy, mut ended) = (format!("train {}", student.kind()), Vec::new());
+            .map_or_else(Vec::new, |feed| feed.turn(robots.len()));
+        let policy = format!("train {}", student.kind());
+        let (team, mut over) = (client.info().n_robots, Vec::new());
         let mut fly = |paths: &[Vec<Move>]| {
             let observations = match wants_full {
-                true => client.step_full(worlds.clone(), paths)?,
-                false => client.step(worlds.clone(), paths)?,
+                true => client.step_full(robots.clone(), paths)?,
+                false => client.step(robots.clone(), paths)?,
             };
-            let over = worlds.clone().zip(&observations);
-            let over = over.filter(|(_, seen)| is_over(seen));
-            ended.extend(over.map(|(world, _)| world));
+            over = ended(client, &observations);
             Ok(observations)
         };
         let mut look = |index: usize, robot: &Robot| {
             if let Some(feed) = feed.as_mut().filter(|_| shown.contains(&index)) {
-                let mut view = robot.view(worlds.start + index as u32);
+                let number = robots.start + index as u32;
+                let mut view = robot.view(number / team, number);
                 view.intent.policy.clone_from(&policy);
                 feed.show(&view);
             }
         };
         let tick = student.step(&mut fly, &mut look)?;
-        for world in ended {
-            let observation = reset(client, world)?;
-            student.begin(world, observation)?;
+        for world in over {
+            for (robot, observation) in reset(client, world)? {
+                student.begin(robot, observation)?;
+            }
         }
         self.summary.steps += tick.n_worlds;
         self.summary.reward += tick.reward;
@@ -259,12 +261,29 @@ impl Told {
 }
 
 fn is_over(seen: &Observation) -> bool {
-    seen.result.truncated != 0 || seen.result.terminated != 0
+    seen.world.truncated != 0 || seen.world.terminated != 0
 }
 
-fn reset(client: &mut Client, world: u32) -> Result<Observation, ConnectionError> {
+/// The worlds whose episodes have ended, by what the client's robots show.
+fn ended(client: &Client, observations: &[Observation]) -> Vec<u32> {
+    let robots = client.robots().zip(observations);
+    let over = robots.filter(|(_, seen)| is_over(seen));
+    let mut worlds: Vec<u32> = over
+        .map(|(robot, _)| robot / client.info().n_robots)
+        .collect();
+    worlds.dedup();
+    worlds
+}
+
+/// Starts a world's next episode; returns what each of its robots shows.
+fn reset(
+    client: &mut Client,
+    world: u32,
+) -> Result<impl Iterator<Item = (u32, Observation)> + use<>, ConnectionError> {
     client.reset(&[WorldSeed { world, seed: None }])?;
-    Ok(client.observe(world..world + 1)?.remove(0))
+    let team = client.info().n_robots;
+    let robots = world * team..(world + 1) * team;
+    Ok(robots.clone().zip(client.observe(robots)?))
 }
 
 /// The file of metrics: a run without learning has one of its own.

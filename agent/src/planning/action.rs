@@ -4,7 +4,8 @@
 use crate::estimation::belief::{Belief, EntropyKind};
 use crate::estimation::summary::{N_BLOCKS, block};
 use crate::planning::objective::{BEAM_BONUS, CellValues, Objective, Target};
-use crate::planning::planner::{Plan, Planner, PlanningProblem};
+use crate::planning::planner::{Plan, Planner};
+use crate::planning::team::{ROUNDS, plan_team};
 use protocol::{Cell, Grid, Model, Shape};
 
 /// Rise in a cell's value per cell nearer to an action's region. A straight flight of T = 12 moves gains
@@ -69,27 +70,22 @@ impl Action {
         values
     }
 
-    /// The path that a planner finds for this action, `n_moves` long; its score is that of the whole horizon.
-    /// `seed` and `step` are those of the planner's random numbers.
+    /// The paths that a planner finds for this action, one for each start, `n_moves` long; scores are those of the whole
+    /// horizon. `random`: seed and step of the planner's random numbers.
     pub fn plan(
         &self,
         planner: &mut dyn Planner,
         belief: &Belief,
-        start: Cell,
+        starts: &[Cell],
         n_moves: usize,
-        (seed, step): (u64, u64),
-    ) -> Plan {
-        let values = self.values(belief);
-        let problem = PlanningProblem {
-            start,
-            n_moves: n_moves * self.horizon,
-            values: &values,
-            seed,
-            step,
-        };
-        let mut plan = planner.plan(&problem);
-        plan.moves.truncate(n_moves);
-        plan
+        random: (u64, u64),
+    ) -> Vec<Plan> {
+        let (values, n_ahead) = (self.values(belief), n_moves * self.horizon);
+        let mut plans = plan_team(planner, &values, starts, n_ahead, random, ROUNDS);
+        for plan in &mut plans {
+            plan.moves.truncate(n_moves);
+        }
+        plans
     }
 }
 
@@ -223,7 +219,7 @@ mod tests {
             let name = format!("exploit_at_{}_{}", region.row, region.col);
             let action = set.named(&name).expect("an action");
             let mut planner = crate::planning::BeamSearch::default();
-            let plan = action.plan(&mut planner, &belief, start, 16, (0, 0));
+            let plan = &action.plan(&mut planner, &belief, &[start], 16, (0, 0))[0];
             let end = protocol::path::fly(shape, start, &plan.moves).end;
             let left = region.distance(start, shape).saturating_sub(16);
             assert_eq!(region.distance(end, shape), left, "{name}: {end}");
@@ -239,7 +235,7 @@ mod tests {
         let action = set.named("exploit_ahead_3").expect("an action");
         let mut planner = crate::planning::BeamSearch::new(200);
         let start = Cell { row: 0, col: 0 };
-        let plan = action.plan(&mut planner, &belief, start, 4, (0, 0));
+        let plan = &action.plan(&mut planner, &belief, &[start], 4, (0, 0))[0];
         assert_eq!(plan.moves.len(), 4);
         let end = protocol::path::fly(shape(), start, &plan.moves).end;
         assert!(end.row > 1, "{end}");

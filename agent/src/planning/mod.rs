@@ -11,6 +11,7 @@ mod planner;
 pub mod policy;
 pub mod random_walk;
 pub mod shooting;
+pub mod team;
 mod window;
 
 pub use basis::{BasisKind, PlanBasis};

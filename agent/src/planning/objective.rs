@@ -115,6 +115,18 @@ impl CellValues {
         self.value.scaled_add(weight, layer);
     }
 
+    /// The same, with nothing left to gain at some cells, by their row-major indices, which may be named more than
+    /// once. Where each visit counts, a teammate's takes nothing away.
+    pub fn without(&self, taken: impl Iterator<Item = usize>) -> Self {
+        let mut left = self.clone();
+        if !left.revisits {
+            let value = left.value.as_slice_mut();
+            let value = value.expect("invariant: grids are row-major");
+            taken.for_each(|cell| value[cell] = -left.coverage_bonus);
+        }
+        left
+    }
+
     /// Added once for each distinct cell.
     pub fn coverage_bonus(&self) -> f32 {
         self.coverage_bonus

@@ -6,9 +6,8 @@ use crate::estimation::belief::{Belief, BeliefError};
 use crate::estimation::scoring::Score;
 use crate::planning::action::Action;
 use crate::planning::policy::{PlannerKind, Policy};
-use crate::planning::{
-    CellValues, Objective, Plan, PlanBasis, Planner, PlanningProblem, RandomWalk, Target,
-};
+use crate::planning::team::{ROUNDS, plan_team};
+use crate::planning::{Objective, Plan, PlanBasis, Planner, RandomWalk, Target};
 use anyhow::Result;
 use protocol::agent_belief::Intent;
 use protocol::{Cell, Frame, Grid};
@@ -44,7 +43,7 @@ pub(crate) enum Aim {
 
 /// Chooses what each path is for (paper eq. 17), given the estimator after its prediction.
 pub trait Decider: Send {
-    /// The choice for the robot's cell.
+    /// The choice for a robot's cell.
     fn decide(&self, estimator: &dyn Estimator, robot: Cell, n_moves: usize) -> Choice;
 }
 
@@ -109,52 +108,41 @@ impl Agent {
         self.target.unwrap_or(otherwise)
     }
 
-    /// The path for step k -> k + 1, from where the robot is (paper eq. 15).
-    pub fn plan(&mut self, robot: Cell, step: u64) -> Plan {
+    /// The paths for step k -> k + 1, from where the robots are (paper eq. 15). What is decided goes by the first.
+    pub fn plan(&mut self, robots: &[Cell], step: u64) -> Vec<Plan> {
         let estimator = &*self.estimator;
         let decided = self.decider.as_ref();
-        let decided = decided.map(|decider| decider.decide(estimator, robot, self.n_moves));
+        let decided = decided.map(|decider| decider.decide(estimator, robots[0], self.n_moves));
         let always = || self.policy.action.clone().map(Choice::Action);
         match decided.or_else(always) {
-            Some(Choice::Action(action)) => self.plan_action(&action, robot, step),
-            Some(Choice::Objective(objective)) => self.plan_for(objective, robot, step),
-            None => self.plan_for(self.objective, robot, step),
+            Some(Choice::Action(action)) => self.plan_action(&action, robots, step),
+            Some(Choice::Objective(objective)) => self.plan_for(objective, robots, step),
+            None => self.plan_for(self.objective, robots, step),
         }
     }
 
     /// As [`Self::plan`], for an action other than the policy's.
-    pub fn plan_action(&mut self, action: &Action, robot: Cell, step: u64) -> Plan {
+    pub fn plan_action(&mut self, action: &Action, robots: &[Cell], step: u64) -> Vec<Plan> {
         self.aim = Aim::Action(action.name.clone());
         let belief = self.basis.belief(self.estimator.belief());
         let random = (self.seed, step);
-        action.plan(&mut *self.planner, belief, robot, self.n_moves, random)
+        action.plan(&mut *self.planner, belief, robots, self.n_moves, random)
     }
 
     /// As [`Self::plan`], for an objective other than the policy's.
-    pub fn plan_for(&mut self, objective: Objective, robot: Cell, step: u64) -> Plan {
+    pub fn plan_for(&mut self, objective: Objective, robots: &[Cell], step: u64) -> Vec<Plan> {
         self.aim = Aim::Objective(objective.target);
-        let values: CellValues = objective.values(self.basis.belief(self.estimator.belief()));
-        let problem = PlanningProblem {
-            start: robot,
-            n_moves: self.n_moves,
-            values: &values,
-            seed: self.seed,
-            step,
-        };
-        self.planner.plan(&problem)
+        let values = objective.values(self.basis.belief(self.estimator.belief()));
+        let (planner, random) = (&mut *self.planner, (self.seed, step));
+        plan_team(planner, &values, robots, self.n_moves, random, ROUNDS)
     }
 
-    /// As [`Self::plan`], a path of random moves.
-    pub fn walk(&mut self, robot: Cell, step: u64) -> Plan {
+    /// As [`Self::plan`], paths of random moves.
+    pub fn walk(&mut self, robots: &[Cell], step: u64) -> Vec<Plan> {
         self.aim = Aim::Walk;
         let values = self.objective.values(self.estimator.belief());
-        RandomWalk.plan(&PlanningProblem {
-            start: robot,
-            n_moves: self.n_moves,
-            values: &values,
-            seed: self.seed,
-            step,
-        })
+        let (planner, random) = (&mut RandomWalk, (self.seed, step));
+        plan_team(planner, &values, robots, self.n_moves, random, ROUNDS)
     }
 
     /// How well the belief predicts a frame; `None` of an estimator that predicts none.

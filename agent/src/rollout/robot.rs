@@ -5,44 +5,64 @@
 use crate::estimation::scoring::Score;
 use crate::planning::Plan;
 use crate::rollout::agent::Agent;
-use crate::server::client::Observation;
+use crate::server::client::{Observation, cell};
 use crate::server::feed::View;
 use anyhow::Result;
+use protocol::message::RobotResult;
 use protocol::{Cell, Grid, Move};
 use rayon::prelude::*;
 use std::time::{Duration, Instant};
 
-/// An agent at its world.
+/// An agent at its world: it flies a robot there, or several on one belief.
 pub struct Robot {
     pub agent: Agent,
     observation: Observation,
+    others: Vec<RobotResult>,
     planning: Duration,
 }
 
-/// What a world shows after a step.
+/// What a world shows to an agent after a step.
 #[derive(Debug, Clone)]
 pub struct Seen {
+    /// Of the first robot that the agent flies; its frame corrects the belief.
     pub observation: Observation,
+    /// What the step gave the others that it flies.
+    pub others: Vec<RobotResult>,
     /// The hidden states X_k, shape `[H, W]`, where they are published.
     pub truth: Option<Grid<u8>>,
 }
 
-/// What a step did to one robot. Between correction and prediction: its agent's belief is the posterior.
+/// What a step did to one agent. Between correction and prediction: its belief is the posterior.
 pub struct Turn {
     pub before: Observation,
-    pub plan: Plan,
+    /// One for each robot that it flies.
+    pub plans: Vec<Plan>,
     /// The hidden states X_{k+1}, where they are published.
     pub truth: Option<Grid<u8>>,
     /// How well the prediction before the frame fits it, where the estimator has one.
     pub score: Option<Score>,
 }
 
+impl Seen {
+    /// What an agent sees that flies these robots of one world, at least one.
+    pub fn new(observations: impl IntoIterator<Item = Observation>) -> Self {
+        let mut observations = observations.into_iter();
+        let first = observations.next();
+        Self {
+            observation: first.expect("invariant: an agent flies a robot"),
+            others: observations.map(|other| other.robot).collect(),
+            truth: None,
+        }
+    }
+}
+
 impl Robot {
     /// An agent before it takes in what its world shows.
-    pub fn new(agent: Agent, observation: Observation) -> Self {
+    pub fn new(agent: Agent, seen: Seen) -> Self {
         Self {
             agent,
-            observation,
+            observation: seen.observation,
+            others: seen.others,
             planning: Duration::ZERO,
         }
     }
@@ -57,16 +77,18 @@ impl Robot {
 
     /// [`Self::new`] and [`Self::begin`].
     pub fn at(agent: Agent, seen: Seen) -> Result<Self> {
-        let mut robot = Self::new(agent, seen.observation);
-        robot.begin(seen.truth.as_ref(), |_| ())?;
+        let truth = seen.truth.clone();
+        let mut robot = Self::new(agent, seen);
+        robot.begin(truth.as_ref(), |_| ())?;
         Ok(robot)
     }
 
-    /// What it tells those who look on at its world.
-    pub fn view(&self, world: u32) -> View<'_> {
+    /// What it tells those who look on at its world; `first`: number of its first robot.
+    pub fn view(&self, world: u32, first: u32) -> View<'_> {
         View {
             world,
-            result: &self.observation.result,
+            robots: first..first + self.results().count() as u32,
+            result: &self.observation.world,
             belief: self.agent.belief(),
             intent: self.agent.intent(self.planning),
         }
@@ -76,36 +98,56 @@ impl Robot {
         &self.observation
     }
 
+    /// What the last step gave each robot that it flies.
+    pub fn results(&self) -> impl Iterator<Item = &RobotResult> {
+        std::iter::once(&self.observation.robot).chain(&self.others)
+    }
+
     /// Time that its last plan took.
     pub fn planning(&self) -> Duration {
         self.planning
     }
 
-    /// Plans the next path on the agent's policy.
-    pub fn plan(&mut self) -> Plan {
+    /// Plans the next path of each robot on the agent's policy.
+    pub fn plan(&mut self) -> Vec<Plan> {
         self.plan_with(Agent::plan)
     }
 
-    /// Plans the next path by other means: given the agent, the robot's cell and the step k.
-    pub fn plan_with(&mut self, plan: impl FnOnce(&mut Agent, Cell, u64) -> Plan) -> Plan {
+    /// Plans the next paths by other means: given the agent, the robots' cells and the step k.
+    pub fn plan_with(
+        &mut self,
+        plan: impl FnOnce(&mut Agent, &[Cell], u64) -> Vec<Plan>,
+    ) -> Vec<Plan> {
         let start = Instant::now();
-        let (cell, step) = (self.observation.robot(), self.observation.result.step);
-        let plan = plan(&mut self.agent, cell, step);
+        let cells: Vec<Cell> = self.results().map(cell).collect();
+        let plans = plan(&mut self.agent, &cells, self.observation.world.step);
         self.planning = start.elapsed();
-        plan
+        plans
     }
 
-    fn see(&mut self, plan: Plan, seen: Seen) -> Result<Turn> {
-        let Seen { observation, truth } = seen;
-        let score = self.agent.score(&observation.frame)?;
-        let before = std::mem::replace(&mut self.observation, observation);
+    /// Takes in what its world shows after steps in which its paths were not flown; the belief is then the posterior.
+    pub fn catch_up(&mut self, seen: Seen) -> Result<()> {
+        let truth = self.take_in(seen).1;
+        self.correct(truth.as_ref())
+    }
+
+    fn see(&mut self, plans: Vec<Plan>, seen: Seen) -> Result<Turn> {
+        let score = self.agent.score(&seen.observation.frame)?;
+        let (before, truth) = self.take_in(seen);
         self.correct(truth.as_ref())?;
         Ok(Turn {
             before,
-            plan,
+            plans,
             truth,
             score,
         })
+    }
+
+    /// Returns what its world showed before, and the hidden states.
+    fn take_in(&mut self, seen: Seen) -> (Observation, Option<Grid<u8>>) {
+        self.others = seen.others;
+        let before = std::mem::replace(&mut self.observation, seen.observation);
+        (before, seen.truth)
     }
 
     fn correct(&mut self, truth: Option<&Grid<u8>>) -> Result<()> {
@@ -113,19 +155,21 @@ impl Robot {
     }
 }
 
-/// One step of all robots. `robot` finds a run's own; `plan` chooses its path; `fly` flies all paths and gives what
-/// each world shows then, in order; `look` is told of each run's turn, by its index, one after the other.
+/// One step of all agents. `robot` finds a run's own; `plan` chooses the paths of the robots that it flies; `fly` flies
+/// all paths and gives what each agent sees then, in order; `look` is told of each run's turn, by its index, one after
+/// the other.
 pub fn step<R: Send>(
     runs: &mut [R],
     robot: impl Fn(&mut R) -> &mut Robot + Sync,
-    plan: impl Fn(&mut R) -> Plan + Sync,
+    plan: impl Fn(&mut R) -> Vec<Plan> + Sync,
     fly: impl FnOnce(&[Vec<Move>]) -> Result<Vec<Seen>>,
     mut look: impl FnMut(usize, &mut R, Turn) -> Result<()>,
 ) -> Result<()> {
     let plans = in_parallel(runs.iter_mut(), plan);
-    let paths: Vec<Vec<Move>> = plans.iter().map(|plan| plan.moves.clone()).collect();
+    let paths = plans.iter().flatten().map(|plan| plan.moves.clone());
+    let paths: Vec<Vec<Move>> = paths.collect();
     let seen = runs.iter_mut().zip(plans).zip(fly(&paths)?);
-    let turns = in_parallel(seen, |((run, plan), seen)| robot(run).see(plan, seen));
+    let turns = in_parallel(seen, |((run, plans), seen)| robot(run).see(plans, seen));
     for (index, (run, turn)) in runs.iter_mut().zip(turns).enumerate() {
         look(index, run, turn?)?;
     }

@@ -3,7 +3,8 @@
 use crate::estimation::belief::Belief;
 use protocol::agent_belief::{BeliefPublisher, Intent};
 use protocol::channels::{AGENT_BUFFER, Instance};
-use protocol::message::{AgentHeader, StepResult};
+use protocol::message::{AgentHeader, WorldResult};
+use std::ops::Range;
 use std::time::{Duration, Instant};
 
 /// Time between two beliefs of a world that are shown: no screen is faster, and each costs a copy.
@@ -30,7 +31,9 @@ struct Turns {
 /// One world's belief, the posterior after the frame of `result`.
 pub struct View<'a> {
     pub world: u32,
-    pub result: &'a StepResult,
+    /// Numbers of the robots that are flown on it.
+    pub robots: Range<u32>,
+    pub result: &'a WorldResult,
     pub belief: &'a Belief,
     /// Who believes it, and what the path was for.
     pub intent: Intent,
@@ -90,6 +93,8 @@ impl Feed {
             episode: view.result.episode,
             step: view.result.step,
             seed: view.result.seed,
+            first_robot: view.robots.start,
+            n_robots: view.robots.len() as u32,
             ..AgentHeader::default()
         };
         if let Err(error) = publisher.show(about, view.belief.probabilities(), &view.intent) {

@@ -1,9 +1,9 @@
 //! The figures' worst cases; the pictures stay in `target/tmp/report` for people to look at.
 
-use crate::synthetic::{Scene, ladder, model, noise, run, scene};
+use crate::synthetic::{Scene, ladder, model, noise, run, scene, teams};
 use agent::benchmark::report::figures::FIRE_CELLS_PER_STEP;
 use agent::benchmark::report::training::{FIGURES, draw_training};
-use agent::benchmark::report::{PolicyRun, draw_ladder, draw_rewards, draw_snapshot};
+use agent::benchmark::report::{PolicyRun, draw_ladder, draw_rewards, draw_snapshot, draw_teams};
 use protocol::Model;
 use std::path::{Path, PathBuf};
 
@@ -97,6 +97,21 @@ fn rewards_over_time() {
     dark.iter_mut().for_each(|run| run.rewards.fill(0.0));
     dark[3].rewards.iter_mut().for_each(|reward| *reward -= 2.5);
     drawn("rewards_zero", &dark, Some(&[0.0; 1500]));
+}
+
+#[test]
+fn rewards_of_teams_are_drawn_over_the_number_of_robots() {
+    let path = target("teams");
+    draw_teams(&path, &teams(3), FIRE_CELLS_PER_STEP).expect("drawn");
+    check(&path, Some(1408));
+    let svg = path.with_extension("svg");
+    draw_teams(&svg, &teams(3), FIRE_CELLS_PER_STEP).expect("drawn");
+    check_svg(&svg, 704, &["robots", "alone", "joint"]);
+    draw_ladder(&target("teams_ladder"), &teams(3), FIRE_CELLS_PER_STEP).expect("drawn");
+    // Robots of one number make no curve.
+    let never = target("teams_never");
+    draw_teams(&never, &ladder(2, 4), FIRE_CELLS_PER_STEP).expect("nothing to draw");
+    assert!(!never.exists());
 }
 
 #[test]

@@ -45,6 +45,9 @@ pub fn run(policy: &str, estimator: &str, world_seed: u64, mean_reward: f64) -> 
         mean_plan_millis: 1.5,
         brier: (estimator == "known_model").then_some(0.125),
         moves: 64,
+        robots: 1,
+        team: "alone".into(),
+        mean_repeated: 0.0,
         is_added: false,
         rewards: Vec::new(),
     }
@@ -66,6 +69,33 @@ pub fn ladder(n_worlds: u64, n_steps: usize) -> Vec<PolicyRun> {
         worlds.collect::<Vec<_>>()
     };
     LADDER.iter().enumerate().flat_map(of_policy).collect()
+}
+
+/// Beam search of 1, 2 and 4 robots, alone and jointly: on world w alone R (w + 1), jointly a half more from R = 2 on.
+pub fn teams(n_worlds: u64) -> Vec<PolicyRun> {
+    let mut runs = Vec::new();
+    for robots in [1_u32, 2, 4] {
+        for team in ["alone", "joint"] {
+            let gain = if robots > 1 && team == "joint" {
+                1.5
+            } else {
+                1.0
+            };
+            runs.extend((0..n_worlds).map(|world| PolicyRun {
+                robots,
+                team: team.into(),
+                mean_repeated: if team == "alone" { 0.25 } else { 0.125 },
+                rewards: vec![1.0; 4],
+                ..run(
+                    "beam",
+                    "known_model",
+                    world,
+                    gain * f64::from(robots) * (world + 1) as f64,
+                )
+            }));
+        }
+    }
+    runs
 }
 
 /// A model of `n` states, the observations named like them.

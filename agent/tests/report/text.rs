@@ -1,5 +1,6 @@
-use crate::synthetic::{ladder, run};
-use agent::benchmark::report::{PolicyRun, render_table, write_csv};
+use crate::synthetic::{ladder, run, teams};
+use agent::benchmark::report::added::{check_settings, read_csv};
+use agent::benchmark::report::{PolicyRun, render_table, write_csv, write_events};
 
 /// Rewards 1, 3, 5 and 2, 5, 8 on worlds 1, 2, 3; the oracle earns 4, 8, 8.
 fn three_policies() -> Vec<PolicyRun> {
@@ -60,6 +61,78 @@ fn a_table_gives_errors_over_worlds_and_paired_differences() {
             "-",
             "1.500"
         ]
+    );
+}
+
+#[test]
+fn teams_are_compared_with_as_many_robots_alone() {
+    let table = render_table(&teams(3), "beam");
+    assert!(
+        table.contains("to beam alone with as many robots"),
+        "{table}"
+    );
+    // Means over worlds of 2 (w + 1) and 3 (w + 1); differences w + 1: sqrt(2 / 2 / 3) = 0.58.
+    let rows = [
+        "alone 2 4.00 ± 1.15 2.00 baseline 60.0 0.250 0.250",
+        "joint 2 6.00 ± 1.73 3.00 +2.00 ± 0.58 60.0 0.250 0.125",
+    ];
+    for (skip, expected) in (2..).zip(rows) {
+        assert_eq!(row(&table, "beam", skip)[2..10].join(" "), expected);
+    }
+    assert_eq!(row(&table, "beam", 6)[2..4], ["alone", "1"], "{table}");
+    // One robot is no team: the table has no such columns.
+    assert!(!render_table(&teams(3)[..3], "beam").contains("team"));
+}
+
+#[test]
+fn rows_of_files_without_teams_are_of_a_robot_alone() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let path = directory.path().join("runs.csv");
+    write_csv(&path, &teams(1)).expect("written");
+    let read = |path| read_csv(path).expect("rows");
+    let crews: Vec<_> = read(&path)
+        .into_iter()
+        .map(|run| (run.robots, run.team))
+        .collect();
+    assert_eq!(
+        crews[..3],
+        [
+            (1, "alone".into()),
+            (1, "joint".into()),
+            (2, "alone".into())
+        ]
+    );
+    let text = std::fs::read_to_string(&path).expect("readable");
+    let without = |line: &str| {
+        line.rsplitn(4, ',')
+            .last()
+            .map(String::from)
+            .expect("a row")
+    };
+    let old: Vec<String> = text.lines().take(2).map(without).collect();
+    std::fs::write(&path, old.join("\n")).expect("written");
+    let runs = read(&path);
+    assert_eq!(
+        (runs.len(), runs[0].robots, &*runs[0].team),
+        (1, 1, "alone")
+    );
+    assert_eq!(runs[0].mean_repeated, 0.0);
+    check_settings(&runs, &["other"], &(0..1), 4, 64).expect("the same worlds");
+}
+
+#[test]
+fn each_team_has_a_folder_of_events() {
+    let directory = tempfile::tempdir().expect("a directory");
+    write_events(directory.path(), &teams(2)).expect("written");
+    let folders = std::fs::read_dir(directory.path()).expect("listed");
+    let mut names: Vec<_> = folders
+        .map(|it| it.expect("an entry").file_name())
+        .collect();
+    names.sort();
+    assert_eq!(names.len(), 6);
+    assert_eq!(
+        (&*names[0], &*names[5]),
+        ("beam-alone_1".as_ref(), "beam-joint_4".as_ref())
     );
 }
 
@@ -127,7 +200,7 @@ fn csv_rows_read_back_as_the_same_numbers() {
     let text = std::fs::read_to_string(&path).expect("readable");
     assert!(text.starts_with(
         "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
-         mean_fire_cells,mean_plan_millis,brier,moves\n"
+         mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated\n"
     ));
     let mut reader = csv::Reader::from_reader(text.as_bytes());
     let rows: Vec<_> = reader.records().map(|row| row.expect("a row")).collect();

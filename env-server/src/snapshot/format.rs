@@ -61,9 +61,11 @@ struct EncodedWorld<'a> {
     first_states: &'a [u8],
     /// Result, frame and path of each robot.
     robots: Vec<(&'a [u8], &'a [u8], Vec<u8>)>,
-    /// Result of each step; result, cells and values of its robots.
-    history: Vec<(&'a [u8], Vec<[&'a [u8]; 3]>)>,
+    history: Vec<Past<&'a [u8]>>,
 }
+
+/// A step's result; result, cells and values of its robots.
+type Past<B> = (B, Vec<[B; 3]>);
 
 /// The same, out of a file.
 #[derive(Decode)]
@@ -72,7 +74,7 @@ struct DecodedWorld {
     states: Vec<u8>,
     first_states: Vec<u8>,
     robots: Vec<(Vec<u8>, Vec<u8>, Vec<u8>)>,
-    history: Vec<(Vec<u8>, Vec<[Vec<u8>; 3]>)>,
+    history: Vec<Past<Vec<u8>>>,
 }
 
 /// Worlds as the bytes of a file.

@@ -96,7 +96,8 @@ mod tests {
                 let without = visited(&mut others.by_ref().map(|(_, other)| other));
                 let marginal = expected - reward(&rules, &states, &without);
                 assert!((robot.result.marginal - marginal).abs() < 1e-12);
-                let visitors = |cell| robots.iter().filter(|o| o.visited.contains(cell)).count();
+                let visitors =
+                    |cell: &usize| robots.iter().filter(|o| o.visited.contains(cell)).count();
                 let of_cell =
                     |cell: &usize| rules.reward[usize::from(states[*cell])] / visitors(cell) as f64;
                 let share: f64 = robot.visited.iter().map(of_cell).sum();

@@ -89,7 +89,7 @@ pub fn check_moves(bytes: &[u8]) -> Result<(), MoveError> {
     let is_wrong = |byte: &u8| usize::from(*byte) >= Move::ALL.len();
     // One pass without branches, which the compiler makes vector code of.
     if bytes.iter().fold(false, |any, byte| any | is_wrong(byte))
-        && let Some(index) = bytes.iter().position(|byte| is_wrong(byte))
+        && let Some(index) = bytes.iter().position(is_wrong)
     {
         let value = bytes[index];
         return Err(MoveError { index, value });

@@ -83,23 +83,25 @@ fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
         agent.predict();
         agent.foresee(&world(step + 1).0).expect("valid states");
         let predictor = agent.belief().clone();
-        let got = agent.plan(ROBOT, step);
+        let got = agent.plan(&[ROBOT], step);
         for (all, belief) in all.iter_mut().zip([estimate, predictor]) {
             let mut planner = config.planner(agent.policy());
             let expected = match (&agent.policy().action, &agent.aim) {
-                (Some(action), _) => action.plan(&mut *planner, &belief, ROBOT, N_MOVES, (7, step)),
+                (Some(action), _) => {
+                    action.plan(&mut *planner, &belief, &[ROBOT], N_MOVES, (7, step))
+                }
                 (None, Aim::Objective(target)) => {
                     let objective = Objective {
                         target: *target,
                         ..agent.objective
                     };
-                    planner.plan(&PlanningProblem {
+                    vec![planner.plan(&PlanningProblem {
                         start: ROBOT,
                         n_moves: N_MOVES,
                         values: &objective.values(&belief),
                         seed: 7,
                         step,
-                    })
+                    })]
                 }
                 _ => panic!("{policy}: nothing was aimed at"),
             };
@@ -196,7 +198,7 @@ fn a_network_decides_on_what_it_was_learned_with() {
         let mut agent = agent("autoencoder_policy", &config, &learned).expect("an agent");
         agent.correct(&world(0).1, None).expect("possible");
         agent.predict();
-        agent.plan(ROBOT, 0);
+        agent.plan(&[ROBOT], 0);
         assert!(
             matches!(agent.aim, Aim::Objective(target) if target == expected),
             "{}",

@@ -11,11 +11,8 @@ use std::path::Path;
 pub fn write_events(folder: &Path, runs: &[PolicyRun]) -> Result<()> {
     let groups = groups(runs);
     for group in &groups {
-        let twins = groups.iter().filter(|other| other.policy == group.policy);
-        let name = match twins.count() {
-            1 => group.policy.to_owned(),
-            _ => format!("{}-{}", group.policy, group.estimator),
-        };
+        let name = [vec![group.policy.to_owned()], group.marks(&groups)].concat();
+        let name = name.join("-");
         let mut file = EventFile::begin(&folder.join(plain(&name)), 0)?;
         for (index, reward) in rewards(group).into_iter().enumerate() {
             let error = reward.standard_error;

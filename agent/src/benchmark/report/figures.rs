@@ -4,6 +4,7 @@ use crate::benchmark::report::number::{decimals, readable, with_error};
 use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
 use crate::benchmark::report::rewards::rewards;
 use crate::benchmark::report::statistics::Estimate;
+use crate::benchmark::report::teams::teams;
 use crate::estimation::belief::Belief;
 use crate::file::{Readers, replace_file};
 use anyhow::{Context, Result, bail, ensure};
@@ -66,7 +67,7 @@ pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<
     let decimals = decimals(bars.iter().map(|bar| bar.1.mean));
     let bars: Vec<Bar> = bars
         .into_iter()
-        .map(|it| bar(it.0, it.1, decimals))
+        .map(|it| bar(it.0, &groups, it.1, decimals))
         .collect();
     let is_used = |family: &(&str, Color)| bars.iter().any(|bar| bar.color == family.1);
     let ladder = Ladder {
@@ -84,10 +85,14 @@ fn estimated<'a>(group: &'a Group<'a>) -> Option<(&'a Group<'a>, Estimate)> {
     estimate.map(|estimate| (group, estimate))
 }
 
-fn bar(group: &Group<'_>, reward: Estimate, decimals: usize) -> Bar {
-    let remark = match group.estimator {
-        "none" => String::new(),
-        estimator => format!(" ({})", readable(estimator)),
+fn bar(group: &Group<'_>, groups: &[Group<'_>], reward: Estimate, decimals: usize) -> Bar {
+    let team = format!("{} {}", group.team, group.robots);
+    let team = groups.iter().any(Group::is_team).then_some(&*team);
+    let estimator = Some(group.estimator).filter(|name| *name != "none");
+    let remark: Vec<&str> = team.into_iter().chain(estimator).collect();
+    let remark = match remark.as_slice() {
+        [] => String::new(),
+        remark => format!(" ({})", readable(&remark.join(", "))),
     };
     let pair = |run: &&PolicyRun| (run.world_seed, run.mean_reward);
     Bar {
@@ -112,6 +117,19 @@ fn family(group: &Group<'_>) -> usize {
         "known_model" | "spatial_filter" if !policy.contains("learn") => 1,
         _ => 3,
     }
+}
+
+/// Draws the reward of all robots of a world over their number, a curve for each kind of team; nothing of runs that all
+/// have as many robots.
+pub fn draw_teams(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<()> {
+    if runs.iter().all(|run| run.robots == runs[0].robots) {
+        return Ok(());
+    }
+    for run in runs {
+        check_finite(run, "mean reward", std::iter::once(run.mean_reward))?;
+    }
+    let svg = teams(runs, axis_label).svg();
+    save(path, &svg.context("teams: expected runs, got none")?)
 }
 
 fn ladder_note(runs: &[PolicyRun]) -> String {

@@ -11,9 +11,10 @@ mod policy_run;
 mod rewards;
 pub mod statistics;
 pub mod table;
+mod teams;
 pub mod training;
 
 pub use self::events::write_events;
-pub use self::figures::{Snapshot, draw_ladder, draw_rewards, draw_snapshot, save};
-pub use self::policy_run::{PolicyRun, write_csv};
+pub use self::figures::{Snapshot, draw_ladder, draw_rewards, draw_snapshot, draw_teams, save};
+pub use self::policy_run::{ALONE, PolicyRun, write_csv};
 pub use self::table::render_table;

@@ -6,6 +6,9 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
 
+/// The team of robots that know nothing of each other, and of one robot.
+pub const ALONE: &str = "alone";
+
 /// One policy on one world: what `emberwatch-agent compare` measured, and a row of its CSV.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PolicyRun {
@@ -28,6 +31,15 @@ pub struct PolicyRun {
     pub brier: Option<f64>,
     /// Moves of a path.
     pub moves: usize,
+    /// Robots of the world. Rewards, cells and plans are those of all together.
+    #[serde(default = "one")]
+    pub robots: u32,
+    /// How they act together, such as `joint`.
+    #[serde(default = "alone")]
+    pub team: String,
+    /// Share of the visits to distinct cells that a teammate made in the same step, in `0..1`.
+    #[serde(default)]
+    pub mean_repeated: f64,
     /// Whether it comes from a file.
     #[serde(skip)]
     pub is_added: bool,
@@ -36,21 +48,34 @@ pub struct PolicyRun {
     pub rewards: Vec<f32>,
 }
 
+fn one() -> u32 {
+    1
+}
+
+fn alone() -> String {
+    ALONE.into()
+}
+
 /// Writes one row per run, ordered by policy, then seed; a missing Brier score is an empty field.
 ///
 /// Numbers are the shortest that read back as the same `f64`.
 pub fn write_csv(path: &Path, runs: &[PolicyRun]) -> Result<()> {
     let mut sorted: Vec<&PolicyRun> = runs.iter().collect();
-    sorted.sort_by_key(|run| (&run.policy, run.world_seed, &run.estimator));
+    sorted.sort_by_key(|run| {
+        let crew = (run.robots, &run.team);
+        (&run.policy, run.world_seed, &run.estimator, crew)
+    });
     let mut writer = csv::Writer::from_writer(Vec::new());
     sorted.iter().try_for_each(|run| writer.serialize(run))?;
     replace_file(path, &writer.into_inner()?, Readers::Any)
 }
 
-/// The runs of one policy with one estimator, in the order given.
+/// The runs of one policy with one estimator and one kind of team, in the order given.
 pub(super) struct Group<'a> {
     pub(super) policy: &'a str,
     pub(super) estimator: &'a str,
+    pub(super) robots: u32,
+    pub(super) team: &'a str,
     pub(super) runs: Vec<&'a PolicyRun>,
 }
 
@@ -63,19 +88,43 @@ impl Group<'_> {
         let pair = |run: &&PolicyRun| (run.world_seed, value(run));
         self.runs.iter().map(pair).collect()
     }
+
+    /// Whether there is more than a robot alone in its world.
+    pub(super) fn is_team(&self) -> bool {
+        (self.robots, self.team) != (1, ALONE)
+    }
+
+    /// What tells it from the other groups of its policy: estimator and team, where these differ.
+    pub(super) fn marks(&self, groups: &[Self]) -> Vec<String> {
+        let twins = || groups.iter().filter(|other| other.policy == self.policy);
+        let mut marks = Vec::new();
+        if twins().any(|other| other.estimator != self.estimator) {
+            marks.push(self.estimator.to_owned());
+        }
+        if twins().any(|other| (other.robots, other.team) != (self.robots, self.team)) {
+            marks.push(format!("{} {}", self.team, self.robots));
+        }
+        marks
+    }
 }
 
-/// Groups runs by policy and estimator, ordered by first appearance.
+/// Groups runs by policy, estimator, robots and team, ordered by first appearance.
 pub(super) fn groups(runs: &[PolicyRun]) -> Vec<Group<'_>> {
     let mut groups: Vec<Group<'_>> = Vec::new();
     for run in runs {
         let (policy, estimator) = (run.policy.as_str(), run.estimator.as_str());
-        let same = |group: &&mut Group<'_>| (group.policy, group.estimator) == (policy, estimator);
+        let (robots, team) = (run.robots, run.team.as_str());
+        let same = |group: &&mut Group<'_>| {
+            let of_group = (group.policy, group.estimator, group.robots, group.team);
+            of_group == (policy, estimator, robots, team)
+        };
         match groups.iter_mut().find(same) {
             Some(group) => group.runs.push(run),
             None => groups.push(Group {
                 policy,
                 estimator,
+                robots,
+                team,
                 runs: vec![run],
             }),
         }

@@ -82,13 +82,12 @@ fn curves(groups: &[Group<'_>], window: usize) -> Vec<Curve> {
         .collect()
 }
 
-/// The policy, with its estimator where the policy stands more than once.
+/// The policy, with its estimator and team where the policy stands more than once.
 fn short_name(group: &Group<'_>, groups: &[Group<'_>]) -> String {
-    let same = groups.iter().filter(|other| other.policy == group.policy);
     let policy = readable(group.policy);
-    match same.count() {
-        0 | 1 => policy,
-        _ => format!("{policy} ({})", readable(group.estimator)),
+    match group.marks(groups).as_slice() {
+        [] => policy,
+        marks => format!("{policy} ({})", readable(&marks.join(", "))),
     }
 }
 

@@ -1,7 +1,7 @@
 //! The comparison as text: fits a terminal, and pastes into Markdown as a table.
 
 use crate::benchmark::report::number::{NOTHING, decimals, number, with_error};
-use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
+use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::{Estimate, median, ratio_of_means};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use std::collections::{BTreeMap, BTreeSet};
@@ -40,35 +40,76 @@ fn heading(runs: &[PolicyRun], groups: &[Group<'_>], baseline: &str) -> String {
         _ => "± is one standard error over worlds",
     };
     let baseline = if groups.iter().any(|group| group.policy == baseline) {
-        format!("differences are paired by world, to {baseline}")
+        let same = match groups.iter().any(Group::is_team) {
+            true => " alone with as many robots",
+            false => "",
+        };
+        format!("differences are paired by world, to {baseline}{same}")
     } else {
         format!("no differences: baseline {baseline:?} was not run")
     };
     format!("{worlds}, {steps} each; {error}; {baseline}.")
 }
 
-/// What every row of the summary is compared with: mean rewards by world.
+/// What rows of the summary are compared with.
 struct References<'a> {
+    groups: &'a [Group<'a>],
     baseline: &'a str,
-    base: Option<BTreeMap<u64, f64>>,
-    oracle: Option<BTreeMap<u64, f64>>,
+    has_teams: bool,
+    has_oracle: bool,
+}
+
+impl References<'_> {
+    /// Mean rewards by world of a policy, with as many robots as a group's; `is_one` chooses among its teams.
+    fn rewards(
+        &self,
+        policy: &str,
+        group: &Group<'_>,
+        is_one: impl Fn(&Group<'_>) -> bool,
+    ) -> Option<BTreeMap<u64, f64>> {
+        let mut all = self.groups.iter();
+        let found = all
+            .rfind(|other| (other.policy, other.robots) == (policy, group.robots) && is_one(other));
+        found.map(|found| found.by_seed(|run| run.mean_reward))
+    }
+
+    fn difference(&self, group: &Group<'_>, decimals: usize) -> String {
+        let is_alone = |group: &Group<'_>| group.team == ALONE;
+        if group.policy == self.baseline && is_alone(group) {
+            return "baseline".into();
+        }
+        let rewards = group.by_seed(|run| run.mean_reward);
+        match self.rewards(self.baseline, group, is_alone) {
+            Some(base) => signed(Estimate::of_difference(&rewards, &base), decimals),
+            None => NOTHING.into(),
+        }
+    }
+
+    fn percent_of_oracle(&self, group: &Group<'_>) -> String {
+        let rewards = group.by_seed(|run| run.mean_reward);
+        let oracle = self.rewards(ORACLE, group, |_| true);
+        let ratio = oracle.and_then(|oracle| ratio_of_means(&rewards, &oracle));
+        ratio.map_or(NOTHING.into(), |ratio| number(100.0 * ratio, 1))
+    }
 }
 
 fn summary(groups: &[Group<'_>], baseline: &str) -> Table {
-    let reward = |run: &PolicyRun| run.mean_reward;
-    let of_policy = |name: &str| {
-        let group = groups.iter().find(|group| group.policy == name);
-        group.map(|group| group.by_seed(reward))
-    };
     let references = References {
+        groups,
         baseline,
-        base: of_policy(baseline),
-        oracle: of_policy(ORACLE),
+        has_teams: groups.iter().any(Group::is_team),
+        has_oracle: groups.iter().any(|group| group.policy == ORACLE),
     };
+    let reward = |run: &PolicyRun| run.mean_reward;
     let decimals = decimals(groups.iter().flat_map(|group| group.values(reward)));
-    let mut header = vec!["policy", "estimator", "mean reward", "difference"];
-    header.extend(["distinct cells", "hit rate"]);
-    header.extend(references.oracle.is_some().then_some("% of oracle"));
+    let teams = |names: &'static [&'static str]| names.iter().filter(|_| references.has_teams);
+    let mut header = vec!["policy", "estimator"];
+    header.extend(teams(&["team", "robots"]));
+    header.push("mean reward");
+    header.extend(teams(&["per robot"]));
+    header.extend(["difference", "distinct cells", "hit rate"]);
+    header.extend(teams(&["repeated"]));
+    header.extend(references.has_oracle.then_some("% of oracle"));
     header.extend(["Brier", "ms/plan"]);
     let mut table = plain_table(&header);
     for group in groups {
@@ -78,24 +119,23 @@ fn summary(groups: &[Group<'_>], baseline: &str) -> Table {
 }
 
 fn summary_row(group: &Group<'_>, references: &References<'_>, decimals: usize) -> Vec<String> {
-    let rewards = group.by_seed(|run| run.mean_reward);
-    let difference = match &references.base {
-        Some(_) if group.policy == references.baseline => "baseline".into(),
-        Some(base) => signed(Estimate::of_difference(&rewards, base), decimals),
-        None => NOTHING.into(),
-    };
-    let percent = references.oracle.as_ref().map(|oracle| {
-        let ratio = ratio_of_means(&rewards, oracle);
-        ratio.map_or(NOTHING.into(), |ratio| number(100.0 * ratio, 1))
-    });
-    let reward = Estimate::of(&group.values(|run| run.mean_reward));
+    let rewards = group.values(|run| run.mean_reward);
     let brier = group.runs.iter().filter_map(|run| run.brier).collect();
+    let teams = |texts: Vec<String>| texts.into_iter().filter(|_| references.has_teams);
     let mut row = vec![group.policy.to_string(), group.estimator.to_string()];
-    row.push(with_error(reward, decimals));
-    row.push(difference);
+    row.extend(teams(vec![group.team.into(), group.robots.to_string()]));
+    row.push(with_error(Estimate::of(&rewards), decimals));
+    let share = |run: &PolicyRun| run.mean_reward / f64::from(run.robots);
+    row.extend(teams(vec![mean(group.values(share), decimals)]));
+    row.push(references.difference(group, decimals));
     row.push(mean(group.values(|run| run.mean_distinct_cells), 1));
     row.push(mean(group.values(|run| run.hit_rate), 3));
-    row.extend(percent);
+    row.extend(teams(vec![mean(group.values(|run| run.mean_repeated), 3)]));
+    row.extend(
+        references
+            .has_oracle
+            .then(|| references.percent_of_oracle(group)),
+    );
     row.push(mean(brier, 4));
     row.push(mean(group.values(|run| run.mean_plan_millis), 3));
     row
@@ -136,7 +176,11 @@ fn split_table(groups: &[Group<'_>], less: &[(f64, u64)], more: &[(f64, u64)]) -
     };
     let less_title = format!("less fire ({})", worlds(less));
     let more_title = format!("more fire ({})", worlds(more));
-    let mut table = plain_table(&["policy", "estimator", &less_title, &more_title]);
+    let has_teams = groups.iter().any(Group::is_team);
+    let mut header = vec!["policy", "estimator"];
+    header.extend(["team", "robots"].iter().filter(|_| has_teams));
+    header.extend([&*less_title, &*more_title]);
+    let mut table = plain_table(&header);
     let all = groups
         .iter()
         .flat_map(|group| group.values(|run| run.mean_reward));
@@ -150,24 +194,24 @@ fn split_table(groups: &[Group<'_>], less: &[(f64, u64)], more: &[(f64, u64)]) -
                 .collect();
             with_error(Estimate::of(&values), decimals)
         };
-        table.add_row([
-            group.policy.into(),
-            group.estimator.into(),
-            half(less),
-            half(more),
-        ]);
+        let mut row = vec![group.policy.to_string(), group.estimator.to_string()];
+        let team = [group.team.to_string(), group.robots.to_string()];
+        row.extend(team.into_iter().filter(|_| has_teams));
+        row.extend([half(less), half(more)]);
+        table.add_row(row);
     }
     table
 }
 
-/// A Markdown table; all but the two columns of names are right-aligned.
+/// A Markdown table; all but the columns of names are right-aligned.
 fn plain_table(header: &[&str]) -> Table {
     let mut table = Table::new();
     table
         .load_preset(presets::ASCII_MARKDOWN)
         .set_content_arrangement(ContentArrangement::Disabled)
         .set_header(header);
-    for column in table.column_iter_mut().skip(2) {
+    let numbers = table.column_iter_mut().zip(header);
+    for (column, _) in numbers.filter(|(_, name)| !["policy", "estimator", "team"].contains(name)) {
         column.set_cell_alignment(CellAlignment::Right);
     }
     table

@@ -17,18 +17,19 @@ use protocol::{Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
 
-/// The worlds to act on, as far as a learner is told.
+/// The robots to fly, as far as a learner is told.
 #[derive(Debug, Clone)]
 pub struct Worlds {
     pub shape: Shape,
     /// Number of values that an observed cell may show.
     pub n_observations: usize,
     pub n_moves: usize,
+    /// Numbers of the robots.
     pub numbers: Range<u32>,
 }
 
 impl Worlds {
-    /// A robot on one of them before it takes in what that shows.
+    /// One of them before it takes in what its world shows.
     pub(super) fn robot(
         &self,
         config: &AgentConfig,
@@ -41,14 +42,14 @@ impl Worlds {
             basis: PlanBasis::new(config.objective.belief),
             state_names,
             n_moves: self.n_moves,
-            seed: config.planner_seed(observation.result.seed),
+            seed: config.planner_seed(observation.world.seed),
         };
         let agent = Agent::new(estimator, policy, config, setup);
-        Robot::new(agent, observation)
+        Robot::new(agent, Seen::new([observation]))
     }
 }
 
-/// Flies a path in each world; gives what they show then, in order.
+/// Flies a path with each robot; gives what they see then, in order.
 pub type Fly<'a> = &'a mut dyn FnMut(&[Vec<Move>]) -> Result<Vec<Observation>, ConnectionError>;
 
 /// Is told of each robot, by its index, when its belief is the posterior.
@@ -67,14 +68,14 @@ pub trait Student {
         false
     }
 
-    /// Takes in what the worlds show when it comes to them. Returns in how many of them it goes on where
+    /// Takes in what the robots see when it comes to them. Returns with how many of them it goes on where
     /// its checkpoint left it.
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize>;
 
-    /// A world begins again.
-    fn begin(&mut self, world: u32, observation: Observation) -> Result<()>;
+    /// A robot's world begins again.
+    fn begin(&mut self, robot: u32, observation: Observation) -> Result<()>;
 
-    /// One step of the rollout in all worlds: plans, flies, scores, corrects, remembers, predicts.
+    /// One step of the rollout of all robots: plans, flies, scores, corrects, remembers, predicts.
     fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick>;
 
     /// Makes the updates that the steps since the last call have earned.
@@ -83,7 +84,7 @@ pub trait Student {
     /// From here on it acts on what was learned, as well as it knows: without random actions.
     fn freeze(&mut self);
 
-    /// World steps that were learned from, of all worlds together.
+    /// World steps that were learned from, of all robots together.
     fn world_steps(&self) -> u64;
 
     /// Updates of the model so far.
@@ -101,9 +102,6 @@ pub trait Student {
 
 /// Observations without hidden states, as learners get them.
 pub(super) fn without_truth(observations: Vec<Observation>) -> Vec<Seen> {
-    let seen = |observation| Seen {
-        observation,
-        truth: None,
-    };
-    observations.into_iter().map(seen).collect()
+    let seen = observations.into_iter();
+    seen.map(|observation| Seen::new([observation])).collect()
 }

@@ -155,7 +155,7 @@ impl DecisionsStudent {
 }
 
 fn input(robot: &Robot, n_moves: usize) -> Vec<f32> {
-    spread_summary(robot.agent.belief(), robot.observation().robot(), n_moves)
+    spread_summary(robot.agent.belief(), robot.observation().cell(), n_moves)
 }
 
 impl Run {
@@ -165,7 +165,7 @@ impl Run {
         self.track.add(Transition {
             input: std::mem::replace(&mut self.input, next.clone()),
             action: self.action,
-            reward: self.robot.observation().result.reward as f32 * reward_scale,
+            reward: self.robot.observation().robot.reward as f32 * reward_scale,
             next,
         })
     }
@@ -187,9 +187,9 @@ impl Student for DecisionsStudent {
         Ok(0)
     }
 
-    fn begin(&mut self, world: u32, observation: Observation) -> Result<()> {
+    fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
         let run = self.run(observation)?;
-        self.runs[(world - self.worlds.numbers.start) as usize] = run;
+        self.runs[(robot - self.worlds.numbers.start) as usize] = run;
         Ok(())
     }
 
@@ -211,14 +211,14 @@ impl Student for DecisionsStudent {
             |run| {
                 let action = &decisions.actions.actions()[run.action];
                 run.robot
-                    .plan_with(|agent, cell, step| agent.plan_action(action, cell, step))
+                    .plan_with(|agent, robots, step| agent.plan_action(action, robots, step))
             },
             |paths| {
                 self.times[0].1 += start.elapsed();
                 anyhow::Ok(without_truth(fly(paths)?))
             },
             |index, run, turn| {
-                tick.reward += run.robot.observation().result.reward;
+                tick.reward += run.robot.observation().robot.reward;
                 tick.score += turn.score.unwrap_or_default();
                 look(index, &run.robot);
                 Ok(())

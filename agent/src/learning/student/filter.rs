@@ -194,8 +194,9 @@ impl Student for FilterStudent {
             },
             |index, run, turn| {
                 let (agent, observation) = (&run.robot.agent, run.robot.observation());
-                let visited = path::fly(self.worlds.shape, turn.before.robot(), &turn.plan.moves);
-                let reward = observation.result.reward;
+                let path = &turn.plans[0].moves;
+                let visited = path::fly(self.worlds.shape, turn.before.cell(), path);
+                let reward = observation.robot.reward;
                 self.learner.see(
                     first_world + index as u32,
                     &observation.frame,
@@ -259,12 +260,13 @@ impl Student for FilterStudent {
 
 impl Run {
     /// The next path on newer parameters.
-    fn plan(&mut self, tables: &Tables, objective: Objective) -> Plan {
+    fn plan(&mut self, tables: &Tables, objective: Objective) -> Vec<Plan> {
         let is_walking = self.is_walking;
         self.robot.agent.estimator_mut().set_tables(tables);
-        self.robot.plan_with(|agent, cell, step| match is_walking {
-            true => agent.walk(cell, step),
-            false => agent.plan_for(objective, cell, step),
-        })
+        self.robot
+            .plan_with(|agent, robots, step| match is_walking {
+                true => agent.walk(robots, step),
+                false => agent.plan_for(objective, robots, step),
+            })
     }
 }

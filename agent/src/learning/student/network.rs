@@ -79,7 +79,7 @@ impl NetworkStudent {
 
     /// What the next action goes by.
     fn input(&self, robot: &Robot) -> Vec<f32> {
-        let cell = robot.observation().robot();
+        let cell = robot.observation().cell();
         self.progress
             .input
             .of(follower(robot), cell, self.worlds.n_moves)
@@ -103,7 +103,7 @@ impl NetworkStudent {
         let step = Transition {
             input: decision.input.clone(),
             action: decision.action,
-            reward: robot.observation().result.reward as f32,
+            reward: robot.observation().robot.reward as f32,
             next: self.input(robot),
         };
         if let Some(transition) = self.progress.position.track.add(step) {
@@ -149,15 +149,16 @@ impl NetworkStudent {
         rollout::step(
             std::slice::from_mut(robot),
             |robot| robot,
-            |robot| robot.plan_with(|agent, cell, step| agent.plan_for(objective, cell, step)),
+            |robot| robot.plan_with(|agent, robots, step| agent.plan_for(objective, robots, step)),
             |paths| {
                 planning = start.elapsed();
                 anyhow::Ok(without_truth(fly(paths)?))
             },
             |index, robot, turn| {
                 tick.score = turn.score.unwrap_or_default();
-                tick.reward = robot.observation().result.reward;
-                let cells = path::fly(self.worlds.shape, turn.before.robot(), &turn.plan.moves);
+                tick.reward = robot.observation().robot.reward;
+                let path = &turn.plans[0].moves;
+                let cells = path::fly(self.worlds.shape, turn.before.cell(), path);
                 let met = met(robot.agent.belief(), cells.visited.iter().copied());
                 self.progress.position.reward.add(&met, tick.reward);
                 look(index, robot);

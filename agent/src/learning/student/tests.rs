@@ -13,7 +13,7 @@ use crate::planning::policy::{PlannerKind, Policy};
 use crate::planning::{BasisKind, Objective, PlanningProblem, Target};
 use crate::rollout::Robot;
 use crate::server::client::Observation;
-use protocol::message::StepResult;
+use protocol::message::{RobotResult, WorldResult};
 use protocol::randomness::split_mix;
 use protocol::{Cell, Frame, Model, Move, Shape};
 
@@ -47,13 +47,18 @@ fn observation(step: u64) -> Observation {
         }
     }
     let (row, col) = (ROBOT.row as u32, ROBOT.col as u32);
-    let result = StepResult {
-        step,
-        row,
-        col,
-        ..StepResult::default()
-    };
-    Observation { result, frame }
+    Observation {
+        world: WorldResult {
+            step,
+            ..WorldResult::default()
+        },
+        robot: RobotResult {
+            row,
+            col,
+            ..RobotResult::default()
+        },
+        frame,
+    }
 }
 
 /// The path that a policy's planner finds for an objective.
@@ -149,8 +154,8 @@ fn students_plan_on_the_belief_that_settings_say() {
             let path = |action: &crate::planning::action::Action| {
                 let random = (config.planner_seed(0), step);
                 let mut planner = config.planner(&beam);
-                let plan = action.plan(&mut *planner, belief, ROBOT, worlds().n_moves, random);
-                plan.moves
+                let plans = action.plan(&mut *planner, belief, &[ROBOT], worlds().n_moves, random);
+                plans[0].moves.clone()
             };
             actions.actions().iter().map(path).collect()
         });

@@ -28,7 +28,7 @@ pub fn student(
         shape: client.shape(),
         n_observations: info.n_observations,
         n_moves: info.n_moves,
-        numbers: training.worlds.clone(),
+        numbers: client.robots(),
     };
     let of_file = || format!("checkpoint {}", place.display());
     Ok(match config.learner {

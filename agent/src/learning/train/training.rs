@@ -5,8 +5,9 @@ use crate::learning::checkpoint::{self, Contents};
 use crate::learning::learner;
 use crate::learning::student::{Student, decisions, network};
 use ::network::Device;
-use anyhow::{Result, anyhow, bail, ensure};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use protocol::connection::ConnectionError;
+use protocol::control::ServerInfo;
 use std::ops::Range;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -17,6 +18,7 @@ pub const CHECKPOINT: &str = "checkpoint.safetensors";
 /// What to train on, for how long.
 #[derive(Debug, Clone)]
 pub struct Training {
+    /// The worlds, with all their robots.
     pub worlds: Range<u32>,
     /// Take the worlds from their holder.
     pub takeover: bool,
@@ -64,6 +66,21 @@ impl Training {
             );
         }
         Ok(Some(contents))
+    }
+
+    /// The numbers of the robots on a server.
+    pub(super) fn robots(&self, info: &ServerInfo) -> Result<Range<u32>> {
+        let team = info.n_robots;
+        if self.config.learner == LearnerKind::Autoencoder {
+            ensure!(
+                team == 1,
+                "the autoencoder follows one robot: expected a server with --robots 1, got {team}"
+            );
+        }
+        let number = |world: u32| world.checked_mul(team);
+        let ends = number(self.worlds.start).zip(number(self.worlds.end));
+        let (first, end) = ends.context("--world: expected a world that the server has")?;
+        Ok(first..end)
     }
 
     /// The error for a student that cannot go on; what it learned is saved when training ends.

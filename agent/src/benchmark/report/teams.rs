@@ -1,0 +1,59 @@
+//! The reward of a team over the number of its robots.
+
+use crate::benchmark::report::number::readable;
+use crate::benchmark::report::policy_run::{Group, PolicyRun, groups};
+use crate::benchmark::report::statistics::Estimate;
+use figures::{Curve, Lines, Panel, Scale};
+use std::collections::BTreeSet;
+
+/// The page of these runs: a curve for each team of each policy, in the order given.
+pub fn teams(runs: &[PolicyRun], axis_label: &str) -> Lines {
+    let groups = groups(runs);
+    let mut kinds: Vec<(&str, &str)> = Vec::new();
+    for kind in groups.iter().map(|group| (group.policy, group.team)) {
+        if !kinds.contains(&kind) {
+            kinds.push(kind);
+        }
+    }
+    let worlds: BTreeSet<u64> = runs.iter().map(|run| run.world_seed).collect();
+    let note = match worlds.len() {
+        1 => "1 world".into(),
+        n => format!("means over {n} worlds; bands: ±1 standard error"),
+    };
+    let curves = kinds.iter().map(|&kind| curve(kind, &kinds, &groups));
+    Lines {
+        title: "Reward of all robots of a world together".into(),
+        note,
+        axis: "robots".into(),
+        panels: vec![Panel {
+            title: axis_label.into(),
+            scale: Scale::Linear,
+            curves: curves.collect(),
+            shade: None,
+        }],
+    }
+}
+
+/// A team's name, with its policy where several have such a team.
+fn curve((policy, team): (&str, &str), kinds: &[(&str, &str)], groups: &[Group<'_>]) -> Curve {
+    let n_twins = kinds.iter().filter(|kind| kind.1 == team).count();
+    let name = match n_twins {
+        1 => team.into(),
+        _ => format!("{team}, {policy}"),
+    };
+    let own = groups
+        .iter()
+        .filter(|it| (it.policy, it.team) == (policy, team));
+    let mut points: Vec<(f64, Estimate)> = own
+        .filter_map(|group| {
+            let reward = Estimate::of(&group.values(|run| run.mean_reward))?;
+            Some((f64::from(group.robots), reward))
+        })
+        .collect();
+    points.sort_by(|a, b| a.0.total_cmp(&b.0));
+    Curve {
+        name: readable(&name),
+        points: points.iter().map(|it| (it.0, it.1.mean)).collect(),
+        errors: points.iter().filter_map(|it| it.1.standard_error).collect(),
+    }
+}

@@ -1,0 +1,71 @@
+//! One plan for several robots: what one of them visits is worth nothing to the others.
+//!
+//! The robots are planned one after the other, each on the values that the paths before it leave. Then each in turn
+//! plans again against all others (best response), and keeps the better of its two paths, so the team never loses.
+
+use crate::planning::objective::CellValues;
+use crate::planning::planner::{Plan, Planner, PlanningProblem};
+use protocol::Cell;
+use protocol::path::fly;
+use protocol::randomness::split_mix;
+
+/// How often each robot answers the others' paths.
+pub const ROUNDS: usize = 2;
+
+/// Plans a path for each robot. A plan's score counts only cells that no teammate's path visited when it was made.
+///
+/// `seed` and `step` are those of the planner's random numbers. In each round the robot that was planned last is left
+/// out, as it knew the others' paths: one robot alone is planned once, whatever the rounds.
+pub fn plan_team(
+    planner: &mut dyn Planner,
+    values: &CellValues,
+    starts: &[Cell],
+    n_moves: usize,
+    (seed, step): (u64, u64),
+    rounds: usize,
+) -> Vec<Plan> {
+    let n_robots = starts.len();
+    let mut plans: Vec<Plan> = Vec::with_capacity(n_robots);
+    let mut visited: Vec<Vec<usize>> = Vec::with_capacity(n_robots);
+    let mut n_unchanged = 0;
+    for turn in 0..n_robots + rounds * n_robots.saturating_sub(1) {
+        // Nobody gains any more.
+        if turn >= n_robots && n_unchanged + 1 >= n_robots {
+            break;
+        }
+        let robot = turn % n_robots;
+        let others = visited.iter().enumerate();
+        let others = others.filter(|(other, _)| *other != robot);
+        let free = values.without(others.flat_map(|(_, cells)| cells.iter().copied()));
+        let plan = planner.plan(&PlanningProblem {
+            start: starts[robot],
+            n_moves,
+            values: &free,
+            seed: robot_seed(seed, robot),
+            step,
+        });
+        let score = |plan: &Plan| free.score(starts[robot], &plan.moves);
+        if turn >= n_robots && score(&plan) <= score(&plans[robot]) {
+            n_unchanged += 1;
+            continue;
+        }
+        n_unchanged = 0;
+        let cells = fly(values.shape(), starts[robot], &plan.moves).visited;
+        match turn < n_robots {
+            true => {
+                plans.push(plan);
+                visited.push(cells);
+            }
+            false => (plans[robot], visited[robot]) = (plan, cells),
+        }
+    }
+    plans
+}
+
+/// Seed of the random numbers of a world's robot: the world's own for the first.
+pub fn robot_seed(seed: u64, robot: usize) -> u64 {
+    match robot {
+        0 => seed,
+        _ => split_mix(seed, robot as u64),
+    }
+}
