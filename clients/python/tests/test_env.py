@@ -458,7 +458,7 @@ def test_wrong_options_are_named(keywords: dict[str, Any], message: str) -> None
     [
         (
             {"observation": ()},
-            r"expected one or several of frame, image, robot, age, belief, got \(\)",
+            r"expected one or several of frame, image, robot, age, belief, team, others, got \(\)",
         ),
         ({"observation": "smoke"}, "got 'smoke'"),
         ({"observation": ["frame", "frame"]}, "observation"),

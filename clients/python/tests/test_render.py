@@ -302,4 +302,4 @@ def test_a_team_has_a_colour_for_each_robot() -> None:
     for (row, col), color in zip(robots, ROBOTS, strict=False):
         assert pixel(image, 40 * row + 20, 40 * col + 20) == color
     assert (pixel(image, 40, 20), pixel(image, 20, 80)) == ROBOTS[:2]  # the lines between cells
-    assert text(robots=robots, paths=paths).split("\n") == ["0*.*.@", "2*1@. "]
+    assert text(robots=robots, paths=paths).split("\n") == ["0*.*.@", "2*1@."]

@@ -154,7 +154,7 @@ def test_disabled_autoreset_leaves_resets_to_the_caller(name: str) -> None:
     left, right = ours.step(action), theirs.step(action)
     assert_same(left, right)
     assert left[3].tolist() == [True, False, True]
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"worlds \[0, 2\]: the episode is over"):
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"rows \[0, 2\]: the episode is over"):
         ours.step(action)
     over = left[3]
     assert_same(

@@ -58,7 +58,7 @@ class Header(ctypes.Structure):
     @classmethod
     def type_name(cls) -> str:
         """The name by which iceoryx2 compares types of two processes."""
-        return f"emberwatch.v{VERSION}.{cls.__name__}"
+        return f"emberwatch.v2.{cls.__name__}"
 
 
 def _fields(format: str, names: str) -> list[tuple[str, Any]]:
