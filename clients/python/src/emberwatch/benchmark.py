@@ -96,7 +96,7 @@ class _Tally:
         worlds = results["world"][:: self.n_robots]
         self.reward += worlds["reward"]
         self.n_visited += worlds["n_visited"]
-        self.n_visits += results["robot"]["n_visited"].reshape(-1, self.n_robots).sum(axis=1)
+        self.n_visits += results["robot"]["n_visited"].reshape(-1, self.n_robots).sum(1, np.int64)
         self.n_hits += worlds["n_hits"]
         self.n_fire += worlds["n_target_cells"]
 
