@@ -6,7 +6,7 @@ use crate::learner::{
 };
 use crate::wire::control_header;
 use agent::acting::decider::{Assignment, Decider};
-use agent::acting::run::prepare;
+use agent::acting::mission::prepare;
 use agent::config::AgentConfig;
 use agent::planning::policy::{EstimatorKind, PlannerKind};
 use agent::server::client::{self, Claim, Client, shape_of};

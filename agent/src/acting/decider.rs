@@ -121,7 +121,7 @@ impl Decider {
             let mut robot = self.robot(observations[index].clone())?;
             robot.begin(None, |robot| {
                 if shown.contains(&turn) {
-                    self.feed.show(&robot.view(world, world));
+                    self.feed.show(&robot.view(world, world..world + 1));
                 }
             })?;
             self.last[index] = decision(&robot, self.n_moves(), None);
@@ -156,7 +156,8 @@ impl Decider {
             },
             |turn, run, _| {
                 if shown.contains(&turn) {
-                    self.feed.show(&run.robot.view(run.world, run.world));
+                    self.feed
+                        .show(&run.robot.view(run.world, run.world..run.world + 1));
                 }
                 Ok(())
             },

@@ -4,7 +4,7 @@
 //! alive. Without the worlds there is nothing to serve, so a lost lease or a server that ends is the end.
 
 use crate::acting::decider::{Assignment, Decider};
-use crate::acting::run::prepare;
+use crate::acting::mission::prepare;
 use crate::estimation::first_belief::first_belief;
 use crate::server::client::{is_outage, refusal, shape_of};
 use anyhow::{Result, ensure};

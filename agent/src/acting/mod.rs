@@ -3,5 +3,7 @@
 pub mod decider;
 pub mod decisions;
 pub mod handover;
+pub mod mission;
+pub mod pilot;
 pub mod registry;
 pub mod run;

@@ -239,7 +239,8 @@ impl Match<'_> {
         let is_last = step + 1 == self.comparison.steps;
         let target = arena.model().target_state();
         let (first_world, shown) = (arena.worlds().start, feed.turn(robots.len()));
-        let crew = arena.n_robots() / n_agents;
+        let crew = (arena.n_robots() / n_agents) as u32;
+        let first_robot = first_world * arena.n_robots() as u32;
         rollout::step(
             robots,
             |robot| robot,
@@ -249,10 +250,9 @@ impl Match<'_> {
                 let world = &mut worlds[index / n_agents];
                 world.look(robot, turn, target, (index % n_agents == 0, is_last));
                 if shown.contains(&index) {
-                    let (world, robots) = (index / n_agents, index * crew);
-                    let first = first_world as usize * n_agents * crew;
-                    let view = robot.view(first_world + world as u32, (first + robots) as u32);
-                    feed.show(&view);
+                    let world = first_world + (index / n_agents) as u32;
+                    let first = first_robot + index as u32 * crew;
+                    feed.show(&robot.view(world, first..first + crew));
                 }
                 Ok(())
             },

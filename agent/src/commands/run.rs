@@ -1,7 +1,8 @@
 //! `run`: act on one world of a running server.
 
 use super::shared::{WaitFlag, model_named, parse_range};
-use agent::acting::run::{Mission, run};
+use agent::acting::mission::{Company, Mission};
+use agent::acting::run::run;
 use agent::config::AgentFlags;
 use agent::learning::learned::Learned;
 use anyhow::{Context, Result};
@@ -27,14 +28,15 @@ pub struct RunCommand {
     /// The robot of that world to fly
     #[arg(long, default_value_t = 0, conflicts_with = "robots")]
     robot: u32,
-    /// Several robots of that world to fly, FIRST..END: needs --team
+    /// Several robots of that world to fly: needs --team
     #[arg(long, value_name = "FIRST..END", value_parser = parse_range::<u32>, requires = "team")]
     robots: Option<Range<u32>>,
-    /// Fly these robots by one plan, on one belief of what all robots of the world see
-    #[arg(long, requires = "robots")]
-    team: bool,
-    /// See what all robots of the world see, whoever flies them
+    /// Plan for all robots of the world that fly, on what all see; agents with the same policy and settings make the
+    /// same plan, of which each flies its own part
     #[arg(long)]
+    team: bool,
+    /// See what all robots of the world see, but plan without regard to the others
+    #[arg(long, conflicts_with = "team")]
     share: bool,
     /// The policy
     #[arg(long, default_value = "beam_exploit")]
@@ -69,7 +71,11 @@ impl RunCommand {
                 .robots
                 .clone()
                 .unwrap_or(self.robot..self.robot.saturating_add(1)),
-            shares_frames: self.share,
+            company: match (self.team, self.share) {
+                (true, _) => Company::Team,
+                (_, true) => Company::Shared,
+                _ => Company::Alone,
+            },
             policy: self.policy.clone(),
             steps: self.steps,
             takeover: self.takeover,

@@ -201,7 +201,7 @@ impl Trainer {
         let mut look = |index: usize, robot: &Robot| {
             if let Some(feed) = feed.as_mut().filter(|_| shown.contains(&index)) {
                 let number = robots.start + index as u32;
-                let mut view = robot.view(number / team, number);
+                let mut view = robot.view(number / team, number..number + 1);
                 view.intent.policy.clone_from(&policy);
                 feed.show(&view);
             }

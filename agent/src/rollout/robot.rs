@@ -11,9 +11,10 @@ use anyhow::Result;
 use protocol::message::RobotResult;
 use protocol::{Cell, Grid, Move};
 use rayon::prelude::*;
+use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// An agent at its world: it flies a robot there, or several on one belief.
+/// An agent at its world: it plans for a robot there, or for several on one belief.
 pub struct Robot {
     pub agent: Agent,
     observation: Observation,
@@ -24,9 +25,9 @@ pub struct Robot {
 /// What a world shows to an agent after a step.
 #[derive(Debug, Clone)]
 pub struct Seen {
-    /// Of the first robot that the agent flies; its frame corrects the belief.
+    /// Of the first robot that the agent plans for; its frame corrects the belief.
     pub observation: Observation,
-    /// What the step gave the others that it flies.
+    /// What the step gave the others.
     pub others: Vec<RobotResult>,
     /// The hidden states X_k, shape `[H, W]`, where they are published.
     pub truth: Option<Grid<u8>>,
@@ -35,7 +36,7 @@ pub struct Seen {
 /// What a step did to one agent. Between correction and prediction: its belief is the posterior.
 pub struct Turn {
     pub before: Observation,
-    /// One for each robot that it flies.
+    /// One for each robot that it plans for.
     pub plans: Vec<Plan>,
     /// The hidden states X_{k+1}, where they are published.
     pub truth: Option<Grid<u8>>,
@@ -44,12 +45,12 @@ pub struct Turn {
 }
 
 impl Seen {
-    /// What an agent sees that flies these robots of one world, at least one.
+    /// What an agent sees that plans for these robots of one world, at least one.
     pub fn new(observations: impl IntoIterator<Item = Observation>) -> Self {
         let mut observations = observations.into_iter();
         let first = observations.next();
         Self {
-            observation: first.expect("invariant: an agent flies a robot"),
+            observation: first.expect("invariant: an agent has a robot"),
             others: observations.map(|other| other.robot).collect(),
             truth: None,
         }
@@ -83,11 +84,11 @@ impl Robot {
         Ok(robot)
     }
 
-    /// What it tells those who look on at its world; `first`: number of its first robot.
-    pub fn view(&self, world: u32, first: u32) -> View<'_> {
+    /// What it tells those who look on at its world; `robots`: numbers of those that it flies.
+    pub fn view(&self, world: u32, robots: Range<u32>) -> View<'_> {
         View {
             world,
-            robots: first..first + self.results().count() as u32,
+            robots,
             result: &self.observation.world,
             belief: self.agent.belief(),
             intent: self.agent.intent(self.planning),
@@ -98,7 +99,7 @@ impl Robot {
         &self.observation
     }
 
-    /// What the last step gave each robot that it flies.
+    /// What the last step gave each robot that it plans for.
     pub fn results(&self) -> impl Iterator<Item = &RobotResult> {
         std::iter::once(&self.observation.robot).chain(&self.others)
     }
@@ -155,7 +156,7 @@ impl Robot {
     }
 }
 
-/// One step of all agents. `robot` finds a run's own; `plan` chooses the paths of the robots that it flies; `fly` flies
+/// One step of all agents. `robot` finds a run's own; `plan` chooses the paths of its robots; `fly` flies
 /// all paths and gives what each agent sees then, in order; `look` is told of each run's turn, by its index, one after
 /// the other.
 pub fn step<R: Send>(

@@ -1,0 +1,101 @@
+//! What an agent is told to do on one world of a running server, and whether that server can be acted on.
+
+use crate::config::AgentConfig;
+use crate::learning::learned::Learned;
+use crate::server::client::{refused, server_info};
+use anyhow::{Result, bail, ensure};
+use protocol::Model;
+use protocol::channels::Instance;
+use protocol::control::ServerInfo;
+use protocol::message::Status;
+use std::ops::Range;
+
+/// What to do on one world.
+#[derive(Debug, Clone)]
+pub struct Mission {
+    pub instance: Instance,
+    pub world: u32,
+    /// Which robots of the world to fly, on one belief.
+    pub robots: Range<u32>,
+    /// How much it has to do with the other robots of the world.
+    pub company: Company,
+    pub policy: String,
+    /// Steps to act for; 0: until stopped.
+    pub steps: u64,
+    /// Take the robots from their holders.
+    pub takeover: bool,
+    /// The model, where the server does not reveal its own.
+    pub model: Option<Model>,
+    pub config: AgentConfig,
+    /// What was learned, for policies that act on it.
+    pub learned: Learned,
+}
+
+/// What an agent has to do with robots of its world that others fly.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Company {
+    /// Nothing.
+    Alone,
+    /// It sees what they see.
+    Shared,
+    /// It also plans for them, as they do for its own: agents that believe the same make the same plan for all, and
+    /// each flies its part.
+    Team,
+}
+
+impl Mission {
+    pub(super) fn worlds(&self) -> Range<u32> {
+        self.world..self.world.saturating_add(1)
+    }
+
+    /// The numbers of its robots on a server.
+    pub(super) fn numbers(&self, info: &ServerInfo) -> Result<Range<u32>> {
+        let (robots, team) = (&self.robots, info.n_robots);
+        ensure!(
+            !robots.is_empty() && robots.end <= team,
+            "robots: expected some of the world's 0..{team}, got {}..{}",
+            robots.start,
+            robots.end
+        );
+        ensure!(
+            robots.len() == 1 || self.company == Company::Team,
+            "robots: expected one, or a team"
+        );
+        Ok(self.world * team + robots.start..self.world * team + robots.end)
+    }
+}
+
+/// What a server says of itself, and its model, or the one given; checks that it has the worlds.
+pub fn prepare(
+    instance: &Instance,
+    worlds: &Range<u32>,
+    model: Option<&Model>,
+) -> Result<(ServerInfo, Model)> {
+    let info = server_info(instance)?;
+    if worlds.end > info.n_worlds {
+        let (status, detail) = (Status::NoSuchWorld, info.n_worlds.into());
+        return Err(refused(status, detail, status.explain(detail)).into());
+    }
+    let revealed = info.model.as_deref().map(Model::from_toml).transpose()?;
+    let model = match (model, revealed) {
+        (Some(given), Some(revealed)) if *given != revealed => {
+            bail!(
+                "model: expected the server's own, {:?}, as it reveals it, got another, {:?}",
+                revealed.file().name,
+                given.file().name
+            );
+        }
+        (Some(given), _) => given.clone(),
+        (None, Some(revealed)) => revealed,
+        (None, None) => bail!(
+            "instance {:?} does not reveal its model: expected --model FILE",
+            instance.name()
+        ),
+    };
+    let (expected, got) = (info.n_observations, model.file().observations.len());
+    ensure!(
+        got == expected,
+        "model: expected the server's {expected} observations, got {got}"
+    );
+    Ok((info, model))
+}

@@ -1,0 +1,324 @@
+//! An agent that flies robots of one world through a connection: attach, step, catch up.
+
+use crate::acting::handover::{catch_up, leave, resume, take_over_left};
+use crate::acting::mission::{Company, Mission, prepare};
+use crate::acting::registry::{self, Task};
+use crate::estimation::Prior;
+use crate::estimation::belief::Belief;
+use crate::estimation::first_belief::first_belief;
+use crate::planning::Plan;
+use crate::planning::policy::{EstimatorKind, Policy};
+use crate::planning::team::robot_seed;
+use crate::rollout::{self, Robot, Seen};
+use crate::server::client::{
+    Claim, Client, Observation, is_belief_left, is_late, refused, shape_of,
+};
+use crate::server::feed::Feed;
+use crate::server::truth::TruthFeed;
+use anyhow::{Result, ensure};
+use protocol::connection::ConnectionError;
+use protocol::message::{Status, WorldResult};
+use protocol::{Cell, Grid, Model};
+use std::cell::RefCell;
+use std::ops::Range;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+use thiserror::Error;
+
+/// Time between two warnings of steps that went on without the agent.
+const WARN_INTERVAL: Duration = Duration::from_secs(10);
+
+/// An agent at its world.
+pub struct Pilot {
+    client: Client,
+    truth: Option<TruthFeed>,
+    /// Knows all robots that are planned for, those that others fly among them.
+    robot: Robot,
+    /// The numbers of these.
+    seen: Range<u32>,
+    feed: Feed,
+    warned: Option<Instant>,
+}
+
+/// A path was not flown, as it was time to stop.
+#[derive(Debug, Error)]
+#[error("stopped")]
+struct NotFlown;
+
+impl Pilot {
+    /// Acquires the robots where their world stands and takes in its last frame.
+    pub fn attach(mission: &Mission) -> Result<Self> {
+        let (info, model) = prepare(&mission.instance, &mission.worlds(), mission.model.as_ref())?;
+        let policy = Policy::named(&mission.policy, &model)?;
+        ensure!(
+            policy.estimator != EstimatorKind::NextTruth,
+            "policy {:?} needs worlds that run one step ahead: only `compare` has them",
+            policy.name
+        );
+        ensure!(
+            !policy.is_decided || mission.company != Company::Team,
+            "policy {:?} decides for one robot, not for a team",
+            policy.name
+        );
+        let numbers = mission.numbers(&info)?;
+        let shape = shape_of(&info)?;
+        // What takes long is done before the lease begins to run, and not at all where a belief was left.
+        let prior = if policy.estimator.knows_model() {
+            let any = Belief::from_initial(&model, shape);
+            if let Some(attached) = Self::go_on(mission, &numbers, &model, &policy, &any)? {
+                return Ok(attached);
+            }
+            mission.config.prior(info.burn_in)
+        } else {
+            Prior::Initial
+        };
+        let prior = first_belief(prior, &model, shape, mission.config.seed)?;
+        let mut attached = Self::acquire(mission, &numbers, &model, &policy, &prior)?;
+        if !resume(&mut attached.client, numbers.start, &mut attached.robot)? {
+            attached.begin()?;
+        }
+        Ok(attached)
+    }
+
+    /// Acquires the robots if a belief was left for the first, in the place of `any`.
+    fn go_on(
+        mission: &Mission,
+        numbers: &Range<u32>,
+        model: &Model,
+        policy: &Policy,
+        any: &Belief,
+    ) -> Result<Option<Self>> {
+        let task = Task {
+            model,
+            shape: any.shape(),
+            n_moves: 1,
+            prior: any,
+            seed: 0,
+            learned: &mission.learned,
+        };
+        let agent = registry::agent(policy, &mission.config, task)?;
+        let Some(kind) = agent.estimator().kind() else {
+            return Ok(None);
+        };
+        if !is_belief_left(&mission.instance, numbers.start, &kind)? {
+            return Ok(None);
+        }
+        let mut attached = Self::acquire(mission, numbers, model, policy, any)?;
+        if take_over_left(&mut attached.client, numbers.start, &mut attached.robot)? {
+            return Ok(Some(attached));
+        }
+        // Another agent acted since.
+        attached.client.release()?;
+        Ok(None)
+    }
+
+    /// Acquires the robots for an agent before its first frame.
+    fn acquire(
+        mission: &Mission,
+        numbers: &Range<u32>,
+        model: &Model,
+        policy: &Policy,
+        prior: &Belief,
+    ) -> Result<Self> {
+        let claim = Claim {
+            robots: numbers.clone(),
+            takeover: mission.takeover,
+            time_to_live: None,
+        };
+        let mut client = Client::acquire(&mission.instance, &claim)?;
+        client.share_frames(mission.company != Company::Alone);
+        let team = client.info().n_robots;
+        let (robots, first) = match mission.company {
+            Company::Team => (mission.world * team..(mission.world + 1) * team, 0),
+            _ => (numbers.clone(), mission.robots.start),
+        };
+        let seen = Seen::new(client.observe(robots.clone())?);
+        let (seed, step) = (seen.observation.world.seed, seen.observation.world.step);
+        tracing::info!(
+            world = mission.world,
+            robots = ?mission.robots,
+            seed,
+            step,
+            policy = policy.name,
+            "acting"
+        );
+        let task = Task {
+            model,
+            shape: client.shape(),
+            n_moves: client.info().n_moves,
+            prior,
+            seed: robot_seed(mission.config.planner_seed(seed), first as usize),
+            learned: &mission.learned,
+        };
+        let agent = registry::agent(policy, &mission.config, task)?;
+        let is_told = policy.estimator == EstimatorKind::Truth;
+        Ok(Self {
+            truth: is_told.then(|| open_truth(mission, &client)).transpose()?,
+            feed: Feed::open(&mission.instance, agent.belief()),
+            robot: Robot::new(agent, seen),
+            seen: robots,
+            client,
+            warned: None,
+        })
+    }
+
+    fn begin(&mut self) -> Result<()> {
+        let world = &self.robot.observation().world;
+        let truth = truth_of(self.truth.as_ref(), &self.client, world)?;
+        let (client, feed) = (&self.client, &mut self.feed);
+        let look = |robot: &Robot| show(feed, client, robot, false);
+        self.robot.begin(truth.as_ref(), look)
+    }
+
+    /// One step of the rollout; returns the reward, or `None` if no path was flown: it is time to stop, or the world has
+    /// moved on without, and the agent has caught up. The last belief is shown in any case.
+    pub fn step(&mut self, is_last: bool, stop: &AtomicBool) -> Result<Option<f64>> {
+        let (own, is_planned) = (self.own(), self.is_planned());
+        let n_before = is_planned[..own.start].iter().filter(|it| **it).count();
+        let flown = n_before..n_before + own.len();
+        let Self {
+            client,
+            truth,
+            robot,
+            seen,
+            feed,
+            ..
+        } = self;
+        let (mut is_flown, client) = (true, RefCell::new(client));
+        let stepped = rollout::step(
+            std::slice::from_mut(robot),
+            |robot| robot,
+            |robot| plan(robot, &is_planned),
+            |paths| {
+                let mut client = client.borrow_mut();
+                let (robots, is_over) = (client.robots(), || stop.load(Ordering::Relaxed));
+                let answer = client.step_until(robots, &paths[flown], &is_over)?;
+                is_flown = answer.is_some();
+                let answer = answer.ok_or(NotFlown)?;
+                let mut seen = Seen::new(with_others(&mut client, seen, answer)?);
+                seen.truth = truth_of(truth.as_ref(), &client, &seen.observation.world)?;
+                Ok(vec![seen])
+            },
+            |_, robot, _| {
+                show(feed, &client.borrow(), robot, is_last);
+                Ok(())
+            },
+        );
+        match stepped {
+            Ok(()) => {
+                let results = self.robot.results().skip(own.start).take(own.len());
+                Ok(Some(results.map(|result| result.reward).sum()))
+            }
+            Err(_) if !is_flown => Ok(None),
+            Err(error) if is_late(&error) => self.catch_up().map(|()| None),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Leaves the belief to the next agent of each robot.
+    pub fn leave(&mut self) -> Result<(), ConnectionError> {
+        let mut numbers = self.client.robots();
+        numbers.try_for_each(|number| leave(&mut self.client, number, &self.robot))
+    }
+
+    /// Gives the robots back, and ends when those who look on have had time to see the last belief.
+    pub fn release(self) -> Result<(), ConnectionError> {
+        let released = self.client.release();
+        self.feed.end();
+        released
+    }
+
+    /// Takes in what the world did meanwhile.
+    fn catch_up(&mut self) -> Result<()> {
+        let before = self.robot.observation().world.step;
+        let mut seen = Seen::new(self.client.observe(self.seen.clone())?);
+        let step = seen.observation.world.step;
+        if self.warned.is_none_or(|at| at.elapsed() > WARN_INTERVAL) {
+            self.warned = Some(Instant::now());
+            tracing::warn!("late: the world went on from step {before} to {step}; catching up");
+        }
+        seen.truth = truth_of(self.truth.as_ref(), &self.client, &seen.observation.world)?;
+        let number = self.seen.start;
+        catch_up(&mut self.client, number, &mut self.robot, seen)?;
+        show(&mut self.feed, &self.client, &self.robot, false);
+        self.robot.agent.predict();
+        Ok(())
+    }
+
+    /// Which of the robots that it knows are its own.
+    fn own(&self) -> Range<usize> {
+        let own = self.client.robots();
+        let index = |number: u32| (number - self.seen.start) as usize;
+        index(own.start)..index(own.end)
+    }
+
+    /// For which of the robots that it knows it plans: its own, and those of others that flew.
+    fn is_planned(&self) -> Vec<bool> {
+        let (own, team) = (self.own(), self.client.info().n_robots);
+        let hovered = self.robot.observation().world.hovered;
+        let is_planned = |(index, number): (usize, u32)| {
+            own.contains(&index) || hovered >> (number % team) & 1 == 0
+        };
+        self.seen.clone().enumerate().map(is_planned).collect()
+    }
+}
+
+/// Plans for some of the robots that an agent knows.
+fn plan(robot: &mut Robot, is_planned: &[bool]) -> Vec<Plan> {
+    robot.plan_with(|agent, cells, step| {
+        let cells = cells.iter().zip(is_planned);
+        let cells: Vec<Cell> = cells.filter(|(_, is)| **is).map(|it| *it.0).collect();
+        agent.plan(&cells, step)
+    })
+}
+
+/// What all robots in `seen` show after the step of an answer.
+///
+/// # Errors
+/// `Late` if the world has moved on since.
+fn with_others(
+    client: &mut Client,
+    seen: &Range<u32>,
+    answer: Vec<Observation>,
+) -> Result<Vec<Observation>, ConnectionError> {
+    if seen.len() == answer.len() {
+        return Ok(answer);
+    }
+    let all = client.observe(seen.clone())?;
+    let step = all[0].world.step;
+    if step != answer[0].world.step {
+        return Err(refused(Status::Late, step, Status::Late.explain(step)));
+    }
+    Ok(all)
+}
+
+/// The hidden states that a world's robots see part of, for policies that are told them.
+fn truth_of(
+    feed: Option<&TruthFeed>,
+    client: &Client,
+    world: &WorldResult,
+) -> Result<Option<Grid<u8>>> {
+    let Some(feed) = feed else {
+        return Ok(None);
+    };
+    let worlds = client.worlds_of(&client.robots());
+    let states = feed.states(worlds, &[world.seed], world.step)?;
+    Ok(states.into_iter().next())
+}
+
+/// Shows an agent's posterior to those who look on, if it is time or in any case.
+fn show(feed: &mut Feed, client: &Client, robot: &Robot, in_any_case: bool) {
+    if feed.is_due() || in_any_case {
+        let (robots, team) = (client.robots(), client.info().n_robots);
+        feed.show(&robot.view(robots.start / team, robots));
+    }
+}
+
+fn open_truth(mission: &Mission, client: &Client) -> Result<TruthFeed> {
+    ensure!(
+        client.info().publish_truth,
+        "policy {:?} needs the truth channel: start the server with --publish-truth",
+        mission.policy
+    );
+    TruthFeed::open(&mission.instance, client.shape())
+}
