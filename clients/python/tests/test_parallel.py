@@ -1,5 +1,7 @@
 """All robots of a world through PettingZoo, and each of them in an environment of its own."""
 
+import hashlib
+import json
 import threading
 import warnings
 from collections.abc import Callable, Iterator
@@ -225,6 +227,43 @@ def test_four_environments_of_one_robot_are_the_team(
             for robot, flown in zip(order, together(calls), strict=True):
                 assert flown[4].pop("n_missed") == 0
                 assert_same(list(flown), [part[AGENTS[robot]] for part in outcome])
+
+
+FLY = """
+import hashlib, json, sys
+import gymnasium, emberwatch
+robot, paths = int(sys.argv[2]), json.loads(sys.argv[3])
+env = gymnasium.make("emberwatch/Wildfire-v0", instance=sys.argv[1], robot=robot, timeout=20.0)
+env.reset()
+print("holds its robot", flush=True)
+input()
+for path in paths:
+    seen, reward, *_ , info = env.step(path)
+    told = [seen["frame"].tobytes(), seen["robot"].tolist(), reward, info]
+    print(hashlib.sha256(repr(told).encode()).hexdigest(), flush=True)
+env.close()
+"""
+
+
+def test_four_processes_are_the_team(script: Callable[..., Any]) -> None:
+    paths = random_actions(20, 4, (4,))
+    with serving(robots=4) as instance:
+        env = team(instance=instance, action="path", observation=("frame", "robot"))
+        expected = rollout(env, paths, 5)[1:]
+        env.reset(seed=5)
+        env.close()
+        given = [[path[agent].tolist() for path in paths] for agent in AGENTS]
+        flyers = [script(FLY, instance, robot, json.dumps(given[robot])) for robot in (2, 0, 3, 1)]
+        for flyer in flyers:
+            assert flyer.line() == "holds its robot"
+        for flyer in flyers:
+            flyer.say()
+        for robot, flyer in zip((2, 0, 3, 1), flyers, strict=True):
+            for seen, rewards, _, _, infos in expected:
+                agent = AGENTS[robot]
+                frame, cell = seen[agent]["frame"].tobytes(), seen[agent]["robot"].tolist()
+                told = [frame, cell, rewards[agent], infos[agent] | {"n_missed": 0}]
+                assert flyer.line() == hashlib.sha256(repr(told).encode()).hexdigest()
 
 
 def test_robots_that_nobody_holds_hover(alone: Callable[..., Any]) -> None:
