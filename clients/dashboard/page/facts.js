@@ -1,13 +1,15 @@
 // What the page says in words: state, note, facts, and what is missing.
 
 import { write } from "/elements.js";
-import { beliefAge, short, stateNames, targetName, text, whole } from "/words.js";
+import { createRobots } from "/robots.js";
+import { beliefAge, isTeam, short, stateNames, targetName, text, whole } from "/words.js";
 
 const byId = (id) => document.getElementById(id);
 
 /** Writes a picture's words. */
 export function createFacts() {
   const announce = byId("announce");
+  const robots = createRobots(byId("robots"));
   let said = "";
   // Whether no picture can be had: that is told until one comes.
   let isTroubled = false;
@@ -36,7 +38,9 @@ export function createFacts() {
     draw(picture, view) {
       if (!isTroubled) drawWell(picture);
       drawServer(picture);
-      drawWorld(picture);
+      const world = picture.status?.worlds.find((other) => other.world === picture.world);
+      drawWorld(picture, world);
+      robots.draw(picture, world?.holder_pids);
       drawAgent(picture, view.at == null);
       drawEmpty(picture);
     },
@@ -94,14 +98,17 @@ function drawLost(lost) {
   fact.classList.toggle("is-alarming", lost?.frames > 0 || others.length > 0);
 }
 
-function drawWorld(picture) {
-  const { shown, status, world } = picture;
+function drawWorld(picture, world) {
+  const { shown } = picture;
   write(byId("step"), whole(shown?.step));
+  write(byId("reward-word"), isTeam(shown) ? "team reward" : "reward");
   write(byId("reward"), short(shown?.reward));
   write(byId("hits"), shown ? `${targetName(picture)} in ${whole(shown.n_hits)} of ${whole(shown.n_visited)} cells` : "");
   write(byId("seed"), text(shown?.seed));
   write(byId("episode"), ending(shown));
-  write(byId("holder"), holder(status?.worlds?.find((other) => other.world === world)));
+  write(byId("holder"), holder(world));
+  // Of a team each robot's line tells it.
+  byId("holder-fact").hidden = isTeam(shown) && !world?.resetting;
 }
 
 function ending(shown) {
@@ -111,7 +118,7 @@ function ending(shown) {
 
 function holder(world) {
   if (!world) return text(null);
-  return world.resetting ? "burning in" : text(world.holder_pid ?? "nobody");
+  return world.resetting ? "burning in" : text(world.holder_pids[0] ?? "nobody");
 }
 
 function drawAgent(picture, isNewest) {
@@ -123,7 +130,14 @@ function drawAgent(picture, isNewest) {
   write(byId("silent"), isSilent ? "silent" : "");
   write(byId("objective"), text(plan?.objective));
   write(byId("belief-from"), text(agent?.belief_from));
+  write(byId("believer"), isTeam(picture.shown) ? flownBy(agent) : "");
   write(byId("plan"), plan?.plan_millis == null ? text(null) : `${Number(plan.plan_millis.toPrecision(2))} ms`);
+}
+
+function flownBy(agent) {
+  if (!agent) return "";
+  const { first_robot: first, n_robots: count } = agent;
+  return count > 1 ? `robots ${first}–${first + count - 1}` : `robot ${first}`;
 }
 
 // Before anything is known there is nothing to lay out: a word on how to begin.

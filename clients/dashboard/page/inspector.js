@@ -1,9 +1,9 @@
-// One cell in numbers: the one pointed at, else the one that the robot is on.
+// One cell in numbers: the one pointed at, else the one that the first robot is on.
 
 import { make, swatch } from "/elements.js";
 import { NEVER, rampColor } from "/palette.js";
 import { cellsOf, shapeOf } from "/wire.js";
-import { beliefAge, beliefNames, observationNames, seenSince, stateNames } from "/words.js";
+import { beliefAge, beliefNames, isTeam, observationNames, seenSince, stateNames } from "/words.js";
 
 // Long enough that a screen reader is not flooded while keys are held.
 const QUIET_MILLIS = 400;
@@ -24,10 +24,11 @@ export function createInspector(announcer) {
     if (!at) return;
     const rows = rowsOf(picture, at);
     const heading = `row ${at.row}, col ${at.col}`;
-    const key = JSON.stringify([heading, rows, Boolean(cell), palette.theme]);
+    const hint = cell ? "" : isTeam(picture.shown) ? "robot 0" : "robot";
+    const key = JSON.stringify([heading, rows, hint, palette.theme]);
     if (key === shownKey) return;
     shownKey = key;
-    title.replaceChildren(make("b", "", {}, heading), make("span", "hint", {}, cell ? "" : "robot"));
+    title.replaceChildren(make("b", "", {}, heading), make("span", "hint", {}, hint));
     list.replaceChildren(...rows.map((row) => rowElement(row, palette)));
   }
 
@@ -44,7 +45,8 @@ export function createInspector(announcer) {
 }
 
 function robotCell({ shown }) {
-  return shown && { row: shown.robot[0], col: shown.robot[1] };
+  const [row, col] = shown?.robots[0].cell ?? [];
+  return shown && { row, col };
 }
 
 function rowsOf(picture, { row, col }) {

@@ -1,25 +1,31 @@
-// Marks over a grid, in device pixels: the path, where it began, the robot, and the pointed-at cell.
-// Marks are dark with a light counterpart, so that they stand out from every colour of every theme.
+// Marks over a grid, in device pixels: paths, where they began, the robots, and the pointed-at cell.
+// Marks are dark with a light counterpart, so that they stand out from every colour of every theme. In a team the
+// light one has the robot's colour.
 
 import { prepare } from "/elements.js";
+import { robotColor } from "/palette.js";
 import { shapeOf } from "/wire.js";
+import { isTeam } from "/words.js";
 
 const DARK = "#141414";
 const LIGHT = "#ffffff";
 
-/** Draws them; `hasPath` only where the path belongs. */
-export function drawMarks(canvas, picture, { cell, hasPath }) {
+/** Draws them; `hasPaths` only where the paths belong. */
+export function drawMarks(canvas, picture, { cell, hasPaths }) {
   const drawn = prepare(canvas);
   if (!drawn) return;
   const shape = shapeOf(picture);
   const ink = getComputedStyle(canvas).getPropertyValue("--ink");
   const frame = { ...drawn, ink, cell: { x: drawn.width / shape.width, y: drawn.height / shape.height } };
-  if (hasPath && picture.shown) {
-    drawPath(frame, picture.shown.path);
-    drawStart(frame, picture.shown.start);
-    drawRobot(frame, picture.shown.robot);
-  }
+  if (hasPaths && picture.shown) drawRobots(frame, picture.shown);
   if (cell) drawCross(frame, cell);
+}
+
+// All paths below all starts below all robots, the first robot on top.
+function drawRobots(frame, shown) {
+  const look = (at) => (isTeam(shown) ? { color: robotColor(at), label: String(at) } : {});
+  const robots = shown.robots.map((robot, at) => ({ ...robot, ...look(at) })).reverse();
+  for (const draw of [drawPath, drawStart, drawRobot]) robots.forEach((robot) => draw(frame, robot));
 }
 
 function middle({ cell }, [row, col]) {
@@ -33,36 +39,60 @@ function inside(frame, place, radius) {
   return [fit(x, frame.width), fit(y, frame.height)];
 }
 
-function drawPath(frame, path) {
+function drawPath(frame, { path, color }) {
   const { context, ratio, cell, ink } = frame;
   context.beginPath();
   for (const place of path) context.lineTo(...middle(frame, place));
   context.lineJoin = "round";
   context.lineCap = "round";
-  context.lineWidth = Math.min(Math.max(cell.x * 0.26, ratio), 3 * ratio);
+  const width = Math.min(Math.max(cell.x * 0.26, ratio), 3 * ratio);
   // Over cells of a pixel or two there is more background than cells around the line.
-  context.strokeStyle = cell.x < 2 * ratio ? ink : DARK;
+  const dark = cell.x < 2 * ratio ? ink : DARK;
+  stroke(context, color ? width + ratio : width, dark);
+  if (color) stroke(context, width, color);
+}
+
+function stroke(context, width, color) {
+  context.lineWidth = width;
+  context.strokeStyle = color;
   context.stroke();
 }
 
-function drawStart(frame, place) {
+function drawStart(frame, { path: [place], color }) {
   const { context, ratio, cell } = frame;
   const side = Math.max(cell.x * 0.9, 6 * ratio);
   const [x, y] = inside(frame, place, side / 2 + ratio);
-  context.fillStyle = LIGHT;
+  context.fillStyle = color ?? LIGHT;
   context.fillRect(x - side / 2, y - side / 2, side, side);
   context.strokeStyle = DARK;
   context.lineWidth = 1.5 * ratio;
   context.strokeRect(x - side / 2, y - side / 2, side, side);
 }
 
-function drawRobot(frame, place) {
+// Hollow if it stayed: hovered or, with a dashed ring, late.
+function drawRobot(frame, { cell: place, state, color = LIGHT, label }) {
   const { context, ratio, cell } = frame;
-  const radius = Math.max(cell.x * 0.85, 5 * ratio);
+  const radius = Math.max(cell.x * 0.85, (label ? 8 : 5) * ratio);
   const [x, y] = inside(frame, place, radius + 1.5 * ratio);
+  const hasStayed = state === "hovered" || state === "late";
   disc(context, x, y, radius + 1.5 * ratio, DARK);
-  disc(context, x, y, radius, LIGHT);
-  disc(context, x, y, radius * 0.42, DARK);
+  disc(context, x, y, radius, hasStayed ? DARK : color);
+  if (hasStayed) ring(context, x, y, radius, { color, isDashed: state === "late" });
+  if (!label) return disc(context, x, y, radius * 0.42, DARK);
+  context.font = `bold ${radius * (label.length > 1 ? 1 : 1.3)}px sans-serif`;
+  context.textAlign = "center";
+  context.textBaseline = "middle";
+  context.fillStyle = hasStayed ? color : DARK;
+  context.fillText(label, x, y + radius * 0.08);
+}
+
+function ring(context, x, y, radius, { color, isDashed }) {
+  context.beginPath();
+  context.arc(x, y, radius * 0.87, 0, 2 * Math.PI);
+  const dash = (radius * 0.87 * 2 * Math.PI) / 16;
+  context.setLineDash(isDashed ? [dash, dash] : []);
+  stroke(context, radius * 0.26, color);
+  context.setLineDash([]);
 }
 
 function disc(context, x, y, radius, color) {

@@ -25,6 +25,9 @@ const RAMPS = {
   },
 };
 
+// Of a team's paths and robots: all are light, so that dark edges and numbers are seen on them.
+const ROBOTS = ["#5ee6c8", "#ff9ad5", "#b9f04a", "#8fd0ff", "#ffa64d", "#c9a8ff", "#f5f09a", "#d9c2a0"];
+
 // Before an agent has planned its first path.
 const IDLE = { name: "nothing yet", color: "#8b93a0" };
 
@@ -81,6 +84,11 @@ export function objectiveColor(name, { objectives, names, palette }) {
   const others = objectives.filter((other) => !names.includes(other) && other !== IDLE.name);
   const at = Math.max(0, others.indexOf(name));
   return OBJECTIVES[at] ?? generated(at);
+}
+
+/** The colour of a team's robot. */
+export function robotColor(at) {
+  return ROBOTS[at % ROBOTS.length];
 }
 
 /** "#rrggbb" as [red, green, blue]. */

@@ -104,7 +104,7 @@ function paint(panel, picture, cell, palette) {
     fill(pixels, values, panel, picture, palette);
     panel.context.putImageData(panel.image, 0, 0);
   }
-  drawMarks(panel.marks, picture, { cell, hasPath: panel.kind === "frame" && Boolean(values) });
+  drawMarks(panel.marks, picture, { cell, hasPaths: panel.kind === "frame" && Boolean(values) });
 }
 
 function fill(pixels, values, { kind }, { arrays }, palette) {

@@ -42,6 +42,11 @@ export function beliefNames(picture) {
   return names?.length === count ? names : numbered("state", count);
 }
 
+/** Whether a world has several robots. */
+export function isTeam(shown) {
+  return shown?.robots.length > 1;
+}
+
 /** The name of the state that pays. */
 export function targetName(picture) {
   const target = picture.info?.target_state;
@@ -74,7 +79,7 @@ export function panelSentence(panel, picture) {
         `${seenSince(picture) && ` ${seenSince(picture)}`} ${at}`;
     case "frame":
       return `this path: ${whole(shown.n_visited)} cells visited, ${whole(shown.n_hits)} of them ` +
-        `${targetName(picture)}, robot at row ${shown.robot[0]}, column ${shown.robot[1]} ${at}`;
+        `${targetName(picture)}, ${isTeam(shown) ? "robots" : "robot"} at ${places(shown)} ${at}`;
     case "belief":
       return `belief ${panel.name}: mean probability ${share(picture, panel)} ${believed}`;
     default:
@@ -89,6 +94,10 @@ export function chartSentence(title, unit, values, current) {
   const mean = known.reduce((sum, value) => sum + value, 0) / known.length;
   return `${title}: now ${short(current)}, mean ${short(mean)}, least ${short(Math.min(...known))}, ` +
     `most ${short(Math.max(...known))} ${unit}`;
+}
+
+function places({ robots }) {
+  return robots.map(({ cell: [row, col] }) => `row ${row}, column ${col}`).join("; ");
 }
 
 function observed(seen) {

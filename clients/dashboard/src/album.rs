@@ -1,11 +1,9 @@
 //! The last few thousand steps of each world, joined from what arrives on three channels. Pure.
 
-use protocol::agent_belief::{AgentBelief, Intent};
-use protocol::frame::UNOBSERVED;
-use protocol::message::{AgentHeader, FrameHeader, StepResult, TruthHeader};
+use crate::entry::{Belief, Entry, Key, States};
+use protocol::agent_belief::AgentBelief;
+use protocol::message::{AgentHeader, FrameHeader, TruthHeader};
 use protocol::observer::Sample;
-use protocol::path::path_from_bytes;
-use protocol::{Cell, Move, Shape};
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
@@ -42,68 +40,8 @@ pub struct Album {
 pub struct Strip {
     entries: VecDeque<Entry>,
     first_serial: u64,
-}
-
-/// One step of a world.
-#[derive(Debug)]
-pub struct Entry {
-    /// The grid.
-    pub shape: Shape,
-    /// The step's result.
-    pub result: StepResult,
-    /// Where the path began.
-    pub start: Cell,
-    /// The path; empty after a reset.
-    pub moves: Vec<Move>,
-    /// Cells seen, row by row, and what they showed.
-    pub seen: Vec<(u32, u8)>,
-    /// Hidden states, row by row, if they are published.
-    pub truth: Option<Box<[u8]>>,
-    /// What an agent made of it, if one shows that.
-    pub belief: Option<Belief>,
-    /// When it came.
-    pub at: Instant,
-}
-
-/// An agent's belief, as bytes.
-#[derive(Debug)]
-pub struct Belief {
-    /// `round(255 p)`, state by state, each row by row.
-    pub levels: Box<[u8]>,
-    /// Entropy as a share of `ln S`, `round(255 share)`.
-    pub entropy: Box<[u8]>,
-    /// What the agent wants.
-    pub intent: Intent,
-    /// Its process.
-    pub pid: u32,
-    /// How good it is, where that is known.
-    pub score: Option<Score>,
-}
-
-/// How a belief compares with the hidden states.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Score {
-    /// Minus the mean over cells of the logarithm of the true state's probability, nats.
-    pub log_loss: f64,
-    /// Mean over cells of the squared error of the target state's probability.
-    pub brier: f64,
-}
-
-/// A step of an episode of a seed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Key {
-    seed: u64,
-    episode: u64,
-    step: u64,
-}
-
-/// The model's states, if the server reveals them: names, and which pays most.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct States {
-    /// The names.
-    pub names: Vec<String>,
-    /// The state that pays most.
-    pub target: usize,
+    /// First robot of the agent whose beliefs are shown, and the time of the last step with one.
+    believer: Option<(u32, Instant)>,
 }
 
 impl Album {
@@ -154,7 +92,8 @@ impl Album {
             episode: header.episode,
             step: header.step,
         };
-        let Some(entry) = self.entry(header.world, key) else {
+        let strip = self.worlds.get_mut(&header.world);
+        let Some((entry, _)) = strip.and_then(|strip| strip.entry(key)) else {
             let early = (header.world, key, sample.payload.clone().into());
             self.early.truncate(MAX_EARLY - 1);
             self.early.push_front(early);
@@ -181,33 +120,31 @@ impl Album {
             episode,
             step,
             world,
-            pid,
+            first_robot,
             ..
         } = published.header;
-        let Some(entry) = self.entry(
-            world,
-            Key {
-                seed,
-                episode,
-                step,
-            },
-        ) else {
+        let key = Key {
+            seed,
+            episode,
+            step,
+        };
+        let strip = self.worlds.get_mut(&world);
+        let Some((entry, believer)) = strip.and_then(|strip| strip.entry(key)) else {
             return false;
         };
         let (_, height, width) = published.belief.dim();
         if (height, width) != entry.shape.dim() {
             return true; // It makes no sense, now or later.
         }
-        let states = states.filter(|states| states.names == published.intent.states);
-        let truth = entry.truth.as_deref();
-        let score = truth.zip(states);
-        let belief = Belief {
-            levels: published.belief.iter().map(|&p| level(p)).collect(),
-            entropy: entropy(published),
-            intent: published.intent.clone(),
-            pid,
-            score: score.and_then(|(truth, states)| score_of(published, truth, states.target)),
+        // Of several agents on a world the one with the first robot is shown, while it tells what it believes.
+        let is_told = |(first, at): (u32, Instant)| {
+            first < first_robot && entry.at.duration_since(at) < MAX_BELIEF_AGE
         };
+        if believer.is_some_and(is_told) {
+            return true;
+        }
+        *believer = Some((first_robot, entry.at));
+        let belief = Belief::of(published, entry.truth.as_deref(), states);
         let n_bytes = belief.n_bytes();
         let replaced = entry.belief.replace(belief);
         self.n_bytes = self.n_bytes + n_bytes - replaced.map_or(0, |old| old.n_bytes());
@@ -230,12 +167,6 @@ impl Album {
         let mut places = self.early.iter();
         let place = places.position(|(of, at, _)| (*of, *at) == (world, key))?;
         self.early.remove(place).map(|(_, _, truth)| truth)
-    }
-
-    fn entry(&mut self, world: u32, key: Key) -> Option<&mut Entry> {
-        let entries = &mut self.worlds.get_mut(&world)?.entries;
-        let mut latest = entries.iter_mut().rev().take(MAX_DELAY);
-        latest.find(|entry| entry.key() == key)
     }
 }
 
@@ -280,117 +211,15 @@ impl Strip {
         self.entries.iter()
     }
 
+    /// One of the latest steps, and whose beliefs are shown.
+    fn entry(&mut self, key: Key) -> Option<(&mut Entry, &mut Option<(u32, Instant)>)> {
+        let mut latest = self.entries.iter_mut().rev().take(MAX_DELAY);
+        let entry = latest.find(|entry| entry.key() == key)?;
+        Some((entry, &mut self.believer))
+    }
+
     fn forget_oldest(&mut self) -> usize {
         self.first_serial += 1;
         self.entries.pop_front().map_or(0, |entry| entry.n_bytes())
     }
-}
-
-impl Entry {
-    fn from_sample(sample: &Sample<FrameHeader>, at: Instant) -> Option<Self> {
-        let header = &sample.header;
-        let shape = Shape::new(header.height as usize, header.width as usize).ok()?;
-        let start = Cell {
-            row: header.start_row as usize,
-            col: header.start_col as usize,
-        };
-        let (values, path) = sample.payload.split_at_checked(shape.n_cells())?;
-        let moves = path_from_bytes(path).ok()?;
-        let is_seen = |(_, value): &(u32, &u8)| **value != UNOBSERVED;
-        let seen = (0..).zip(values).filter(is_seen);
-        let mut seen: Vec<(u32, u8)> = seen.map(|(cell, &value)| (cell, value)).collect();
-        seen.shrink_to_fit();
-        (shape.contains(start) && moves.len() == header.n_moves as usize).then_some(Self {
-            shape,
-            result: header.result,
-            start,
-            moves,
-            seen,
-            truth: None,
-            belief: None,
-            at,
-        })
-    }
-
-    /// The cells of the path, its start first.
-    pub fn path(&self) -> Vec<Cell> {
-        let mut cells = vec![self.start];
-        let mut cell = self.start;
-        for step in &self.moves {
-            cell = step.apply(cell, self.shape);
-            cells.push(cell);
-        }
-        cells
-    }
-
-    fn key(&self) -> Key {
-        Key {
-            seed: self.result.seed,
-            episode: self.result.episode,
-            step: self.result.step,
-        }
-    }
-
-    /// Whether it is an earlier step of the same episode, on the same grid.
-    fn precedes(&self, other: &Self) -> bool {
-        let of = |entry: &Self| (entry.result.seed, entry.result.episode, entry.shape);
-        of(self) == of(other) && self.result.step < other.result.step
-    }
-
-    /// Whether it is the same again, as a server shows it to an observer who has just come.
-    fn repeats(&self, next: &Self) -> bool {
-        (self.result, self.start) == (next.result, next.start) && self.moves == next.moves
-    }
-
-    fn n_bytes(&self) -> usize {
-        let truth = self.truth.as_ref().map_or(0, |truth| truth.len());
-        let belief = self.belief.as_ref().map_or(0, Belief::n_bytes);
-        size_of::<Self>() + self.moves.len() + self.seen.len() * 8 + truth + belief
-    }
-}
-
-impl Belief {
-    fn n_bytes(&self) -> usize {
-        let intent = &self.intent;
-        let words = [&intent.policy, &intent.belief_from, &intent.objective];
-        let words = words.into_iter().chain(&intent.states);
-        let n_words: usize = words.map(|word| size_of::<String>() + word.len()).sum();
-        self.levels.len() + self.entropy.len() + n_words
-    }
-}
-
-fn level(share: f32) -> u8 {
-    (share * 255.0).round() as u8
-}
-
-/// Entropy of each cell as a share of the greatest, `ln S`.
-fn entropy(published: &AgentBelief) -> Box<[u8]> {
-    let (n_states, height, width) = published.belief.dim();
-    let mut sums = vec![0f32; height * width];
-    for plane in published.belief.outer_iter() {
-        for (sum, &p) in sums.iter_mut().zip(plane) {
-            *sum -= if p > 0.0 { p * p.ln() } else { 0.0 };
-        }
-    }
-    let greatest = (n_states as f32).ln().max(f32::MIN_POSITIVE);
-    sums.iter().map(|sum| level(sum / greatest)).collect()
-}
-
-/// `None` if the hidden states are not among the belief's.
-fn score_of(published: &AgentBelief, truth: &[u8], target: usize) -> Option<Score> {
-    let n_cells = truth.len();
-    let numbers = published.belief.as_slice()?;
-    let (mut log_loss, mut brier) = (0.0, 0.0);
-    for (cell, &state) in truth.iter().enumerate() {
-        let p = f64::from(*numbers.get(usize::from(state) * n_cells + cell)?);
-        log_loss -= p.max(f64::from(f32::MIN_POSITIVE)).ln();
-        let of_target = f64::from(*numbers.get(target * n_cells + cell)?);
-        let miss = of_target - f64::from(u8::from(usize::from(state) == target));
-        brier += miss * miss;
-    }
-    let mean = |sum: f64| sum / n_cells as f64;
-    Some(Score {
-        log_loss: mean(log_loss),
-        brier: mean(brier),
-    })
 }

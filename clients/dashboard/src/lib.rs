@@ -5,6 +5,8 @@
 //! over a WebSocket of the [`server`], at its own pace; [`page`] is what draws them.
 
 pub mod album;
+pub mod entry;
+mod memory;
 pub mod page;
 pub mod picture;
 pub mod player;

@@ -22,7 +22,7 @@ macro_rules! assets {
 }
 
 /// Every file of the page.
-pub const ASSETS: [Asset; 21] = assets![
+pub const ASSETS: [Asset; 22] = assets![
     "/" "index.html" "text/html",
     "/page.css" "page.css" "text/css",
     "/icon.svg" "icon.svg" "image/svg+xml",
@@ -39,6 +39,7 @@ pub const ASSETS: [Asset; 21] = assets![
     "/panels.js" "panels.js" "text/javascript",
     "/plot.js" "plot.js" "text/javascript",
     "/pointer.js" "pointer.js" "text/javascript",
+    "/robots.js" "robots.js" "text/javascript",
     "/scale.js" "scale.js" "text/javascript",
     "/socket.js" "socket.js" "text/javascript",
     "/view.js" "view.js" "text/javascript",

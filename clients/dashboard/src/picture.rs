@@ -4,10 +4,11 @@
 //! JSON is padded with spaces and each array with zeros, so that all arrays begin at multiples of eight bytes.
 //! Numbers are little-endian.
 
-use crate::album::{Entry, Strip};
+use crate::album::Strip;
+use crate::entry::Entry;
+use crate::memory::Memory;
 use crate::scene::{Info, Lost, Player, Scene};
-use protocol::Cell;
-use protocol::control::{ServerStatus, WorldStatus};
+use protocol::control::ServerStatus;
 use protocol::frame::UNOBSERVED;
 use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
@@ -53,7 +54,7 @@ struct Header<'a> {
     state: &'static str,
     note: Option<&'a str>,
     info: Option<&'a Info>,
-    status: Option<Status<'a>>,
+    status: Option<&'a ServerStatus>,
     world: u32,
     kept: Option<Range>,
     shown: Option<Shown>,
@@ -72,17 +73,6 @@ struct Range {
 }
 
 #[derive(Debug, Serialize)]
-struct Status<'a> {
-    steps_per_second: f64,
-    n_steps: u64,
-    n_observers: usize,
-    n_clients: usize,
-    n_refused: u64,
-    uptime_millis: u64,
-    worlds: &'a [WorldStatus],
-}
-
-#[derive(Debug, Serialize)]
 struct Shown {
     serial: u64,
     height: usize,
@@ -96,10 +86,7 @@ struct Shown {
     n_visited: u32,
     n_hits: u32,
     n_target_cells: u32,
-    robot: [u32; 2],
-    start: [usize; 2],
-    path: Vec<[usize; 2]>,
-    coverage: &'static str,
+    robots: Vec<ShownRobot>,
     terminated: bool,
     truncated: bool,
     log_loss: Option<f64>,
@@ -107,8 +94,21 @@ struct Shown {
 }
 
 #[derive(Debug, Serialize)]
+struct ShownRobot {
+    /// `flew`, `hovered`, `late`, or after a reset `new`.
+    state: &'static str,
+    cell: [u32; 2],
+    /// From its start on.
+    path: Vec<[usize; 2]>,
+    share: f64,
+}
+
+#[derive(Debug, Serialize)]
 struct AgentFacts<'a> {
     pid: u32,
+    /// The first robot of the world that it flies.
+    first_robot: u32,
+    n_robots: u32,
     policy: &'a str,
     belief_from: &'a str,
     objective: &'a str,
@@ -172,7 +172,7 @@ pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
         },
         note: scene.note.as_deref().or(scene.trouble.as_deref()),
         info: scene.info.as_ref(),
-        status: scene.status.as_ref().map(Status::of),
+        status: scene.status.as_ref(),
         world: ask.world,
         kept: strip
             .and_then(Strip::kept)
@@ -263,7 +263,7 @@ impl Arrays {
             let belief = entry.belief.as_ref();
             let log_loss = belief.and_then(|belief| Some(belief.score?.log_loss));
             let values = [
-                (!entry.moves.is_empty()).then_some(entry.result.reward),
+                entry.is_step().then_some(entry.result.reward),
                 Some(entry.result.n_target_cells.into()),
                 log_loss,
             ];
@@ -298,63 +298,9 @@ fn number_of<'a>(objective: &'a str, objectives: &mut Vec<&'a str>) -> u8 {
     number as u8
 }
 
-/// What each cell showed last.
-struct Memory {
-    /// The observation, [`UNOBSERVED`] if there was none.
-    seen: Vec<u8>,
-    /// How many steps before, at most 255.
-    age: Vec<u8>,
-    /// The first step that is remembered; 0: the episode's first.
-    since: u64,
-}
-
-impl Memory {
-    /// Of the steps of one run up to one of them.
-    fn of(strip: &Strip, serial: u64, last: &Entry) -> Self {
-        let n_cells = last.shape.n_cells();
-        let (mut seen, mut age) = (vec![UNOBSERVED; n_cells], vec![u8::MAX; n_cells]);
-        let (mut n_unseen, mut since) = (n_cells, last.result.step + 1);
-        for entry in strip.run_up_to(serial) {
-            let (then, now) = (&entry.result, &last.result);
-            if n_unseen == 0 {
-                break;
-            }
-            since = then.step;
-            for &(cell, value) in &entry.seen {
-                let cell = cell as usize;
-                if seen[cell] == UNOBSERVED {
-                    (seen[cell], age[cell]) = (value, (now.step - then.step).min(255) as u8);
-                    n_unseen -= 1;
-                }
-            }
-        }
-        let is_complete = n_unseen == 0 || since <= 1;
-        Self {
-            seen,
-            age,
-            since: if is_complete { 0 } else { since },
-        }
-    }
-}
-
-impl<'a> Status<'a> {
-    fn of(status: &'a ServerStatus) -> Self {
-        Self {
-            steps_per_second: status.steps_per_second,
-            n_steps: status.n_steps,
-            n_observers: status.n_observers,
-            n_clients: status.n_clients,
-            n_refused: status.n_refused,
-            uptime_millis: status.uptime_millis,
-            worlds: &status.worlds,
-        }
-    }
-}
-
 impl Shown {
     fn of(serial: u64, entry: &Entry, seen_since: u64) -> Self {
         let result = &entry.result;
-        let pair = |cell: Cell| [cell.row, cell.col];
         let score = entry.belief.as_ref().and_then(|belief| belief.score);
         Self {
             serial,
@@ -368,18 +314,32 @@ impl Shown {
             n_visited: result.n_visited,
             n_hits: result.n_hits,
             n_target_cells: result.n_target_cells,
-            robot: [result.row, result.col],
-            start: pair(entry.start),
-            path: entry.path().into_iter().map(pair).collect(),
-            coverage: match result.coverage {
-                0 => "nothing",
-                1 => "path",
-                _ => "full",
-            },
+            robots: (0..entry.robots.len())
+                .map(|index| ShownRobot::of(entry, index))
+                .collect(),
             terminated: result.terminated != 0,
             truncated: result.truncated != 0,
             log_loss: score.map(|score| score.log_loss),
             brier: score.map(|score| score.brier),
+        }
+    }
+}
+
+impl ShownRobot {
+    fn of(entry: &Entry, index: usize) -> Self {
+        let robot = &entry.robots[index];
+        let is_among = |robots: u64| robots >> index & 1 == 1;
+        let path = robot.path(entry.shape).into_iter();
+        Self {
+            state: match robot.moves.is_empty() {
+                _ if is_among(entry.result.hovered) => "hovered",
+                _ if is_among(entry.result.late) => "late",
+                true => "new",
+                false => "flew",
+            },
+            cell: [robot.result.row, robot.result.col],
+            path: path.map(|cell| [cell.row, cell.col]).collect(),
+            share: robot.result.reward,
         }
     }
 }
@@ -390,6 +350,8 @@ impl<'a> AgentFacts<'a> {
         let intent = &belief.intent;
         Some(Self {
             pid: belief.pid,
+            first_robot: belief.first_robot % entry.robots.len() as u32,
+            n_robots: belief.n_robots,
             policy: &intent.policy,
             belief_from: &intent.belief_from,
             objective: &intent.objective,

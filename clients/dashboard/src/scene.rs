@@ -1,6 +1,7 @@
 //! All that there is to show, shared between what watches and what answers browsers.
 
-use crate::album::{Album, States};
+use crate::album::Album;
+use crate::entry::States;
 use protocol::Model;
 use protocol::control::{CoverageRule, ServerInfo, ServerStatus};
 use serde::Serialize;

@@ -1,32 +1,48 @@
 //! What browsers get, from what was published.
 
-use dashboard::album::{Album, MAX_ENTRIES, States};
+use dashboard::album::{Album, MAX_ENTRIES};
+use dashboard::entry::States;
 use dashboard::picture::{Ask, picture};
 use dashboard::scene::Scene;
 use protocol::Probabilities;
 use protocol::agent_belief::{AgentBelief, Intent};
-use protocol::message::{AgentHeader, FrameHeader, StepResult, TruthHeader};
+use protocol::message::{AgentHeader, FrameHeader, RobotResult, TruthHeader, WorldResult};
 use protocol::observer::Sample;
 use serde_json::Value;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// A frame of a 2 x 3 world: the robot flew right along the upper row and saw the values.
 fn frame(step: u64, values: [u8; 6]) -> Sample<FrameHeader> {
+    let robot = RobotResult {
+        col: 2,
+        n_moves: 2,
+        reward: 0.25,
+        ..RobotResult::default()
+    };
+    frame_of(step, &[(robot, values)])
+}
+
+/// A frame of several robots; who flew flew right.
+fn frame_of(step: u64, robots: &[(RobotResult, [u8; 6])]) -> Sample<FrameHeader> {
     let header = FrameHeader {
+        n_robots: robots.len() as u32,
         height: 2,
         width: 3,
-        n_moves: 2,
-        result: StepResult {
+        result: WorldResult {
             step,
             seed: u64::MAX,
-            col: 2,
             reward: step as f64,
-            coverage: 1,
-            ..StepResult::default()
+            ..WorldResult::default()
         },
         ..FrameHeader::default()
     };
-    let payload = [&values[..], &[3, 3]].concat();
+    let results = robots
+        .iter()
+        .flat_map(|(robot, _)| bytemuck::bytes_of(robot));
+    let values = robots.iter().flat_map(|(_, values)| values);
+    let n_moves: u32 = robots.iter().map(|(robot, _)| robot.n_moves).sum();
+    let mut payload: Vec<u8> = results.chain(values).copied().collect();
+    payload.resize(payload.len() + n_moves as usize, 3);
     Sample { header, payload }
 }
 
@@ -128,10 +144,9 @@ fn a_picture_joins_frame_truth_and_belief_of_a_step() {
     let (header, array) = read(album, None);
     assert_eq!(header["shown"]["step"], 2);
     assert_eq!(header["shown"]["seed"], u64::MAX.to_string());
-    assert_eq!(
-        header["shown"]["path"],
-        serde_json::json!([[0, 0], [0, 1], [0, 2]])
-    );
+    let path = [[0, 0], [0, 1], [0, 2]];
+    let robot = serde_json::json!({"state": "flew", "cell": [0, 2], "path": path, "share": 0.25});
+    assert_eq!(header["shown"]["robots"], serde_json::json!([robot]));
     assert_eq!(array("frame"), [255, 1, 0, 255, 255, 255]);
     assert_eq!(array("truth"), [1, 1, 0, 1, 0, 0]);
     assert_eq!(
@@ -146,6 +161,76 @@ fn a_picture_joins_frame_truth_and_belief_of_a_step() {
         "{log_loss}"
     );
     assert!((header["shown"]["brier"].as_f64().expect("a number") - 1.0 / 6.0).abs() < 1e-6);
+}
+
+#[test]
+fn a_picture_tells_what_each_robot_did_and_what_all_saw() {
+    let mut album = Album::default();
+    let flew = RobotResult {
+        start_col: 1,
+        col: 2,
+        n_moves: 1,
+        reward: 0.5,
+        ..RobotResult::default()
+    };
+    let stayed = RobotResult {
+        start_row: 1,
+        row: 1,
+        ..RobotResult::default()
+    };
+    let robots = [
+        (stayed, [255; 6]),
+        (flew, [255, 255, 1, 255, 255, 255]),
+        (stayed, [255; 6]),
+        (flew, [0, 255, 1, 255, 255, 255]),
+    ];
+    let mut sample = frame_of(4, &robots);
+    (sample.header.result.hovered, sample.header.result.late) = (0b1, 0b100);
+    album.add_frame(&frame_of(3, &[(stayed, [255; 6]); 4]), Instant::now());
+    album.add_frame(&sample, Instant::now());
+    album.add_frame(&sample, Instant::now()); // shown again
+    let (header, array) = read(album, None);
+    assert_eq!(
+        header["shown"]["robots"],
+        serde_json::json!([
+            {"state": "hovered", "cell": [1, 0], "path": [[1, 0]], "share": 0.0},
+            {"state": "flew", "cell": [0, 2], "path": [[0, 1], [0, 2]], "share": 0.5},
+            {"state": "late", "cell": [1, 0], "path": [[1, 0]], "share": 0.0},
+            {"state": "flew", "cell": [0, 2], "path": [[0, 1], [0, 2]], "share": 0.5},
+        ])
+    );
+    assert_eq!(array("frame"), [0, 255, 1, 255, 255, 255]);
+    assert_eq!(header["kept"], serde_json::json!({"first": 0, "last": 1}));
+    // No robot flew in the first entry: its reward is none.
+    let rewards: Vec<f32> = array("series_reward")
+        .chunks_exact(4)
+        .map(|bytes| f32::from_le_bytes(bytes.try_into().expect("a float")))
+        .filter(|reward| !reward.is_nan())
+        .collect();
+    assert_eq!(rewards, [4.0]);
+}
+
+#[test]
+fn of_several_agents_the_one_with_the_first_robot_is_shown_while_it_tells() {
+    let told = |step: u64, robot: u32| {
+        let mut belief = agent_belief(step);
+        (belief.header.first_robot, belief.header.pid) = (robot, robot);
+        belief
+    };
+    let (mut album, now) = (Album::default(), Instant::now());
+    let shown = |album: &mut Album, step: u64, robots: [u32; 3], at: Instant| {
+        album.add_frame(&frame(step, [255; 6]), at);
+        for robot in robots {
+            assert!(album.add_belief(&told(step, robot), None));
+        }
+        let strip = album.strip(0).expect("a world");
+        let newest = strip.entries().last().expect("a step");
+        newest.belief.as_ref().map(|belief| belief.pid)
+    };
+    assert_eq!(shown(&mut album, 1, [2, 1, 2], now), Some(1));
+    assert_eq!(shown(&mut album, 2, [2, 3, 2], now), None);
+    let later = now + Duration::from_secs(5);
+    assert_eq!(shown(&mut album, 3, [2, 3, 3], later), Some(2));
 }
 
 #[test]
@@ -242,9 +327,11 @@ fn what_makes_no_sense_is_left_out() {
     for bad in [
         change(|sample| sample.header.height = 0),
         change(|sample| sample.header.height = u32::MAX),
-        change(|sample| sample.header.start_row = 2),
-        change(|sample| sample.header.n_moves = 3),
-        change(|sample| sample.payload[7] = 4),
+        change(|sample| sample.header.n_robots = 2),
+        change(|sample| sample.header.result.late = 2),
+        change(|sample| sample.payload[24] = 2), // the row where it started
+        change(|sample| sample.payload[44] = 3), // moves
+        change(|sample| sample.payload[55] = 4), // the last of them
         change(|sample| sample.payload.truncate(3)),
     ] {
         album.add_frame(&bad, Instant::now());

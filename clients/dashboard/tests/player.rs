@@ -3,7 +3,7 @@
 use dashboard::player::play;
 use dashboard::scene::{Scene, Stage};
 use protocol::control::{CoverageRule, ServerInfo};
-use protocol::message::FrameHeader;
+use protocol::message::{FrameHeader, RobotResult};
 use protocol::observer::Sample;
 use protocol::recording::{Event, Record, Writer};
 use std::sync::Arc;
@@ -13,13 +13,14 @@ use std::time::{Duration, Instant};
 /// Three steps of a 2 x 3 world, the last of them damaged.
 fn damaged() -> Vec<u8> {
     let info = ServerInfo {
-        protocol: 1,
+        protocol: 2,
         build: "0.1.0".into(),
         pid: 1,
         height: 2,
         width: 3,
         n_moves: 1,
         n_worlds: 1,
+        n_robots: 1,
         n_observations: 3,
         observations: vec!["normal".into(), "latent".into(), "fire".into()],
         model: None,
@@ -29,17 +30,23 @@ fn damaged() -> Vec<u8> {
         coverage: CoverageRule::Path,
         publish_truth: false,
         lease_millis: 30_000,
+        deadline_millis: 0,
     };
     let frame = |step| {
         let mut header = FrameHeader {
-            version: 1,
+            version: 2,
+            n_robots: 1,
             height: 2,
             width: 3,
-            n_moves: 1,
             ..FrameHeader::default()
         };
         header.result.step = step;
-        let payload = vec![255, 0, 255, 255, 1, 255, 3];
+        let robot = RobotResult {
+            n_moves: 1,
+            ..RobotResult::default()
+        };
+        let mut payload = bytemuck::bytes_of(&robot).to_vec();
+        payload.extend([255, 0, 255, 255, 1, 255, 3]);
         Event::Frame(Sample { header, payload })
     };
     let mut bytes = Vec::new();

@@ -36,6 +36,7 @@ class Program:
             env=environment,
             start_new_session=True,
         )
+        self.pid = self._process.pid
 
     def line(self) -> str:
         """The next line that it prints."""
@@ -50,6 +51,10 @@ class Program:
         """Asks it to end; returns when it has."""
         self._process.send_signal(signal.SIGINT)
         self.wait()
+
+    def suspend(self) -> None:
+        """Stops it where it is: it hangs."""
+        self._process.send_signal(signal.SIGSTOP)
 
     def wait(self) -> int:
         """Waits for its end: the exit code."""

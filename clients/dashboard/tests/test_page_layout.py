@@ -3,6 +3,7 @@
 import pytest
 
 from running import eventually
+from teams import write_recording
 
 SIZES = [
     (360, 740),
@@ -62,6 +63,11 @@ PROBLEMS = """() => {
     pairs(canvas.texts, 0, nameOf(canvas));
   }
 
+  const around = all(".bar, .facts, .robots, .stage").map((element) => {
+    const { left, top, right, bottom } = element.getBoundingClientRect();
+    return { name: nameOf(element), left, top, right, bottom };
+  });
+  pairs(around, 1, "page");
   const parts = all(".panel, .inspector, .no-belief, .chart, .legend, .ramps").map((element) => {
     const { left, top, right, bottom } = element.getBoundingClientRect();
     const filled = Math.max(bottom, top + element.scrollHeight);
@@ -181,6 +187,17 @@ def test_with_a_recording(programs, open_page, tmp_path):
     begin(look)
     look.at("speed").select_option("0")
     look.eventually(lambda: look.text("clock") == "ended", "its end")
+    check(look, LIVE | {"play", "speed"})
+
+
+@pytest.mark.parametrize("n_robots", [3, 64])
+def test_with_a_team(programs, open_page, tmp_path, n_robots):
+    file = tmp_path / "team.recording"
+    write_recording(file, n_robots, n_steps=5)
+    look = open_page(programs.dashboard(recording=file))
+    begin(look)
+    look.eventually(lambda: look.text("clock") == "ended", "its end")
+    assert look.at("robots").locator("li").count() == n_robots
     check(look, LIVE | {"play", "speed"})
 
 

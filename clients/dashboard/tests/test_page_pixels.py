@@ -1,6 +1,7 @@
 """Every pixel against what other readers of the instance got, coloured by a table of our own."""
 
 import tomllib
+from collections.abc import Sequence
 from contextlib import ExitStack
 
 import numpy as np
@@ -133,7 +134,7 @@ def check_arrays(look, witness: Witness) -> None:
     """The picture's arrays are what was published."""
     frame = witness.frames[STEPS]
     result = frame.result
-    assert look.picture(".shown.robot") == [result.row, result.col]
+    assert look.picture(".shown.robots")[0]["cell"] == place(frame)
     assert look.number("step") == STEPS
     assert look.number("reward") == pytest.approx(result.reward)
     np.testing.assert_array_equal(look.array("truth"), witness.truth.states.ravel())
@@ -147,6 +148,12 @@ def check_arrays(look, witness: Witness) -> None:
     check_levels(look.array("entropy"), -255 * (belief * logarithms).sum(0) / np.log(len(belief)))
 
 
+def place(frame) -> list[int]:
+    """Row and column of the robot."""
+    result = frame.robots[0].result
+    return [result.row, result.col]
+
+
 def check_marks(look, witness: Witness) -> None:
     """The path's line, its start and the robot are where they were, and no mark is elsewhere."""
     pixels = look.pixels("overlay-frame").astype(int)
@@ -156,13 +163,12 @@ def check_marks(look, witness: Witness) -> None:
     # A thin line between two rows of pixels covers half of each.
     is_dark = (pixels[..., 3] > 64) & (np.abs(pixels[..., :3] - 0x14) <= 4).all(-1)
     is_light = (pixels == 255).all(-1)
-    last, before = witness.frames[STEPS].result, witness.frames[STEPS - 1].result
-    start, robot = (before.row, before.col), (last.row, last.col)
-    path = np.array(look.picture(".shown.path"))
-    assert tuple(path[0]) == start
-    assert tuple(path[-1]) == robot
+    start, robot = place(witness.frames[STEPS - 1]), place(witness.frames[STEPS])
+    path = np.array(look.picture(".shown.robots")[0]["path"])
+    assert path[0].tolist() == start
+    assert path[-1].tolist() == robot
 
-    def around(cell: tuple[int, int], reach: float) -> tuple[slice, slice]:
+    def around(cell: Sequence[int], reach: float) -> tuple[slice, slice]:
         low = np.floor((np.array(cell) + 0.5 - reach).clip(0) * scale).astype(int)
         high = np.ceil((np.array(cell) + 0.5 + reach) * scale).astype(int)
         return slice(low[0], high[0]), slice(low[1], high[1])

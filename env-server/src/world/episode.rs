@@ -25,6 +25,8 @@ pub struct Episode {
     result: WorldResult,
     /// A 0 for each cell, for [`pay`].
     counts: Vec<u8>,
+    /// Scratch of flights.
+    seen: Vec<u64>,
     history: History,
 }
 
@@ -58,7 +60,7 @@ impl Episode {
                 Coverage::Empty => &[],
                 _ => &flown.moves[r * n_moves..][..n_moves],
             };
-            robot.fly(rules.shape, path, flown.coverage(r));
+            robot.fly(rules.shape, path, flown.coverage(r), &mut self.seen);
         }
         self.world.advance();
         self.observe(rules);
@@ -160,6 +162,7 @@ impl Episode {
             robots: robots.collect::<Result<_, _>>()?,
             result,
             counts: vec![0; rules.shape.n_cells()],
+            seen: Vec::new(),
             history: kept,
         })
     }
@@ -181,6 +184,7 @@ impl Episode {
             robots,
             result,
             counts: vec![0; rules.shape.n_cells()],
+            seen: Vec::new(),
             history,
         }
     }

@@ -74,7 +74,8 @@ mod tests {
                 let mut robot = Robot::at(shape, shape.cell(draw(100 + r) as usize % 20));
                 let n_moves = draw(200 + r) as usize % 8; // 0: it stays.
                 let moves = (0..n_moves).map(|t| Move::from_low_bits(draw(300 + 10 * r + t) >> 9));
-                robot.fly(shape, &moves.collect::<Vec<_>>(), Coverage::Path);
+                let moves: Vec<Move> = moves.collect();
+                robot.fly(shape, &moves, Coverage::Path, &mut Vec::new());
                 robot
             };
             let mut robots: Vec<Robot> = (0..1 + case as usize % 6).map(fly).collect();

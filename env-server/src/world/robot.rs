@@ -1,7 +1,7 @@
 //! One robot of a world: where it is, what it flew and what it saw.
 
 use protocol::message::RobotResult;
-use protocol::path::fly;
+use protocol::path::fly_into;
 use protocol::{Cell, Coverage, Frame, Move, Shape};
 
 /// A robot after a step or a reset.
@@ -27,15 +27,20 @@ impl Robot {
             path: Vec::new(),
             visited: Vec::new(),
         };
-        robot.fly(shape, &[], Coverage::Empty);
+        robot.fly(shape, &[], Coverage::Empty, &mut Vec::new());
         robot
     }
 
-    /// Flies a path, or stays if it is empty; what the step pays is yet to be counted.
-    pub(super) fn fly(&mut self, shape: Shape, path: &[Move], coverage: Coverage) {
+    /// Flies a path, or stays if it is empty; what the step pays is yet to be counted. `seen` is scratch.
+    pub(super) fn fly(
+        &mut self,
+        shape: Shape,
+        path: &[Move],
+        coverage: Coverage,
+        seen: &mut Vec<u64>,
+    ) {
         let start = self.cell();
-        let flight = fly(shape, start, path);
-        self.visited = flight.visited;
+        let end = fly_into(shape, start, path, &mut self.visited, seen);
         self.path.clear();
         self.path.extend_from_slice(path);
         self.frame.clear();
@@ -43,8 +48,8 @@ impl Robot {
             n_visited: self.visited.len() as u32,
             start_row: start.row as u32,
             start_col: start.col as u32,
-            row: flight.end.row as u32,
-            col: flight.end.col as u32,
+            row: end.row as u32,
+            col: end.col as u32,
             coverage: coverage as u32,
             n_moves: path.len() as u32,
             ..RobotResult::default()

@@ -104,8 +104,23 @@ pub fn path_to_bytes(path: &[Move]) -> Vec<u8> {
 
 /// Flies a path from `start` (paper eq. 12, `z_{t+1} = z_t + v_t`, each move clamped to the grid).
 pub fn fly(shape: Shape, start: Cell, path: &[Move]) -> Flight {
-    let mut seen = vec![0_u64; shape.n_cells().div_ceil(64)];
-    let mut visited = vec![0; path.len()];
+    let mut visited = Vec::new();
+    let end = fly_into(shape, start, path, &mut visited, &mut Vec::new());
+    Flight { visited, end }
+}
+
+/// [`fly`] without new memory: the visited cells go to `visited`; `seen` is scratch of any content. Returns the
+/// robot's last cell.
+pub fn fly_into(
+    shape: Shape,
+    start: Cell,
+    path: &[Move],
+    visited: &mut Vec<usize>,
+    seen: &mut Vec<u64>,
+) -> Cell {
+    seen.clear();
+    seen.resize(shape.n_cells().div_ceil(64), 0);
+    visited.resize(path.len(), 0);
     let (mut n_visited, mut cell) = (0, start);
     for &step in path {
         cell = step.apply(cell, shape);
@@ -117,7 +132,7 @@ pub fn fly(shape: Shape, start: Cell, path: &[Move]) -> Flight {
         *word |= 1 << bit;
     }
     visited.truncate(n_visited);
-    Flight { visited, end: cell }
+    cell
 }
 
 #[cfg(test)]
