@@ -21,7 +21,7 @@ use rustix::process::Signal;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-const FLAGS: &str = "--height 64 --width 64 --moves 64 --burn-in 1000 --robots 5 --deadline-ms 200 \
+const FLAGS: &str = "--height 64 --width 64 --moves 64 --burn-in 1000 --robots 5 --deadline-ms 100 \
                      --lease-millis 86400000";
 
 /// Robots that agents fly; this process flies the one after them.
@@ -46,10 +46,9 @@ struct Last {
     late: AtomicU64,
 }
 
-/// A step: when it was made, how long the world took for it, and the robots that stayed.
+/// A step: when it was seen here, and the robots that stayed.
 struct Step {
     at: Instant,
-    took: Duration,
     hovered: u64,
     late: u64,
 }
@@ -82,22 +81,15 @@ pub fn disturb(n_times: usize) {
         "{n_steps} steps, each made once, all as their own paths make them, all paths planned for their step; \
          in {n_late} a robot was late"
     ));
-    report("a step of the world, all", steps.iter());
-    let undisturbed = |step: &&Step| step.hovered | step.late == 0;
-    report("where all robots fly", steps.iter().filter(undisturbed));
-    report(
-        "the first without a killed agent",
-        firsts(&steps, &events, Event::Kill),
-    );
-    report(
-        "the first without a stopped agent",
-        firsts(&steps, &events, Event::Stop),
-    );
-}
-
-fn report<'a>(what: &str, steps: impl Iterator<Item = &'a Step>) {
-    let seconds: Vec<f64> = steps.map(|step| step.took.as_secs_f64()).collect();
-    say(&format!("{what:<36} {}", spread(seconds)));
+    let pairs = steps.windows(2);
+    let seconds = pairs.map(|pair| (pair[1].at - pair[0].at).as_secs_f64());
+    say(&format!("from step to step: {}", spread(seconds.collect())));
+    for (kind, words) in [(Event::Kill, "a kill"), (Event::Stop, "a stop")] {
+        let delays = spread(delays(&steps, &events, kind));
+        say(&format!(
+            "from {words} to the first step without the agent: {delays}"
+        ));
+    }
 }
 
 /// Says so when the thread ends, also if it fails.
@@ -109,29 +101,26 @@ impl Drop for Done<'_> {
     }
 }
 
-/// The first step after each such event in which its robot stayed.
-fn firsts<'a>(
-    steps: &'a [Step],
-    events: &'a [(Event, usize, Instant)],
-    kind: Event,
-) -> impl Iterator<Item = &'a Step> {
-    let events = events.iter().filter(move |(event, ..)| *event == kind);
-    events.map(move |(_, robot, at)| {
+/// Seconds from each such event to the first step in which its robot stayed.
+fn delays(steps: &[Step], events: &[(Event, usize, Instant)], kind: Event) -> Vec<f64> {
+    let events = events.iter().filter(|(event, ..)| *event == kind);
+    let delay = |(_, robot, at): &(Event, usize, Instant)| {
         let next = steps.partition_point(|step| step.at < *at);
         let stayed = |step: &&Step| (step.hovered | step.late) >> robot & 1 == 1;
-        steps[next..].iter().find(stayed).expect("it stayed")
-    })
+        let step = steps[next..].iter().find(stayed).expect("it stayed");
+        (step.at - *at).as_secs_f64()
+    };
+    events.map(delay).collect()
 }
 
 /// Flies and checks until it is done.
 fn observe(world: &mut PacedWorld, last: &Last, is_done: &AtomicBool) -> Vec<Step> {
     let (paths, mut steps) = (PlannedPaths::new(), Vec::new());
     while !is_done.load(Ordering::Relaxed) {
-        let took = world.step(|sample| paths.check(sample));
+        world.step(|sample| paths.check(sample));
         let result = world.last;
         steps.push(Step {
             at: Instant::now(),
-            took,
             hovered: result.hovered,
             late: result.late,
         });
@@ -230,7 +219,7 @@ impl<'a> Crowd<'a> {
     fn stop(&mut self, robot: usize) {
         self.agents[robot].signal(Signal::STOP);
         self.wait(robot, "be late", |last| last.late.load(Ordering::Relaxed));
-        std::thread::sleep(Duration::from_millis(self.rng.random_range(0..300)));
+        std::thread::sleep(Duration::from_millis(self.rng.random_range(0..150)));
         self.agents[robot].signal(Signal::CONT);
     }
 
