@@ -74,12 +74,14 @@ fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
 fn beliefs_that_nobody_looks_at_are_not_shown() {
     let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 200");
     let agent = run(&server, &[]);
-    let acts = || server.observe(0).0.step > 500;
+    let acts = || server.step_of(0) > 500;
     assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
     let observer = Observer::agents(&server.instance).expect("observe");
     let shown = until(&observer, |_| true);
     assert!(shown[0].header.step > 500, "a belief of before");
-    assert_eq!(shown[0].header.pid, agent.pid());
+    let header = &shown[0].header;
+    let flown = (header.first_robot, header.n_robots);
+    assert_eq!((header.pid, flown), (agent.pid(), (0, 1)));
 }
 
 #[test]
@@ -112,7 +114,7 @@ fn a_comparison_that_is_watched_shows_the_beliefs_of_all_its_worlds() {
             .status()
             .worlds
             .iter()
-            .any(|world| world.holder_pid.is_some())
+            .any(|world| world.holder_pids != [None])
     };
     assert!(eventually(PATIENCE, || !held()));
     let ended = compare(5).wait(PATIENCE);

@@ -1,10 +1,13 @@
 //! A client that sends what no client should: random numbers, random bytes, mutated requests.
 
 use crate::harness::PATIENCE;
-use crate::wire::{RawClient, Wire, answer};
+use crate::wire::{RawClient, Wire, answer, step_body};
 use protocol::channels::Instance;
 use protocol::control::Reply;
-use protocol::message::{ControlRequest, FLAG_FULL_COVERAGE, Status, StepRequest, VERSION};
+use protocol::message::{
+    ControlRequest, FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Status, StepRequest, VERSION,
+};
+use protocol::payload::split_step_payload;
 use rand::RngExt;
 use rand::seq::IndexedRandom;
 use rand_chacha::ChaCha8Rng;
@@ -12,9 +15,9 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 
 /// A control request of each kind but shutdown and takeover, which every client may do.
 const TEMPLATES: [&str; 8] = [
-    r#"{"op":"hello","protocol":1,"client":"x"}"#,
-    r#"{"op":"acquire","first_world":1,"n_worlds":1}"#,
-    r#"{"op":"acquire","first_world":0,"n_worlds":2,"ttl_millis":100}"#,
+    r#"{"op":"hello","protocol":2,"client":"x"}"#,
+    r#"{"op":"acquire","first_robot":1,"n_robots":1}"#,
+    r#"{"op":"acquire","first_robot":0,"n_robots":2,"ttl_millis":100}"#,
     r#"{"op":"renew","lease":LEASE}"#,
     r#"{"op":"release","lease":LEASE}"#,
     r#"{"op":"reset","lease":LEASE,"worlds":[{"world":1,"seed":3}]}"#,
@@ -28,6 +31,8 @@ pub struct Attacker {
     rng: ChaCha8Rng,
     /// Leases to try: none, its own, the victim's.
     leases: Vec<u64>,
+    /// The step that it last saw in an answer.
+    k: u64,
     /// Answers that refused.
     pub n_refused: u64,
     /// Answers that did not.
@@ -35,7 +40,7 @@ pub struct Attacker {
 }
 
 impl Attacker {
-    /// An attacker that holds world 1 and knows somebody else's lease.
+    /// An attacker that holds robot 1 and knows somebody else's lease.
     pub fn new(instance: &Instance, stolen: u64, seed: u64) -> Self {
         let wire = Wire::open(instance);
         let own = wire.acquire(1, 1).lease;
@@ -43,6 +48,7 @@ impl Attacker {
             wire,
             rng: ChaCha8Rng::seed_from_u64(seed),
             leases: vec![0, 1, own, own, own, stolen, u64::MAX],
+            k: 0,
             n_refused: 0,
             n_accepted: 0,
         }
@@ -74,6 +80,13 @@ impl Attacker {
         let (reply, payload) = answer(&pending, PATIENCE).expect("an answer");
         assert_eq!(reply.sequence, header.sequence);
         assert_eq!(payload.is_empty(), reply.status != 0);
+        let parts = split_step_payload(&reply, &payload).expect("a whole payload");
+        if let [world] = parts.worlds[..] {
+            self.k = world.step;
+        }
+        if [Status::Late as u32, Status::Early as u32].contains(&reply.status) {
+            self.k = reply.detail;
+        }
         Some(reply.status)
     }
 
@@ -106,13 +119,12 @@ impl Attacker {
             operation: self.number(1),
             lease: *self.leases.choose(&mut self.rng).expect("leases"),
             sequence: self.rng.random(),
-            first_world: self.number(1),
-            n_worlds: self.number(1),
+            first_robot: self.number(1),
+            n_robots: self.number(1),
             n_moves: self.number(6),
             flags: self.number(0),
             listener_low: self.rng.random(),
             listener_high: self.rng.random(),
-            step: self.rng.random(),
         }
     }
 
@@ -124,6 +136,7 @@ impl Attacker {
             2 => u32::MAX,
             3 => self.rng.random(),
             4 => FLAG_FULL_COVERAGE,
+            5 => FLAG_TEAM_FRAMES,
             _ => right,
         }
     }
@@ -132,7 +145,10 @@ impl Attacker {
         match self.rng.random_range(0..4) {
             0 => self.bytes(300),
             1 => Vec::new(),
-            _ => (0..6).map(|_| self.rng.random_range(0..4)).collect(),
+            _ => {
+                let path: Vec<u8> = (0..6).map(|_| self.rng.random_range(0..4)).collect();
+                step_body(&[self.k], &path)
+            }
         }
     }
 

@@ -230,7 +230,7 @@ fn status_tells_people_and_programs_of_every_world() {
     let json = run(SERVER, &["status", "--json", "--instance", name], LIMIT);
     let status: serde_json::Value = serde_json::from_str(&json.stdout).expect("JSON");
     assert_eq!(status["pid"], server.program.pid());
-    assert_eq!(status["worlds"][1]["holder_pid"], std::process::id());
+    assert_eq!(status["worlds"][1]["holder_pids"][0], std::process::id());
     assert_eq!(status["worlds"][1]["seed"], 41);
     let stop = run(SERVER, &["stop", "--instance", name], LIMIT);
     assert_eq!(stop.code, Some(0), "{}", stop.stderr);

@@ -18,7 +18,7 @@ const WHAT: &str = "compare --seeds 3..5 --steps 5 --shooting-samples 16 --beam-
 const WORLDS: &str = "--height 6 --width 9 --moves 5 --burn-in 60";
 
 const HEADER: &str = "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
-                      mean_fire_cells,mean_plan_millis,brier,moves";
+                      mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated";
 
 fn agent(arguments: &[&str]) -> Ended {
     let words = arguments.iter().flat_map(|flags| flags.split_whitespace());
@@ -35,7 +35,7 @@ fn rows(path: &Path) -> Vec<Vec<String>> {
     assert_eq!(lines.next(), Some(HEADER));
     let rows = lines.map(|line| {
         let mut fields: Vec<String> = line.split(',').map(String::from).collect();
-        assert_eq!(fields.len(), 11, "{line}");
+        assert_eq!(fields.len(), 14, "{line}");
         let millis: f64 = fields.remove(8).parse().expect("a time");
         assert!(millis >= 0.0);
         fields
@@ -119,7 +119,7 @@ fn runs_with_one_seed_act_alike() {
             let server = Server::start(&format!("{WORLDS} --publish-truth"));
             let name = server.instance.name();
             agent(&["run --instance", name, "--policy", policy, flags]);
-            (server.observe(0), server.status().worlds[0].holder_pid)
+            (server.observe(0), server.status().worlds[0].holder_pids[0])
         };
         let (first, holder) = act();
         assert_eq!((first.0.step, holder), (20, None), "{policy}");

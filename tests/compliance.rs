@@ -3,17 +3,18 @@
 
 use crate::harness::{PATIENCE, SMALL, Server};
 use crate::python::PythonWire;
-use crate::wire::{RawClient, Wire, control_header, step_header};
+use crate::wire::{RawClient, Wire, control_header, step_body, step_header};
 use protocol::Model;
 use protocol::channels::Instance;
 use protocol::control::{CoverageRule, Reply, Request, ServerInfo};
 use protocol::message::Status::{
-    self, BadMove, LeaseLost, NoLease, NoSuchWorld, NotPermitted, UnknownFlags, UnknownOperation,
-    VersionMismatch, WrongLength, WrongPathLength,
+    self, BadMove, Early, Incomplete, Late, LeaseLost, NoLease, NoSuchRobot, NotPermitted,
+    UnknownFlags, UnknownOperation, VersionMismatch, WrongLength, WrongPathLength,
 };
 use protocol::message::{
-    ControlRequest, FLAG_FULL_COVERAGE, Operation, StepRequest, VERSION, split_step_payload,
+    ControlRequest, FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, StepRequest, VERSION,
 };
+use protocol::payload::split_step_payload;
 
 /// Moves of a path on a [`SMALL`] server.
 const N_MOVES: u32 = 6;
@@ -62,14 +63,15 @@ suite! {
     a_handshake_tells_everything_a_client_needs,
     a_hidden_model_is_not_in_the_handshake,
     a_step_of_wrong_numbers_is_refused_and_changes_nothing,
-    a_step_without_a_lease_on_its_worlds_is_refused_and_changes_nothing,
+    a_step_without_a_lease_on_its_robots_is_refused_and_changes_nothing,
+    a_step_that_is_not_whole_or_not_for_the_present_is_refused_and_changes_nothing,
     a_control_request_is_refused_for_one_reason_and_changes_nothing,
     another_version_is_refused_with_both_versions_and_what_to_do,
     a_step_answer_echoes_its_request_and_fits_its_payload,
     a_client_that_shuts_the_server_down_is_answered,
 }
 
-/// Three worlds: two held by one client, one by another.
+/// Three worlds of two robots: five of these held by one client, the last by another.
 struct Table {
     server: Server,
     ours: Box<dyn RawClient>,
@@ -81,15 +83,21 @@ struct Table {
 
 impl Table {
     fn lay(client: Client) -> Self {
-        let server = Server::start(&format!("{SMALL} --worlds 3 --lease-millis 86400000"));
+        let server = Server::start(&format!(
+            "{SMALL} --worlds 3 --robots 2 --lease-millis 86400000"
+        ));
         let (ours, theirs) = (client.open(&server.instance), client.open(&server.instance));
         let ended_lease = ours.acquire(0, 1).lease;
         assert_eq!(
             ours.ask(&Request::Release { lease: ended_lease }),
             Reply::Done
         );
-        let (our_lease, their_lease) = (ours.acquire(0, 2).lease, theirs.acquire(2, 1).lease);
-        let (reply, _) = ours.step(step_header(our_lease, N_MOVES), &[3; 6]);
+        let (our_lease, their_lease) = (ours.acquire(0, 5).lease, theirs.acquire(5, 1).lease);
+        let header = StepRequest {
+            n_robots: 2,
+            ..step_header(our_lease, N_MOVES)
+        };
+        let (reply, _) = ours.step(header, &step_body(&[0], &[3; 12]));
         assert_eq!(reply.status, Status::Ok as u32);
         Self {
             server,
@@ -105,8 +113,7 @@ impl Table {
     fn everything(&self) -> (String, Vec<u8>) {
         let header = StepRequest {
             operation: Operation::Observe as u32,
-            lease: 0,
-            n_worlds: 3,
+            n_robots: 6,
             n_moves: 0,
             ..step_header(0, 0)
         };
@@ -115,22 +122,20 @@ impl Table {
         (format!("{:?}", self.server.status().worlds), payload)
     }
 
-    fn refused_step(&self, header: StepRequest, paths: &[u8], status: Status, detail: u64) {
+    fn refused_step(&self, header: StepRequest, body: &[u8], status: Status, detail: u64) {
         let before = self.everything();
-        let (reply, payload) = self.ours.step(header, paths);
+        let (reply, payload) = self.ours.step(header, body);
         assert_eq!(
             (Status::try_from(reply.status), reply.detail),
             (Ok(status), detail),
             "{header:?}"
         );
         assert_eq!(
-            (reply.sequence, reply.first_world),
-            (header.sequence, header.first_world)
+            (reply.sequence, reply.first_robot, reply.flags),
+            (header.sequence, header.first_robot, header.flags)
         );
-        assert_eq!(
-            (reply.version, reply.n_worlds, payload.len()),
-            (VERSION, 0, 0)
-        );
+        let counts = (reply.n_worlds, reply.n_robots, payload.len());
+        assert_eq!((reply.version, counts), (VERSION, (0, 0, 0)));
         assert_eq!(self.everything(), before, "{status:?} changed something");
     }
 
@@ -162,7 +167,7 @@ impl Table {
 
 fn a_handshake_tells_everything_a_client_needs(client: Client) {
     let flags = "--height 5 --width 7 --moves 6 --burn-in 20 --worlds 3 --max-steps 9 \
-                 --coverage client --lease-millis 1234 --publish-truth";
+                 --coverage client --lease-millis 1234 --publish-truth --robots 2 --deadline-ms 99";
     let server = Server::start(flags);
     let info = hello(&*client.open(&server.instance));
     assert_eq!((info.protocol, info.pid), (VERSION, server.program.pid()));
@@ -170,6 +175,7 @@ fn a_handshake_tells_everything_a_client_needs(client: Client) {
         (info.height, info.width, info.n_moves, info.n_worlds),
         (5, 7, 6, 3)
     );
+    assert_eq!((info.n_robots, info.deadline_millis), (2, 99));
     assert_eq!(
         (info.burn_in, info.max_steps, info.lease_millis),
         (20, 9, 1234)
@@ -197,7 +203,7 @@ fn hello(client: &dyn RawClient) -> ServerInfo {
 
 fn a_hidden_model_is_not_in_the_handshake(client: Client) {
     let server = Server::start(&format!("{SMALL} --reveal-model false"));
-    let text = br#"{"op":"hello","protocol":1,"client":"tests"}"#;
+    let text = br#"{"op":"hello","protocol":2,"client":"tests"}"#;
     let (_, payload) = client
         .open(&server.instance)
         .control(control_header(1), text);
@@ -215,65 +221,101 @@ struct Steps {
 }
 
 impl Steps {
+    /// Good are those of world 0, which is at step 1.
     fn new(client: Client) -> Self {
         let table = Table::lay(client);
         let good = StepRequest {
             sequence: 41,
+            n_robots: 2,
             ..step_header(table.our_lease, N_MOVES)
         };
         Self { table, good }
     }
 
     fn check(&self, change: impl Fn(&mut StepRequest), status: Status, detail: u64) {
-        self.check_paths(change, &[1; 6], status, detail);
+        self.check_body(change, &step_body(&[1], &[1; 12]), status, detail);
     }
 
-    fn check_paths(
+    fn check_body(
         &self,
         change: impl Fn(&mut StepRequest),
-        paths: &[u8],
+        body: &[u8],
         status: Status,
         detail: u64,
     ) {
         let mut header = self.good;
         change(&mut header);
-        self.table.refused_step(header, paths, status, detail);
+        self.table.refused_step(header, body, status, detail);
     }
 }
 
 fn a_step_of_wrong_numbers_is_refused_and_changes_nothing(client: Client) {
     let steps = Steps::new(client);
-    steps.check(|h| h.version = 2, VersionMismatch, 1);
-    steps.check(|h| h.version = 0, VersionMismatch, 1);
+    steps.check(|h| h.version = 1, VersionMismatch, 2);
+    steps.check(|h| h.version = 0, VersionMismatch, 2);
     steps.check(|h| h.operation = 0, UnknownOperation, 0);
     steps.check(|h| h.operation = 4, UnknownOperation, 4);
-    for (first, n_worlds) in [(0, 0), (3, 1), (0, 4), (2, 2), (u32::MAX, 1), (1, u32::MAX)] {
-        let range = |h: &mut StepRequest| (h.first_world, h.n_worlds) = (first, n_worlds);
-        steps.check(range, NoSuchWorld, 3);
+    for (first, n_robots) in [(0, 0), (6, 1), (0, 7), (5, 2), (u32::MAX, 1), (1, u32::MAX)] {
+        let range = |h: &mut StepRequest| (h.first_robot, h.n_robots) = (first, n_robots);
+        steps.check(range, NoSuchRobot, 6);
     }
     steps.check(|h| h.n_moves = 5, WrongPathLength, 6);
     steps.check(|h| h.n_moves = u32::MAX, WrongPathLength, 6);
     steps.check(|h| h.flags = FLAG_FULL_COVERAGE, NotPermitted, 0);
     steps.check(|h| h.flags = 6, UnknownFlags, 6);
-    steps.check(|h| h.n_worlds = 2, WrongLength, 12);
-    steps.check(|h| h.operation = Operation::Observe as u32, WrongLength, 0);
-    for length in [0, 1, 5, 7, 100] {
-        steps.check_paths(|_| (), &vec![1; length], WrongLength, 6);
+    steps.check(|h| h.n_robots = 3, WrongLength, 2 * 8 + 18);
+    let observe = |h: &mut StepRequest| h.operation = Operation::Observe as u32;
+    steps.check(observe, WrongLength, 0);
+    let full = |h: &mut StepRequest| {
+        observe(h);
+        h.flags = FLAG_FULL_COVERAGE;
+    };
+    steps.check_body(full, &[], UnknownFlags, 1);
+    let recall = |h: &mut StepRequest| h.operation = Operation::Recall as u32;
+    steps.check(recall, WrongLength, 8);
+    for length in [0, 1, 7, 8, 14, 19, 21, 100] {
+        steps.check_body(|_| (), &vec![1; length], WrongLength, 8 + 12);
     }
-    steps.check_paths(|_| (), &[1, 2, 3, 0, 1, 4], BadMove, 5);
-    steps.check_paths(|_| (), &[255, 2, 3, 0, 1, 4], BadMove, 0);
+    let mut paths = [1, 2, 3, 0, 1, 4, 0, 0, 0, 0, 0, 9];
+    steps.check_body(|_| (), &step_body(&[1], &paths), BadMove, 13);
+    paths[0] = 255;
+    steps.check_body(|_| (), &step_body(&[1], &paths), BadMove, 8);
 }
 
-fn a_step_without_a_lease_on_its_worlds_is_refused_and_changes_nothing(client: Client) {
+fn a_step_without_a_lease_on_its_robots_is_refused_and_changes_nothing(client: Client) {
     let steps = Steps::new(client);
     let (theirs, ended) = (steps.table.their_lease, steps.table.ended_lease);
     steps.check(|h| h.lease = 0, NoLease, 0);
     steps.check(|h| h.lease = u64::MAX, NoLease, 0);
-    steps.check(|h| h.first_world = 2, NoLease, 2);
-    steps.check(|h| (h.first_world, h.lease) = (2, theirs), NoLease, 2);
-    steps.check_paths(|h| h.n_worlds = 3, &[0; 18], NoLease, 2);
+    let last = |h: &mut StepRequest| h.first_robot = 4;
+    steps.check(last, NoLease, 5);
+    let stolen = |h: &mut StepRequest| {
+        last(h);
+        h.lease = theirs;
+    };
+    steps.check(stolen, NoLease, 4);
+    let body = step_body(&[1, 0, 0], &[0; 36]);
+    steps.check_body(|h| h.n_robots = 6, &body, NoLease, 5);
     let us = u64::from(steps.table.ours.pid());
     steps.check(|h| h.lease = ended, LeaseLost, us);
+}
+
+fn a_step_that_is_not_whole_or_not_for_the_present_is_refused_and_changes_nothing(client: Client) {
+    let steps = Steps::new(client);
+    let one = step_body(&[1], &[0; 6]);
+    steps.check_body(|h| h.n_robots = 1, &one, Incomplete, 1);
+    let second = |h: &mut StepRequest| (h.first_robot, h.n_robots) = (1, 1);
+    steps.check_body(second, &one, Incomplete, 0);
+    let both = step_body(&[1, 0], &[0; 18]);
+    steps.check_body(|h| h.n_robots = 3, &both, Incomplete, 3);
+    // All of its own, of several worlds, where another client holds a robot of one.
+    let all = step_body(&[1, 0, 0], &[0; 30]);
+    steps.check_body(|h| h.n_robots = 5, &all, Incomplete, 5);
+    for (k, status) in [(0, Late), (2, Early), (u64::MAX, Early)] {
+        steps.check_body(|_| (), &step_body(&[k], &[0; 12]), status, 1);
+    }
+    let second = step_body(&[1, 1], &[0; 24]);
+    steps.check_body(|h| h.n_robots = 4, &second, Early, 0);
 }
 
 /// Requests, the status and detail of their refusal, and words of it. `OURS`, `THEIRS` and `ENDED`
@@ -287,23 +329,23 @@ null => Malformed 0 malformed control message
 {"op":"renew"} => Malformed 0 lease
 {"op":"renew","lease":-1} => Malformed 0 -1
 {"op":"renew","lease":1,"more":2} => Malformed 0 more
-{"op":"hello","protocol":2,"client":""} => VersionMismatch 1 version mismatch
-{"op":"acquire","first_world":0,"n_worlds":0} => NoSuchWorld 3 worlds 0 to 2
-{"op":"acquire","first_world":3,"n_worlds":1} => NoSuchWorld 3 worlds 0 to 2
-{"op":"acquire","first_world":0,"n_worlds":4} => NoSuchWorld 3 worlds 0 to 2
-{"op":"acquire","first_world":4294967295,"n_worlds":4294967295} => NoSuchWorld 3 worlds 0 to 2
-{"op":"acquire","first_world":4294967296,"n_worlds":1} => Malformed 0 4294967296
-{"op":"acquire","first_world":1,"n_worlds":2} => Busy THEM acquire with "takeover": true
+{"op":"hello","protocol":1,"client":""} => VersionMismatch 2 version mismatch
+{"op":"acquire","first_robot":0,"n_robots":0} => NoSuchRobot 6 robots 0 to 5
+{"op":"acquire","first_robot":6,"n_robots":1} => NoSuchRobot 6 robots 0 to 5
+{"op":"acquire","first_robot":0,"n_robots":7} => NoSuchRobot 6 robots 0 to 5
+{"op":"acquire","first_robot":4294967295,"n_robots":4294967295} => NoSuchRobot 6 robots 0 to 5
+{"op":"acquire","first_robot":4294967296,"n_robots":1} => Malformed 0 4294967296
+{"op":"acquire","first_robot":1,"n_robots":5} => Busy THEM acquire with "takeover": true
 {"op":"renew","lease":12345} => NoLease 0 acquire it first
-{"op":"renew","lease":THEIRS} => NoLease 2 no lease on world 2
+{"op":"renew","lease":THEIRS} => NoLease 5 no lease on robot 5
 {"op":"renew","lease":ENDED} => LeaseLost US lease lost
 {"op":"release","lease":12345} => NoLease 0 acquire it first
-{"op":"release","lease":THEIRS} => NoLease 2 no lease on world 2
+{"op":"release","lease":THEIRS} => NoLease 5 no lease on robot 5
 {"op":"release","lease":ENDED} => LeaseLost US lease lost
-{"op":"reset","lease":OURS,"worlds":[{"world":2}]} => NoLease 2 no lease on world 2
-{"op":"reset","lease":OURS,"worlds":[{"world":0},{"world":2}]} => NoLease 2 no lease on world 2
-{"op":"reset","lease":THEIRS,"worlds":[{"world":2}]} => NoLease 2 no lease on world 2
-{"op":"reset","lease":THEIRS,"worlds":[]} => NoLease 2 no lease on world 2
+{"op":"reset","lease":OURS,"worlds":[{"world":2}]} => Busy THEM held by pid
+{"op":"reset","lease":OURS,"worlds":[{"world":0},{"world":2}]} => Busy THEM held by pid
+{"op":"reset","lease":THEIRS,"worlds":[{"world":2}]} => NoLease 5 no lease on robot 5
+{"op":"reset","lease":THEIRS,"worlds":[]} => NoLease 5 no lease on robot 5
 {"op":"reset","lease":OURS,"worlds":[{"world":9}]} => NoSuchWorld 3 worlds 0 to 2
 {"op":"reset","lease":OURS,"worlds":[{"world":0},{"world":0}]} => Malformed 0 world 0 twice
 {"op":"reset","lease":ENDED,"worlds":[{"world":0}]} => LeaseLost US lease lost
@@ -332,7 +374,7 @@ fn a_control_request_is_refused_for_one_reason_and_changes_nothing(client: Clien
 fn another_version_is_refused_with_both_versions_and_what_to_do(client: Client) {
     let server = Server::start(SMALL);
     let wire = client.open(&server.instance);
-    for version in [0, 2, u32::MAX] {
+    for version in [0, 1, u32::MAX] {
         let header = ControlRequest {
             version,
             ..control_header(5)
@@ -341,7 +383,7 @@ fn another_version_is_refused_with_both_versions_and_what_to_do(client: Client) 
         assert_eq!(reply.status, VersionMismatch as u32);
         let text = String::from_utf8(payload).expect("text");
         assert!(
-            text.contains("the server 1") && text.contains("one release"),
+            text.contains("the server 2") && text.contains("one release"),
             "{text}"
         );
     }
@@ -349,25 +391,37 @@ fn another_version_is_refused_with_both_versions_and_what_to_do(client: Client) 
 }
 
 fn a_step_answer_echoes_its_request_and_fits_its_payload(client: Client) {
-    let server = Server::start(&format!("{SMALL} --worlds 3"));
+    let server = Server::start(&format!("{SMALL} --worlds 3 --robots 2"));
     let wire = client.open(&server.instance);
-    let lease = wire.acquire(0, 3).lease;
-    for sequence in [0, 1, u64::MAX] {
-        let header = StepRequest {
-            sequence,
-            first_world: 1,
-            n_worlds: 2,
-            ..step_header(lease, N_MOVES)
-        };
-        let (reply, payload) = wire.step(header, &[3; 12]);
-        assert_eq!(
-            (reply.sequence, reply.first_world, reply.n_worlds),
-            (sequence, 1, 2)
-        );
-        assert_eq!((reply.height, reply.width, reply.version), (5, 7, VERSION));
-        let (results, frames) = split_step_payload(&reply, &payload).expect("a whole payload");
-        assert_eq!((results.len(), frames.len()), (2, 2 * N_CELLS));
-        assert!(reply.simulation_nanos > 0);
+    let lease = wire.acquire(0, 6).lease;
+    for (k, sequence) in [0, 1, u64::MAX].into_iter().enumerate() {
+        for (operation, flags) in [(Operation::Step, 0), (Operation::Observe, FLAG_TEAM_FRAMES)] {
+            let header = StepRequest {
+                operation: operation as u32,
+                sequence,
+                first_robot: 2,
+                n_robots: 4,
+                flags,
+                ..step_header(lease, N_MOVES)
+            };
+            let body = match operation {
+                Operation::Step => step_body(&[k as u64; 2], &[3; 24]),
+                _ => Vec::new(),
+            };
+            let (reply, payload) = wire.step(header, &body);
+            assert_eq!(
+                (reply.sequence, reply.first_robot, reply.n_robots),
+                (sequence, 2, 4)
+            );
+            assert_eq!((reply.n_worlds, reply.flags), (2, flags));
+            assert_eq!((reply.height, reply.width, reply.version), (5, 7, VERSION));
+            let parts = split_step_payload(&reply, &payload).expect("a whole payload");
+            assert_eq!((parts.worlds.len(), parts.robots.len()), (2, 4));
+            let n_frames = if flags == 0 { 4 } else { 2 };
+            assert_eq!(parts.frames.len(), n_frames * N_CELLS);
+            assert!(parts.worlds.iter().all(|world| world.step == k as u64 + 1));
+            assert!(reply.simulation_nanos > 0);
+        }
     }
 }
 

@@ -1,25 +1,23 @@
 //! Agents that are killed or stopped in the middle of a step: the world stays exactly where it was.
 
 use crate::harness::{
-    PATIENCE, Paths, Program, Server, claim, eventually, fly, frames_until, status, takeover,
+    PATIENCE, Paths, Program, Server, claim, eventually, fly, frames_until, path_of, seen_by,
+    seen_in, status, takeover,
 };
-use crate::wire::{RawClient, Wire, answer, control_header, step_header};
-use agent::server::client::{Claim, Client, Observation};
+use crate::wire::{RawClient, Wire, answer, control_header, step_body, step_header};
+use agent::server::client::{Claim, Client};
+use protocol::Connection;
 use protocol::channels::{ChannelError, Instance};
 use protocol::connection::ConnectionError;
 use protocol::control::{Reply, Request};
-use protocol::message::{FrameHeader, StepRequest, split_step_payload};
+use protocol::message::{FrameHeader, Status, StepRequest};
 use protocol::observer::{Observer, Sample};
-use protocol::path::path_from_bytes;
-use protocol::{Connection, Move};
+use protocol::payload::split_step_payload;
 use rustix::process::Signal;
 use std::time::Duration;
 
 /// A grid on which planning takes most of a step.
 const FLAGS: &str = "--height 12 --width 9 --moves 8 --burn-in 50";
-
-/// Cells of that grid.
-const N_CELLS: usize = 12 * 9;
 
 /// An agent that acts without end, some tens of milliseconds a step.
 fn start_agent(instance: &Instance, flags: &[&str]) -> Program {
@@ -32,13 +30,7 @@ fn start_agent(instance: &Instance, flags: &[&str]) -> Program {
 }
 
 fn holder(server: &Server) -> Option<u32> {
-    server.status().worlds[0].holder_pid
-}
-
-/// What a published frame says, as an answer to a step would.
-fn published(sample: &Sample<FrameHeader>) -> (Vec<u8>, Vec<Move>) {
-    let (frame, path) = sample.payload.split_at(N_CELLS);
-    (frame.to_vec(), path_from_bytes(path).expect("a path"))
+    server.status().worlds[0].holder_pids[0]
 }
 
 #[test]
@@ -59,9 +51,8 @@ fn a_killed_agents_world_is_free_at_once_and_goes_on_as_if_nothing_had_been() {
         while let Some(frame) = observer.try_receive().expect("receive") {
             frames.push(frame);
         }
-        let (result, frame) = server.observe(0);
         let last = frames.last().expect("a frame");
-        assert_eq!((result, frame), (last.header.result, published(last).0));
+        assert_eq!(server.observe(0), seen_in(last));
         assert_eq!(next.ask(&Request::Release { lease }), Reply::Done);
     }
     let is_next =
@@ -80,8 +71,8 @@ fn a_killed_agents_world_is_free_at_once_and_goes_on_as_if_nothing_had_been() {
 /// Acquires with the first request that a stopped server finds when it goes on.
 fn acquire_from_stopped(server: &Server, next: &Wire) -> u64 {
     let request = Request::Acquire {
-        first_world: 0,
-        n_worlds: 1,
+        first_robot: 0,
+        n_robots: 1,
         takeover: false,
         ttl_millis: None,
     };
@@ -99,22 +90,15 @@ fn acquire_from_stopped(server: &Server, next: &Wire) -> u64 {
 fn replay(frames: &[Sample<FrameHeader>]) -> (Server, Client) {
     let server = Server::start(FLAGS);
     let mut client = server.acquire(0..1);
-    let flown: Vec<_> = frames
-        .iter()
-        .filter(|frame| frame.header.n_moves > 0)
-        .collect();
-    for (index, sample) in flown.iter().enumerate() {
-        let (frame, path) = published(sample);
+    let flown = frames.iter().filter(|frame| frame.header.result.step > 0);
+    for (index, sample) in flown.enumerate() {
         assert_eq!(
             sample.header.result.step,
             index as u64 + 1,
             "a step without a frame"
         );
-        let Observation {
-            result,
-            frame: seen,
-        } = fly(&mut client, path);
-        assert_eq!((result, seen.as_bytes()), (sample.header.result, &*frame));
+        let seen = fly(&mut client, path_of(sample));
+        assert_eq!(seen_by(&seen), seen_in(sample));
     }
     (server, client)
 }
@@ -186,23 +170,23 @@ fn agents_killed_one_after_the_other_change_no_world_and_use_up_no_limit() {
             "random_walk",
         ];
         let agent = Program::start("emberwatch-agent", &[&flags[..], &["--takeover"]].concat());
-        let acts = || server.observe(0).0.step > before;
+        let acts = || server.step_of(0) > before;
         assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
         agent.signal(Signal::KILL);
         agent.wait(PATIENCE);
-        before = server.observe(0).0.step;
+        before = server.step_of(0);
     }
     // From here on what the last one asked for is refused.
     drop(Client::acquire(&server.instance, &takeover(0..1)).expect("take over"));
-    let (result, frame) = server.observe(0);
-    let last = result.step;
+    let (world, _, frame) = server.observe(0);
+    let last = world.step;
     let mut client = undisturbed.acquire(0..1);
     for path in Paths::new(0).take(8, last as usize - 1) {
         fly(&mut client, path);
     }
     let seen = fly(&mut client, Paths::new(1).next(8));
     assert_eq!(
-        (seen.result.step, seen.frame.as_bytes()),
+        (seen.world.step, seen.frame.as_bytes()),
         (last, &*frame),
         "a function of k"
     );
@@ -215,7 +199,7 @@ fn agents_killed_one_after_the_other_change_no_world_and_use_up_no_limit() {
 }
 
 #[test]
-fn a_step_whose_client_gave_up_waiting_is_made_once_and_its_answer_taken_for_no_other() {
+fn a_step_whose_client_gave_up_waiting_is_made_once_or_not_and_its_answer_taken_for_no_other() {
     let server = Server::start(FLAGS);
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(0, 1).lease;
@@ -224,23 +208,31 @@ fn a_step_whose_client_gave_up_waiting_is_made_once_and_its_answer_taken_for_no_
         sequence,
         ..step_header(lease, 8)
     };
-    let pending = wire.send_step(header(1), &[3; 8]).expect("send");
+    let pending = wire
+        .send_step(header(1), &step_body(&[0], &[3; 8]))
+        .expect("send");
     assert!(
         answer(&pending, Duration::ZERO).is_none(),
         "the server is stopped"
     );
     drop(pending);
     server.program.signal(Signal::CONT);
-    for sequence in 2..10 {
-        let (reply, payload) = wire.step(header(sequence), &[1; 8]);
-        assert_eq!((reply.status, reply.sequence), (0, sequence));
-        let (results, _) = split_step_payload(&reply, &payload).expect("a whole payload");
-        assert!(
-            [sequence - 1, sequence].contains(&results[0].step),
-            "{:?}",
-            results[0]
-        );
+    let mut made = Vec::new();
+    for (k, sequence) in (0..8).zip(2..) {
+        let body = step_body(&[k], &[1; 8]);
+        let (reply, payload) = wire.step(header(sequence), &body);
+        assert_eq!(reply.sequence, sequence);
+        if reply.status == Status::Ok as u32 {
+            let parts = split_step_payload(&reply, &payload).expect("a whole payload");
+            assert_eq!(parts.worlds[0].step, k + 1);
+            made.push(k);
+        } else {
+            assert_eq!((reply.status, reply.detail), (Status::Late as u32, 1));
+        }
     }
+    // Of two paths for k = 0 one is flown.
+    assert!(made == (0..8).collect::<Vec<_>>() || made == (1..8).collect::<Vec<_>>());
+    assert_eq!(server.step_of(0), 8);
 }
 
 #[test]

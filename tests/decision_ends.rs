@@ -21,7 +21,7 @@ use std::time::{Duration, Instant};
 const CHILD: &str = "EMBERWATCH_TEST_CHILD";
 
 fn holder(server: &Server) -> Option<u32> {
-    server.status().worlds[0].holder_pid
+    server.status().worlds[0].holder_pids[0]
 }
 
 #[test]
@@ -191,7 +191,7 @@ fn a_world_goes_from_agent_to_agent_in_the_middle_of_an_episode() {
     assert!(refused.stderr.contains(&words), "{}", refused.stderr);
     let (_agent, learner) = start_with_learner(&server.instance, "--takeover");
     assert_eq!(first.wait(PATIENCE).code, Some(3));
-    let (result, _) = server.observe(0);
+    let (result, ..) = server.observe(0);
     let last = learner.last();
     assert_eq!((last.step, last.reward), (result.step, result.reward));
     assert_eq!(last.objective, None);

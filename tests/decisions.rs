@@ -1,6 +1,6 @@
 //! Agents that take decisions from a learner outside: same worlds, same plans, clear refusals.
 
-use crate::harness::{PATIENCE, SMALL, Server, frames_until, new_instance, run};
+use crate::harness::{PATIENCE, SMALL, Server, frames_until, new_instance, run, seen_in};
 use crate::learner::{
     Learner, decide, decisions, refusal, reset, start_agent, start_at, start_with_learner,
 };
@@ -51,7 +51,7 @@ fn hello_tells_what_can_be_decided() {
     assert_eq!(info.objectives, ["normal", "latent", "fire", "entropy"]);
     assert_eq!((&*info.estimator, &*info.planner), ("known_model", "beam"));
     assert_eq!(info.summary.len(), learner.last().summary.len());
-    assert_eq!(server.status().worlds[0].holder_pid, Some(agent.pid()));
+    assert_eq!(server.status().worlds[0].holder_pids, [Some(agent.pid())]);
 }
 
 #[test]
@@ -80,10 +80,10 @@ fn assert_the_same_steps(policy: &str, estimator: &str) {
     assert_eq!(ran.code, Some(0), "{}", ran.stderr);
     let flown: Vec<_> = frames_until(&observer, 0, 30)
         .iter()
-        .filter(|sample| sample.header.n_moves > 0)
-        .map(|sample| sample.header.result)
+        .filter(|sample| sample.header.result.step > 0)
+        .map(seen_in)
         .collect();
-    assert!(flown.iter().any(|result| result.reward > 0.0));
+    assert!(flown.iter().any(|(world, ..)| world.reward > 0.0));
     let flags = format!("--estimator {estimator}");
     let (_agent, learner) = start_with_learner(&other.instance, &flags);
     assert_eq!(learner.hello().estimator, estimator);
@@ -91,15 +91,15 @@ fn assert_the_same_steps(policy: &str, estimator: &str) {
         if let Some(seed) = seed {
             learner.reset(seed);
         }
-        for result in &flown {
+        for (world, robot, _) in &flown {
             let made = learner.decide(2);
             assert_eq!(
                 (made.step, made.reward, made.n_hits, made.robot),
                 (
-                    result.step,
-                    result.reward,
-                    result.n_hits,
-                    [result.row, result.col]
+                    world.step,
+                    world.reward,
+                    world.n_hits,
+                    [robot.row, robot.col]
                 )
             );
             assert_eq!(made.objective, Some(2));
@@ -147,7 +147,7 @@ fn many_worlds_are_decided_for_as_each_alone() {
     let info = learner.hello();
     assert_eq!((info.first_world, info.n_worlds), (1, 3));
     let holders = together.status().worlds.into_iter();
-    let holders: Vec<_> = holders.map(|world| world.holder_pid).collect();
+    let holders: Vec<_> = holders.map(|world| world.holder_pids[0]).collect();
     let held = Some(agent.pid());
     assert_eq!(holders, [None, held, held, held]);
     let mut rows = vec![
@@ -270,7 +270,7 @@ fn what_is_no_decision_is_refused_and_changes_nothing() {
         r#"{"op":"reset","worlds":[{"world":0,"seed":-1}]}"#,
         r#"{"op":"reset","worlds":[{"world":0,"seed":18446744073709551616}]}"#,
         r#"{"op":"reset","worlds":[{"world":0},{"world":0}]}"#,
-        r#"{"op":"hello","protocol":1}"#,
+        r#"{"op":"hello","protocol":2}"#,
         r#"{"op":"hello","protocol":"1","client":"x"}"#,
     ] {
         let (status, detail, message) =
@@ -281,7 +281,7 @@ fn what_is_no_decision_is_refused_and_changes_nothing() {
             "{message}"
         );
     }
-    let hello = br#"{"op":"hello","protocol":2,"client":"x"}"#;
+    let hello = br#"{"op":"hello","protocol":3,"client":"x"}"#;
     assert_mismatch(learner.exchange(control_header(1), hello));
     let header = ControlRequest {
         version: 9,

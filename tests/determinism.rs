@@ -32,7 +32,7 @@ fn paths(seed: u64) -> Vec<Vec<Move>> {
 }
 
 fn without_episode(mut observation: Observation) -> Observation {
-    observation.result.episode = 0;
+    observation.world.episode = 0;
     observation
 }
 
@@ -147,6 +147,6 @@ fn random_starts_and_paths_far_apart_leave_the_world_the_same() {
             mine.frame, theirs.frame,
             "full frames show the world and its noise"
         );
-        assert_eq!(mine.result.n_target_cells, theirs.result.n_target_cells);
+        assert_eq!(mine.world.n_target_cells, theirs.world.n_target_cells);
     }
 }

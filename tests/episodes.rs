@@ -1,9 +1,10 @@
 //! Resets, episode ends and coverage, as every client sees them.
 
 use crate::harness::{PATIENCE, SMALL, Server, eventually, fly, new_instance, reset};
-use crate::wire::{RawClient, Wire, answer, control_header, step_header};
+use crate::wire::{RawClient, Wire, answer, control_header, step_body, step_header};
 use protocol::control::{Reply, Request, WorldInfo, WorldSeed};
-use protocol::message::{FLAG_FULL_COVERAGE, Operation, Status, StepRequest, split_step_payload};
+use protocol::message::{FLAG_FULL_COVERAGE, Operation, Status, StepRequest};
+use protocol::payload::split_step_payload;
 use protocol::{Coverage, Move, UNOBSERVED};
 use std::time::Duration;
 
@@ -26,9 +27,9 @@ fn a_reset_starts_an_empty_frame_in_the_corner_and_answers_in_order() {
     assert!(
         start
             .iter()
-            .all(|w| (w.step, w.episode, w.robot) == (0, 0, [0, 0]))
+            .all(|w| (w.step, w.episode, &w.robots[..]) == (0, 0, &[[0, 0]]))
     );
-    wire.step(step_header(lease, N_MOVES), &[3; 6]);
+    wire.step(step_header(lease, N_MOVES), &step_body(&[0], &[3; 6]));
     let order = |world, seed| WorldSeed { world, seed };
     let worlds = vec![order(2, Some(0)), order(0, Some(u64::MAX))];
     let Reply::Reset { worlds } = wire.ask(&Request::Reset { lease, worlds }) else {
@@ -39,13 +40,13 @@ fn a_reset_starts_an_empty_frame_in_the_corner_and_answers_in_order() {
         step: 0,
         seed,
         episode: 1,
-        robot: [0, 0],
+        robots: vec![[0, 0]],
     };
     assert_eq!(worlds, [expected(2, 0), expected(0, u64::MAX)]);
-    let (result, frame) = server.observe(0);
+    let (world, robot, frame) = server.observe(0);
     assert_eq!(frame, vec![UNOBSERVED; N_CELLS]);
     assert_eq!(
-        (result.coverage, result.reward, result.n_visited),
+        (robot.coverage, world.reward, world.n_visited),
         (Coverage::Empty as u32, 0.0, 0)
     );
 }
@@ -80,7 +81,7 @@ fn unseeded_resets_go_on_to_other_seeds_and_seeded_ones_repeat_every_byte() {
             Move::Up,
         ];
         let mut steps: Vec<_> = (0..20).map(|_| fly(&mut client, path.clone())).collect();
-        steps.iter_mut().for_each(|step| step.result.episode = 0);
+        steps.iter_mut().for_each(|step| step.world.episode = 0);
         steps
     };
     let (first, other, again) = (run(3), run(4), run(3));
@@ -93,26 +94,26 @@ fn an_episode_is_over_at_max_steps_until_it_is_reset() {
     let server = Server::start(&format!("{SMALL} --max-steps 3 --worlds 2"));
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(0, 2).lease;
-    let step = || wire.step(step_header(lease, N_MOVES), &[3; 6]);
+    let step = |k| wire.step(step_header(lease, N_MOVES), &step_body(&[k], &[3; 6]));
     for k in 1..=3 {
-        let (reply, payload) = step();
-        let (results, _) = split_step_payload(&reply, &payload).expect("a whole payload");
-        let (truncated, terminated) = (results[0].truncated, results[0].terminated);
+        let (reply, payload) = step(k - 1);
+        let parts = split_step_payload(&reply, &payload).expect("a whole payload");
+        let world = parts.worlds[0];
         assert_eq!(
-            (results[0].step, truncated, terminated),
+            (world.step, world.truncated, world.terminated),
             (k, u16::from(k == 3), 0)
         );
     }
-    let (reply, _) = step();
+    let (reply, _) = step(3);
     assert_eq!(
         (Status::try_from(reply.status), reply.detail),
         (Ok(Status::EpisodeOver), 0)
     );
     let both = StepRequest {
-        n_worlds: 2,
+        n_robots: 2,
         ..step_header(lease, N_MOVES)
     };
-    let (reply, _) = wire.step(both, &[3; 12]);
+    let (reply, _) = wire.step(both, &step_body(&[3, 0], &[3; 12]));
     assert_eq!(
         (Status::try_from(reply.status), reply.detail),
         (Ok(Status::EpisodeOver), 0)
@@ -127,7 +128,7 @@ fn an_episode_is_over_at_max_steps_until_it_is_reset() {
         seed: None,
     }];
     wire.ask(&Request::Reset { lease, worlds });
-    assert_eq!(step().0.status, Status::Ok as u32);
+    assert_eq!(step(0).0.status, Status::Ok as u32);
 }
 
 #[test]
@@ -146,16 +147,18 @@ fn coverage_is_what_the_server_says() {
             flags: u32::from(asks) * FLAG_FULL_COVERAGE,
             ..step_header(wire.acquire(0, 1).lease, N_MOVES)
         };
-        let (reply, payload) = wire.step(header, &[3, 3, 3, 1, 1, 2]);
+        let body = step_body(&[0], &[3, 3, 3, 1, 1, 2]);
+        let (reply, payload) = wire.step(header, &body);
         let status = expected.err().unwrap_or(Status::Ok);
         assert_eq!(Status::try_from(reply.status), Ok(status), "{rule} {asks}");
         let Ok(coverage) = expected else { continue };
-        let (results, frame) = split_step_payload(&reply, &payload).expect("a whole payload");
-        let n_seen = frame.iter().filter(|&&value| value != UNOBSERVED).count();
+        let parts = split_step_payload(&reply, &payload).expect("a whole payload");
+        let seen = parts.frames.iter();
+        let n_seen = seen.filter(|&&value| value != UNOBSERVED).count();
         let is_full = coverage == Coverage::Full;
         assert_eq!(n_seen, if is_full { N_CELLS } else { 6 }, "{rule} {asks}");
         assert_eq!(
-            (results[0].coverage, results[0].n_visited),
+            (parts.robots[0].coverage, parts.robots[0].n_visited),
             (coverage as u32, 6)
         );
     }
@@ -175,20 +178,18 @@ fn a_world_in_burn_in_takes_no_step_and_requests_for_it_wait() {
     let is_resetting = || server.status().worlds[1].resetting;
     assert!(eventually(PATIENCE, is_resetting));
     let second = StepRequest {
-        first_world: 1,
+        first_robot: 1,
         ..step_header(lease, N_MOVES)
     };
-    assert_eq!(
-        wire.step(second, &[0; 6]).0.status,
-        Status::Resetting as u32
-    );
+    let body = step_body(&[0], &[0; 6]);
+    assert_eq!(wire.step(second, &body).0.status, Status::Resetting as u32);
     let observe = StepRequest {
         operation: Operation::Observe as u32,
-        first_world: 1,
+        first_robot: 1,
         ..step_header(0, 0)
     };
     assert_eq!(wire.step(observe, &[]).0.status, Status::Resetting as u32);
-    let first = wire.step(step_header(lease, N_MOVES), &[0; 6]);
+    let first = wire.step(step_header(lease, N_MOVES), &body);
     assert_eq!(first.0.status, Status::Ok as u32, "its neighbour goes on");
     let other = Wire::open(&server.instance);
     let (refused, _) = answer(&reset(&other), PATIENCE).expect("an answer");
@@ -212,6 +213,6 @@ fn what_waits_for_a_burn_in_is_answered_after_it() {
     };
     let begun = (worlds[0].seed, worlds[0].step, worlds[0].episode);
     assert_eq!(begun, (7, 0, 1));
-    let (step, _) = wire.step(step_header(lease, N_MOVES), &[0; 6]);
+    let (step, _) = wire.step(step_header(lease, N_MOVES), &step_body(&[0], &[0; 6]));
     assert_eq!(step.status, Status::Ok as u32);
 }

@@ -1,10 +1,12 @@
 //! Observers: what `frames` and `truth` show, to whom, and that nobody waits for them.
 
-use crate::harness::{PATIENCE, Paths, SMALL, Server, eventually, fly, frames_until, new_instance};
+use crate::harness::{
+    PATIENCE, Paths, SMALL, Server, eventually, fly, frames_until, new_instance, path_of,
+    robots_of, seen_by, seen_in,
+};
 use protocol::channels::{FRAME_BUFFER, channel_directory};
-use protocol::message::FrameHeader;
+use protocol::message::{FrameHeader, VERSION};
 use protocol::observer::{Observer, Sample};
-use protocol::path::path_to_bytes;
 use protocol::{Coverage, UNOBSERVED};
 use std::time::Duration;
 
@@ -33,19 +35,16 @@ fn a_reading_observer_gets_every_frame_with_its_path() {
         let path = paths.next(6);
         let answer = fly(&mut client, path.clone());
         let new = frames_until(&observer, 1, step);
-        let Sample { header, payload } = new.last().expect("a frame");
-        let (frame, flown) = payload.split_at(N_CELLS);
+        let sample = new.last().expect("a frame");
+        assert_eq!((seen_in(sample), path_of(sample)), (seen_by(&answer), path));
+        let header = &sample.header;
         assert_eq!(
-            (frame, flown),
-            (answer.frame.as_bytes(), &*path_to_bytes(&path))
+            (header.version, header.height, header.width),
+            (VERSION, 5, 7)
         );
-        assert_eq!(header.result, answer.result);
-        assert_eq!(
-            (header.version, header.height, header.width, header.n_moves),
-            (1, 5, 7, 6)
-        );
-        assert_eq!((header.start_row, header.start_col), start);
-        start = (answer.result.row, answer.result.col);
+        assert_eq!((header.first_robot, header.n_robots), (1, 1));
+        assert_eq!((answer.robot.start_row, answer.robot.start_col), start);
+        start = (answer.robot.row, answer.robot.col);
         seen.extend(new);
     }
     assert_gapless(&seen);
@@ -60,22 +59,25 @@ fn a_reset_is_published_as_an_empty_frame_without_a_path() {
     frames_until(&observer, 0, 1);
     crate::harness::reset(&mut client, 5);
     let new = frames_until(&observer, 0, 0);
-    let Sample { header, payload } = new.last().expect("a frame");
+    let sample = new.last().expect("a frame");
+    let world = sample.header.result;
+    assert_eq!((world.seed, world.episode), (5, 1));
+    let [robot] = &robots_of(sample)[..] else {
+        panic!("expected one robot");
+    };
+    assert_eq!(robot.result.coverage, Coverage::Empty as u32);
     assert_eq!(
-        (header.n_moves, header.result.seed, header.result.episode),
-        (0, 5, 1)
+        (robot.frame, robot.path),
+        (&[UNOBSERVED; N_CELLS][..], &[][..])
     );
-    assert_eq!(header.result.coverage, Coverage::Empty as u32);
-    assert_eq!(*payload, vec![UNOBSERVED; N_CELLS]);
 }
 
 #[test]
 fn a_late_observer_gets_the_current_frame_of_every_world_at_once() {
     let server = Server::start(&format!("{SMALL} --worlds 3"));
     let mut client = server.acquire(0..3);
-    let worlds = client.worlds();
     client
-        .step(worlds, &vec![Paths::new(0).next(6); 3])
+        .step(0..3, &vec![Paths::new(0).next(6); 3])
         .expect("step");
     // The second and third come when another has just gone: the number of observers stays one.
     for _ in 0..3 {
@@ -181,9 +183,15 @@ fn what_is_told_of_a_world_agrees_with_its_hidden_states() {
             found.map(|sample| states = sample.payload).is_some()
         }));
         let burning = states.iter().filter(|&&state| state == 2).count();
-        assert_eq!(told.result.n_target_cells as usize, burning);
-        assert!(told.result.n_hits <= told.result.n_visited && told.result.n_visited <= 8);
-        assert_eq!(told.result.reward, f64::from(told.result.n_hits));
+        let (world, robot) = (told.world, told.robot);
+        assert_eq!(world.n_target_cells as usize, burning);
+        assert!(robot.n_hits <= robot.n_visited && robot.n_visited <= 8);
+        assert_eq!(
+            (world.n_hits, world.n_visited),
+            (robot.n_hits, robot.n_visited)
+        );
+        assert_eq!(world.reward, f64::from(robot.n_hits));
+        assert_eq!((robot.reward, robot.marginal), (world.reward, world.reward));
         let seen = states.iter().zip(told.frame.as_bytes());
         // A normal or burning cell looks like itself with .98.
         let sharp = seen.filter(|(state, _)| **state != 1);
@@ -206,7 +214,7 @@ fn an_observer_whose_files_are_removed_says_so() {
     let services = std::fs::read_dir(channel_directory().join("services")).expect("services");
     for entry in services.flatten() {
         let text = std::fs::read_to_string(entry.path()).unwrap_or_default();
-        if text.contains(&format!("emberwatch/v1/{}/", instance.name())) {
+        if text.contains(&format!("emberwatch/v2/{}/", instance.name())) {
             std::fs::remove_file(entry.path()).expect("remove it");
         }
     }

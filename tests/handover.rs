@@ -1,15 +1,15 @@
 //! What the next agent believes: what the last one left, or what the kept frames tell.
 
-use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly};
-use crate::wire::{RawClient, Wire, step_header};
+use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly, frames_until, path_of};
+use crate::wire::{RawClient, Wire, step_body, step_header};
 use agent::estimation::belief::Belief;
 use agent::estimation::{BayesFilter, Estimator};
 use protocol::Model;
 use protocol::Move;
 use protocol::control::{LeftPart, Reply, Request, WorldSeed};
-use protocol::message::{FrameHeader, Operation, Status, StepRequest, split_step_payload};
-use protocol::observer::{Observer, Sample};
-use protocol::path::path_from_bytes;
+use protocol::message::{FrameHeader, Operation, Status, StepRequest};
+use protocol::observer::Observer;
+use protocol::payload::split_step_payload;
 use rustix::process::Signal;
 
 /// A world with fires to find, and room for all their frames.
@@ -28,13 +28,9 @@ fn run(server: &Server, flags: &[&str]) -> Program {
 
 /// The last paths flown until step `last`: as many as an observer is kept, more than 40.
 fn paths(observer: &Observer<FrameHeader>, last: u64) -> Vec<Vec<Move>> {
-    let samples = crate::harness::frames_until(observer, 0, last);
-    let flown = samples.iter().filter(|sample| sample.header.n_moves > 0);
-    let path = |sample: &Sample<FrameHeader>| {
-        let path = &sample.payload[16 * 16..];
-        path_from_bytes(path).expect("a path")
-    };
-    flown.map(path).collect()
+    let samples = frames_until(observer, 0, last);
+    let flown = samples.iter().filter(|it| it.header.result.step > 0);
+    flown.map(path_of).collect()
 }
 
 /// What one agent flies that nobody disturbs.
@@ -57,7 +53,7 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
         let server = Server::start(&format!("{FLAGS} {ALL}"));
         let observer = Observer::frames(&server.instance).expect("observe");
         let first = run(&server, &[&policy[..], &["--steps", "0"]].concat());
-        let acts = || server.observe(0).0.step > 20;
+        let acts = || server.step_of(0) > 20;
         assert!(eventually(PATIENCE, acts), "{}", first.stderr());
         let second = run(
             &server,
@@ -79,7 +75,7 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
             third.stderr
         );
         assert!(!third.stderr.contains(FIRST_BELIEF), "{}", third.stderr);
-        let last = server.observe(0).0.step;
+        let last = server.step_of(0);
         assert_eq!(
             paths(&observer, last),
             undisturbed(last, &policy),
@@ -94,7 +90,7 @@ fn an_agent_that_finds_a_damaged_belief_begins_with_its_own() {
     let server = Server::start(FLAGS);
     let observer = Observer::frames(&server.instance).expect("observe");
     let mut client = server.acquire(0..1);
-    let at = client.observe(0..1).expect("observe")[0].result;
+    let at = client.observe(0..1).expect("observe")[0].world;
     let model = Model::wildfire();
     let shape = client.shape();
     let filter = BayesFilter::known(&model, Belief::from_initial(&model, shape));
@@ -145,15 +141,16 @@ fn kept_frames_are_those_that_were_answered() {
         );
     }
     let wire = Wire::open(&server.instance);
-    let recall = |step, n_worlds| StepRequest {
-        operation: Operation::Recall as u32,
-        n_worlds,
-        n_moves: 0,
-        step,
-        ..step_header(0, 6)
+    let recall = |step, n_robots| {
+        let header = StepRequest {
+            operation: Operation::Recall as u32,
+            n_robots,
+            ..step_header(0, 0)
+        };
+        wire.step(header, &step_body(&vec![step; n_robots as usize], &[]))
     };
     for (step, nearest) in [(0, 3), (2, 3), (7, 6), (u64::MAX, 6)] {
-        let (reply, payload) = wire.step(recall(step, 2), &[]);
+        let (reply, payload) = recall(step, 2);
         assert_eq!(
             (reply.status, reply.detail),
             (Status::NotKept as u32, nearest),
@@ -161,30 +158,28 @@ fn kept_frames_are_those_that_were_answered() {
         );
         assert!(payload.is_empty());
     }
-    let (reply, _) = wire.step(recall(3, 2), &[1]);
-    assert_eq!(reply.status, Status::WrongLength as u32);
-    let (reply, _) = wire.step(recall(3, 3), &[]);
-    assert_eq!(reply.status, Status::NoSuchWorld as u32);
+    let (reply, _) = recall(3, 3);
+    assert_eq!(reply.status, Status::NoSuchRobot as u32);
     let seeds = [WorldSeed {
         world: 1,
         seed: Some(8),
     }];
     client.reset(&seeds).expect("reset");
-    let (reply, _) = wire.step(recall(3, 2), &[]);
+    let (reply, _) = recall(3, 2);
     assert_eq!((reply.status, reply.detail), (Status::NotKept as u32, 0));
-    let (reply, payload) = wire.step(recall(6, 1), &[]);
-    let (results, _) = split_step_payload(&reply, &payload).expect("a whole payload");
-    assert_eq!(results[0].step, 6);
+    let (reply, payload) = recall(6, 1);
+    let parts = split_step_payload(&reply, &payload).expect("a whole payload");
+    assert_eq!(parts.worlds[0].step, 6);
 }
 
 #[test]
-fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_world_alone() {
+fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_robot_alone() {
     let server = Server::start("--height 5 --width 7 --moves 6 --burn-in 20 --worlds 2");
     let mut client = server.acquire(0..1);
     fly(&mut client, Paths::new(0).next(6));
     assert_eq!(client.belief(0, "kind").expect("none yet"), None);
     let bytes: Vec<u8> = (0..35 * 76 + 32_768).map(|n| n as u8).collect();
-    let at = client.observe(0..1).expect("observe")[0].result;
+    let at = client.observe(0..1).expect("observe")[0].world;
     client.leave_belief(0, &at, "kind", &bytes).expect("leave");
     assert_eq!(
         client.belief(0, "kind").expect("belief"),
@@ -193,10 +188,10 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_world_alone() 
     assert_eq!(client.belief(0, "another kind").expect("belief"), None);
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(1, 1).lease;
-    let part = |lease, world, step, offset, length, data: &str| {
+    let part = |lease, robot, step, offset, length, data: &str| {
         Request::LeaveBelief(LeftPart {
             lease,
-            world,
+            robot,
             episode: 0,
             step,
             kind: "kind".into(),
@@ -206,10 +201,10 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_world_alone() 
         })
     };
     let leave =
-        |lease, world, offset, length, data: &str| part(lease, world, 0, offset, length, data);
+        |lease, robot, offset, length, data: &str| part(lease, robot, 0, offset, length, data);
     for (request, status) in [
         (leave(lease, 0, 0, 1, "AA=="), Status::NoLease),
-        (leave(lease, 7, 0, 1, "AA=="), Status::NoSuchWorld),
+        (leave(lease, 7, 0, 1, "AA=="), Status::NoSuchRobot),
         (leave(lease, 1, 0, 1, "A"), Status::Malformed),
         (leave(lease, 1, 1, 2, "AA=="), Status::Malformed),
         (leave(lease, 1, 0, 35_429, "AA=="), Status::Malformed),
@@ -226,7 +221,7 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_world_alone() 
     // Half a belief is none.
     assert_eq!(wire.ask(&leave(lease, 1, 0, 2, "AA==")), Reply::Done);
     let ask = Request::Belief {
-        world: 1,
+        robot: 1,
         offset: 0,
     };
     assert_eq!(wire.ask(&ask).status(), Status::NotKept);
@@ -243,13 +238,13 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_world_alone() 
 fn an_agent_told_to_stop_leaves_its_belief() {
     let server = Server::start(FLAGS);
     let agent = run(&server, &["--steps", "0"]);
-    let acts = || server.observe(0).0.step > 5;
+    let acts = || server.step_of(0) > 5;
     assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
     agent.signal(Signal::TERM);
     assert_eq!(agent.wait(PATIENCE).code, Some(0));
     let mut connection = server.connect();
     let ask = Request::Belief {
-        world: 0,
+        robot: 0,
         offset: 0,
     };
     let Reply::Belief { info, .. } = connection.control(&ask, PATIENCE).expect("a belief") else {

@@ -7,8 +7,10 @@ use env_server::world::Episode;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
 use protocol::control::{Reply, Request, ServerInfo, ServerStatus, WorldSeed};
-use protocol::message::{FrameHeader, Operation, StepRequest, StepResult};
+use protocol::message::{FrameHeader, Operation, RobotResult, StepRequest, WorldResult};
 use protocol::observer::{Observer, Sample};
+use protocol::path::path_from_bytes;
+use protocol::payload::{RobotSample, split_frame_payload};
 use protocol::{Connection, Move};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -39,6 +41,9 @@ pub struct Program {
     child: Child,
     folder: TempDir,
 }
+
+/// A world's last result, that of one of its robots, and what this robot saw.
+pub type Seen = (WorldResult, RobotResult, Vec<u8>);
 
 /// A running server; killed on drop.
 pub struct Server {
@@ -229,9 +234,9 @@ impl Server {
         Connection::open(&self.instance, "tests", PATIENCE).expect("connect")
     }
 
-    /// A client that holds worlds of it.
-    pub fn acquire(&self, worlds: Range<u32>) -> Client {
-        Client::acquire(&self.instance, &claim(worlds)).expect("acquire")
+    /// A client that holds robots of it.
+    pub fn acquire(&self, robots: Range<u32>) -> Client {
+        Client::acquire(&self.instance, &claim(robots)).expect("acquire")
     }
 
     /// What it answers to `hello`.
@@ -244,19 +249,24 @@ impl Server {
         status(&self.instance).expect("status")
     }
 
-    /// The last result and frame of a world, over a connection that holds nothing.
-    pub fn observe(&self, world: u32) -> (StepResult, Vec<u8>) {
+    /// What a robot shows, and its world's last result, over a connection that holds nothing.
+    pub fn observe(&self, robot: u32) -> Seen {
         let request = StepRequest {
             operation: Operation::Observe as u32,
-            first_world: world,
-            n_worlds: 1,
+            first_robot: robot,
+            n_robots: 1,
             ..StepRequest::default()
         };
         let answer = self
             .connect()
             .step(request, &[], PATIENCE)
             .expect("observe");
-        (answer.results[0], answer.frames)
+        (answer.worlds[0], answer.robots[0], answer.frames)
+    }
+
+    /// The step k that the world of a robot is at.
+    pub fn step_of(&self, robot: u32) -> u64 {
+        self.observe(robot).0.step
     }
 
     /// Kills it as no handler can prevent; returns when it is gone.
@@ -265,20 +275,20 @@ impl Server {
     }
 }
 
-/// A claim on worlds that waits for nobody and takes from nobody.
-pub fn claim(worlds: Range<u32>) -> Claim {
+/// A claim on robots that waits for nobody and takes from nobody.
+pub fn claim(robots: Range<u32>) -> Claim {
     Claim {
-        worlds,
+        robots,
         takeover: false,
         time_to_live: None,
     }
 }
 
 /// The same claim, as a takeover.
-pub fn takeover(worlds: Range<u32>) -> Claim {
+pub fn takeover(robots: Range<u32>) -> Claim {
     Claim {
         takeover: true,
-        ..claim(worlds)
+        ..claim(robots)
     }
 }
 
@@ -333,7 +343,7 @@ fn status_within(instance: &Instance, limit: Duration) -> Result<ServerStatus, C
     }
 }
 
-/// Reproducible paths, `n_worlds` for each step.
+/// Reproducible paths.
 pub struct Paths(ChaCha8Rng);
 
 impl Paths {
@@ -354,10 +364,10 @@ impl Paths {
     }
 }
 
-/// Starts world 0 and its neighbours again with consecutive seeds.
+/// Starts a client's worlds again with consecutive seeds.
 pub fn reset(client: &mut Client, first_seed: u64) {
     let seeds: Vec<WorldSeed> = client
-        .worlds()
+        .worlds_of(&client.robots())
         .zip(first_seed..)
         .map(|(world, seed)| WorldSeed {
             world,
@@ -367,10 +377,32 @@ pub fn reset(client: &mut Client, first_seed: u64) {
     client.reset(&seeds).expect("reset");
 }
 
-/// Flies one path in a client's only world.
+/// Flies one path with a client's only robot.
 pub fn fly(client: &mut Client, path: Vec<Move>) -> Observation {
-    let worlds = client.worlds();
-    client.step(worlds, &[path]).expect("step").remove(0)
+    let robots = client.robots();
+    client.step(robots, &[path]).expect("step").remove(0)
+}
+
+/// The robots of a published step.
+pub fn robots_of(sample: &Sample<FrameHeader>) -> Vec<RobotSample<'_>> {
+    split_frame_payload(&sample.header, &sample.payload).expect("a whole sample")
+}
+
+/// The path of the only robot of a published step; empty after a reset.
+pub fn path_of(sample: &Sample<FrameHeader>) -> Vec<Move> {
+    path_from_bytes(robots_of(sample)[0].path).expect("a path")
+}
+
+/// What the only robot of a published step shows, as [`Server::observe`] does.
+pub fn seen_in(sample: &Sample<FrameHeader>) -> Seen {
+    let robot = &robots_of(sample)[0];
+    (sample.header.result, robot.result, robot.frame.to_vec())
+}
+
+/// What an answer of a client shows, as [`Server::observe`] does.
+pub fn seen_by(observation: &Observation) -> Seen {
+    let frame = observation.frame.as_bytes().to_vec();
+    (observation.world, observation.robot, frame)
 }
 
 /// Reads frames until one of a world and step has come; returns all, that one last.

@@ -6,7 +6,7 @@
 use crate::attacker::Attacker;
 use crate::harness::{PATIENCE, Paths, Program, Server, claim, eventually, fly};
 use crate::siege::{FLAGS, besiege};
-use crate::wire::{RawClient, Wire, answer, client, control_header, step_header};
+use crate::wire::{RawClient, Wire, answer, client, control_header, step_body, step_header};
 use agent::server::client::Client;
 use protocol::Connection;
 use protocol::channels::{Channel, MAX_CLIENTS, MAX_OBSERVERS, Services, create_node};
@@ -71,7 +71,7 @@ fn refusals_are_counted_one_by_one() {
     let server = Server::start(FLAGS);
     let wire = Wire::open(&server.instance);
     for count in 1..=100 {
-        let (reply, _) = wire.step(step_header(1, 6), &[0; 6]);
+        let (reply, _) = wire.step(step_header(1, 6), &step_body(&[0], &[0; 6]));
         assert_eq!(reply.status, Status::NoLease as u32);
         wire.control(control_header(1), b"nonsense");
         assert_eq!(server.status().n_refused, 2 * count);
@@ -84,12 +84,13 @@ fn a_stolen_token_opens_nothing() {
     let (owner, thief) = (Wire::open(&server.instance), Wire::open(&server.instance));
     let lease = owner.acquire(0, 3).lease;
     let before = server.status().worlds;
-    for world in 0..3 {
+    for robot in 0..3 {
         let header = StepRequest {
-            first_world: world,
+            first_robot: robot,
             ..step_header(lease, 6)
         };
-        assert_eq!(thief.step(header, &[0; 6]).0.status, Status::NoLease as u32);
+        let (reply, _) = thief.step(header, &step_body(&[0], &[0; 6]));
+        assert_eq!(reply.status, Status::NoLease as u32);
     }
     let seed = |world| WorldSeed { world, seed: None };
     for request in [
@@ -109,12 +110,23 @@ fn a_stolen_token_opens_nothing() {
     assert_eq!(server.status().worlds, before);
 }
 
-/// The header of a correct step of world 1.
-fn second_world(lease: u64) -> StepRequest {
+/// The header of a correct step of robot 1.
+fn second_robot(lease: u64) -> StepRequest {
     StepRequest {
-        first_world: 1,
+        first_robot: 1,
         ..step_header(lease, 6)
     }
+}
+
+/// The payload of a step of one world.
+fn body(k: u64) -> Vec<u8> {
+    step_body(&[k], &[3; 6])
+}
+
+/// Steps robot 1 of a server from where it is.
+fn fly_second(server: &Server, wire: &Wire, lease: u64) -> Status {
+    let (reply, _) = wire.step(second_robot(lease), &body(server.step_of(1)));
+    Status::try_from(reply.status).expect("a known status")
 }
 
 #[test]
@@ -123,17 +135,18 @@ fn a_flood_of_requests_whose_answers_nobody_reads_disturbs_nobody() {
         let wire = Wire::open(&server.instance);
         let lease = wire.acquire(1, 1).lease;
         for round in 0..2_000 {
+            // The first may be flown; what comes after it is late.
             let step = wire
-                .send_step(second_world(lease), &[3; 6])
+                .send_step(second_robot(lease), &body(0))
                 .expect("send a step");
             let control = wire.send_control(control_header(round), br#"{"op":"status"}"#);
             let control = control.expect("send a control request");
-            let refused = wire.send_step(second_world(lease), &[3; 6]);
+            let refused = wire.send_step(second_robot(lease), &body(0));
             assert!(refused.is_err(), "a client has one request under way");
             drop((step, control));
         }
-        let (reply, _) = wire.step(second_world(lease), &[3; 6]);
-        assert_eq!(reply.status, Status::Ok as u32);
+        assert!(server.step_of(1) <= 1, "a step was made twice");
+        assert_eq!(fly_second(server, &wire, lease), Status::Ok);
     });
 }
 
@@ -145,7 +158,7 @@ fn answers_and_requests_that_are_held_keep_only_their_holder_from_more() {
         let mut held = Vec::new();
         for _ in 0..200 {
             // As soon as it holds too many, the client cannot send, or gets no answer.
-            let Ok(pending) = wire.send_step(second_world(lease), &[3; 6]) else {
+            let Ok(pending) = wire.send_step(second_robot(lease), &body(held.len() as u64)) else {
                 break;
             };
             let n_held = held.len();
@@ -156,10 +169,9 @@ fn answers_and_requests_that_are_held_keep_only_their_holder_from_more() {
         }
         assert!(!held.is_empty(), "no answer at all");
         let pending = wire.send_control(control_header(1), b"{}");
-        assert!(server.observe(1).0.step > 0, "another client is answered");
+        assert!(server.step_of(1) > 0, "another client is answered");
         drop((held, pending));
-        let (reply, _) = wire.step(second_world(lease), &[3; 6]);
-        assert_eq!(reply.status, Status::Ok as u32);
+        assert_eq!(fly_second(server, &wire, lease), Status::Ok);
     });
 }
 
@@ -168,16 +180,17 @@ fn old_leases_and_numbers_open_nothing_again() {
     besiege(|server, stolen| {
         let (wire, other) = (Wire::open(&server.instance), Wire::open(&server.instance));
         let mut old = Vec::new();
-        for _ in 0..20 {
+        for round in 0..20 {
             let lease = wire.acquire(1, 2).lease;
-            // The very same request again: it counts again, and only in worlds of the lease.
-            for _ in 0..5 {
-                assert_eq!(
-                    wire.step(second_world(lease), &[3; 6]).0.status,
-                    Status::Ok as u32
-                );
-                let status = other.step(second_world(lease), &[3; 6]).0.status;
-                assert_eq!(status, Status::NoLease as u32);
+            for k in 5 * round..5 * (round + 1) {
+                let status = |from: &Wire| {
+                    let (reply, _) = from.step(second_robot(lease), &body(k));
+                    Status::try_from(reply.status)
+                };
+                // The very same request again comes too late.
+                assert_eq!(status(&wire), Ok(Status::Ok));
+                assert_eq!(status(&wire), Ok(Status::Late));
+                assert_eq!(status(&other), Ok(Status::NoLease));
             }
             assert_eq!(wire.ask(&Request::Release { lease }), Reply::Done);
             old.push(lease);
@@ -185,7 +198,8 @@ fn old_leases_and_numbers_open_nothing_again() {
                 .iter()
                 .flat_map(|&lease| [(&wire, lease), (&other, lease)])
             {
-                let status = from.step(second_world(lease), &[3; 6]).0.status;
+                let now = body(5 * (round + 1));
+                let status = from.step(second_robot(lease), &now).0.status;
                 assert_eq!(status, Status::LeaseLost as u32);
                 assert_eq!(
                     from.ask(&Request::Renew { lease }).status(),
@@ -196,15 +210,14 @@ fn old_leases_and_numbers_open_nothing_again() {
         // All three worlds with a lease on two of them, and the victim's with its own lease.
         let lease = wire.acquire(1, 2).lease;
         let all = StepRequest {
-            n_worlds: 3,
+            n_robots: 3,
             ..step_header(lease, 6)
         };
-        assert_eq!(wire.step(all, &[3; 18]).0.status, Status::NoLease as u32);
-        assert_eq!(
-            wire.step(step_header(stolen, 6), &[3; 6]).0.status,
-            Status::NoLease as u32
-        );
-        assert_eq!(server.observe(1).0.step, 100);
+        let (reply, _) = wire.step(all, &step_body(&[0, 100, 0], &[3; 18]));
+        assert_eq!(reply.status, Status::NoLease as u32);
+        let (reply, _) = wire.step(step_header(stolen, 6), &body(server.step_of(0)));
+        assert_eq!(reply.status, Status::NoLease as u32);
+        assert_eq!(server.step_of(1), 100);
     });
 }
 
@@ -266,12 +279,12 @@ fn a_client_that_is_stopped_in_the_middle_disturbs_nobody() {
         );
         let mut step = 0;
         for round in 0..40 {
-            let acts = eventually(PATIENCE, || server.observe(1).0.step > step);
+            let acts = eventually(PATIENCE, || server.step_of(1) > step);
             assert!(acts, "{}", agent.stderr());
             std::thread::sleep(Duration::from_micros(37 * round));
             agent.stop();
-            step = server.observe(1).0.step;
-            assert!(server.observe(1).0.step <= step + 1, "it is stopped");
+            step = server.step_of(1);
+            assert!(server.step_of(1) <= step + 1, "it is stopped");
             agent.signal(Signal::CONT);
         }
         // And dies so.
@@ -290,7 +303,7 @@ fn the_longest_control_requests_are_answered_in_short() {
     };
     let texts = [
         (
-            longest(r#"{"op":"hello","protocol":1,"client":""#, "x", r#""}"#),
+            longest(r#"{"op":"hello","protocol":2,"client":""#, "x", r#""}"#),
             Status::Ok,
         ),
         (longest(r#"{"op":""#, "x", r#""}"#), Status::Malformed),
@@ -348,14 +361,14 @@ fn requests_that_wait_for_a_reset_and_are_given_up_do_not_wear_the_server_out() 
     for step in 1..=50 {
         let given_up = send(&renew);
         let seen = fly(&mut bystander, Paths::new(0).next(6));
-        assert_eq!(seen.result.step, step);
+        assert_eq!(seen.world.step, step);
         server.status();
         drop(given_up);
     }
     let Reply::Status(status) = wire.ask(&Request::Status {}) else {
         panic!("expected a status");
     };
-    assert_eq!(status.worlds[1].holder_pid, Some(std::process::id()));
+    assert_eq!(status.worlds[1].holder_pids, [Some(std::process::id())]);
 }
 
 #[test]
@@ -373,10 +386,10 @@ fn messages_of_any_length_are_refused_whole() {
         MAX_CONTROL_BYTES + 1,
         3 * MAX_CONTROL_BYTES,
     ] {
-        let (reply, _) = wire.step(second_world(lease), &vec![0; length]);
+        let (reply, _) = wire.step(second_robot(lease), &vec![0; length]);
         assert_eq!(
             (reply.status, reply.detail),
-            (Status::WrongLength as u32, 6)
+            (Status::WrongLength as u32, 8 + 6)
         );
         let (reply, text) = wire.control(control_header(1), &vec![b' '; length]);
         assert_eq!(
@@ -396,7 +409,7 @@ fn clients_that_come_and_go_in_the_middle_of_everything_disturb_nobody() {
     for round in 1..=60 {
         let wire = Wire::open(&server.instance);
         let step = wire
-            .send_step(step_header(round, 6), &[3; 6])
+            .send_step(step_header(round, 6), &body(0))
             .expect("send");
         let control = wire.send_control(control_header(round), br#"{"op":"status"}"#);
         match round % 3 {
@@ -404,10 +417,7 @@ fn clients_that_come_and_go_in_the_middle_of_everything_disturb_nobody() {
             1 => drop((step, wire, control)),
             _ => drop((answer(&step, PATIENCE), control, wire)),
         }
-        assert_eq!(
-            fly(&mut bystander, Paths::new(0).next(6)).result.step,
-            round
-        );
+        assert_eq!(fly(&mut bystander, Paths::new(0).next(6)).world.step, round);
     }
     assert!(Client::acquire(&server.instance, &claim(1..3)).is_ok());
 }

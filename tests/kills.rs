@@ -152,7 +152,7 @@ pub fn files_of(left: &Left) -> Vec<PathBuf> {
     let names: Vec<String> = left
         .instances
         .iter()
-        .map(|instance| format!("emberwatch/v1/{}/", instance.name()))
+        .map(|instance| format!("emberwatch/v2/{}/", instance.name()))
         .collect();
     let is_theirs = |path: &PathBuf| {
         if path.extension() == Some("service".as_ref()) {

@@ -7,7 +7,7 @@ use iceoryx2::port::notifier::Notifier;
 use protocol::channels::{Channel, ChannelError, Instance, Ipc, Services, create_node, ipc_error};
 use protocol::control::WorldSeed;
 use protocol::decisions::{AgentInfo, Decision, Reply, Request};
-use protocol::message::{ControlReply, ControlRequest, Status};
+use protocol::message::{ControlReply, ControlRequest, Status, VERSION};
 use std::time::Duration;
 
 /// A learner that is connected to an agent.
@@ -167,7 +167,7 @@ pub fn decide(objectives: &[Option<u64>]) -> Request {
 
 fn hello() -> Request {
     Request::Hello {
-        protocol: 1,
+        protocol: VERSION,
         client: "tests".into(),
     }
 }

@@ -1,4 +1,4 @@
-//! Who may act: one holder a world, ended by release, expiry or takeover; the world stays put.
+//! Who may act: one holder a robot, ended by release, expiry or takeover; its world stays put.
 
 use crate::harness::{
     ENDLESS, PATIENCE, Paths, SMALL, Server, claim, eventually, fly, new_instance, takeover,
@@ -25,12 +25,12 @@ fn us() -> u64 {
     std::process::id().into()
 }
 
-fn paths(n_worlds: usize) -> Vec<Vec<protocol::Move>> {
-    vec![Paths::new(0).next(6); n_worlds]
+fn paths(n_robots: usize) -> Vec<Vec<protocol::Move>> {
+    vec![Paths::new(0).next(6); n_robots]
 }
 
 #[test]
-fn a_world_has_one_holder_until_it_is_released() {
+fn a_robot_has_one_holder_until_it_is_released() {
     let server = Server::start(&format!("{SMALL} --worlds 2"));
     let holder = server.acquire(0..1);
     check(
@@ -47,15 +47,15 @@ fn a_world_has_one_holder_until_it_is_released() {
         .status()
         .worlds
         .iter()
-        .map(|world| world.holder_pid)
+        .flat_map(|world| world.holder_pids.clone())
         .collect();
     assert_eq!(
         pids,
         [Some(std::process::id()), None],
-        "a refused claim takes no world"
+        "a refused claim takes no robot"
     );
     holder.release().expect("release");
-    assert_eq!(server.status().worlds[0].holder_pid, None);
+    assert_eq!(server.status().worlds[0].holder_pids, [None]);
     server.acquire(0..2);
 }
 
@@ -82,7 +82,7 @@ fn a_takeover_ends_the_former_lease_and_leaves_the_world_where_it_was() {
         former.observe(0..1).expect("observing needs no lease"),
         [last]
     );
-    assert_eq!(fly(&mut next, Paths::new(2).next(6)).result.step, 2);
+    assert_eq!(fly(&mut next, Paths::new(2).next(6)).world.step, 2);
     next.release().expect("release");
     check(former.step(0..1, &paths(1)), Status::LeaseLost, us());
     check(former.release(), Status::LeaseLost, us());
@@ -107,7 +107,7 @@ fn a_takeover_of_some_worlds_leaves_the_others_with_their_holder() {
 }
 
 #[test]
-fn a_renewal_tells_of_the_worlds_that_are_still_held() {
+fn a_renewal_tells_of_the_robots_that_are_still_held() {
     let server = Server::start(&format!("{SMALL} --worlds 3"));
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(0, 3).lease;
@@ -117,9 +117,10 @@ fn a_renewal_tells_of_the_worlds_that_are_still_held() {
     };
     let worlds: Vec<u32> = renewed.worlds.iter().map(|world| world.world).collect();
     assert_eq!(
-        (renewed.lease, renewed.ttl_millis, worlds),
+        (renewed.lease, renewed.ttl_millis, renewed.robots),
         (lease, 30_000, vec![0, 2])
     );
+    assert_eq!(worlds, [0, 2]);
 }
 
 #[test]
@@ -130,14 +131,13 @@ fn a_client_may_ask_for_a_lease_of_its_own_length() {
         ..claim(0..1)
     };
     let mut client = Client::acquire(&server.instance, &short).expect("acquire");
-    assert!(eventually(PATIENCE, || server.status().worlds[0]
-        .holder_pid
-        .is_none()));
+    let is_free = || server.status().worlds[0].holder_pids == [None];
+    assert!(eventually(PATIENCE, is_free));
     check(client.step(0..1, &paths(1)), Status::LeaseLost, 0);
     for (asked, given) in [(Some(0), 100), (Some(u64::MAX), 86_400_000), (None, 30_000)] {
         let request = Request::Acquire {
-            first_world: 0,
-            n_worlds: 1,
+            first_robot: 0,
+            n_robots: 1,
             takeover: true,
             ttl_millis: asked,
         };
@@ -153,9 +153,10 @@ fn a_lease_outlives_a_burn_in_that_is_longer() {
     let flags = format!("{SMALL} --lease-millis 100").replace("20", &ENDLESS.to_string());
     let server = Server::start_in_burn_in(&new_instance(), &flags);
     let wire = Wire::open(&server.instance);
-    let acquire = br#"{"op":"acquire","first_world":0,"n_worlds":1}"#;
+    let acquire = br#"{"op":"acquire","first_robot":0,"n_robots":1}"#;
     let _pending = wire.send_control(control_header(1), acquire).expect("send");
-    let is_held = |status: &ServerStatus| status.worlds[0].holder_pid.map(u64::from) == Some(us());
+    let is_held =
+        |status: &ServerStatus| status.worlds[0].holder_pids == [Some(std::process::id())];
     assert!(eventually(PATIENCE, || is_held(&server.status())));
     let due = server.status().uptime_millis + 1_000;
     let mut late = server.status();

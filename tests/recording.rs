@@ -6,7 +6,7 @@ use crate::harness::{
 };
 use protocol::channels::Instance;
 use protocol::control::{CoverageRule, ServerInfo};
-use protocol::message::{FrameHeader, Header, TruthHeader};
+use protocol::message::{FrameHeader, Header, RobotResult, TruthHeader, VERSION};
 use protocol::observer::{Observer, Sample};
 use protocol::recording::{Event, Reader, Record, RecordingError, Writer};
 use rustix::process::Signal;
@@ -106,13 +106,14 @@ pub fn take<H: Header>(observer: &Observer<H>, n_samples: usize) -> Vec<Sample<H
 pub fn write_recording(file: &Path, n_frames: u64, millis_apart: u64) -> Vec<Sample<FrameHeader>> {
     let mut writer = Writer::new(File::create(file).expect("create")).expect("begin");
     let info = ServerInfo {
-        protocol: 1,
+        protocol: VERSION,
         build: "0.1.0".into(),
         pid: 1,
         height: 2,
         width: 3,
         n_moves: 1,
         n_worlds: 1,
+        n_robots: 1,
         n_observations: 3,
         observations: vec!["normal".into(), "latent".into(), "fire".into()],
         model: None,
@@ -122,6 +123,7 @@ pub fn write_recording(file: &Path, n_frames: u64, millis_apart: u64) -> Vec<Sam
         coverage: CoverageRule::Path,
         publish_truth: false,
         lease_millis: 30_000,
+        deadline_millis: 0,
     };
     let mut write = |nanos: u64, event: Event| {
         let record = Record {
@@ -135,15 +137,19 @@ pub fn write_recording(file: &Path, n_frames: u64, millis_apart: u64) -> Vec<Sam
     let mut samples = Vec::new();
     for sequence in 0..n_frames {
         let mut header = FrameHeader {
-            version: 1,
+            version: VERSION,
             sequence,
+            n_robots: 1,
             height: 2,
             width: 3,
-            n_moves: 1,
             ..FrameHeader::default()
         };
         header.result.step = sequence;
-        let payload = vec![255, 0, 255, 255, 1, 255, 3];
+        let robot = RobotResult {
+            n_moves: 1,
+            ..RobotResult::default()
+        };
+        let payload = [bytemuck::bytes_of(&robot), &[255, 0, 255, 255, 1, 255, 3]].concat();
         let sample = Sample { header, payload };
         write(
             sequence * millis_apart * 1_000_000,
@@ -239,7 +245,7 @@ fn what_a_recorder_misses_is_said_by_it_and_by_the_file() {
     recorder.stop();
     let mut last = 1;
     for _ in 0..400 {
-        last = fly(&mut client, paths.next(6)).result.step;
+        last = fly(&mut client, paths.next(6)).world.step;
     }
     recorder.signal(Signal::CONT);
     wait_for_step(&file, last);
@@ -270,9 +276,8 @@ fn a_recorder_ends_after_its_steps_with_its_worlds_alone() {
     let recorder = start_recorder(&server.instance, &file, &flags);
     let mut client = server.acquire(0..3);
     for step in 0..2 {
-        let worlds = client.worlds();
         let paths = Paths::new(step).take(6, 3);
-        client.step(worlds, &paths).expect("step");
+        client.step(0..3, &paths).expect("step");
     }
     let ended = recorder.wait(PATIENCE);
     assert_eq!(ended.code, Some(0), "{}", ended.stderr);
@@ -299,7 +304,8 @@ fn a_damaged_recording_is_replayed_up_to_the_damage_unless_that_is_checked() {
     let good = frames(&records);
     assert!(matches!(error, Some(RecordingError::Damaged { .. })));
     assert!((1..5).contains(&good.len()) && good[..] == samples[..good.len()]);
-    let words = format!("good before it: {} steps", good.len());
+    // The first frame is that of a reset.
+    let words = format!("good before it: {} steps", good.len() - 1);
     let instance = new_instance();
     let observer = Observer::frames(&instance).expect("observe");
     let replay = start_replay(&instance, &file, &[]);
@@ -350,7 +356,7 @@ fn wrong_input_is_named() {
     damaged[60] ^= 4;
     let damaged = write("damaged", &damaged);
     let mut newer = bytes.clone();
-    newer[8] = 2;
+    newer[8] = 3;
     let newer = write("newer", &newer);
     let foreign = write("foreign", b"a text that is no recording");
     let start = write("start", &bytes[..16]);
@@ -366,7 +372,7 @@ replay => FILE
 replay no/such => recording no/such: No such file
 replay / => recording /: Is a directory
 replay FOREIGN => not a recording | got "a text t"
-replay NEWER => recording version: expected 1, got 2
+replay NEWER => recording version: expected 2, got 3
 replay DAMAGED => damaged at byte 16: checksum: expected
 replay START => cut short: expected a whole record at byte 16, got 0 bytes; good before it: 0 steps
 replay GOOD --from 9 => expected samples from 9s on, got none

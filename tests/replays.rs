@@ -74,8 +74,8 @@ fn a_replay_answers_for_its_server_and_lets_nobody_act() {
         .map(|it| it.header.result.step);
     assert_eq!(steps.collect::<Vec<_>>(), [0, 1, 2, 0, 1, 2, 0]);
     let acquire = Request::Acquire {
-        first_world: 0,
-        n_worlds: 1,
+        first_robot: 0,
+        n_robots: 1,
         takeover: true,
         ttl_millis: None,
     };
@@ -90,7 +90,7 @@ fn a_replay_answers_for_its_server_and_lets_nobody_act() {
     }
     let observe = StepRequest {
         operation: Operation::Observe as u32,
-        n_worlds: 1,
+        n_robots: 1,
         ..StepRequest::default()
     };
     let refused = connection.step(observe, &[], PATIENCE);

@@ -24,7 +24,7 @@ fn start_agent(instance: &Instance) -> Program {
 }
 
 fn is_held_by(server: &Server, agent: &Program) -> bool {
-    server.status().worlds[0].holder_pid == Some(agent.pid())
+    server.status().worlds[0].holder_pids == [Some(agent.pid())]
 }
 
 #[test]

@@ -2,7 +2,7 @@
 //! were there, and afterwards the server must hold no more than before.
 
 use crate::harness::{PATIENCE, Paths, Server, eventually};
-use crate::wire::{RawClient, Wire, step_header};
+use crate::wire::{RawClient, Wire, step_body, step_header};
 use protocol::channels::{Instance, SHARED_MEMORY};
 use protocol::message::Status;
 use protocol::path::path_to_bytes;
@@ -69,7 +69,8 @@ fn live(instance: &Instance, tell_lease: &Sender<u64>, stop: &AtomicBool) -> Vec
     let lease = wire.acquire(0, 1).lease;
     let (mut paths, mut seen) = (Paths::new(0), Vec::new());
     while !stop.load(Ordering::Relaxed) || seen.len() <= 50 {
-        let (reply, payload) = wire.step(step_header(lease, 6), &path_to_bytes(&paths.next(6)));
+        let body = step_body(&[seen.len() as u64], &path_to_bytes(&paths.next(6)));
+        let (reply, payload) = wire.step(step_header(lease, 6), &body);
         assert_eq!(Status::try_from(reply.status), Ok(Status::Ok));
         seen.push(payload);
         if seen.len() == 1 {
@@ -87,9 +88,9 @@ fn assert_undisturbed(seen: &[Vec<u8>]) {
     let wire = Wire::open(&server.instance);
     let (lease, mut paths) = (wire.acquire(0, 1).lease, Paths::new(0));
     for (step, payload) in seen.iter().enumerate() {
-        let path = path_to_bytes(&paths.next(6));
+        let body = step_body(&[step as u64], &path_to_bytes(&paths.next(6)));
         assert_eq!(
-            wire.step(step_header(lease, 6), &path).1,
+            wire.step(step_header(lease, 6), &body).1,
             *payload,
             "step {step}"
         );

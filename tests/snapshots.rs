@@ -127,7 +127,7 @@ fn one_world_of_a_file_takes_the_place_of_one_and_observers_see_it() {
     let nowhere = ["restore", text(&file), "--first-world", "2", "--takeover"];
     refused(
         &server_command(&server, &nowhere),
-        "the server has worlds 0 to 2",
+        "the server has robots 0 to 2",
     );
 }
 
@@ -152,7 +152,7 @@ fn a_fork_has_the_future_of_its_world_and_a_life_of_its_own() {
     );
     refused(
         &server_command(&server, &["fork", "0", "3"]),
-        "no such world",
+        "no such robot",
     );
     refused(
         &server_command(&server, &["fork", "7", "1"]),
@@ -188,8 +188,8 @@ fn a_file_that_is_none_is_refused_by_name_and_changes_nothing() {
         refused(&server_command(&server, &restore), words);
         let wire = Wire::open(&server.instance);
         let request = Request::Acquire {
-            first_world: 0,
-            n_worlds: 1,
+            first_robot: 0,
+            n_robots: 1,
             takeover: true,
             ttl_millis: None,
         };
@@ -220,8 +220,8 @@ fn a_file_that_is_none_is_refused_by_name_and_changes_nothing() {
     );
     check(&whole[..whole.len() - 1], "damaged: expected");
     let mut version = whole.clone();
-    version[8] = 2;
-    check(&version, "expected a snapshot of version 1, got version 2");
+    version[8] = 3;
+    check(&version, "expected a snapshot of version 2, got version 3");
     let mut damaged = whole.clone();
     damaged[whole.len() / 2] ^= 1;
     check(&damaged, "damaged: expected the checksum");
@@ -273,7 +273,7 @@ fn a_killed_server_comes_back_where_its_last_snapshot_left_it() {
     for round in 1..=3 {
         let server = Server::start_on(&instance, &flags);
         let mut client = Client::acquire(&instance, &takeover(0..2)).expect("acquire");
-        let stands = client.observe(0..2).expect("observe")[0].result.step;
+        let stands = client.observe(0..2).expect("observe")[0].world.step;
         assert!(stands <= at && stands + 20 > at, "{stands} after {at}");
         for k in stands..25 * round {
             let seen = client.step(0..2, &path(k)).expect("step");
@@ -298,7 +298,7 @@ fn a_killed_server_comes_back_where_its_last_snapshot_left_it() {
         server.kill();
     }
     let server = Server::start_on(&instance, &flags);
-    let stands = server.observe(0).0.step;
+    let stands = server.step_of(0);
     let stopped = server_command(&server, &["stop"]);
     assert_eq!(stopped.code, Some(0), "{}", stopped.stderr);
     drop(server.program.wait(PATIENCE));
@@ -310,12 +310,7 @@ fn a_killed_server_comes_back_where_its_last_snapshot_left_it() {
     files.sort();
     std::fs::write(files.last().expect("a snapshot"), "EMBRSNAPnonsense").expect("write");
     let server = Server::start_on(&instance, &flags);
-    assert_eq!(
-        server.observe(0).0.step,
-        stands,
-        "{}",
-        server.program.stderr()
-    );
+    assert_eq!(server.step_of(0), stands, "{}", server.program.stderr());
     server
         .program
         .wait_for_words("another kind of file", PATIENCE);

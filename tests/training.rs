@@ -153,7 +153,7 @@ fn other_worlds_begin_new_tracks_and_an_empty_replay() {
     let refused = place.words("out", &format!("{WORLDS} --steps 60"));
     check(AGENT, &refused, &["--out", "expected --resume"]);
     let ended = place.train("out", &format!("{WORLDS} --steps 60 --resume"));
-    let told = "beliefs begin again worlds=2";
+    let told = "beliefs begin again robots=2";
     assert!(ended.stderr.contains(told), "{}", ended.stderr);
     let files = std::fs::read_dir(place.path("out")).expect("the folder");
     let names = files.map(|file| file.expect("a file").file_name());
@@ -180,7 +180,7 @@ fn a_world_that_stands_elsewhere_begins_a_new_track_and_the_replay_stays() {
     let n_rows = place.rows("out").len();
     fly(&mut server.acquire(0..1), vec![Move::from_low_bits(0); 6]);
     let ended = place.train("out", &format!("{flags} --steps 60 --resume"));
-    let told = "beliefs begin again worlds=1";
+    let told = "beliefs begin again robots=1";
     assert!(ended.stderr.contains(told), "{}", ended.stderr);
     let rows = place.rows("out");
     let updates = |row: &Vec<String>| row[0].parse::<u64>().expect("a number");
@@ -403,7 +403,7 @@ fn worlds_and_settings_that_do_not_fit_are_named() {
         let name = server.instance.name();
         place.words("out", &format!("--instance {name} {flags}"))
     };
-    check(AGENT, &words("--worlds 2"), &["no such world"]);
+    check(AGENT, &words("--worlds 2"), &["no such robot"]);
     let _held = server.acquire(0..1);
     check(AGENT, &words("--worlds 1"), &["pid"]);
     let settings = "[learning]\nkernel = [2, 3]\n";

@@ -14,6 +14,7 @@ use protocol::control::{LeaseInfo, Reply, Request};
 use protocol::message::{
     ControlReply, ControlRequest, Header, Operation, Status, StepReply, StepRequest, VERSION,
 };
+use protocol::payload::write_step_body;
 use protocol::wait::Waiter;
 use std::time::Duration;
 
@@ -50,11 +51,11 @@ pub trait RawClient {
         reply
     }
 
-    /// Acquires worlds.
-    fn acquire(&self, first_world: u32, n_worlds: u32) -> LeaseInfo {
+    /// Acquires robots.
+    fn acquire(&self, first_robot: u32, n_robots: u32) -> LeaseInfo {
         let request = Request::Acquire {
-            first_world,
-            n_worlds,
+            first_robot,
+            n_robots,
             takeover: false,
             ttl_millis: None,
         };
@@ -137,17 +138,24 @@ impl RawClient for Wire {
     }
 }
 
-/// The header of a correct step of world 0.
+/// The header of a correct step of robot 0.
 pub fn step_header(lease: u64, n_moves: u32) -> StepRequest {
     StepRequest {
         version: VERSION,
         operation: Operation::Step as u32,
         lease,
         sequence: 1,
-        n_worlds: 1,
+        n_robots: 1,
         n_moves,
         ..StepRequest::default()
     }
+}
+
+/// The payload of a step of worlds that are at these steps.
+pub fn step_body(steps: &[u64], paths: &[u8]) -> Vec<u8> {
+    let mut body = Vec::new();
+    write_step_body(steps, paths, &mut body);
+    body
 }
 
 /// The header of a correct control request.

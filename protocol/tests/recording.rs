@@ -3,22 +3,26 @@
 use proptest::collection::vec;
 use proptest::prelude::*;
 use protocol::control::{CoverageRule, ServerInfo};
-use protocol::message::{FrameHeader, StepResult, TruthHeader};
+use protocol::message::{FrameHeader, RobotResult, TruthHeader, VERSION, WorldResult};
 use protocol::observer::Sample;
 use protocol::recording::{
     Event, Kind, MAX_STORED_BYTES, Reader, Record, RecordHeader, RecordingError, Totals, Writer,
 };
 use std::io::Write;
 
+/// Robots of a world.
+const N_ROBOTS: usize = 2;
+
 fn server(height: usize, width: usize, n_moves: usize) -> Event {
     Event::Server(Box::new(ServerInfo {
-        protocol: 1,
+        protocol: VERSION,
         build: "0.1.0".into(),
         pid: 7,
         height,
         width,
         n_moves,
         n_worlds: 3,
+        n_robots: N_ROBOTS as u32,
         n_observations: 3,
         observations: vec!["normal".into(), "latent".into(), "fire".into()],
         model: None,
@@ -28,30 +32,43 @@ fn server(height: usize, width: usize, n_moves: usize) -> Event {
         coverage: CoverageRule::Path,
         publish_truth: true,
         lease_millis: 30_000,
+        deadline_millis: 0,
     }))
 }
 
-fn frame(sequence: u64, (height, width): (usize, usize), payload: Vec<u8>) -> Event {
+/// A sample of robots that flew so many moves; `bytes` are their frames and paths.
+fn frame(
+    sequence: u64,
+    (height, width): (usize, usize),
+    n_moves: [usize; N_ROBOTS],
+    bytes: &[u8],
+) -> Sample<FrameHeader> {
+    let world = sequence as u32 % 3;
     let header = FrameHeader {
-        version: 1,
-        world: sequence as u32 % 3,
+        version: VERSION,
+        world,
         sequence,
+        first_robot: world * N_ROBOTS as u32,
+        n_robots: N_ROBOTS as u32,
         height: height as u32,
         width: width as u32,
-        n_moves: (payload.len() - height * width) as u32,
-        result: StepResult {
+        result: WorldResult {
             step: sequence,
             reward: 1.5,
-            ..StepResult::default()
+            ..WorldResult::default()
         },
-        ..FrameHeader::default()
     };
-    Event::Frame(Sample { header, payload })
+    let results = n_moves.map(|n_moves| RobotResult {
+        n_moves: n_moves as u32,
+        ..RobotResult::default()
+    });
+    let payload = [bytemuck::cast_slice(&results), bytes].concat();
+    Sample { header, payload }
 }
 
 fn truth(sequence: u64, (height, width): (usize, usize), payload: Vec<u8>) -> Event {
     let header = TruthHeader {
-        version: 1,
+        version: VERSION,
         world: sequence as u32 % 3,
         sequence,
         height: height as u32,
@@ -66,10 +83,10 @@ fn example() -> Vec<Record> {
     let events = [
         server(2, 3, 4),
         truth(0, (2, 3), vec![0, 1, 2, 2, 1, 0]),
-        frame(0, (2, 3), vec![255; 6]),
-        frame(4, (2, 3), vec![255, 0, 1, 2, 255, 255, 0, 1, 2, 3]),
+        Event::Frame(frame(0, (2, 3), [0, 0], &[255; 12])),
+        Event::Frame(frame(4, (2, 3), [0, 4], &[1; 16])),
         server(1, 2, 1),
-        frame(0, (1, 2), vec![255, 1, 3]),
+        Event::Frame(frame(1, (1, 2), [1, 1], &[255, 1, 0, 2, 3, 0])),
     ];
     let nanos = [5, 5, 6, 1 << 40, 1 << 40, u64::MAX];
     let n_lost = [0, 0, 0, 3, 0, 0];
@@ -120,9 +137,9 @@ fn read(bytes: &[u8]) -> (Vec<Record>, Option<RecordingError>) {
     (records, None)
 }
 
-/// Frames of a path; none of the example's comes twice.
+/// Frames of steps; none of the example's comes twice.
 fn count_steps(records: &[Record]) -> u64 {
-    let is_step = |record: &&Record| matches!(&record.event, Event::Frame(sample) if sample.header.n_moves > 0);
+    let is_step = |record: &&Record| matches!(&record.event, Event::Frame(sample) if sample.header.result.step > 0);
     records.iter().filter(is_step).count() as u64
 }
 
@@ -231,9 +248,9 @@ fn other_files_are_refused_by_what_they_begin_with() {
         "cut short: expected a whole record at byte 0, got 1 bytes",
     );
     let mut bytes = written(&example());
-    bytes[8..12].copy_from_slice(&1u32.to_be_bytes());
-    check_refused(&bytes, "version: expected 1, got 16777216");
-    bytes[8..16].copy_from_slice(&[1, 0, 0, 0, 2, 0, 0, 0]);
+    bytes[8..12].copy_from_slice(&2u32.to_be_bytes());
+    check_refused(&bytes, "version: expected 2, got 33554432");
+    bytes[8..16].copy_from_slice(&[2, 0, 0, 0, 2, 0, 0, 0]);
     check_refused(&bytes, "expected 0 in byte 12 to 15, got 2");
 }
 
@@ -259,7 +276,7 @@ fn a_hostile_record_is_refused_by_where_it_is() {
     check(&sealed(1, &twice), "4 bytes behind it");
     check(&raw_record(5, b""), "kind: expected 1 to 4, got 5");
     check(&raw_record(1, b"{\"protocol\":1}"), "JSON: missing field");
-    check(&raw_record(2, &[0; 103]), "expected 104 bytes, got 103");
+    check(&raw_record(2, &[0; 95]), "expected 96 bytes, got 95");
     check(&raw_record(3, &[0; 48]), "expected a server before");
     check(&[raw_record(4, b"{}")].concat(), "JSON: missing field");
     check_refused(&[&whole[..], b"x"].concat(), "nothing behind the end");
@@ -285,21 +302,46 @@ fn a_writer_refuses_what_a_reader_would() {
             }
         }
     };
-    check(1, frame(0, (2, 3), vec![0; 6]), "expected a server before");
+    let good = frame(1, (2, 3), [0, 4], &[0; 16]);
+    check(1, Event::Frame(good.clone()), "expected a server before");
     check(1, server(0, 3, 1), "got 0 x 3");
     check(1, server(2, 3, 5000), "at most 4096, got 5000");
     check(1, server(2, 3, 4), "");
     check(0, server(2, 3, 4), "time: expected at least 1 ns, got 0");
-    check(
-        2,
-        frame(0, (3, 2), vec![0; 6]),
+    let mut check_frame = |change: fn(&mut Sample<FrameHeader>), words: &str| {
+        let mut sample = good.clone();
+        change(&mut sample);
+        check(2, Event::Frame(sample), words);
+    };
+    check_frame(
+        |it| *it = frame(1, (3, 2), [0, 0], &[0; 12]),
         "grid: expected 2 x 3, got 3 x 2",
     );
-    check(
-        2,
-        frame(0, (2, 3), vec![0; 7]),
+    check_frame(
+        |it| *it = frame(1, (2, 3), [1, 0], &[0; 13]),
         "expected 0 or 4 moves, got 1",
     );
+    check_frame(
+        |it| it.payload.push(0),
+        "payload bytes: expected 112, got 113",
+    );
+    check_frame(
+        |it| it.header.n_robots = 1,
+        "payload bytes: expected 54, got 112",
+    );
+    check_frame(
+        |it| it.header.n_robots = 65,
+        "robots: expected 1 to 64, got 65",
+    );
+    check_frame(
+        |it| it.header.first_robot = 3,
+        "first robot: expected 2, got 3",
+    );
+    check_frame(
+        |it| it.header.result.hovered = 4,
+        "expected bits below 2, got 0x4",
+    );
+    check_frame(|_| (), "");
     let Event::Truth(mut sample) = truth(0, (2, 3), vec![0; 6]) else {
         unreachable!("truth() makes a truth")
     };
@@ -310,8 +352,7 @@ fn a_writer_refuses_what_a_reader_would() {
     check(2, Event::Truth(sample.clone()), "below 3, got 3");
     sample.header.world = 2;
     sample.header.version = 9;
-    check(2, Event::Truth(sample), "version: expected 1, got 9");
-    check(2, frame(0, (2, 3), vec![0; 10]), "");
+    check(2, Event::Truth(sample), "version: expected 2, got 9");
 }
 
 #[test]
@@ -322,7 +363,8 @@ fn every_kind_has_its_number() {
 
 /// Records of a random grid, each a frame or hidden states of any bytes.
 fn records() -> impl Strategy<Value = Vec<Record>> {
-    let sample = (any::<bool>(), any::<u32>(), 0..1u64 << 50, any::<bool>());
+    let flew = any::<[bool; N_ROBOTS]>();
+    let sample = (any::<bool>(), any::<u32>(), 0..1u64 << 50, flew);
     (1usize..20, 1usize..20, 0usize..9, vec(sample, 0..9)).prop_flat_map(
         |(height, width, n_moves, samples)| {
             let grid = (height, width);
@@ -333,33 +375,25 @@ fn records() -> impl Strategy<Value = Vec<Record>> {
             };
             let mut nanos = 0;
             let made = samples.into_iter().enumerate().map(
-                move |(sequence, (is_frame, n_lost, wait, has_path))| {
+                move |(sequence, (is_frame, n_lost, wait, flew))| {
                     nanos += wait;
-                    let path = if is_frame && has_path { n_moves } else { 0 };
-                    let length = height * width + path;
-                    (
-                        Just((sequence as u64, nanos, n_lost, is_frame)),
-                        vec(any::<u8>(), length),
-                    )
+                    let (nanos, sequence) = (nanos, sequence as u64);
+                    let n_moves = flew.map(|flew| if flew { n_moves } else { 0 });
+                    let n_frames = if is_frame { N_ROBOTS } else { 1 };
+                    let n_path_bytes = if is_frame { n_moves.iter().sum() } else { 0 };
+                    let length = n_frames * height * width + n_path_bytes;
+                    vec(any::<u8>(), length).prop_map(move |bytes| Record {
+                        nanos,
+                        n_lost,
+                        event: match is_frame {
+                            true => Event::Frame(frame(sequence, grid, n_moves, &bytes)),
+                            false => truth(sequence, grid, bytes),
+                        },
+                    })
                 },
             );
-            made.collect::<Vec<_>>().prop_map(move |made| {
-                let rest = made
-                    .into_iter()
-                    .map(|((sequence, nanos, n_lost, is_frame), bytes)| {
-                        let event = if is_frame {
-                            frame(sequence, grid, bytes)
-                        } else {
-                            truth(sequence, grid, bytes)
-                        };
-                        Record {
-                            nanos,
-                            n_lost,
-                            event,
-                        }
-                    });
-                std::iter::once(first.clone()).chain(rest).collect()
-            })
+            made.collect::<Vec<_>>()
+                .prop_map(move |rest| [vec![first.clone()], rest].concat())
         },
     )
 }

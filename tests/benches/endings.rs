@@ -71,10 +71,10 @@ fn killed_agent() -> (Duration, Duration) {
     let mut next = server.connect();
     let flags = ["run", "--instance", server.instance.name()];
     let agent = Program::start("emberwatch-agent", &flags);
-    assert!(eventually(PATIENCE, || server.observe(0).0.step > 0));
+    assert!(eventually(PATIENCE, || server.step_of(0) > 0));
     let request = Request::Acquire {
-        first_world: 0,
-        n_worlds: 1,
+        first_robot: 0,
+        n_robots: 1,
         takeover: false,
         ttl_millis: None,
     };

@@ -7,8 +7,8 @@ use agent::estimation::belief::Belief;
 use agent::estimation::{BayesFilter, Prior};
 use agent::planning::BeamSearch;
 use agent::planning::action::{ActionSet, Region};
-use env_server::world::{Episode, Rules, Start};
-use protocol::{Cell, Coverage, Model, Shape};
+use env_server::world::{Episode, Flown, Rules, Start};
+use protocol::{Cell, Model, Shape};
 use std::io::Write;
 
 /// Worth of what lies a path's length further off.
@@ -44,11 +44,7 @@ impl Robot {
     }
 
     fn cell(&self) -> Cell {
-        let result = self.episode.result();
-        Cell {
-            row: result.row as usize,
-            col: result.col as usize,
-        }
+        self.episode.robots()[0].cell()
     }
 
     /// Mean reward per step of an action by index, or of the rule.
@@ -61,9 +57,16 @@ impl Robot {
             let random = (self.episode.result().seed, step);
             let belief = self.filter.belief();
             let plan = action.plan(&mut beam, belief, self.cell(), setup.n_moves, random);
-            self.episode.step(&setup.rules, &plan.moves, Coverage::Path);
+            let flown = Flown {
+                moves: &plan.moves,
+                ready: 1,
+                full: 0,
+                hovered: 0,
+                late: 0,
+            };
+            self.episode.step(&setup.rules, &flown);
             self.filter
-                .correct(self.episode.frame())
+                .correct(self.episode.robots()[0].frame())
                 .expect("a possible frame");
             self.filter.predict();
             sum += self.episode.result().reward;

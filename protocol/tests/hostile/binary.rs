@@ -5,9 +5,11 @@ use proptest::prelude::*;
 use proptest::sample::select;
 use protocol::frame::FrameError;
 use protocol::message::{
-    Operation, RESULT_BYTES, Status, StepReply, StepResult, UnknownCode, split_step_payload,
+    FLAG_TEAM_FRAMES, FrameHeader, Operation, RobotResult, Status, StepReply, UnknownCode,
+    WorldResult,
 };
 use protocol::path::{MoveError, path_from_bytes, path_to_bytes};
+use protocol::payload::{ROBOT_BYTES, WORLD_BYTES, split_frame_payload, split_step_payload};
 use protocol::{Coverage, Frame, Move, Shape, UNOBSERVED};
 
 proptest! {
@@ -53,46 +55,82 @@ proptest! {
 
     #[test]
     fn a_step_payload_splits_only_at_its_exact_length(
-        numbers in (any::<u32>(), any::<u32>(), any::<u32>()),
+        numbers in any::<[u32; 5]>(),
         length in 0usize..300,
     ) {
-        let (n_worlds, height, width) = numbers;
-        let reply = StepReply { n_worlds, height, width, ..StepReply::default() };
-        if let Ok((results, frames)) = split_step_payload(&reply, &vec![7; length]) {
-            prop_assert_eq!(results.len(), n_worlds as usize);
-            prop_assert_eq!(results.len() * RESULT_BYTES + frames.len(), length);
+        let [n_worlds, n_robots, flags, height, width] = numbers;
+        let reply = StepReply { n_worlds, n_robots, flags, height, width, ..StepReply::default() };
+        if let Ok(parts) = split_step_payload(&reply, &vec![7; length]) {
+            let counts = (parts.worlds.len(), parts.robots.len());
+            prop_assert_eq!(counts, (n_worlds as usize, n_robots as usize));
+            prop_assert_eq!(counts.0 * WORLD_BYTES + counts.1 * ROBOT_BYTES + parts.frames.len(), length);
         }
     }
 
     #[test]
     fn results_and_frames_come_back_as_they_were_sent(
         side in (1u32..6, 1u32..6),
-        results in vec(any::<[u8; RESULT_BYTES]>(), 0..5),
+        worlds in vec(any::<[u8; WORLD_BYTES]>(), 0..5),
+        robots in vec(any::<[u8; ROBOT_BYTES]>(), 0..5),
+        is_team in any::<bool>(),
         excess in 0usize..3,
         shift in 0usize..8,
     ) {
+        let n_frames = if is_team { worlds.len() } else { robots.len() };
         let n_cells = (side.0 * side.1) as usize;
-        let frames: Vec<u8> = (0..results.len() * n_cells).map(|byte| byte as u8).collect();
+        let frames: Vec<u8> = (0..n_frames * n_cells).map(|byte| byte as u8).collect();
         // In shared memory a payload begins at any address.
         let mut memory = vec![0; shift];
-        memory.extend(results.iter().flatten().chain(&frames));
+        memory.extend(worlds.iter().flatten().chain(robots.iter().flatten()).chain(&frames));
         memory.resize(memory.len() + excess, 0);
         let reply = StepReply {
-            n_worlds: results.len() as u32,
+            n_worlds: worlds.len() as u32,
+            n_robots: robots.len() as u32,
+            flags: if is_team { FLAG_TEAM_FRAMES } else { 0 },
             height: side.0,
             width: side.1,
             ..StepReply::default()
         };
         match split_step_payload(&reply, &memory[shift..]) {
-            Ok((decoded, rest)) => {
-                prop_assert!(excess == 0 && rest == frames);
-                let again: Vec<[u8; RESULT_BYTES]> =
-                    decoded.iter().map(|result: &StepResult| bytemuck::cast(*result)).collect();
-                prop_assert_eq!(again, results);
+            Ok(parts) => {
+                prop_assert!(excess == 0 && parts.frames == frames);
+                prop_assert_eq!(bytemuck::cast_slice::<_, u8>(&parts.worlds), worlds.concat());
+                prop_assert_eq!(bytemuck::cast_slice::<_, u8>(&parts.robots), robots.concat());
             }
             Err(expected) => {
                 prop_assert!(excess > 0 && expected + excess + shift == memory.len());
             }
+        }
+    }
+
+    #[test]
+    fn a_sample_splits_only_at_its_exact_length(
+        side in (0u32..3, 0u32..3),
+        n_moves in vec(prop_oneof![9 => 0u32..4, 1 => any::<u32>()], 0..4),
+        n_robots in prop_oneof![9 => Just(None), 1 => any::<u32>().prop_map(Some)],
+        stayed in prop_oneof![9 => 0u64..2, 1 => any::<u64>()],
+        excess in 0usize..3,
+    ) {
+        let n_robots = n_robots.unwrap_or(n_moves.len() as u32);
+        let result = WorldResult { late: stayed, ..WorldResult::default() };
+        let (height, width) = side;
+        let header = FrameHeader { n_robots, height, width, result, ..FrameHeader::default() };
+        let results: Vec<RobotResult> = n_moves
+            .iter()
+            .map(|&n_moves| RobotResult { n_moves, ..RobotResult::default() })
+            .collect();
+        let n_cells = (height * width) as usize;
+        let n_flown: usize = n_moves.iter().map(|&n_moves| n_moves as usize % 300).sum();
+        let behind = vec![1; n_moves.len() * n_cells + n_flown + excess];
+        let payload = [bytemuck::cast_slice(&results), &behind].concat();
+        let is_whole = n_robots > 0 && n_robots as usize == n_moves.len() && n_cells > 0;
+        let is_short = n_moves.iter().all(|&n_moves| n_moves < 300);
+        let is_good = is_whole && is_short && excess == 0 && stayed < 1 << n_moves.len();
+        let robots = split_frame_payload(&header, &payload);
+        prop_assert_eq!(robots.is_ok(), is_good, "{:?}", robots);
+        for (robot, n_moves) in robots.into_iter().flatten().zip(n_moves) {
+            let lengths = (robot.frame.len(), robot.path.len());
+            prop_assert_eq!(lengths, (n_cells, n_moves as usize));
         }
     }
 

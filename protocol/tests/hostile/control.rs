@@ -83,9 +83,9 @@ fn request() -> impl Strategy<Value = Request> {
             any::<Option<u64>>()
         )
             .prop_map(
-                |(first_world, n_worlds, takeover, ttl_millis)| Request::Acquire {
-                    first_world,
-                    n_worlds,
+                |(first_robot, n_robots, takeover, ttl_millis)| Request::Acquire {
+                    first_robot,
+                    n_robots,
                     takeover,
                     ttl_millis,
                 }
@@ -100,27 +100,34 @@ fn request() -> impl Strategy<Value = Request> {
 }
 
 fn world() -> impl Strategy<Value = WorldInfo> {
-    (any::<u32>(), any::<[u64; 3]>(), any::<[u32; 2]>()).prop_map(
-        |(world, [step, seed, episode], robot)| WorldInfo {
+    let robots = vec(any::<[u32; 2]>(), 0..4);
+    (any::<u32>(), any::<[u64; 3]>(), robots).prop_map(|(world, [step, seed, episode], robots)| {
+        WorldInfo {
             world,
             step,
             seed,
             episode,
-            robot,
-        },
-    )
+            robots,
+        }
+    })
 }
 
 fn reply() -> impl Strategy<Value = Reply> {
     prop_oneof![
         server_info().prop_map(|info| Reply::Hello(Box::new(info))),
-        (any::<[u64; 2]>(), vec(world(), 0..4)).prop_map(|([lease, ttl_millis], worlds)| {
-            Reply::Lease(LeaseInfo {
-                lease,
-                ttl_millis,
-                worlds,
-            })
-        }),
+        (
+            any::<[u64; 2]>(),
+            vec(any::<u32>(), 0..4),
+            vec(world(), 0..4)
+        )
+            .prop_map(|([lease, ttl_millis], robots, worlds)| {
+                Reply::Lease(LeaseInfo {
+                    lease,
+                    ttl_millis,
+                    robots,
+                    worlds,
+                })
+            }),
         Just(Reply::Done),
         vec(world(), 0..4).prop_map(|worlds| Reply::Reset { worlds }),
         server_status().prop_map(Reply::Status),
@@ -136,7 +143,7 @@ fn reply() -> impl Strategy<Value = Reply> {
 
 fn server_info() -> impl Strategy<Value = ServerInfo> {
     let rules = [CoverageRule::Path, CoverageRule::Full, CoverageRule::Client];
-    let numbers = (any::<[u32; 3]>(), any::<[usize; 5]>(), any::<[u64; 3]>());
+    let numbers = (any::<[u32; 4]>(), any::<[usize; 5]>(), any::<[u64; 4]>());
     let texts = (".*", vec(".*", 0..4), any::<Option<String>>());
     (numbers, texts, select(rules.to_vec()), any::<bool>()).prop_map(
         |((small, sizes, long), (build, observations, model), coverage, publish_truth)| {
@@ -148,6 +155,7 @@ fn server_info() -> impl Strategy<Value = ServerInfo> {
                 width: sizes[1],
                 n_moves: sizes[2],
                 n_worlds: small[2],
+                n_robots: small[3],
                 n_observations: sizes[3],
                 observations,
                 model,
@@ -157,20 +165,22 @@ fn server_info() -> impl Strategy<Value = ServerInfo> {
                 coverage,
                 publish_truth,
                 lease_millis: long[2],
+                deadline_millis: long[3],
             }
         },
     )
 }
 
 fn server_status() -> impl Strategy<Value = ServerStatus> {
-    let status =
-        (world(), any::<Option<u32>>(), any::<bool>()).prop_map(|(info, holder_pid, resetting)| {
-            WorldStatus {
-                info,
-                holder_pid,
-                resetting,
-            }
-        });
+    let holders = vec(any::<Option<u32>>(), 0..4);
+    let status = (world(), holders, any::<u32>(), any::<bool>()).prop_map(
+        |(info, holder_pids, n_paths, resetting)| WorldStatus {
+            info,
+            holder_pids,
+            n_paths,
+            resetting,
+        },
+    );
     let numbers = (any::<u32>(), any::<[u64; 3]>(), any::<[usize; 2]>());
     (numbers, 0.0..1e12f64, vec(status, 0..4)).prop_map(
         |((pid, [uptime_millis, n_steps, n_refused], sizes), steps_per_second, worlds)| {

@@ -92,14 +92,13 @@ pub fn sizes_of_struct_format(format: &str) -> Vec<usize> {
     sizes
 }
 
-/// The sizes of a struct's numbers, nested structs and arrays laid out flat.
+/// The sizes of a struct's numbers, nested structs laid out flat.
 pub fn scalar_sizes(layout: &Layout) -> Vec<usize> {
     let of_field = |field: &Field| match field.of.as_str() {
         "u16" => vec![2],
         "u32" => vec![4],
         "u64" | "f64" => vec![8],
-        "u64[2]" => vec![8, 8],
-        "StepResult" => scalar_sizes(&documented_struct("StepResult").0),
+        "WorldResult" => scalar_sizes(&documented_struct("WorldResult").0),
         other => panic!("{other}: unknown type"),
     };
     layout.fields.iter().flat_map(of_field).collect()
@@ -130,15 +129,16 @@ pub fn worked_example(name: &str, layouts: &[Layout]) -> Vec<u8> {
             bytes.extend(group);
         }
     }
-    let header = layouts.iter().filter(|layout| layout.name == name);
-    let result = layouts
-        .iter()
-        .filter(|layout| layout.name == "StepResult" && name == "StepReply");
-    let expected: Vec<&str> = header
-        .chain(result)
-        .flat_map(|layout| &layout.fields)
-        .flat_map(|field| vec![field.name.as_str(); if field.of == "u64[2]" { 2 } else { 1 }])
-        .collect();
+    let structs: &[&str] = match name {
+        "StepReply" => &["StepReply", "WorldResult", "RobotResult", "RobotResult"],
+        other => &[other],
+    };
+    let fields_of = |name: &&str| {
+        let layout = layouts.iter().find(|layout| layout.name == *name);
+        &layout.expect("a struct of this name").fields
+    };
+    let fields = structs.iter().flat_map(fields_of);
+    let expected: Vec<&str> = fields.map(|field| field.name.as_str()).collect();
     assert_eq!(names[..expected.len()], expected[..], "fields of {name}");
     bytes
 }
@@ -150,12 +150,16 @@ fn shown(name: &str, bytes: &[u8]) -> String {
         words.join(" ")
     };
     match (name, bytes.len()) {
-        ("path", _) => words(|byte| ["up", "down", "left", "right"][usize::from(byte)].into()),
-        (row, _) if row.starts_with("frame row") => words(|byte| match byte {
+        (path, _) if path.starts_with("path") => {
+            words(|byte| ["up", "down", "left", "right"][usize::from(byte)].into())
+        }
+        (row, _) if row.starts_with("frame") => words(|byte| match byte {
             255 => "-".into(),
             value => value.to_string(),
         }),
-        ("reward", 8) => f64::from_le_bytes(bytes.try_into().expect("eight bytes")).to_string(),
+        ("reward" | "marginal", 8) => {
+            f64::from_le_bytes(bytes.try_into().expect("eight bytes")).to_string()
+        }
         (_, length) => {
             let mut wide = [0; 8];
             wide[..length].copy_from_slice(bytes);

@@ -6,16 +6,17 @@ use document::{Field, Layout, PROTOCOL, documented_struct, fences, rows_under};
 use iceoryx2::prelude::ZeroCopySend;
 use protocol::channels::{
     AGENT_BUFFER, Channel, FRAME_BUFFER, Instance, MAX_AGENT_READERS, MAX_CLIENTS, MAX_NODES,
-    MAX_OBSERVERS, MAX_TRUTH_READERS, TRUTH_BUFFER,
+    MAX_OBSERVERS, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS, MAX_TRUTH_READERS, TRUTH_BUFFER,
 };
 use protocol::control::{MAX_CONTROL_BYTES, Reply, Request};
 use protocol::decisions;
 use protocol::grid::MAX_SIDE;
 use protocol::message::{
-    AgentHeader, ControlReply, ControlRequest, FLAG_FULL_COVERAGE, FrameHeader, Operation, Status,
-    StepReply, StepRequest, StepResult, TruthHeader, VERSION, split_step_payload,
+    AgentHeader, ControlReply, ControlRequest, FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, FrameHeader,
+    Operation, RobotResult, Status, StepReply, StepRequest, TruthHeader, VERSION, WorldResult,
 };
-use protocol::path::{MAX_MOVES, path_from_bytes, path_to_bytes};
+use protocol::path::{MAX_MOVES, path_from_bytes};
+use protocol::payload::split_step_payload;
 use protocol::recording::{
     self, FileHeader, Kind, MAX_BODY_BYTES, MAX_STORED_BYTES, RecordHeader, Totals,
 };
@@ -58,7 +59,6 @@ fn type_name<T: ZeroCopySend>() -> &'static str {
 /// The type of a field as PROTOCOL.md writes it.
 fn type_of<T>(_: &T) -> String {
     match std::any::type_name::<T>() {
-        "[u64; 2]" => "u64[2]".into(),
         "[u8; 8]" => "u8[8]".into(),
         name => name.rsplit("::").next().unwrap_or(name).into(),
     }
@@ -71,40 +71,50 @@ fn layouts() -> Vec<Layout> {
             operation,
             lease,
             sequence,
-            first_world,
-            n_worlds,
+            first_robot,
+            n_robots,
             n_moves,
             flags,
             listener_low,
             listener_high,
-            step,
         }),
         layout!(StepReply {
             version,
             status,
             sequence,
-            first_world,
+            first_robot,
+            n_robots,
             n_worlds,
+            flags,
             height,
             width,
             simulation_nanos,
             detail,
-            reserved,
         }),
-        layout!(StepResult {
+        layout!(WorldResult {
             step,
             seed,
             episode,
             reward,
+            hovered,
+            late,
             n_target_cells,
             n_visited,
             n_hits,
+            terminated,
+            truncated,
+        }),
+        layout!(RobotResult {
+            reward,
+            marginal,
+            n_visited,
+            n_hits,
+            start_row,
+            start_col,
             row,
             col,
             coverage,
-            terminated,
-            truncated,
-            reserved,
+            n_moves,
         }),
         layout!(ControlRequest {
             version,
@@ -122,12 +132,10 @@ fn layouts() -> Vec<Layout> {
             version,
             world,
             sequence,
+            first_robot,
+            n_robots,
             height,
             width,
-            n_moves,
-            start_row,
-            start_col,
-            reserved,
             result,
         }),
         layout!(TruthHeader {
@@ -151,6 +159,8 @@ fn layouts() -> Vec<Layout> {
             width,
             n_states,
             pid,
+            first_robot,
+            n_robots,
         }),
     ]
 }
@@ -193,8 +203,13 @@ fn every_other_code_is_documented() {
     let entry = |kind: &str, name: String, code: u32| [kind.into(), name, code.to_string()];
     let operations = (0..=255).filter_map(|code| Operation::try_from(code).ok());
     let coverages = (0..=255).filter_map(|code| Coverage::try_from(code).ok());
+    let flags = [
+        ("full_coverage", FLAG_FULL_COVERAGE),
+        ("team_frames", FLAG_TEAM_FRAMES),
+    ];
     let known = operations
         .map(|it| entry("operation", format!("{it:?}").to_lowercase(), it as u32))
+        .chain(flags.map(|(name, code)| entry("flag", name.into(), code)))
         .chain(
             Move::ALL
                 .iter()
@@ -205,7 +220,6 @@ fn every_other_code_is_documented() {
     for sentence in [
         format!("The version is {VERSION}."),
         format!("**{UNOBSERVED} where nothing was"),
-        format!("0, or {FLAG_FULL_COVERAGE}: observe every cell"),
     ] {
         assert!(PROTOCOL.contains(&sentence), "{sentence:?} is not there");
     }
@@ -234,6 +248,9 @@ fn every_limit_is_documented() {
         ("MAX_CONTROL_BYTES", MAX_CONTROL_BYTES),
         ("MAX_MOVES", MAX_MOVES),
         ("MAX_SIDE", MAX_SIDE),
+        ("MAX_ROBOTS", MAX_ROBOTS),
+        ("MAX_ROBOT_NUMBERS", MAX_ROBOT_NUMBERS),
+        ("MAX_TEAM_CELLS", MAX_TEAM_CELLS),
     ];
     assert_eq!(
         documented,
@@ -323,7 +340,7 @@ fn every_service_is_documented() {
         Channel::WakeAgent(7),
     ];
     let names = known.map(|channel| instance.service_name(channel).to_string());
-    let known = names.map(|name| name.replace("emberwatch/v1/x/", ""));
+    let known = names.map(|name| name.replace("emberwatch/v2/x/", ""));
     assert_eq!(documented, BTreeSet::from(known));
 }
 
@@ -353,7 +370,11 @@ fn a_recording_is_laid_out_as_documented() {
     for sentence in [
         format!("`{}` in ASCII", recording::MAGIC.escape_ascii()),
         format!("{}; refuse any other", recording::VERSION),
-        format!("version 1 is {}", recording::VERSION.swap_bytes()),
+        format!(
+            "version {0} is {1}",
+            recording::VERSION,
+            recording::VERSION.swap_bytes()
+        ),
         format!("has {} bytes, struct `=QIIII`", size_of::<RecordHeader>()),
         format!("stored, at most {MAX_STORED_BYTES} |"),
         format!("of at most {MAX_BODY_BYTES} bytes"),
@@ -370,24 +391,37 @@ fn a_recording_is_laid_out_as_documented() {
 #[test]
 fn the_worked_example_decodes_to_what_stands_beside_it() {
     let request = document::worked_example("StepRequest", &layouts());
-    let (header, path) = request.split_at(size_of::<StepRequest>());
+    let (header, body) = request.split_at(size_of::<StepRequest>());
     let header: StepRequest = bytemuck::pod_read_unaligned(header);
     assert_eq!(Operation::try_from(header.operation), Ok(Operation::Step));
-    let path = path_from_bytes(path).expect("a path");
+    let (step, paths) = body.split_at(size_of::<u64>());
+    assert_eq!((header.n_robots, step), (2, &[0; 8][..]));
+    assert_eq!(paths.len(), 2 * header.n_moves as usize);
+    let path = path_from_bytes(&paths[..4]).expect("a path");
     assert_eq!(path, [Move::Down, Move::Right, Move::Right, Move::Down]);
-    assert_eq!(path_to_bytes(&path).len(), header.n_moves as usize);
 
     let reply = document::worked_example("StepReply", &layouts());
     let (header, payload) = reply.split_at(size_of::<StepReply>());
     let header: StepReply = bytemuck::pod_read_unaligned(header);
     assert_eq!(Status::try_from(header.status), Ok(Status::Ok));
-    let (results, frames) = split_step_payload(&header, payload).expect("the right length");
+    let parts = split_step_payload(&header, payload).expect("the right length");
     let shape = Shape::new(header.height as usize, header.width as usize).expect("a grid");
-    let frame = Frame::from_bytes(shape, 3, frames).expect("a frame");
-    let seen: Vec<(usize, u8)> = frame.observed().collect();
-    assert_eq!(seen, [(5, 1), (6, 0), (7, 2), (12, 2)]);
-    assert_eq!(results[0].n_visited as usize, seen.len());
-    assert_eq!(Coverage::try_from(results[0].coverage), Ok(Coverage::Path));
+    let frames = parts.frames.chunks_exact(shape.n_cells()).map(|bytes| {
+        let frame = Frame::from_bytes(shape, 3, bytes).expect("a frame");
+        frame.observed().map(|(cell, _)| cell).collect()
+    });
+    let seen: Vec<Vec<usize>> = frames.collect();
+    assert_eq!(seen, [[5, 6, 7, 12], [2, 7, 8, 9]]);
+    for (robot, seen) in parts.robots.iter().zip(&seen) {
+        assert_eq!((robot.n_visited as usize, robot.n_moves), (seen.len(), 4));
+        assert_eq!(Coverage::try_from(robot.coverage), Ok(Coverage::Path));
+    }
+    let [world] = parts.worlds[..] else {
+        panic!("expected one world");
+    };
+    assert_eq!((world.step, world.n_visited), (1, 7));
+    let shares: f64 = parts.robots.iter().map(|robot| robot.reward).sum();
+    assert_eq!(world.reward, shares);
 }
 
 /// The lines of the JSON examples with this behind `json`.

@@ -1,13 +1,12 @@
 //! Agents that are killed at random moments, one after the other, on one server.
 
-use crate::harness::{Program, Server, eventually, fly};
+use crate::harness::{Program, Server, eventually, fly, path_of, seen_by, seen_in};
 use crate::meter::Use;
 use crate::{say, spread};
 use protocol::channels::Instance;
 use protocol::control::Request;
 use protocol::message::FrameHeader;
 use protocol::observer::{Observer, Sample};
-use protocol::path::path_from_bytes;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -52,7 +51,7 @@ pub fn kill(n_kills: usize) {
             Use::of(server.program.pid())
         ));
     }
-    let last = server.observe(0).0.step;
+    let last = server.step_of(0);
     let n_compared = compare(&frames);
     assert_eq!(
         n_compared, last,
@@ -66,7 +65,7 @@ pub fn kill(n_kills: usize) {
 /// Starts an agent, kills it after some steps; seconds from the kill until its world can be had.
 fn one(server: &Server, rng: &mut ChaCha8Rng) -> f64 {
     let mut next = server.connect();
-    let at = server.observe(0).0.step;
+    let at = server.step_of(0);
     let flags = [
         "run",
         "--instance",
@@ -77,7 +76,7 @@ fn one(server: &Server, rng: &mut ChaCha8Rng) -> f64 {
     ];
     let agent = Program::start("emberwatch-agent", &flags);
     assert!(
-        eventually(PATIENCE, || server.observe(0).0.step > at),
+        eventually(PATIENCE, || server.step_of(0) > at),
         "{}",
         agent.stderr()
     );
@@ -85,8 +84,8 @@ fn one(server: &Server, rng: &mut ChaCha8Rng) -> f64 {
     agent.signal(Signal::KILL);
     let killed = Instant::now();
     let request = Request::Acquire {
-        first_world: 0,
-        n_worlds: 1,
+        first_robot: 0,
+        n_robots: 1,
         takeover: false,
         ttl_millis: None,
     };
@@ -121,20 +120,15 @@ fn collect(instance: &Instance, stop: &AtomicBool) -> Vec<Sample<FrameHeader>> {
 fn compare(frames: &[Sample<FrameHeader>]) -> u64 {
     let server = Server::start(FLAGS);
     let mut client = server.acquire(0..1);
-    let flown = frames.iter().filter(|frame| frame.header.n_moves > 0);
     let mut last = 0;
-    for sample in flown {
-        let (frame, path) = sample.payload.split_at(64 * 64);
+    for sample in frames {
         let step = sample.header.result.step;
         if step == last {
             continue; // Shown again to an observer that has just come: none has, but may.
         }
         assert_eq!(step, last + 1, "a step is missing");
-        let seen = fly(&mut client, path_from_bytes(path).expect("a path"));
-        assert_eq!(
-            (seen.result, seen.frame.as_bytes()),
-            (sample.header.result, frame)
-        );
+        let seen = fly(&mut client, path_of(sample));
+        assert_eq!(seen_by(&seen), seen_in(sample));
         last = step;
     }
     last

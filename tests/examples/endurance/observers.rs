@@ -4,10 +4,12 @@ use crate::harness::{Paths, Server};
 use crate::{range, say};
 use protocol::agent_belief::{BeliefPublisher, Intent};
 use protocol::channels::Instance;
+use protocol::connection::StepAnswer;
 use protocol::control::{Reply, Request};
 use protocol::message::{AgentHeader, Operation, StepRequest};
 use protocol::observer::Observer;
 use protocol::path::path_to_bytes;
+use protocol::payload::write_step_body;
 use protocol::{Connection, Probabilities};
 use rustix::process::{Pid, Signal, kill_process};
 use std::process::{Child, Command, Stdio};
@@ -66,8 +68,8 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
     let server = Server::start(flags);
     let _audience = attend(&server);
     std::thread::sleep(Duration::from_millis(500));
-    let (mut connection, request) = acquire(&server);
-    let info = connection.info().clone();
+    let mut stepper = Stepper::new(&server);
+    let info = stepper.connection.info().clone();
     let belief = Probabilities::from_elem((3, info.height, info.width), 1.0 / 3.0);
     let mut showcase = BeliefPublisher::open(&server.instance, 4 * belief.len() + 1024)
         .expect("the agent channel");
@@ -81,18 +83,19 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
             std::hint::spin_loop();
         }
         last = Instant::now();
-        let answer = connection.step(request, &path, TIMEOUT).expect("a step");
+        let answer = stepper.step(&path);
         if n > N_STEPS / 10 {
             work.push(answer.reply.simulation_nanos as f64 / 1e3);
             trips.push(last.elapsed().as_secs_f64() * 1e6);
         }
         // As an agent shows its beliefs: at most each 20 ms.
         if n % 40 == 0 && showcase.is_watched() {
-            let results = &answer.results;
+            let world = &answer.worlds[0];
             let about = AgentHeader {
-                step: results[0].step,
-                seed: results[0].seed,
-                episode: results[0].episode,
+                step: world.step,
+                seed: world.seed,
+                episode: world.episode,
+                n_robots: 1,
                 ..AgentHeader::default()
             };
             let shown = showcase.show(about, &belief, &Intent::default());
@@ -111,26 +114,47 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
     ]
 }
 
-/// A connection that holds the first world, and the request of its step.
-pub fn acquire(server: &Server) -> (Connection, StepRequest) {
-    let mut connection = server.connect();
-    let acquire = Request::Acquire {
-        first_world: 0,
-        n_worlds: 1,
-        takeover: false,
-        ttl_millis: None,
-    };
-    let Ok(Reply::Lease(lease)) = connection.control(&acquire, TIMEOUT) else {
-        panic!("expected a lease");
-    };
-    let request = StepRequest {
-        operation: Operation::Step as u32,
-        lease: lease.lease,
-        n_worlds: 1,
-        n_moves: connection.info().n_moves as u32,
-        ..StepRequest::default()
-    };
-    (connection, request)
+/// A connection that holds the first robot, and the request of its step.
+pub struct Stepper {
+    pub connection: Connection,
+    request: StepRequest,
+    k: u64,
+}
+
+impl Stepper {
+    pub fn new(server: &Server) -> Self {
+        let mut connection = server.connect();
+        let acquire = Request::Acquire {
+            first_robot: 0,
+            n_robots: 1,
+            takeover: false,
+            ttl_millis: None,
+        };
+        let Ok(Reply::Lease(lease)) = connection.control(&acquire, TIMEOUT) else {
+            panic!("expected a lease");
+        };
+        let request = StepRequest {
+            operation: Operation::Step as u32,
+            lease: lease.lease,
+            n_robots: 1,
+            n_moves: connection.info().n_moves as u32,
+            ..StepRequest::default()
+        };
+        let k = lease.worlds[0].step;
+        Self {
+            connection,
+            request,
+            k,
+        }
+    }
+
+    pub fn step(&mut self, path: &[u8]) -> StepAnswer {
+        let mut body = Vec::new();
+        write_step_body(&[self.k], path, &mut body);
+        self.k += 1;
+        let answer = self.connection.step(self.request, &body, TIMEOUT);
+        answer.expect("a step")
+    }
 }
 
 fn start(server: &Server, is_stopped: bool) -> Process {

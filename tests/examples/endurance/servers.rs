@@ -34,19 +34,19 @@ pub fn kill(n_kills: usize) {
         let mut client = Client::acquire(&instance, &takeover(0..2)).expect("acquire");
         let mut seen = client.observe(0..2).expect("observe");
         waits.push(started.elapsed().as_secs_f64());
-        let stands = seen[0].result.step;
+        let stands = seen[0].world.step;
         redone += furthest - stands;
         // Now and then the last kill came before the next snapshot.
         let until = Instant::now() + Duration::from_millis(rng.random_range(5..60));
         while Instant::now() < until {
-            let step = seen[0].result.step;
+            let step = seen[0].world.step;
             if step > 0 {
                 check(&mut true_world, &mut known, step, &seen);
             }
             seen = client.step(0..2, &paths(step)).expect("step");
         }
-        check(&mut true_world, &mut known, seen[0].result.step, &seen);
-        furthest = furthest.max(seen[0].result.step);
+        check(&mut true_world, &mut known, seen[0].world.step, &seen);
+        furthest = furthest.max(seen[0].world.step);
         if n < n_kills {
             server.kill();
         }

@@ -1,7 +1,7 @@
 //! What `--snapshot-every 1000` costs a client that steps as fast as it can, with a folder where temporary files are.
 
 use crate::harness::{Paths, Server};
-use crate::observers::{TIMEOUT, acquire};
+use crate::observers::Stepper;
 use crate::{range, say};
 use protocol::path::path_to_bytes;
 use std::time::Instant;
@@ -41,9 +41,10 @@ pub fn compare(n_rounds: usize) {
 /// Microseconds of a step.
 fn measure(flags: &str) -> f64 {
     let server = Server::start(&format!("--burn-in 1000 {flags}"));
-    let (mut connection, request) = acquire(&server);
-    let path = path_to_bytes(&Paths::new(0).next(request.n_moves as usize));
-    let mut step = || _ = connection.step(request, &path, TIMEOUT).expect("a step");
+    let mut stepper = Stepper::new(&server);
+    let n_moves = stepper.connection.info().n_moves;
+    let path = path_to_bytes(&Paths::new(0).next(n_moves));
+    let mut step = || _ = stepper.step(&path);
     (0..N_STEPS / 20).for_each(|_| step());
     let start = Instant::now();
     (0..N_STEPS).for_each(|_| step());

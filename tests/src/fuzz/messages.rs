@@ -6,11 +6,12 @@ use protocol::agent_belief::{AgentBelief, Intent};
 use protocol::control::{LeaseInfo, Reply, ServerStatus, WorldInfo, WorldSeed, WorldStatus, parse};
 use protocol::decisions;
 use protocol::message::{
-    AgentHeader, FrameHeader, RESULT_BYTES, Status, StepReply, StepResult, VERSION,
-    split_step_payload,
+    AgentHeader, FLAG_TEAM_FRAMES, FrameHeader, RobotResult, Status, StepReply, VERSION,
+    WorldResult,
 };
 use protocol::observer::Sample;
 use protocol::path::{fly, path_from_bytes, path_to_bytes};
+use protocol::payload::{RobotSample, split_frame_payload, split_step_payload};
 use protocol::{Cell, Coverage, Frame, Shape, UNOBSERVED};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -35,41 +36,47 @@ pub fn step_answer(bytes: &[u8]) -> bool {
         assert_eq!(status as u32, reply.status);
         assert!(!status.explain(reply.detail).is_empty());
     }
-    let Ok((results, frames)) = split_step_payload(&reply, payload) else {
+    let Ok(parts) = split_step_payload(&reply, payload) else {
         return false;
     };
-    assert_eq!(results.len(), reply.n_worlds as usize);
-    let again: Vec<u8> = results.iter().flat_map(bytes_of).copied().collect();
-    assert_eq!([&again, frames].concat(), payload);
-    for result in &results {
-        if let Ok(coverage) = Coverage::try_from(result.coverage) {
-            assert_eq!(coverage as u32, result.coverage);
+    let counts = (parts.worlds.len(), parts.robots.len());
+    assert_eq!(counts, (reply.n_worlds as usize, reply.n_robots as usize));
+    let results = [
+        bytemuck::cast_slice(&parts.worlds),
+        bytemuck::cast_slice(&parts.robots),
+    ];
+    assert_eq!([&results.concat(), parts.frames].concat(), payload);
+    for robot in &parts.robots {
+        if let Ok(coverage) = Coverage::try_from(robot.coverage) {
+            assert_eq!(coverage as u32, robot.coverage);
         }
     }
     let Ok(shape) = Shape::new(reply.height as usize, reply.width as usize) else {
         return false;
     };
-    let frames = frames.chunks_exact(shape.n_cells());
-    !results.is_empty() && frames.map(|frame| is_frame(shape, frame)).min() == Some(true)
+    let frames = parts.frames.chunks_exact(shape.n_cells());
+    !parts.worlds.is_empty() && frames.map(|frame| is_frame(shape, frame)).min() == Some(true)
 }
 
-/// A sample of `frames`: a frame, then a path that stays on the grid.
+/// A sample of `frames`: of each robot a frame, and a path that stays on the grid.
 pub fn frame(bytes: &[u8]) -> bool {
     let Some((header, payload)) = split_header::<FrameHeader>(bytes) else {
         return false;
     };
-    let Ok(shape) = Shape::new(header.height as usize, header.width as usize) else {
+    let Ok(robots) = split_frame_payload(&header, payload) else {
         return false;
     };
-    let Some((values, path)) = payload.split_at_checked(shape.n_cells()) else {
-        return false;
+    let shape = Shape::new(header.height as usize, header.width as usize);
+    let shape = shape.expect("its frames were split");
+    let is_good = |robot: &RobotSample<'_>| {
+        let result = robot.result;
+        let (row, col) = (result.start_row as usize, result.start_col as usize);
+        is_frame(shape, robot.frame)
+            && row < shape.height()
+            && col < shape.width()
+            && is_path(shape, Cell { row, col }, robot.path)
     };
-    let (row, col) = (header.start_row as usize, header.start_col as usize);
-    let is_whole = path.len() == header.n_moves as usize && is_frame(shape, values);
-    is_whole
-        && row < shape.height()
-        && col < shape.width()
-        && is_path(shape, Cell { row, col }, path)
+    robots.iter().filter(|robot| is_good(robot)).count() == header.n_robots as usize
 }
 
 fn is_frame(shape: Shape, values: &[u8]) -> bool {
@@ -144,53 +151,71 @@ pub fn survives<T: Serialize + DeserializeOwned + PartialEq + Debug>(bytes: &[u8
 pub fn step_answer_seeds() -> Vec<Seed> {
     let header = StepReply {
         version: VERSION,
-        n_worlds: 2,
+        n_worlds: 1,
+        n_robots: 2,
         height: 1,
         width: 3,
         ..StepReply::default()
     };
-    let result = StepResult {
+    let team = StepReply {
+        flags: FLAG_TEAM_FRAMES,
+        ..header
+    };
+    let world = WorldResult {
         step: 1,
         reward: 2.0,
-        coverage: 1,
-        ..StepResult::default()
+        late: 2,
+        ..WorldResult::default()
     };
-    let answer = [
-        bytes_of(&header),
-        bytes_of(&result),
-        bytes_of(&result),
-        &[0, 255, 2, 255, 1, 255],
-    ];
-    assert_eq!(answer.concat().len(), 64 + 2 * RESULT_BYTES + 6);
+    let results = [bytes_of(&world), bytes_of(&flew(4)), bytes_of(&flew(0))].concat();
     let refusal = StepReply {
         status: Status::NoLease as u32,
         n_worlds: 0,
+        n_robots: 0,
         detail: 1,
         ..header
     };
+    let answer = |header: &StepReply, frames: &[u8]| [bytes_of(header), &results, frames].concat();
     vec![
-        ("two_worlds", answer.concat()),
+        ("two_robots", answer(&header, &[0, 255, 2, 255, 255, 255])),
+        ("team_frame", answer(&team, &[0, 255, 2])),
         ("refusal", bytes_of(&refusal).to_vec()),
     ]
 }
 
+/// What a robot was given that flew so many moves.
+fn flew(n_moves: u32) -> RobotResult {
+    RobotResult {
+        reward: 2.0,
+        coverage: u32::from(n_moves > 0),
+        n_moves,
+        ..RobotResult::default()
+    }
+}
+
 pub fn frame_seeds() -> Vec<Seed> {
-    let header = FrameHeader {
+    let mut header = FrameHeader {
         version: VERSION,
+        n_robots: 2,
         height: 2,
         width: 3,
-        n_moves: 4,
         ..FrameHeader::default()
     };
-    let step = [bytes_of(&header), &[255, 1, 2, 0, 255, 255, 3, 3, 1, 0]].concat();
-    let reset = [
-        bytes_of(&FrameHeader {
-            n_moves: 0,
-            ..header
-        }),
-        &[255; 6],
+    let unseen = [255; 6];
+    let sample = |header: &FrameHeader, n_moves: [u32; 2], behind: &[u8]| {
+        let robots = n_moves.map(flew);
+        [bytes_of(header), bytemuck::cast_slice(&robots), behind].concat()
+    };
+    let reset = sample(&header, [0, 0], &[unseen, unseen].concat());
+    header.result.step = 1;
+    header.result.hovered = 1;
+    let seen = [
+        [255; 6].as_slice(),
+        &[255, 1, 2, 0, 255, 255],
+        &[3, 3, 1, 0],
     ]
     .concat();
+    let step = sample(&header, [0, 4], &seen);
     vec![("step", step), ("reset", reset)]
 }
 
@@ -200,6 +225,7 @@ pub fn outlook_seeds() -> Vec<Seed> {
         height: 2,
         width: 3,
         n_states: 2,
+        n_robots: 1,
         ..AgentHeader::default()
     };
     let intent = Intent {
@@ -221,11 +247,12 @@ pub fn control_reply_seeds() -> Vec<Seed> {
         step: 2,
         seed: 42,
         episode: 1,
-        robot: [2, 4],
+        robots: vec![[2, 4], [0, 0]],
     };
     let lease = LeaseInfo {
         lease: 5_179_721,
         ttl_millis: 60_000,
+        robots: vec![0, 1],
         worlds: vec![world.clone()],
     };
     let status = ServerStatus {
@@ -238,11 +265,12 @@ pub fn control_reply_seeds() -> Vec<Seed> {
         n_observers: 0,
         worlds: vec![WorldStatus {
             info: world,
-            holder_pid: Some(14_683),
+            holder_pids: vec![Some(14_683), None],
+            n_paths: 1,
             resetting: false,
         }],
     };
-    let hello = r#"{"reply":"hello","protocol":1,"build":"0.1.0","pid":1,"height":3,"width":5,"n_moves":4,"n_worlds":1,"n_observations":1,"observations":["fire"],"model":null,"burn_in":500,"max_steps":0,"max_clients":16,"coverage":"path","publish_truth":false,"lease_millis":30000}"#;
+    let hello = r#"{"reply":"hello","protocol":2,"build":"0.1.0","pid":1,"height":3,"width":5,"n_moves":4,"n_worlds":1,"n_robots":2,"n_observations":1,"observations":["fire"],"model":null,"burn_in":500,"max_steps":0,"max_clients":16,"coverage":"path","publish_truth":false,"lease_millis":30000,"deadline_millis":0}"#;
     vec![
         ("hello", hello.into()),
         ("lease", json(&Reply::Lease(lease))),

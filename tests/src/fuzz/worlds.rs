@@ -3,12 +3,12 @@
 use super::target::Seed;
 use env_server::config::ServerConfig;
 use env_server::snapshot::{NewEpisode, SnapshotWorld, WorldSpec, decode, encode};
-use env_server::world::Episode;
+use env_server::world::{Episode, Flown};
+use protocol::Move;
 use protocol::control::ServerInfo;
-use protocol::message::{FrameHeader, VERSION};
+use protocol::message::{FrameHeader, RobotResult, VERSION};
 use protocol::observer::Sample;
 use protocol::recording::{Event, Reader, Record, Writer};
-use protocol::{Coverage, Move};
 use std::sync::OnceLock;
 
 /// Bytes in front of a snapshot's body.
@@ -27,6 +27,7 @@ fn spec() -> &'static WorldSpec {
             moves: 2,
             burn_in: 5,
             history: 3,
+            robots: 2,
             ..ServerConfig::default()
         };
         let checked = config.check().expect("valid settings");
@@ -51,7 +52,7 @@ pub fn snapshot(bytes: &[u8]) -> bool {
             let again = encode(settings, &[SnapshotWorld::Ready(&episode)]).expect("small");
             assert!(decode(&again).is_ok());
             if !episode.is_over() {
-                episode.step(rules, &[Move::Left, Move::Down], Coverage::Path);
+                episode.step(rules, &flown(3, 0));
             }
             let step = episode.result().step;
             assert!(episode.recall(step).is_ok() && episode.recall(step + 1).is_err());
@@ -59,6 +60,17 @@ pub fn snapshot(bytes: &[u8]) -> bool {
         }
     }
     true
+}
+
+/// A step of two robots: those that fly, and those that observe every cell.
+fn flown(ready: u64, full: u64) -> Flown<'static> {
+    Flown {
+        moves: &[Move::Right, Move::Down, Move::Left, Move::Down],
+        ready,
+        full,
+        hovered: !ready & 1,
+        late: !ready & 2,
+    }
 }
 
 /// A recording: refused, or read to its end. Its checksums are mended, too.
@@ -96,14 +108,9 @@ fn mend(bytes: &mut [u8]) {
 
 pub fn snapshot_seeds() -> Vec<Seed> {
     let WorldSpec { settings, rules } = spec();
-    let mut flown = Episode::new(rules, 3);
-    for coverage in [
-        Coverage::Path,
-        Coverage::Full,
-        Coverage::Path,
-        Coverage::Path,
-    ] {
-        flown.step(rules, &[Move::Right, Move::Down], coverage);
+    let mut flown_in = Episode::new(rules, 3);
+    for (ready, full) in [(3, 0), (3, 1), (1, 0), (2, 2)] {
+        flown_in.step(rules, &flown(ready, full));
     }
     let in_burn_in = SnapshotWorld::New(NewEpisode {
         seed: 1,
@@ -112,13 +119,13 @@ pub fn snapshot_seeds() -> Vec<Seed> {
     let new = Episode::new(rules, 4);
     let written = |worlds: &[SnapshotWorld<&Episode>]| encode(settings, worlds).expect("small");
     vec![
-        ("flown", written(&[SnapshotWorld::Ready(&flown)])),
+        ("flown", written(&[SnapshotWorld::Ready(&flown_in)])),
         (
             "three",
             written(&[
                 SnapshotWorld::Ready(&new),
                 in_burn_in,
-                SnapshotWorld::Ready(&flown),
+                SnapshotWorld::Ready(&flown_in),
             ]),
         ),
         ("none", written(&[])),
@@ -126,18 +133,24 @@ pub fn snapshot_seeds() -> Vec<Seed> {
 }
 
 pub fn recording_seeds() -> Vec<Seed> {
-    let text = r#"{"protocol":1,"build":"0.1.0","pid":7,"height":2,"width":3,"n_moves":2,"n_worlds":1,
+    let text = r#"{"protocol":2,"build":"0.1.0","pid":7,"height":2,"width":3,"n_moves":2,"n_worlds":1,"n_robots":2,
         "n_observations":3,"observations":["normal","latent","fire"],"model":null,"burn_in":5,"max_steps":0,
-        "max_clients":16,"coverage":"path","publish_truth":false,"lease_millis":30000}"#;
+        "max_clients":16,"coverage":"path","publish_truth":false,"lease_millis":30000,"deadline_millis":0}"#;
     let info: ServerInfo = serde_json::from_str(text).expect("what a server says");
-    let header = FrameHeader {
+    let mut header = FrameHeader {
         version: VERSION,
+        n_robots: 2,
         height: 2,
         width: 3,
-        n_moves: 2,
         ..FrameHeader::default()
     };
-    let payload = vec![255, 0, 255, 255, 1, 255, 3, 1];
+    (header.result.step, header.result.late) = (1, 2);
+    let robots = [2, 0].map(|n_moves| RobotResult {
+        n_moves,
+        ..RobotResult::default()
+    });
+    let behind = [255, 0, 255, 255, 1, 255, 255, 255, 255, 255, 255, 255, 3, 1];
+    let payload = [bytemuck::cast_slice(&robots), behind.as_slice()].concat();
     let events = [
         Event::Server(Box::new(info)),
         Event::Frame(Sample { header, payload }),

@@ -1,0 +1,88 @@
+//! A world as its published steps must make it, stepped in this process: no server, no clients, no time.
+
+use env_server::config::ServerConfig;
+use env_server::snapshot::WorldSpec;
+use env_server::world::{Episode, Flown, Robot, Rules};
+use protocol::control::ServerInfo;
+use protocol::message::FrameHeader;
+use protocol::observer::Sample;
+use protocol::path::{path_from_bytes, path_to_bytes};
+use protocol::payload::{RobotSample, split_frame_payload};
+use protocol::{Coverage, Move};
+
+/// World 0 of a server, undisturbed.
+pub struct Mirror {
+    rules: Rules,
+    episode: Episode,
+}
+
+impl Mirror {
+    /// At k = 0 of the first episode; but for what it says of itself, the server has the default settings.
+    pub fn of(info: &ServerInfo) -> Self {
+        let config = ServerConfig {
+            height: info.height,
+            width: info.width,
+            moves: info.n_moves,
+            robots: info.n_robots,
+            burn_in: info.burn_in,
+            ..ServerConfig::default()
+        };
+        let seed = config.seed;
+        let checked = config.check().expect("valid settings");
+        let rules = WorldSpec::of(&checked).expect("a valid model").rules;
+        let episode = Episode::new(&rules, seed);
+        Self { rules, episode }
+    }
+
+    /// Takes a published step, with the paths and masks that the sample tells; returns whether it is a new one, not the
+    /// last one again.
+    ///
+    /// # Panics
+    /// If a step is missing, or the sample shows anything else than these paths give.
+    pub fn follow(&mut self, sample: &Sample<FrameHeader>) -> bool {
+        let (world, k) = (sample.header.result, self.episode.result().step);
+        let robots = split_frame_payload(&sample.header, &sample.payload).expect("a whole sample");
+        let is_new = world.step != k;
+        if is_new {
+            assert_eq!(world.step, k + 1, "a step was lost, or made twice");
+            self.fly(sample, &robots);
+        }
+        assert_eq!(*self.episode.result(), world);
+        for (index, (robot, shown)) in self.episode.robots().iter().zip(&robots).enumerate() {
+            assert_eq!(*robot.result(), shown.result, "robot {index}, step {k}");
+            assert_eq!(
+                seen(robot),
+                (shown.frame, shown.path.to_vec()),
+                "robot {index}, step {k}"
+            );
+        }
+        is_new
+    }
+
+    fn fly(&mut self, sample: &Sample<FrameHeader>, robots: &[RobotSample<'_>]) {
+        let mut moves = vec![Move::Up; self.rules.n_robots * self.rules.n_moves];
+        let (mut ready, mut full) = (0, 0);
+        for (index, robot) in robots.iter().enumerate() {
+            let path = path_from_bytes(robot.path).expect("a path");
+            moves[index * self.rules.n_moves..][..path.len()].copy_from_slice(&path);
+            ready |= u64::from(!path.is_empty()) << index;
+            full |= u64::from(robot.result.coverage == Coverage::Full as u32) << index;
+        }
+        let (hovered, late) = (sample.header.result.hovered, sample.header.result.late);
+        // Each robot flew, hovered or was late, and only one of these.
+        assert_eq!(ready ^ hovered ^ late, (1 << robots.len()) - 1);
+        assert_eq!(hovered & late, 0);
+        let flown = Flown {
+            moves: &moves,
+            ready,
+            full,
+            hovered,
+            late,
+        };
+        self.episode.step(&self.rules, &flown);
+    }
+}
+
+fn seen(robot: &Robot) -> (&[u8], Vec<u8>) {
+    (robot.frame().as_bytes(), path_to_bytes(robot.path()))
+}

@@ -1,0 +1,559 @@
+//! Several robots in one world, flown by several clients: the same paths give the same bytes, and no client that dies,
+//! hangs, is replaced or is not allowed changes what the others fly and see.
+
+use crate::harness::{
+    Ended, PATIENCE, Paths, Program, Server, claim, eventually, frames_until, new_instance,
+    robots_of,
+};
+use crate::mirror::Mirror;
+use crate::recording::{frames, new_file, read_whole, start_recorder, stop};
+use crate::wire::{Pending, RawClient, Wire, answer, step_body, step_header};
+use agent::server::client::{Claim, Client};
+use protocol::control::{Reply, Request, WorldSeed};
+use protocol::message::{
+    FLAG_TEAM_FRAMES, FrameHeader, Operation, RobotResult, Status, StepReply, StepRequest,
+    WorldResult,
+};
+use protocol::observer::Observer;
+use protocol::path::path_to_bytes;
+use protocol::payload::split_step_payload;
+use rustix::process::Signal;
+use std::ops::Range;
+use std::time::{Duration, Instant};
+
+/// Robots of the world.
+const TEAM: u32 = 4;
+
+const N_MOVES: usize = 10;
+
+const FLAGS: &str = "--height 9 --width 14 --moves 10 --burn-in 2000 --robots 4";
+
+/// Steps: one for each order in which four clients can come.
+const N_STEPS: u64 = 24;
+
+/// A lease that ends by nothing but what a test does.
+const LONG: Duration = Duration::from_secs(3600);
+
+/// What a robot shows, with the result of its world.
+type Shown = (WorldResult, RobotResult, Vec<u8>);
+
+/// A client of some robots.
+struct Flyer {
+    wire: Wire,
+    lease: u64,
+    robots: Range<u32>,
+}
+
+type Sent = Pending<StepRequest, StepReply>;
+
+impl Flyer {
+    fn new(server: &Server, robots: Range<u32>) -> Self {
+        let wire = Wire::open(&server.instance);
+        let lease = wire.acquire(robots.start, robots.len() as u32).lease;
+        Self {
+            wire,
+            lease,
+            robots,
+        }
+    }
+
+    fn header(&self) -> StepRequest {
+        StepRequest {
+            first_robot: self.robots.start,
+            n_robots: self.robots.len() as u32,
+            ..step_header(self.lease, N_MOVES as u32)
+        }
+    }
+
+    /// Sends its robots' paths for a step.
+    fn send(&self, k: u64) -> Sent {
+        let paths: Vec<u8> = self
+            .robots
+            .clone()
+            .flat_map(|robot| path(k, robot))
+            .collect();
+        let sent = self.wire.send_step(self.header(), &step_body(&[k], &paths));
+        sent.expect("send a step")
+    }
+
+    /// Waits for the answer to a step.
+    fn shown(&self, sent: &Sent) -> Vec<Shown> {
+        let (reply, payload) = answer(sent, PATIENCE).expect("an answer to a step");
+        assert_eq!(Status::try_from(reply.status), Ok(Status::Ok), "{reply:?}");
+        let parts = split_step_payload(&reply, &payload).expect("a whole payload");
+        let frames = parts.frames.chunks_exact(9 * 14);
+        let robots = parts.robots.iter().zip(frames);
+        let shown = robots.map(|(robot, frame)| (parts.worlds[0], *robot, frame.to_vec()));
+        shown.collect()
+    }
+
+    /// Waits for the refusal of a step.
+    fn refusal(&self, sent: &Sent) -> (Status, u64) {
+        let (reply, _) = answer(sent, PATIENCE).expect("an answer to a step");
+        let status = Status::try_from(reply.status).expect("a known status");
+        (status, reply.detail)
+    }
+
+    /// Waits until so many robots of the world have a path for its next step.
+    fn wait_for_paths(&self, n_paths: u32) {
+        let has_come = || match self.wire.ask(&Request::Status {}) {
+            Reply::Status(status) => status.worlds[0].n_paths == n_paths,
+            other => panic!("expected a status, got {other:?}"),
+        };
+        assert!(eventually(PATIENCE, has_come), "not {n_paths} paths");
+    }
+}
+
+/// The path of a robot in a step.
+fn path(k: u64, robot: u32) -> Vec<u8> {
+    path_to_bytes(&Paths::new(k * u64::from(TEAM) + u64::from(robot)).next(N_MOVES))
+}
+
+/// The steps of four robots, flown by clients that each hold some; in step k the clients send in the k-th order.
+fn fly(server: &Server, shares: &[Range<u32>]) -> Vec<Vec<Shown>> {
+    let flyers: Vec<Flyer> = shares
+        .iter()
+        .map(|robots| Flyer::new(server, robots.clone()))
+        .collect();
+    let step = |k: u64| {
+        let mut sent: Vec<Option<Sent>> = flyers.iter().map(|_| None).collect();
+        let mut n_paths = 0;
+        for index in order(k as usize, flyers.len()) {
+            sent[index] = Some(flyers[index].send(k));
+            n_paths += flyers[index].robots.len() as u32;
+            if n_paths < TEAM {
+                flyers[index].wait_for_paths(n_paths);
+            }
+        }
+        let answers = flyers.iter().zip(&sent);
+        let shown = answers.flat_map(|(flyer, sent)| flyer.shown(sent.as_ref().expect("sent")));
+        shown.collect()
+    };
+    (0..N_STEPS).map(step).collect()
+}
+
+/// The `number`-th order of so many.
+fn order(mut number: usize, n: usize) -> Vec<usize> {
+    let mut left: Vec<usize> = (0..n).collect();
+    let mut order = Vec::new();
+    for n_left in (1..=n).rev() {
+        order.push(left.remove(number % n_left));
+        number /= n_left;
+    }
+    order
+}
+
+#[test]
+fn the_same_paths_give_the_same_bytes_whoever_sends_them_in_whatever_order() {
+    let together = Server::start(&format!("{FLAGS} --threads 1"));
+    let expected = fly(&together, &[0..4]);
+    let has_shared = |step: &Vec<Shown>| {
+        let own: u32 = step.iter().map(|(_, robot, _)| robot.n_visited).sum();
+        own > step[0].0.n_visited
+    };
+    assert!(expected.iter().any(has_shared), "no cell was visited twice");
+    let apart = Server::start(&format!("{FLAGS} --threads 2"));
+    let (_folder, file) = new_file();
+    let recorder = start_recorder(&apart.instance, &file, &[]);
+    assert!(fly(&apart, &[0..1, 1..2, 2..3, 3..4]) == expected);
+    stop(recorder);
+    let in_parts = Server::start(FLAGS);
+    assert!(fly(&in_parts, &[0..3, 3..4]) == expected);
+
+    let mut mirror = Mirror::of(&apart.info());
+    let steps = frames(&read_whole(&file));
+    let new: Vec<_> = steps.iter().filter(|step| mirror.follow(step)).collect();
+    assert_eq!(new.len(), expected.len());
+    for (k, (step, expected)) in new.into_iter().zip(&expected).enumerate() {
+        for (robot, (sample, (world, result, frame))) in
+            robots_of(step).iter().zip(expected).enumerate()
+        {
+            assert_eq!((step.header.result, sample.result), (*world, *result));
+            assert_eq!(sample.frame, frame);
+            assert_eq!(sample.path, path(k as u64, robot as u32));
+        }
+    }
+}
+
+/// Large enough that worlds are stepped by several threads.
+const LARGE: &str = "--height 128 --width 128 --moves 10 --burn-in 3 --robots 2 --worlds 8";
+
+#[test]
+fn many_worlds_at_once_are_as_each_alone_with_one_thread_and_two() {
+    let [together, alone] = [2, 1].map(|n| Server::start(&format!("{LARGE} --threads {n}")));
+    let (mut all, mut each) = (together.acquire(0..16), alone.acquire(0..16));
+    for k in 0..4 {
+        let paths = Paths::new(k).take(N_MOVES, 16);
+        let seen = all.step(0..16, &paths).expect("step");
+        for world in (0..8).rev() {
+            let robots = 2 * world..2 * world + 2;
+            let own = robots.start as usize..robots.end as usize;
+            let shown = each.step(robots, &paths[own.clone()]).expect("step");
+            assert!(shown == seen[own], "world {world}");
+        }
+    }
+}
+
+#[test]
+fn a_team_frame_holds_what_all_saw_and_is_open_to_all() {
+    let server = Server::start(FLAGS);
+    let flyers = [0..1, 1..4].map(|robots| Flyer::new(&server, robots));
+    let sent = flyers.each_ref().map(|flyer| flyer.send(0));
+    let own: Vec<Shown> = flyers
+        .iter()
+        .zip(&sent)
+        .flat_map(|(flyer, sent)| flyer.shown(sent))
+        .collect();
+    drop(sent);
+    let union = |cell: usize| own.iter().map(|(.., frame)| frame[cell]).min();
+    let union: Vec<u8> = (0..9 * 14).filter_map(union).collect();
+    let stranger = Wire::open(&server.instance);
+    for (operation, body) in [
+        (Operation::Observe, Vec::new()),
+        (Operation::Recall, step_body(&[1], &[])),
+    ] {
+        let header = StepRequest {
+            operation: operation as u32,
+            flags: FLAG_TEAM_FRAMES,
+            first_robot: 2,
+            ..step_header(0, 0)
+        };
+        let (reply, payload) = stranger.step(header, &body);
+        let parts = split_step_payload(&reply, &payload).expect("a whole payload");
+        assert_eq!(
+            (&parts.worlds[..], &parts.robots[..]),
+            (&[own[2].0][..], &[own[2].1][..])
+        );
+        assert_eq!(parts.frames, union, "{operation:?}");
+    }
+}
+
+#[test]
+fn a_path_that_is_withdrawn_is_never_flown() {
+    let server = Server::start(&format!("{FLAGS} --lease-millis 86400000"));
+    let [first, second] = [0..2, 2..4].map(|robots| Flyer::new(&server, robots));
+    // Its client gives it up, and sends it again.
+    let given_up = first.send(0);
+    second.wait_for_paths(2);
+    drop(given_up);
+    second.wait_for_paths(0);
+    // Its client releases its robots, which hover from then on.
+    let waiting = first.send(0);
+    second.wait_for_paths(2);
+    let lease = first.lease;
+    assert_eq!(first.wire.ask(&Request::Release { lease }), Reply::Done);
+    assert_eq!(first.refusal(&waiting), (Status::LeaseLost, 0));
+    drop(waiting);
+    let sent = second.send(0);
+    let shown = second.shown(&sent);
+    assert_eq!(
+        (shown[0].0.step, shown[0].0.hovered, shown[0].0.late),
+        (1, 3, 0)
+    );
+    drop(sent);
+    // One of its robots is taken over: the path of the other is withdrawn with it.
+    let first = Flyer::new(&server, 0..2);
+    let waiting = first.send(1);
+    second.wait_for_paths(2);
+    let thief = Wire::open(&server.instance);
+    let take = Request::Acquire {
+        first_robot: 1,
+        n_robots: 1,
+        takeover: true,
+        ttl_millis: None,
+    };
+    assert_eq!(thief.ask(&take).status(), Status::Ok);
+    let us = u64::from(std::process::id());
+    assert_eq!(first.refusal(&waiting), (Status::LeaseLost, us));
+    second.wait_for_paths(0);
+    // The connection of who waits is closed.
+    drop((waiting, thief));
+    let waiting = second.send(1);
+    first.wait_for_paths(2);
+    drop((waiting, second));
+    first.wait_for_paths(0);
+    assert_eq!(server.step_of(0), 1, "nothing was flown");
+}
+
+#[test]
+fn a_late_path_is_refused_and_not_flown_in_a_later_step() {
+    let server = Server::start(&format!("{FLAGS} --lease-millis 86400000 --deadline-ms 50"));
+    let observer = Observer::frames(&server.instance).expect("observe");
+    let mut mirror = Mirror::of(&server.info());
+    let flyers = [0..1, 1..4].map(|robots| Flyer::new(&server, robots));
+    let [quick, slow] = &flyers;
+    let shown = quick.shown(&quick.send(0));
+    assert_eq!(
+        (shown[0].0.step, shown[0].0.late, shown[0].1.n_moves),
+        (1, 0b1110, 10)
+    );
+    assert_eq!(slow.refusal(&slow.send(0)), (Status::Late, 1));
+    assert_eq!(slow.refusal(&slow.send(2)), (Status::Early, 1));
+    // The next step has the paths that were meant for it, whichever come in time.
+    let sent = flyers.each_ref().map(|flyer| flyer.send(1));
+    assert!(
+        flyers
+            .iter()
+            .zip(&sent)
+            .any(|(flyer, sent)| flyer.refusal(sent).0 == Status::Ok)
+    );
+    for step in frames_until(&observer, 0, 2) {
+        mirror.follow(&step);
+        for (robot, sample) in (0..).zip(robots_of(&step)) {
+            let k = step.header.result.step.saturating_sub(1);
+            assert!(sample.path.is_empty() || sample.path == path(k, robot));
+        }
+    }
+}
+
+#[test]
+fn who_holds_no_robot_can_neither_fly_nor_read_ahead_nor_block() {
+    let server = Server::start(&format!("{FLAGS} --lease-millis 86400000"));
+    let flyers = [0..1, 1..4].map(|robots| Flyer::new(&server, robots));
+    let stranger = Wire::open(&server.instance);
+    let status = |header: StepRequest, body: &[u8]| {
+        let (reply, _) = stranger.step(header, body);
+        (
+            Status::try_from(reply.status).expect("a known status"),
+            reply.detail,
+        )
+    };
+    let observe = || {
+        let header = StepRequest {
+            operation: Operation::Observe as u32,
+            n_robots: TEAM,
+            ..step_header(0, 0)
+        };
+        stranger.step(header, &[]).1
+    };
+    for k in 0..5 {
+        let before = observe();
+        let first = flyers[0].send(k);
+        flyers[1].wait_for_paths(1);
+        assert!(observe() == before, "a path that waits is shown");
+        for (robot, lease) in [(0, flyers[0].lease), (1, flyers[1].lease), (1, 0)] {
+            let header = StepRequest {
+                first_robot: robot,
+                ..step_header(lease, N_MOVES as u32)
+            };
+            let body = step_body(&[k], &[3; N_MOVES]);
+            assert_eq!(status(header, &body), (Status::NoLease, robot.into()));
+        }
+        let recall = StepRequest {
+            operation: Operation::Recall as u32,
+            n_robots: TEAM,
+            ..step_header(0, 0)
+        };
+        let ahead = step_body(&[k + 1], &[]);
+        assert_eq!(status(recall, &ahead), (Status::NotKept, k));
+        let acquire = Request::Acquire {
+            first_robot: 3,
+            n_robots: 1,
+            takeover: false,
+            ttl_millis: None,
+        };
+        let reset = |lease| Request::Reset {
+            lease,
+            worlds: vec![WorldSeed {
+                world: 0,
+                seed: None,
+            }],
+        };
+        assert_eq!(stranger.ask(&acquire).status(), Status::Busy);
+        assert_eq!(
+            stranger.ask(&reset(flyers[0].lease)).status(),
+            Status::NoLease
+        );
+        // Not even who holds some of its robots may reset the world.
+        assert_eq!(
+            flyers[1].wire.ask(&reset(flyers[1].lease)).status(),
+            Status::Busy
+        );
+        assert!(observe() == before);
+        flyers[1].wait_for_paths(1);
+        let second = flyers[1].send(k);
+        let shown = [flyers[0].shown(&first), flyers[1].shown(&second)].concat();
+        assert!(
+            shown
+                .iter()
+                .all(|(world, ..)| (world.step, world.hovered) == (k + 1, 0))
+        );
+    }
+}
+
+/// A world of agents, and of a robot that is flown by this process: so its steps come as fast as they are checked.
+struct Lab {
+    server: Server,
+    observer: Observer<FrameHeader>,
+    mirror: Mirror,
+    pacer: Client,
+    paths: Paths,
+    last: WorldResult,
+}
+
+impl Lab {
+    fn new(flags: &str) -> Self {
+        let server = Server::start(&format!("{FLAGS} {flags}"));
+        let observer = Observer::frames(&server.instance).expect("observe");
+        frames_until(&observer, 0, 0);
+        let long = Claim {
+            time_to_live: Some(LONG),
+            ..claim(0..1)
+        };
+        Self {
+            mirror: Mirror::of(&server.info()),
+            pacer: Client::acquire(&server.instance, &long).expect("acquire"),
+            server,
+            observer,
+            paths: Paths::new(0),
+            last: WorldResult::default(),
+        }
+    }
+
+    fn start_agent(&self, robot: u32, flags: &[&str]) -> Program {
+        let robot = robot.to_string();
+        let common = ["run", "--instance", self.server.instance.name()];
+        let which = ["--robot", &robot, "--policy", "random_walk"];
+        Program::start("emberwatch-agent", &[&common[..], &which, flags].concat())
+    }
+
+    /// Steps until a result is as wanted; every step on the way must be as its own paths make it.
+    fn until(&mut self, agents: &[&Program], wanted: impl Fn(&WorldResult) -> bool) {
+        let start = Instant::now();
+        while self.last.step == 0 || !wanted(&self.last) {
+            let said = || {
+                agents
+                    .iter()
+                    .map(|agent| agent.stderr())
+                    .collect::<String>()
+            };
+            assert!(start.elapsed() < PATIENCE, "{:?}: {}", self.last, said());
+            self.step();
+        }
+    }
+
+    fn step(&mut self) {
+        let (start, path) = (Instant::now(), self.paths.next(N_MOVES));
+        let is_over = || start.elapsed() > PATIENCE;
+        // Late is this process, too, where it is not given the time; then it goes on with the next step.
+        let flown = self.pacer.step_until(0..1, &[path], &is_over);
+        assert!(!matches!(flown, Ok(None)), "the world does not move");
+        let now = self.pacer.observe(0..1).expect("observe")[0].world;
+        for sample in frames_until(&self.observer, 0, now.step) {
+            self.mirror.follow(&sample);
+            self.last = sample.header.result;
+        }
+    }
+}
+
+/// No robot stays.
+fn all_fly(world: &WorldResult) -> bool {
+    world.hovered | world.late == 0
+}
+
+fn check_end(ended: &Ended, words: &str) {
+    assert_eq!(ended.code, Some(3), "{}", ended.stderr);
+    assert!(ended.stderr.contains(words), "{words:?}: {}", ended.stderr);
+}
+
+#[test]
+fn the_robot_of_a_killed_agent_hovers_until_the_next_one_flies_it() {
+    let mut lab = Lab::new("--lease-millis 86400000");
+    let agents = [1, 2, 3].map(|robot| lab.start_agent(robot, &[]));
+    lab.until(&agents.each_ref(), all_fly);
+    let [one, two, three] = agents;
+    two.kill();
+    lab.until(&[&one, &three], |world| world.hovered == 0b0100);
+    for _ in 0..20 {
+        lab.step();
+        assert_eq!(
+            (lab.last.hovered, lab.last.late),
+            (0b0100, 0),
+            "the others fly on"
+        );
+    }
+    let two = lab.start_agent(2, &[]);
+    lab.until(&[&one, &two, &three], all_fly);
+}
+
+#[test]
+fn a_takeover_changes_who_flies_a_robot_and_nothing_else() {
+    let mut lab = Lab::new("--lease-millis 86400000");
+    let agents = [1, 2, 3].map(|robot| lab.start_agent(robot, &[]));
+    lab.until(&agents.each_ref(), all_fly);
+    let [one, two, three] = agents;
+    let next = lab.start_agent(2, &["--takeover"]);
+    let start = Instant::now();
+    while lab.server.status().worlds[0].holder_pids[2] != Some(next.pid()) {
+        assert!(start.elapsed() < PATIENCE, "{}", next.stderr());
+        lab.step();
+        assert!(all_fly(&lab.last), "a robot was left alone: {:?}", lab.last);
+    }
+    for _ in 0..20 {
+        lab.step();
+        assert!(all_fly(&lab.last), "{:?}", lab.last);
+    }
+    check_end(
+        &two.wait(PATIENCE),
+        &format!("lease lost to pid {}", next.pid()),
+    );
+    drop((one, three));
+}
+
+#[test]
+fn a_stopped_agent_delays_its_world_until_its_lease_ends() {
+    let mut lab = Lab::new("--lease-millis 1500");
+    let agents = [1, 2, 3].map(|robot| lab.start_agent(robot, &[]));
+    lab.until(&agents.each_ref(), all_fly);
+    let [_one, _two, three] = agents;
+    three.stop();
+    lab.until(&[&three], |world| world.hovered & 0b1000 != 0);
+    let holder = lab.server.status().worlds[0].holder_pids[3];
+    assert_eq!(holder, None);
+    three.signal(Signal::CONT);
+    // It has no world to wait for it: it asks by itself, and hears.
+    check_end(&three.wait(PATIENCE), "lease lost");
+}
+
+#[test]
+fn a_stopped_agent_is_late_in_each_step_and_flies_again_when_it_wakes() {
+    let mut lab = Lab::new("--lease-millis 86400000 --deadline-ms 200");
+    let agents = [1, 2, 3].map(|robot| lab.start_agent(robot, &[]));
+    lab.until(&agents.each_ref(), all_fly);
+    let [one, two, mut three] = agents;
+    three.stop();
+    for _ in 0..3 {
+        lab.until(&[&three], |world| world.late & 0b1000 != 0);
+        lab.step();
+        assert_eq!(lab.last.hovered, 0, "it holds its robot");
+    }
+    three.signal(Signal::CONT);
+    lab.until(&[&one, &two, &three], all_fly);
+    assert!(!three.has_ended(), "{}", three.stderr());
+}
+
+#[test]
+fn one_agent_flies_a_team_and_others_share_its_frames() {
+    let instance = new_instance();
+    let server = Server::start_on(&instance, FLAGS);
+    let observer = Observer::frames(&instance).expect("observe");
+    let mut mirror = Mirror::of(&server.info());
+    let run = |flags: &[&str]| {
+        let common = ["run", "--instance", instance.name(), "--steps", "10"];
+        Program::start("emberwatch-agent", &[&common[..], flags].concat())
+    };
+    let team = run(&["--robots", "0..4", "--team"]).wait(PATIENCE);
+    assert_eq!(team.code, Some(0), "{}", team.stderr);
+    let mates = ["0", "1", "2", "3"].map(|robot| run(&["--robot", robot, "--share"]));
+    for mate in mates {
+        let ended = mate.wait(PATIENCE);
+        assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    }
+    let steps = server.step_of(0);
+    let n_new = frames_until(&observer, 0, steps)
+        .iter()
+        .filter(|sample| mirror.follow(sample))
+        .count();
+    assert_eq!(n_new as u64, steps);
+    assert!(steps >= 20, "{steps}");
+}
