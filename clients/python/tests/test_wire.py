@@ -188,6 +188,8 @@ def test_the_limits_are_the_documented_ones() -> None:
         "MAX_CONTROL_BYTES",
         "MAX_MOVES",
         "MAX_SIDE",
+        "MAX_ROBOT_NUMBERS",
+        "MAX_TEAM_CELLS",
     }
 
 
@@ -196,19 +198,20 @@ def test_the_values_are_the_documented_ones() -> None:
     codes = {(kind, name): int(code) for kind, name, code, _ in rows}
     operations = [codes["operation", name] for name in ("step", "observe", "recall")]
     assert operations == [wire.STEP, wire.OBSERVE, wire.RECALL]
+    flags = [codes["flag", name] for name in ("full_coverage", "team_frames")]
+    assert flags == [wire.FULL_COVERAGE, wire.TEAM_FRAMES]
     assert sum(kind == "move" for kind, _ in codes) == wire.N_MOVES
     for sentence in (
         f"The version is {wire.VERSION}.",
         f"**{wire.UNOBSERVED} where nothing was",
-        f"{wire.FULL_COVERAGE} full coverage",
-        f"{wire.TEAM_FRAMES} team frames",
     ):
         assert sentence in document.PROTOCOL
 
 
 def test_the_worked_request_is_what_a_lease_sends() -> None:
-    message, values = document.worked_example("StepRequest")
-    number = {name: int(text) for name, text in values.items() if text.isdigit()}
+    message, pairs = document.worked_example("StepRequest")
+    values = dict(pairs)
+    number = {name: int(text) for name, text in pairs if text.isdigit()}
     wired = Wired()
     wired.peer.listener_low = number["listener_low"]
     wired.peer.listener_high = number["listener_high"]
@@ -217,9 +220,9 @@ def test_the_worked_request_is_what_a_lease_sends() -> None:
     wired.step.answer = answer[:56], answer[56:]
     grant = SimpleNamespace(lease=number["lease"], ttl_millis=1)
     lease = Lease(wired.client, grant, (), range(2))
-    paths = [values[f"path of robot {robot}"].split() for robot in range(2)]
     names = ["up", "down", "left", "right"]
-    lease.step([[names.index(move) for move in path] for path in paths])
+    paths = [[names.index(move) for move in values[f"path {row}"].split()] for row in range(2)]
+    lease.step(paths)
     assert b"".join(wired.step.sent[-1]) == message
     assert lease.steps_of(lease.robots).tolist() == [1]
 
@@ -227,22 +230,20 @@ def test_the_worked_request_is_what_a_lease_sends() -> None:
 def test_the_worked_answer_reads_as_what_stands_beside_it() -> None:
     message, values = document.worked_example("StepReply")
     reply = wire.StepReply.from_buffer_copy(message[:56])
-    for name, _ in wire.StepReply._fields_:
-        assert str(getattr(reply, name)) == values[name]
     answer = wire.StepAnswer(reply, bytearray(message[56:]), SHAPE)
-    for index in range(2):
-        world, robot = answer.result(index)
-        told = {f"world {name}": value for name, value in world._asdict().items()}
-        told |= {f"robot {index} {name}": value for name, value in robot._asdict().items()}
-        assert {name: f"{value:g}" for name, value in told.items()} == {
-            name: values[name] for name in told
-        }
-        frame = answer.frames[index]
-        rows = [" ".join("-" if cell == 255 else str(cell) for cell in row) for row in frame]
-        assert rows == [values[f"frame {index} row {row}"] for row in range(3)]
-        record = answer.results[index]
-        assert (tuple(record["world"]), tuple(record["robot"])) == (world, robot)
-    assert answer.simulation_nanos == int(values["simulation_nanos"])
+    (world, first), (same, second) = answer.result(0), answer.result(1)
+    assert world == same and answer.simulation_nanos == reply.simulation_nanos
+    told = [(name, getattr(reply, name)) for name, _ in wire.StepReply._fields_]
+    for result in (world, first, second):
+        told += result._asdict().items()
+    read = [(name, f"{value:.12g}") for name, value in told]
+    for robot, row in np.ndindex(2, 3):
+        cells = answer.frames[robot, row].tolist()
+        shown = " ".join("-" if cell == 255 else str(cell) for cell in cells)
+        read.append((f"frame {robot} row {row}", shown))
+    assert read == values
+    for record, result in zip(answer.results, (first, second), strict=True):
+        assert (tuple(record["world"]), tuple(record["robot"])) == (world, result)
 
 
 def answered(n_robots: int = 2, **changes: int) -> wire.StepAnswer:
@@ -322,7 +323,7 @@ def test_the_documented_replies_become_records() -> None:
     assert wired.client.belief() == (LEFT["kind"], 1, 2, ONE)
     wired.say(replies("status")[0])
     status = wired.client.status()
-    assert (status.pid, status.n_steps, status.worlds[0].n_paths) == (14661, 2, 1)
+    assert (status.pid, status.n_steps, status.worlds[0].n_paths) == (14661, 2, 0)
     assert status.worlds[0].holder_pids == (14683, None)
     (error,) = replies("error")
     wired.say(error, status=10)
