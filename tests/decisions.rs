@@ -8,7 +8,7 @@ use crate::wire::control_header;
 use protocol::channels::ChannelError;
 use protocol::control::WorldSeed;
 use protocol::decisions::{Decision, Reply, Request};
-use protocol::message::{ControlRequest, Status};
+use protocol::message::{ControlRequest, Status, VERSION};
 use protocol::observer::Observer;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -41,7 +41,7 @@ fn hello_tells_what_can_be_decided() {
     let (agent, learner) = start_with_learner(&server.instance, "");
     let info = learner.hello();
     assert_eq!((info.height, info.width, info.n_moves), (5, 7, 6));
-    assert_eq!((info.protocol, info.max_steps), (1, 9));
+    assert_eq!((info.protocol, info.max_steps), (VERSION, 9));
     assert_eq!((info.first_world, info.n_worlds), (0, 1));
     assert_eq!(
         (info.pid, &*info.instance),
@@ -294,7 +294,11 @@ fn what_is_no_decision_is_refused_and_changes_nothing() {
 
 fn assert_mismatch(reply: Reply) {
     let (status, detail, message) = refusal(reply);
-    assert_eq!((status, detail), (Status::VersionMismatch, 1), "{message}");
+    assert_eq!(
+        (status, detail),
+        (Status::VersionMismatch, VERSION.into()),
+        "{message}"
+    );
 }
 
 #[test]

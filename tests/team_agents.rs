@@ -1,6 +1,6 @@
 //! Agents that fly robots of one world: by one plan without a word between them, in a world that goes on without them.
 
-use crate::harness::{PATIENCE, Program, Server, claim, eventually, robots_of};
+use crate::harness::{PATIENCE, Program, Server, claim, eventually, robots_of, run as run_program};
 use agent::acting::mission::{Company, Mission};
 use agent::acting::run::{Summary, run};
 use agent::config::AgentConfig;
@@ -101,4 +101,36 @@ fn an_agent_whose_path_comes_late_catches_up() {
         let ended = agent.wait(PATIENCE);
         assert_eq!(ended.code, Some(0), "{}", ended.stderr);
     }
+}
+
+#[test]
+fn what_a_server_of_several_robots_cannot_give_is_refused_by_name() {
+    let server = Server::start(&format!("{FLAGS} --publish-truth"));
+    let check = |flags: &str, words: &str| {
+        let flags = format!("{flags} --instance {}", server.instance.name());
+        let ended = run_program(
+            "emberwatch-agent",
+            &flags.split(' ').collect::<Vec<_>>(),
+            PATIENCE,
+        );
+        assert_ne!(ended.code, Some(0), "{flags}");
+        assert!(ended.stderr.contains(words), "{flags}: {}", ended.stderr);
+    };
+    check(
+        "run --robot 4",
+        "expected some of the world's 0..4, got 4..5",
+    );
+    check(
+        "run --robots 2..6 --team",
+        "expected some of the world's 0..4, got 2..6",
+    );
+    check("run --world 1", "no such world");
+    check(
+        "serve-decisions",
+        "expected a server with --robots 1, got 4",
+    );
+    check(
+        "compare --robots 2",
+        "expected the running server's 4, got 2",
+    );
 }

@@ -249,7 +249,10 @@ impl<'a> Crowd<'a> {
         let holds = eventually(PATIENCE, || {
             match self.connection.control(&Request::Status {}, PATIENCE) {
                 Ok(Reply::Status(status)) => status.worlds[0].holder_pids[robot] == pid,
-                other => panic!("expected a status, got {other:?}"),
+                other => panic!(
+                    "expected a status, got {other:?}: {}",
+                    self.server.program.stderr()
+                ),
             }
         });
         assert!(holds, "{}", self.agents[robot].stderr());
