@@ -175,7 +175,7 @@ fn hello() -> Request {
 /// The reply to a request under way.
 pub fn reply_to(pending: &Pending<ControlRequest, ControlReply>, header: ControlRequest) -> Reply {
     let (answered, payload) = answer(pending, PATIENCE).expect("an answer");
-    assert_eq!((answered.version, answered.sequence), (1, header.sequence));
+    assert_eq!((answered.version, answered.sequence), (VERSION, header.sequence));
     let reply: Reply = serde_json::from_slice(&payload).expect("a reply");
     assert_eq!(Status::try_from(answered.status), Ok(reply.status()));
     reply

@@ -1,14 +1,22 @@
-//! A world as its published steps must make it, stepped in this process: no server, no clients, no time.
+//! A world as its published steps must make it, stepped in this process: no server, no clients, no time. And a world of
+//! a server that goes as fast as it is checked so.
 
+use crate::harness::{PATIENCE, Paths, Server, claim, frames_until};
+use agent::server::client::{Claim, Client};
 use env_server::config::ServerConfig;
 use env_server::snapshot::WorldSpec;
 use env_server::world::{Episode, Flown, Robot, Rules};
+use protocol::connection::ConnectionError;
 use protocol::control::ServerInfo;
-use protocol::message::FrameHeader;
-use protocol::observer::Sample;
+use protocol::message::{FrameHeader, Status, WorldResult};
+use protocol::observer::{Observer, Sample};
 use protocol::path::{path_from_bytes, path_to_bytes};
 use protocol::payload::{RobotSample, split_frame_payload};
 use protocol::{Coverage, Move};
+use std::time::{Duration, Instant};
+
+/// A lease that ends by nothing but what a test does.
+const LONG: Duration = Duration::from_secs(3600);
 
 /// World 0 of a server, undisturbed.
 pub struct Mirror {
@@ -85,4 +93,56 @@ impl Mirror {
 
 fn seen(robot: &Robot) -> (&[u8], Vec<u8>) {
     (robot.frame().as_bytes(), path_to_bytes(robot.path()))
+}
+
+/// World 0 of a server, one of whose robots is flown by this process: it checks each step before it flies the next, so
+/// that no step is missed.
+pub struct PacedWorld {
+    /// What flies the robot.
+    pub client: Client,
+    /// The last step.
+    pub last: WorldResult,
+    observer: Observer<FrameHeader>,
+    mirror: Mirror,
+    paths: Paths,
+}
+
+impl PacedWorld {
+    /// The world at k = 0, and a robot that nobody holds.
+    pub fn new(server: &Server, robot: u32) -> Self {
+        let observer = Observer::frames(&server.instance).expect("observe");
+        frames_until(&observer, 0, 0);
+        let claim = Claim {
+            time_to_live: Some(LONG),
+            ..claim(robot..robot + 1)
+        };
+        Self {
+            client: Client::acquire(&server.instance, &claim).expect("acquire"),
+            last: WorldResult::default(),
+            observer,
+            mirror: Mirror::of(&server.info()),
+            paths: Paths::new(0),
+        }
+    }
+
+    /// Flies a path, checks all steps until then, and tells of each.
+    pub fn step(&mut self, mut tell: impl FnMut(&Sample<FrameHeader>)) {
+        let path = self.paths.next(self.client.info().n_moves);
+        let (start, robots) = (Instant::now(), self.client.robots());
+        let is_over = || start.elapsed() > PATIENCE;
+        let flown = self.client.step_until(robots.clone(), &[path], &is_over);
+        match flown {
+            Ok(Some(_)) => {}
+            // This process was not given the time: it goes on with the next step.
+            Err(ConnectionError::Refused { status, .. }) if status == Status::Late => {}
+            other => panic!("the world does not move: {other:?}"),
+        }
+        let now = self.client.observe(robots).expect("observe")[0].world;
+        for sample in frames_until(&self.observer, 0, now.step) {
+            if self.mirror.follow(&sample) {
+                self.last = sample.header.result;
+                tell(&sample);
+            }
+        }
+    }
 }

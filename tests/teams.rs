@@ -2,24 +2,21 @@
 //! hangs, is replaced or is not allowed changes what the others fly and see.
 
 use crate::harness::{
-    Ended, PATIENCE, Paths, Program, Server, claim, eventually, frames_until, new_instance,
-    robots_of,
+    Ended, PATIENCE, Paths, Program, Server, eventually, frames_until, new_instance, robots_of,
 };
-use crate::mirror::Mirror;
+use crate::mirror::{Mirror, PacedWorld};
 use crate::recording::{frames, new_file, read_whole, start_recorder, stop};
 use crate::wire::{Pending, RawClient, Wire, answer, step_body, step_header};
-use agent::server::client::{Claim, Client};
 use protocol::control::{Reply, Request, WorldSeed};
 use protocol::message::{
-    FLAG_TEAM_FRAMES, FrameHeader, Operation, RobotResult, Status, StepReply, StepRequest,
-    WorldResult,
+    FLAG_TEAM_FRAMES, Operation, RobotResult, Status, StepReply, StepRequest, WorldResult,
 };
 use protocol::observer::Observer;
 use protocol::path::path_to_bytes;
 use protocol::payload::split_step_payload;
 use rustix::process::Signal;
 use std::ops::Range;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// Robots of the world.
 const TEAM: u32 = 4;
@@ -30,9 +27,6 @@ const FLAGS: &str = "--height 9 --width 14 --moves 10 --burn-in 2000 --robots 4"
 
 /// Steps: one for each order in which four clients can come.
 const N_STEPS: u64 = 24;
-
-/// A lease that ends by nothing but what a test does.
-const LONG: Duration = Duration::from_secs(3600);
 
 /// What a robot shows, with the result of its world.
 type Shown = (WorldResult, RobotResult, Vec<u8>);
@@ -381,33 +375,17 @@ fn who_holds_no_robot_can_neither_fly_nor_read_ahead_nor_block() {
     }
 }
 
-/// A world of agents, and of a robot that is flown by this process: so its steps come as fast as they are checked.
+/// A world of agents, and of robot 0, which this process flies.
 struct Lab {
     server: Server,
-    observer: Observer<FrameHeader>,
-    mirror: Mirror,
-    pacer: Client,
-    paths: Paths,
-    last: WorldResult,
+    world: PacedWorld,
 }
 
 impl Lab {
     fn new(flags: &str) -> Self {
         let server = Server::start(&format!("{FLAGS} {flags}"));
-        let observer = Observer::frames(&server.instance).expect("observe");
-        frames_until(&observer, 0, 0);
-        let long = Claim {
-            time_to_live: Some(LONG),
-            ..claim(0..1)
-        };
-        Self {
-            mirror: Mirror::of(&server.info()),
-            pacer: Client::acquire(&server.instance, &long).expect("acquire"),
-            server,
-            observer,
-            paths: Paths::new(0),
-            last: WorldResult::default(),
-        }
+        let world = PacedWorld::new(&server, 0);
+        Self { server, world }
     }
 
     fn start_agent(&self, robot: u32, flags: &[&str]) -> Program {
@@ -420,29 +398,25 @@ impl Lab {
     /// Steps until a result is as wanted; every step on the way must be as its own paths make it.
     fn until(&mut self, agents: &[&Program], wanted: impl Fn(&WorldResult) -> bool) {
         let start = Instant::now();
-        while self.last.step == 0 || !wanted(&self.last) {
+        while !wanted(&self.step()) {
             let said = || {
                 agents
                     .iter()
                     .map(|agent| agent.stderr())
                     .collect::<String>()
             };
-            assert!(start.elapsed() < PATIENCE, "{:?}: {}", self.last, said());
-            self.step();
+            assert!(
+                start.elapsed() < PATIENCE,
+                "{:?}: {}",
+                self.world.last,
+                said()
+            );
         }
     }
 
-    fn step(&mut self) {
-        let (start, path) = (Instant::now(), self.paths.next(N_MOVES));
-        let is_over = || start.elapsed() > PATIENCE;
-        // Late is this process, too, where it is not given the time; then it goes on with the next step.
-        let flown = self.pacer.step_until(0..1, &[path], &is_over);
-        assert!(!matches!(flown, Ok(None)), "the world does not move");
-        let now = self.pacer.observe(0..1).expect("observe")[0].world;
-        for sample in frames_until(&self.observer, 0, now.step) {
-            self.mirror.follow(&sample);
-            self.last = sample.header.result;
-        }
+    fn step(&mut self) -> WorldResult {
+        self.world.step(|_| ());
+        self.world.last
     }
 }
 
@@ -465,9 +439,9 @@ fn the_robot_of_a_killed_agent_hovers_until_the_next_one_flies_it() {
     two.kill();
     lab.until(&[&one, &three], |world| world.hovered == 0b0100);
     for _ in 0..20 {
-        lab.step();
+        let world = lab.step();
         assert_eq!(
-            (lab.last.hovered, lab.last.late),
+            (world.hovered, world.late),
             (0b0100, 0),
             "the others fly on"
         );
@@ -486,12 +460,12 @@ fn a_takeover_changes_who_flies_a_robot_and_nothing_else() {
     let start = Instant::now();
     while lab.server.status().worlds[0].holder_pids[2] != Some(next.pid()) {
         assert!(start.elapsed() < PATIENCE, "{}", next.stderr());
-        lab.step();
-        assert!(all_fly(&lab.last), "a robot was left alone: {:?}", lab.last);
+        let world = lab.step();
+        assert!(all_fly(&world), "a robot was left alone: {world:?}");
     }
     for _ in 0..20 {
-        lab.step();
-        assert!(all_fly(&lab.last), "{:?}", lab.last);
+        let world = lab.step();
+        assert!(all_fly(&world), "{world:?}");
     }
     check_end(
         &two.wait(PATIENCE),
@@ -524,8 +498,7 @@ fn a_stopped_agent_is_late_in_each_step_and_flies_again_when_it_wakes() {
     three.stop();
     for _ in 0..3 {
         lab.until(&[&three], |world| world.late & 0b1000 != 0);
-        lab.step();
-        assert_eq!(lab.last.hovered, 0, "it holds its robot");
+        assert_eq!(lab.step().hovered, 0, "it holds its robot");
     }
     three.signal(Signal::CONT);
     lab.until(&[&one, &two, &three], all_fly);

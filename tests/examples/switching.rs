@@ -56,9 +56,9 @@ impl Robot {
             let action = &setup.actions.actions()[action];
             let random = (self.episode.result().seed, step);
             let belief = self.filter.belief();
-            let plan = action.plan(&mut beam, belief, self.cell(), setup.n_moves, random);
+            let plans = action.plan(&mut beam, belief, &[self.cell()], setup.n_moves, random);
             let flown = Flown {
-                moves: &plan.moves,
+                moves: &plans[0].moves,
                 ready: 1,
                 full: 0,
                 hovered: 0,

@@ -1,7 +1,7 @@
 //! What long and rough use does to a server: agents and servers that are killed, observers that are
 //! stopped, hours of coming and going.
 //!
-//! `cargo run --release -p tests --example endurance -- agents 1000 | servers 200 | starts 2000 | observers 5 |
+//! `cargo run --release -p tests --example endurance -- agents 1000 | teams 1000 | servers 200 | starts 2000 | observers 5 |
 //! dashboard 5 64 | snapshots 9 | soak 3600 FOLDER`
 
 #[expect(dead_code, reason = "the tests use all of it")]
@@ -9,6 +9,8 @@
 mod harness;
 #[path = "../../kills.rs"]
 mod kills;
+#[path = "../../mirror.rs"]
+mod mirror;
 
 mod agents;
 mod dashboard;
@@ -18,6 +20,7 @@ mod servers;
 mod snapshots;
 mod soak;
 mod starts;
+mod teams;
 
 use std::io::Write;
 
@@ -30,6 +33,7 @@ fn main() {
     }
     match words[..] {
         ["agents", n] => agents::kill(number(n)),
+        ["teams", n] => teams::disturb(number(n)),
         ["servers", n] => servers::kill(number(n)),
         ["starts", n] => starts::kill(number(n)),
         ["observers", n] => observers::compare(number(n)),
@@ -38,7 +42,7 @@ fn main() {
         ["observe", instance] => observers::observe(instance),
         ["soak", seconds, folder] => soak::soak(number(seconds), folder.as_ref()),
         _ => panic!(
-            "expected agents N, servers N, starts N, observers ROUNDS, dashboard ROUNDS SIDE, snapshots ROUNDS or soak SECONDS FOLDER, got {words:?}"
+            "expected agents N, teams N, servers N, starts N, observers ROUNDS, dashboard ROUNDS SIDE, snapshots ROUNDS or soak SECONDS FOLDER, got {words:?}"
         ),
     }
 }
