@@ -276,6 +276,8 @@ def test_robots_that_nobody_holds_hover(alone: Callable[..., Any]) -> None:
             assert info["n_missed"] == 0
             assert (seen["others"] == before).all() and before.sum() == 2 * 255
             assert (seen["team"] == seen["frame"]).all()
+        other = alone(instance, 2)
+        assert other.reset()[1] == info | {"n_visited": 0, "n_hits": 0}
 
 
 def test_a_late_path_is_not_flown_and_told(alone: Callable[..., Any]) -> None:
