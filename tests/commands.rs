@@ -28,6 +28,11 @@ const WRONG_SERVER_FLAGS: &str = r#"
 --height 0 => height and width in 1..=4096, got 0 x 64
 --width 4097 => height and width in 1..=4096, got 64 x 4097
 --moves 0 => moves: expected 1 to 4096, got 0
+--robots 0 => robots: expected 1 to 64, got 0
+--robots 65 => robots: expected 1 to 64, got 65
+--worlds 1024 --robots 5 => worlds times robots: expected 1 to 4096, got 5120
+--robots 64 --height 1000 --width 1000 => cells times robots: expected | got 64000000
+--deadline-ms 86400001 => deadline_millis: expected 0 to 86400000, got 86400001
 --seed -1 => -1
 --seed 18446744073709551616 => --seed
 --burn-in 9999999999999 => burn_in: expected 0 to | 9999999999999
@@ -69,6 +74,8 @@ run --robot x => --robot | 'x'
 run --robots 0..2 => --team
 run --team --robots 3..3 => --robots | FIRST below END
 run --team --share => --share | --team
+run --robots x --team => --robots | expected FIRST..END
+run --robot 1 --robots 0..2 --team => '--robot <ROBOT>' cannot be used with '--robots
 run --model no.toml => model file no.toml | No such file | wildfire, wildfire-sparse, wildfire-latent, wildfire-small
 run --model /dev/zero => model file /dev/zero | expected at most 16777216 bytes
 run --checkpoint /dev/zero => checkpoint /dev/zero: expected a regular file
@@ -189,6 +196,7 @@ fn a_server_that_does_not_fit_is_refused_with_what_is_missing() {
     check_against(
         "--reveal-model false",
         "run SERVER --world 1 => no such world | worlds 0 to 0
+run SERVER --robot 1 => robots: expected some of the world's 0..1, got 1..2
 run SERVER => does not reveal its model | --model FILE
 compare SERVER --policies coverage => comparing needs the hidden states | --publish-truth",
     );

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from environments import SMALL, assert_same, make, make_vec, no_warnings, serving
+from environments import SMALL, assert_same, impatient, make, make_vec, no_warnings, serving
 from pettingzoo.utils.conversions import parallel_to_aec
 
 import emberwatch
@@ -276,6 +276,8 @@ def test_robots_that_nobody_holds_hover(alone: Callable[..., Any]) -> None:
             assert info["n_missed"] == 0
             assert (seen["others"] == before).all() and before.sum() == 2 * 255
             assert (seen["team"] == seen["frame"]).all()
+        other = alone(instance, 2)
+        assert other.reset()[1] == info | {"n_visited": 0, "n_hits": 0}
 
 
 def test_a_late_path_is_not_flown_and_told(alone: Callable[..., Any]) -> None:
@@ -306,9 +308,11 @@ def test_a_belief_goes_through_the_steps_that_were_missed(alone: Callable[..., A
         assert info["n_missed"] == 2 and set(np.unique(ages)) == {2, 255}
 
 
-def test_slow_teammates_are_waited_for_beyond_the_timeout(alone: Callable[..., Any]) -> None:
+def test_slow_teammates_are_waited_for_beyond_the_timeout(
+    alone: Callable[..., Any], caplog: pytest.LogCaptureFixture
+) -> None:
     with serving(robots=2) as instance:
-        patient, slow = alone(instance, 0, timeout=0.1), alone(instance, 1)
+        patient, slow = alone(instance, 0), alone(instance, 1)
         patient.reset()
         slow.reset()
         waits = threading.Event()
@@ -317,10 +321,12 @@ def test_slow_teammates_are_waited_for_beyond_the_timeout(alone: Callable[..., A
             waits.wait(0.5)
             return slow.step([1, 1, 1, 1])
 
-        first, second = together([lambda: patient.step([3, 3, 3, 3]), late])
+        with impatient(patient, 0.1):
+            first, second = together([lambda: patient.step([3, 3, 3, 3]), late])
         assert first[4]["step"] == second[4]["step"] == 1
         assert first[4]["n_missed"] == second[4]["n_missed"] == 0
         assert first[4]["n_visited"] > 0 and second[4]["n_visited"] > 0
+        assert "world 0 waits for the paths of other robots that are held" in caplog.text
 
 
 def test_a_robot_is_taken_over_where_it_stands(alone: Callable[..., Any]) -> None:

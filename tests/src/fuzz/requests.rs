@@ -71,8 +71,8 @@ struct Siege {
     pending: Vec<(ClientId, PendingReply)>,
     /// The victim's lease, then the attackers' last, then the victim's in the shared world.
     leases: [u64; 4],
-    /// The attacker's step that waits.
-    attackers_step: Option<Ticket>,
+    /// The attacker's step that waits, and since when.
+    attackers_step: Option<(Ticket, Instant)>,
     /// The victim's step that waits in the shared world, and its path.
     shared_step: Option<(Ticket, Vec<u8>)>,
     /// The shared world as it must be.
@@ -174,10 +174,10 @@ impl Siege {
 
     fn step(&mut self, request: &StepRequest, body: &[u8]) -> bool {
         // One request at a time: with the next one it gives up what waits.
-        if let Some(given_up) = self.attackers_step.take() {
+        if let Some((given_up, _)) = self.attackers_step.take() {
             self.simulator.cancel_step(self.now, given_up);
         }
-        let body = self.from_present(request, body);
+        let body = self.body_from_present(request, body);
         let (before, mut payload) = (self.worlds(), Vec::new());
         let stepped = self
             .simulator
@@ -187,7 +187,7 @@ impl Siege {
             Stepped::Reply(reply) => reply,
             Stepped::Waits(ticket) => {
                 assert!(before == after, "a step that waits changed a world");
-                self.attackers_step = Some(ticket);
+                self.attackers_step = Some((ticket, self.now));
                 return true;
             }
         };
@@ -221,7 +221,7 @@ impl Siege {
     }
 
     /// Adds the present steps of the worlds of a step to those in its payload.
-    fn from_present(&self, request: &StepRequest, body: &[u8]) -> Vec<u8> {
+    fn body_from_present(&self, request: &StepRequest, body: &[u8]) -> Vec<u8> {
         let mut body = body.to_vec();
         let end = u64::from(request.first_robot) + u64::from(request.n_robots);
         let robots = request.first_robot as usize..end as usize;
@@ -372,7 +372,11 @@ impl Siege {
             self.victim_step(number) == steps[number],
             "the victim's step {number} differs"
         );
-        self.fly_shared();
+        match self.shared_step.take_if(|_| number % 2 == 1) {
+            // What is given up is never flown.
+            Some((ticket, _)) => self.simulator.cancel_step(self.now, ticket),
+            None => self.fly_shared(),
+        }
     }
 
     fn victim_step(&mut self, number: usize) -> (StepReply, Vec<u8>) {
@@ -417,11 +421,12 @@ impl Siege {
 
     /// Takes the answers to steps that waited, and checks that the shared world is as its own paths make it.
     fn check_shared(&mut self) {
-        let mut payload = Vec::new();
+        let (mut payload, mut waited) = (Vec::new(), Duration::ZERO);
+        let before = self.mirror.result().step;
         while let Some((ticket, reply)) = self.simulator.next_answer(&mut payload) {
             let status = check_answer(&reply, &payload);
-            if self.attackers_step == Some(ticket) {
-                self.attackers_step = None;
+            if let Some((_, since)) = self.attackers_step.take_if(|(own, _)| *own == ticket) {
+                waited = self.now - since;
                 continue;
             }
             let (waiting, path) = self.shared_step.take().expect("somebody waits for it");
@@ -432,6 +437,12 @@ impl Siege {
             assert_ne!(world, HOME, "the victim's world moved on its own");
         }
         self.check_shared_step(None);
+        let now = self.mirror.result();
+        let is_late = now.step > before && now.late & 2 != 0;
+        assert!(
+            !is_late || waited >= DEADLINE,
+            "the victim was not waited for"
+        );
     }
 
     /// Takes the step in the mirror that the shared world has taken, if any: with this path of the victim's, or none.

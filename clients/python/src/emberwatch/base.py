@@ -56,6 +56,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
         self._reveals = reveals
         #: Which robot of a world that others fly in; None: it is alone in its world.
         self._robot: Final = session.settings.robot
+        self._n_missed = 0
         self._answer: StepAnswer | None = None
         self._truth: NDArray[np.uint8] | None = None
         self._path: NDArray[np.intp] | None = None
@@ -85,11 +86,12 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
         else:
             drawn = draw_seed(self.np_random) if seed is None else seed
             answer = self._session.reset([0], [drawn])
-        self._path = None
+        self._path, self._n_missed = None, 0
         return answer
 
     def _update(self, observations: Observations, answer: StepAnswer) -> None:
         """Takes in a step, after those that passed unseen."""
+        self._n_missed = self._session.n_skipped + (answer.robots["n_moves"][0] == 0)
         for _ in range(self._session.n_skipped):
             observations.update(ONE_ROW, np.full_like(answer.frames, UNOBSERVED))
         observations.update(ONE_ROW, answer.frames)
@@ -108,8 +110,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
             name: getattr(getattr(result, part), name) for name, part in REPORTED.items()
         }
         if self._robot is not None:
-            stayed = (result.world.hovered | result.world.late) >> self._robot & 1
-            info["n_missed"] = self._session.n_skipped + stayed
+            info["n_missed"] = int(self._n_missed)
         if self._reveals:
             self._truth = truth = self._session.truth(answer)[0]
             info["truth"] = truth.copy()

@@ -7,6 +7,7 @@ process and used in a forked child, as Gymnasium's `AsyncVectorEnv` does.
 from __future__ import annotations
 
 import inspect
+import logging
 import warnings
 import weakref
 from collections.abc import Sequence
@@ -35,6 +36,8 @@ from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program, unused_instance
 from emberwatch.settings import Settings, WorldSpec, private_spec, running_spec
 from emberwatch.wire import StepAnswer, WorldResult
+
+_log: Final = logging.getLogger("emberwatch")
 
 # Seconds after its last use that a lease ends: learners may think long, and a dead holder is
 # noticed at once anyway. No other client uses the worlds of a private server.
@@ -147,6 +150,11 @@ class Session:
             if n_moved > 0:
                 self.n_skipped = n_moved - 1
                 return answer
+            _log.warning(
+                "world %d waits for the paths of other robots that are held; environments of one "
+                "world need a thread or a process each",
+                self._worlds.start,
+            )
 
     def truth(self, answer: StepAnswer) -> NDArray[np.uint8]:
         """The hidden states that belong to an answer, `(n_rows, H, W)`; a copy."""
