@@ -217,7 +217,9 @@ class Lease:
         return range(robots.start // n_robots, (robots.stop - 1) // n_robots + 1)
 
     def steps_of(self, robots: range) -> NDArray[np.uint64]:
-        """K of the worlds of some robots: of the next path to fly. To read and to write."""
+        """The next step k of the worlds of some robots, to read and to write."""
+        if robots is self.robots:
+            return self._steps
         worlds = self._worlds_of(robots)
         return self._steps[worlds.start - self.worlds.start :][: len(worlds)]
 

@@ -136,7 +136,6 @@ class Session:
             raise timed_out_before()
         robots = lease.robots if rows is None else lease.robots[rows.start : rows.stop]
         self.n_skipped = 0
-        before = int(lease.steps_of(robots)[0])
         while True:
             try:
                 return lease.step_moves(moves, robots, timeout=self.settings.timeout)
@@ -145,6 +144,7 @@ class Session:
             except EmberwatchError as error:
                 if error.code not in ("timeout", "late"):
                     raise
+            before = int(lease.steps_of(robots)[0])
             answer = self._look(lease, robots)
             n_moved = int(answer.worlds["step"][0]) - before
             if n_moved > 0:

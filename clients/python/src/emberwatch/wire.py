@@ -231,7 +231,15 @@ class StepAnswer:
             `(n_worlds, H, W)`. A copy of your own; write to it as you like.
     """
 
-    __slots__ = ("_shape", "first_robot", "frames", "robots", "simulation_nanos", "worlds")
+    __slots__ = (
+        "_payload",
+        "_shape",
+        "first_robot",
+        "frames",
+        "robots",
+        "simulation_nanos",
+        "worlds",
+    )
 
     def __init__(self, reply: StepReply, payload: bytearray, shape: Shape) -> None:
         n_worlds, n_robots, n_cells = reply.n_worlds, reply.n_robots, reply.height * reply.width
@@ -245,7 +253,7 @@ class StepAnswer:
         expected = head + n_frames * n_cells
         if len(payload) != expected:
             raise bad_answer(f"answer to step: expected {expected} bytes, got {len(payload)}")
-        self._shape = shape
+        self._payload, self._shape = payload, shape
         self.first_robot: int = reply.first_robot
         self.simulation_nanos: int = reply.simulation_nanos
         self.worlds: NDArray[np.void] = np.frombuffer(payload, WORLD_DTYPE, n_worlds)
@@ -283,9 +291,12 @@ class StepAnswer:
         return results
 
     def result(self, index: int = 0) -> StepResult:
+        """The results of one robot and its world; `index` counts from the first."""
         world = self._shape.n_worlds(self.first_robot, index + 1) - 1
+        offset = len(self.worlds) * WORLD.size + index * ROBOT.size
         return StepResult(
-            WorldResult(*self.worlds[world].item()), RobotResult(*self.robots[index].item())
+            WorldResult(*WORLD.unpack_from(self._payload, world * WORLD.size)),
+            RobotResult(*ROBOT.unpack_from(self._payload, offset)),
         )
 
 
