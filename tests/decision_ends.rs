@@ -9,7 +9,8 @@ use agent::acting::decider::{Assignment, Decider};
 use agent::acting::mission::prepare;
 use agent::config::AgentConfig;
 use agent::planning::policy::{EstimatorKind, PlannerKind};
-use agent::server::client::{self, Claim, Client, shape_of};
+use agent::server::client::{Claim, Client, shape_of};
+use agent::server::errors;
 use protocol::channels::{ChannelError, Instance};
 use protocol::decisions::{Reply, Request};
 use protocol::message::Status;
@@ -59,7 +60,7 @@ fn an_agent_renews_its_lease_when_a_third_of_it_has_passed_without_use() {
     let _thief = Client::acquire(&server.instance, &takeover(0..1)).expect("take over");
     decider.keep_alive(almost).expect("nothing is asked");
     let lost = decider.keep_alive(due).expect_err("the lease is lost");
-    let status = client::refusal(&lost).map(|(status, ..)| status);
+    let status = errors::refusal(&lost).map(|(status, ..)| status);
     assert_eq!(status, Some(Status::LeaseLost), "{lost:?}");
 }
 

@@ -1,10 +1,10 @@
 //! The real processes together: `emberwatch-server` and `emberwatch-agent` as a user runs them.
 //!
 //! `cargo build --workspace` first: cargo does not build another package's programs for a test.
-//! `harness` runs programs; `wire` speaks the protocol byte by byte, `python` lets the Python package speak
-//! it; `mirror` steps a published world again; `learner` decides and `attacker` annoys; every other module is a group of facts. Each test has an
-//! instance, a folder and a deadline of its own. `cargo test -p tests -- --ignored` adds the long run of the
-//! hostile clients, and what needs Python (`scripts/test` installs it).
+//! `harness` runs programs; `wire` speaks the protocol byte by byte, `python` lets the Python package speak it;
+//! `mirror` steps a published world again; `learner` decides and `attacker` annoys; every other module is a group of
+//! facts. Each test has an instance, a folder and a deadline of its own. `cargo test -p tests -- --ignored` adds the
+//! long run of the hostile clients, and what needs Python (`scripts/test` installs it).
 
 mod agent_beliefs;
 mod attacker;

@@ -134,7 +134,10 @@ impl PacedWorld {
         match flown {
             Ok(Some(_)) => {}
             // This process was not given the time: it goes on with the next step.
-            Err(ConnectionError::Refused { status, .. }) if status == Status::Late => {}
+            Err(ConnectionError::Refused {
+                status: Status::Late,
+                ..
+            }) => {}
             other => panic!("the world does not move: {other:?}"),
         }
         let now = self.client.observe(robots).expect("observe")[0].world;

@@ -63,7 +63,8 @@ fn fly(parts: &[Range<u32>], company: Company) -> (Vec<Vec<Vec<u8>>>, f64) {
 #[test]
 fn agents_of_a_team_fly_one_plan_whoever_flies_what() {
     let single = [0..1, 1..2, 2..3, 3..4];
-    let together = fly(&[0..4], Company::Team);
+    let all = 0..4;
+    let together = fly(std::slice::from_ref(&all), Company::Team);
     assert_eq!(fly(&single, Company::Team), together);
     assert_eq!(fly(&[0..1, 1..4], Company::Team), together);
     // One that plans for itself flies where others fly too.

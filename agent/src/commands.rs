@@ -17,7 +17,7 @@ pub use run::RunCommand;
 pub use train::TrainCommand;
 
 use agent::planning::policy;
-use agent::server::client::refusal;
+use agent::server::errors::refusal;
 use protocol::Model;
 use protocol::message::Status;
 use std::process::ExitCode;

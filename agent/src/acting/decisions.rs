@@ -6,7 +6,8 @@
 use crate::acting::decider::{Assignment, Decider};
 use crate::acting::mission::prepare;
 use crate::estimation::first_belief::first_belief;
-use crate::server::client::{is_outage, refusal, shape_of};
+use crate::server::client::shape_of;
+use crate::server::errors::{is_outage, refusal};
 use anyhow::{Result, ensure};
 use protocol::Model;
 use protocol::channels::{ChannelError, ipc_error};

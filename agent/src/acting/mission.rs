@@ -2,7 +2,9 @@
 
 use crate::config::AgentConfig;
 use crate::learning::learned::Learned;
-use crate::server::client::{refused, server_info};
+use crate::server::client::Claim;
+use crate::server::errors::refused;
+use crate::server::info::server_info;
 use anyhow::{Result, bail, ensure};
 use protocol::Model;
 use protocol::channels::Instance;
@@ -46,6 +48,14 @@ pub enum Company {
 impl Mission {
     pub(super) fn worlds(&self) -> Range<u32> {
         self.world..self.world.saturating_add(1)
+    }
+
+    pub(super) fn claim(&self, numbers: &Range<u32>) -> Claim {
+        Claim {
+            robots: numbers.clone(),
+            takeover: self.takeover,
+            time_to_live: None,
+        }
     }
 
     /// The numbers of its robots on a server.

@@ -10,10 +10,10 @@ use crate::planning::Plan;
 use crate::planning::policy::{EstimatorKind, Policy};
 use crate::planning::team::robot_seed;
 use crate::rollout::{self, Robot, Seen};
-use crate::server::client::{
-    Claim, Client, Observation, is_belief_left, is_late, refused, shape_of,
-};
+use crate::server::client::{Client, Observation, shape_of};
+use crate::server::errors::{is_late, refused};
 use crate::server::feed::Feed;
+use crate::server::info::is_belief_left;
 use crate::server::truth::TruthFeed;
 use anyhow::{Result, ensure};
 use protocol::connection::ConnectionError;
@@ -120,12 +120,7 @@ impl Pilot {
         policy: &Policy,
         prior: &Belief,
     ) -> Result<Self> {
-        let claim = Claim {
-            robots: numbers.clone(),
-            takeover: mission.takeover,
-            time_to_live: None,
-        };
-        let mut client = Client::acquire(&mission.instance, &claim)?;
+        let mut client = Client::acquire(&mission.instance, &mission.claim(numbers))?;
         client.share_frames(mission.company != Company::Alone);
         let team = client.info().n_robots;
         let (robots, first) = match mission.company {
@@ -142,15 +137,16 @@ impl Pilot {
             policy = policy.name,
             "acting"
         );
+        let config = &mission.config;
         let task = Task {
             model,
             shape: client.shape(),
             n_moves: client.info().n_moves,
             prior,
-            seed: robot_seed(mission.config.planner_seed(seed), first as usize),
+            seed: robot_seed(config.planner_seed(seed), first as usize),
             learned: &mission.learned,
         };
-        let agent = registry::agent(policy, &mission.config, task)?;
+        let agent = registry::agent(policy, config, task)?;
         let is_told = policy.estimator == EstimatorKind::Truth;
         Ok(Self {
             truth: is_told.then(|| open_truth(mission, &client)).transpose()?,

@@ -2,7 +2,8 @@
 
 use crate::acting::mission::Mission;
 use crate::acting::pilot::Pilot;
-use crate::server::client::{RETRY_INTERVAL, is_outage, refusal};
+use crate::server::errors::{is_outage, refusal};
+use crate::server::info::RETRY_INTERVAL;
 use anyhow::Result;
 use protocol::message::Status;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -34,9 +34,8 @@ pub fn plan_team(
             break;
         }
         let robot = turn % n_robots;
-        let others = visited.iter().enumerate();
-        let others = others.filter(|(other, _)| *other != robot);
-        let free = values.without(others.flat_map(|(_, cells)| cells.iter().copied()));
+        let others = visited.iter().enumerate().filter(|it| it.0 != robot);
+        let free = values.without(others.flat_map(|it| it.1.iter().copied()));
         let plan = planner.plan(&PlanningProblem {
             start: starts[robot],
             n_moves,

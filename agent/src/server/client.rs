@@ -1,8 +1,9 @@
 //! The agent's end of the wire: acquire robots, fly paths, receive frames.
 
+use crate::server::errors::refused;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
-use protocol::channels::{ChannelError, Instance};
+use protocol::channels::Instance;
 use protocol::connection::{ConnectionError, StepAnswer, unexpected, worlds_of};
 use protocol::control::{
     LeftPart, MAX_BELIEF_PART, Reply, Request, ServerInfo, WorldInfo, WorldSeed,
@@ -16,16 +17,13 @@ use protocol::{Cell, Connection, Frame, Move, Shape};
 use std::fmt::Display;
 use std::ops::Range;
 use std::os::fd::BorrowedFd;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// How this program names itself to servers.
-const CLIENT_NAME: &str = concat!("emberwatch-agent ", env!("CARGO_PKG_VERSION"));
+pub const CLIENT_NAME: &str = concat!("emberwatch-agent ", env!("CARGO_PKG_VERSION"));
 
 /// How long a step may take, beside the server's deadline.
 pub const STEP_TIMEOUT: Duration = Duration::from_secs(5);
-
-/// How long to wait between attempts to reach a server that is away.
-pub const RETRY_INTERVAL: Duration = Duration::from_millis(200);
 
 /// How long anything else may take; resets simulate the burn-in of all their worlds.
 pub const CONTROL_TIMEOUT: Duration = Duration::from_secs(120);
@@ -450,93 +448,6 @@ fn garbled(what: &'static str, problem: &dyn Display) -> ConnectionError {
     ConnectionError::Garbled {
         what,
         problem: problem.to_string(),
-    }
-}
-
-/// What a server says of itself, from a connection of its own.
-pub fn server_info(instance: &Instance) -> Result<ServerInfo, ConnectionError> {
-    let connection = Connection::open(instance, CLIENT_NAME, STEP_TIMEOUT)?;
-    Ok(connection.info().clone())
-}
-
-/// Waits until an instance has a server, and says so once if that is not at once; returns whether it has
-/// one: not once `is_over`.
-pub fn wait_for_server(
-    instance: &Instance,
-    limit: Duration,
-    is_over: impl Fn() -> bool,
-) -> Result<bool, ConnectionError> {
-    let (start, mut is_told) = (Instant::now(), false);
-    while !is_over() {
-        match server_info(instance) {
-            Ok(_) => return Ok(true),
-            Err(error) if is_away(&error) && start.elapsed() < limit => {
-                if !is_told {
-                    tracing::info!("{error}; waiting for it, {limit:?} at most");
-                }
-                is_told = true;
-            }
-            Err(error) => return Err(error),
-        }
-        let left = limit.saturating_sub(start.elapsed());
-        std::thread::sleep(RETRY_INTERVAL.min(left));
-    }
-    Ok(false)
-}
-
-/// Whether a server is away and may come.
-pub fn is_away(error: &ConnectionError) -> bool {
-    match error {
-        ConnectionError::ServerGone { .. } | ConnectionError::Timeout { .. } => true,
-        ConnectionError::Channel(channel) => matches!(channel, ChannelError::NoServer { .. }),
-        _ => false,
-    }
-}
-
-/// Whether something failed because a server is away that may come back.
-pub fn is_outage(error: &anyhow::Error) -> bool {
-    error.downcast_ref().is_some_and(is_away)
-}
-
-/// Status, detail and message, if something failed because a server refused.
-pub fn refusal(error: &anyhow::Error) -> Option<(Status, u64, &str)> {
-    match error.downcast_ref()? {
-        ConnectionError::Refused {
-            status,
-            detail,
-            message,
-        } => Some((*status, *detail, message)),
-        _ => None,
-    }
-}
-
-/// Whether something failed because a world moved on before a path for it came.
-pub fn is_late(error: &anyhow::Error) -> bool {
-    refusal(error).is_some_and(|(status, ..)| status == Status::Late)
-}
-
-/// The error of what is refused before a server is asked.
-pub fn refused(status: Status, detail: u64, message: String) -> ConnectionError {
-    ConnectionError::Refused {
-        status,
-        detail,
-        message,
-    }
-}
-
-/// Whether a belief of a kind was left for a robot's agent about its world as it stands; needs no lease.
-pub fn is_belief_left(
-    instance: &Instance,
-    robot: u32,
-    kind: &str,
-) -> Result<bool, ConnectionError> {
-    let mut connection = Connection::open(instance, CLIENT_NAME, STEP_TIMEOUT)?;
-    let request = Request::Belief { robot, offset: 0 };
-    match connection.control(&request, STEP_TIMEOUT) {
-        Ok(Reply::Belief { info, .. }) => Ok(info.kind == kind),
-        Ok(other) => Err(unexpected("belief", &other)),
-        Err(ConnectionError::Refused { .. }) => Ok(false),
-        Err(error) => Err(error),
     }
 }
 

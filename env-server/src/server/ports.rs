@@ -357,8 +357,8 @@ fn check_shared_memory(config: &PortConfig) -> Result<()> {
     ensure!(
         needed <= free,
         "shared memory: expected {} MiB free in {SHARED_MEMORY}, got {} MiB; free some, give the container more \
-         (docker: --shm-size), or serve fewer worlds, fewer \
-         robots or a smaller grid",
+         (docker: --shm-size), or serve fewer worlds or robots, or a smaller \
+         grid",
         needed.div_ceil(1 << 20),
         free >> 20
     );

@@ -1,0 +1,45 @@
+//! What the errors of connections mean to an agent.
+
+use protocol::channels::ChannelError;
+use protocol::connection::ConnectionError;
+use protocol::message::Status;
+
+/// Whether a server is away and may come.
+pub fn is_away(error: &ConnectionError) -> bool {
+    match error {
+        ConnectionError::ServerGone { .. } | ConnectionError::Timeout { .. } => true,
+        ConnectionError::Channel(channel) => matches!(channel, ChannelError::NoServer { .. }),
+        _ => false,
+    }
+}
+
+/// Whether something failed because a server is away that may come back.
+pub fn is_outage(error: &anyhow::Error) -> bool {
+    error.downcast_ref().is_some_and(is_away)
+}
+
+/// Status, detail and message, if something failed because a server refused.
+pub fn refusal(error: &anyhow::Error) -> Option<(Status, u64, &str)> {
+    match error.downcast_ref()? {
+        ConnectionError::Refused {
+            status,
+            detail,
+            message,
+        } => Some((*status, *detail, message)),
+        _ => None,
+    }
+}
+
+/// Whether something failed because a world moved on before a path for it came.
+pub fn is_late(error: &anyhow::Error) -> bool {
+    refusal(error).is_some_and(|(status, ..)| status == Status::Late)
+}
+
+/// The error of what is refused before a server is asked.
+pub fn refused(status: Status, detail: u64, message: String) -> ConnectionError {
+    ConnectionError::Refused {
+        status,
+        detail,
+        message,
+    }
+}
