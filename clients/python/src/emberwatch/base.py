@@ -91,7 +91,9 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
 
     def _update(self, observations: Observations, answer: StepAnswer) -> None:
         """Takes in a step, after those that passed unseen."""
-        self._n_missed = self._session.n_skipped + (answer.robots["n_moves"][0] == 0)
+        if self._robot is not None:
+            stayed = int(answer.robots["n_moves"][0]) == 0
+            self._n_missed = self._session.n_skipped + stayed
         for _ in range(self._session.n_skipped):
             observations.update(ONE_ROW, np.full_like(answer.frames, UNOBSERVED))
         observations.update(ONE_ROW, answer.frames)
@@ -110,7 +112,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
             name: getattr(getattr(result, part), name) for name, part in REPORTED.items()
         }
         if self._robot is not None:
-            info["n_missed"] = int(self._n_missed)
+            info["n_missed"] = self._n_missed
         if self._reveals:
             self._truth = truth = self._session.truth(answer)[0]
             info["truth"] = truth.copy()
