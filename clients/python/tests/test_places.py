@@ -1,6 +1,7 @@
 """Where a client connects: limits, instance names, and the directory of the channels."""
 
 import errno
+import fcntl
 import os
 import subprocess
 import sys
@@ -224,6 +225,16 @@ for number in range(1, 200):
     command = [sys.executable, "-c", code, str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert done.stdout == "done\n", done.stderr
+
+
+def test_a_lock_that_is_given_up_leaves_no_file_open(tmp_path: Path) -> None:
+    with (tmp_path / "lock").open("wb") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        expected = fails("channel", match="expected the lock within 0.01 s")
+        with expected as raised, turn_module.turn(tmp_path, 0.01):
+            pass
+    given_up = [lock for lock in turn_module._locks if lock.name == str(tmp_path / "lock")]
+    assert raised.value and all(lock.closed for lock in given_up)
 
 
 def test_an_unreadable_process_counts_as_living(monkeypatch: pytest.MonkeyPatch) -> None:

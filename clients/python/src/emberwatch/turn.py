@@ -110,6 +110,7 @@ def _wait(path: Path, limit: float) -> FileIO | None:
                         return None
                 # Not ">": "not a number" would never end.
                 if not now - start < limit:
+                    lock.close()
                     problem = f"expected the lock within {limit} s, got it held by pid {holder}"
                     raise EmberwatchError(f"{path}: {problem}", "channel") from None
                 time.sleep(_INTERVAL)
