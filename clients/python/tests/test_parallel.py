@@ -11,7 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from environments import SMALL, assert_same, impatient, make, make_vec, no_warnings, serving
+from environments import (
+    OBJECTIVE,
+    SMALL,
+    assert_same,
+    impatient,
+    make,
+    make_vec,
+    no_warnings,
+    serving,
+)
 from pettingzoo.utils.conversions import parallel_to_aec
 
 import emberwatch
@@ -383,6 +392,16 @@ def test_private_worlds_and_vectors_have_no_single_robot() -> None:
     with serving(robots=2) as instance:
         with pytest.raises(InvalidArgumentError, match="robot: expected None, as a vector"):
             make_vec(2, instance=instance, robot=0)
+
+
+def test_decisions_are_for_worlds_of_one_robot() -> None:
+    words = "expected worlds of one robot, as an agent that serves decisions flies one"
+    with serving(robots=2) as instance:
+        for keywords in ({"robots": 2}, {"instance": instance, "robot": 0}):
+            with pytest.raises(InvalidArgumentError, match=words):
+                make(OBJECTIVE, **keywords)
+        with pytest.raises(InvalidArgumentError, match=words):
+            make_vec(2, OBJECTIVE, instance=instance)
 
 
 def test_rows_of_a_world_are_reset_together() -> None:

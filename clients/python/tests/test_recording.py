@@ -203,12 +203,12 @@ def program(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
 def test_what_a_recorder_wrote_is_what_the_server_answered(
     path: Path, server: Callable[..., Server]
 ) -> None:
-    started = server(worlds=2, publish_truth="true")
+    started = server(worlds=2, robots=2, publish_truth="true")
     flags = ("--instance", started.instance, "--out", path, "--truth", "--steps", 20)
     with program("record", *flags) as recorder:
         assert eventually(lambda: started.status().n_observers == 1)
-        lease = started.connect().acquire(1)
-        paths = np.random.default_rng(0).integers(0, 4, (20, 6))
+        lease = started.connect().acquire(2, 2)
+        paths = np.random.default_rng(0).integers(0, 4, (20, 2, 6))
         answers = [lease.step(moves) for moves in paths]
         assert recorder.wait(PATIENCE) == 0
     samples = [record.sample for record in recording.read(path, world=1)]
@@ -218,9 +218,11 @@ def test_what_a_recorder_wrote_is_what_the_server_answered(
     assert set(range(1, 21)) <= set(frames)
     for step, (answer, moves) in enumerate(zip(answers, paths, strict=True), 1):
         frame_ = frames[step]
-        (robot,) = frame_.robots
-        assert (frame_.result, robot.result) == answer.result() and frame_.n_lost == 0
-        assert (robot.frame == answer.frames[0]).all() and (robot.path == moves).all()
+        assert len(frame_.robots) == 2 and frame_.n_lost == 0
+        for index, robot in enumerate(frame_.robots):
+            assert (frame_.result, robot.result) == answer.result(index)
+            assert (robot.frame == answer.frames[index]).all()
+            assert (robot.path == moves[index]).all()
         n_fires = int((truths[frame_.result.step].states == 2).sum())
         assert n_fires == frame_.result.n_target_cells
 

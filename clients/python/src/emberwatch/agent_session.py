@@ -61,12 +61,11 @@ class AgentSession(Session):
             raise InvalidArgumentError(
                 f"render_mode: expected at most {wire.FRAME_BUFFER} worlds, got {n_worlds}"
             )
+        if settings.robot is not None or (settings.robots or 1) > 1:
+            raise _no_team()
         super().__init__(settings, n_worlds)
-        if self.spec.n_robots > 1 or settings.robot is not None:
-            raise InvalidArgumentError(
-                "robots: expected worlds of one robot, as an agent decides for one in each, got "
-                f"{self.spec.n_robots}"
-            )
+        if self.spec.n_robots > 1:
+            raise _no_team()
         if self.spec.model is None:
             raise InvalidArgumentError("model: expected one, as the server does not reveal its own")
         n_objectives = self.spec.model.n_states + 1
@@ -220,6 +219,12 @@ class AgentSession(Session):
             return error
         kind = LeaseLostError if code == _LEASE_LOST else ServerGoneError
         return kind(f"{error}: {words}")
+
+
+def _no_team() -> InvalidArgumentError:
+    return InvalidArgumentError(
+        "robots, robot: expected worlds of one robot, as an agent that serves decisions flies one"
+    )
 
 
 def _world(made: Decision) -> bytes:

@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=_NAME,
-        description="Make a film or a still of a recording: what is hidden, what the robot saw, "
+        description="Make a film or a still of a recording: what is hidden, what the robots saw, "
         "and what the known model's filter makes of it.",
     )
     add = parser.add_argument
