@@ -70,8 +70,11 @@ run --wait=-1 => --wait | expected seconds
 run --instance a/b => instance name | "a/b"
 run --steps -1 => -1
 run --world x => --world | 'x'
-run --robots x --team => --robots | expected FIRST..END
+run --robot x => --robot | 'x'
 run --robots 0..2 => --team
+run --team --robots 3..3 => --robots | FIRST below END
+run --team --share => --share | --team
+run --robots x --team => --robots | expected FIRST..END
 run --robot 1 --robots 0..2 --team => '--robot <ROBOT>' cannot be used with '--robots
 run --model no.toml => model file no.toml | No such file | wildfire, wildfire-sparse, wildfire-latent, wildfire-small
 run --model /dev/zero => model file /dev/zero | expected at most 16777216 bytes
@@ -109,6 +112,9 @@ compare --seeds 8..0 => --seeds | FIRST below END
 compare --seeds 3 => --seeds | FIRST..END
 compare --seeds 0..100001 => --seeds | 100000
 compare --steps 0 => --steps | 1..=10000000
+compare --robots 0 => --robots | 1..=64
+compare --robots 1,65 => --robots | 1..=64
+compare --team apart => --team | alone, shared, joint, oracle
 compare --policies ash => policy: expected one of random_walk | got "ash"
 compare --policies coverage,coverage => each name once | got "coverage" twice
 compare --baseline ash => --baseline | expected one of | got "ash"

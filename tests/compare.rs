@@ -107,6 +107,49 @@ fn a_comparison_repeats_to_the_bit_on_any_server() {
 }
 
 #[test]
+fn teams_meet_the_worlds_of_one_robot_and_one_robot_is_each_team() {
+    let folder = TempDir::new().expect("a folder");
+    let path = |name: &str| folder.path().join(name);
+    let lively = "--model wildfire-small --height 12 --width 14 --moves 8 --burn-in 300";
+    let alone = compare_to(&path("one.csv"), &[lively, "--policies beam_exploit"]);
+    let teams = "--robots 1,3 --team alone,shared,joint,oracle";
+    let rows = compare_to(&path("teams.csv"), &[lively, teams]);
+    assert_eq!(rows.len(), 2 * 4 * 2, "{rows:?}");
+    // Robots and team stand in columns 10 and 11.
+    let of = |robots: &str, team: &str| -> Vec<Vec<String>> {
+        let rows = rows.iter().filter(|row| row[10..12] == [robots, team]);
+        rows.cloned().collect()
+    };
+    for team in ["alone", "shared", "joint"] {
+        let expected = alone.iter().cloned().map(|mut row| {
+            row[11] = team.into();
+            row
+        });
+        assert_eq!(of("1", team), expected.collect::<Vec<_>>());
+        let fire_cells = of("3", team).into_iter().map(|row| row[7].clone());
+        let expected = alone.iter().map(|row| row[7].clone());
+        assert_eq!(fire_cells.collect::<Vec<_>>(), expected.collect::<Vec<_>>());
+    }
+    assert!(of("3", "oracle").iter().all(|row| row[0] == "oracle_beam"));
+    let distinct = |team: &str| -> f64 {
+        let cells = of("3", team).into_iter();
+        cells
+            .map(|row| row[5].parse::<f64>().expect("a number"))
+            .sum()
+    };
+    assert!(distinct("joint") > distinct("alone"), "{rows:?}");
+    let server = Server::start(&format!(
+        "{lively} --robots 3 --publish-truth --coverage client"
+    ));
+    let flags = format!("--team joint --instance {}", server.instance.name());
+    let joint = compare_to(&path("joint.csv"), &[&flags]);
+    assert!(
+        joint.iter().all(|row| row[10..12] == ["3", "joint"]),
+        "{joint:?}"
+    );
+}
+
+#[test]
 fn runs_with_one_seed_act_alike() {
     let flags = "--steps 20 --shooting-samples 32 --beam-width 5";
     for policy in [

@@ -34,6 +34,7 @@ mod restart;
 mod security;
 mod siege;
 mod snapshots;
+mod team_agents;
 mod teams;
 mod training;
 mod wire;

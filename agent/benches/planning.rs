@@ -4,6 +4,7 @@
 
 use agent::estimation::belief::{Belief, EntropyKind};
 use agent::estimation::{BayesFilter, Correlations, Estimator, SpatialFilter};
+use agent::planning::team::{ROUNDS, plan_team};
 use agent::planning::{
     BeamSearch, CellValues, Objective, Planner, PlanningProblem, RandomWalk, Shooting, Target,
 };
@@ -84,6 +85,22 @@ fn planners(c: &mut Criterion) {
     }
 }
 
+fn teams(c: &mut Criterion) {
+    let values = Objective::new(Target::State(2)).values(settled(filter()).belief());
+    for n_robots in [1, 4, 8] {
+        let starts: Vec<Cell> = (0..n_robots)
+            .map(|robot| shape().cell(517 * robot + 100))
+            .collect();
+        let (mut planner, mut step) = (BeamSearch::default(), 0);
+        c.bench_function(&format!("one plan for {n_robots} robots"), |b| {
+            b.iter(|| {
+                step += 1;
+                plan_team(&mut planner, &values, &starts, N_MOVES, (1, step), ROUNDS)
+            });
+        });
+    }
+}
+
 fn estimators(c: &mut Criterion) {
     let mut filter = settled(filter());
     let spatial = SpatialFilter::new(self::filter(), 2, Correlations::default());
@@ -104,5 +121,5 @@ fn estimators(c: &mut Criterion) {
     });
 }
 
-criterion_group!(benches, planners, estimators);
+criterion_group!(benches, planners, teams, estimators);
 criterion_main!(benches);

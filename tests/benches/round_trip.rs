@@ -11,6 +11,7 @@ use protocol::control::{Reply, Request};
 use protocol::message::{Operation, StepRequest};
 use protocol::payload::write_step_body;
 use std::process::{Child, Command};
+use std::sync::Barrier;
 use std::time::{Duration, Instant};
 
 const TIMEOUT: Duration = Duration::from_secs(20);
@@ -167,15 +168,19 @@ fn main() {
 
 /// Steps of one world whose robots have a client each.
 fn report_barrier(instance: &Instance, team: u32, n_steps: usize) {
-    let robots = (0..team).map(|robot| Stepper::new(instance, robot, 1));
-    let mut steppers: Vec<Stepper> = robots.collect();
-    let mut last = steppers.pop().expect("robots");
+    let all_hold_one = Barrier::new(team as usize);
     std::thread::scope(|scope| {
-        for mut stepper in steppers {
-            let n_steps = n_steps + n_steps / 10;
-            scope.spawn(move || (0..n_steps).for_each(|_| _ = stepper.step()));
+        for robot in 1..team {
+            let all_hold_one = &all_hold_one;
+            scope.spawn(move || {
+                let mut stepper = Stepper::new(instance, robot, 1);
+                all_hold_one.wait();
+                (0..n_steps + n_steps / 10).for_each(|_| _ = stepper.step());
+            });
         }
-        last.report(&format!("{team} robots of {team} clients"), n_steps);
+        let mut stepper = Stepper::new(instance, 0, 1);
+        all_hold_one.wait();
+        stepper.report(&format!("{team} robots of {team} clients"), n_steps);
     });
 }
 

@@ -84,7 +84,7 @@ impl WorldFlags {
             None => {
                 check(&self.grid.check()?)?;
                 let mut arguments = self.server_arguments(needs_scouts);
-                arguments.extend(["--robots".into(), n_robots.unwrap_or(1).to_string()]);
+                arguments.extend(robot_arguments(n_robots.unwrap_or(1)));
                 let server = OwnServer::start(self.server.clone(), &arguments)?;
                 (server.instance().clone(), Some(server))
             }
@@ -119,6 +119,17 @@ impl WorldFlags {
         arguments.extend(rest.map(String::from));
         arguments
     }
+}
+
+/// The flags of a server with so many robots a world. Robots with one start and one belief would fly one path for good,
+/// so several start at random cells.
+fn robot_arguments(n_robots: u32) -> Vec<String> {
+    let robots = ["--robots".to_owned(), n_robots.to_string()];
+    let start = ["--start", "random"].iter().filter(|_| n_robots > 1);
+    robots
+        .into_iter()
+        .chain(start.map(|text| (*text).into()))
+        .collect()
 }
 
 impl GridFlags {

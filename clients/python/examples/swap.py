@@ -31,21 +31,21 @@ def main() -> None:
         if frame.result.step >= args.steps:
             break
     lease = client.acquire(takeover=True)
-    taken = lease.observe().result()
+    taken = lease.observe().result().world
     print(f"the Rust agent flew to k = {taken.step}; Python takes over")
 
     generator = np.random.default_rng(0)
     rewards = [
-        lease.step(generator.integers(4, size=client.info.n_moves)).result().reward
+        lease.step(generator.integers(4, size=client.info.n_moves)).result().world.reward
         for _ in range(args.steps)
     ]
-    given = lease.observe().result()
+    given = lease.observe().result().world
     print(f"Python flew to k = {given.step}, {np.mean(rewards):.2f} fires a step; hands back")
     print(f"the first agent ended with code {first.wait(timeout=20)} (3: lease lost)")
     lease.release()
 
     subprocess.run([*agent, "--steps", str(args.steps)], check=True, stderr=subprocess.DEVNULL)
-    last = client.observe().result()
+    last = client.observe().result().world
     print(f"the second Rust agent flew from k = {given.step} to k = {last.step}")
     assert last.step == given.step + args.steps
     client.close()

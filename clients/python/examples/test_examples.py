@@ -30,6 +30,12 @@ EXAMPLES = [
         r"always fire +[1-9]\S* fires found a step\n(.*\n)*PPO +\d",
     ),
     ("rllib_ppo.py", "--iterations 1 --batch 500", r"iteration 0: 500\S* steps, reward of an epi"),
+    ("rllib_team.py", "--iterations 1 --batch 500", r"iteration 0: 500\S* moves, reward of .* \d"),
+    (
+        "supersuit_team.py",
+        "--total-steps 400 --worlds 2 --steps 5",
+        r"ppo_marginal: \d\S* \+- \S+ a step on 8 worlds\nvisited twice: \d",
+    ),
     ("minari_dataset.py", "--episodes 2 --steps 20", r"2 episodes, 40 steps"),
     ("swap.py", "--steps 50", r"Python takes over\n(.*\n)*.*code 3 .*\n.*second Rust agent flew"),
     ("live_plot.py", "--private --frames 60 --out OUT/plot.png", ""),

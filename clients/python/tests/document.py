@@ -51,17 +51,18 @@ def examples() -> list[dict[str, Any]]:
     return [json.loads(line) for block in blocks for line in block.splitlines()]
 
 
-def worked_example(name: str) -> tuple[bytes, dict[str, str]]:
-    """A message of section 12: its bytes, and the values that stand beside them."""
+def worked_example(name: str) -> tuple[bytes, list[tuple[str, str]]]:
+    """A message of section 12: its bytes, and the names and values that stand beside them."""
     found = re.search(rf"^```hex {name}\n(.*?)^```", PROTOCOL, re.MULTILINE | re.DOTALL)
     assert found
-    message, values = b"", {}
+    message, values = b"", list[tuple[str, str]]()
     for line in found[1].splitlines():
         numbers, _, words = line.partition("  | ")
         offset, _, text = numbers.partition("  ")
         assert int(offset, 16) == len(message), line
         message += bytes.fromhex(text)
-        values |= dict(word.split(" = ") for word in words.split(", "))
+        pairs = (word.partition(" = ") for word in words.split(", "))
+        values += [(name, value) for name, _, value in pairs]
     return message, values
 
 

@@ -83,7 +83,7 @@ def test_paths_flown_again_score_the_same_to_the_digit(
         recorder.wait(20)
     samples = (record.sample for record in recording.read(file))
     frames = [sample for sample in samples if isinstance(sample, emberwatch.Frame)]
-    paths = {(frame.result.seed, frame.result.step): frame.path for frame in frames}
+    paths = {(frame.result.seed, frame.result.step): frame.robots[0].path for frame in frames}
     steps = iter(range(1, 13))
 
     def again(_: Any) -> NDArray[np.int64]:

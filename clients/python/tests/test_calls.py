@@ -38,7 +38,7 @@ def test_every_call_has_a_timeout(server: Start) -> None:
             call()
         assert started.instance in str(raised.value)
     started.wake_up()
-    assert client.observe().result().step == 0
+    assert client.observe().result().world.step == 0
 
 
 @pytest.mark.parametrize("timeout", [0, -1, float("nan"), -float("inf")])
@@ -49,7 +49,7 @@ def test_a_timeout_that_is_no_time_has_passed_already(server: Start, timeout: fl
     with pytest.raises(errors.RequestTimeoutError):
         client.observe(timeout=timeout)
     started.wake_up()
-    assert client.observe(timeout=float("inf")).result().step == 0
+    assert client.observe(timeout=float("inf")).result().world.step == 0
 
 
 def test_a_signal_that_is_handled_does_not_end_a_step(server: Start) -> None:
@@ -70,7 +70,7 @@ def test_a_signal_that_is_handled_does_not_end_a_step(server: Start) -> None:
     thread = threading.Thread(target=disturb)
     thread.start()
     try:
-        assert lease.step([3] * 6, timeout=PATIENCE).result().step == 1
+        assert lease.step([3] * 6, timeout=PATIENCE).result().world.step == 1
     finally:
         thread.join()
         signal.signal(signal.SIGUSR1, before)
@@ -117,7 +117,7 @@ def child():
     observer.close()
     program.stop()
     with Client(instance) as own:
-        assert own.observe().result().step == 1
+        assert own.observe().result().world.step == 1
     if how == "sys.exit":
         sys.exit(5)
     if how == "os._exit":
@@ -136,7 +136,7 @@ else:
         child()
         sys.exit(9)
     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-assert lease.step([3] * 6).result().step == 2
+assert lease.step([3] * 6).result().world.step == 2
 assert observer.receive(5) is not None
 print("child", code)
 """
@@ -182,9 +182,9 @@ def test_ctrl_c_ends_a_blocked_step_and_the_client_goes_on(server: Start) -> Non
     thread.join()
     started.wake_up()
     # `raised` still holds the traceback, as an `except` block does.
-    before = client.observe().result().step
+    before = client.observe().result().world.step
     assert raised is not None
-    assert lease.step([3] * 6).result().step == before + 1
+    assert lease.step([3] * 6).result().world.step == before + 1
 
 
 def test_a_client_may_be_used_while_its_error_is_handled(server: Start) -> None:
@@ -196,5 +196,5 @@ def test_a_client_may_be_used_while_its_error_is_handled(server: Start) -> None:
         lease.step([3] * 6, timeout=0.05)
     except errors.RequestTimeoutError:
         started.wake_up()
-        assert client.observe().result().step in (0, 1)
+        assert client.observe().result().world.step in (0, 1)
         assert client.status().pid == started.program.pid

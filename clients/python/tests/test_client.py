@@ -3,6 +3,7 @@
 import gc
 import os
 import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -58,16 +59,18 @@ def test_a_hidden_model_is_none(server: Start) -> None:
 def test_a_step_moves_the_robot_and_the_world(server: Start) -> None:
     lease = server(seed=11).connect().acquire()
     (start,) = lease.start
-    assert (start.step, start.seed, start.robot) == (0, 11, (0, 0))
+    assert (start.step, start.seed, start.robots) == (0, 11, ((0, 0),))
     # up (off the grid), down, down, right, right, left
     answer = lease.step([0, 1, 1, 3, 3, 2])
-    result = answer.result()
-    assert (result.step, result.seed, result.row, result.col) == (1, 11, 2, 1)
-    assert (answer.first_world, answer.frames.shape) == (0, (1, 5, 7))
+    world, robot = answer.result()
+    assert (world.step, world.seed, robot.start, robot.cell) == (1, 11, (0, 0), (2, 1))
+    assert (answer.first_robot, answer.frames.shape) == (0, (1, 5, 7))
     visited = {(0, 0), (1, 0), (2, 0), (2, 1), (2, 2)}
     seen = {(int(row), int(col)) for row, col in np.argwhere(answer.frames[0] != 255)}
-    assert seen == visited and result.n_visited == 5
-    assert (result.coverage, result.terminated, result.truncated) == (1, 0, 0)
+    assert seen == visited and world.n_visited == robot.n_visited == 5
+    assert (robot.coverage, robot.n_moves) == (1, 6)
+    assert (world.hovered, world.late, world.terminated, world.truncated) == (0, 0, 0, 0)
+    assert world.reward == robot.reward == robot.marginal
     assert answer.simulation_nanos > 0
 
 
@@ -75,7 +78,7 @@ def test_paths_may_be_integers_of_any_type(server: Start) -> None:
     lease = server(worlds=2).connect().acquire(0, 2)
     given = [paths(2).astype(kind) for kind in ("i1", "u1", "i2", "u4", "i8", "u8")]
     for k, moves in enumerate([*given, paths(2).tolist(), tuple(map(tuple, paths(2)))], start=1):
-        assert lease.step(moves).result(1).step == k
+        assert lease.step(moves).result(1).world.step == k
 
 
 def test_a_batch_equals_single_steps(server: Start) -> None:
@@ -85,11 +88,12 @@ def test_a_batch_equals_single_steps(server: Start) -> None:
         moves = paths(3, seed=k)
         batch = together.step(moves)
         for world in range(3):
-            single = alone.step(moves[world], worlds=range(world, world + 1))
-            assert single.first_world == world
+            single = alone.step(moves[world], robots=range(world, world + 1))
+            assert single.first_robot == world
             assert single.result() == batch.result(world)
             assert (single.frames[0] == batch.frames[world]).all()
-    assert [tuple(record)[:-1] for record in batch.results] == [batch.result(i) for i in range(3)]
+    results = [(tuple(record["world"]), tuple(record["robot"])) for record in batch.results]
+    assert results == [batch.result(i) for i in range(3)]
 
 
 def test_observing_repeats_the_last_answer(server: Start) -> None:
@@ -100,7 +104,7 @@ def test_observing_repeats_the_last_answer(server: Start) -> None:
         assert (again.results == answer.results).all()
         assert (again.frames == answer.frames).all()
     before = started.connect().observe(0)
-    assert before.result().step == 0 and (before.frames == 255).all()
+    assert before.result().world.step == 0 and (before.frames == 255).all()
 
 
 def test_an_answer_is_a_copy(server: Start) -> None:
@@ -117,21 +121,21 @@ def test_a_full_frame_is_seen_when_asked_for(server: Start) -> None:
     lease = server(coverage="client").connect().acquire()
     assert (lease.step(paths(1)).frames == 255).any()
     full = lease.step(paths(1), full=True)
-    assert (full.frames != 255).all() and full.result().coverage == 2
+    assert (full.frames != 255).all() and full.result().robot.coverage == 2
 
 
 def test_a_reset_begins_the_episode_of_its_seed(server: Start) -> None:
     lease = server(worlds=3).connect().acquire(0, 3)
     lease.step(paths(3))
     worlds = lease.reset([7, 2**64 - 1, None])
-    assert [(w.world, w.step, w.episode, w.robot) for w in worlds] == [
-        (i, 0, 1, (0, 0)) for i in range(3)
+    assert [(w.world, w.step, w.episode, w.robots) for w in worlds] == [
+        (i, 0, 1, ((0, 0),)) for i in range(3)
     ]
     assert [w.seed for w in worlds][:2] == [7, 2**64 - 1] and worlds[2].seed < 2**53
     first = lease.step(paths(3))
     again = lease.reset([7], worlds=[0])
     assert [w.world for w in again] == [0]
-    assert (lease.step(paths(3)[0], worlds=range(1)).frames[0] == first.frames[0]).all()
+    assert (lease.step(paths(3)[0], robots=range(1)).frames[0] == first.frames[0]).all()
     with pytest.raises(InvalidArgumentError, match="expected 3, got 2"):
         lease.reset([1, 2])
 
@@ -144,10 +148,10 @@ def test_the_next_client_goes_on_where_the_last_stopped(server: Start) -> None:
     with started.connect().acquire(1) as lease:
         (start,) = lease.start
         result = last.result()
-        assert (start.step, start.robot) == (3, (result.row, result.col))
+        assert (start.step, start.robots) == (3, (result.robot.cell,))
         resumed = lease.observe()
         assert resumed.result() == result and (resumed.frames == last.frames).all()
-        assert lease.step(paths(1)).result().step == 4
+        assert lease.step(paths(1)).result().world.step == 4
 
 
 def test_a_takeover_ends_the_lease_of_the_former_holder(server: Start, script: Run) -> None:
@@ -161,7 +165,7 @@ def test_a_takeover_ends_the_lease_of_the_former_holder(server: Start, script: R
         started.instance,
     )
     assert other.line() == "1"
-    assert started.status().worlds[0].holder_pid == other.pid
+    assert started.status().worlds[0].holder_pids[0] == other.pid
     for call in (lambda: lease.step(paths(1)), lambda: lease.reset(), lease.renew):
         assert f"pid {other.pid}" in refused(call, "lease_lost", other.pid)
     assert lease.observe().result() == last.result()
@@ -174,14 +178,14 @@ def test_a_released_world_is_free(server: Start) -> None:
     started = server()
     client = started.connect()
     lease = client.acquire()
-    assert started.status().worlds[0].holder_pid == US
+    assert started.status().worlds[0].holder_pids[0] == US
     lease.release()
     lease.release()
-    assert started.status().worlds[0].holder_pid is None
+    assert started.status().worlds[0].holder_pids[0] is None
     refused(lambda: lease.step(paths(1)), "lease_lost", 0)
     with started.connect().acquire() as lease:
         lease.step(paths(1))
-    assert started.status().worlds[0].holder_pid is None
+    assert started.status().worlds[0].holder_pids[0] is None
 
 
 def test_leaving_a_with_keeps_the_first_error(server: Start) -> None:
@@ -196,18 +200,18 @@ def test_closing_a_client_frees_its_worlds(server: Start) -> None:
     client = started.connect()
     client.acquire()
     client.close()
-    assert eventually(lambda: started.status().worlds[0].holder_pid is None)
+    assert eventually(lambda: started.status().worlds[0].holder_pids[0] is None)
 
 
 def test_an_unused_lease_expires_and_a_longer_one_does_not(server: Start) -> None:
     started = server(worlds=2)
     long, short = started.connect().acquire(0, ttl=3600), started.connect().acquire(1, ttl=0.1)
     assert (long.ttl, short.ttl) == (3600, 0.1)
-    assert eventually(lambda: started.status().worlds[1].holder_pid is None)
+    assert eventually(lambda: started.status().worlds[1].holder_pids[0] is None)
     sentence = refused(lambda: short.step(paths(1)), "lease_lost", 0)
     assert "expired" in sentence
     long.renew()
-    assert started.status().worlds[0].holder_pid == US
+    assert started.status().worlds[0].holder_pids[0] == US
 
 
 def test_status_counts(server: Start) -> None:
@@ -218,9 +222,9 @@ def test_status_counts(server: Start) -> None:
     status = started.status()
     assert status.pid == started.program.pid and status.uptime_millis > 0
     assert (status.n_steps, status.n_refused, status.n_clients) == (1, 1, 3)
-    assert [(w.step, w.holder_pid, w.resetting) for w in status.worlds] == [
-        (0, None, False),
-        (1, US, False),
+    assert [(w.step, w.holder_pids, w.n_paths, w.resetting) for w in status.worlds] == [
+        (0, (None,), 0, False),
+        (1, (US,), 0, False),
     ]
 
 
@@ -263,11 +267,12 @@ class Table:
         self.theirs = self.server.connect().acquire(2)
 
     def exchange(self, **changes: int) -> None:
-        """Sends a step of world 0, right but for the changes."""
-        fields = {"operation": 1, "lease": self.lease.number, "first_world": 0, "n_worlds": 1}
+        """Sends a step of robot 0, right but for the changes."""
+        fields = {"operation": 1, "lease": self.lease.number, "first_robot": 0, "n_robots": 1}
         fields |= {"flags": 0} | changes
-        payload = bytes([1] * fields.pop("bytes", 6))
-        self.client.exchange(**fields, paths=payload, timeout=PATIENCE)
+        body = fields.pop("step", 0).to_bytes(8, sys.byteorder)
+        body += bytes([1] * fields.pop("bytes", 6))
+        self.client.exchange(**fields, body=body, timeout=PATIENCE)
 
     def control(self, **request: object) -> None:
         self.client.control(request, timeout=PATIENCE)
@@ -277,24 +282,26 @@ def test_each_refusal_of_a_step_has_its_exception(server: Start) -> None:
     table = Table(server)
     step = table.exchange
     refused(lambda: step(operation=7), "unknown_operation", 7)
-    refused(lambda: step(first_world=3), "no_such_world", 3)
-    refused(lambda: step(n_worlds=0), "no_such_world", 3)
-    refused(lambda: step(n_worlds=2), "wrong_length", 12)
-    refused(lambda: step(bytes=5), "wrong_length", 6)
+    refused(lambda: step(first_robot=3), "no_such_robot", 3)
+    refused(lambda: step(n_robots=0), "no_such_robot", 3)
+    refused(lambda: step(n_robots=2), "wrong_length", 28)
+    refused(lambda: step(bytes=5), "wrong_length", 14)
     refused(lambda: step(flags=4), "unknown_flags", 4)
     refused(lambda: step(flags=1), "not_permitted", 0)
     refused(lambda: step(lease=99), "no_lease", 0)
-    refused(lambda: step(first_world=2), "no_lease", 2)
+    refused(lambda: step(first_robot=2), "no_lease", 2)
+    refused(lambda: step(step=1), "early", 0)
     sentence = refused(lambda: step(lease=0), "no_lease", 0)
-    assert sentence == "no lease on world 0: acquire it first"
+    assert sentence == "no lease on robot 0: acquire it first"
     moves = np.full(6, 9, np.uint8)
     call = table.lease.step_moves
-    refused(lambda: call(moves, range(1), full=False, timeout=PATIENCE), "bad_move", 0)
+    refused(lambda: call(moves, range(1), timeout=PATIENCE), "bad_move", 8)
     table.lease.step(paths(2))
+    refused(lambda: step(), "late", 1)
     table.lease.step(paths(2))
     refused(lambda: table.lease.step(paths(2)), "episode_over", 0)
     status = table.server.status()
-    assert (status.n_refused, status.n_steps) == (12, 4)
+    assert (status.n_refused, status.n_steps) == (14, 4)
 
 
 def test_a_world_in_its_burn_in_is_refused_and_waited_for(server: Start) -> None:
@@ -312,8 +319,8 @@ def test_each_refusal_on_control_has_its_exception(server: Start) -> None:
     ask, number = table.control, table.lease.number
     refused(lambda: ask(op="dance"), "malformed", 0)
     refused(lambda: ask(op="renew", lease=-1), "malformed", 0)
-    refused(lambda: ask(op="hello", protocol=2, client=""), "version_mismatch", 1)
-    refused(lambda: table.client.acquire(0, 4), "no_such_world", 3)
+    refused(lambda: ask(op="hello", protocol=1, client=""), "version_mismatch", 2)
+    refused(lambda: table.client.acquire(0, 4), "no_such_robot", 3)
     refused(lambda: table.client.acquire(2), "busy", US)
     refused(lambda: ask(op="renew", lease=5), "no_lease", 0)
     refused(lambda: ask(op="release", lease=table.theirs.number), "no_lease", 2)
@@ -328,11 +335,11 @@ def test_each_refusal_on_control_has_its_exception(server: Start) -> None:
 def test_a_refusal_says_the_same_on_both_channels(server: Start) -> None:
     table = Table(server)
     for kind, detail, step, control in (
-        ("no_such_world", 3, {"first_world": 9}, {"op": "acquire", "first_world": 9}),
+        ("no_such_robot", 3, {"first_robot": 9}, {"op": "acquire", "first_robot": 9}),
         ("no_lease", 0, {"lease": 99}, {"op": "renew", "lease": 99}),
     ):
         if control["op"] == "acquire":
-            control["n_worlds"] = 1
+            control["n_robots"] = 1
         words = refused(lambda step=step: table.exchange(**step), kind, detail)
         assert refused(lambda control=control: table.control(**control), kind, detail) == words
 
@@ -341,7 +348,7 @@ def test_a_refused_client_goes_on(server: Start) -> None:
     table = Table(server)
     for _ in range(20):
         refused(lambda: table.exchange(operation=9), "unknown_operation", 9)
-    assert table.lease.step(paths(2)).result().step == 1
+    assert table.lease.step(paths(2)).result().world.step == 1
 
 
 WRONG_ACTIONS = [
@@ -375,7 +382,7 @@ def test_a_wrong_action_is_named_and_never_sent(server: Start) -> None:
             lease.step(action)
     status = started.status()
     assert (status.n_steps, status.n_refused) == (0, 0)
-    assert lease.step([3] * 6).result().step == 1
+    assert lease.step([3] * 6).result().world.step == 1
 
 
 def test_wrong_actions_of_many_worlds_are_named(server: Start) -> None:
@@ -392,18 +399,18 @@ def test_wrong_actions_of_many_worlds_are_named(server: Start) -> None:
 
 
 @pytest.mark.parametrize(
-    "worlds", [range(0, 3, 2), range(0), range(-1, 1), range(2, 4), [0, 2]], ids=str
+    "robots", [range(0, 3, 2), range(0), range(-1, 1), range(2, 4), [0, 2]], ids=str
 )
-def test_worlds_to_step_are_consecutive_and_of_the_lease(
-    server: Callable[..., Server], worlds: Any
+def test_robots_to_step_are_consecutive_and_of_the_lease(
+    server: Callable[..., Server], robots: Any
 ) -> None:
     client = server(worlds=4).connect()
     lease = client.acquire(0, 3)
     with pytest.raises(
-        errors.InvalidArgumentError, match="worlds: expected a range of consecutive"
+        errors.InvalidArgumentError, match="robots: expected a range of consecutive"
     ):
-        lease.step([[3] * 6] * 2, worlds=worlds)
-    assert client.observe(0, 4).results["step"].tolist() == [0, 0, 0, 0]
+        lease.step([[3] * 6] * 2, robots=robots)
+    assert client.observe(0, 4).results["world"]["step"].tolist() == [0, 0, 0, 0]
 
 
 @pytest.mark.parametrize("seed", [1.5, -1, 2**64, "7"])
@@ -419,7 +426,7 @@ def test_threads_take_turns(server: Callable[..., Server]) -> None:
 
     def fly() -> None:
         for _ in range(200):
-            steps.append(lease.step([3] * 6).result().step)
+            steps.append(lease.step([3] * 6).result().world.step)
 
     threads = [threading.Thread(target=fly) for _ in range(3)]
     for thread in threads:

@@ -322,10 +322,10 @@ def test_rust_and_python_see_the_same_frames() -> None:
     env = make()
     env.reset(seed=seeds.pop())
     for step in range(1, n_steps + 1):
-        observation, reward, _, _, info = env.step(frames[step].path)
-        theirs = frames[step].result
-        assert observation["frame"].tobytes() == frames[step].frame.tobytes()
-        assert observation["robot"].tolist() == [theirs.row, theirs.col]
+        theirs, (robot,) = frames[step].result, frames[step].robots
+        observation, reward, _, _, info = env.step(robot.path)
+        assert observation["frame"].tobytes() == robot.frame.tobytes()
+        assert observation["robot"].tolist() == [robot.result.row, robot.result.col]
         assert reward == theirs.reward
         assert info["n_target_cells"] == theirs.n_target_cells
     env.close()
@@ -414,7 +414,7 @@ def test_resume_goes_on_where_another_agent_stopped() -> None:
         observation, info = env.reset(options={"resume": True})
         assert info["step"] == 5
         assert observation["frame"].tobytes() == left.frames.tobytes()
-        assert observation["robot"].tolist() == [left.result().row, left.result().col]
+        assert tuple(observation["robot"]) == left.result().robot.cell
         seen = observation["frame"] != 255
         assert (observation["age"] == np.where(seen, 0, 255)).all()
         # The time limit counts the environment's own steps.
@@ -458,7 +458,7 @@ def test_wrong_options_are_named(keywords: dict[str, Any], message: str) -> None
     [
         (
             {"observation": ()},
-            r"expected one or several of frame, image, robot, age, belief, got \(\)",
+            r"expected one or several of frame, image, robot, age, belief, team, others, got \(\)",
         ),
         ({"observation": "smoke"}, "got 'smoke'"),
         ({"observation": ["frame", "frame"]}, "observation"),

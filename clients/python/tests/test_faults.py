@@ -105,17 +105,17 @@ def test_a_stopped_server_is_a_timeout_and_observing_tells_what_happened(server:
     started = server()
     lease = started.connect().acquire()
     for k in range(5):
-        before = lease.observe().result().step
-        assert before == lease.observe().result().step
+        before = lease.observe().result().world.step
+        assert before == lease.observe().result().world.step
         started.stop()
         with pytest.raises(errors.RequestTimeoutError, match=r"within 0\.3 s"):
             lease.step([k % 4] * 6, timeout=0.3)
         started.wake_up()
         seen = lease.observe()
         # The step was made or not; it is never made later.
-        assert seen.result().step in (before, before + 1)
+        assert seen.result().world.step in (before, before + 1)
         assert lease.observe().result() == seen.result()
-        assert lease.step([1] * 6).result().step == seen.result().step + 1
+        assert lease.step([1] * 6).result().world.step == seen.result().world.step + 1
 
 
 def test_an_answer_that_comes_in_time_after_a_pause_is_the_steps(server: Start) -> None:
@@ -123,7 +123,7 @@ def test_an_answer_that_comes_in_time_after_a_pause_is_the_steps(server: Start) 
     lease = started.connect().acquire()
     started.stop()
     threading.Timer(0.1, started.wake_up).start()
-    assert lease.step([3] * 6, timeout=PATIENCE).result().step == 1
+    assert lease.step([3] * 6, timeout=PATIENCE).result().world.step == 1
 
 
 class Remains:
@@ -223,7 +223,7 @@ def test_a_killed_client_frees_its_worlds_at_once(server: Start, script: Run) ->
     next_client = started.connect()
     holder.signal(signal.SIGKILL)
     holder.end()
-    assert next_client.acquire().step([3] * 6).result().step > 1
+    assert next_client.acquire().step([3] * 6).result().world.step > 1
 
 
 def test_killed_clients_use_up_no_limit(server: Start, script: Run) -> None:
@@ -243,9 +243,9 @@ def test_killed_clients_use_up_no_limit(server: Start, script: Run) -> None:
 
 
 def check_mismatch(raised: pytest.ExceptionInfo[errors.EmberwatchError]) -> None:
-    assert raised.value.detail == 1
+    assert raised.value.detail == 2
     words = str(raised.value)
-    assert "the client speaks 2, the server 1;" in words
+    assert "the client speaks 3, the server 2;" in words
     assert "use a client and a server of one release" in words
 
 
@@ -253,7 +253,7 @@ def test_a_client_of_another_version_is_told_both_and_what_to_do(
     server: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started = server()
-    monkeypatch.setattr(wire, "VERSION", 2)
+    monkeypatch.setattr(wire, "VERSION", 3)
     with fails("version_mismatch") as raised:
         connect(started.instance)
     monkeypatch.undo()
@@ -267,12 +267,12 @@ def test_a_server_refuses_the_header_of_another_version(
     started = server()
     client = started.connect()
     name = channels.Node._name
-    monkeypatch.setattr(wire, "VERSION", 2)
-    # By the services of version 1, as nobody should.
+    monkeypatch.setattr(wire, "VERSION", 3)
+    # By the services of version 2, as nobody should.
     monkeypatch.setattr(
         channels.Node,
         "_name",
-        lambda self, service: iox2.ServiceName.new(f"emberwatch/v1/{self.instance}/{service}"),
+        lambda self, service: iox2.ServiceName.new(f"emberwatch/v2/{self.instance}/{service}"),
     )
     with fails("version_mismatch") as raised:
         connect(started.instance)
@@ -281,15 +281,15 @@ def test_a_server_refuses_the_header_of_another_version(
     monkeypatch.undo()
     assert channels.Node._name is name
     check_mismatch(raised)
-    assert on_step.value.detail == 1 and "one release" in str(on_step.value)
-    assert client.observe().result().step == 0
+    assert on_step.value.detail == 2 and "one release" in str(on_step.value)
+    assert client.observe().result().world.step == 0
 
 
 def test_a_server_of_another_version_elsewhere_is_not_meant(
     server: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started = server()
-    monkeypatch.setattr(wire, "VERSION", 2)
+    monkeypatch.setattr(wire, "VERSION", 3)
     for instance in (started.instance + "0", started.instance[:-1] + "x", "nobody"):
         with pytest.raises(errors.NoServerError):
             connect(instance)

@@ -16,12 +16,14 @@ from emberwatch import wire
 from emberwatch.belief import Filter, uniform_prior
 from emberwatch.film.__main__ import main
 from emberwatch.model import Model
+from emberwatch.palette import ROBOTS
 
 MODEL = Model.wildfire()
 HEIGHT, WIDTH, SCALE = 3, 5, 10
 #: Left and upper edges of the four panels, pixels: they are 150 wide, with 16 between.
 LEFTS, TOP = [14, 180, 346, 512], 68
 INFO = document.examples()[1] | {"height": HEIGHT, "width": WIDTH, "n_moves": 2, "n_worlds": 2}
+INFO |= {"n_robots": 1, "deadline_millis": 0}
 SEEN = np.full((HEIGHT, WIDTH), 255, np.uint8)
 SEEN[0, :2], SEEN[1, 1] = [0, 1], 2
 TRUTH = np.arange(HEIGHT * WIDTH, dtype=np.uint8).reshape(HEIGHT, WIDTH) % 3
@@ -33,16 +35,32 @@ def server(**changes: Any) -> bytes:
     return packed(1, deflated(json.dumps(info).encode()))
 
 
-def frame(step: int, *, episode: int = 0, world: int = 0, reward: float = 2.0) -> bytes:
-    """The robot flies right and down from the corner; sees `SEEN`."""
-    result = wire.StepResult(step, 7, episode, reward, 0, 3, 0, 1, 1, 1, 0, 0)
-    header = wire.FrameHeader(version=1, world=world, height=HEIGHT, width=WIDTH, n_moves=2)
-    header.result[:] = wire.RESULT.pack(*result)
-    return packed(2, deflated(bytes(header) + SEEN.tobytes() + b"\3\1"))
+def frame(
+    step: int,
+    *,
+    episode: int = 0,
+    world: int = 0,
+    reward: float = 2.0,
+    robots: int = 1,
+    hovered: int = 0,
+    late: int = 0,
+) -> bytes:
+    """Robot r flies right and down from column r of the first row; they see `SEEN`."""
+    header = wire.FrameHeader(version=2, world=world, first_robot=world * robots, n_robots=robots)
+    header.height, header.width = HEIGHT, WIDTH
+    result = (step, 7, episode, reward, hovered, late, 0, 3, 0, 0, 0)
+    header.result[:] = wire.WORLD.pack(*result)
+    results = paths = b""
+    for robot in range(robots):
+        flew = not (hovered | late) >> robot & 1
+        place = (0, robot, 1, robot + 1) if flew else (0, robot, 0, robot)
+        results += wire.ROBOT.pack(reward, reward, 3, 0, *place, 1, 2 * flew)
+        paths += b"\3\1" * flew
+    return packed(2, deflated(bytes(header) + results + SEEN.tobytes() * robots + paths))
 
 
 def truth(step: int) -> bytes:
-    header = wire.TruthHeader(version=1, height=HEIGHT, width=WIDTH, step=step, seed=7)
+    header = wire.TruthHeader(version=2, height=HEIGHT, width=WIDTH, step=step, seed=7)
     return packed(3, deflated(bytes(header) + TRUTH.tobytes()))
 
 
@@ -248,3 +266,21 @@ def test_without_pillow_it_says_what_to_install(
     monkeypatch.delitem(sys.modules, "emberwatch.film.page", raising=False)
     monkeypatch.setitem(sys.modules, "PIL", None)
     assert "pip install emberwatch[film]" in studio.fails([server(), frame(0)])
+
+
+def test_a_team_is_drawn_with_its_paths_and_who_stayed_is_told(studio: Studio) -> None:
+    team = server(n_robots=3)
+    blank = studio.still([team, frame(1, robots=3, hovered=7)], 1)
+    flown = studio.still([team, frame(1, robots=3, hovered=0)], 1)
+    some = studio.still([team, frame(1, robots=3, hovered=2, late=4)], 1)
+    for robot, color in enumerate(ROBOTS[:3]):
+        middles = [(0, robot), (1, robot + 1)]
+        for image, (row, col) in ((blank, middles[0]), (flown, middles[1])):
+            at = TOP + SCALE * row + SCALE // 2, LEFTS[0] + SCALE * col + SCALE // 2
+            assert tuple(image[at]) == color, (robot, row, col)
+    # One line of small print says who stayed.
+    foot = {
+        name: (image[-30:] != 255).sum()
+        for name, image in (("flown", flown), ("some", some), ("blank", blank))
+    }
+    assert foot["flown"] < foot["some"] < foot["blank"]

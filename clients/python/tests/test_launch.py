@@ -41,7 +41,7 @@ def test_a_second_server_on_an_instance_says_who_serves_it(server: Start) -> Non
     words = program.output()
     program.stop()
     assert f"already running, as pid {started.program.pid}" in words
-    assert started.connect().acquire().step([3] * 6).result().step == 1
+    assert started.connect().acquire().step([3] * 6).result().world.step == 1
 
 
 def test_a_missing_model_file_is_named(tmp_path: Path) -> None:

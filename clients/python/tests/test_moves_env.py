@@ -277,7 +277,10 @@ def test_moves_come_as_any_integer(kind: Any) -> None:
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"reward": "cell"}, "reward: expected 'path' or 'move', got 'cell'"),
+        (
+            {"reward": "cell"},
+            "reward: expected one of 'share', 'team', 'marginal', 'move', got 'cell'",
+        ),
         ({"observation": "path"}, "expected one or several of frame, .*, visited, move, got"),
         ({"observation": ["move", "move"]}, "observation"),
         ({"n_moves": 0}, "moves: expected 1 to 4096, got 0"),

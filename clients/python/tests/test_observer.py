@@ -58,11 +58,13 @@ def test_a_frame_is_the_answer_of_its_step_with_the_path_flown(server: Start) ->
             answer = lease.step(paths(k))
             new = frames_until(observer, k, world=1)
             frame = new[-1]
-            assert frame.result == answer.result()
-            assert (frame.frame == answer.frames[0]).all() and frame.frame.dtype == np.uint8
-            assert (frame.path == paths(k)[0]).all()
-            assert frame.start == start
-            start = (frame.result.row, frame.result.col)
+            (robot,) = frame.robots
+            assert (frame.result, robot.result) == answer.result()
+            assert (robot.frame == answer.frames[0]).all() and robot.frame.dtype == np.uint8
+            assert (frame.frame == robot.frame).all()
+            assert (robot.path == paths(k)[0]).all()
+            assert robot.result.start == start
+            start = robot.result.cell
             frames += new
     assert sum(frame.n_lost for frame in frames) == 0
 
@@ -75,8 +77,9 @@ def test_a_reset_is_an_empty_frame_without_a_path(server: Start) -> None:
         frames_until(observer, 1)
         lease.reset([5])
         frame = frames_until(observer, 0, seed=5)[-1]
-    assert (frame.result.seed, frame.result.episode, frame.result.coverage) == (5, 1, 0)
-    assert (frame.frame == 255).all() and frame.path.shape == (0,)
+    (robot,) = frame.robots
+    assert (frame.result.seed, frame.result.episode, robot.result.coverage) == (5, 1, 0)
+    assert (frame.frame == 255).all() and robot.path.shape == (0,)
 
 
 def test_a_late_observer_is_greeted_with_the_frame_of_every_world(server: Start) -> None:
@@ -91,7 +94,7 @@ def test_a_late_observer_is_greeted_with_the_frame_of_every_world(server: Start)
                 assert frame is not None
                 greeted[frame.world] = frame
         for world, frame in greeted.items():
-            assert frame.result == answer.result(world)
+            assert (frame.result, frame.robots[0].result) == answer.result(world)
             assert (frame.frame == answer.frames[world]).all()
 
 
@@ -167,7 +170,7 @@ def test_hidden_states_agree_with_the_results(server: Start) -> None:
     n_burning = []
     with TruthReader(started.instance) as reader:
         for k in range(1, 11):
-            n_burning.append(lease.step(paths(k)).result().n_target_cells)
+            n_burning.append(lease.step(paths(k)).result().world.n_target_cells)
             truth = truth_at(reader, k)
             assert (truth.episode, truth.seed, truth.n_lost) == (0, 28, 0)
             assert truth.states.shape == (12, 9) and truth.states.max() < 3
@@ -180,7 +183,7 @@ def test_a_frame_is_a_copy(server: Start) -> None:
     lease = started.connect().acquire()
     with observe(started.instance) as observer:
         lease.step([3] * 6)
-        first = frames_until(observer, 1)[-1]
+        (first,) = frames_until(observer, 1)[-1].robots
         kept = first.frame.copy(), first.path.copy()
         first_again = first.frame
         lease.step([1] * 6)
@@ -304,7 +307,7 @@ def test_a_bad_instance_name_is_refused() -> None:
 
 def test_a_reader_whose_files_are_removed_says_so() -> None:
     with observe(unused_instance()) as observer:
-        name = f"emberwatch/v1/{observer.instance}/"
+        name = f"emberwatch/v{wire.VERSION}/{observer.instance}/"
         for path in (channels.directory() / "services").iterdir():
             if name in path.read_text(errors="replace"):
                 path.unlink()

@@ -31,7 +31,7 @@ def test_a_seventeenth_client_is_told_the_limit_and_others_go_on(server: Start) 
     clients = [started.connect() for _ in range(15)]
     with fails("channel", match="more than 16 clients"):
         started.connect()
-    assert clients[-1].acquire().step([3] * 6).result().step == 1
+    assert clients[-1].acquire().step([3] * 6).result().world.step == 1
     clients[0].close()
     assert eventually(lambda: connects(started))
 

@@ -26,9 +26,9 @@ from emberwatch.recording import (
     RecordingDamagedWarning,
 )
 
-INFO = document.examples()[1]
+INFO = document.examples()[1] | {"n_robots": 2, "deadline_millis": 0}
 TOTALS = {"n_servers": 1, "n_frames": 2, "n_truths": 1, "n_lost_frames": 3, "n_lost_truths": 0}
-FILE_HEADER = recording.FILE_HEADER.pack(b"EMBERREC", 1, 0)
+FILE_HEADER = recording.FILE_HEADER.pack(b"EMBERREC", 2, 0)
 
 
 def deflated(body: bytes) -> bytes:
@@ -41,15 +41,21 @@ def packed(kind: int, stored: bytes, n_lost: int = 0, nanos: int = 1_500_000_000
     return head + struct.pack("=I", zlib.crc32(head + stored)) + stored
 
 
-def frame(sequence: int, n_lost: int = 0, **changes: int) -> bytes:
-    sizes = {"height": 3, "width": 5, "n_moves": 4} | changes
-    header = wire.FrameHeader(version=1, sequence=sequence, **sizes)
-    return packed(2, deflated(bytes(header) + b"\xff" * 14 + b"\2" + b"\0\1\2\3"), n_lost)
+def frame(sequence: int, n_lost: int = 0, n_moves: int = 4, **changes: int) -> bytes:
+    """Robot 0 was late; robot 1 flew and saw something in its last cell."""
+    sizes = {"height": 3, "width": 5, "n_robots": 2} | changes
+    header = wire.FrameHeader(version=2, sequence=sequence, **sizes)
+    header.result[:] = wire.WORLD.pack(7, 0, 0, 1.0, 0, 1, 0, 4, 1, 0, 0)
+    robots = wire.ROBOT.pack(0, 0, 0, 0, 1, 1, 1, 1, 0, 0)
+    robots += wire.ROBOT.pack(1, 1, 4, 1, 0, 0, 2, 4, 1, n_moves)
+    frames = b"\xff" * 15 + b"\xff" * 14 + b"\2"
+    return packed(2, deflated(bytes(header) + robots + frames + b"\0\1\2\3"), n_lost)
 
 
 SERVER = packed(1, deflated(json.dumps(INFO).encode()), nanos=0)
+SHORT = packed(1, deflated(json.dumps(INFO | {"n_moves": 3}).encode()), nanos=0)
 HIDDEN = packed(
-    3, deflated(bytes(wire.TruthHeader(version=1, height=3, width=5, step=7)) + bytes(15))
+    3, deflated(bytes(wire.TruthHeader(version=2, height=3, width=5, step=7)) + bytes(15))
 )
 END = packed(4, deflated(json.dumps(TOTALS).encode()))
 PARTS = [FILE_HEADER, SERVER, frame(0), HIDDEN, frame(4, n_lost=3), END]
@@ -99,10 +105,14 @@ def test_a_recording_is_read_in_order_with_its_losses(path: Path) -> None:
     assert isinstance(first.sample, Frame) and isinstance(hidden.sample, Truth)
     assert first.seconds == 1.5 and first.server.n_moves == 4
     assert (first.sample.n_lost, last.sample.n_lost) == (0, 3)
-    assert first.sample.frame.tolist() == [[255] * 5, [255] * 5, [255] * 4 + [2]]
-    assert first.sample.path.tolist() == [0, 1, 2, 3]
+    late, flew = first.sample.robots
+    assert (first.sample.result.late, first.sample.result.hovered) == (1, 0)
+    assert flew.frame.tolist() == [[255] * 5, [255] * 5, [255] * 4 + [2]]
+    assert (first.sample.frame == flew.frame).all() and (late.frame == 255).all()
+    assert late.path.tolist() == [] and flew.path.tolist() == [0, 1, 2, 3]
+    assert (late.result.start, flew.result.cell) == ((1, 1), (2, 4))
     assert hidden.sample.step == 7 and not hidden.sample.states.any()
-    first.sample.frame[:] = 1  # your own to write to
+    flew.frame[:] = 1  # your own to write to
 
 
 def test_a_recording_cut_anywhere_is_read_up_to_its_last_whole_record(path: Path) -> None:
@@ -139,9 +149,9 @@ def test_a_damaged_recording_is_read_up_to_the_damage(path: Path) -> None:
     "content, words",
     [
         (b"PK\3\4 and so on, at length", "expected it to begin with b'EMBERREC', got b'PK"),
-        (b"EMBERREC\2" + bytes(7), "version: expected 1, got 2"),
-        (b"EMBERREC\0\0\0\1" + bytes(4), "version: expected 1, got 16777216"),
-        (b"EMBERREC\1\0\0\0\1\0\0\0", "expected 0 in byte 12 to 15, got 1"),
+        (b"EMBERREC\1" + bytes(7), "version: expected 2, got 1"),
+        (b"EMBERREC\0\0\0\2" + bytes(4), "version: expected 2, got 33554432"),
+        (b"EMBERREC\2\0\0\0\1\0\0\0", "expected 0 in byte 12 to 15, got 1"),
         (FILE_HEADER + frame(0), "at byte 16: expected a server before its samples"),
         (FILE_HEADER + packed(5, deflated(b"")), "kind: expected 1 to 4, got 5"),
         (FILE_HEADER + packed(2, deflated(b"short")), "Buffer size too small"),
@@ -149,9 +159,14 @@ def test_a_damaged_recording_is_read_up_to_the_damage(path: Path) -> None:
         (FILE_HEADER + packed(1, deflated(b"[" * 100_000)), "at byte 16"),
         (FILE_HEADER + packed(1, b"\xff\xff"), "expected deflate"),
         (FILE_HEADER + packed(1, deflated(b"{}") + b"more"), "one deflate stream"),
-        (FILE_HEADER + packed(2, deflated(bytes(50 << 20))), "of at most 16781416 bytes"),
+        (FILE_HEADER + packed(2, deflated(bytes(50 << 20))), "of at most 17042528 bytes"),
         (FILE_HEADER + struct.pack("=QIIII", 0, 2, 2**32 - 1, 0, 0), "bytes, got 4294967295"),
-        (FILE_HEADER + SERVER + frame(0, n_moves=3), "expected 18 bytes, got 19"),
+        (FILE_HEADER + SERVER + frame(0, n_moves=3), "expected 129 bytes, got 130"),
+        (FILE_HEADER + SERVER + frame(0, n_robots=0), "expected 1 to 64 robots, got 0"),
+        (FILE_HEADER + SERVER + frame(0, n_robots=65), "expected 1 to 64 robots, got 65"),
+        (FILE_HEADER + SERVER + frame(0, n_robots=1), "expected 63 bytes, got 130"),
+        (FILE_HEADER + SERVER + frame(0, first_robot=2), "robots: expected range(0, 2), got rang"),
+        (FILE_HEADER + SHORT + frame(0), "path: expected 0 or 3 moves, got 4"),
         (FILE_HEADER + SERVER + frame(0, height=5, width=3), "grid: expected (3, 5), got (5, 3)"),
         (FILE_HEADER + SERVER + frame(0, world=1), "world: expected one below 1, got 1"),
         (FILE_HEADER + SERVER + frame(0) + END, "totals: expected"),
@@ -203,8 +218,9 @@ def test_what_a_recorder_wrote_is_what_the_server_answered(
     assert set(range(1, 21)) <= set(frames)
     for step, (answer, moves) in enumerate(zip(answers, paths, strict=True), 1):
         frame_ = frames[step]
-        assert frame_.result == answer.result() and frame_.n_lost == 0
-        assert (frame_.frame == answer.frames[0]).all() and (frame_.path == moves).all()
+        (robot,) = frame_.robots
+        assert (frame_.result, robot.result) == answer.result() and frame_.n_lost == 0
+        assert (robot.frame == answer.frames[0]).all() and (robot.path == moves).all()
         n_fires = int((truths[frame_.result.step].states == 2).sum())
         assert n_fires == frame_.result.n_target_cells
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from emberwatch.model import Model
+from emberwatch.palette import ROBOTS
 from emberwatch.render import Palette, Picture, Screen, ansi, rgb_array
 
 WILDFIRE = Palette.of(Model.wildfire())
@@ -27,13 +28,13 @@ def pixel(image: NDArray[np.uint8], row: int, col: int) -> tuple[int, ...]:
 
 
 def draw(**changes: Any) -> NDArray[np.uint8]:
-    usual = {"frame": FRAME, "robot": (1, 1), "palette": WILDFIRE, "path": PATH}
+    usual = {"frame": FRAME, "robots": [(1, 1)], "palette": WILDFIRE, "paths": [PATH]}
     scale = changes.pop("scale", 40)
     return rgb_array(Picture(**{**usual, **changes}), scale=scale)
 
 
 def text(**changes: Any) -> str:
-    usual = {"frame": FRAME, "robot": (1, 1), "palette": WILDFIRE, "path": PATH}
+    usual = {"frame": FRAME, "robots": [(1, 1)], "palette": WILDFIRE, "paths": [PATH]}
     color = changes.pop("color", False)
     return ansi(Picture(**{**usual, **changes}), color=color)
 
@@ -53,13 +54,13 @@ def test_the_path_is_a_line_and_ends_in_the_robot() -> None:
     assert pixel(image, 20, 20) == WHITE  # where it begins
     assert pixel(image, 60, 60) == DARK  # the robot's dot
     assert {DARK, WHITE} <= {pixel(image, 60, col) for col in range(45, 60)}  # and its circle
-    without = draw(path=None)
+    without = draw(paths=[])
     assert pixel(without, 40, 20) == FIRE and pixel(without, 20, 20) == NORMAL
 
 
 def test_without_robot_and_path_there_are_only_cells() -> None:
     cells = WILDFIRE.paint_frame(FRAME).repeat(40, axis=0).repeat(40, axis=1)
-    assert (draw(robot=None, path=None) == cells).all()
+    assert (draw(robots=[], paths=[]) == cells).all()
 
 
 def test_a_path_over_unseen_cells_is_light() -> None:
@@ -70,12 +71,12 @@ def test_a_path_over_unseen_cells_is_light() -> None:
 
 def test_a_path_may_begin_in_the_corner() -> None:
     frame = np.zeros((4, 4), np.uint8)
-    image = draw(frame=frame, robot=(3, 3), path=[(0, 0), (0, 1)], scale=4)
+    image = draw(frame=frame, robots=[(3, 3)], paths=[[(0, 0), (0, 1)]], scale=4)
     assert pixel(image, 0, 0) == WHITE and pixel(image, 3, 3) == DARK
 
 
 def test_odd_pictures_repeat_their_last_row_and_column() -> None:
-    image = draw(frame=np.full((3, 3), 2, np.uint8), robot=(0, 0), path=None, scale=15)
+    image = draw(frame=np.full((3, 3), 2, np.uint8), robots=[(0, 0)], paths=[], scale=15)
     assert image.shape == (46, 46, 3)
     assert pixel(image, 45, 45) == pixel(image, 45, 0) == FIRE
 
@@ -83,7 +84,7 @@ def test_odd_pictures_repeat_their_last_row_and_column() -> None:
 def test_small_cells_are_tinted_where_visited() -> None:
     wide = np.full((2, 40), 255, np.uint8)
     wide[0] = 2
-    image = draw(frame=wide, robot=(1, 39), path=[(0, 0), (0, 1)], scale=2)
+    image = draw(frame=wide, robots=[(1, 39)], paths=[[(0, 0), (0, 1)]], scale=2)
     tinted, plain = pixel(image, 0, 0), pixel(image, 0, 6)
     assert plain == FIRE
     assert all(t > p for t, p in zip(tinted, plain, strict=True)) and tinted != WHITE
@@ -113,9 +114,9 @@ def test_panels_are_about_512_pixels_and_even(
     grid: tuple[int, int], panel: tuple[int, int], both: tuple[int, int]
 ) -> None:
     frame = np.full(grid, 255, np.uint8)
-    assert draw(frame=frame, robot=(0, 0), path=None, scale=None).shape[:2] == panel
+    assert draw(frame=frame, robots=[(0, 0)], paths=[], scale=None).shape[:2] == panel
     truth = np.zeros(grid, np.uint8)
-    assert draw(frame=frame, robot=(0, 0), path=None, truth=truth, scale=None).shape[:2] == both
+    assert draw(frame=frame, robots=[(0, 0)], paths=[], truth=truth, scale=None).shape[:2] == both
 
 
 @settings(deadline=None)
@@ -136,17 +137,17 @@ def test_sizes_depend_on_the_grid_only(
     frame = rng.choice(np.array([0, 1, 2, 255], np.uint8), grid)
     truth = rng.integers(0, 3, grid).astype(np.uint8) if with_truth else None
     robot = (int(cells[-1][0]), int(cells[-1][1]))
-    full = draw(frame=frame, robot=robot, path=np.array(cells), truth=truth, scale=scale)
+    full = draw(frame=frame, robots=[robot], paths=[np.array(cells)], truth=truth, scale=scale)
     unobserved = np.full(grid, 255, np.uint8)
-    empty = draw(frame=unobserved, robot=(0, 0), path=None, truth=truth, scale=scale)
+    empty = draw(frame=unobserved, robots=[(0, 0)], paths=[], truth=truth, scale=scale)
     assert full.shape == empty.shape
     assert full.shape[0] % 2 == full.shape[1] % 2 == 0
 
 
 def test_drawing_changes_no_argument() -> None:
     frame, truth, path = FRAME.copy(), TRUTH.copy(), np.array(PATH)
-    draw(frame=frame, truth=truth, path=path, scale=2)
-    text(frame=frame, truth=truth, path=path, color=True)
+    draw(frame=frame, truth=truth, paths=[path], scale=2)
+    text(frame=frame, truth=truth, paths=[path], color=True)
     assert (frame == FRAME).all() and (truth == TRUTH).all() and (path == PATH).all()
 
 
@@ -156,9 +157,9 @@ def test_drawing_changes_no_argument() -> None:
     [
         ({"frame": FRAME[0]}, r"frame: expected shape \(H, W\)"),
         ({"truth": TRUTH[:1]}, r"truth: expected shape \(2, 3\), got \(1, 3\)"),
-        ({"robot": (2, 0)}, r"robot: expected cells of a \(2, 3\) grid, got \(2, 0\)"),
-        ({"path": [(0, 0), (-1, 0)]}, r"path: expected cells .* got \(-1, 0\)"),
-        ({"path": [(0, 0), (1, 1)]}, "path: expected neighbours"),
+        ({"robots": [(1, 1), (2, 0)]}, r"robot: expected cells of a \(2, 3\) grid, got \(2, 0\)"),
+        ({"paths": [[(0, 0), (-1, 0)]]}, r"path: expected cells .* got \(-1, 0\)"),
+        ({"paths": [[(0, 0), (1, 1)]]}, "path: expected neighbours"),
         ({"frame": FRAME + np.uint8(3)}, "expected values out of .0, 1, 2, 255., got 3"),
         ({"truth": TRUTH + np.uint8(3)}, "expected values out of .0, 1, 2., got 3"),
     ],
@@ -188,9 +189,9 @@ def test_a_hidden_model_has_colours_too() -> None:
 def test_ascii_shows_values_path_and_robot() -> None:
     assert text().split("\n") == ["0*. .", "2*1@."]
     assert text(truth=TRUTH).split("\n") == ["0*. .   0 1 2", "2*1@.   2 1@0"]
-    assert text(path=None).isascii()
+    assert text(paths=[]).isascii()
     many = Palette.of(64)
-    assert text(palette=many, frame=FRAME + np.uint8(10), path=None).startswith("A 9 9")
+    assert text(palette=many, frame=FRAME + np.uint8(10), paths=[]).startswith("A 9 9")
 
 
 def test_colours_are_written_where_they_change() -> None:
@@ -204,18 +205,18 @@ def test_colours_are_written_where_they_change() -> None:
 def test_tall_grids_take_half_the_lines() -> None:
     tall = np.full((41, 3), 255, np.uint8)
     tall[1] = 2
-    lines = text(frame=tall, robot=(0, 0), path=None, color=True).split("\n")
+    lines = text(frame=tall, robots=[(0, 0)], paths=[], color=True).split("\n")
     assert len(lines) == 21
     assert lines[0].startswith("\x1b[38;2;255;255;255;48;2;200;55;27m▀")
     assert lines[-1] == "\x1b[38;2;48;48;48;49m▀▀▀\x1b[0m"
-    even = text(frame=tall[:40], robot=(0, 0), path=None, color=True).split("\n")
+    even = text(frame=tall[:40], robots=[(0, 0)], paths=[], color=True).split("\n")
     assert even == lines[:20]
-    flown = text(frame=tall, robot=(0, 0), path=[(0, 1)], color=True).split("\n")[0]
+    flown = text(frame=tall, robots=[(0, 0)], paths=[[(0, 1)]], color=True).split("\n")[0]
     tint = round(48 * 0.55 + 255 * 0.45)
     assert f"\x1b[38;2;{tint};{tint};{tint};48;2;200;55;27m▀" in flown
 
 
-PARTS: dict[str, Any] = {"frame": FRAME, "robot": (1, 1), "palette": WILDFIRE, "path": PATH}
+PARTS: dict[str, Any] = {"frame": FRAME, "robots": [(1, 1)], "palette": WILDFIRE, "paths": [PATH]}
 
 
 @pytest.fixture
@@ -293,3 +294,12 @@ def test_pictures_keep_their_pace(headless: None, monkeypatch: pytest.MonkeyPatc
     for _ in range(3):
         screen.show(Picture(**PARTS))
     assert waits == [0.0, 0.25, 0.5]
+
+
+def test_a_team_has_a_colour_for_each_robot() -> None:
+    robots, paths = [(1, 1), (0, 2)], [PATH, [(0, 1), (0, 2)]]
+    image = draw(robots=robots, paths=paths)
+    for (row, col), color in zip(robots, ROBOTS, strict=False):
+        assert pixel(image, 40 * row + 20, 40 * col + 20) == color
+    assert (pixel(image, 40, 20), pixel(image, 20, 80)) == ROBOTS[:2]  # the lines between cells
+    assert text(robots=robots, paths=paths).split("\n") == ["0*.*.@", "2*1@."]

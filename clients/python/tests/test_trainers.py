@@ -116,6 +116,20 @@ def test_a_model_learns_on_the_vector_and_is_evaluated() -> None:
     assert rows[0].moves == 4 and rows[0].mean_distinct_cells > 0
 
 
+def test_robots_of_a_world_share_a_policy() -> None:
+    import stable_baselines3
+
+    world = {**IMAGE, "observation": "local", "robots": 3, "reward": "marginal"}
+    vector = VecMonitor(make_vec_env(MOVES, 6, max_episode_steps=8, **world))
+    agent = stable_baselines3.PPO("MlpPolicy", vector, n_steps=8, batch_size=16, device="cpu")
+    agent.learn(96)
+    assert len(agent.ep_info_buffer) == 12
+    vector.close()
+    del world["reward"]
+    (row,) = evaluate(agent, name="team", seeds=[1000], steps=3, progress=None, **world)
+    assert (row.robots, row.team) == (3, "alone") and row.mean_distinct_cells > 0
+
+
 def test_what_is_no_vector_for_it_is_named() -> None:
     with pytest.raises(InvalidArgumentError, match="env: expected gymnasium.make_vec of an env"):
         WildfireVecEnv(gymnasium.make_vec(MOVES, num_envs=2, **IMAGE))

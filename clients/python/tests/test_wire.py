@@ -28,7 +28,7 @@ from emberwatch.replies import LeftBeliefInfo, ServerInfo, ServerStatus, WorldIn
 
 LAYOUTS = document.layouts()
 SCALARS = {"u16": ctypes.c_uint16, "u32": ctypes.c_uint32, "u64": ctypes.c_uint64}
-TYPES = SCALARS | {"u64[2]": ctypes.c_uint64 * 2, "StepResult": ctypes.c_ubyte * 64}
+TYPES = SCALARS | {"WorldResult": ctypes.c_ubyte * 64}
 HEADERS = [
     wire.StepRequest,
     wire.StepReply,
@@ -38,12 +38,17 @@ HEADERS = [
     wire.TruthHeader,
     wire.AgentHeader,
 ]
+#: What is in payloads: as bytes, as an array, as a tuple.
+RESULTS = {
+    "WorldResult": (wire.WORLD, wire.WORLD_DTYPE, wire.WorldResult),
+    "RobotResult": (wire.ROBOT, wire.ROBOT_DTYPE, wire.RobotResult),
+}
 EXAMPLES = document.examples()
 HELLO = next(message for message in EXAMPLES if message.get("reply") == "hello")
 LEFT = next(message for message in EXAMPLES if message.get("reply") == "belief")
 
 #: Where the world stands in that example.
-RESULT = SimpleNamespace(episode=1, step=2)
+RESULT = SimpleNamespace(world=SimpleNamespace(episode=1, step=2))
 
 #: The belief of that example.
 ONE = bytes([0, 0, 128, 63])
@@ -74,17 +79,19 @@ class Port:
 
 
 class Wired:
-    """A client on two such ports, after a handshake with the answer that PROTOCOL.md shows."""
+    """A client of a world of two robots on two such ports, after a handshake as in PROTOCOL.md."""
 
     def __init__(self, **hello: Any) -> None:
         self.control, self.step = Port(), Port()
-        self.say(HELLO | {"height": 3, "width": 5, "n_moves": 4} | hello)
+        sizes = {"height": 3, "width": 5, "n_moves": 4, "n_worlds": 1, "n_robots": 2}
+        self.say(HELLO | sizes | hello)
         self.peer = SimpleNamespace(
             listener_low=0, listener_high=0, watch=lambda _: None, close=lambda: None
         )
         with self._in_place():
             self.client = Client("nowhere")
-        self.lease = Lease(self.client, SimpleNamespace(lease=5, ttl_millis=1000), (), range(0, 1))
+        grant = SimpleNamespace(lease=5, ttl_millis=1000)
+        self.lease = Lease(self.client, grant, (), range(0, 2))
 
     def say(self, reply: object, status: int = 0) -> None:
         """Lets `control` answer this, to whatever request."""
@@ -92,7 +99,7 @@ class Wired:
 
         def answer(request: bytes) -> tuple[bytes, bytes]:
             _, _, sequence, _, _ = wire.CONTROL_REQUEST.unpack(request)
-            return struct.pack("=IIQ", 1, status, sequence), text
+            return struct.pack("=IIQ", 2, status, sequence), text
 
         self.control.answer = answer
 
@@ -129,23 +136,23 @@ def test_a_header_is_laid_out_as_documented(header: type[wire.Header]) -> None:
 
 
 def test_every_documented_header_is_there() -> None:
-    assert {header.__name__ for header in HEADERS} | {"StepResult"} == set(LAYOUTS)
+    assert {header.__name__ for header in HEADERS} | set(RESULTS) == set(LAYOUTS)
 
 
 def test_the_formats_are_the_documented_ones() -> None:
     assert wire.STEP_REQUEST.format == LAYOUTS["StepRequest"].format
     assert wire.CONTROL_REQUEST.format == LAYOUTS["ControlRequest"].format
-    # The reserved end is skipped, not read.
-    assert wire.RESULT.format == LAYOUTS["StepResult"].format.removesuffix("I") + "4x"
 
 
-def test_a_result_is_laid_out_as_documented() -> None:
-    layout = LAYOUTS["StepResult"]
-    assert wire.RESULT.size == wire.RESULT_DTYPE.itemsize == layout.size
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_result_is_laid_out_as_documented(name: str) -> None:
+    layout, (packed, dtype, kind) = LAYOUTS[name], RESULTS[name]
+    assert packed.format == layout.format
+    assert packed.size == dtype.itemsize == layout.size
     kinds = {"u16": "<u2", "u32": "<u4", "u64": "<u8", "f64": "<f8"}
     fields = {field.name: (np.dtype(kinds[field.of]), field.offset) for field in layout.fields}
-    assert dict(wire.RESULT_DTYPE.fields) == fields
-    assert [*wire.StepResult._fields, "reserved"] == list(fields)
+    assert dict(dtype.fields) == fields
+    assert [*kind._fields] == list(fields)
 
 
 def test_every_status_has_a_refusal_with_its_name_and_code() -> None:
@@ -166,7 +173,7 @@ def test_a_refusal_says_the_detail_that_the_table_gives_it() -> None:
 
 
 def test_an_unknown_status_is_a_refusal() -> None:
-    for code in (19, 2**32 - 1):
+    for code in (23, 2**32 - 1):
         error = errors.refusal(code, 3)
         assert (type(error), error.code, error.detail) == (EmberwatchError, "unknown", 3)
         assert str(code) in str(error)
@@ -181,6 +188,8 @@ def test_the_limits_are_the_documented_ones() -> None:
         "MAX_CONTROL_BYTES",
         "MAX_MOVES",
         "MAX_SIDE",
+        "MAX_ROBOT_NUMBERS",
+        "MAX_TEAM_CELLS",
     }
 
 
@@ -189,67 +198,83 @@ def test_the_values_are_the_documented_ones() -> None:
     codes = {(kind, name): int(code) for kind, name, code, _ in rows}
     operations = [codes["operation", name] for name in ("step", "observe", "recall")]
     assert operations == [wire.STEP, wire.OBSERVE, wire.RECALL]
+    flags = [codes["flag", name] for name in ("full_coverage", "team_frames")]
+    assert flags == [wire.FULL_COVERAGE, wire.TEAM_FRAMES]
     assert sum(kind == "move" for kind, _ in codes) == wire.N_MOVES
     for sentence in (
         f"The version is {wire.VERSION}.",
         f"**{wire.UNOBSERVED} where nothing was",
-        f"0, or {wire.FULL_COVERAGE}: observe every cell",
     ):
         assert sentence in document.PROTOCOL
 
 
 def test_the_worked_request_is_what_a_lease_sends() -> None:
-    message, values = document.worked_example("StepRequest")
-    number = {name: int(text) for name, text in values.items() if text.isdigit()}
+    message, pairs = document.worked_example("StepRequest")
+    values = dict(pairs)
+    number = {name: int(text) for name, text in pairs if text.isdigit()}
     wired = Wired()
     wired.peer.listener_low = number["listener_low"]
     wired.peer.listener_high = number["listener_high"]
     wired.client._sequence = number["sequence"] - 1
     answer, _ = document.worked_example("StepReply")
-    wired.step.answer = answer[:64], answer[64:]
-    lease = Lease(wired.client, SimpleNamespace(lease=number["lease"], ttl_millis=1), (), range(1))
-    moves = [["up", "down", "left", "right"].index(move) for move in values["path"].split()]
-    lease.step(moves)
+    wired.step.answer = answer[:56], answer[56:]
+    grant = SimpleNamespace(lease=number["lease"], ttl_millis=1)
+    lease = Lease(wired.client, grant, (), range(2))
+    names = ["up", "down", "left", "right"]
+    paths = [[names.index(move) for move in values[f"path {row}"].split()] for row in range(2)]
+    lease.step(paths)
     assert b"".join(wired.step.sent[-1]) == message
+    assert lease.steps_of(lease.robots).tolist() == [1]
 
 
 def test_the_worked_answer_reads_as_what_stands_beside_it() -> None:
     message, values = document.worked_example("StepReply")
-    reply = wire.StepReply.from_buffer_copy(message[:64])
-    for name, _ in wire.StepReply._fields_[:-1]:
-        assert str(getattr(reply, name)) == values[name]
-    answer = wire.StepAnswer(reply, bytearray(message[64:]), n_observations=3)
-    result = answer.result()
-    assert {name: f"{value:g}" for name, value in result._asdict().items()} == {
-        name: values[name] for name in result._fields
-    }
-    rows = [" ".join("-" if cell == 255 else str(cell) for cell in row) for row in answer.frames[0]]
-    assert rows == [values[f"frame row {row}"] for row in range(3)]
-    assert answer.simulation_nanos == int(values["simulation_nanos"])
-    (record,) = answer.results
-    assert tuple(record)[:-1] == tuple(result)
+    reply = wire.StepReply.from_buffer_copy(message[:56])
+    answer = wire.StepAnswer(reply, bytearray(message[56:]), SHAPE)
+    (world, first), (same, second) = answer.result(0), answer.result(1)
+    assert world == same and answer.simulation_nanos == reply.simulation_nanos
+    told = [(name, getattr(reply, name)) for name, _ in wire.StepReply._fields_]
+    for result in (world, first, second):
+        told += result._asdict().items()
+    read = [(name, f"{value:.12g}") for name, value in told]
+    for robot, row in np.ndindex(2, 3):
+        cells = answer.frames[robot, row].tolist()
+        shown = " ".join("-" if cell == 255 else str(cell) for cell in cells)
+        read.append((f"frame {robot} row {row}", shown))
+    assert read == values
+    for record, result in zip(answer.results, (first, second), strict=True):
+        assert (tuple(record["world"]), tuple(record["robot"])) == (world, result)
+
+
+def answered(n_robots: int = 2, **changes: int) -> wire.StepAnswer:
+    """A good answer about worlds of two robots."""
+    n_worlds = (n_robots + 1) // 2
+    reply = wire.StepReply(n_robots=n_robots, n_worlds=n_worlds, height=3, width=5, **changes)
+    n_frames = n_worlds if reply.flags & wire.TEAM_FRAMES else n_robots
+    payload = bytes(64 * n_worlds + 48 * n_robots) + b"\xff" * 15 * n_frames
+    return wire.StepAnswer(reply, bytearray(payload), SHAPE)
 
 
 def test_a_frame_is_your_own_to_write_to() -> None:
-    message, _ = document.worked_example("StepReply")
-    reply = wire.StepReply.from_buffer_copy(message[:64])
-    answer = wire.StepAnswer(reply, bytearray(message[64:]), n_observations=3)
+    answer = answered()
     answer.frames[:] = 7
-    assert answer.result().step == 1 and (answer.frames == 7).all()
+    assert answer.result().world.step == 0 and (answer.frames == 7).all()
+
+
+def test_each_robot_is_in_its_world() -> None:
+    for first, n_robots, worlds in ((0, 2, [0, 0]), (1, 1, [0]), (0, 4, [0, 0, 1, 1])):
+        assert answered(n_robots, first_robot=first).world_of.tolist() == worlds
+    answer = answered(4, flags=wire.TEAM_FRAMES)
+    assert (len(answer.worlds), len(answer.robots), answer.frames.shape) == (2, 4, (2, 3, 5))
 
 
 def test_an_answer_is_shown_in_short() -> None:
-    message, _ = document.worked_example("StepReply")
-    reply = wire.StepReply.from_buffer_copy(message[:64])
-    shape = (1, reply.height, reply.width)
-    answer = wire.StepAnswer(reply, bytearray(message[64:]), n_observations=3)
+    answer = answered(1, first_robot=1)
     assert repr(answer) == (
-        f"StepAnswer(first_world={reply.first_world}, simulation_nanos={reply.simulation_nanos}, "
-        f"frames=<uint8 {shape}>, results=[{answer.result()}])"
+        "StepAnswer(first_robot=1, simulation_nanos=0, "
+        f"frames=<uint8 (1, 3, 5)>, results=[{answer.result()}])"
     )
-    several = wire.StepReply(n_worlds=3, height=64, width=64)
-    answer = wire.StepAnswer(several, bytearray(3 * (64 + 64 * 64)), n_observations=3)
-    assert repr(answer).endswith("truncated=0), and 2 more])") and len(repr(answer)) < 400
+    assert repr(answered(4)).endswith("n_moves=0)), and 3 more])") and len(repr(answered(4))) < 500
 
 
 def test_the_documented_requests_are_what_a_client_sends() -> None:
@@ -259,10 +284,10 @@ def test_the_documented_requests_are_what_a_client_sends() -> None:
         return json.loads(wired.control.sent[-1][1])
 
     wired = Wired()
-    lease = Lease(wired.client, SimpleNamespace(lease=5179721184253228, ttl_millis=1), (), range(1))
+    lease = Lease(wired.client, SimpleNamespace(lease=5179721184253228, ttl_millis=1), (), range(2))
     got = [
         json.loads(wired.control.sent[0][1]) | {"client": "probe 0.1"},
-        sent(lambda: wired.client.acquire(0, 1, ttl=60), replies("lease")[0]),
+        sent(lambda: wired.client.acquire(0, 2, ttl=60), replies("lease")[0]),
         sent(lease.renew),
         sent(lambda: lease.reset([42]), replies("reset")[0]),
         sent(wired.client.status, replies("status")[0]),
@@ -284,18 +309,22 @@ def test_the_documented_replies_become_records() -> None:
         "height": 3,
         "width": 5,
         "n_moves": 4,
+        "n_worlds": 1,
+        "n_robots": 2,
     }
     wired.say(replies("lease")[0])
     lease = wired.client.acquire()
     assert (lease.number, lease.ttl) == (5179721184253228, 60.0)
-    assert lease.start == (WorldInfo(world=0, step=0, seed=0, episode=0, robot=(0, 0)),)
+    robots = ((0, 0), (2, 4))
+    assert lease.start == (WorldInfo(world=0, step=0, seed=0, episode=0, robots=robots),)
     wired.say(replies("reset")[0])
-    assert lease.reset() == (WorldInfo(world=0, step=0, seed=42, episode=1, robot=(0, 0)),)
+    assert lease.reset() == (WorldInfo(world=0, step=0, seed=42, episode=1, robots=robots),)
     wired.say(LEFT)
     assert wired.client.belief() == (LEFT["kind"], 1, 2, ONE)
     wired.say(replies("status")[0])
     status = wired.client.status()
-    assert (status.pid, status.n_steps, status.worlds[0].holder_pid) == (14661, 2, 14683)
+    assert (status.pid, status.n_steps, status.worlds[0].n_paths) == (14661, 2, 0)
+    assert status.worlds[0].holder_pids == (14683, None)
     (error,) = replies("error")
     wired.say(error, status=10)
     with fails("busy") as raised:
@@ -319,16 +348,20 @@ def test_a_record_has_every_documented_key(kind: type[Any]) -> None:
     assert names == set(messages[kind]) - {"reply"}
 
 
+PATHS = [[0, 1, 2, 3]] * 2
+SHAPE = wire.Shape(n_robots=2, n_moves=4, n_observations=3)
+
+
 def step_reply(**changes: int) -> bytes:
     """The header of a good answer to the step that `WIRED` is about to send, changed."""
-    fields = {"version": 1, "sequence": WIRED.client._sequence + 1, "n_worlds": 1}
+    fields = {"version": 2, "sequence": WIRED.client._sequence + 1, "n_robots": 2, "n_worlds": 1}
     return bytes(wire.StepReply(**(fields | {"height": 3, "width": 5} | changes)))
 
 
 def garbled_step(header: bytes, payload: bytes, words: str | None = None) -> None:
     WIRED.step.answer = header, payload
     with fails("bad_answer", match=words):
-        WIRED.lease.step([0, 1, 2, 3])
+        WIRED.lease.step(PATHS)
 
 
 def garbled_control(reply: object) -> None:
@@ -337,40 +370,57 @@ def garbled_control(reply: object) -> None:
         WIRED.client.acquire()
 
 
-GOOD = bytes(64) + b"\xff" * 15
+def payload(hovered: int = 0, late: int = 0, n_moves: int = 4, cell: int = 255) -> bytes:
+    world = wire.WORLD.pack(1, 0, 0, 0.0, hovered, late, 0, 0, 0, 0, 0)
+    robots = [wire.ROBOT.pack(0, 0, 0, 0, 0, 0, 0, 0, 1, moves) for moves in (n_moves, 4)]
+    return world + b"".join(robots) + b"\xff" * 29 + bytes([cell])
 
 
 def test_a_good_answer_is_accepted() -> None:
-    WIRED.step.answer = step_reply(), GOOD
-    assert WIRED.lease.step([0, 1, 2, 3]).frames.shape == (1, 3, 5)
+    for good in (payload(), payload(hovered=1, n_moves=0), payload(late=3, cell=2)):
+        WIRED.step.answer = step_reply(), good
+        assert WIRED.lease.step(PATHS).frames.shape == (2, 3, 5)
 
 
-@pytest.mark.parametrize("length", [0, 1, 63, 64, 78, 80, 158])
+@pytest.mark.parametrize("length", [0, 1, 63, 64, 189, 191, 380])
 def test_a_step_answer_of_a_wrong_length_is_refused(length: int) -> None:
-    garbled_step(step_reply(), bytes(length), f"expected 79 bytes, got {length}")
+    garbled_step(step_reply(), bytes(length), f"expected 190 bytes, got {length}")
 
 
 @pytest.mark.parametrize("value", [3, 4, 254])
 def test_a_frame_with_an_impossible_value_is_refused(value: int) -> None:
-    frame = bytes([0, 1, 2, 255, value]) + bytes(10)
-    garbled_step(step_reply(), bytes(64) + frame, f"below 3 or 255, got {value}")
+    garbled_step(step_reply(), payload(cell=value), f"below 3 or 255, got {value}")
 
 
 @pytest.mark.parametrize(
     "changes, words",
     [
-        ({"version": 2}, "expected version 1, got 2"),
-        ({"version": 0}, "expected version 1, got 0"),
+        ({"hovered": 4}, "robots that stayed: expected bits below 2, got 0x4"),
+        ({"late": 2**63}, "robots that stayed: expected bits below 2, got 0x8000000000000000"),
+        ({"n_moves": 3}, r"n_moves: expected 0 or 4, got \{"),
+    ],
+)
+def test_robots_that_cannot_be_are_refused(changes: dict[str, int], words: str) -> None:
+    garbled_step(step_reply(), payload(**changes), words)
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"version": 3}, "expected version 2, got 3"),
+        ({"version": 0}, "expected version 2, got 0"),
         ({"sequence": 0}, "expected sequence number"),
-        ({"first_world": 1}, "first world"),
-        ({"n_worlds": 0}, "first world"),
-        ({"n_worlds": 2}, "first world"),
+        ({"first_robot": 1}, "first robot"),
+        ({"n_robots": 0}, "first robot"),
+        ({"n_robots": 3}, "first robot"),
+        ({"flags": 2}, "flags"),
+        ({"n_worlds": 2}, "expected robots and their worlds, got 2 in 2"),
         ({"height": 5, "width": 3}, "height, width"),
-        ({"height": 2**32 - 1, "width": 2**32 - 1, "n_worlds": 2**32 - 1}, "height, width"),
+        ({"height": 2**32 - 1, "width": 2**32 - 1, "n_robots": 2**32 - 1}, "height, width"),
     ],
 )
 def test_an_answer_to_something_else_is_refused(changes: dict[str, int], words: str) -> None:
-    garbled_step(step_reply(**changes), GOOD, words)
+    garbled_step(step_reply(**changes), payload(), words)
 
 
 @pytest.mark.parametrize(
@@ -395,7 +445,7 @@ def test_an_answer_to_something_else_is_refused(changes: dict[str, int], words: 
         {
             "lease": 1,
             "ttl_millis": 1,
-            "worlds": [{"world": 0, "step": 0, "seed": None, "episode": 0, "robot": [0, 0]}],
+            "worlds": [{"world": 0, "step": 0, "seed": None, "episode": 0, "robots": [[0, 0]]}],
         },
     ],
     ids=lambda reply: repr(reply)[:40],
@@ -412,7 +462,7 @@ def test_a_refusal_without_good_words_is_a_refusal_still(reply: object) -> None:
 
 
 def test_a_control_reply_to_another_request_or_of_another_version_is_refused() -> None:
-    for header in (struct.pack("=IIQ", 1, 0, 0), struct.pack("=IIQ", 2, 0, 0)):
+    for header in (struct.pack("=IIQ", 2, 0, 0), struct.pack("=IIQ", 1, 0, 0)):
         WIRED.control.answer = header, b"{}"
         with fails("bad_answer", match="expected"):
             WIRED.client.status()
@@ -424,29 +474,30 @@ def test_a_handshake_that_makes_no_sense_is_refused(name: str) -> None:
         Wired(**{name: {}})
 
 
-payloads = st.binary(max_size=300) | st.integers(0, 3).map(lambda n: bytes(n * 79))
+payloads = st.binary(max_size=300) | st.integers(0, 3).map(lambda n: bytes(n * 190))
 numbers = st.integers(0, 4) | st.integers(0, 2**32 - 1)
 
 
-@given(st.binary(min_size=64, max_size=64), payloads)
+@given(st.binary(min_size=56, max_size=56), payloads)
 def test_random_bytes_are_no_answer(header: bytes, payload: bytes) -> None:
     WIRED.step.answer = header, payload
     with pytest.raises(EmberwatchError):
-        WIRED.lease.step([0, 1, 2, 3])
+        WIRED.lease.step(PATHS)
 
 
-@given(numbers, numbers, numbers, numbers, payloads)
+@given(numbers, numbers, numbers, numbers, numbers, payloads)
 def test_any_answer_is_taken_whole_or_refused_whole(
-    first: int, n_worlds: int, height: int, width: int, payload: bytes
+    first: int, n_robots: int, n_worlds: int, height: int, width: int, payload: bytes
 ) -> None:
-    sizes = {"n_worlds": n_worlds, "height": height, "width": width}
-    reply = wire.StepReply(first_world=first, **sizes)
+    sizes = {"n_robots": n_robots, "n_worlds": n_worlds, "height": height, "width": width}
+    reply = wire.StepReply(first_robot=first, **sizes)
     try:
-        answer = wire.StepAnswer(reply, bytearray(payload), 3)
+        answer = wire.StepAnswer(reply, bytearray(payload), SHAPE)
     except EmberwatchError:
         return
-    assert answer.frames.shape == (n_worlds, height, width)
-    assert len(answer.results) == n_worlds and len(payload) == n_worlds * (64 + height * width)
+    assert answer.frames.shape == (n_robots, height, width)
+    assert (len(answer.worlds), len(answer.results)) == (n_worlds, n_robots)
+    assert len(payload) == 64 * n_worlds + n_robots * (48 + height * width)
 
 
 @given(st.binary() | st.recursive(st.none() | st.integers(), st.lists).map(json.dumps))
@@ -454,19 +505,33 @@ def test_random_text_is_no_lease(reply: bytes | str) -> None:
     garbled_control(reply if isinstance(reply, bytes) else reply.encode())
 
 
-@given(numbers, numbers, numbers, payloads)
+@given(numbers, numbers, numbers, st.lists(st.integers(0, 5), max_size=4), payloads)
 def test_random_samples_are_read_whole_or_refused_whole(
-    height: int, width: int, n_moves: int, payload: bytes
+    n_robots: int, height: int, width: int, moves: list[int], payload: bytes
 ) -> None:
-    header = wire.FrameHeader(height=height, width=width, n_moves=n_moves)
+    header = wire.FrameHeader(n_robots=n_robots, height=height, width=width)
     truth = wire.TruthHeader(height=height, width=width)
+    results = b"".join(wire.ROBOT.pack(0, 0, 0, 0, 0, 0, 0, 0, 1, n_moves) for n_moves in moves)
+    for content in (payload, results + payload):
+        try:
+            frame = observer.frame_from_sample(header, bytearray(content), 0)
+        except EmberwatchError:
+            continue
+        assert len(frame.robots) == n_robots and frame.frame.shape == (height, width)
+        n_moves = sum(len(robot.path) for robot in frame.robots)
+        assert len(content) == n_robots * (48 + height * width) + n_moves
     try:
-        frame = observer.frame_from_sample(header, bytearray(payload), 0)
-        assert (frame.frame.shape, frame.path.shape) == ((height, width), (n_moves,))
         states = observer.truth_from_sample(truth, bytearray(payload), 0).states
         assert states.shape == (height, width)
     except EmberwatchError:
         pass
+
+
+def test_a_sample_with_robots_that_cannot_be_is_refused() -> None:
+    header = wire.FrameHeader(n_robots=2, height=1, width=1)
+    header.result[:] = wire.WORLD.pack(1, 0, 0, 0.0, 2, 4, 0, 0, 0, 0, 0)
+    with fails("bad_answer", match="expected bits below 2, got 0x6"):
+        observer.frame_from_sample(header, bytearray(98), 0)
 
 
 def test_the_worked_example_is_what_a_server_answers(server: Callable[..., Server]) -> None:
@@ -475,9 +540,9 @@ def test_the_worked_example_is_what_a_server_answers(server: Callable[..., Serve
     pairs = re.findall(r"--(\S+) (\S+)", flags[1])
     started = server(**{name.replace("-", "_"): value for name, value in pairs})
     message, _ = document.worked_example("StepReply")
-    path = document.worked_example("StepRequest")[0][ctypes.sizeof(wire.StepRequest) :]
-    with emberwatch.connect(started.instance) as client, client.acquire() as lease:
-        answer = lease.step(list(path))
-    head = ctypes.sizeof(wire.StepReply)
-    assert answer.results.tobytes() == message[head : head + wire.RESULT.size]
-    assert answer.frames.tobytes() == message[head + wire.RESULT.size :]
+    paths = document.worked_example("StepRequest")[0][ctypes.sizeof(wire.StepRequest) + 8 :]
+    with emberwatch.connect(started.instance) as client, client.acquire(0, 2) as lease:
+        answer = lease.step(np.frombuffer(paths, np.uint8).reshape(2, -1))
+    payload = message[ctypes.sizeof(wire.StepReply) :]
+    assert answer.worlds.tobytes() + answer.robots.tobytes() == payload[: 64 + 2 * 48]
+    assert answer.frames.tobytes() == payload[64 + 2 * 48 :]

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Start {
-    /// The corners, in turn: (0, 0), the opposite one, upper right, lower left.
+    /// The corners (0, 0), the opposite one, upper right, lower left; then the middles of the sides; and again.
     Corner,
     /// All in the middle.
     Centre,
@@ -79,12 +79,8 @@ impl Rules {
     }
 
     pub(super) fn start_cell(&self, seed: u64, robot: usize) -> Cell {
-        let (bottom, right) = (self.shape.height() - 1, self.shape.width() - 1);
         match self.start {
-            Start::Corner => {
-                let (row, col) = [(0, 0), (bottom, right), (0, right), (bottom, 0)][robot % 4];
-                Cell { row, col }
-            }
+            Start::Corner => corner_or_side(self.shape, robot),
             Start::Centre => self.shape.centre(),
             Start::Random => {
                 let mut stream = stream(seed, Purpose::Start, robot as u64);
@@ -94,4 +90,21 @@ impl Rules {
             Start::At(cell) => cell,
         }
     }
+}
+
+/// A place at the edge, another one for each of eight robots.
+fn corner_or_side(shape: Shape, robot: usize) -> Cell {
+    let (bottom, right) = (shape.height() - 1, shape.width() - 1);
+    let places = [
+        (0, 0),
+        (bottom, right),
+        (0, right),
+        (bottom, 0),
+        (0, right / 2),
+        (bottom, right / 2),
+        (bottom / 2, 0),
+        (bottom / 2, right),
+    ];
+    let (row, col) = places[robot % places.len()];
+    Cell { row, col }
 }

@@ -177,7 +177,7 @@ impl Siege {
         if let Some((given_up, _)) = self.attackers_step.take() {
             self.simulator.cancel_step(self.now, given_up);
         }
-        let body = self.from_present(request, body);
+        let body = self.body_from_present(request, body);
         let (before, mut payload) = (self.worlds(), Vec::new());
         let stepped = self
             .simulator
@@ -221,7 +221,7 @@ impl Siege {
     }
 
     /// Adds the present steps of the worlds of a step to those in its payload.
-    fn from_present(&self, request: &StepRequest, body: &[u8]) -> Vec<u8> {
+    fn body_from_present(&self, request: &StepRequest, body: &[u8]) -> Vec<u8> {
         let mut body = body.to_vec();
         let end = u64::from(request.first_robot) + u64::from(request.n_robots);
         let robots = request.first_robot as usize..end as usize;

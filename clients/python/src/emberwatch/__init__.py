@@ -8,6 +8,10 @@ Importing this package registers its environments with Gymnasium:
 Without Gymnasium, `connect` talks to a running server and `observe` reads what it publishes.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 import gymnasium
 
 from emberwatch import recording
@@ -24,7 +28,10 @@ from emberwatch.observer import Frame, Observer, Outlook, OutlookReader, Truth, 
 from emberwatch.release import VERSION
 from emberwatch.replies import Decision, DecisionsInfo, ServerInfo, ServerStatus, WorldInfo
 from emberwatch.vector_env import WildfireVectorEnv
-from emberwatch.wire import StepAnswer, StepResult
+from emberwatch.wire import RobotResult, StepAnswer, StepResult, WorldResult
+
+if TYPE_CHECKING:
+    from emberwatch.parallel import WildfireParallelEnv
 
 __all__ = [
     "Client",
@@ -37,6 +44,7 @@ __all__ = [
     "Observer",
     "Outlook",
     "OutlookReader",
+    "RobotResult",
     "ServerInfo",
     "ServerStatus",
     "StepAnswer",
@@ -50,8 +58,10 @@ __all__ = [
     "WildfireObjectiveVectorEnv",
     "WildfireVectorEnv",
     "WorldInfo",
+    "WorldResult",
     "connect",
     "observe",
+    "parallel_env",
     "recording",
 ]
 
@@ -78,3 +88,10 @@ gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
     vector_entry_point="emberwatch.objective_vector_env:WildfireObjectiveVectorEnv",
     max_episode_steps=MAX_EPISODE_STEPS,
 )
+
+
+def parallel_env(**keywords: Any) -> WildfireParallelEnv:
+    """All robots of one world as a PettingZoo environment; see `WildfireParallelEnv`."""
+    from emberwatch.parallel import WildfireParallelEnv
+
+    return WildfireParallelEnv(**keywords)

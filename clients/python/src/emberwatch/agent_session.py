@@ -62,6 +62,11 @@ class AgentSession(Session):
                 f"render_mode: expected at most {wire.FRAME_BUFFER} worlds, got {n_worlds}"
             )
         super().__init__(settings, n_worlds)
+        if self.spec.n_robots > 1 or settings.robot is not None:
+            raise InvalidArgumentError(
+                "robots: expected worlds of one robot, as an agent decides for one in each, got "
+                f"{self.spec.n_robots}"
+            )
         if self.spec.model is None:
             raise InvalidArgumentError("model: expected one, as the server does not reveal its own")
         n_objectives = self.spec.model.n_states + 1
@@ -184,22 +189,24 @@ class AgentSession(Session):
             got = self.summaries.shape
             raise wire.bad_answer(f"decisions: expected summaries of shape {expected}, got {got}")
         header = wire.StepReply(
-            first_world=self.settings.world,
+            first_robot=self.settings.world,
+            n_robots=len(decisions),
             n_worlds=len(decisions),
             height=spec.height,
             width=spec.width,
         )
-        results = b"".join(map(_result, decisions))
+        results = b"".join([*map(_world, decisions), *map(_robot, decisions)])
         frames = self._seen([(made.seed, made.episode, made.step) for made in decisions])
-        return StepAnswer(header, bytearray(results + frames), spec.n_observations)
+        return StepAnswer(header, bytearray(results + frames), spec.shape)
 
     def _seen(self, moments: list[tuple[int, int, int]]) -> bytes:
         spec = self.spec
         if self._frames is None:
             return bytes([wire.UNOBSERVED]) * (len(moments) * spec.height * spec.width)
         seen = self._frames.at(moments, self.settings.timeout)
-        self.paths = [fly(one.start, one.path, spec) for one in seen]
-        return b"".join(one.frame.tobytes() for one in seen)
+        robots = [one.robots[0] for one in seen]
+        self.paths = [fly(robot.result.start, robot.path, spec) for robot in robots]
+        return b"".join(robot.frame.tobytes() for robot in robots)
 
     def _lost(self, error: EmberwatchError) -> EmberwatchError:
         """The error in the agent's own words, if it has ended."""
@@ -215,20 +222,15 @@ class AgentSession(Session):
         return kind(f"{error}: {words}")
 
 
-def _result(made: Decision) -> bytes:
-    return wire.RESULT.pack(
-        made.step,
-        made.seed,
-        made.episode,
-        made.reward,
-        made.n_target_cells,
-        made.n_visited,
-        made.n_hits,
-        *made.robot,
-        0,
-        made.terminated,
-        made.truncated,
-    )
+def _world(made: Decision) -> bytes:
+    counts = made.n_target_cells, made.n_visited, made.n_hits
+    ends = made.terminated, made.truncated
+    return wire.WORLD.pack(made.step, made.seed, made.episode, made.reward, 0, 0, *counts, *ends)
+
+
+def _robot(made: Decision) -> bytes:
+    counts, cell = (made.n_visited, made.n_hits), made.robot
+    return wire.ROBOT.pack(made.reward, made.reward, *counts, *cell, *cell, 0, 0)
 
 
 class Summaries:

@@ -1,32 +1,46 @@
-"""What the environments of one world share: its session, its pictures, its beginning."""
+"""What the environments of one robot share: its session, its pictures, its beginning."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, Literal, TypeAlias
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.observations import Observations
 from emberwatch.session import Session, SessionOwner
 from emberwatch.settings import draw_seed
-from emberwatch.view import RENDER_FPS, RENDER_MODES, View
-from emberwatch.wire import StepAnswer, StepResult
+from emberwatch.view import RENDER_FPS, RENDER_MODES, View, fly
+from emberwatch.wire import UNOBSERVED, RobotResult, StepAnswer, StepResult
 
 NOTHING_TO_DRAW: Final = (
     "render: nothing to draw; give a render_mode to gymnasium.make and reset first"
 )
 
 #: Fields of a result that become `info`: not the seed, which gives the hidden states away.
-REPORTED: Final = ("step", "n_target_cells", "n_visited", "n_hits")
+REPORTED: Final = {
+    "step": "world",
+    "n_target_cells": "world",
+    "n_visited": "robot",
+    "n_hits": "robot",
+}
 
-#: What moves in an environment of one world.
-ONE_WORLD: Final = np.ones(1, np.bool_)
+#: What a robot's step can pay, and the field of a result that says it.
+REWARDS: Final = {
+    "share": ("robot", "reward"),
+    "team": ("world", "reward"),
+    "marginal": ("robot", "marginal"),
+}
+Reward: TypeAlias = Literal["share", "team", "marginal"]
+
+#: What moves in an environment of one robot.
+ONE_ROW: Final = np.ones(1, np.bool_)
 
 
 class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
-    """One world of a private or a running server."""
+    """One robot of a private or a running server."""
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
         "render_modes": list(RENDER_MODES),
@@ -40,6 +54,10 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
         self.render_mode = session.settings.render_mode
         self._view = View(self.render_mode, self._spec)
         self._reveals = reveals
+        #: Which robot of a world that others fly in; None: it is alone in its world.
+        self._robot: Final = session.settings.robot
+        self._n_missed = 0
+        self._answer: StepAnswer | None = None
         self._truth: NDArray[np.uint8] | None = None
         self._path: NDArray[np.intp] | None = None
 
@@ -57,23 +75,71 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
     def _begin(self, seed: int | None, options: dict[str, Any] | None) -> StepAnswer:
         """Begins an episode, or goes on from where the world stands."""
         super().reset(seed=seed)
-        if wants_to_resume(options, seed):
+        if wants_to_resume(options, seed) or self._robot is not None:
             answer = self._session.resume()
+            if self._robot is not None and answer.worlds["truncated"][0]:
+                raise EmberwatchError(
+                    "the episode of the world is over: a reset is for a client that holds all "
+                    "its robots",
+                    "episode_over",
+                )
         else:
             drawn = draw_seed(self.np_random) if seed is None else seed
             answer = self._session.reset([0], [drawn])
-        self._path = None
+        self._path, self._n_missed = None, 0
         return answer
 
+    def _update(self, observations: Observations, answer: StepAnswer) -> None:
+        """Takes in a step, after those that passed unseen."""
+        self._n_missed = self._session.n_skipped + (answer.robots["n_moves"][0] == 0)
+        for _ in range(self._session.n_skipped):
+            observations.update(ONE_ROW, np.full_like(answer.frames, UNOBSERVED))
+        observations.update(ONE_ROW, answer.frames)
+
+    def _teams(self, observations: Observations, answer: StepAnswer) -> StepAnswer | None:
+        """What is seen of teammates that others fly."""
+        is_needed = self._robot is not None and observations.shows_team
+        return self._session.teams(answer) if is_needed else None
+
+    def _trace(self, result: RobotResult, path: NDArray[np.uint8]) -> None:
+        """Keeps the cells of a path for pictures, if it was flown."""
+        self._path = fly(result.start, path[: result.n_moves], self._spec)
+
     def _describe(self, answer: StepAnswer, result: StepResult) -> dict[str, Any]:
-        info: dict[str, Any] = {name: getattr(result, name) for name in REPORTED}
+        info: dict[str, Any] = {
+            name: getattr(getattr(result, part), name) for name, part in REPORTED.items()
+        }
+        if self._robot is not None:
+            info["n_missed"] = int(self._n_missed)
         if self._reveals:
             self._truth = truth = self._session.truth(answer)[0]
             info["truth"] = truth.copy()
         return info
 
     def _draw(self) -> Any:
-        raise NotImplementedError
+        if self._answer is None:
+            return None
+        cells, paths = [self._cell()], [] if self._path is None else [self._path]
+        return self._view.draw(self._answer.frames[0], cells, paths, self._truth)
+
+    def _cell(self) -> tuple[int, int]:
+        """Where the robot is drawn."""
+        assert self._answer is not None
+        return self._answer.result().robot.cell
+
+
+def check_reward(reward: str, *more: str) -> tuple[str, str]:
+    """The field of a result that says what a step pays; `more` rewards are the share as well."""
+    if reward not in (*REWARDS, *more):
+        expected = ", ".join(map(repr, (*REWARDS, *more)))
+        raise InvalidArgumentError(f"reward: expected one of {expected}, got {reward!r}")
+    return REWARDS.get(reward, REWARDS["share"])
+
+
+def paid(result: StepResult, field: tuple[str, str]) -> float:
+    """What a step pays."""
+    part, name = field
+    return getattr(getattr(result, part), name)
 
 
 def wants_to_resume(options: dict[str, Any] | None, seed: object) -> bool:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from emberwatch.arguments import as_seed
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.observations import OF_BELIEF, names_of
+from emberwatch.observations import OF_BELIEF, OF_TEAM, names_of
 
 #: Takes the stacked observations of some worlds; returns an action for each.
 Policy = Callable[[Any], Any]
@@ -62,18 +62,27 @@ class Row:
     brier: str
     #: Moves of a path.
     moves: int
+    #: Robots of the world; the numbers above are those of all of them together.
+    robots: int = 1
+    #: What they share: `alone`, `shared` (what they see), or a word of your own.
+    team: str = "alone"
+    #: Share of their visits to cells that another robot visited in the same step.
+    mean_repeated: float = 0.0
 
 
+#: Columns that a file may lack.
+_OF_TEAMS: Final = ("robots", "team", "mean_repeated")
 _HEADER: Final = [field.name for field in fields(Row)]
 
 
 class _Tally:
     """Sums over the steps of some worlds."""
 
-    def __init__(self, n_moves: int, n_worlds: int) -> None:
+    def __init__(self, n_moves: int, n_worlds: int, n_robots: int) -> None:
         self.n_moves: Final = n_moves
+        self.n_robots: Final = n_robots
         self.reward = np.zeros(n_worlds)
-        self.n_visited, self.n_hits, self.n_fire = np.zeros((3, n_worlds), np.int64)
+        self.n_visited, self.n_visits, self.n_hits, self.n_fire = np.zeros((4, n_worlds), np.int64)
         self.seconds = 0.0
 
     def timed(self, act: Policy, seen: Any) -> Any:
@@ -82,11 +91,14 @@ class _Tally:
         self.seconds += time.perf_counter() - begin
         return actions
 
-    def add(self, rewards: NDArray[Any], infos: dict[str, Any]) -> None:
-        self.reward += rewards
-        self.n_visited += infos["n_visited"]
-        self.n_hits += infos["n_hits"]
-        self.n_fire += infos["n_target_cells"]
+    def add(self, results: NDArray[np.void]) -> None:
+        """One step of all robots."""
+        worlds = results["world"][:: self.n_robots]
+        self.reward += worlds["reward"]
+        self.n_visited += worlds["n_visited"]
+        self.n_visits += results["robot"]["n_visited"].reshape(-1, self.n_robots).sum(1, np.int64)
+        self.n_hits += worlds["n_hits"]
+        self.n_fire += worlds["n_target_cells"]
 
 
 def evaluate(
@@ -123,6 +135,7 @@ def evaluate(
             run again; those of other policies are kept. A changed policy needs another name.
         progress: Where to write how far it is; None: nowhere.
         keywords: Of the environment: `model`, `height`, `width`, `n_moves`, `observation`, ...
+            With `robots` the policy acts for all robots of each world: rows are robots.
 
     Returns:
         A row for each seed, in order.
@@ -134,14 +147,18 @@ def evaluate(
         has_belief = OF_BELIEF & set(names_of(keywords.get("observation")))
         estimator = "known_model" if has_belief else "none"
     file = None if csv is None else _File(Path(csv))
-    done = {} if file is None else file.done(name, estimator, steps, _n_moves(env, keywords))
+    robots = keywords.get("robots") or 1
+    shares = robots > 1 and bool(OF_TEAM & set(names_of(keywords.get("observation"))))
+    team = "shared" if shares else "alone"
+    kind = (name, estimator, robots, team)
+    done = {} if file is None else file.done(kind, steps, _n_moves(env, keywords))
     missing = [seed for seed in chosen if seed not in done]
     report = _Progress(progress, name, chosen, len(missing) * steps)
     for first in range(0, len(missing), batch):
         part = missing[first : first + batch]
         getattr(policy, "begin", _nothing)(len(part))
         tally = _play(env, keywords, act, part, steps, report)
-        rows = _rows(tally, part, steps, name, estimator)
+        rows = _rows(tally, part, steps, kind)
         done |= {row.world_seed: row for row in rows}
         if file is not None:
             file.add(rows)
@@ -150,7 +167,8 @@ def evaluate(
 
 
 def _make(env: str, keywords: dict[str, Any], n_worlds: int) -> Any:
-    make: Any = {"num_envs": n_worlds, "max_episode_steps": -1, **keywords}
+    n_robots = keywords.get("robots") or 1
+    make: Any = {"num_envs": n_worlds * n_robots, "max_episode_steps": -1, **keywords}
     return gymnasium.make_vec(env, autoreset_mode=AutoresetMode.DISABLED, **make)
 
 
@@ -172,23 +190,27 @@ def _play(
     """Flies so many paths in some worlds."""
     worlds = _make(env, keywords, len(seeds))
     try:
-        tally = _Tally(worlds.unwrapped.n_moves, len(seeds))
-        seen, _ = worlds.reset(seed=list(seeds))
+        n_robots = worlds.num_envs // len(seeds)
+        tally = _Tally(worlds.unwrapped.n_moves, len(seeds), n_robots)
+        seen, _ = worlds.reset(seed=np.repeat(seeds, n_robots).tolist())
         n_actions = tally.n_moves if env == _MOVES else 1
         for _ in range(steps):
             for _ in range(n_actions - 1):
                 seen, *_ = worlds.step(tally.timed(act, seen))
-            seen, rewards, _, truncated, infos = worlds.step(tally.timed(act, seen))
+            seen, _, _, truncated, _ = worlds.step(tally.timed(act, seen))
             if truncated.any():
                 raise InvalidArgumentError("instance: expected a server without --max-steps")
-            tally.add(rewards, infos)
+            tally.add(worlds.unwrapped.results)
             report.add(len(seeds))
     finally:
         worlds.close()
     return tally
 
 
-def _rows(tally: _Tally, seeds: Sequence[int], steps: int, name: str, estimator: str) -> list[Row]:
+def _rows(
+    tally: _Tally, seeds: Sequence[int], steps: int, kind: tuple[str, str, int, str]
+) -> list[Row]:
+    name, estimator, robots, team = kind
     return [
         Row(
             policy=name,
@@ -202,6 +224,9 @@ def _rows(tally: _Tally, seeds: Sequence[int], steps: int, name: str, estimator:
             mean_plan_millis=1e3 * tally.seconds / steps / len(seeds),
             brier="",
             moves=tally.n_moves,
+            robots=robots,
+            team=team,
+            mean_repeated=1.0 - int(tally.n_visited[index]) / int(tally.n_visits[index]),
         )
         for index, seed in enumerate(seeds)
     ]
@@ -260,15 +285,17 @@ class _File:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._rows = read(path) if path.exists() else []
 
-    def done(self, name: str, estimator: str, steps: int, n_moves: int) -> dict[int, Row]:
+    def done(self, kind: tuple[str, str, int, str], steps: int, n_moves: int) -> dict[int, Row]:
         """What a policy has done already, by seed."""
-        own = [row for row in self._rows if (row.policy, row.estimator) == (name, estimator)]
+        own = [
+            row for row in self._rows if (row.policy, row.estimator, row.robots, row.team) == kind
+        ]
         for row in own:
             if (row.steps, row.moves) != (steps, n_moves):
                 raise InvalidArgumentError(
-                    f"csv: {self._path} has {row.steps} steps of {row.moves} moves of {name!r} on "
-                    f"world {row.world_seed}, expected {steps} of {n_moves}: choose another file "
-                    "or name"
+                    f"csv: {self._path} has {row.steps} steps of {row.moves} moves of "
+                    f"{row.policy!r} on world {row.world_seed}, expected {steps} of "
+                    f"{n_moves}: choose another file or name"
                 )
         return {row.world_seed: row for row in own}
 
@@ -282,7 +309,9 @@ class _File:
                     "model, grid or burn-in): choose another file"
                 )
         self._rows += rows
-        self._rows.sort(key=lambda row: (row.policy, row.world_seed, row.estimator))
+        self._rows.sort(
+            key=lambda row: (row.policy, row.world_seed, row.estimator, row.robots, row.team)
+        )
         temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}.tmp")
         with temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv_files.writer(file, lineterminator="\n")
@@ -296,7 +325,7 @@ def read(path: str | os.PathLike[str]) -> list[Row]:
     try:
         with Path(path).open(newline="", encoding="utf-8") as file:
             lines = csv_files.DictReader(file)
-            if lines.fieldnames != _HEADER:
+            if lines.fieldnames not in (_HEADER, _HEADER[: -len(_OF_TEAMS)]):
                 raise ValueError(lines.fieldnames)
             return [_row(line) for line in lines]
     except (ValueError, TypeError) as error:
@@ -307,7 +336,11 @@ def read(path: str | os.PathLike[str]) -> list[Row]:
 
 def _row(line: dict[str, Any]) -> Row:
     kinds: dict[Any, Callable[[str], Any]] = {"int": int, "float": float, "str": str}
-    values = {field.name: kinds[field.type](line[field.name]) for field in fields(Row)}
+    values = {
+        field.name: kinds[field.type](line[field.name])
+        for field in fields(Row)
+        if field.name in line
+    }
     return Row(**values)
 
 

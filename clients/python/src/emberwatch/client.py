@@ -1,4 +1,4 @@
-"""A connection to a server: worlds to act on, to observe, to store.
+"""A connection to a server: robots to fly, worlds to observe and to store.
 
 `connect` gives a `Client`, its `acquire` a `Lease`, and that one's `step` a `StepAnswer`.
 Every call waits `timeout` seconds for its answer; everything returned is a copy.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import time
 from base64 import b64decode
 from collections.abc import Callable
@@ -43,46 +44,48 @@ class Client(ServerConnection):
 
     def acquire(
         self,
-        first_world: int = 0,
-        n_worlds: int = 1,
+        first_robot: int = 0,
+        n_robots: int = 1,
         *,
         takeover: bool = False,
         ttl: float | None = None,
         timeout: float = RESET_TIMEOUT,
     ) -> Lease:
-        """Gets the right to act on consecutive worlds, once they are out of their burn-in.
+        """Gets the right to fly consecutive robots, once their worlds are out of their burn-in.
 
-        To resume what another agent left, go on from `lease.observe()`: it has k, the robot's
-        cell and the last frame. To start again, `lease.reset()`.
+        Robot r of world w has number w R + r, with R = `info.n_robots`. To resume what another
+        agent left, go on from `lease.observe()`: it has k, the robot's cell and the last frame.
+        To start again, `lease.reset()`.
 
         Args:
-            takeover: Take them from their holder.
+            takeover: Take them from their holders.
             ttl: The lease ends this long after its last use, seconds; None: the server's default.
 
         Raises:
             EmberwatchError: With code `"busy"` if somebody else holds one of them, or
-                `"no_such_world"`.
+                `"no_such_robot"`.
         """
         request = {
             "op": "acquire",
-            "first_world": first_world,
-            "n_worlds": n_worlds,
+            "first_robot": first_robot,
+            "n_robots": n_robots,
             "takeover": takeover,
             "ttl_millis": None if ttl is None else round(ttl * 1000),
         }
         reply = self.control(request, timeout=timeout)
-        worlds = range(first_world, first_world + n_worlds)
-        return Lease(self, record(Grant, reply), records(WorldInfo, reply), worlds)
+        robots = range(first_robot, first_robot + n_robots)
+        return Lease(self, record(Grant, reply), records(WorldInfo, reply), robots)
 
     def recall(
         self,
         step: int,
-        first_world: int = 0,
-        n_worlds: int = 1,
+        first_robot: int = 0,
+        n_robots: int = 1,
         *,
+        team: bool = False,
         timeout: float = STEP_TIMEOUT,
     ) -> StepAnswer:
-        """The results and frames of an earlier step k of the episode. Needs no lease.
+        """The results and frames of an earlier step k of the episode, as `observe` has them.
 
         If the server no longer keeps it, the error's `code` is `"not_kept"`, and its `detail` the
         nearest step that it keeps.
@@ -91,9 +94,9 @@ class Client(ServerConnection):
             raise InvalidArgumentError(
                 f"step: expected an integer within 0 to 2**64 - 1, got {step!r}"
             )
-        return self.exchange(
-            wire.RECALL, 0, first_world, n_worlds, 0, b"", step=step, timeout=timeout
-        )
+        flags = wire.TEAM_FRAMES if team else 0
+        body = step.to_bytes(8, sys.byteorder) * self.shape.n_worlds(first_robot, n_robots)
+        return self.exchange(wire.RECALL, 0, first_robot, n_robots, flags, body, timeout=timeout)
 
     def snapshot(
         self,
@@ -117,11 +120,11 @@ class Client(ServerConnection):
         request = {"op": "snapshot", **place, "path": os.path.abspath(path)}
         return records(WorldInfo, self.control(request, timeout=timeout))
 
-    def belief(self, world: int = 0, *, timeout: float = STEP_TIMEOUT) -> LeftBelief | None:
-        """The belief that was left about the present step of a world; None if there is none."""
+    def belief(self, robot: int = 0, *, timeout: float = STEP_TIMEOUT) -> LeftBelief | None:
+        """The belief that a robot's agent left about the present step; None if there is none."""
         data, first = b"", None
         while True:
-            request = {"op": "belief", "world": world, "offset": len(data)}
+            request = {"op": "belief", "robot": robot, "offset": len(data)}
             try:
                 reply = self.control(request, timeout=timeout)
             except EmberwatchError as error:

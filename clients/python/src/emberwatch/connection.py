@@ -114,33 +114,45 @@ class ServerConnection(Connection):
     def __init__(self, instance: str = "default", *, timeout: float = STEP_TIMEOUT) -> None:
         super().__init__(instance, "control", "wake-server", "server", timeout)
         with self._closed_on_error():
-            self.info: Final = self._shake_hands(ServerInfo)
+            info = self._shake_hands(ServerInfo)
+            self.info: Final = info
+            self.shape: Final = info.shape
             with in_turn(self._left()):
-                self._step.create(slice_len=self.info.n_worlds * self.info.n_moves, grows=False)
+                longest = info.n_worlds * (8 + info.n_robots * info.n_moves)
+                self._step.create(slice_len=longest, grows=False)
 
     def _open_others(self) -> None:
         self._step = self._open("step", wire.StepRequest, wire.StepReply)
 
     def observe(
-        self, first_world: int = 0, n_worlds: int = 1, *, timeout: float = STEP_TIMEOUT
+        self,
+        first_robot: int = 0,
+        n_robots: int = 1,
+        *,
+        team: bool = False,
+        timeout: float = STEP_TIMEOUT,
     ) -> StepAnswer:
-        """The last results and frames again. Needs no lease and changes nothing."""
-        return self.exchange(wire.OBSERVE, 0, first_world, n_worlds, 0, b"", timeout=timeout)
+        """The last results and frames again, or with `team` the frame of each world's team.
+
+        Needs no lease and changes nothing.
+        """
+        flags = wire.TEAM_FRAMES if team else 0
+        return self.exchange(wire.OBSERVE, 0, first_robot, n_robots, flags, b"", timeout=timeout)
 
     def exchange(
         self,
         operation: int,
         lease: int,
-        first_world: int,
-        n_worlds: int,
+        first_robot: int,
+        n_robots: int,
         flags: int,
-        paths: bytes,
+        body: bytes,
         *,
-        step: int = 0,
         timeout: float,
     ) -> StepAnswer:
         """Sends one request on `step` as it is; `Lease.step` and `observe` are easier."""
         self._node.check()
+        info = self.info
         with self._lock:
             self._sequence = sequence = self._sequence + 1
             header = wire.STEP_REQUEST.pack(
@@ -148,20 +160,19 @@ class ServerConnection(Connection):
                 operation,
                 lease,
                 sequence,
-                first_world,
-                n_worlds,
-                self.info.n_moves if operation == wire.STEP else 0,
+                first_robot,
+                n_robots,
+                info.n_moves if operation == wire.STEP else 0,
                 flags,
                 self._peer.listener_low,
                 self._peer.listener_high,
-                step,
             )
-            reply, payload = self._step.exchange(header, paths, "a step", timeout)
+            reply, payload = self._step.exchange(header, body, "a step", timeout)
         if reply.status != 0:
             raise refusal(reply.status, reply.detail)
         wire.check_answer("answer to step", reply, sequence)
-        wire.check_worlds(reply, (first_world, n_worlds, self.info.height, self.info.width))
-        return StepAnswer(reply, payload, self.info.n_observations)
+        wire.check_asked(reply, (first_robot, n_robots, flags, info.height, info.width))
+        return StepAnswer(reply, payload, self.shape)
 
 
 def _decoded(what: str, answer: bytearray) -> dict[str, Any]:

@@ -9,11 +9,10 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from emberwatch.arguments import as_moves
-from emberwatch.base import ONE_WORLD, WorldEnv
-from emberwatch.observations import Observations, Parts, of_world
+from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward, paid
+from emberwatch.observations import Observations, Parts, of_row
 from emberwatch.session import Session
 from emberwatch.settings import Settings, WorldArguments
-from emberwatch.view import fly
 from emberwatch.wire import StepAnswer, StepResult
 
 
@@ -49,6 +48,8 @@ class WildfireEnv(WorldEnv):
     | `robot` | `MultiDiscrete([H, W])` | the robot's row and column |
     | `age` | `Box(0, 255, (H, W, 1), uint8)` | steps since it was seen; 255: never, or as many |
     | `belief` | `Box(0, 255, (H, W, S), uint8)` | 255 times each state's probability |
+    | `team` | `Box(0, 255, (H, W, 1), uint8)` | `frame`, of what all robots of the world saw |
+    | `others` | `Box(0, 255, (H, W, 1), uint8)` | 255 in the cells where other robots are |
 
     The last channel of `image` stands for nothing observed. `belief` is about what the next path
     will meet, by the known model's Bayes filter (paper equations 5 and 6) given all frames so far;
@@ -57,7 +58,19 @@ class WildfireEnv(WorldEnv):
     ## Rewards
 
     The number of distinct cells visited that burn after the world moved (in general the sum of
-    the model's rewards). The start cell counts only if it is flown over again.
+    the model's rewards). The start cell counts only if it is flown over again. In a world of
+    several robots `reward` chooses: `"share"` (the default), where a cell that v robots visited
+    pays 1 / v to each; `"team"`, the reward of all robots together; or `"marginal"`, what that
+    would lack without this robot.
+
+    ## One Robot of a Team
+
+    With `instance` and `robot=2` it is one robot of a world in which other processes fly the
+    others. A step waits for the paths of all robots that somebody holds, but no longer than the
+    server's `--deadline-ms`. A path that comes too late is not flown: the answer tells how the
+    world stands, and `info["n_missed"]` in how many steps this robot stayed where it was. `reset`
+    begins no episode, as the world is not its own; it goes on from where the world stands, and
+    its `seed` is for `np_random` alone. `emberwatch.parallel_env` flies all robots of a world.
 
     ## Starting State
 
@@ -85,6 +98,8 @@ class WildfireEnv(WorldEnv):
     * `observation`: parts of the observation; `("frame", "robot")` by default.
     * `instance`: attach to this running server; None: a private one.
     * `world`: which of its worlds (0).
+    * `robot`: which of the world's robots, where others fly the rest (None: it has only one).
+    * `reward`: `"share"`, `"team"` or `"marginal"`.
     * `takeover`: take the world from its holder (False).
     * `model`: `"wildfire"` (the default), `"wildfire-sparse"`, `"wildfire-latent"`,
       `"wildfire-small"` (for learning on 12 x 12 to 32 x 32 cells) or the path of a model file;
@@ -106,22 +121,26 @@ class WildfireEnv(WorldEnv):
     """
 
     def __init__(
-        self, *, observation: Parts = ("frame", "robot"), **world: Unpack[WorldArguments]
+        self,
+        *,
+        observation: Parts = ("frame", "robot"),
+        reward: Reward = "share",
+        **world: Unpack[WorldArguments],
     ) -> None:
         """See the class. No server of its own runs before the first reset."""
         settings = Settings.of(WildfireEnv, world)
+        self._pays = check_reward(reward)
         super().__init__(Session(settings), reveals=settings.truth)
-        self._observations = Observations(observation, self._spec)
+        self._observations = Observations(observation, self._spec, first=self._robot or 0)
         self.observation_space = self._observations.space
         self.action_space = spaces.MultiDiscrete([4] * self._spec.n_moves)
-        self._answer: StepAnswer | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begins an episode; see the class, *Starting State*."""
         self._answer = answer = self._begin(seed, options)
-        self._observations.reset(ONE_WORLD, answer.frames)
+        self._observations.reset(ONE_ROW, answer.frames)
         return self._seen(answer, answer.result())
 
     def step(
@@ -136,15 +155,14 @@ class WildfireEnv(WorldEnv):
             RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
         """
         moves = as_moves(action, 1, self._spec.n_moves)
-        before, answer = self._answer, self._session.step(moves)
-        self._answer = answer
-        self._observations.update(ONE_WORLD, answer.frames)
+        self._answer = answer = self._session.step(moves)
+        self._update(self._observations, answer)
         result = answer.result()
-        if self.render_mode is not None and before is not None:
-            start = before.result()
-            self._path = fly((start.row, start.col), moves.reshape(-1), self._spec)
+        if self.render_mode is not None:
+            self._trace(result.robot, moves.reshape(-1))
         observation, info = self._seen(answer, result)
-        return observation, result.reward, bool(result.terminated), bool(result.truncated), info
+        reward, world = paid(result, self._pays), result.world
+        return observation, reward, bool(world.terminated), bool(world.truncated), info
 
     def _seen(self, answer: StepAnswer, result: StepResult) -> tuple[Any, dict[str, Any]]:
         info = self._describe(answer, result)
@@ -154,12 +172,6 @@ class WildfireEnv(WorldEnv):
             frames = frames.copy()
         if self.render_mode == "human":
             self._draw()
-        robots = np.array([(result.row, result.col)], np.int64)
-        return of_world(self._observations.all(frames, robots), 0), info
-
-    def _draw(self) -> Any:
-        if self._answer is None:
-            return None
-        result = self._answer.result()
-        robot = (result.row, result.col)
-        return self._view.draw(self._answer.frames[0], robot, self._path, self._truth)
+        cells = np.array([result.robot.cell], np.int64)
+        teams = self._teams(self._observations, answer)
+        return of_row(self._observations.all(frames, cells, teams), 0), info

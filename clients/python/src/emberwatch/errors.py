@@ -35,7 +35,7 @@ class InvalidArgumentError(EmberwatchError, ValueError):
 
 
 class LeaseLostError(EmberwatchError):
-    """The lease ended, or another client took the world over; `detail` is its pid, or 0."""
+    """The lease ended, or another client took robots over; `detail` is its pid, or 0."""
 
     code = "lease_lost"
 
@@ -69,9 +69,9 @@ STATUSES: Final = (
     ("no_such_world", "no such world: the server has worlds 0 to {last}"),
     ("wrong_length", "wrong payload length: expected {} bytes"),
     ("wrong_path_length", "wrong path length: the server flies {} moves a step"),
-    ("bad_move", "byte {} of the paths: expected a move in 0..=3"),
-    ("no_lease", "no lease on world {}: acquire it first"),
-    ("lease_lost", "lease lost to pid {}, which took the world over or acquired it since"),
+    ("bad_move", "byte {} of the payload: expected a move in 0..=3"),
+    ("no_lease", "no lease on robot {}: acquire it first"),
+    ("lease_lost", "lease lost to pid {}, which took the robot over or acquired it since"),
     ("busy", "busy: held by pid {}; wait for its release, or acquire with takeover=True"),
     ("resetting", "world {} is being reset; wait for the answer to the reset"),
     ("episode_over", "world {} was truncated: reset it first"),
@@ -80,11 +80,22 @@ STATUSES: Final = (
         'not permitted: full frames need a server with coverage "client" or "full", and a replay '
         "takes no steps",
     ),
-    ("unknown_flags", "flags: expected 0 or 1 (full coverage), got {}"),
+    ("unknown_flags", "flags: expected 1 (full coverage), 2 (team frames), both or 0, got {}"),
     ("bad_objective", "objective: expected one below {}"),
     ("agent_ends", "the agent ends"),
     ("bad_file", "the file cannot be used"),
     ("not_kept", "not kept: the nearest step that is kept is {}"),
+    (
+        "late",
+        "late: the world is at step {} already; observe it, and send a path for that step",
+    ),
+    ("early", "early: the world is at step {} only"),
+    (
+        "incomplete",
+        "incomplete: robot {} is missing; a step names all robots that its client holds in a "
+        "world, and a step of several worlds needs them all",
+    ),
+    ("no_such_robot", "no such robot: the server has robots 0 to {last}"),
 )
 
 _CLASSES: Final = {"lease_lost": LeaseLostError, "agent_ends": ServerGoneError}
@@ -97,7 +108,7 @@ def refusal(status: int, detail: int, message: str | None = None) -> EmberwatchE
         return EmberwatchError(message, detail=detail)
     code, sentence = STATUSES[status - 1]
     if code == "lease_lost" and detail == 0:
-        sentence = "lease lost: it expired or was released; acquire the worlds again"
+        sentence = "lease lost: it expired or was released; acquire the robots again"
     if message is None or code == "busy":  # the server's words name a flag, not a keyword
         message = sentence.format(detail, last=max(detail - 1, 0))
     return _CLASSES.get(code, EmberwatchError)(message, code, detail)

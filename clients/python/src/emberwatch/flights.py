@@ -1,4 +1,4 @@
-"""Paths flown move by move in many worlds: where the robots are, what they have visited."""
+"""Paths flown move by move by many robots: where they are, what they have visited."""
 
 from __future__ import annotations
 
@@ -14,52 +14,52 @@ _DIRECTIONS: Final = np.array(DIRECTIONS, np.int64)
 
 
 class Flights:
-    """The present path of each world, as far as it is flown."""
+    """The present path of each robot, as far as it is flown. Rows are robots."""
 
-    def __init__(self, spec: WorldSpec, n_worlds: int, *, pays: bool) -> None:
+    def __init__(self, spec: WorldSpec, n_rows: int, *, pays: bool) -> None:
         """`pays`: each cell pays when it is first visited, what its hidden state pays."""
         self.spec: Final = spec
         self._reward = None if spec.model is None or not pays else spec.model.reward
         self._last_cell = np.array((spec.height - 1, spec.width - 1), np.int64)
         #: Row and column of each robot.
-        self.robots = np.zeros((n_worlds, 2), np.int64)
+        self.robots = np.zeros((n_rows, 2), np.int64)
         #: Number of moves made.
-        self.n_made = np.zeros(n_worlds, np.int64)
+        self.n_made = np.zeros(n_rows, np.int64)
         #: 255 in the cells visited, else 0.
-        self.visited = np.zeros((n_worlds, spec.height, spec.width), np.uint8)
+        self.visited = np.zeros((n_rows, spec.height, spec.width), np.uint8)
         #: What the moves have been paid.
-        self.paid = np.zeros(n_worlds)
+        self.paid = np.zeros(n_rows)
         self._states = np.zeros_like(self.visited)
-        self._moves = np.zeros((n_worlds, spec.n_moves), np.uint8)
+        self._moves = np.zeros((n_rows, spec.n_moves), np.uint8)
 
     def begin(
         self,
-        worlds: NDArray[np.bool_],
+        begun: NDArray[np.bool_],
         robots: NDArray[np.int64],
         states: NDArray[np.uint8] | None,
     ) -> None:
-        """Begins paths in some worlds; `robots` and hidden `states` are those of all."""
-        self.robots[worlds] = robots[worlds]
-        self.n_made[worlds] = 0
-        self.visited[worlds] = 0
-        self.paid[worlds] = 0.0
+        """Begins some paths; `robots` and hidden `states` are those of all rows."""
+        self.robots[begun] = robots[begun]
+        self.n_made[begun] = 0
+        self.visited[begun] = 0
+        self.paid[begun] = 0.0
         if states is not None:
-            self._states[worlds] = states[worlds]
+            self._states[begun] = states[begun]
 
     def completes(self) -> NDArray[np.bool_]:
-        """In which worlds the next move is the last of its path."""
+        """Of which rows the next move is the last of its path."""
         return self.n_made == self.spec.n_moves - 1
 
     def paths(self, actions: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The paths that these actions would complete, `(n_worlds, T)`."""
+        """The paths that these actions would complete, `(n_rows, T)`."""
         return np.concatenate((self._moves[:, :-1], actions[:, np.newaxis]), axis=1)
 
-    def made(self, world: int) -> NDArray[np.uint8]:
-        """The moves made in one world."""
-        return self._moves[world, : self.n_made[world]]
+    def made(self, row: int) -> NDArray[np.uint8]:
+        """The moves made by one robot."""
+        return self._moves[row, : self.n_made[row]]
 
     def move(self, indices: NDArray[np.intp], actions: NDArray[np.uint8]) -> NDArray[np.float64]:
-        """One move in some worlds; returns what it pays in them."""
+        """One move of some robots; returns what it pays them."""
         chosen = actions[indices]
         self._moves[indices, self.n_made[indices]] = chosen
         self.n_made[indices] += 1

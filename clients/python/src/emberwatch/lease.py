@@ -1,8 +1,9 @@
-"""A lease: the right to act on some worlds, and what may be done with it."""
+"""A lease: the right to fly some robots, and what may be done with it."""
 
 from __future__ import annotations
 
 import os
+import threading
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from typing import Any, Final, Self
@@ -23,66 +24,101 @@ _BELIEF_PART: Final = 1 << 19
 
 
 class Lease:
-    """The right to act on consecutive worlds. Ends by `release`, or leaving its `with`."""
+    """The right to fly consecutive robots. Ends by `release`, or leaving its `with`.
+
+    A path is flown in the step k that it is meant for: of each world, the one after the last step
+    that this lease has stepped to, reset to or observed.
+    """
 
     def __init__(
-        self, client: ServerConnection, grant: Grant, start: tuple[WorldInfo, ...], worlds: range
+        self, client: ServerConnection, grant: Grant, start: tuple[WorldInfo, ...], robots: range
     ) -> None:
         self.client: Final = client
         #: The server's number for it.
         self.number: Final = grant.lease
         #: It ends this many seconds after its last use.
         self.ttl: Final = grant.ttl_millis / 1000
-        #: The worlds it covers.
-        self.worlds: Final = worlds
-        #: Where they stood when it was given.
+        #: The numbers of the robots it covers.
+        self.robots: Final = robots
+        #: The worlds that these robots are in.
+        self.worlds: Final = self._worlds_of(robots)
+        #: Where these worlds stood when it was given.
         self.start: Final = start
+        #: k of each world, as far as is known here.
+        self._steps = np.zeros(len(self.worlds), np.uint64)
+        self._lock = threading.Lock()
         self._is_over = False
+        self._note(start)
 
     def step(
         self,
         paths: ArrayLike,
         *,
-        worlds: range | None = None,
+        robots: range | None = None,
         full: bool = False,
+        team: bool = False,
         timeout: float = STEP_TIMEOUT,
     ) -> StepAnswer:
-        """Flies one path in each world and moves the worlds from k to k + 1.
+        """Flies one path with each robot, and moves the worlds from k to k + 1.
+
+        Where others hold robots of the world, it waits for their paths too.
 
         Args:
-            paths: Moves, integers: 0 up, 1 down, 2 left, 3 right; `(n_worlds, T)`, or `(T,)` for
-                one world.
-            worlds: Only these, consecutive; None: all of the lease.
+            paths: Moves, integers: 0 up, 1 down, 2 left, 3 right; `(n_robots, T)`, or `(T,)` for
+                one robot.
+            robots: Only these, consecutive, and all of the lease in their worlds; None: all.
             full: Observe every cell; needs a server with coverage "client" or "full".
+            team: Get the frame of each world's team instead of each robot's.
 
         Raises:
             InvalidArgumentError: If the paths are not of that shape, type and range.
-            LeaseLostError: If the lease ended or a world was taken over.
+            LeaseLostError: If the lease ended or a robot was taken over.
             RequestTimeoutError: If no answer comes; `observe` tells whether the step was made.
             ServerGoneError: If the server ended.
-            EmberwatchError: With code `"episode_over"`: reset that world.
+            EmberwatchError: With code `"late"`: the world has moved on without this path, `observe`
+                tells to where. With code `"episode_over"`: reset that world.
         """
-        chosen = self.worlds if worlds is None else self._part(worlds)
+        chosen = self.robots if robots is None else _part("robots", robots, self.robots)
         moves = as_moves(paths, len(chosen), self.client.info.n_moves)
-        return self.step_moves(moves, chosen, full=full, timeout=timeout)
+        return self.step_moves(moves, chosen, full=full, team=team, timeout=timeout)
 
     def step_moves(
-        self, moves: NDArray[np.uint8], worlds: range, *, full: bool, timeout: float
+        self,
+        moves: NDArray[np.uint8],
+        robots: range,
+        *,
+        full: bool = False,
+        team: bool = False,
+        timeout: float,
     ) -> StepAnswer:
         """The same for moves that `as_moves` has checked."""
-        return self.client.exchange(
-            wire.STEP,
-            self.number,
-            worlds.start,
-            len(worlds),
-            wire.FULL_COVERAGE if full else 0,
-            moves.tobytes(),
-            timeout=timeout,
-        )
+        steps = self.steps_of(robots)
+        flags = full * wire.FULL_COVERAGE | team * wire.TEAM_FRAMES
+        with self._lock:  # each thread's path is for a step of its own
+            answer = self.client.exchange(
+                wire.STEP,
+                self.number,
+                robots.start,
+                len(robots),
+                flags,
+                steps.tobytes() + moves.tobytes(),
+                timeout=timeout,
+            )
+            steps[:] = answer.worlds["step"]
+        return answer
 
-    def observe(self, *, timeout: float = STEP_TIMEOUT) -> StepAnswer:
-        """The last results and frames of its worlds again."""
-        return self.client.observe(self.worlds.start, len(self.worlds), timeout=timeout)
+    def observe(
+        self,
+        *,
+        robots: range | None = None,
+        team: bool = False,
+        timeout: float = STEP_TIMEOUT,
+    ) -> StepAnswer:
+        """The last results and frames of its robots again, or of some; steps go on from there."""
+        chosen = self.robots if robots is None else _part("robots", robots, self.robots)
+        answer = self.client.observe(chosen.start, len(chosen), team=team, timeout=timeout)
+        self.steps_of(chosen)[:] = answer.worlds["step"]
+        return answer
 
     def reset(
         self,
@@ -91,7 +127,9 @@ class Lease:
         worlds: Sequence[int] | None = None,
         timeout: float = RESET_TIMEOUT,
     ) -> tuple[WorldInfo, ...]:
-        """Begins new episodes: burn-in, k = 0, the robot at its start, empty frames.
+        """Begins new episodes: burn-in, k = 0, the robots at their starts, empty frames.
+
+        No other client may hold robots of these worlds.
 
         Args:
             seeds: One per world; None: the server derives the next from the world's last.
@@ -101,7 +139,7 @@ class Lease:
             Where the worlds stand, in the order asked.
         """
         pairs = as_seeds(seeds, self.worlds if worlds is None else worlds)
-        return records(WorldInfo, self._ask("reset", timeout, worlds=pairs))
+        return self._note(records(WorldInfo, self._ask("reset", timeout, worlds=pairs)))
 
     def restore(
         self,
@@ -118,16 +156,17 @@ class Lease:
             worlds: Only these worlds, consecutive; None: all of the lease.
             first: The first of the file's worlds that is read.
         """
-        chosen = self.worlds if worlds is None else self._part(worlds)
+        chosen = self.worlds if worlds is None else _part("worlds", worlds, self.worlds)
         place = {"first_world": chosen.start, "n_worlds": len(chosen), "from": first}
         reply = self._ask("restore", timeout, **place, path=os.path.abspath(path))
-        return records(WorldInfo, reply)
+        return self._note(records(WorldInfo, reply))
 
     def fork(
         self, source: int, target: int, *, timeout: float = STEP_TIMEOUT
     ) -> tuple[WorldInfo, ...]:
         """Puts a copy of any world in the place of one of its own: both have the same future."""
-        return records(WorldInfo, self._ask("fork", timeout, **{"from": source, "to": target}))
+        reply = self._ask("fork", timeout, **{"from": source, "to": target})
+        return self._note(records(WorldInfo, reply))
 
     def leave_belief(
         self,
@@ -135,24 +174,24 @@ class Lease:
         kind: str,
         data: bytes,
         *,
-        world: int | None = None,
+        robot: int | None = None,
         timeout: float = STEP_TIMEOUT,
     ) -> None:
-        """Leaves bytes about the present step of a world to its next client (`Client.belief`).
+        """Leaves bytes about the present step to a robot's next client (`Client.belief`).
 
         Args:
-            result: The world's last result; another step is refused.
+            result: The robot's last result; another step is refused.
             kind: Says to other agents what the bytes are, in at most 256 bytes.
             data: At most 32,768 bytes and 76 per cell; more if the model has over 18 states.
-            world: Which world; None: the first of the lease.
+            robot: Its number; None: the first of the lease.
         """
         for offset in range(0, max(len(data), 1), _BELIEF_PART):
             self._ask(
                 "leave_belief",
                 timeout,
-                world=self.worlds.start if world is None else world,
-                episode=result.episode,
-                step=result.step,
+                robot=self.robots.start if robot is None else robot,
+                episode=result.world.episode,
+                step=result.world.step,
                 kind=kind,
                 offset=offset,
                 length=len(data),
@@ -164,7 +203,7 @@ class Lease:
         self._ask("renew", timeout)
 
     def release(self, *, timeout: float = STEP_TIMEOUT) -> None:
-        """Gives the worlds back. May be called again."""
+        """Gives the robots back. May be called again."""
         if not self._is_over:
             self._is_over = True
             self._ask("release", timeout)
@@ -173,12 +212,19 @@ class Lease:
         request = {"op": operation, "lease": self.number, **keys}
         return self.client.control(request, timeout=timeout)
 
-    def _part(self, worlds: range) -> range:
-        is_part = isinstance(worlds, range) and worlds.step == 1 and len(worlds) > 0  # pyright: ignore[reportUnnecessaryIsInstance]
-        if not is_part or worlds.start < self.worlds.start or worlds.stop > self.worlds.stop:
-            raise InvalidArgumentError(
-                f"worlds: expected a range of consecutive worlds within {self.worlds}, got {worlds}"
-            )
+    def _worlds_of(self, robots: range) -> range:
+        n_robots = self.client.info.n_robots
+        return range(robots.start // n_robots, (robots.stop - 1) // n_robots + 1)
+
+    def steps_of(self, robots: range) -> NDArray[np.uint64]:
+        """K of the worlds of some robots: of the next path to fly. To read and to write."""
+        worlds = self._worlds_of(robots)
+        return self._steps[worlds.start - self.worlds.start :][: len(worlds)]
+
+    def _note(self, worlds: tuple[WorldInfo, ...]) -> tuple[WorldInfo, ...]:
+        for info in worlds:
+            if info.world in self.worlds:
+                self._steps[info.world - self.worlds.start] = info.step
         return worlds
 
     def __enter__(self) -> Self:
@@ -190,3 +236,12 @@ class Lease:
         except Exception:
             if kind is None:  # else the first error says more
                 raise
+
+
+def _part(what: str, part: range, whole: range) -> range:
+    is_part = isinstance(part, range) and part.step == 1 and len(part) > 0  # pyright: ignore[reportUnnecessaryIsInstance]
+    if not is_part or part.start < whole.start or part.stop > whole.stop:
+        raise InvalidArgumentError(
+            f"{what}: expected a range of consecutive {what} within {whole}, got {part}"
+        )
+    return part

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal, Unpack
+from typing import Any, Final, Literal, TypeAlias, Unpack
 
 import numpy as np
 from gymnasium import spaces
 
 from emberwatch import wire
 from emberwatch.arguments import as_choice
-from emberwatch.base import ONE_WORLD, WorldEnv
+from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward, paid
 from emberwatch.errors import InvalidArgumentError
 from emberwatch.flights import Flights
-from emberwatch.observations import WINDOW, MovesParts, Observations, of_world
+from emberwatch.observations import WINDOW, MovesParts, Observations, of_row
 from emberwatch.session import Session, not_reset
 from emberwatch.settings import Settings, WorldArguments, WorldSpec
 from emberwatch.view import fly
 from emberwatch.wire import StepAnswer
 
 _FIRST: Final = np.zeros(1, np.intp)
+
+MovesReward: TypeAlias = Literal[Reward, "move"]
 
 
 class WildfireMovesEnv(WorldEnv):
@@ -50,15 +52,16 @@ class WildfireMovesEnv(WorldEnv):
 
     ## Rewards
 
-    With `reward="path"` (the default) the path's reward comes with its last move, and 0 before:
-    what a cell pays is only decided when the world moves, after the flight.
+    With `reward="share"` (the default), `"team"` or `"marginal"` the path's reward comes with its
+    last move, and 0 before: what a cell pays is only decided when the world moves, after the
+    flight. The three differ in worlds of several robots, as for `WildfireEnv`.
 
     With `reward="move"` each cell pays when it is first visited, what its hidden state pays
-    before the world moves; the last move also brings the difference to the path's true reward,
-    which is small, as one step changes few cells. So both sum to the same over each path, but
-    the second says more about the hidden state, and earlier: results with the two are not
-    comparable. The environment needs the `truth` channel for it: a private server publishes it,
-    a running one must.
+    before the world moves; the last move also brings the difference to the robot's share of the
+    path's true reward, which is small for a lone robot, as one step changes few cells. So both sum
+    to the same over each path, but the second says more about the hidden state, and earlier:
+    results with the two are not comparable. The environment needs the `truth` channel for it: a
+    private server publishes it, a running one must.
 
     ## Episode End
 
@@ -73,7 +76,7 @@ class WildfireMovesEnv(WorldEnv):
     ## Arguments
 
     As `WildfireEnv`; `observation` is `("frame", "visited", "robot", "move")` by default, `reward`
-    is `"path"` or `"move"`, and `window` an odd number of cells (15).
+    may also be `"move"`, and `window` is an odd number of cells (15).
 
     ## Vectorized environment
 
@@ -88,26 +91,29 @@ class WildfireMovesEnv(WorldEnv):
         self,
         *,
         observation: MovesParts = ("frame", "visited", "robot", "move"),
-        reward: Literal["path", "move"] = "path",
+        reward: MovesReward = "share",
         window: int = WINDOW,
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class. No server of its own runs before the first reset."""
         reveals = world.get("truth", False)
+        self._pays = check_reward(reward, "move")
         settings = moves_settings(WildfireMovesEnv, reward, world)
         super().__init__(Session(settings), reveals=reveals)
         self._flights = flights = moves_flights(self._spec, 1, reward)
-        self._observations = Observations(observation, self._spec, 1, flights, window)
+        self._observations = Observations(
+            observation, self._spec, 1, flights, window, first=self._robot or 0
+        )
+        self._seen_teams: StepAnswer | None = None
         self.observation_space = self._observations.space
         self.action_space = spaces.Discrete(wire.N_MOVES)
-        self._answer: StepAnswer | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begins an episode; see `WildfireEnv`."""
         answer = self._begin(seed, options)
-        self._observations.reset(ONE_WORLD, answer.frames)
+        self._observations.reset(ONE_ROW, answer.frames)
         self._begin_path(answer)
         return self._seen(answer)
 
@@ -129,47 +135,51 @@ class WildfireMovesEnv(WorldEnv):
         path = flights.paths(move)
         answer = self._session.step(path)
         result = answer.result()
-        reward = result.reward - float(flights.paid[0])
-        self._path = fly(self._start, path[0], self._spec)
-        self._observations.update(ONE_WORLD, answer.frames)
+        reward = paid(result, self._pays) - float(flights.paid[0])
+        self._trace(result.robot, path[0])
+        self._update(self._observations, answer)
         self._begin_path(answer)
         observation, info = self._seen(answer)
-        return observation, reward, bool(result.terminated), bool(result.truncated), info
+        world = result.world
+        return observation, reward, bool(world.terminated), bool(world.truncated), info
 
     def _begin_path(self, answer: StepAnswer) -> None:
-        result = answer.result()
         self._answer = answer
-        self._start = (result.row, result.col)
+        self._start = answer.result().robot.cell
+        self._seen_teams = self._teams(self._observations, answer)
         states = self._session.truth(answer) if self._session.settings.truth else None
-        self._flights.begin(ONE_WORLD, np.array([self._start], np.int64), states)
+        self._flights.begin(ONE_ROW, np.array([self._start], np.int64), states)
 
     def _seen(self, answer: StepAnswer) -> tuple[Any, dict[str, Any]]:
         info = self._describe(answer, answer.result())
         if self.render_mode == "human":
             self._draw()
         # Copies: each move of a path returns the frame again.
-        seen = self._observations.all(answer.frames.copy(), self._flights.robots.copy())
-        return of_world(seen, 0), info
+        cells = self._flights.robots.copy()
+        seen = self._observations.all(answer.frames.copy(), cells, self._seen_teams)
+        return of_row(seen, 0), info
 
     def _draw(self) -> Any:
-        if self._answer is None:
-            return None
-        made = self._flights.made(0)
-        flown = fly(self._start, made, self._spec) if len(made) else self._path
+        made, path = self._flights.made(0), self._path
+        if len(made):
+            self._path = fly(self._start, made, self._spec)
+        picture = super()._draw()
+        self._path = path
+        return picture
+
+    def _cell(self) -> tuple[int, int]:
         row, col = self._flights.robots[0].tolist()
-        return self._view.draw(self._answer.frames[0], (row, col), flown, self._truth)
+        return row, col
 
 
 def moves_settings(environment: type, reward: str, world: WorldArguments) -> Settings:
     """The settings of an environment, which a reward for each move adds the truth to."""
-    if reward not in ("path", "move"):
-        raise InvalidArgumentError(f"reward: expected 'path' or 'move', got {reward!r}")
     reveals = world.get("truth", False)
     return Settings.of(environment, {**world, "truth": reveals or reward == "move"})
 
 
-def moves_flights(spec: WorldSpec, n_worlds: int, reward: str) -> Flights:
-    """The flights of worlds that reward each move, or the path."""
+def moves_flights(spec: WorldSpec, n_rows: int, reward: str) -> Flights:
+    """The flights of robots that are paid for each move, or for the path."""
     if reward == "move" and spec.model is None:
         raise InvalidArgumentError("reward='move': expected a server that reveals its model")
-    return Flights(spec, n_worlds, pays=reward == "move")
+    return Flights(spec, n_rows, pays=reward == "move")

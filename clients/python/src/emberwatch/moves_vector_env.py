@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from gymnasium import spaces
@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 
 from emberwatch import wire
 from emberwatch.arguments import as_choices
-from emberwatch.moves_env import moves_flights, moves_settings
+from emberwatch.base import check_reward
+from emberwatch.moves_env import MovesReward, moves_flights, moves_settings
 from emberwatch.observations import WINDOW, MovesParts, Observations
-from emberwatch.session import Session, not_reset
+from emberwatch.session import not_reset
 from emberwatch.settings import WorldArguments
-from emberwatch.vector_base import WorldVectorEnv
+from emberwatch.vector_base import WorldVectorEnv, vector_session
 from emberwatch.view import fly
 
 
 class WildfireMovesVectorEnv(WorldVectorEnv):
-    """Many worlds of `WildfireMovesEnv`: one message steps all whose paths are complete.
+    """Many robots of `WildfireMovesEnv`: one message steps all whose paths are complete.
 
     As `WildfireVectorEnv`; arguments are those of `WildfireMovesEnv`, and `num_envs`,
     `max_episode_steps` (moves), `autoreset_mode`.
@@ -29,20 +30,22 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
     def __init__(
         self,
         *,
-        num_envs: int = 1,
+        num_envs: int | None = 1,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         observation: MovesParts = ("frame", "visited", "robot", "move"),
-        reward: Literal["path", "move"] = "path",
+        reward: MovesReward = "share",
         window: int = WINDOW,
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class. No server of its own runs before the first reset."""
         reveals = world.get("truth", False)
+        self._pays = check_reward(reward, "move")
         settings = moves_settings(WildfireMovesVectorEnv, reward, world)
-        session = Session(settings, num_envs)
-        self._flights = flights = moves_flights(session.spec, num_envs, reward)
-        self._parts = Observations(observation, session.spec, num_envs, flights, window)
+        session = vector_session(settings, num_envs)
+        n_rows = session.n_rows
+        self._flights = flights = moves_flights(session.spec, n_rows, reward)
+        self._parts = Observations(observation, session.spec, n_rows, flights, window)
         super().__init__(
             session,
             self._parts,
@@ -61,17 +64,13 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         completed = flown & self._flights.completes()
         if not completed.any():
             return self._move(actions, flown)
-        paths, starts = self._flights.paths(actions), super()._robots()
-        self._exchange(paths, completed)
-        rewards = self._results["reward"] - self._flights.paid
+        self._exchange(self._flights.paths(actions), completed)
+        part, name = self._pays
+        rewards = self._results[part][name] - self._flights.paid
         others = flown & ~completed
         if others.any():
             rewards = np.where(others, self._move(actions, others), rewards)
         self._begin(completed)
-        if self.render_mode is not None:
-            for index in np.flatnonzero(completed).tolist():
-                row, col = starts[index].tolist()
-                self._paths[index] = fly((row, col), paths[index], self._spec)
         return rewards
 
     def _move(self, actions: NDArray[np.uint8], moved: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -91,11 +90,8 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
     def _shown(self) -> NDArray[np.uint8]:
         return self._frames.copy()  # each move of a path returns the frames again
 
-    def _draw(self, index: int) -> Any:
-        flown = self._paths[index]
-        if self._flights.n_made[index]:
-            row, col = super()._robots()[index].tolist()
-            self._paths[index] = fly((row, col), self._flights.made(index), self._spec)
-        picture = super()._draw(index)
-        self._paths[index] = flown
-        return picture
+    def _path(self, row: int) -> NDArray[np.intp] | None:
+        if not self._flights.n_made[row]:
+            return super()._path(row)
+        start_row, start_col = super()._robots()[row].tolist()
+        return fly((start_row, start_col), self._flights.made(row), self._spec)

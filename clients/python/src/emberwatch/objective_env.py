@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from emberwatch.agent_session import AgentSession, AgentSessionOwner
 from emberwatch.arguments import as_choice
-from emberwatch.base import ONE_WORLD, WorldEnv
+from emberwatch.base import ONE_ROW, WorldEnv
 from emberwatch.settings import Settings, WorldArguments
 from emberwatch.wire import StepAnswer
 
@@ -44,7 +44,7 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
 
     ## Arguments
 
-    As `WildfireEnv` without `observation`, and
+    As `WildfireEnv` without `observation`, `reward` and `robot`, in worlds of one robot, and
 
     * `estimator`: `"known_model"` (the paper's Bayes filter, the default) or `"spatial_filter"`
       (what is seen also changes the belief about neighbouring cells, by correlations that each
@@ -80,7 +80,6 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
         super().__init__(self._agent, reveals=settings.truth)
         self.action_space = self._agent.action_space
         self.observation_space = self._agent.space
-        self._answer: StepAnswer | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -97,12 +96,12 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
             EmberwatchError: As `WildfireEnv.step`, in the agent's words if it has ended.
         """
         objective = as_choice(action, int(self._agent.action_space.n))
-        answer = self._agent.decide(np.array([objective], np.uint8), ONE_WORLD)
+        answer = self._agent.decide(np.array([objective], np.uint8), ONE_ROW)
         if self.render_mode is not None:
             self._path = self._agent.paths[0]
         observation, info = self._seen(answer)
-        result = answer.result()
-        return observation, result.reward, bool(result.terminated), bool(result.truncated), info
+        world = answer.result().world
+        return observation, world.reward, bool(world.terminated), bool(world.truncated), info
 
     def _seen(self, answer: StepAnswer) -> tuple[NDArray[np.float32], dict[str, Any]]:
         self._answer = answer
@@ -110,10 +109,3 @@ class WildfireObjectiveEnv(AgentSessionOwner, WorldEnv):
         if self.render_mode == "human":
             self._draw()
         return self._agent.summaries[0], info
-
-    def _draw(self) -> Any:
-        if self._answer is None:
-            return None
-        result = self._answer.result()
-        robot = (result.row, result.col)
-        return self._view.draw(self._answer.frames[0], robot, self._path, self._truth)

@@ -17,7 +17,7 @@ from emberwatch.prior import prior_of
 from emberwatch.settings import WorldSpec
 from emberwatch.window import CHANNELS, Windows
 
-Part: TypeAlias = Literal["frame", "image", "robot", "age", "belief"]
+Part: TypeAlias = Literal["frame", "image", "robot", "age", "belief", "team", "others"]
 MovesPart: TypeAlias = Literal[Part, "local", "visited", "move"]
 
 #: One part makes a plain observation, several make a flat dictionary.
@@ -30,22 +30,28 @@ MAX_AGE: Final = 255
 #: Cells along a side of the part `local`, unless told otherwise.
 WINDOW: Final = 15
 
-#: Parts that a filter is needed for.
+#: Parts that a filter is needed for, and those about other robots.
 OF_BELIEF: Final = frozenset(("belief", "local"))
+OF_TEAM: Final = frozenset(("team", "others"))
 
 
 class Observations:
-    """Observations of some worlds, counted from 0."""
+    """Observations of some robots, in rows: all of some worlds, or a single one."""
 
     def __init__(
         self,
         parts: str | Sequence[str],
         spec: WorldSpec,
-        n_worlds: int = 1,
+        n_rows: int = 1,
         flights: Flights | None = None,
         window: int = WINDOW,
+        *,
+        first: int = 0,
     ) -> None:
-        """With `flights`, there are the parts of a path that is not complete."""
+        """With `flights`, there are the parts of a path that is not complete.
+
+        `first`: which robot of its world is the first row.
+        """
         known = _spaces(spec, None if flights is None else window)
         names = names_of(parts)
         if not names or len(set(names)) < len(names) or not known.keys() >= set(names):
@@ -53,13 +59,15 @@ class Observations:
                 f"observation: expected one or several of {', '.join(known)}, got {parts!r}"
             )
         self._names, self._is_plain = names, isinstance(parts, str)
-        self._spec, self._n_worlds, self._flights = spec, n_worlds, flights
-        self._side = window
+        self._spec, self._n_rows, self._flights = spec, n_rows, flights
+        self._side, self._first = window, first
+        #: Whether there are parts about other robots.
+        self.shows_team = bool(OF_TEAM & set(names))
         if OF_BELIEF & set(names) and spec.model is None:
             raise InvalidArgumentError(
                 "observation: expected a server that reveals its model, for the belief"
             )
-        #: The space of one world's observation.
+        #: The space of one robot's observation.
         self.space = (
             known[names[0]]
             if self._is_plain
@@ -67,7 +75,7 @@ class Observations:
         )
         self._ages: NDArray[np.uint8] | None = None
         if "age" in names:
-            self._ages = np.full((n_worlds, spec.height, spec.width), MAX_AGE, np.uint8)
+            self._ages = np.full((n_rows, spec.height, spec.width), MAX_AGE, np.uint8)
         self._filters: Filters | None = None
         self._windows: Windows | None = None
         self._beliefs = np.empty(0, np.uint8)
@@ -75,9 +83,9 @@ class Observations:
         self._one_hot = 255 * np.eye(spec.n_observations + 1, dtype=np.uint8)
 
     def reset(self, begun: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
-        """Forgets all about worlds whose episode has begun, or been resumed with a frame.
+        """Forgets all in rows whose episode has begun, or been resumed with a frame.
 
-        `frames` are those of all worlds, `(n_worlds, H, W)`.
+        `frames` are those of all rows, `(n_rows, H, W)`.
         """
         if self._ages is not None:
             is_seen = frames[begun] != wire.UNOBSERVED
@@ -88,7 +96,7 @@ class Observations:
             self._show(filters, begun)
 
     def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
-        """One step of the worlds `moved`; `frames` are those of all."""
+        """One step of the rows `moved`; `frames` are those of all."""
         if self._ages is not None:
             ages = self._ages
             ages[moved] += ages[moved] < MAX_AGE
@@ -98,18 +106,33 @@ class Observations:
             self._show(self._filters, moved)
 
     def visit(self, indices: NDArray[np.intp]) -> None:
-        """The robots of some worlds have made a move."""
+        """Some robots have made a move."""
         if self._windows is not None and self._flights is not None:
             rows, cols = self._flights.robots[indices].T
             self._windows.visit(indices, rows, cols)
 
-    def all(self, frames: NDArray[np.uint8], robots: NDArray[np.int64]) -> Any:
-        """The observations of all worlds, stacked; `frames` and `robots` are taken as they are."""
-        parts = {name: self._part(name, frames, robots) for name in self._names}
+    def all(
+        self,
+        frames: NDArray[np.uint8],
+        robots: NDArray[np.int64],
+        teams: wire.StepAnswer | None = None,
+    ) -> Any:
+        """The observations of all rows, stacked.
+
+        Args:
+            frames: Of all rows; taken as they are.
+            robots: Row and column of each; taken as they are.
+            teams: Team frames and all robots of the worlds, where the rows are not all of them.
+        """
+        parts = {name: self._part(name, frames, robots, teams) for name in self._names}
         return parts[self._names[0]] if self._is_plain else parts
 
     def _part(
-        self, name: str, frames: NDArray[np.uint8], robots: NDArray[np.int64]
+        self,
+        name: str,
+        frames: NDArray[np.uint8],
+        robots: NDArray[np.int64],
+        teams: wire.StepAnswer | None,
     ) -> NDArray[Any]:
         if name == "frame":
             return frames[..., np.newaxis]
@@ -118,6 +141,11 @@ class Observations:
             return self._one_hot[np.where(frames == wire.UNOBSERVED, unseen, frames)]
         if name == "robot":
             return robots
+        if name == "team":
+            seen = team_frames(frames, self._spec.n_robots) if teams is None else teams.frames
+            return np.repeat(seen, self._n_rows // len(seen), axis=0)[..., np.newaxis]
+        if name == "others":
+            return self._others(robots if teams is None else cells_of(teams.robots))
         if self._ages is not None and name == "age":
             return self._ages[..., np.newaxis].copy()
         if self._filters is not None and name == "belief":
@@ -129,21 +157,42 @@ class Observations:
             return self._flights.visited[..., np.newaxis].copy()
         return self._flights.n_made.copy()
 
+    def _others(self, robots: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Where the other robots of each row's world are; `robots` are all of the worlds."""
+        spec = self._spec
+        shown = np.zeros((self._n_rows, spec.height, spec.width, 1), np.uint8)
+        own = (self._first + np.arange(self._n_rows)) % spec.n_robots
+        n_same = self._n_rows * spec.n_robots // len(robots)  # rows of a world
+        rows, others = np.nonzero(own[:, np.newaxis] != np.arange(spec.n_robots))
+        cells = robots[rows // n_same * spec.n_robots + others]
+        shown[rows, cells[:, 0], cells[:, 1]] = 255
+        return shown
+
     def _first_beliefs(self) -> Filters:
         spec = self._spec
         assert spec.model is not None
         grid = {"height": spec.height, "width": spec.width, "burn_in": spec.burn_in}
-        filters = Filters(spec.model, prior_of(None, spec.model, **grid), self._n_worlds)
+        filters = Filters(spec.model, prior_of(None, spec.model, **grid), self._n_rows)
         if "local" in self._names:
-            self._windows = Windows(spec.model, spec, self._n_worlds, self._side)
+            self._windows = Windows(spec.model, spec, self._n_rows, self._side)
         return filters
 
-    def _show(self, filters: Filters, worlds: NDArray[np.bool_]) -> None:
+    def _show(self, filters: Filters, rows: NDArray[np.bool_]) -> None:
         if "belief" in self._names:
             beliefs = np.rint(255.0 * filters.predictor.transpose(1, 2, 3, 0))
             self._beliefs = beliefs.astype(np.uint8)
         if self._windows is not None:
-            self._windows.begin(filters, worlds)
+            self._windows.begin(filters, rows)
+
+
+def team_frames(frames: NDArray[np.uint8], n_robots: int) -> NDArray[np.uint8]:
+    """What the robots of each world saw together, `(n_worlds, H, W)`."""
+    return frames.reshape(-1, n_robots, *frames.shape[1:]).min(axis=1)  # 255 is nothing
+
+
+def cells_of(robots: NDArray[np.void]) -> NDArray[np.int64]:
+    """Row and column of each robot, a new array."""
+    return np.stack((robots["row"], robots["col"]), axis=1).astype(np.int64)
 
 
 def names_of(parts: object) -> tuple[str, ...]:
@@ -153,8 +202,8 @@ def names_of(parts: object) -> tuple[str, ...]:
     return tuple(map(str, cast("Iterable[object]", parts))) if isinstance(parts, Iterable) else ()
 
 
-def of_world(observations: Any, index: int) -> Any:
-    """The observation of one world among stacked ones."""
+def of_row(observations: Any, index: int) -> Any:
+    """The observation of one row among stacked ones."""
     if isinstance(observations, dict):
         parts = cast("dict[str, NDArray[Any]]", observations)
         return {name: part[index] for name, part in parts.items()}
@@ -172,6 +221,8 @@ def _spaces(spec: WorldSpec, window: int | None) -> dict[str, spaces.Space[Any]]
         "robot": spaces.MultiDiscrete([spec.height, spec.width]),
         "age": image(1),
         "belief": image(n_states),
+        "team": image(1),
+        "others": image(1),
     }
     if window is None:
         return known

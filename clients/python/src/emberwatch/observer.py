@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from emberwatch import wire
 from emberwatch.channels import Closable, Node, channel_errors, in_turn
 from emberwatch.errors import EmberwatchError, InvalidArgumentError
-from emberwatch.wire import StepResult
+from emberwatch.wire import RobotResult, WorldResult
 
 # Seconds to sleep while there is no sample, soon after many came and else: publishing notifies
 # nobody, and spinning would take a core from the server.
@@ -32,19 +32,31 @@ _Sample = TypeVar("_Sample")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RobotFrame:
+    """What one robot flew and saw, copied."""
+
+    result: RobotResult
+    #: What it saw, `(H, W)`: an observation, or 255 where it saw nothing.
+    frame: NDArray[np.uint8]
+    #: The moves that it flew, `(n_moves,)`; empty after a reset, or if it stayed.
+    path: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Frame:
-    """A published frame, copied."""
+    """A published step of one world, copied."""
 
     world: int
-    result: StepResult
-    #: What was seen, `(H, W)`: an observation, or 255 where nothing was seen.
-    frame: NDArray[np.uint8]
-    #: The moves flown, `(n_moves,)`; empty after a reset.
-    path: NDArray[np.uint8]
-    #: Where the path began, `(row, col)`.
-    start: tuple[int, int]
+    result: WorldResult
+    #: By robot of the world.
+    robots: tuple[RobotFrame, ...]
     #: Samples that this observer missed since the last one it got.
     n_lost: int
+
+    @property
+    def frame(self) -> NDArray[np.uint8]:
+        """What the team saw, `(H, W)`: an observation, or 255 where nobody saw anything."""
+        return np.minimum.reduce([robot.frame for robot in self.robots])
 
     @property
     def moment(self) -> tuple[int, int, int]:
@@ -92,6 +104,8 @@ class Outlook:
     objective: str
     plan_millis: float
     pid: int
+    #: The numbers of the robots that the agent flies.
+    robots: range
     #: Samples of this agent that this reader missed since the last one it got.
     n_lost: int
 
@@ -193,7 +207,10 @@ class Reader(Closable, Generic[_Sample]):
 
 
 class Observer(Reader[Frame]):
-    """Reads the frames of an instance; iterate over it. Never slows the server."""
+    """Reads the frames of an instance, a sample for each step of a world. Iterate over it.
+
+    It never slows the server.
+    """
 
     def __init__(
         self, instance: str = "default", *, world: int | None = None, timeout: float | None = None
@@ -255,17 +272,27 @@ def observe(
 
 
 def frame_from_sample(header: Any, payload: bytearray, n_lost: int) -> Frame:
-    """A frame out of a sample's header and payload, which it keeps."""
-    n_cells = header.height * header.width
-    _check_length(len(payload), n_cells + header.n_moves)
-    return Frame(
-        world=header.world,
-        result=StepResult(*wire.RESULT.unpack(bytes(header.result))),
-        frame=np.frombuffer(payload, np.uint8, n_cells).reshape(header.height, header.width),
-        path=np.frombuffer(payload, np.uint8, offset=n_cells),
-        start=(header.start_row, header.start_col),
-        n_lost=n_lost,
-    )
+    """A step out of a sample's header and payload, which it keeps."""
+    n_robots, grid = header.n_robots, (header.height, header.width)
+    if not 1 <= n_robots <= wire.MAX_ROBOTS:
+        raise _bad_sample(f"1 to {wire.MAX_ROBOTS} robots, got {n_robots}")
+    world = WorldResult(*wire.WORLD.unpack(bytes(header.result)))
+    wire.check_stayed(world.hovered | world.late, n_robots)
+    n_cells = grid[0] * grid[1]
+    at = n_robots * (wire.ROBOT.size + n_cells)
+    _check_length(min(len(payload), at), at)
+    results = [
+        RobotResult(*wire.ROBOT.unpack_from(payload, robot * wire.ROBOT.size))
+        for robot in range(n_robots)
+    ]
+    _check_length(len(payload), at + sum(result.n_moves for result in results))
+    frames = np.frombuffer(payload, np.uint8, n_robots * n_cells, n_robots * wire.ROBOT.size)
+    robots: list[RobotFrame] = []
+    for result, frame in zip(results, frames.reshape(n_robots, *grid), strict=True):
+        path = np.frombuffer(payload, np.uint8, result.n_moves, at)
+        robots.append(RobotFrame(result=result, frame=frame, path=path))
+        at += result.n_moves
+    return Frame(world=header.world, result=world, robots=tuple(robots), n_lost=n_lost)
 
 
 def truth_from_sample(header: Any, payload: bytearray, n_lost: int) -> Truth:
@@ -301,6 +328,7 @@ def outlook_from_sample(header: Any, payload: bytearray, n_lost: int) -> Outlook
             objective=str(intent["objective"]),
             plan_millis=float(intent["plan_millis"]),
             pid=header.pid,
+            robots=range(header.first_robot, header.first_robot + header.n_robots),
             n_lost=n_lost,
         )
     except (ValueError, KeyError, TypeError) as error:

@@ -23,7 +23,11 @@ LIGHT: Final[Color] = (0xFF, 0xFF, 0xFF)
 
 # The wildfire model's three, then from Okabe and Ito (2008), with a brown for their orange.
 _COLORS = ("3B6EA5", "E3B23C", "C8371B", "009E73", "CC79A7", "56B4E9", "8C510A", "F0E442")
+# As on the dashboard: light, so that a dark edge makes each stand out from every cell.
+_ROBOTS = ("5EE6C8", "FF9AD5", "B9F04A", "8FD0FF", "FFA64D", "C9A8FF", "F5F09A", "D9C2A0")
 _GREYS = (0x30, 0x60, 0x98, 0xE2)  # for what was not observed
+ROBOTS: Final[tuple[Color, ...]] = tuple(map(color_from_hex, _ROBOTS))
+"""Of the robots of a team, in turn."""
 _APART = (
     3 * 60 * 60
 )  # squared distance at which colours can be distinguished, as in the Rust figures

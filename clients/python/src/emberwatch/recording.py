@@ -25,11 +25,11 @@ from emberwatch.replies import record as record_from_reply
 
 #: The first bytes of every recording, and the version of the format.
 MAGIC: Final = b"EMBERREC"
-VERSION: Final = 1
+VERSION: Final = 2
 
 #: Longest body, bytes: inflated, and as stored.
-MAX_BODY_BYTES: Final = 16_781_416
-MAX_STORED_BYTES: Final = 16_797_868
+MAX_BODY_BYTES: Final = 17_042_528
+MAX_STORED_BYTES: Final = 17_059_235
 
 #: The beginning of a file, and of each record.
 FILE_HEADER: Final = struct.Struct("=8sII")
@@ -168,18 +168,18 @@ class _Reader:
                 sample = truth_from_sample(header, body[ctypes.sizeof(header) :], n_lost)
         except (ValueError, RecursionError, EmberwatchError) as error:
             self._damaged(str(error))
-        self._check_sample(header)
+        self._check_sample(header, sample)
         name = "frames" if kind == FRAME else "truths"
         self._totals[f"n_{name}"] += 1
         self._totals[f"n_lost_{name}"] += n_lost
         if isinstance(sample, Frame):  # which may be published again
             now = (sample.result.episode, sample.result.step)
             is_new = self._last.get(sample.world) != now
-            self._n_steps += is_new and len(sample.path) > 0
+            self._n_steps += is_new and sample.result.step > 0
             self._last[sample.world] = now
         return sample
 
-    def _check_sample(self, header: Any) -> None:
+    def _check_sample(self, header: Any, sample: Frame | Truth) -> None:
         server = self._server
         if server is None:
             self._damaged("expected a server before its samples, got a sample")
@@ -188,11 +188,18 @@ class _Reader:
         grid = header.height, header.width
         if grid != (server.height, server.width):
             self._damaged(f"grid: expected {(server.height, server.width)}, got {grid}")
-        n_moves = getattr(header, "n_moves", 0)
-        if n_moves not in (0, server.n_moves):
-            self._damaged(f"path: expected 0 or {server.n_moves} moves, got {n_moves}")
         if header.world >= server.n_worlds:
             self._damaged(f"world: expected one below {server.n_worlds}, got {header.world}")
+        if isinstance(sample, Truth):
+            return
+        robots = range(header.first_robot, header.first_robot + header.n_robots)
+        expected = range(header.world * server.n_robots, (header.world + 1) * server.n_robots)
+        if robots != expected:
+            self._damaged(f"robots: expected {expected}, got {robots}")
+        for robot in sample.robots:
+            if len(robot.path) not in (0, server.n_moves):
+                got = len(robot.path)
+                self._damaged(f"path: expected 0 or {server.n_moves} moves, got {got}")
 
     def _inflate(self, stored: bytes) -> bytearray:
         inflater = zlib.decompressobj(wbits=-zlib.MAX_WBITS)

@@ -1,8 +1,8 @@
 """Pictures of one world: what was seen along the path, beside the truth where it is known.
 
 `rgb_array` and `ansi` are pure: arrays in, a picture or a text out. `Screen` shows either to
-people, for ``render_mode="human"``. The path is dark or light, whichever is further from the
-colours below it, and the robot a circle of both.
+people, for ``render_mode="human"``. The path of one robot is dark or light, whichever is further
+from the colours below it, and the robot a circle of both; each robot of a team has a colour.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.palette import DARK, LIGHT, mark_on
+from emberwatch.model import Color
+from emberwatch.palette import DARK, LIGHT, ROBOTS, mark_on
 from emberwatch.palette import Palette as Palette
 from emberwatch.wire import UNOBSERVED
 
@@ -48,38 +49,45 @@ class Picture:
     def __init__(
         self,
         frame: NDArray[np.uint8],
-        robot: tuple[int, int] | None,
+        robots: Sequence[tuple[int, int]],
         palette: Palette,
-        path: Cells | None = None,
+        paths: Sequence[Cells] = (),
         truth: NDArray[np.uint8] | None = None,
     ) -> None:
         """Takes what is known of a world.
 
         Args:
             frame: Observed values, 255 where nothing was observed; shape (H, W).
-            robot: The robot's cell (row, column); None leaves it out.
+            robots: The cell (row, column) of each robot to draw.
             palette: The colours.
-            path: Visited cells in order.
+            paths: Visited cells in order, of each robot that flew.
             truth: Hidden states, shape (H, W).
         """
         if frame.ndim != 2 or not frame.size:
             raise InvalidArgumentError(f"frame: expected shape (H, W), got {frame.shape}")
         if truth is not None and truth.shape != frame.shape:
             raise InvalidArgumentError(f"truth: expected shape {frame.shape}, got {truth.shape}")
-        self.frame, self.robot, self.palette, self.truth = frame, robot, palette, truth
-        self.path = np.asarray([] if path is None else path, dtype=np.intp).reshape(-1, 2)
-        for what, places in (("robot", np.asarray([robot or (0, 0)])), ("path", self.path)):
+        self.frame, self.robots, self.palette, self.truth = frame, robots, palette, truth
+        self.paths = [np.asarray(path, dtype=np.intp).reshape(-1, 2) for path in paths]
+        for what, places in (("robot", _cells(robots)), *(("path", path) for path in self.paths)):
             off = ((places < 0) | (places >= frame.shape)).any(axis=1)
             if off.any():
                 got = tuple(places[np.argmax(off)].tolist())
                 raise InvalidArgumentError(
                     f"{what}: expected cells of a {frame.shape} grid, got {got}"
                 )
-        jumps = np.abs(np.diff(self.path, axis=0)).sum(axis=1) > 1
-        if jumps.any():
-            at = int(np.argmax(jumps))
-            got = [tuple(cell) for cell in self.path[at : at + 2].tolist()]
-            raise InvalidArgumentError(f"path: expected neighbours one after the other, got {got}")
+        for path in self.paths:
+            jumps = np.abs(np.diff(path, axis=0)).sum(axis=1) > 1
+            if jumps.any():
+                at = int(np.argmax(jumps))
+                got = [tuple(cell) for cell in path[at : at + 2].tolist()]
+                raise InvalidArgumentError(
+                    f"path: expected neighbours one after the other, got {got}"
+                )
+
+    def color_of(self, robot: int) -> Color | None:
+        """The colour of a robot of a team; None if it is alone."""
+        return ROBOTS[robot % len(ROBOTS)] if len(self.robots) > 1 else None
 
 
 def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8]:
@@ -94,7 +102,7 @@ def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8
     Returns:
         Shape (height, width, 3), red, green, blue.
     """
-    palette, cells = picture.palette, picture.path
+    palette = picture.palette
     height, width = picture.frame.shape
     if scale is None:  # even, where cells can be
         scale = max(1, 2 * round(_LONG_SIDE / max(height, width) / 2))
@@ -102,17 +110,18 @@ def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8
         raise InvalidArgumentError(f"scale: expected at least 1 pixel, got {scale}")
     colors = palette.paint_frame(picture.frame)
     if scale < LEAST_LINE_SCALE:
-        panels = [_enlarge(_tinted(colors, cells), scale)]
+        panels = [_enlarge(_tinted(colors, _visited(picture)), scale)]
     else:
         seen = (picture.frame != UNOBSERVED)[:, :, None]
         line = np.where(seen, palette.path, mark_on(palette.unobserved)).astype(np.uint8)
         panels = [_enlarge(colors, scale)]
-        _draw_path(panels[0], cells, line, scale)
+        for robot, path in enumerate(picture.paths):
+            _draw_path(panels[0], path, line, picture.color_of(robot), scale)
     if picture.truth is not None:
         panels.append(_enlarge(palette.paint_truth(picture.truth), scale))
-    if picture.robot is not None:
-        for panel in panels:
-            _draw_robot(panel, picture.robot, scale)
+    for panel in panels:
+        for robot, cell in enumerate(picture.robots):
+            _draw_robot(panel, cell, picture.color_of(robot), scale)
     return _join(panels, axis=0 if width >= 2 * height else 1)
 
 
@@ -123,16 +132,16 @@ def ansi(picture: Picture, *, color: bool = True) -> str:
     which tints the path. Without colour it is two ASCII characters: the value as ``0-9A-Za-z+/``,
     or ``.`` where nothing was observed, then ``@`` for the robot, ``*`` for the path or a space.
     """
-    palette, cells, robot = picture.palette, picture.path, picture.robot
+    palette, cells, robots = picture.palette, _visited(picture), _cells(picture.robots)
     grids = [(picture.frame, palette.paint_frame(picture.frame), cells)]
     if picture.truth is not None:
         grids.append((picture.truth, palette.paint_truth(picture.truth), cells[:0]))
     if not color:
-        panels = [_ascii_lines(values, _marks(values, at, robot)) for values, _, at in grids]
+        panels = [_ascii_lines(values, _marks(values, at, robots)) for values, _, at in grids]
     elif len(picture.frame) <= _MOST_WIDE_ROWS:
-        panels = [_wide_lines(colors, _marks(values, at, robot)) for values, colors, at in grids]
+        panels = [_wide_lines(colors, _marks(values, at, robots)) for values, colors, at in grids]
     else:
-        panels = [_half_lines(_tinted(colors, at), robot) for _, colors, at in grids]
+        panels = [_half_lines(_tinted(colors, at), robots) for _, colors, at in grids]
     return "\n".join("  ".join(lines).rstrip(" ") for lines in zip(*panels, strict=True))
 
 
@@ -198,6 +207,15 @@ class Screen:
             self._next = at + (1.0 / self._fps if self._fps > 0.0 else 0.0)
 
 
+def _cells(places: Sequence[tuple[int, int]]) -> NDArray[np.intp]:
+    return np.array(places, np.intp).reshape(-1, 2)
+
+
+def _visited(picture: Picture) -> NDArray[np.intp]:
+    """The cells of all paths."""
+    return np.concatenate([_cells([]), *picture.paths])
+
+
 def _tinted(colors: NDArray[np.uint8], cells: NDArray[np.intp]) -> NDArray[np.uint8]:
     tinted, (rows, cols) = colors.copy(), cells.T
     tinted[rows, cols] = np.rint(colors[rows, cols] * (1 - _TINT) + 255 * _TINT)
@@ -209,16 +227,24 @@ def _enlarge(colors: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
 
 
 def _draw_path(
-    image: NDArray[np.uint8], cells: NDArray[np.intp], colors: NDArray[np.uint8], scale: int
+    image: NDArray[np.uint8],
+    cells: NDArray[np.intp],
+    colors: NDArray[np.uint8],
+    color: Color | None,
+    scale: int,
 ) -> None:
-    """A line through the cells' middles in each cell's colour, and a square where it begins."""
+    """A line through the cells' middles, and a square where it begins.
+
+    In each cell's colour, dark or light, or in one `color`.
+    """
     if not len(cells):
         return
+    rims = np.where(colors[:, :, :1] == DARK[0], LIGHT, DARK).astype(np.uint8)
+    if color is not None:
+        colors, rims = np.full_like(colors, color), np.full_like(colors, mark_on(color))
     line = max(1, min(6, scale // 4))
     rim = 0 if scale < _LEAST_RIM_SCALE else max(1, line // 3)
-    is_dark = colors[:, :, :1] == DARK[0]
-    ink = _enlarge(colors, scale)
-    other = _enlarge(np.where(is_dark, LIGHT, DARK).astype(np.uint8), scale)
+    ink, other = _enlarge(colors, scale), _enlarge(rims, scale)
     middles = cells * scale + (scale - line) // 2
     legs = list(zip(middles, middles[1:], strict=False))
     begin = (middles[0], middles[0])
@@ -234,16 +260,19 @@ def _draw_path(
             image[top:bottom, left:right] = source[top:bottom, left:right]
 
 
-def _draw_robot(image: NDArray[np.uint8], robot: tuple[int, int], scale: int) -> None:
-    """A circle around a dot, at least as large as can be seen."""
+def _draw_robot(
+    image: NDArray[np.uint8], robot: tuple[int, int], color: Color | None, scale: int
+) -> None:
+    """A circle around a dot, or a disc of one `color`, at least as large as can be seen."""
     row, col = ((2 * at + 1) * scale / 2 - 0.5 for at in robot)
     radius = min(_MOST_RADIUS, max(_LEAST_RADIUS, 0.46 * scale))
     top, left = max(0, int(row - radius)), max(0, int(col - radius))
     window = image[top : int(row + radius) + 2, left : int(col + radius) + 2]
     rows, cols = np.ogrid[: window.shape[0], : window.shape[1]]
     distance = np.hypot(rows + top - row, cols + left - col)
-    for share, color in ((1.0, LIGHT), (0.8, DARK), (0.55, LIGHT), (0.3, DARK)):
-        window[distance <= radius * share] = color
+    rings = ((1.0, LIGHT), (0.8, DARK), (0.55, color or LIGHT), (0.3, color or DARK))
+    for share, ink in rings:
+        window[distance <= radius * share] = ink
 
 
 def _join(panels: list[NDArray[np.uint8]], *, axis: int) -> NDArray[np.uint8]:
@@ -257,12 +286,11 @@ def _join(panels: list[NDArray[np.uint8]], *, axis: int) -> NDArray[np.uint8]:
 
 
 def _marks(
-    values: NDArray[np.uint8], cells: NDArray[np.intp], robot: tuple[int, int] | None
+    values: NDArray[np.uint8], cells: NDArray[np.intp], robots: NDArray[np.intp]
 ) -> NDArray[np.str_]:
     marks = np.full(values.shape, " ")
     marks[tuple(cells.T)] = "*"
-    if robot is not None:
-        marks[robot] = "@"
+    marks[tuple(robots.T)] = "@"
     return marks
 
 
@@ -284,11 +312,10 @@ def _wide_lines(colors: NDArray[np.uint8], marks: NDArray[np.str_]) -> Iterator[
         yield _styled(cells)
 
 
-def _half_lines(colors: NDArray[np.uint8], robot: tuple[int, int] | None) -> Iterator[str]:
+def _half_lines(colors: NDArray[np.uint8], robots: NDArray[np.intp]) -> Iterator[str]:
     """Lines of cells half a character high: the upper one in front, the lower one behind it."""
     colors = colors.copy()
-    if robot is not None:
-        colors[robot] = LIGHT
+    colors[tuple(robots.T)] = LIGHT
     for row in range(0, len(colors), 2):
         cells: list[tuple[str, str]] = []
         for col, (red, green, blue) in enumerate(colors[row].tolist()):

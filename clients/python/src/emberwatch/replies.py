@@ -8,6 +8,7 @@ from functools import cache
 from typing import Any, NamedTuple, TypeVar, cast, get_origin, get_type_hints
 
 from emberwatch.errors import EmberwatchError
+from emberwatch.wire import Shape
 
 _Record = TypeVar("_Record")
 
@@ -23,6 +24,8 @@ class ServerInfo:
     width: int
     n_moves: int
     n_worlds: int
+    #: Robots of each world, R: robot r of world w has number w R + r.
+    n_robots: int
     n_observations: int
     observations: tuple[str, ...]
     #: The model as TOML text; None if the server hides it.
@@ -35,6 +38,13 @@ class ServerInfo:
     coverage: str
     publish_truth: bool
     lease_millis: int
+    #: How long the other robots have after the first path of a step; 0: as long as they hold it.
+    deadline_millis: int
+
+    @property
+    def shape(self) -> Shape:
+        """What the answers of this server depend on."""
+        return Shape(self.n_robots, self.n_moves, self.n_observations)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,15 +55,18 @@ class WorldInfo:
     step: int
     seed: int
     episode: int
-    robot: tuple[int, int]
+    #: The cell of each robot.
+    robots: tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldStatus(WorldInfo):
     """One world in a `ServerStatus`."""
 
-    #: The process that holds it, if any.
-    holder_pid: int | None
+    #: The process that holds each robot, if any.
+    holder_pids: tuple[int | None, ...]
+    #: Paths that have come for the next step.
+    n_paths: int
     #: Whether it is in its burn-in.
     resetting: bool
 
@@ -168,11 +181,16 @@ def record(kind: type[_Record], keys: Any) -> _Record:
     for name, types in _types(kind).items():
         if name not in given:
             raise _wrong(f"a key {name!r}, got {sorted(given)}")
-        value = tuple(given[name]) if isinstance(given[name], list) else given[name]
+        value = _as_tuples(given[name])
         if not isinstance(value, types):
             raise _wrong(f"another {name!r}, got {value!r}")
         values[name] = value
     return kind(**values)
+
+
+def _as_tuples(value: Any) -> Any:
+    """Lists, and those in them, as tuples."""
+    return tuple(map(_as_tuples, cast("list[Any]", value))) if isinstance(value, list) else value
 
 
 def _wrong(problem: str) -> EmberwatchError:

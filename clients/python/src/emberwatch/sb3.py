@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.vector_base import WorldVectorEnv
+from emberwatch.vector_base import WorldVectorEnv, info_of
 
 
 def make_vec_env(name: str, n_envs: int = 1, **keywords: Any) -> WildfireVecEnv:
@@ -72,9 +72,7 @@ class WildfireVecEnv(VecEnv):
         ended = terminated | truncated
         reported: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for index in np.flatnonzero(ended).tolist():
-            last = infos["final_info"]
-            shown = [key for key in last if not key.startswith("_")]
-            reported[index] = {key: _plain(last[key][index]) for key in shown}
+            reported[index] = info_of(infos["final_info"], index)
             reported[index]["terminal_observation"] = infos["final_obs"][index]
             reported[index]["TimeLimit.truncated"] = bool(truncated[index] & ~terminated[index])
         return observations, rewards.astype(np.float32), ended, reported
@@ -104,8 +102,3 @@ class WildfireVecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         return [False] * len(list(self._get_indices(indices)))
-
-
-def _plain(value: Any) -> Any:
-    """A number as Python's own, as the single environments have it."""
-    return value.item() if isinstance(value, np.generic) else value

@@ -1,4 +1,4 @@
-"""The worlds behind an environment: those of a running server, or of a private one.
+"""The robots behind an environment: those of a running server, or of a private one.
 
 Nothing of iceoryx2 is open before the first reset, so that environments may be made in one
 process and used in a forked child, as Gymnasium's `AsyncVectorEnv` does.
@@ -7,6 +7,7 @@ process and used in a forked child, as Gymnasium's `AsyncVectorEnv` does.
 from __future__ import annotations
 
 import inspect
+import logging
 import warnings
 import weakref
 from collections.abc import Sequence
@@ -33,8 +34,10 @@ from emberwatch.newest import Newest
 from emberwatch.observer import Truth, TruthReader
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program, unused_instance
-from emberwatch.settings import Settings, private_spec, running_spec
-from emberwatch.wire import StepAnswer
+from emberwatch.settings import Settings, WorldSpec, private_spec, running_spec
+from emberwatch.wire import StepAnswer, WorldResult
+
+_log: Final = logging.getLogger("emberwatch")
 
 # Seconds after its last use that a lease ends: learners may think long, and a dead holder is
 # noticed at once anyway. No other client uses the worlds of a private server.
@@ -49,12 +52,15 @@ LOST: Final = (LeaseLostError, RequestTimeoutError, ServerGoneError)
 
 
 class Session:
-    """Consecutive worlds, under a lease. Opens itself at the first reset."""
+    """Consecutive robots, under a lease, in rows. Opens itself at the first reset.
 
-    def __init__(self, settings: Settings, n_worlds: int = 1) -> None:
+    It flies all robots of its worlds, or one robot of a world that others fly in.
+    """
+
+    def __init__(self, settings: Settings, n_rows: int | None = 1) -> None:
+        """`n_rows`: how many robots; None: those of one world."""
         self.settings: Final = settings
-        self.n_worlds: Final = n_worlds
-        self._worlds: Final = range(settings.world, settings.world + n_worlds)
+        self._asked_rows = n_rows
         self._client: Client | None = None
         self._lease: Lease | None = None
         self._program: Program | None = None
@@ -62,15 +68,21 @@ class Session:
         self._has_warned = False
         #: Whether a step has timed out, so that the worlds may stand elsewhere than expected.
         self._is_lost = False
+        #: World steps that passed unseen before the last answer, as a path came too late.
+        self.n_skipped = 0
+        if settings.instance is None:
+            self.spec, self._robots = private_spec(settings, n_rows)
+        else:
+            with self._connect(settings.instance) as client:
+                self.spec, self._robots = running_spec(settings, n_rows, client.info)
+        self.n_rows: Final = len(self._robots)
+        n_worlds = self.spec.shape.n_worlds(self._robots.start, self.n_rows)
+        self.n_worlds: Final = n_worlds
+        self._worlds: Final = range(settings.world, settings.world + n_worlds)
         if settings.truth and n_worlds > wire.TRUTH_BUFFER:
             raise InvalidArgumentError(
                 f"truth: expected at most {wire.TRUTH_BUFFER} worlds, got {n_worlds}"
             )
-        if settings.instance is None:
-            self.spec = private_spec(settings, n_worlds)
-        else:
-            with self._connect(settings.instance) as client:
-                self.spec = running_spec(settings, n_worlds, client.info)
         model = self.spec.model
         if model is not None and not model.reward.any():
             _warn(
@@ -113,26 +125,55 @@ class Session:
                 raise
         return self._begin(indices, seeds)
 
-    def step(self, moves: NDArray[np.uint8], indices: range | None = None) -> StepAnswer:
-        """Flies checked paths in all worlds, or some consecutive ones."""
+    def step(self, moves: NDArray[np.uint8], rows: range | None = None) -> StepAnswer:
+        """Flies checked paths with all robots, or with those of some consecutive worlds.
+
+        Slow teammates are waited for, without end while the server lives. A path that came too
+        late is given up, and the answer is how the world stands.
+        """
         lease = self._opened()
         if self._is_lost:
             raise timed_out_before()
-        worlds = lease.worlds if indices is None else lease.worlds[indices.start : indices.stop]
-        try:
-            return lease.step_moves(moves, worlds, full=False, timeout=self.settings.timeout)
-        except LOST as error:
-            raise self._lost(error) from None
+        robots = lease.robots if rows is None else lease.robots[rows.start : rows.stop]
+        self.n_skipped = 0
+        before = int(lease.steps_of(robots)[0])
+        while True:
+            try:
+                return lease.step_moves(moves, robots, timeout=self.settings.timeout)
+            except (LeaseLostError, ServerGoneError) as error:
+                raise self._lost(error) from None
+            except EmberwatchError as error:
+                if error.code not in ("timeout", "late"):
+                    raise
+            answer = self._look(lease, robots)
+            n_moved = int(answer.worlds["step"][0]) - before
+            if n_moved > 0:
+                self.n_skipped = n_moved - 1
+                return answer
+            _log.warning(
+                "world %d waits for the paths of other robots that are held; environments of one "
+                "world need a thread or a process each",
+                self._worlds.start,
+            )
 
     def truth(self, answer: StepAnswer) -> NDArray[np.uint8]:
-        """The hidden states that belong to an answer, `(n_worlds, H, W)`; a copy."""
+        """The hidden states that belong to an answer, `(n_rows, H, W)`; a copy."""
         if self._truth is None:
             raise EmberwatchError("truth: expected an open session made with truth=True", "closed")
-        first = answer.first_world - self.settings.world
-        results = [answer.result(index) for index in range(len(answer.frames))]
-        moments = [result.moment for result in results]
+        first = answer.first_robot // self.spec.n_robots - self.settings.world
+        moments = [WorldResult(*world.item()).moment for world in answer.worlds]
         truths = self._truth.at(moments, self.settings.timeout, first)
-        return np.stack([truth.states for truth in truths])
+        return np.stack([truth.states for truth in truths])[answer.world_of]
+
+    def teams(self, answer: StepAnswer) -> StepAnswer:
+        """Results of all robots in the answer's worlds, and the frame of each world's team."""
+        # Of one robot's world, which may stand elsewhere by now.
+        shape, client = self.spec.shape, self._client
+        if client is None:
+            raise not_reset()
+        first = answer.first_robot - answer.first_robot % shape.n_robots
+        step = int(answer.worlds["step"][0])
+        return client.recall(step, first, shape.n_robots, team=True, timeout=self.settings.timeout)
 
     def launch(self, seed: int) -> Client:
         """Starts the private server, with this seed for world 0; `close` stops it."""
@@ -185,10 +226,10 @@ class Session:
             raise
 
     def _hold(self, client: Client) -> None:
-        """Gets the right to act on the worlds."""
+        """Gets the right to fly the robots."""
         self._lease = client.acquire(
-            self.settings.world,
-            self.n_worlds,
+            self._robots.start,
+            self.n_rows,
             takeover=self.settings.takeover,
             ttl=_PRIVATE_LEASE if self.settings.instance is None else _LEASE,
             timeout=RESET_TIMEOUT,
@@ -212,13 +253,13 @@ class Session:
 
     def _warn_of_barren(self, answer: StepAnswer) -> None:
         """Warns once of worlds in which there is nothing to find."""
-        results = answer.results
-        barren = np.flatnonzero((results["n_target_cells"] == 0) & (results["step"] == 0))
+        worlds = answer.worlds
+        barren = np.flatnonzero((worlds["n_target_cells"] == 0) & (worlds["step"] == 0))
         if self._has_warned or not len(barren):
             return
         self._has_warned = True
         _warn(
-            f"no cell of world {barren[0]} (of {len(barren)} of {len(results)} worlds) is in the "
+            f"no cell of world {barren[0]} (of {len(barren)} of {len(worlds)} worlds) is in the "
             "state that pays most: give it a burn_in, a larger grid, or a model for small ones, "
             "model='wildfire-small'"
         )
@@ -241,9 +282,16 @@ class Session:
         self._is_lost = False
         return answer
 
+    def _look(self, lease: Lease, robots: range) -> StepAnswer:
+        """Where the worlds stand after a step that has no answer."""
+        try:
+            return lease.observe(robots=robots, timeout=self.settings.timeout)
+        except LOST as error:
+            raise self._lost(error) from None
+
     def _check_unchanged(self, client: Client) -> None:
         """Another server may serve the instance by now."""
-        spec = running_spec(self.settings, self.n_worlds, client.info)
+        spec, _ = running_spec(self.settings, self._asked_rows, client.info)
         if spec != self.spec:
             raise InvalidArgumentError(
                 f"instance {client.instance!r}: expected the server as it was when the environment "
@@ -261,6 +309,11 @@ class SessionOwner:
     def model(self) -> Model | None:
         """The model behind the worlds; None if a running server hides it."""
         return self._session.spec.model
+
+    @property
+    def world_spec(self) -> WorldSpec:
+        """What is known of the worlds before the first reset."""
+        return self._session.spec
 
     @property
     def n_moves(self) -> int:

@@ -15,6 +15,7 @@ from emberwatch.model import Model
 from emberwatch.ports import STEP_TIMEOUT
 from emberwatch.programs import check_settings
 from emberwatch.replies import ServerInfo
+from emberwatch.wire import Shape
 
 #: Seeds drawn for resets stay below this, which every JSON reader holds (PROTOCOL.md section 2).
 SEEDS: Final = 2**53
@@ -25,6 +26,8 @@ class WorldArguments(TypedDict, total=False):
 
     instance: str | None
     world: int
+    robot: int | None
+    robots: int | None
     takeover: bool
     model: str | Path | None
     height: int | None
@@ -43,6 +46,8 @@ class Settings:
 
     instance: str | None = None
     world: int = 0
+    robot: int | None = None
+    robots: int | None = None
     takeover: bool = False
     model: str | Path | None = None
     height: int | None = None
@@ -65,6 +70,8 @@ class Settings:
             is_kind = isinstance(value, int | float if kind is float else kind)
             if not is_kind or (isinstance(value, bool) and kind is not bool):
                 raise InvalidArgumentError(f"{field.name}: expected {field.type}, got {value!r}")
+        if self.robots is not None and self.robots < 1:
+            raise InvalidArgumentError(f"robots: expected at least 1, got {self.robots}")
         if not self.timeout > 0:
             raise InvalidArgumentError(f"timeout: expected seconds above 0, got {self.timeout}")
 
@@ -92,6 +99,7 @@ class Settings:
         """The flags of a private server with these worlds."""
         flags = {
             "worlds": n_worlds,
+            "robots": self.robots,
             "model": self.model,
             "height": self.height,
             "width": self.width,
@@ -114,6 +122,12 @@ class WorldSpec:
     n_moves: int
     n_observations: int
     burn_in: int
+    #: Robots of a world.
+    n_robots: int
+
+    @property
+    def shape(self) -> Shape:
+        return Shape(self.n_robots, self.n_moves, self.n_observations)
 
 
 def draw_seed(generator: np.random.Generator) -> int:
@@ -121,53 +135,84 @@ def draw_seed(generator: np.random.Generator) -> int:
     return int(generator.integers(SEEDS))
 
 
-def private_spec(settings: Settings, n_worlds: int) -> WorldSpec:
-    """The worlds that a private server will have; the program itself checks the settings."""
-    if settings.takeover or settings.world != 0:
+def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, range]:
+    """The worlds that a private server will have, and the robots to fly.
+
+    `n_rows`: how many robots; None: those of one world. The program itself checks the settings.
+    """
+    if settings.takeover or settings.world != 0 or settings.robot is not None:
         raise InvalidArgumentError(
-            "takeover, world: expected instance=..., a running server to attach to; a private "
-            f"server has its own worlds, got world {settings.world}"
+            "takeover, world, robot: expected instance=..., a running server to attach to; a "
+            f"private server has its own worlds, got world {settings.world}"
         )
+    robots = _robots(settings, n_rows, settings.robots or 1)
+    n_worlds = len(robots) // (settings.robots or 1)
     checked: dict[str, Any] = check_settings(settings.server_flags(n_worlds))
     model = Model.checked(checked["model"])
-    return WorldSpec(
+    spec = WorldSpec(
         model=model,
         height=checked["height"],
         width=checked["width"],
         n_moves=checked["moves"],
         n_observations=model.n_observations,
         burn_in=checked["burn_in"],
+        n_robots=checked["robots"],
     )
+    return spec, robots
 
 
-def running_spec(settings: Settings, n_worlds: int, info: ServerInfo) -> WorldSpec:
-    """A running server's worlds, which the settings must agree with."""
+def running_spec(
+    settings: Settings, n_rows: int | None, info: ServerInfo
+) -> tuple[WorldSpec, range]:
+    """A running server's worlds, which the settings must agree with, and the robots to fly."""
     if settings.start is not None:
         raise InvalidArgumentError("start: expected None, as the running server has its own")
     if settings.model is not None and info.model is not None:
         raise InvalidArgumentError("model: expected None, as the running server reveals its own")
-    for name in ("height", "width", "n_moves", "burn_in"):
-        asked, has = getattr(settings, name), getattr(info, name)
+    for name in ("height", "width", "n_moves", "burn_in", "robots"):
+        asked = getattr(settings, name)
+        has = getattr(info, "n_robots" if name == "robots" else name)
         if asked not in (None, has):
             raise InvalidArgumentError(
                 f"{name}: expected {has}, as the server has, or None, got {asked}"
             )
-    last = settings.world + n_worlds - 1
-    if not 0 <= settings.world <= last < info.n_worlds:
+    robots = _robots(settings, n_rows, info.n_robots)
+    first, last = settings.world, (robots.stop - 1) // info.n_robots
+    if not 0 <= first <= last < info.n_worlds:
         raise InvalidArgumentError(
-            f"world: expected worlds within 0 to {info.n_worlds - 1}, "
-            f"got {settings.world} to {last}"
+            f"world: expected worlds within 0 to {info.n_worlds - 1}, got {first} to {last}"
         )
     if settings.truth and not info.publish_truth:
         raise InvalidArgumentError(
             "truth: expected a server started with --publish-truth, got one without"
         )
     model = None if info.model is None else Model.from_toml(info.model)
-    return WorldSpec(
+    spec = WorldSpec(
         model=model if settings.model is None else Model.named(settings.model),
         height=info.height,
         width=info.width,
         n_moves=info.n_moves,
         n_observations=info.n_observations,
         burn_in=info.burn_in,
+        n_robots=info.n_robots,
     )
+    return spec, robots
+
+
+def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:
+    """The numbers of the robots to fly: one, or all of some worlds."""
+    first = settings.world * n_robots
+    if settings.robot is not None:
+        if n_rows != 1:
+            raise InvalidArgumentError("robot: expected None, as all robots of a world are flown")
+        if not 0 <= settings.robot < n_robots:
+            raise InvalidArgumentError(f"robot: expected 0 to {n_robots - 1}, got {settings.robot}")
+        return range(first + settings.robot, first + settings.robot + 1)
+    n_rows = n_robots if n_rows is None else n_rows
+    if n_rows % n_robots:
+        raise InvalidArgumentError(
+            f"robots: expected one robot in a world, got {n_robots}: fly one of them with "
+            "robot=..., all of a world with emberwatch.parallel_env, or of several worlds with "
+            f"num_envs, a multiple of {n_robots}, got {n_rows}"
+        )
+    return range(first, first + n_rows)

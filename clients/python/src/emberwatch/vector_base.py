@@ -1,4 +1,8 @@
-"""What the vector environments share: episodes, their ends, infos, pictures."""
+"""What the vector environments share: episodes, their ends, infos, pictures.
+
+Rows are robots: all of the first world, then those of the next. The robots of a world begin and end
+their episodes together.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +21,15 @@ from emberwatch.agent_session import Summaries
 from emberwatch.arguments import as_seed
 from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, wants_to_resume
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.observations import Observations, of_world
+from emberwatch.observations import Observations, cells_of, of_row
 from emberwatch.session import Session, SessionOwner
-from emberwatch.settings import draw_seed
-from emberwatch.view import View
+from emberwatch.settings import Settings, draw_seed
+from emberwatch.view import View, fly
 from emberwatch.wire import RESULT_DTYPE, StepAnswer
 
 
 class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
-    """Many worlds, stepped together."""
+    """Many robots, stepped together."""
 
     # Until it is made: Gymnasium 1.2 closes what failed to be made, too.
     closed = True
@@ -49,7 +53,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
             )
         self._mode = AutoresetMode(autoreset_mode)
         self._session, self._spec = session, session.spec
-        spec, num_envs, mode = session.spec, session.n_worlds, session.settings.render_mode
+        spec, num_envs, mode = session.spec, session.n_rows, session.settings.render_mode
         self._observations = observations
         self._views = [View(mode, spec) for _ in range(num_envs)]
         self._max_steps = max_episode_steps
@@ -61,12 +65,12 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         self.observation_space = batch_space(observations.space, num_envs)
         self.single_action_space = action_space
         self.action_space = batch_space(action_space, num_envs)
-        self._generators: list[np.random.Generator | None] = [None] * num_envs
+        self._generators: list[np.random.Generator | None] = [None] * session.n_worlds
         self._frames = np.zeros((num_envs, spec.height, spec.width), np.uint8)
         self._results = np.zeros(num_envs, RESULT_DTYPE)
         self._elapsed = np.zeros(num_envs, np.int64)
         self._over = np.zeros(num_envs, np.bool_)
-        # Worlds that completed a path in this step.
+        # Robots that completed a path in this step.
         self._exchanged = np.zeros(num_envs, np.bool_)
         self._truths: NDArray[np.uint8] | None = None
         self._paths: list[NDArray[np.intp] | None] = [None] * num_envs
@@ -81,10 +85,10 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         """Begins episodes in all worlds, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: For world 0, the others follow; or one per world; None: each world's own
-                generator goes on.
-            options: `reset_mask`, `(num_envs,)` booleans, at least one true; or `resume`, see
-                `WildfireEnv`.
+            seed: For world 0, the others follow; or one per row, of which each world takes its
+                first; None: each world's own generator goes on.
+            options: `reset_mask`, `(num_envs,)` booleans, at least one true, the same for all
+                robots of a world; or `resume`, see `WildfireEnv`.
         """
         rest = dict(options or {})
         mask = self._check_mask(rest.pop("reset_mask", None))
@@ -104,7 +108,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
     def step(
         self, actions: NDArray[np.integer[Any]]
     ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """One step of each world.
+        """One step of each robot.
 
         Raises:
             gymnasium.error.ResetNeeded: In mode `DISABLED`, if an episode is over.
@@ -114,7 +118,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         over = self._over
         if over.any() and self._mode is not AutoresetMode.NEXT_STEP:
             raise gymnasium.error.ResetNeeded(
-                f"worlds {np.flatnonzero(over).tolist()}: the episode is over; reset with "
+                f"rows {np.flatnonzero(over).tolist()}: the episode is over; reset with "
                 "options={'reset_mask': ...}"
             )
         flown = ~over
@@ -122,17 +126,43 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         rewards = self._fly(chosen, flown)
         self._elapsed += flown
         if over.any():
-            self._restart(np.flatnonzero(over).tolist(), [None] * self.num_envs)
+            self._restart(np.flatnonzero(over).tolist(), [None] * self._session.n_worlds)
         return self._outcome(flown, rewards)
 
     def render(self) -> tuple[Any, ...] | None:
-        """The picture of each world, as `WildfireEnv.render` draws it."""
+        """The picture of each robot, as `WildfireEnv.render` draws it."""
         if self.render_mode is None or not self._session.is_open:
             gymnasium.logger.warn(NOTHING_TO_DRAW)
             return None
         if self.render_mode == "human":
             return (None,) * self.num_envs
-        return tuple(self._draw(index) for index in range(self.num_envs))
+        return tuple(self.draw(slice(row, row + 1)) for row in range(self.num_envs))
+
+    def draw(self, rows: slice) -> Any:
+        """The picture of some robots of one world, and of what they saw together."""
+        row: int = rows.start
+        frame, cells = self.seen(rows)
+        robots = [(at[0], at[1]) for at in cells.tolist()]
+        paths = [path for path in map(self._path, range(self.num_envs)[rows]) if path is not None]
+        truth = self._truths[row] if self._truths is not None and self._reveals else None
+        return self._views[row].draw(frame, robots, paths, truth)
+
+    def seen(self, rows: slice) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+        """What some robots of one world saw together, `(H, W)`, and their cells; new arrays."""
+        return self._frames[rows].min(axis=0), self._robots()[rows]
+
+    @property
+    def results(self) -> NDArray[np.void]:
+        """The last result of each robot and its world, for reports, not for learners.
+
+        `(num_envs,)` of `wire.RESULT_DTYPE`.
+        """
+        return self._results.copy()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there has been a reset since it was made or closed."""
+        return self._session.is_open
 
     def close_extras(self, **kwargs: Any) -> None:
         self._session.close()
@@ -143,18 +173,22 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         raise NotImplementedError
 
     def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Steps the worlds `flown`; of the rewards, those of the others do not count."""
+        """Steps the rows `flown`; of the rewards, those of the others do not count."""
         raise NotImplementedError
 
     def _begin(self, begun: NDArray[np.bool_]) -> None:
-        """Episodes have begun in some worlds, or go on."""
+        """Episodes have begun in some rows, or go on."""
 
     def _robots(self) -> NDArray[np.int64]:
         """Row and column of each robot, a new array."""
-        return np.stack((self._results["row"], self._results["col"]), axis=1).astype(np.int64)
+        return cells_of(self._results["robot"])
+
+    def _path(self, row: int) -> NDArray[np.intp] | None:
+        """The cells of a robot's path, where there is a render mode."""
+        return self._paths[row]
 
     def _exchange(self, paths: NDArray[np.uint8], moved: NDArray[np.bool_]) -> None:
-        """Flies whole paths in some worlds, in one message where they are consecutive."""
+        """Flies whole paths in some rows, in one message where they are consecutive."""
         if moved.all():
             self._take(self._session.step(paths))
         elif moved.any():
@@ -163,6 +197,11 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
                 self._exchange_run(paths, run)
         self._exchanged = moved
         self._observations.update(moved, self._frames)
+        if self.render_mode is not None:
+            for row in np.flatnonzero(moved).tolist():
+                robot = self._results["robot"][row]
+                start = int(robot["start_row"]), int(robot["start_col"])
+                self._paths[row] = fly(start, paths[row], self._spec)
 
     def _exchange_run(self, paths: NDArray[np.uint8], run: range) -> None:
         chosen = slice(run.start, run.stop)
@@ -171,28 +210,29 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         if self._truths is not None:
             self._truths[chosen] = self._session.truth(answer)
 
-    def _restart(self, indices: list[int], seeds: Sequence[int | None]) -> None:
-        """Begins episodes in some worlds."""
-        chosen: list[int] = []
-        for index in indices:
-            seed, generator = seeds[index], self._generators[index]
+    def _restart(self, rows: list[int], seeds: Sequence[int | None]) -> None:
+        """Begins episodes in the worlds of some rows; `seeds` are those of all worlds."""
+        n_robots = self._spec.n_robots
+        worlds, chosen = [row // n_robots for row in rows[::n_robots]], list[int]()
+        for world in worlds:
+            seed, generator = seeds[world], self._generators[world]
             if seed is not None or generator is None:
                 generator, _ = seeding.np_random(seed)
-                self._generators[index] = generator
+                self._generators[world] = generator
             chosen.append(draw_seed(generator) if seed is None else seed)
-        self._take(self._session.reset(indices, chosen))
-        self._reset_episodes(indices)
+        self._take(self._session.reset(worlds, chosen))
+        self._reset_episodes(rows)
 
-    def _reset_episodes(self, chosen: list[int]) -> None:
-        self._elapsed[chosen] = 0
+    def _reset_episodes(self, rows: list[int]) -> None:
+        self._elapsed[rows] = 0
         self._over = self._over.copy()
-        self._over[chosen] = False
+        self._over[rows] = False
         begun = np.zeros(self.num_envs, np.bool_)
-        begun[chosen] = True
+        begun[rows] = True
         self._observations.reset(begun, self._frames)
         self._begin(begun)
-        for index in chosen:
-            self._paths[index] = None
+        for row in rows:
+            self._paths[row] = None
 
     def _take(self, answer: StepAnswer) -> None:
         self._frames, self._results = answer.frames, answer.results
@@ -202,17 +242,18 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
     def _outcome(
         self, flown: NDArray[np.bool_], rewards: NDArray[np.float64]
     ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """What `step` returns; worlds that began an episode in this step earned nothing."""
+        """What `step` returns; rows that began an episode in this step earned nothing."""
         rewards = np.where(flown, rewards, 0.0)
-        terminations = self._exchanged & (self._results["terminated"] != 0)
-        truncations = self._exchanged & (self._results["truncated"] != 0)
+        worlds = self._results["world"]
+        terminations = self._exchanged & (worlds["terminated"] != 0)
+        truncations = self._exchanged & (worlds["truncated"] != 0)
         if self._max_steps is not None:
             truncations |= flown & (self._elapsed >= self._max_steps)
         over = terminations | truncations
         infos: dict[str, Any] = {}
         if self._mode is AutoresetMode.SAME_STEP and over.any():
             infos = self._final(over)
-            self._restart(np.flatnonzero(over).tolist(), [None] * self.num_envs)
+            self._restart(np.flatnonzero(over).tolist(), [None] * self._session.n_worlds)
         else:
             self._over = over
         infos |= self._infos(np.ones(self.num_envs, np.bool_))
@@ -223,7 +264,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         observations = np.full(self.num_envs, None, dtype=object)
         seen = self._observations.all(self._frames.copy(), self._robots())
         for index in np.flatnonzero(over).tolist():
-            observations[index] = of_world(seen, index)
+            observations[index] = of_row(seen, index)
         return {
             "final_obs": observations,
             "_final_obs": over.copy(),
@@ -232,10 +273,10 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         }
 
     def _infos(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
-        """The infos of some worlds, zero for the others, as Gymnasium stacks them."""
+        """The infos of some rows, zero for the others, as Gymnasium stacks them."""
         infos: dict[str, Any] = {}
-        for name in REPORTED:
-            infos[name] = np.where(mask, self._results[name], 0).astype(np.int64)
+        for name, part in REPORTED.items():
+            infos[name] = np.where(mask, self._results[part][name], 0).astype(np.int64)
             infos[f"_{name}"] = mask.copy()
         if self._truths is not None and self._reveals:
             infos["truth"] = np.where(mask[:, np.newaxis, np.newaxis], self._truths, np.uint8(0))
@@ -244,29 +285,27 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
 
     def _seen(self) -> Any:
         if self.render_mode == "human":
-            self._draw(0)
+            self.draw(slice(0, self._spec.n_robots))
         return self._observations.all(self._shown(), self._robots())
 
     def _shown(self) -> NDArray[np.uint8]:
         """The frames, which the learner may write to: pictures come from others."""
         return self._frames if self.render_mode is None else self._frames.copy()
 
-    def _draw(self, index: int) -> Any:
-        row, col = self._robots()[index].tolist()
-        truth = self._truths[index] if self._truths is not None and self._reveals else None
-        return self._views[index].draw(self._frames[index], (row, col), self._paths[index], truth)
-
     def _check_seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
+        """The seed of each world."""
+        n_worlds = self._session.n_worlds
         if seed is None:
-            return [None] * self.num_envs
+            return [None] * n_worlds
         # Checked before any world's generator is replaced.
         if isinstance(seed, int | np.integer):
-            return [as_seed(int(seed) + index) for index in range(self.num_envs)]
+            return [as_seed(int(seed) + world) for world in range(n_worlds)]
         if not hasattr(seed, "__len__") or len(seed) != self.num_envs:
             raise InvalidArgumentError(
                 f"seed: expected an integer, None or {self.num_envs} of them, got {seed!r}"
             )
-        return [None if one is None else as_seed(one) for one in seed]
+        seeds = [None if one is None else as_seed(one) for one in seed]
+        return seeds[:: self._spec.n_robots]
 
     def _check_mask(self, mask: Any) -> NDArray[np.bool_]:
         shape = (self.num_envs,)
@@ -277,7 +316,30 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
             raise InvalidArgumentError(
                 f"reset_mask: expected an array {shape} of bool with at least one True, got {got}"
             )
+        worlds = mask.reshape(-1, self._spec.n_robots)
+        if (worlds.any(axis=1) != worlds.all(axis=1)).any():
+            raise InvalidArgumentError(
+                "reset_mask: expected all robots of a world or none, got some"
+            )
         return mask
+
+
+def info_of(infos: dict[str, Any], row: int) -> dict[str, Any]:
+    """The info of one row among stacked ones, its numbers as Python's own."""
+    shown = {name: values[row] for name, values in infos.items() if not name.startswith("_")}
+    return {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in shown.items()
+    }
+
+
+def vector_session(settings: Settings, num_envs: int | None) -> Session:
+    """A session of all robots of some worlds."""
+    if settings.robot is not None:
+        raise InvalidArgumentError(
+            f"robot: expected None, as a vector environment flies all, got {settings.robot}"
+        )
+    return Session(settings, num_envs)
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[range]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -23,7 +24,7 @@ DIRECTIONS: Final[tuple[tuple[int, int], ...]] = ((-1, 0), (1, 0), (0, -1), (0, 
 
 
 class View:
-    """Draws one world: the frame, the path flown, the robot, and the truth where it is known."""
+    """Draws one world: the frame, robots and their paths, and the truth where it is known."""
 
     def __init__(self, render_mode: str | None, spec: WorldSpec) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
@@ -38,12 +39,12 @@ class View:
     def draw(
         self,
         frame: NDArray[np.uint8],
-        robot: tuple[int, int],
-        path: NDArray[np.intp] | None,
+        robots: Sequence[tuple[int, int]],
+        paths: Sequence[NDArray[np.intp]],
         truth: NDArray[np.uint8] | None,
     ) -> Any:
         """An image, a text, or `None` after showing it to a human, as the mode has it."""
-        picture = Picture(frame, robot, self._palette, path, truth)
+        picture = Picture(frame, robots, self._palette, paths, truth)
         if self.mode == "rgb_array":
             return rgb_array(picture)
         if self.mode == "ansi":

@@ -21,32 +21,32 @@ _TARGET, _ENTROPY, _VISITED, _OFF, _LEFT = range(len(CHANNELS))
 class Windows:
     """A square of cells around each robot, cut out of maps with a margin."""
 
-    def __init__(self, model: Model, spec: WorldSpec, n_worlds: int, side: int) -> None:
+    def __init__(self, model: Model, spec: WorldSpec, n_rows: int, side: int) -> None:
         margin = side // 2
         height, width = spec.height + 2 * margin, spec.width + 2 * margin
         self._model, self._spec, self._side = model, spec, side
-        self._maps = np.zeros((n_worlds, height, width, len(CHANNELS)), np.uint8)
+        self._maps = np.zeros((n_rows, height, width, len(CHANNELS)), np.uint8)
         self._maps[..., _OFF] = 255
         self._inside = self._maps[:, margin : margin + spec.height, margin : margin + spec.width]
         self._inside[..., _OFF] = 0
-        # By world and robot's cell: rows of a window, each contiguous in the maps.
+        # By row and robot's cell: rows of a window, each contiguous in the maps.
         step, row, col, _ = self._maps.strides
         self._cut = as_strided(
             self._maps,
-            (n_worlds, spec.height, spec.width, side, side * len(CHANNELS)),
+            (n_rows, spec.height, spec.width, side, side * len(CHANNELS)),
             (step, row, col, row, 1),
             writeable=False,
         )
-        self._worlds = np.arange(n_worlds)
+        self._rows = np.arange(n_rows)
 
-    def begin(self, filters: Filters, worlds: NDArray[np.bool_]) -> None:
-        """Shows the predictor in some worlds, of which nothing is visited yet."""
-        predictor = filters.predictor[:, worlds]
+    def begin(self, filters: Filters, begun: NDArray[np.bool_]) -> None:
+        """Shows the predictor to some robots, which have visited nothing yet."""
+        predictor = filters.predictor[:, begun]
         shown = np.empty((*predictor.shape[1:], 3))
         shown[..., _TARGET] = predictor[self._model.target_state]
         shown[..., _ENTROPY] = entropy(predictor) / np.log(self._model.n_states)
         shown[..., _VISITED] = 0.0
-        self._inside[worlds, :, :, :_OFF] = np.rint(255.0 * shown)
+        self._inside[begun, :, :, :_OFF] = np.rint(255.0 * shown)
 
     def visit(
         self, indices: NDArray[np.intp], rows: NDArray[np.int64], cols: NDArray[np.int64]
@@ -55,9 +55,9 @@ class Windows:
         self._inside[indices, rows, cols, :_OFF] = (0, 0, 255)
 
     def around(self, flights: Flights) -> NDArray[np.uint8]:
-        """The windows of all worlds, `(n_worlds, side, side, channels)`; a copy."""
+        """The windows of all robots, `(n_rows, side, side, channels)`; a copy."""
         robots = flights.robots
-        windows = self._cut[self._worlds, robots[:, 0], robots[:, 1]]
+        windows = self._cut[self._rows, robots[:, 0], robots[:, 1]]
         windows = windows.reshape(-1, self._side, self._side, len(CHANNELS))
         left = 1.0 - flights.n_made / self._spec.n_moves
         windows[..., _LEFT] = np.rint(255.0 * left)[:, np.newaxis, np.newaxis]

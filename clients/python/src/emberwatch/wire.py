@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from emberwatch.errors import EmberwatchError
 
 #: The protocol version that this package speaks.
-VERSION: Final = 1
+VERSION: Final = 2
 
 #: Byte of a frame where nothing was observed.
 UNOBSERVED: Final = 255
@@ -26,14 +26,16 @@ STEP: Final = 1
 OBSERVE: Final = 2
 RECALL: Final = 3
 
-#: Flag of a step that asks for every cell.
+#: Flags: a step that observes every cell; an answer with the team's frame of each world.
 FULL_COVERAGE: Final = 1
+TEAM_FRAMES: Final = 2
 
 #: Number of moves: up, down, left, right.
 N_MOVES: Final = 4
 
 #: Limits of section 1.
 MAX_CLIENTS: Final = 16
+MAX_ROBOTS: Final = 64
 MAX_OBSERVERS: Final = 16
 MAX_TRUTH_READERS: Final = 4
 MAX_AGENT_READERS: Final = 4
@@ -42,7 +44,7 @@ TRUTH_BUFFER: Final = 128
 AGENT_BUFFER: Final = 4
 MAX_NODES: Final = 64
 
-_STEP_REQUEST: Final = "IIQQIIIIQQQ"
+_STEP_REQUEST: Final = "IIQQIIIIQQ"
 _CONTROL_REQUEST: Final = "IIQQQ"
 
 #: The two request headers as bytes, field by field.
@@ -56,7 +58,7 @@ class Header(ctypes.Structure):
     @classmethod
     def type_name(cls) -> str:
         """The name by which iceoryx2 compares types of two processes."""
-        return f"emberwatch.v1.{cls.__name__}"
+        return f"emberwatch.v2.{cls.__name__}"
 
 
 def _fields(format: str, names: str) -> list[tuple[str, Any]]:
@@ -66,25 +68,23 @@ def _fields(format: str, names: str) -> list[tuple[str, Any]]:
 
 
 class StepRequest(Header):
-    """In front of the paths: `n_worlds * n_moves` bytes."""
+    """In front of the step k of each world, and of a step then `n_robots` paths."""
 
     _fields_ = _fields(
         _STEP_REQUEST,
-        "version operation lease sequence first_world n_worlds n_moves flags listener_low "
-        "listener_high step",
+        "version operation lease sequence first_robot n_robots n_moves flags listener_low "
+        "listener_high",
     )
 
 
 class StepReply(Header):
-    """In front of `n_worlds` results and as many frames."""
+    """In front of `n_worlds` results, `n_robots` results, and the frames."""
 
-    _fields_ = [
-        *_fields(
-            "IIQIIIIQQ",
-            "version status sequence first_world n_worlds height width simulation_nanos detail",
-        ),
-        ("reserved", ctypes.c_uint64 * 2),
-    ]
+    _fields_ = _fields(
+        "IIQIIIIIIQQ",
+        "version status sequence first_robot n_robots n_worlds flags height width "
+        "simulation_nanos detail",
+    )
 
 
 class ControlRequest(Header):
@@ -100,13 +100,10 @@ class ControlReply(Header):
 
 
 class FrameHeader(Header):
-    """In front of a published frame and its path."""
+    """In front of what a world's robots saw and flew."""
 
     _fields_ = [
-        *_fields(
-            "IIQIIIIII",
-            "version world sequence height width n_moves start_row start_col reserved",
-        ),
+        *_fields("IIQIIII", "version world sequence first_robot n_robots height width"),
         ("result", ctypes.c_ubyte * 64),
     ]
 
@@ -121,12 +118,13 @@ class AgentHeader(Header):
     """In front of an agent's belief and what it wants."""
 
     _fields_ = _fields(
-        "IIQQQQIIII", "version world sequence episode step seed height width n_states pid"
+        "IIQQQQIIIIII",
+        "version world sequence episode step seed height width n_states pid first_robot n_robots",
     )
 
 
-class StepResult(NamedTuple):
-    """How one world stands after a step or a reset (PROTOCOL.md, `StepResult`)."""
+class WorldResult(NamedTuple):
+    """How one world stands after a step or a reset (PROTOCOL.md, `WorldResult`)."""
 
     #: k, the number of steps since the last reset.
     step: int
@@ -134,19 +132,18 @@ class StepResult(NamedTuple):
     seed: int
     #: Resets of this world since the server started.
     episode: int
-    #: Sum of the model's rewards over the distinct cells visited.
+    #: The team's: the sum of the model's rewards over the distinct cells that any robot visited.
     reward: float
+    #: Bit r: nobody held robot r.
+    hovered: int
+    #: Bit r: robot r was held, and its path came too late.
+    late: int
     #: Cells of the whole grid in the state that pays most (fire): for reports.
     n_target_cells: int
-    #: Distinct cells visited.
+    #: Distinct cells that the team visited.
     n_visited: int
-    #: Distinct cells visited in the state that pays most.
+    #: Of these, those in the state that pays most.
     n_hits: int
-    #: The robot's place.
-    row: int
-    col: int
-    #: What the frame shows: 0 nothing, 1 the path, 2 every cell.
-    coverage: int
     #: 1 if the episode ended by itself.
     terminated: int
     #: 1 if the server's `max_steps` ended it.
@@ -158,58 +155,138 @@ class StepResult(NamedTuple):
         return self.seed, self.episode, self.step
 
 
-#: One `StepResult` as bytes; the last four are reserved.
-RESULT: Final = struct.Struct("=QQQdIIIIIIHH4x")
+class RobotResult(NamedTuple):
+    """How one robot stands after a step or a reset (PROTOCOL.md, `RobotResult`)."""
 
-#: The same for many at once.
-RESULT_DTYPE: Final = np.dtype(
-    [*zip(StepResult._fields, "QQQdIIIIIIHH", strict=True), ("reserved", "I")]
-)
+    #: Its share: a cell that v robots visited pays 1 / v of its reward.
+    reward: float
+    #: What the team's reward would lack without it.
+    marginal: float
+    #: Distinct cells that it visited.
+    n_visited: int
+    #: Of these, those in the state that pays most.
+    n_hits: int
+    #: Where its path began.
+    start_row: int
+    start_col: int
+    #: Where it is.
+    row: int
+    col: int
+    #: What its frame shows: 0 nothing, 1 the path, 2 every cell.
+    coverage: int
+    #: Moves flown: 0 after a reset, or if it hovered or was late.
+    n_moves: int
+
+    @property
+    def start(self) -> tuple[int, int]:
+        """The cell where its path began."""
+        return self.start_row, self.start_col
+
+    @property
+    def cell(self) -> tuple[int, int]:
+        """The cell where it is."""
+        return self.row, self.col
+
+
+class StepResult(NamedTuple):
+    """How one robot and its world stand after a step or a reset."""
+
+    world: WorldResult
+    robot: RobotResult
+
+
+#: The results as bytes.
+WORLD: Final = struct.Struct("=QQQdQQIIIHH")
+ROBOT: Final = struct.Struct("=ddIIIIIIII")
+
+#: The same for many at once, and a `StepResult` for each robot.
+WORLD_DTYPE: Final = np.dtype([*zip(WorldResult._fields, WORLD.format[1:], strict=True)])
+ROBOT_DTYPE: Final = np.dtype([*zip(RobotResult._fields, ROBOT.format[1:], strict=True)])
+RESULT_DTYPE: Final = np.dtype([("world", WORLD_DTYPE), ("robot", ROBOT_DTYPE)])
+
+
+class Shape(NamedTuple):
+    """What the length and the values of an answer depend on, as `hello` tells it."""
+
+    #: Robots of a world, R.
+    n_robots: int
+    n_moves: int
+    n_observations: int
+
+    def n_worlds(self, first_robot: int, n_robots: int) -> int:
+        """How many worlds some consecutive robots are in."""
+        return (first_robot % self.n_robots + n_robots - 1) // self.n_robots + 1
 
 
 class StepAnswer:
-    """The answer to a step or an observation: results and frames of consecutive worlds.
+    """The answer to a step or an observation: results and frames of consecutive robots.
 
     Attributes:
-        first_world: The first world.
+        first_robot: The number of the first robot; robot r of world w has number w R + r.
         simulation_nanos: How long the server worked on it, nanoseconds.
-        frames: What was seen, `(n_worlds, H, W)`: an observation, or 255 where nothing was seen.
-            A copy of your own; write to it as you like.
+        worlds: A `WorldResult` per world, `(n_worlds,)` of `WORLD_DTYPE`.
+        robots: A `RobotResult` per robot, `(n_robots,)` of `ROBOT_DTYPE`.
+        frames: What each robot saw, `(n_robots, H, W)`: an observation, or 255 where nothing was
+            seen. If team frames were asked for: what all robots of each world saw,
+            `(n_worlds, H, W)`. A copy of your own; write to it as you like.
     """
 
-    __slots__ = ("_payload", "first_world", "frames", "simulation_nanos")
+    __slots__ = ("_shape", "first_robot", "frames", "robots", "simulation_nanos", "worlds")
 
-    def __init__(self, reply: StepReply, payload: bytearray, n_observations: int) -> None:
-        n_worlds, height, width = reply.n_worlds, reply.height, reply.width
-        if not n_worlds * height * width:
+    def __init__(self, reply: StepReply, payload: bytearray, shape: Shape) -> None:
+        n_worlds, n_robots, n_cells = reply.n_worlds, reply.n_robots, reply.height * reply.width
+        if not n_robots * n_cells or n_worlds != shape.n_worlds(reply.first_robot, n_robots):
             raise bad_answer(
-                f"answer to step: expected worlds, got {n_worlds} of {height} x {width} cells"
+                f"answer to step: expected robots and their worlds, got {n_robots} in {n_worlds} "
+                f"of {reply.height} x {reply.width} cells"
             )
-        expected = n_worlds * (RESULT.size + height * width)
+        n_frames = n_worlds if reply.flags & TEAM_FRAMES else n_robots
+        head = n_worlds * WORLD.size + n_robots * ROBOT.size
+        expected = head + n_frames * n_cells
         if len(payload) != expected:
             raise bad_answer(f"answer to step: expected {expected} bytes, got {len(payload)}")
-        self._payload = payload
-        self.first_world: int = reply.first_world
+        self._shape = shape
+        self.first_robot: int = reply.first_robot
         self.simulation_nanos: int = reply.simulation_nanos
-        frames = np.frombuffer(payload, np.uint8, offset=n_worlds * RESULT.size)
-        check_frame(frames, n_observations)
-        self.frames = frames.reshape(n_worlds, height, width)
+        self.worlds: NDArray[np.void] = np.frombuffer(payload, WORLD_DTYPE, n_worlds)
+        self.robots: NDArray[np.void] = np.frombuffer(
+            payload, ROBOT_DTYPE, n_robots, n_worlds * WORLD.size
+        )
+        stayed = max(self.worlds["hovered"].tolist() + self.worlds["late"].tolist())
+        check_stayed(stayed, shape.n_robots)
+        n_moves = set(self.robots["n_moves"].tolist())
+        if not n_moves <= {0, shape.n_moves}:
+            raise bad_answer(f"n_moves: expected 0 or {shape.n_moves}, got {n_moves}")
+        frames = np.frombuffer(payload, np.uint8, offset=head)
+        check_frame(frames, shape.n_observations)
+        self.frames = frames.reshape(n_frames, reply.height, reply.width)
 
     def __repr__(self) -> str:
-        others = len(self.frames) - 1
+        others = len(self.robots) - 1
         more = f", and {others} more" if others else ""
         return (
-            f"StepAnswer(first_world={self.first_world}, simulation_nanos={self.simulation_nanos}, "
+            f"StepAnswer(first_robot={self.first_robot}, simulation_nanos={self.simulation_nanos}, "
             f"frames=<uint8 {self.frames.shape}>, results=[{self.result()}{more}])"
         )
 
     @property
+    def world_of(self) -> NDArray[np.intp]:
+        """The position in `worlds` of each robot's world, `(n_robots,)`."""
+        first, n_robots = self.first_robot % self._shape.n_robots, len(self.robots)
+        return np.arange(first, first + n_robots) // self._shape.n_robots
+
+    @property
     def results(self) -> NDArray[np.void]:
-        """One `StepResult` per world, as a structured array `(n_worlds,)` of `RESULT_DTYPE`."""
-        return np.frombuffer(self._payload, RESULT_DTYPE, count=len(self.frames))
+        """One `StepResult` per robot, `(n_robots,)` of `RESULT_DTYPE`; a new array."""
+        results = np.empty(len(self.robots), RESULT_DTYPE)
+        results["world"], results["robot"] = self.worlds[self.world_of], self.robots
+        return results
 
     def result(self, index: int = 0) -> StepResult:
-        return StepResult(*RESULT.unpack_from(self._payload, index * RESULT.size))
+        world = self._shape.n_worlds(self.first_robot, index + 1) - 1
+        return StepResult(
+            WorldResult(*self.worlds[world].item()), RobotResult(*self.robots[index].item())
+        )
 
 
 def bad_answer(message: str) -> EmberwatchError:
@@ -227,12 +304,19 @@ def check_frame(values: NDArray[np.uint8], n_observations: int) -> None:
         )
 
 
-def check_worlds(reply: StepReply, expected: tuple[int, int, int, int]) -> None:
-    """Refuses an answer about other worlds, or of another size: first, number, height, width."""
-    got = (reply.first_world, reply.n_worlds, reply.height, reply.width)
+def check_stayed(stayed: int, n_robots: int) -> None:
+    """Refuses bits of robots that a world does not have."""
+    if stayed >> n_robots:
+        raise bad_answer(f"robots that stayed: expected bits below {n_robots}, got {stayed:#x}")
+
+
+def check_asked(reply: StepReply, expected: tuple[int, int, int, int, int]) -> None:
+    """Refuses an answer to another question: first robot, number, flags, height, width."""
+    got = (reply.first_robot, reply.n_robots, reply.flags, reply.height, reply.width)
     if got != expected:
         raise bad_answer(
-            f"answer to step: expected first world, worlds, height, width {expected}, got {got}"
+            "answer to step: expected first robot, robots, flags, height, width "
+            f"{expected}, got {got}"
         )
 
 

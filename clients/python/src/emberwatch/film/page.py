@@ -15,7 +15,7 @@ from emberwatch.belief import entropy
 from emberwatch.errors import InvalidArgumentError
 from emberwatch.film.scenes import Scene
 from emberwatch.model import Color, Model
-from emberwatch.palette import DARK, LIGHT, Palette
+from emberwatch.palette import DARK, LIGHT, ROBOTS, Palette
 from emberwatch.render import LEAST_LINE_SCALE, Picture, rgb_array
 from emberwatch.replies import ServerInfo
 
@@ -94,7 +94,7 @@ class Page:
         step = f"step k = {scene.k}"
         _write(image, (_MARGIN, middle), step, font=_TITLE)
         left = _MARGIN + _length(step, _TITLE) + _GAP
-        if scene.step.frame.path.size and not scene.is_gap:
+        if result.step > 0 and not scene.is_gap:
             reward = f"reward {result.reward:.4g}, mean {scene.mean_reward:.1f}"
             right -= _length(reward, _TITLE)
             _write(image, (right, middle), reward, font=_TITLE)
@@ -123,11 +123,11 @@ class Page:
             at = left + (width - _length(text)) // 2, _TOP + height // 2
             _write(image, at, text, ink=_WARNING)
             return
-        robot: tuple[int, int] | None = None
-        if scene.path is not None:
-            robot = (int(scene.path[-1, 0]), int(scene.path[-1, 1]))
-        path = scene.path if panel.has_path and self._scale >= LEAST_LINE_SCALE else None
-        pixels = rgb_array(Picture(cells, robot, panel.palette, path), scale=self._scale)
+        paths = scene.paths or []
+        robots = [(row, col) for row, col in (path[-1].tolist() for path in paths)]
+        if not panel.has_path or self._scale < LEAST_LINE_SCALE:
+            paths = []
+        pixels = rgb_array(Picture(cells, robots, panel.palette, paths), scale=self._scale)
         image.paste(Image.fromarray(pixels[:height, :width]), (left, _TOP))
 
     def _placed(self, marks: list[tuple[_Mark, str]]) -> list[tuple[_Mark, str, tuple[int, int]]]:
@@ -149,7 +149,7 @@ class Page:
         if mark == "robot":
             blank = Palette(states=(), observations=(LIGHT,), unobserved=LIGHT, path=DARK)
             frame = np.zeros((1, 1), np.uint8)
-            robot = rgb_array(Picture(frame, (0, 0), blank), scale=_SWATCH + 1)
+            robot = rgb_array(Picture(frame, [(0, 0)], blank), scale=_SWATCH + 1)
             self._base.paste(Image.fromarray(robot), (x, top))
         elif mark == "scale":
             _write(self._base, (x, y), "0")
@@ -194,7 +194,7 @@ def _film_palette(palette: Palette) -> Image.Image:
     """All colours of cells, marks and letters, few enough for a GIF."""
     cells = np.array([*palette.observations, palette.unobserved])
     inks = np.linspace(LIGHT, [_INK, _WARNING], 8).reshape(-1, 3)
-    marks = np.array([DARK, LIGHT, _EDGE, *palette.states, *_ramp(_SHADES)])
+    marks = np.array([DARK, LIGHT, _EDGE, *ROBOTS, *palette.states, *_ramp(_SHADES)])
     image = Image.new("P", (1, 1))
     image.putpalette(np.concatenate([cells, marks, inks]).astype(np.uint8).tobytes())
     return image
@@ -216,7 +216,7 @@ def _panels(
         cells=lambda scene: None if scene.is_gap else scene.step.truth,
     )
     path = _Panel(
-        title="seen on this path",
+        title="seen in this step",
         palette=palette,
         marks=[*seen, (palette.unobserved, "not seen"), ("robot", "robot")],
         cells=lambda scene: None if scene.is_gap else scene.step.frame.frame,
@@ -271,4 +271,9 @@ def _small_print(scene: Scene) -> tuple[str, Color]:
     begins = f"the belief begins at step {scene.since}"
     lost = f"{scene.n_lost} steps before this one are not recorded"
     texts = [begins] * (scene.since > 0) + [lost] * (scene.n_lost > 0)
+    result = scene.step.frame.result
+    for what, mask in (("hovered", result.hovered), ("late", result.late)):
+        texts += [
+            f"robot {robot} {what}" for robot in range(mask.bit_length()) if mask >> robot & 1
+        ]
     return "; ".join(texts), _INK

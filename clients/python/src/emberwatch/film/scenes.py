@@ -43,7 +43,7 @@ class Scene:
         step: The step, or the one behind a gap.
         k: Number of the step shown: of a gap the last.
         is_gap: Whether it stands for the steps before `step` that are not recorded.
-        path: The robot's cells, the start first, `(n, 2)`.
+        paths: Each robot's cells, the start first, `(n, 2)`.
         belief: The posterior, of a gap the predictor, `(S, H, W)`; None where no model is known.
         since: The step at which the belief began.
         n_lost: Steps since then that are not recorded.
@@ -53,7 +53,7 @@ class Scene:
     step: Step
     k: int
     is_gap: bool = False
-    path: NDArray[np.intp] | None = None
+    paths: list[NDArray[np.intp]] | None = None
     belief: NDArray[np.float64] | None
     since: int
     n_lost: int
@@ -92,13 +92,13 @@ def scenes(
                 known.correct(step.frame.frame)
         except EmberwatchError as error:
             raise EmberwatchError(f"step {k}: {error}", error.code) from error
-        if step.frame.path.size:
+        if k > 0:
             n_rewards, total = n_rewards + 1, total + step.frame.result.reward
         if selection.shows(step):
             yield Scene(
                 step=step,
                 k=k,
-                path=_path(step),
+                paths=_paths(step),
                 belief=known and known.belief,
                 since=since,
                 n_lost=n_lost,
@@ -112,7 +112,8 @@ def _predict(known: Filter | None, n_steps: int) -> None:
             known.predict()
 
 
-def _path(step: Step) -> NDArray[np.intp]:
-    frame = step.frame
-    start = frame.start if frame.path.size else (frame.result.row, frame.result.col)
-    return np.concatenate([np.array([start], np.intp), fly(start, frame.path, step.server)])
+def _paths(step: Step) -> list[NDArray[np.intp]]:
+    return [
+        np.array([robot.result.start, *fly(robot.result.start, robot.path, step.server)], np.intp)
+        for robot in step.frame.robots
+    ]

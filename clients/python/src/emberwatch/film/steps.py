@@ -22,7 +22,7 @@ class Step:
 
     Attributes:
         server: The server that simulated it.
-        frame: What the robot saw, and the step's result.
+        frame: What the robots saw and flew, and the step's result.
         truth: Hidden states, `(H, W)`; None where they are not recorded.
         n_lost: Steps right before it that are not recorded; None where a new episode begins.
     """

@@ -1,0 +1,401 @@
+"""All robots of a world through PettingZoo, and each of them in an environment of its own."""
+
+import hashlib
+import json
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from environments import SMALL, assert_same, impatient, make, make_vec, no_warnings, serving
+from pettingzoo.utils.conversions import parallel_to_aec
+
+import emberwatch
+from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.parallel import WildfireParallelEnv
+
+with warnings.catch_warnings(action="ignore"):  # of its own games, which it imports
+    from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
+
+AGENTS = [f"robot_{robot}" for robot in range(4)]
+
+
+def team(**keywords: Any) -> WildfireParallelEnv:
+    """Robots of a small world, or with `instance` of a running server's."""
+    if keywords.get("instance") is not None:
+        return emberwatch.parallel_env(**keywords)
+    return emberwatch.parallel_env(**{**SMALL, "robots": 4, **keywords})
+
+
+@pytest.mark.parametrize("observation", ["local", "image", "team", "others"])
+@pytest.mark.parametrize("robots", [2, 3])
+def test_pettingzoo_finds_no_fault(robots: int, observation: str) -> None:
+    with no_warnings():
+        parallel_api_test(team(robots=robots, observation=observation), num_cycles=100)
+        env = parallel_to_aec(team(robots=robots, observation=observation, max_episode_steps=9))
+        api_test(env, num_cycles=50)
+        env.close()
+
+
+def test_pettingzoo_finds_no_fault_in_paths() -> None:
+    with no_warnings():
+        parallel_api_test(team(action="path", max_episode_steps=20), num_cycles=50)
+    env = parallel_to_aec(team(action="path", max_episode_steps=20))
+    with pytest.warns(UserWarning) as warned:
+        api_test(env, num_cycles=20)
+    # It knows neither dictionaries of observations nor actions that are arrays of choices.
+    about = {str(warning.message).partition(" of ")[0] for warning in warned}
+    assert all("bservation" in text or "ction" in text for text in about), about
+    env.close()
+
+
+@pytest.mark.parametrize("action", ["move", "path"])
+def test_seeds_begin_the_same_episodes(action: str) -> None:
+    with no_warnings():
+        parallel_seed_test(lambda: team(action=action), num_cycles=20)
+
+
+def rollout(env: WildfireParallelEnv, actions: list[dict[str, Any]], seed: int) -> list[Any]:
+    return [env.reset(seed=seed), *map(env.step, actions)]
+
+
+def random_actions(n_steps: int, n_robots: int, shape: tuple[int, ...] = ()) -> list[Any]:
+    generator = np.random.default_rng(7)
+    return [
+        {f"robot_{robot}": generator.integers(0, 4, shape) for robot in range(n_robots)}
+        for _ in range(n_steps)
+    ]
+
+
+PARTS = ("frame", "robot", "age", "belief", "team", "others")
+
+
+@pytest.mark.parametrize("reward", ["share", "team", "marginal"])
+def test_each_agent_sees_and_earns_what_its_row_does(reward: str) -> None:
+    keywords = {"observation": PARTS, "reward": reward, "robots": 3, "max_episode_steps": 5}
+    ours, rows = team(action="path", **keywords), make_vec(3, **keywords)
+    actions = random_actions(5, 3, (4,))
+    outcomes = rollout(ours, actions, 11)
+    expected = [rows.reset(seed=11)]
+    expected += [rows.step(np.array(list(action.values()))) for action in actions]
+    for outcome, (seen, *others) in zip(outcomes, expected, strict=True):
+        for row, agent in enumerate(ours.possible_agents):
+            one = {name: part[row] for name, part in seen.items()}
+            assert_same(outcome[0][agent], one)
+            if len(others) > 1:
+                assert [part[agent] for part in outcome[1:4]] == [part[row] for part in others[:3]]
+            names = ("step", "n_target_cells", "n_visited", "n_hits")
+            info = {name: int(others[-1][name][row]) for name in names}
+            assert_same(outcome[-1][agent], info)
+    assert ours.agents == [] and all(outcomes[-1][3].values())
+    ours.close()
+    rows.close()
+
+
+def test_rewards_of_a_team_are_what_its_definition_says() -> None:
+    """Shares sum to the team's reward, and what is visited together is paid once."""
+    paths = random_actions(30, 4, (4,))
+    flown: dict[str, list[dict[str, float]]] = {}
+    for reward in ("share", "team", "marginal"):
+        env = team(action="path", reward=reward, start="centre")
+        flown[reward] = [outcome[1] for outcome in rollout(env, paths, 5)[1:]]
+        env.close()
+    n_apart = 0
+    for shares, whole, marginal in zip(*flown.values(), strict=True):
+        (reward,) = set(whole.values())
+        assert sum(shares.values()) == pytest.approx(reward)
+        for agent in AGENTS:
+            assert marginal[agent] <= shares[agent] + 1e-9 <= reward + 2e-9
+        n_apart += sum(marginal.values()) < reward
+    assert n_apart > 5, "robots that begin in one cell meet"
+
+
+def test_the_state_is_what_the_team_saw_and_where_it_is() -> None:
+    env = team(action="path", observation=("frame", "robot"))
+    env.reset(seed=3)
+    for action in random_actions(5, 4, (4,)):
+        seen, *_ = env.step(action)
+        state = env.state()
+        assert env.state_space.contains(state)
+        frame = np.min([one["frame"] for one in seen.values()], axis=0)[..., 0]
+        values = np.where(frame == 255, state.shape[2] - 2, frame)
+        assert (state[..., :-1].argmax(axis=2) == values).all()
+        assert (state[..., :-1].sum(axis=2, dtype=int) == 255).all()
+        places = np.zeros_like(frame)
+        places[tuple(np.array([one["robot"] for one in seen.values()]).T)] = 255
+        assert (state[..., -1] == places).all()
+    env.close()
+
+
+def test_a_team_is_drawn_as_a_whole() -> None:
+    env, alone = team(render_mode="rgb_array", start="centre"), make(render_mode="rgb_array")
+    with pytest.warns(UserWarning, match="nothing to draw"):
+        assert env.render() is None
+    env.reset(seed=3)
+    alone.reset(seed=3)
+    assert env.render().shape == alone.render().shape
+    before = env.render()
+    env.step(dict(zip(AGENTS, range(4), strict=True)))
+    assert (env.render() != before).any()
+    env.close()
+    alone.close()
+
+
+@pytest.mark.parametrize(
+    ("keywords", "words"),
+    [
+        ({"action": "fly"}, "action: expected 'move' or 'path', got 'fly'"),
+        ({"robots": 0}, "robots: expected at least 1, got 0"),
+        ({"robots": 65}, "robots: expected 1 to 64, got 65"),
+        ({"robot": 1}, "robot: expected"),
+        ({"reward": "all"}, "reward: expected one of 'share', 'team', 'marginal', 'move'"),
+        ({"action": "path", "reward": "move"}, "reward: expected one of 'share', 'team', 'marg"),
+        ({"observation": "age of fire"}, "observation: expected one or several of"),
+    ],
+)
+def test_impossible_teams_are_named(keywords: dict[str, Any], words: str) -> None:
+    with pytest.raises(InvalidArgumentError, match=words):
+        team(**keywords)
+
+
+def test_actions_of_other_agents_are_refused() -> None:
+    env = team(robots=2)
+    assert env.step({}) == ({}, {}, {}, {}, {})
+    env.reset(seed=1)
+    for actions in ({}, {"robot_0": 1}, {"robot_0": 1, "robot_1": 1, "robot_2": 1}):
+        with pytest.raises(InvalidArgumentError, match="actions: expected one for each of"):
+            env.step(actions)
+    with pytest.raises(InvalidArgumentError, match="action: expected 0 to 3, got 4"):
+        env.step({"robot_0": 1, "robot_1": 4})
+    env.close()
+
+
+# One robot of a team.
+
+
+@pytest.fixture
+def alone() -> Iterator[Callable[..., Any]]:
+    """Makes environments of one robot each, which end with the test."""
+    with ExitStack() as stack:
+
+        def start(instance: str, robot: int, **keywords: Any) -> Any:
+            env = make(instance=instance, robot=robot, **keywords)
+            stack.callback(env.close)
+            return env
+
+        yield start
+
+
+def together(calls: list[Callable[[], Any]]) -> list[Any]:
+    """What calls return that wait for each other, each on a thread of its own."""
+    results: list[Any] = [None] * len(calls)
+
+    def run(index: int) -> None:
+        results[index] = calls[index]()
+
+    threads = [threading.Thread(target=run, args=(index,)) for index in range(len(calls))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return results
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 1, 0, 2)])
+@pytest.mark.parametrize("reward", ["share", "team", "marginal"])
+def test_four_environments_of_one_robot_are_the_team(
+    alone: Callable[..., Any], order: tuple[int, ...], reward: str
+) -> None:
+    paths = random_actions(6, 4, (4,))
+    with serving(robots=4) as instance:
+        env = team(instance=instance, action="path", observation=PARTS, reward=reward)
+        expected = rollout(env, paths, 77)
+        env.reset(seed=77)
+        env.close()
+        keywords = {"observation": PARTS, "reward": reward}
+        robots = {robot: alone(instance, robot, **keywords) for robot in order}
+        for robot in order:
+            seen, info = robots[robot].reset()
+            assert_same(seen, expected[0][0][AGENTS[robot]])
+            assert info.pop("n_missed") == 0
+        for path, outcome in zip(paths, expected[1:], strict=True):
+            calls = [partial(robots[robot].step, path[AGENTS[robot]]) for robot in order]
+            for robot, flown in zip(order, together(calls), strict=True):
+                assert flown[4].pop("n_missed") == 0
+                assert_same(list(flown), [part[AGENTS[robot]] for part in outcome])
+
+
+FLY = """
+import hashlib, json, sys
+import gymnasium, emberwatch
+robot, paths = int(sys.argv[2]), json.loads(sys.argv[3])
+env = gymnasium.make("emberwatch/Wildfire-v0", instance=sys.argv[1], robot=robot, timeout=20.0)
+env.reset()
+print("holds its robot", flush=True)
+input()
+for path in paths:
+    seen, reward, *_ , info = env.step(path)
+    told = [seen["frame"].tobytes(), seen["robot"].tolist(), reward, info]
+    print(hashlib.sha256(repr(told).encode()).hexdigest(), flush=True)
+env.close()
+"""
+
+
+def test_four_processes_are_the_team(script: Callable[..., Any]) -> None:
+    paths = random_actions(20, 4, (4,))
+    with serving(robots=4) as instance:
+        env = team(instance=instance, action="path", observation=("frame", "robot"))
+        expected = rollout(env, paths, 5)[1:]
+        env.reset(seed=5)
+        env.close()
+        given = [[path[agent].tolist() for path in paths] for agent in AGENTS]
+        flyers = [script(FLY, instance, robot, json.dumps(given[robot])) for robot in (2, 0, 3, 1)]
+        for flyer in flyers:
+            assert flyer.line() == "holds its robot"
+        for flyer in flyers:
+            flyer.say()
+        for robot, flyer in zip((2, 0, 3, 1), flyers, strict=True):
+            for seen, rewards, _, _, infos in expected:
+                agent = AGENTS[robot]
+                frame, cell = seen[agent]["frame"].tobytes(), seen[agent]["robot"].tolist()
+                told = [frame, cell, rewards[agent], infos[agent] | {"n_missed": 0}]
+                assert flyer.line() == hashlib.sha256(repr(told).encode()).hexdigest()
+
+
+def test_robots_that_nobody_holds_hover(alone: Callable[..., Any]) -> None:
+    with serving(robots=3) as instance:
+        one = alone(instance, 1, observation=("frame", "robot", "others", "team"))
+        seen, _ = one.reset(seed=3)
+        before = seen["others"].copy()
+        for _ in range(3):
+            seen, _, _, _, info = one.step([1, 1, 3, 3])
+            assert info["n_missed"] == 0
+            assert (seen["others"] == before).all() and before.sum() == 2 * 255
+            assert (seen["team"] == seen["frame"]).all()
+        other = alone(instance, 2)
+        assert other.reset()[1] == info | {"n_visited": 0, "n_hits": 0}
+
+
+def test_a_late_path_is_not_flown_and_told(alone: Callable[..., Any]) -> None:
+    with serving(robots=2, deadline_ms=50) as instance:
+        quick, slow = alone(instance, 0), alone(instance, 1, observation=PARTS)
+        quick.reset()
+        first, _ = slow.reset()
+        for _ in range(3):
+            quick.step([1, 1, 1, 1])
+        seen, reward, _, _, info = slow.step([3, 3, 3, 3])
+        assert (reward, info["step"], info["n_missed"], info["n_visited"]) == (0.0, 3, 3, 0)
+        assert (seen["robot"] == first["robot"]).all() and (seen["frame"] == 255).all()
+        # From there on it flies again.
+        flown, _ = together([lambda: slow.step([0, 0, 0, 0]), lambda: quick.step([1, 1, 1, 1])])
+        assert flown[4]["n_missed"] == 0 and flown[4]["step"] == 4 and flown[4]["n_visited"] > 0
+
+
+def test_a_belief_goes_through_the_steps_that_were_missed(alone: Callable[..., Any]) -> None:
+    with serving(robots=2, deadline_ms=50) as instance:
+        quick, slow = alone(instance, 0), alone(instance, 1, observation=("belief", "age"))
+        quick.reset()
+        slow.reset()
+        together([lambda: slow.step([2, 2, 2, 2]), lambda: quick.step([1, 1, 1, 1])])
+        for _ in range(2):
+            quick.step([1, 1, 1, 1])
+        seen, *_, info = slow.step([3, 3, 3, 3])
+        ages = seen["age"]
+        assert info["n_missed"] == 2 and set(np.unique(ages)) == {2, 255}
+
+
+def test_slow_teammates_are_waited_for_beyond_the_timeout(
+    alone: Callable[..., Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    with serving(robots=2) as instance:
+        patient, slow = alone(instance, 0), alone(instance, 1)
+        patient.reset()
+        slow.reset()
+        waits = threading.Event()
+
+        def late() -> Any:
+            waits.wait(0.5)
+            return slow.step([1, 1, 1, 1])
+
+        with impatient(patient, 0.1):
+            first, second = together([lambda: patient.step([3, 3, 3, 3]), late])
+        assert first[4]["step"] == second[4]["step"] == 1
+        assert first[4]["n_missed"] == second[4]["n_missed"] == 0
+        assert first[4]["n_visited"] > 0 and second[4]["n_visited"] > 0
+        assert "world 0 waits for the paths of other robots that are held" in caplog.text
+
+
+def test_a_robot_is_taken_over_where_it_stands(alone: Callable[..., Any]) -> None:
+    with serving(robots=2) as instance:
+        first = alone(instance, 1)
+        first.reset()
+        seen = first.step([0, 0, 2, 2])[0]
+        with pytest.raises(EmberwatchError, match="busy"):
+            alone(instance, 1).reset()
+        second = alone(instance, 1, takeover=True)
+        again, info = second.reset()
+        assert info["step"] == 1
+        assert_same(again["robot"], seen["robot"])
+        with pytest.raises(emberwatch.errors.LeaseLostError):
+            first.step([0, 0, 0, 0])
+
+
+def test_an_episode_that_is_over_is_for_the_holder_of_all(alone: Callable[..., Any]) -> None:
+    with serving(robots=2, max_steps=1) as instance:
+        one = alone(instance, 0)
+        one.reset()
+        assert one.step([1, 1, 1, 1])[3]
+        with pytest.raises(EmberwatchError, match="holds all its robots") as raised:
+            one.reset()
+        assert raised.value.code == "episode_over"
+        one.close()
+        env = team(instance=instance)
+        assert env.reset(seed=1)[1]["robot_0"]["step"] == 0
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("keywords", "words"),
+    [
+        ({}, "robots: expected one robot in a world, got 3: fly one of them with robot="),
+        ({"robot": 3}, "robot: expected 0 to 2, got 3"),
+        ({"robot": -1}, "robot: expected 0 to 2, got -1"),
+        ({"robot": 0, "robots": 2}, "robots: expected 3, as the server has"),
+        ({"robot": 0, "world": 1}, "world: expected worlds within 0 to 0, got 1 to 1"),
+    ],
+)
+def test_a_robot_that_is_not_there_is_named(keywords: dict[str, Any], words: str) -> None:
+    with serving(robots=3) as instance, pytest.raises(InvalidArgumentError, match=words):
+        make(instance=instance, **keywords)
+
+
+def test_private_worlds_and_vectors_have_no_single_robot() -> None:
+    with pytest.raises(InvalidArgumentError, match="takeover, world, robot: expected instance"):
+        make(robot=0)
+    with pytest.raises(InvalidArgumentError, match="robots: expected one robot in a world, got 2"):
+        make(robots=2)
+    with pytest.raises(InvalidArgumentError, match="a multiple of 2, got 3"):
+        make_vec(3, robots=2)
+    with serving(robots=2) as instance:
+        with pytest.raises(InvalidArgumentError, match="robot: expected None, as a vector"):
+            make_vec(2, instance=instance, robot=0)
+
+
+def test_rows_of_a_world_are_reset_together() -> None:
+    envs = make_vec(6, robots=3, autoreset_mode="Disabled")
+    first, _ = envs.reset(seed=[5, 0, 0, 9, 0, 0])
+    assert_same(envs.reset(seed=[5, 1, 1, 9, 2, 2])[0], first)
+    some = np.array([True, False, False, False, False, False])
+    with pytest.raises(InvalidArgumentError, match="reset_mask: expected all robots of a world"):
+        envs.reset(options={"reset_mask": some})
+    envs.step(envs.action_space.sample())
+    _, infos = envs.reset(options={"reset_mask": np.arange(6) < 3})
+    assert (
+        infos["step"].tolist() == [0, 0, 0, 0, 0, 0]
+        and infos["_step"].tolist() == [True] * 3 + [False] * 3
+    )
+    envs.close()

@@ -1,0 +1,136 @@
+//! Agents that fly robots of one world: by one plan without a word between them, in a world that goes on without them.
+
+use crate::harness::{PATIENCE, Program, Server, claim, eventually, robots_of, run as run_program};
+use agent::acting::mission::{Company, Mission};
+use agent::acting::run::{Summary, run};
+use agent::config::AgentConfig;
+use agent::learning::learned::Learned;
+use agent::server::client::Client;
+use protocol::observer::Observer;
+use rustix::process::Signal;
+use std::ops::Range;
+use std::sync::atomic::AtomicBool;
+
+/// A lively world of four robots, whose server keeps all frames of these steps.
+const FLAGS: &str =
+    "--model wildfire-small --height 16 --width 14 --moves 8 --burn-in 300 --robots 4";
+
+const STEPS: u64 = 40;
+
+/// Flies four robots by agents that hold some each, from k = 0 on; returns the paths by step, and the reward.
+fn fly(parts: &[Range<u32>], company: Company) -> (Vec<Vec<Vec<u8>>>, f64) {
+    let server = Server::start(FLAGS);
+    // Holds the world until each robot has its agent.
+    let _holder = Client::acquire(&server.instance, &claim(0..4)).expect("free robots");
+    let frames = Observer::frames(&server.instance).expect("the channel");
+    let mission = |robots: &Range<u32>| Mission {
+        instance: server.instance.clone(),
+        world: 0,
+        robots: robots.clone(),
+        company,
+        policy: "beam_exploit".into(),
+        steps: STEPS,
+        takeover: true,
+        model: None,
+        config: AgentConfig::default(),
+        learned: Learned::default(),
+    };
+    let reward = std::thread::scope(|scope| {
+        let run = |robots| {
+            let mission = mission(robots);
+            scope.spawn(move || run(&mission, &AtomicBool::new(false)).expect("a run"))
+        };
+        let runs: Vec<_> = parts.iter().map(run).collect();
+        let done = runs.into_iter().map(|run| run.join().expect("no panic"));
+        done.map(|Summary { steps, reward }| {
+            assert_eq!(steps, STEPS);
+            reward
+        })
+        .sum()
+    });
+    let mut paths = Vec::new();
+    while paths.len() < STEPS as usize {
+        let sample = frames.receive(PATIENCE).expect("the channel");
+        let sample = sample.expect("a sample of each step");
+        if sample.header.result.step > paths.len() as u64 {
+            let robots = robots_of(&sample).into_iter();
+            paths.push(robots.map(|robot| robot.path.to_vec()).collect());
+        }
+    }
+    (paths, reward)
+}
+
+#[test]
+fn agents_of_a_team_fly_one_plan_whoever_flies_what() {
+    let single = [0..1, 1..2, 2..3, 3..4];
+    let together = fly(&[0..4], Company::Team);
+    assert_eq!(fly(&single, Company::Team), together);
+    assert_eq!(fly(&[0..1, 1..4], Company::Team), together);
+    // One that plans for itself flies where others fly too.
+    let (_, alone) = fly(&single, Company::Alone);
+    assert!(together.1 > 1.2 * alone, "{} and {alone}", together.1);
+}
+
+#[test]
+fn an_agent_whose_path_comes_late_catches_up() {
+    let server = Server::start(&format!("{FLAGS} --deadline-ms 50"));
+    let name = server.instance.name().to_owned();
+    let agent = |robot: &str| {
+        let flags = ["run", "--instance", &name, "--robot", robot, "--team"];
+        Program::start("emberwatch-agent", &flags)
+    };
+    let (prompt, slow) = (agent("0"), agent("1"));
+    slow.wait_for_words("acting", PATIENCE);
+    slow.stop();
+    let before = server.step_of(0);
+    assert!(eventually(PATIENCE, || server.step_of(0) > before + 3));
+    slow.signal(Signal::CONT);
+    slow.wait_for_words("late: the world went on", PATIENCE);
+    let late = |step: u64| {
+        let (world, robot, _) = server.observe(1);
+        world.step > step && robot.n_moves > 0
+    };
+    let after = server.step_of(0);
+    assert!(
+        eventually(PATIENCE, || late(after + 3)),
+        "{}",
+        slow.stderr()
+    );
+    for agent in [prompt, slow] {
+        agent.signal(Signal::TERM);
+        let ended = agent.wait(PATIENCE);
+        assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    }
+}
+
+#[test]
+fn what_a_server_of_several_robots_cannot_give_is_refused_by_name() {
+    let server = Server::start(&format!("{FLAGS} --publish-truth"));
+    let check = |flags: &str, words: &str| {
+        let flags = format!("{flags} --instance {}", server.instance.name());
+        let ended = run_program(
+            "emberwatch-agent",
+            &flags.split(' ').collect::<Vec<_>>(),
+            PATIENCE,
+        );
+        assert_ne!(ended.code, Some(0), "{flags}");
+        assert!(ended.stderr.contains(words), "{flags}: {}", ended.stderr);
+    };
+    check(
+        "run --robot 4",
+        "expected some of the world's 0..4, got 4..5",
+    );
+    check(
+        "run --robots 2..6 --team",
+        "expected some of the world's 0..4, got 2..6",
+    );
+    check("run --world 1", "no such world");
+    check(
+        "serve-decisions",
+        "expected a server with --robots 1, got 4",
+    );
+    check(
+        "compare --robots 2",
+        "expected the running server's 4, got 2",
+    );
+}
