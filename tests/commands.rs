@@ -196,7 +196,6 @@ fn a_server_that_does_not_fit_is_refused_with_what_is_missing() {
     check_against(
         "--reveal-model false",
         "run SERVER --world 1 => no such world | worlds 0 to 0
-run SERVER --robot 1 => robots: expected some of the world's 0..1, got 1..2
 run SERVER => does not reveal its model | --model FILE
 compare SERVER --policies coverage => comparing needs the hidden states | --publish-truth",
     );
@@ -208,6 +207,7 @@ compare SERVER --policies coverage => comparing needs the hidden states | --publ
         "--publish-truth",
         "compare SERVER --policies clairvoyant_beam => 2 worlds for these policies, it has 1
 compare SERVER --policies coverage --burn-in 7 => expected the running server's 20, got 7
+run SERVER --robot 1 => robots: expected some of the world's 0..1, got 1..2
 run SERVER --policy ash => policy: expected one of | got \"ash\"
 run SERVER --policy clairvoyant_beam => only `compare` has them",
     );
