@@ -81,11 +81,27 @@ pub fn prepare(
     worlds: &Range<u32>,
     model: Option<&Model>,
 ) -> Result<(ServerInfo, Model)> {
+    let info = info_of(instance, worlds)?;
+    let model = model_of(instance, &info, model)?;
+    Ok((info, model))
+}
+
+/// What a server says of itself, if it has the worlds.
+pub(super) fn info_of(instance: &Instance, worlds: &Range<u32>) -> Result<ServerInfo> {
     let info = server_info(instance)?;
     if worlds.end > info.n_worlds {
         let (status, detail) = (Status::NoSuchWorld, info.n_worlds.into());
         return Err(refused(status, detail, status.explain(detail)).into());
     }
+    Ok(info)
+}
+
+/// A server's model, or the one given.
+pub(super) fn model_of(
+    instance: &Instance,
+    info: &ServerInfo,
+    model: Option<&Model>,
+) -> Result<Model> {
     let revealed = info.model.as_deref().map(Model::from_toml).transpose()?;
     let model = match (model, revealed) {
         (Some(given), Some(revealed)) if *given != revealed => {
@@ -107,5 +123,5 @@ pub fn prepare(
         got == expected,
         "model: expected the server's {expected} observations, got {got}"
     );
-    Ok((info, model))
+    Ok(model)
 }

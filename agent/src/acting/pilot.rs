@@ -1,7 +1,7 @@
 //! An agent that flies robots of one world through a connection: attach, step, catch up.
 
 use crate::acting::handover::{catch_up, leave, resume, take_over_left};
-use crate::acting::mission::{Company, Mission, prepare};
+use crate::acting::mission::{Company, Mission, info_of, model_of};
 use crate::acting::registry::{self, Task};
 use crate::estimation::Prior;
 use crate::estimation::belief::Belief;
@@ -48,7 +48,9 @@ struct NotFlown;
 impl Pilot {
     /// Acquires the robots where their world stands and takes in its last frame.
     pub fn attach(mission: &Mission) -> Result<Self> {
-        let (info, model) = prepare(&mission.instance, &mission.worlds(), mission.model.as_ref())?;
+        let info = info_of(&mission.instance, &mission.worlds())?;
+        let numbers = mission.numbers(&info)?;
+        let model = model_of(&mission.instance, &info, mission.model.as_ref())?;
         let policy = Policy::named(&mission.policy, &model)?;
         ensure!(
             policy.estimator != EstimatorKind::NextTruth,
@@ -60,7 +62,6 @@ impl Pilot {
             "policy {:?} decides for one robot, not for a team",
             policy.name
         );
-        let numbers = mission.numbers(&info)?;
         let shape = shape_of(&info)?;
         // What takes long is done before the lease begins to run, and not at all where a belief was left.
         let prior = if policy.estimator.knows_model() {
