@@ -305,6 +305,7 @@ fn a_late_path_is_refused_and_not_flown_in_a_later_step() {
 fn who_holds_no_robot_can_neither_fly_nor_read_ahead_nor_block() {
     let server = Server::start(&format!("{FLAGS} --lease-millis 86400000"));
     let flyers = [0..1, 1..4].map(|robots| Flyer::new(&server, robots));
+    let frames = Observer::frames(&server.instance).expect("the channel");
     let stranger = Wire::open(&server.instance);
     let status = |header: StepRequest, body: &[u8]| {
         let (reply, _) = stranger.step(header, body);
@@ -374,6 +375,16 @@ fn who_holds_no_robot_can_neither_fly_nor_read_ahead_nor_block() {
                 .all(|(world, ..)| (world.step, world.hovered) == (k + 1, 0))
         );
     }
+    // What was refused is not published either: each step once, after the present state for a new observer.
+    let mut steps = Vec::new();
+    while steps.last() != Some(&5) {
+        let sample = frames.receive(PATIENCE).expect("the channel");
+        steps.push(sample.expect("a sample").header.result.step);
+    }
+    assert!(
+        steps.is_sorted_by(|before, after| before < after),
+        "{steps:?}"
+    );
 }
 
 /// A world of agents, and of robot 0, which this process flies.

@@ -49,7 +49,7 @@ pub struct ServerConfig {
     pub max_steps: u64,
     /// What a step observes: `path`, `full`, or `client` (a step may ask for a full frame).
     pub coverage: CoverageRule,
-    /// The robots' first cells: `corner` (each in the next), `centre`, `random`, or `{ row = R, col = C }`.
+    /// The robots' first cells: `corner` (each in another), `centre`, `random`, or `{ row = R, col = C }`.
     pub start: Start,
     /// Publish the hidden states, for evaluation and pictures.
     pub publish_truth: bool,

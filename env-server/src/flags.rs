@@ -51,7 +51,7 @@ pub struct ServerFlags {
     /// What a step observes [default: path]
     #[arg(long)]
     pub coverage: Option<CoverageFlag>,
-    /// The robots' first cells: corner (each in the next), centre, random or ROW,COL [default: corner]
+    /// The robots' first cells: corner (each in another), centre, random or ROW,COL [default: corner]
     #[arg(long, value_parser = parse_start)]
     pub start: Option<Start>,
     /// Publish the hidden states, for evaluation and pictures

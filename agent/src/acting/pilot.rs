@@ -11,13 +11,13 @@ use crate::planning::policy::{EstimatorKind, Policy};
 use crate::planning::team::robot_seed;
 use crate::rollout::{self, Robot, Seen};
 use crate::server::client::{Client, Observation, shape_of};
-use crate::server::errors::{is_late, refused};
+use crate::server::errors::is_late;
 use crate::server::feed::Feed;
 use crate::server::info::is_belief_left;
 use crate::server::truth::TruthFeed;
 use anyhow::{Result, ensure};
 use protocol::connection::ConnectionError;
-use protocol::message::{Status, WorldResult};
+use protocol::message::WorldResult;
 use protocol::{Cell, Grid, Model};
 use std::cell::RefCell;
 use std::ops::Range;
@@ -218,7 +218,7 @@ impl Pilot {
         numbers.try_for_each(|number| leave(&mut self.client, number, &self.robot))
     }
 
-    /// Gives the robots back, and ends when those who look on have had time to see the last belief.
+    /// Gives the robots back, and ends when observers have had time to see the last belief.
     pub fn release(self) -> Result<(), ConnectionError> {
         let released = self.client.release();
         self.feed.end();
@@ -270,9 +270,6 @@ fn plan(robot: &mut Robot, is_planned: &[bool]) -> Vec<Plan> {
 }
 
 /// What all robots in `seen` show after the step of an answer.
-///
-/// # Errors
-/// `Late` if the world has moved on since.
 fn with_others(
     client: &mut Client,
     seen: &Range<u32>,
@@ -281,12 +278,7 @@ fn with_others(
     if seen.len() == answer.len() {
         return Ok(answer);
     }
-    let all = client.observe(seen.clone())?;
-    let step = all[0].world.step;
-    if step != answer[0].world.step {
-        return Err(refused(Status::Late, step, Status::Late.explain(step)));
-    }
-    Ok(all)
+    client.recall(seen.clone(), answer[0].world.step)
 }
 
 /// The hidden states that a world's robots see part of, for policies that are told them.
@@ -303,7 +295,7 @@ fn truth_of(
     Ok(states.into_iter().next())
 }
 
-/// Shows an agent's posterior to those who look on, if it is time or in any case.
+/// Shows an agent's posterior to observers, if it is time or in any case.
 fn show(feed: &mut Feed, client: &Client, robot: &Robot, in_any_case: bool) {
     if feed.is_due() || in_any_case {
         let (robots, team) = (client.robots(), client.info().n_robots);

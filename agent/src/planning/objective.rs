@@ -26,7 +26,7 @@ pub enum Target {
 }
 
 impl Target {
-    /// In a word, for those who look on; `states`: names of the belief's states.
+    /// In a word, for observers; `states`: names of the belief's states.
     ///
     /// # Panics
     /// If a state has no name.

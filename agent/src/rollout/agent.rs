@@ -108,7 +108,7 @@ impl Agent {
         self.target.unwrap_or(otherwise)
     }
 
-    /// The paths for step k -> k + 1, from where the robots are (paper eq. 15). What is decided goes by the first.
+    /// The paths for step k -> k + 1, from where the robots are (paper eq. 15). Decisions are made for the first robot.
     pub fn plan(&mut self, robots: &[Cell], step: u64) -> Vec<Plan> {
         let estimator = &*self.estimator;
         let decided = self.decider.as_ref();
@@ -202,7 +202,7 @@ impl Agent {
         }
     }
 
-    /// What it tells those who look on; `planning`: time that its last plan took.
+    /// What it tells observers; `planning`: time that its last plan took.
     pub fn intent(&self, planning: Duration) -> Intent {
         Intent {
             policy: self.policy.name.clone(),

@@ -84,7 +84,7 @@ impl Robot {
         Ok(robot)
     }
 
-    /// What it tells those who look on at its world; `robots`: numbers of those that it flies.
+    /// What it tells observers at its world; `robots`: numbers of those that it flies.
     pub fn view(&self, world: u32, robots: Range<u32>) -> View<'_> {
         View {
             world,

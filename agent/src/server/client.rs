@@ -172,7 +172,7 @@ impl Client {
         Ok(observations.expect("invariant: it is never over"))
     }
 
-    /// As [`Self::step`]; `None` if the world has not moved when `is_over`, which is looked at now and then.
+    /// As [`Self::step`]; `None` if `is_over` before the world has moved, which is checked after each timeout.
     pub fn step_until(
         &mut self,
         robots: Range<u32>,
@@ -324,7 +324,7 @@ impl Client {
         self.connection.control(&request, STEP_TIMEOUT).map(|_| ())
     }
 
-    /// Sends paths for the step at which their worlds were last seen, as often as it takes: a slow teammate is waited
+    /// Sends paths for the step at which their worlds were last seen, again after each timeout: a slow teammate is waited
     /// for, a silent server is not.
     fn step_unless(
         &mut self,

@@ -1,4 +1,4 @@
-//! Shows beliefs to those who look on, as often as a screen shows: the agent's side of the channel `agent`.
+//! Shows beliefs to observers, as often as a screen shows: the agent's side of the channel `agent`.
 
 use crate::estimation::belief::Belief;
 use protocol::agent_belief::{BeliefPublisher, Intent};

@@ -1,4 +1,4 @@
-//! The agent's ends of the wire: a lease on worlds, hidden states for scores, beliefs for those who look on.
+//! The agent's ends of the wire: a lease on robots, hidden states for scores, beliefs for observers.
 
 pub mod client;
 pub mod errors;

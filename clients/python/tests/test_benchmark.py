@@ -253,3 +253,18 @@ def test_what_cannot_be_evaluated_is_named(changes: dict[str, Any], problem: str
 def test_a_csv_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(InvalidArgumentError, match="csv: expected a file, got the folder"):
         score(tmp_path)
+
+
+def test_worlds_of_teams_are_not_taken_for_worlds_of_one_robot(
+    server: Callable[..., Server],
+) -> None:
+    running = server(worlds=1, robots=4, height=7, width=9, moves=6, model=LIVELY, burn_in=60)
+    with pytest.raises(InvalidArgumentError, match="robots: expected 4"):
+        evaluate(
+            walk(0),
+            name="mine",
+            instance=running.instance,
+            burn_in=60,
+            observation="frame",
+            **SCALE,
+        )

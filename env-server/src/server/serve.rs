@@ -133,7 +133,7 @@ impl Server {
             Stepped::Reply(reply) => {
                 self.send_step(now, &request, reply);
                 self.answer_settled(now);
-                if header.operation == Operation::Step as u32 {
+                if header.operation == Operation::Step as u32 && reply.n_robots > 0 {
                     let first = reply.first_robot as usize;
                     let robots = first..first + reply.n_robots as usize;
                     self.publish(self.simulator.worlds_of(&robots));
@@ -172,7 +172,7 @@ impl Server {
     }
 
     fn answer_control(&mut self, now: Instant, request: ActiveControl) {
-        // The worlds of a holder that died a moment ago must be free.
+        // The robots of a holder that died a moment ago must be free.
         self.forget_ended_clients(now);
         let client = self.clients.identify(request.header().node_id().value());
         let stats = ServerStats {
@@ -242,5 +242,7 @@ impl Server {
         if n_leases > 0 {
             tracing::info!(n_leases, "a connection was closed without a release");
         }
+        // Before anything else changes the worlds.
+        self.answer_settled(now);
     }
 }

@@ -3,7 +3,7 @@
 
 use super::barrier::{Barrier, Ticket, Waiter};
 use super::lease::Refusal;
-use super::state::{Place, Simulator, Slot};
+use super::state::{Place, Simulator, Slot, within};
 use super::step::numbers;
 use crate::world::{Episode, Flown, Rules};
 use protocol::UNOBSERVED;
@@ -80,7 +80,7 @@ impl Simulator {
         self.forget_idle_worlds();
     }
 
-    /// Refuses all requests that wait for a world which begins anew or is replaced.
+    /// Refuses all requests that wait for a world which is reset or replaced.
     pub(super) fn refuse_waiting(&mut self, now: Instant, world: usize) {
         for waiter in self.places[world].barrier.withdraw(|_| true) {
             let refusal = Refusal::new(Status::Resetting, world as u64);
@@ -181,10 +181,9 @@ impl Simulator {
         let episodes = || worlds.clone().filter_map(|world| self.episode(world));
         let own = || {
             let (worlds, robots) = (worlds.clone(), robots.clone());
-            let team = self.spec.rules.n_robots;
             let all = worlds.filter_map(|world| Some((world, self.episode(world)?)));
             all.flat_map(move |(world, episode)| {
-                &episode.robots()[within(&robots, world * team, team)]
+                &episode.robots()[within(&robots, self.robots_of(world))]
             })
         };
         for episode in episodes() {
@@ -216,11 +215,10 @@ impl Simulator {
         payload: &mut Vec<u8>,
     ) -> StepReply {
         let (reply, robots) = self.answer(request);
-        let team = self.spec.rules.n_robots;
         let worlds = self.worlds_of(&robots).zip(numbers(steps));
         let past = worlds.filter_map(|(world, step)| {
             let past = self.episode(world)?.recall(step).ok()?;
-            Some((past, within(&robots, world * team, team)))
+            Some((past, within(&robots, self.robots_of(world))))
         });
         let past: Vec<_> = past.collect();
         for (past, _) in &past {
@@ -258,11 +256,6 @@ fn step(rules: &Rules, episode: &mut Episode, barrier: &Barrier, held: u64) {
         late: held & !ready,
     };
     episode.step(rules, &flown);
-}
-
-/// Which robots of a world, whose first one is `first`, are among `robots`.
-fn within(robots: &Range<usize>, first: usize, team: usize) -> Range<usize> {
-    robots.start.max(first) - first..robots.end.min(first + team) - first
 }
 
 /// Appends a frame in which nothing was observed.

@@ -346,6 +346,18 @@ fn a_request_that_is_given_up_takes_its_path_back_and_may_be_sent_again() {
 }
 
 #[test]
+fn a_robot_has_one_path_at_a_time() {
+    let (mut lab, leases) = Lab::of_three(Duration::ZERO);
+    let waiting = lab.waits(1, leases[0], (0, 1), 0);
+    let refused = lab.replies(1, leases[0], (0, 1), 0);
+    assert_eq!(refused, (Status::Busy, 1));
+    lab.waits(2, leases[1], (1, 1), 0);
+    assert_eq!(lab.replies(3, leases[2], (2, 1), 0).0, Status::Ok);
+    assert_eq!(lab.answers()[0], (waiting, Status::Ok, 1));
+    lab.assert_is_as_after(&[(0b111, 0, 0)]);
+}
+
+#[test]
 fn a_takeover_withdraws_the_path_and_the_world_waits_for_the_taker() {
     let (mut lab, leases) = Lab::of_three(Duration::ZERO);
     let first = lab.waits(1, leases[0], (0, 1), 0);

@@ -254,13 +254,13 @@ impl Leases {
     /// Which of at most 64 robots are held, bit by bit.
     pub fn held(&self, robots: Range<usize>) -> u64 {
         let holders = self.holders[robots].iter();
-        mask(holders.map(Option::is_some))
+        bits(holders.map(Option::is_some))
     }
 
     /// Which of at most 64 robots a lease holds, bit by bit.
     pub fn held_under(&self, token: u64, robots: Range<usize>) -> u64 {
         let holders = self.holders[robots].iter();
-        mask(holders.map(|holder| *holder == Some(token)))
+        bits(holders.map(|holder| *holder == Some(token)))
     }
 
     fn check_robots(&self, robots: &Range<usize>) -> Result<(), Refusal> {
@@ -334,7 +334,7 @@ impl Leases {
     }
 }
 
-fn mask(bits: impl Iterator<Item = bool>) -> u64 {
+fn bits(bits: impl Iterator<Item = bool>) -> u64 {
     bits.enumerate()
         .fold(0, |mask, (index, bit)| mask | u64::from(bit) << index)
 }

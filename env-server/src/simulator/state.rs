@@ -163,13 +163,13 @@ impl Simulator {
 
     /// Worlds by their numbers.
     pub(super) fn range(&self, first: u32, n_worlds: u32) -> Result<Range<usize>, Refusal> {
-        within(first, n_worlds, self.places.len(), Status::NoSuchWorld)
+        checked(first, n_worlds, self.places.len(), Status::NoSuchWorld)
     }
 
     /// Robots by their numbers.
     pub(super) fn robot_range(&self, first: u32, n_robots: u32) -> Result<Range<usize>, Refusal> {
         let n_all = self.places.len() * self.spec.rules.n_robots;
-        within(first, n_robots, n_all, Status::NoSuchRobot)
+        checked(first, n_robots, n_all, Status::NoSuchRobot)
     }
 
     /// The worlds of some robots.
@@ -206,12 +206,18 @@ impl Simulator {
     }
 }
 
-fn within(first: u32, n: u32, n_all: usize, otherwise: Status) -> Result<Range<usize>, Refusal> {
+fn checked(first: u32, n: u32, n_all: usize, otherwise: Status) -> Result<Range<usize>, Refusal> {
     let (first, end) = (first as usize, first as usize + n as usize);
     if first < end && end <= n_all {
         return Ok(first..end);
     }
     Err(Refusal::new(otherwise, n_all as u64))
+}
+
+/// Which of a world's robots, by their place in it, are among some robots.
+pub(super) fn within(robots: &Range<usize>, of_world: Range<usize>) -> Range<usize> {
+    let (first, end) = (of_world.start, of_world.end);
+    robots.start.max(first) - first..robots.end.min(end) - first
 }
 
 /// `[row, col]` of each robot.

@@ -4,7 +4,7 @@
 
 use super::barrier::{Ticket, Waiter, mask};
 use super::lease::{ClientId, Refusal};
-use super::state::Simulator;
+use super::state::{Simulator, within};
 use protocol::Coverage;
 use protocol::message::{
     FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, Status, StepReply, StepRequest, VERSION,
@@ -22,7 +22,7 @@ pub enum Stepped {
     Waits(Ticket),
 }
 
-/// Why a request is answered now.
+/// What a request that is granted leads to.
 enum Granted<'a> {
     /// With the worlds as they are.
     Present,
@@ -90,6 +90,7 @@ impl Simulator {
                 self.leases.use_lease(now, request.lease, client, &robots)?;
                 self.check_whole(client, &robots)?;
                 self.check_ready(&robots, body)?;
+                self.check_new(client, &robots)?;
                 let waiting = self.fly(now, client, request, body, coverage);
                 Ok(waiting.map_or(Granted::Present, Granted::Waits))
             }
@@ -111,11 +112,10 @@ impl Simulator {
         let mut paths = &body[worlds.len() * size_of::<u64>()..];
         let is_full = coverage == Coverage::Full;
         for world in worlds.clone() {
-            let from = first.max(world * team);
-            let to = (first + n_robots).min((world + 1) * team);
-            let (own, rest) = paths.split_at((to - from) * n_moves);
+            let robots = within(&(first..first + n_robots), self.robots_of(world));
+            let (own, rest) = paths.split_at(robots.len() * n_moves);
             let barrier = &mut self.places[world].barrier;
-            barrier.put(from - world * team, n_moves, own, is_full);
+            barrier.put(robots.start, n_moves, own, is_full);
             paths = rest;
         }
         // Of several worlds nobody else holds a robot, so that none of them waits.
@@ -187,6 +187,17 @@ impl Simulator {
             });
             if let Some(robot) = missing {
                 return Err(Refusal::new(Status::Incomplete, robot as u64));
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks that no path of these robots waits already; a client with two ports could send another.
+    fn check_new(&self, client: ClientId, robots: &Range<usize>) -> Result<(), Refusal> {
+        for world in self.worlds_of(robots) {
+            let own = within(robots, self.robots_of(world));
+            if self.places[world].barrier.ready & mask(own.start, own.len()) != 0 {
+                return Err(Refusal::new(Status::Busy, client.pid.into()));
             }
         }
         Ok(())

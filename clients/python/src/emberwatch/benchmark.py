@@ -191,6 +191,11 @@ def _play(
     worlds = _make(env, keywords, len(seeds))
     try:
         n_robots = worlds.num_envs // len(seeds)
+        if worlds.unwrapped.world_spec.n_robots != n_robots:
+            raise InvalidArgumentError(
+                f"robots: expected {worlds.unwrapped.world_spec.n_robots}, as the server's worlds "
+                f"have, got {n_robots}"
+            )
         tally = _Tally(worlds.unwrapped.n_moves, len(seeds), n_robots)
         seen, _ = worlds.reset(seed=np.repeat(seeds, n_robots).tolist())
         n_actions = tally.n_moves if env == _MOVES else 1

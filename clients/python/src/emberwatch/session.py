@@ -136,9 +136,11 @@ class Session:
             raise timed_out_before()
         robots = lease.robots if rows is None else lease.robots[rows.start : rows.stop]
         self.n_skipped = 0
+        # Sooner would take back the path with which the deadline began.
+        timeout = self.settings.timeout + lease.client.info.deadline_millis / 1000
         while True:
             try:
-                return lease.step_moves(moves, robots, timeout=self.settings.timeout)
+                return lease.step_moves(moves, robots, timeout=timeout)
             except (LeaseLostError, ServerGoneError) as error:
                 raise self._lost(error) from None
             except EmberwatchError as error:
