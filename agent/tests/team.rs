@@ -56,7 +56,7 @@ impl Field {
         )
     }
 
-    /// What the team gains: each cell once, whoever visits it, unless each visit counts.
+    /// What the team gains: each cell once, however many robots visit it, unless each visit counts.
     fn worth(&self, plans: &[Plan]) -> f64 {
         let paths: Vec<&[Move]> = plans.iter().map(|plan| &*plan.moves).collect();
         self.worth_of(&paths)

@@ -1,13 +1,9 @@
 //! The agent's end of the wire: acquire robots, fly paths, receive frames.
 
 use crate::server::errors::refused;
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD as BASE64;
 use protocol::channels::Instance;
 use protocol::connection::{ConnectionError, StepAnswer, unexpected, worlds_of};
-use protocol::control::{
-    LeftPart, MAX_BELIEF_PART, Reply, Request, ServerInfo, WorldInfo, WorldSeed,
-};
+use protocol::control::{Reply, Request, ServerInfo, WorldInfo, WorldSeed};
 use protocol::message::{
     FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, RobotResult, Status, StepRequest, WorldResult,
 };
@@ -39,8 +35,8 @@ pub struct Observation {
 
 /// A connection with a lease on consecutive robots, numbered through: robot r of world w is `w * R + r`.
 pub struct Client {
-    connection: Connection,
-    lease: u64,
+    pub(super) connection: Connection,
+    pub(super) lease: u64,
     robots: Range<u32>,
     /// The step of each world of these robots, as last seen.
     steps: Vec<u64>,
@@ -234,58 +230,6 @@ impl Client {
         self.observations(&answer)
     }
 
-    /// Leaves a belief about a robot's world, as it stands after a result, for the robot's next agent.
-    pub fn leave_belief(
-        &mut self,
-        robot: u32,
-        at: &WorldResult,
-        kind: &str,
-        bytes: &[u8],
-    ) -> Result<(), ConnectionError> {
-        for (index, part) in bytes.chunks(MAX_BELIEF_PART).enumerate() {
-            let request = Request::LeaveBelief(LeftPart {
-                lease: self.lease,
-                robot,
-                episode: at.episode,
-                step: at.step,
-                kind: kind.into(),
-                offset: (index * MAX_BELIEF_PART) as u64,
-                length: bytes.len() as u64,
-                data: BASE64.encode(part),
-            });
-            self.connection.control(&request, STEP_TIMEOUT)?;
-        }
-        Ok(())
-    }
-
-    /// The belief that was left for a robot's agent about its world as it stands, if it is of a kind.
-    pub fn belief(&mut self, robot: u32, kind: &str) -> Result<Option<Vec<u8>>, ConnectionError> {
-        let (mut first, mut bytes) = (None, Vec::new());
-        loop {
-            let offset = bytes.len() as u64;
-            let request = Request::Belief { robot, offset };
-            match self.connection.control(&request, STEP_TIMEOUT) {
-                Ok(Reply::Belief { info, data, .. }) if info.kind == kind => {
-                    let part = BASE64
-                        .decode(data)
-                        .map_err(|error| garbled("belief", &error))?;
-                    bytes.extend_from_slice(&part);
-                    let (is_last, is_whole) = (part.is_empty(), bytes.len() as u64 == info.length);
-                    if *first.get_or_insert_with(|| info.clone()) != info {
-                        return Ok(None); // Another one was left meanwhile.
-                    }
-                    if is_last || is_whole {
-                        return Ok(is_whole.then_some(bytes));
-                    }
-                }
-                // Of another kind, none, or a server that knows no beliefs.
-                Ok(Reply::Belief { .. }) | Err(ConnectionError::Refused { .. }) => return Ok(None),
-                Ok(other) => return Err(unexpected("belief", &other)),
-                Err(error) => return Err(error),
-            }
-        }
-    }
-
     /// Starts new episodes with the given seeds; returns when burn-in is done.
     pub fn reset(&mut self, seeds: &[WorldSeed]) -> Result<Vec<WorldInfo>, ConnectionError> {
         let request = Request::Reset {
@@ -444,7 +388,7 @@ impl Client {
     }
 }
 
-fn garbled(what: &'static str, problem: &dyn Display) -> ConnectionError {
+pub(super) fn garbled(what: &'static str, problem: &dyn Display) -> ConnectionError {
     ConnectionError::Garbled {
         what,
         problem: problem.to_string(),

@@ -5,4 +5,5 @@ pub mod errors;
 pub mod feed;
 pub mod info;
 pub mod launch;
+mod left_belief;
 pub mod truth;

@@ -22,6 +22,7 @@ from environments import (
     serving,
 )
 from pettingzoo.utils.conversions import parallel_to_aec
+from processes import at_once
 
 import emberwatch
 from emberwatch.errors import EmberwatchError, InvalidArgumentError
@@ -199,21 +200,6 @@ def alone() -> Iterator[Callable[..., Any]]:
         yield start
 
 
-def together(calls: list[Callable[[], Any]]) -> list[Any]:
-    """What calls return that wait for each other, each on a thread of its own."""
-    results: list[Any] = [None] * len(calls)
-
-    def run(index: int) -> None:
-        results[index] = calls[index]()
-
-    threads = [threading.Thread(target=run, args=(index,)) for index in range(len(calls))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return results
-
-
 @pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 1, 0, 2)])
 @pytest.mark.parametrize("reward", ["share", "team", "marginal"])
 def test_four_environments_of_one_robot_are_the_team(
@@ -233,7 +219,7 @@ def test_four_environments_of_one_robot_are_the_team(
             assert info.pop("n_missed") == 0
         for path, outcome in zip(paths, expected[1:], strict=True):
             calls = [partial(robots[robot].step, path[AGENTS[robot]]) for robot in order]
-            for robot, flown in zip(order, together(calls), strict=True):
+            for robot, flown in zip(order, at_once(*calls), strict=True):
                 assert flown[4].pop("n_missed") == 0
                 assert_same(list(flown), [part[AGENTS[robot]] for part in outcome])
 
@@ -300,7 +286,7 @@ def test_a_late_path_is_not_flown_and_told(alone: Callable[..., Any]) -> None:
         assert (reward, info["step"], info["n_missed"], info["n_visited"]) == (0.0, 3, 3, 0)
         assert (seen["robot"] == first["robot"]).all() and (seen["frame"] == 255).all()
         # From there on it flies again.
-        flown, _ = together([lambda: slow.step([0, 0, 0, 0]), lambda: quick.step([1, 1, 1, 1])])
+        flown, _ = at_once(lambda: slow.step([0, 0, 0, 0]), lambda: quick.step([1, 1, 1, 1]))
         assert flown[4]["n_missed"] == 0 and flown[4]["step"] == 4 and flown[4]["n_visited"] > 0
 
 
@@ -309,7 +295,7 @@ def test_a_belief_goes_through_the_steps_that_were_missed(alone: Callable[..., A
         quick, slow = alone(instance, 0), alone(instance, 1, observation=("belief", "age"))
         quick.reset()
         slow.reset()
-        together([lambda: slow.step([2, 2, 2, 2]), lambda: quick.step([1, 1, 1, 1])])
+        at_once(lambda: slow.step([2, 2, 2, 2]), lambda: quick.step([1, 1, 1, 1]))
         for _ in range(2):
             quick.step([1, 1, 1, 1])
         seen, *_, info = slow.step([3, 3, 3, 3])
@@ -331,7 +317,7 @@ def test_slow_teammates_are_waited_for_beyond_the_timeout(
             return slow.step([1, 1, 1, 1])
 
         with impatient(patient, 0.1):
-            first, second = together([lambda: patient.step([3, 3, 3, 3]), late])
+            first, second = at_once(lambda: patient.step([3, 3, 3, 3]), late)
         assert first[4]["step"] == second[4]["step"] == 1
         assert first[4]["n_missed"] == second[4]["n_missed"] == 0
         assert first[4]["n_visited"] > 0 and second[4]["n_visited"] > 0

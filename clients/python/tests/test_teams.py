@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from environments import SMALL, WILDFIRE
 from failures import fails
-from processes import PATIENCE, Server, eventually
+from processes import PATIENCE, Server, at_once, eventually
 
 import emberwatch.benchmark
 from emberwatch import errors
@@ -21,21 +21,6 @@ Start = Callable[..., Server]
 
 def paths(n_robots: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 4, (n_robots, 6))
-
-
-def at_once(*calls: Callable[[], Any]) -> list[Any]:
-    """What calls return that wait for each other."""
-    results: list[Any] = [None] * len(calls)
-
-    def run(index: int) -> None:
-        results[index] = calls[index]()
-
-    threads = [threading.Thread(target=run, args=(index,)) for index in range(len(calls))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return results
 
 
 def test_robots_are_numbered_through_all_worlds(server: Start) -> None:

@@ -5,6 +5,7 @@ use super::lease::ClientId;
 use super::outcome::{Outcome, ServerStats};
 use super::state::Simulator;
 use super::step::Stepped;
+use super::tests::{finish, new_simulator};
 use crate::config::ServerConfig;
 use crate::world::{Episode, Flown};
 use protocol::Move;
@@ -13,7 +14,6 @@ use protocol::message::{
     FLAG_TEAM_FRAMES, Operation, Status, StepReply, StepRequest, VERSION, WorldResult,
 };
 use protocol::payload::{split_step_payload, write_step_body};
-use rayon::ThreadPoolBuilder;
 use std::collections::HashSet;
 use std::time::{Duration, Instant};
 
@@ -51,19 +51,8 @@ impl Lab {
             lease_millis: LEASE.as_millis() as u64,
             ..ServerConfig::default()
         };
-        let threads = ThreadPoolBuilder::new().num_threads(1).build();
-        let mut token = 0;
-        let next_token = Box::new(move || {
-            token += 1;
-            token
-        });
-        let checked = config.check().expect("valid settings");
-        let simulator = Simulator::new(checked, threads.expect("a thread"), next_token);
-        let (mut simulator, jobs) = simulator.expect("a valid model");
-        for job in jobs {
-            let (world, episode) = job.run(&simulator.spec().rules);
-            simulator.put(world, episode);
-        }
+        let (mut simulator, jobs) = new_simulator(config);
+        finish(&mut simulator, jobs);
         let now = Instant::now();
         Self { simulator, now }
     }
@@ -77,10 +66,7 @@ impl Lab {
         match outcome {
             Outcome::Answer(reply) | Outcome::Changed(_, reply) => reply,
             Outcome::Pending(jobs, pending) => {
-                for job in jobs {
-                    let (world, episode) = job.run(&self.simulator.spec().rules);
-                    self.simulator.put(world, episode);
-                }
+                finish(&mut self.simulator, jobs);
                 let reply = self.simulator.pending_reply(self.now, &pending);
                 reply.expect("ready")
             }

@@ -18,7 +18,7 @@ const LEASE: Duration = Duration::from_secs(20);
 
 /// Two worlds in their first burn-in, and what ends it.
 fn start() -> (Simulator, Vec<ResetJob>) {
-    let config = ServerConfig {
+    new_simulator(ServerConfig {
         worlds: 2,
         height: 3,
         width: 5,
@@ -26,7 +26,11 @@ fn start() -> (Simulator, Vec<ResetJob>) {
         burn_in: 20,
         lease_millis: LEASE.as_millis() as u64,
         ..ServerConfig::default()
-    };
+    })
+}
+
+/// A simulator whose worlds are in their first burn-in, and what ends it; its first lease is 1.
+pub fn new_simulator(config: ServerConfig) -> (Simulator, Vec<ResetJob>) {
     let threads = ThreadPoolBuilder::new().num_threads(1).build();
     let mut token = 0;
     let next_token = Box::new(move || {
@@ -37,7 +41,8 @@ fn start() -> (Simulator, Vec<ResetJob>) {
     Simulator::new(checked, threads.expect("a thread"), next_token).expect("a valid model")
 }
 
-fn finish(simulator: &mut Simulator, jobs: Vec<ResetJob>) {
+/// Ends burn-ins.
+pub fn finish(simulator: &mut Simulator, jobs: Vec<ResetJob>) {
     for job in jobs {
         let (world, episode) = job.run(&simulator.spec().rules);
         simulator.put(world, episode);
