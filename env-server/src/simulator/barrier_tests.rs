@@ -5,7 +5,7 @@ use super::lease::ClientId;
 use super::outcome::{Outcome, ServerStats};
 use super::state::Simulator;
 use super::step::Stepped;
-use super::tests::{finish, new_simulator};
+use super::test_worlds::{finish, new_simulator};
 use crate::config::ServerConfig;
 use crate::world::{Episode, Flown};
 use protocol::Move;

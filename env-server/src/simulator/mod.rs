@@ -13,6 +13,8 @@ mod outcome;
 mod state;
 mod step;
 #[cfg(test)]
+mod test_worlds;
+#[cfg(test)]
 mod tests;
 mod worlds;
 

@@ -4,11 +4,11 @@ use super::lease::ClientId;
 use super::outcome::{Outcome, PendingReply, ServerStats};
 use super::state::{ResetJob, Simulator};
 use super::step::Stepped;
+use super::test_worlds::{finish, new_simulator};
 use crate::config::ServerConfig;
 use protocol::control::{Reply, Request, WorldSeed};
 use protocol::message::{Operation, Status, StepRequest, VERSION};
 use protocol::payload::write_step_body;
-use rayon::ThreadPoolBuilder;
 use std::time::{Duration, Instant};
 
 const US: ClientId = ClientId { node: 1, pid: 7 };
@@ -27,26 +27,6 @@ fn start() -> (Simulator, Vec<ResetJob>) {
         lease_millis: LEASE.as_millis() as u64,
         ..ServerConfig::default()
     })
-}
-
-/// A simulator whose worlds are in their first burn-in, and what ends it; its first lease is 1.
-pub fn new_simulator(config: ServerConfig) -> (Simulator, Vec<ResetJob>) {
-    let threads = ThreadPoolBuilder::new().num_threads(1).build();
-    let mut token = 0;
-    let next_token = Box::new(move || {
-        token += 1;
-        token
-    });
-    let checked = config.check().expect("valid settings");
-    Simulator::new(checked, threads.expect("a thread"), next_token).expect("a valid model")
-}
-
-/// Ends burn-ins.
-pub fn finish(simulator: &mut Simulator, jobs: Vec<ResetJob>) {
-    for job in jobs {
-        let (world, episode) = job.run(&simulator.spec().rules);
-        simulator.put(world, episode);
-    }
 }
 
 fn ask(simulator: &mut Simulator, now: Instant, request: &Request) -> Outcome {
