@@ -3,6 +3,8 @@
 import json
 from collections.abc import Callable
 
+import pytest
+
 
 def told_again(message: bytes, change: Callable[[dict], None]) -> bytes:
     """A picture whose words are changed."""
@@ -32,6 +34,24 @@ def test_damaged_pictures_are_told_and_do_not_flood_the_console(watched):
     look.eventually(lambda: look.text("state") == "serving", "pictures again")
     assert not look.at("note").is_visible()
     assert look.heard("expected 4 bytes") == 1
+
+
+@pytest.mark.parametrize("width", [1056, 1280, 1600])
+def test_losses_move_nothing(watched, width):
+    look = watched.look
+    look.page.set_viewport_size({"width": width, "height": 720})
+    watched.agent.interrupt()
+    lost: dict[str, int] = {}
+    look.alter(lambda message: told_again(message, lambda words: words.update(lost=lost)))
+
+    def place_with(frames: int, others: int) -> dict[str, float]:
+        lost.update(frames=frames, truth=others, agent=others)
+        shown = f"{frames:,}"
+        look.eventually(lambda: look.text("lost") == shown, "the frames lost")
+        look.wait_for_pictures()
+        return look.at("chart-reward").bounding_box()
+
+    assert place_with(0, 0) == place_with(1_234_567, 72_141)
 
 
 def test_what_is_lost_or_not_known_is_told(watched):
