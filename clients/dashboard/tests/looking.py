@@ -19,6 +19,26 @@ _BYTES = """bytes => {
   return btoa(text);
 }"""
 
+#: The browser tells the harness all that a page gets, and doesn't wait for it. On a busy machine it
+#: would fall behind for minutes, so pages ask for 2 MB a second at most.
+_PACE = """(() => {
+  const BYTES_A_MILLI = 2000;
+  window.WebSocket = class extends WebSocket {
+    #free = 0;
+    constructor(...given) {
+      super(...given);
+      this.addEventListener("message", ({ data }) => {
+        const length = data.byteLength ?? data.size ?? data.length;
+        this.#free = Math.max(this.#free, performance.now()) + length / BYTES_A_MILLI;
+      });
+    }
+    send(data) {
+      const later = () => this.readyState === WebSocket.OPEN && super.send(data);
+      setTimeout(later, Math.max(0, this.#free - performance.now()));
+    }
+  };
+})()"""
+
 
 class Look:
     """A page, looked at. `allowed` are patterns of complaints that the test provokes."""
@@ -29,6 +49,7 @@ class Look:
         # Reading pixels back, as only tests do, is slow and said to be.
         self.allowed = ["willReadFrequently"]
         self._complaints: list[str] = []
+        page.add_init_script(_PACE)
         page.on("console", self._hear)
         page.on("pageerror", lambda error: self._complaints.append(f"error: {error}"))
 
