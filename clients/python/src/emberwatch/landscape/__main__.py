@@ -24,9 +24,11 @@ examples:
   python -m emberwatch.landscape time_of_arrival.tif --kind arrival --unit s --step "10 min" \\
       --burning 6 --cell 120 --out world.npz
   # Masks of all that has burnt so far, one file a time:
-  python -m emberwatch.landscape folder --kind mask --step "1 h" --burning 3 --height 64 --out world.npz
+  python -m emberwatch.landscape folder --kind mask --step "1 h" --burning 3 --height 64 \\
+      --out world.npz
   # A NetCDF variable with a time dimension, of codes 0, 1, 2:
-  python -m emberwatch.landscape fire.nc --variable state --kind states --step "30 min" --out world.npz
+  python -m emberwatch.landscape fire.nc --variable state --kind states --step "30 min" \\
+      --out world.npz
 """
 #: Flags that mean something for some kinds only.
 _ONLY_FOR: Final = {
@@ -76,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--codes", type=_codes, metavar="U,B,D", help="unburnt, burning, burnt [0,1,2]")
     add("--variable", metavar="NAME", help="of a NetCDF or .npz file that has several")
     add("--band", type=_whole, metavar="N", help="the one band to take of each file [all]")
-    add("--nodata", type=float, nargs="+", default=(), metavar="X", help="numbers for no value")
+    add("--nodata", type=float, action="append", metavar="X", help="a number for no value")
     add("--missing-is-unburnt", action="store_true", help="take cells without a value as unburnt")
     add("--crop", type=_crop, metavar="TOP,LEFT,HEIGHT,WIDTH", help="cells of the input to use")
     add("--height", type=_whole, metavar="N", help="rows of the world [the input's]")
@@ -100,7 +102,7 @@ def _import(flags: argparse.Namespace) -> None:
     meaning = _meaning(flags)
     files = outputs(flags.out, force=flags.force)
     _check_picture(flags)
-    choice = Choice(variable=flags.variable, band=flags.band, nodata=tuple(flags.nodata))
+    choice = Choice(variable=flags.variable, band=flags.band, nodata=tuple(flags.nodata or ()))
     sequences = list[NDArray[np.uint8]]()
     for stack in stacks(flags.inputs, one_file_each=meaning.kind == "arrival"):
         fire = times(read(stack, choice), meaning)

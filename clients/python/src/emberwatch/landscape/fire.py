@@ -129,8 +129,9 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
     if not finite.size:
         raise InvalidArgumentError(f"{layer.name}: expected cells that burn, got none")
     step = meaning.step / _SECONDS[_unit_of(layer, meaning)]
-    # Rounded, so that a time of three steps is not two and a bit.
-    steps = np.floor((arrival - finite.min()) / step + 1e-6)
+    # A step shows the fire at its time: what begins later burns in the next one. Rounded, so that
+    # three steps are not a bit more than three.
+    steps = np.ceil((arrival - finite.min()) / step - 1e-6)
     n_steps = int(steps[np.isfinite(steps)].max()) + 1
     return _checked(steps, steps + meaning.burning, n_steps, layer)
 

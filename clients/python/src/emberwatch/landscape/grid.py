@@ -64,6 +64,7 @@ def check_same(place: Place, name: str, first: Place, first_name: str) -> None:
 
 
 def check_square(place: Place, name: str) -> None:
+    """Refuses a layer whose cells are not square on the ground."""
     width, height = place.sides()
     if not (1 - _SQUARE) * height <= width <= (1 + _SQUARE) * height:
         unit = " degrees of latitude" if place.is_in_degrees else ""
@@ -138,8 +139,8 @@ def resampled(
     `"nearest"` takes the input cell in the middle of each, `"earliest"` the least of all input
     cells that it overlaps (`latest`: the greatest).
     """
-    for axis in (0, 1):
-        old, new = times.shape[axis], shape[axis]
+    for axis, new in enumerate(shape):
+        old = len(times) if axis == 0 else times[0].size
         if old == new:
             continue
         if rule == "nearest":

@@ -128,7 +128,7 @@ def _read_numpy(file: Path, choice: Choice) -> Iterator[Layer]:
 def _array(file: Path, choice: Choice) -> NDArray[Any]:
     try:
         loaded: Any = np.load(file, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
+        if hasattr(loaded, "dtype"):
             if choice.variable is not None:
                 raise InvalidArgumentError(
                     f"--variable: expected none for {file}, which has one array, "

@@ -40,8 +40,9 @@ def _draw_one(states: NDArray[np.uint8], title: str) -> Image.Image:
     image = Image.new("RGB", whole, _PAPER)
     pen = ImageDraw.Draw(image)
     pen.text((_GAP, 4), f"{title}: {n_steps} steps, {height} x {width} cells", _INK, _TEXT)
-    shown = np.linspace(0, n_steps - 1, _COLUMNS * _ROWS).round().astype(int).tolist()
-    for number, k in enumerate(shown):
+    n_panels = _COLUMNS * _ROWS
+    for number in range(n_panels):
+        k = round(number * (n_steps - 1) / (n_panels - 1))
         row, column = divmod(number, _COLUMNS)
         left, top = _GAP + column * panel[0], 2 * _LINE + row * panel[1]
         pixels = Image.fromarray(np.array(COLORS, np.uint8)[states[k]])
