@@ -1,5 +1,6 @@
 """Rasters of fires become recorded worlds: the same fire from each format, kind and grid."""
 
+import re
 import subprocess
 import sys
 import tomllib
@@ -222,6 +223,20 @@ def test_it_says_what_came_out(
     one(out, geotiff(tmp_path / "fire.tif"), *ARRIVALS, "--unit", "min")
     words = "6 steps of 3 x 4 cells: at most 4 burn, at step 2; 75.0 % have burnt at the end"
     assert words in capsys.readouterr().out
+
+
+def test_the_page_has_the_flags_of_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    page = (ROOT / "docs" / "landscapes.md").read_text("utf-8")
+    options = page[page.index("## Options") : page.index("## Time and grid")]
+    in_help = set(re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, re.MULTILINE))
+    in_page = {
+        flag
+        for row in re.findall(r"(?m)^\| `.*?\|", options)
+        for flag in re.findall(r"--[a-z-]+", row)
+    }
+    assert in_help == in_page and len(in_help) > 15
 
 
 def test_the_package_needs_no_rasterio() -> None:

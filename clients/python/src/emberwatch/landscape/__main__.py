@@ -121,7 +121,7 @@ def _import(flags: argparse.Namespace) -> None:
     write(files[0], sequences, description(name, flags.step))
     for states_of_fire in sequences:
         print(_told(states_of_fire))
-    print(f"{files[0]}: {len(sequences)} sequences, {files[0].stat().st_size} bytes; {files[1]}")
+    print(f"{files[0]}: {files[0].stat().st_size} bytes, sequences: {len(sequences)}; {files[1]}")
     if flags.picture is not None:
         from emberwatch.landscape.picture import draw
 
