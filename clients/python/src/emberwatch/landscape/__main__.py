@@ -1,0 +1,200 @@
+"""`python -m emberwatch.landscape`: rasters of fires in, a recorded world out."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.landscape.fire import BURNING, BURNT, Meaning, seconds, states, times
+from emberwatch.landscape.grid import crop, target_shape
+from emberwatch.landscape.layers import Choice, read, stacks
+from emberwatch.landscape.world import description, outputs, write
+
+_NAME: Final = "python -m emberwatch.landscape"
+_EXAMPLES: Final = """
+examples:
+  # Arrival times in seconds (as of ELMFIRE); a cell burns for 6 steps of 10 minutes:
+  python -m emberwatch.landscape time_of_arrival.tif --kind arrival --unit s --step "10 min" \\
+      --burning 6 --cell 120 --out world.npz
+  # Masks of all that has burnt so far, one file a time:
+  python -m emberwatch.landscape folder --kind mask --step "1 h" --burning 3 --height 64 \\
+      --out world.npz
+  # A NetCDF variable with a time dimension, of codes 0, 1, 2:
+  python -m emberwatch.landscape fire.nc --variable state --kind states --step "30 min" \\
+      --out world.npz
+"""
+#: Flags that mean something for some kinds only.
+_ONLY_FOR: Final = {
+    "unit": ("arrival",),
+    "burning": ("arrival", "mask"),
+    "codes": ("states",),
+    "every": ("mask", "burning", "states"),
+    "missing_is_unburnt": ("mask", "burning", "states"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Imports what the flags name; else exits with code 2 and what is wrong."""
+    parser = _parser()
+    flags = parser.parse_args(arguments)
+    try:
+        _import(flags)
+    except (EmberwatchError, OSError) as error:
+        parser.exit(2, f"{_NAME}: {error}\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=_NAME,
+        description="Make a recorded world for `emberwatch-server --states` of rasters: GeoTIFF "
+        "(.tif), ESRI ASCII grid (.asc), NetCDF (.nc) or NumPy (.npy, .npz). docs/landscapes.md "
+        "has all rules.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("inputs", type=Path, nargs="+", metavar="IN", help="files, or a folder for each sequence")
+    add("--out", type=Path, required=True, metavar="FILE.npz", help="and FILE.toml beside it")
+    add(
+        "--kind",
+        required=True,
+        choices=("arrival", "mask", "burning", "states"),
+        help="arrival: one file a fire, of the times at which cells begin to burn; mask: layers of "
+        "what has burnt so far; burning: layers of what burns now; states: layers of codes",
+    )
+    add("--step", required=True, metavar="TIME", help="what one step lasts, such as '10 min'")
+    add(
+        "--unit", choices=("s", "min", "h", "d"), help="what arrival times count [as the file says]"
+    )
+    add("--burning", type=_whole, metavar="N", help="steps that a cell burns (arrival, mask)")
+    add("--every", type=_whole, metavar="N", help="make a step of each so many layers [1]")
+    add("--codes", type=_codes, metavar="U,B,D", help="unburnt, burning, burnt [0,1,2]")
+    add("--variable", metavar="NAME", help="of a NetCDF or .npz file that has several")
+    add("--band", type=_whole, metavar="N", help="the one band to take of each file [all]")
+    add("--nodata", type=float, action="append", metavar="X", help="a number for no value")
+    add("--missing-is-unburnt", action="store_true", help="take cells without a value as unburnt")
+    add("--crop", type=_crop, metavar="TOP,LEFT,HEIGHT,WIDTH", help="cells of the input to use")
+    add("--height", type=_whole, metavar="N", help="rows of the world [the input's]")
+    add("--width", type=_whole, metavar="N", help="columns of the world [the input's]")
+    add("--cell", type=float, metavar="METRES", help="side of a cell, instead of rows and columns")
+    add(
+        "--resample",
+        choices=("earliest", "nearest"),
+        default="earliest",
+        help="when a larger cell burns: as the first of its input cells, or as its middle one "
+        "[earliest]",
+    )
+    add("--oblong", action="store_true", help="take cells that are not square as squares")
+    add("--name", help="of the world [the output's]")
+    add("--picture", type=Path, metavar="FILE.png", help="draw what came out")
+    add("--force", action="store_true", help="replace the output")
+    return parser
+
+
+def _import(flags: argparse.Namespace) -> None:
+    meaning = _meaning(flags)
+    files = outputs(flags.out, force=flags.force)
+    _check_picture(flags)
+    choice = Choice(variable=flags.variable, band=flags.band, nodata=tuple(flags.nodata or ()))
+    sequences = list[NDArray[np.uint8]]()
+    for stack in stacks(flags.inputs, one_file_each=meaning.kind == "arrival"):
+        fire = times(read(stack, choice), meaning)
+        window = crop(fire.place, flags.crop)
+        left: Any = fire.arrival[window].shape
+        sides = {"height": flags.height, "width": flags.width, "cell": flags.cell}
+        shape = target_shape(fire.place, left, **sides)
+        if sequences and shape != sequences[0].shape[1:]:
+            height, width = sequences[0].shape[1:]
+            raise InvalidArgumentError(
+                f"{fire.name}: expected {height} x {width} cells as the first sequence, "
+                f"got {shape[0]} x {shape[1]}; use --height and --width"
+            )
+        sequences.append(states(fire, shape, window, flags.resample))
+    name = flags.name or flags.out.stem
+    write(files[0], sequences, description(name, flags.step))
+    for states_of_fire in sequences:
+        print(_told(states_of_fire))
+    print(f"{files[0]}: {files[0].stat().st_size} bytes, sequences: {len(sequences)}; {files[1]}")
+    if flags.picture is not None:
+        from emberwatch.landscape.picture import draw
+
+        draw(sequences, name).save(flags.picture)
+
+
+def _meaning(flags: argparse.Namespace) -> Meaning:
+    for name, kinds in _ONLY_FOR.items():
+        if flags.kind not in kinds and getattr(flags, name) not in (None, False):
+            flag = name.replace("_", "-")
+            raise InvalidArgumentError(
+                f"--{flag}: expected --kind {' or '.join(kinds)} beside it, got {flags.kind}"
+            )
+    if flags.kind in _ONLY_FOR["burning"] and flags.burning is None:
+        raise InvalidArgumentError(
+            f"--burning: expected the steps that a cell burns, as --kind {flags.kind} does not "
+            "say it, got none"
+        )
+    if flags.cell is not None and (flags.height, flags.width) != (None, None):
+        raise InvalidArgumentError("--cell: expected neither --height nor --width beside it")
+    if flags.cell is not None and not 0 < flags.cell < float("inf"):
+        raise InvalidArgumentError(f"--cell: expected metres above 0, got {flags.cell}")
+    return Meaning(
+        kind=flags.kind,
+        step=seconds(flags.step),
+        unit=flags.unit,
+        burning=flags.burning or 1,
+        every=flags.every or 1,
+        codes=flags.codes or (0, 1, 2),
+        oblong=flags.oblong,
+        missing_is_unburnt=flags.missing_is_unburnt,
+    )
+
+
+def _check_picture(flags: argparse.Namespace) -> None:
+    if flags.picture is None:
+        return
+    if flags.picture.suffix != ".png":
+        raise InvalidArgumentError(f"--picture: expected a .png, got {flags.picture}")
+    if find_spec("PIL") is None:
+        raise InvalidArgumentError("--picture: expected Pillow; pip install emberwatch[landscape]")
+
+
+def _told(sequence: NDArray[np.uint8]) -> str:
+    n_steps, height, width = sequence.shape
+    burning = (sequence == BURNING).sum(axis=(1, 2))
+    burnt = (sequence[-1] >= BURNING).mean()
+    return (
+        f"{n_steps} steps of {height} x {width} cells: at most {burning.max()} burn, "
+        f"at step {burning.argmax()}; {100 * burnt:.1f} % have burnt at the end"
+    )
+
+
+def _whole(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"expected at least 1, got {text}")
+    return number
+
+
+def _codes(text: str) -> tuple[float, ...]:
+    codes = tuple(float(part) for part in text.split(","))
+    if len(set(codes)) != len(codes) or len(codes) != BURNT + 1:
+        raise argparse.ArgumentTypeError(f"expected three different numbers, got {text}")
+    return codes
+
+
+def _crop(text: str) -> tuple[int, ...]:
+    numbers = tuple(int(part) for part in text.split(","))
+    if len(numbers) != 4:
+        raise argparse.ArgumentTypeError(f"expected TOP,LEFT,HEIGHT,WIDTH, got {text}")
+    return numbers
+
+
+if __name__ == "__main__":
+    main()

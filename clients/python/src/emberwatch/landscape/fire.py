@@ -1,0 +1,284 @@
+"""States of a fire from its layers: unburnt, burning, burnt.
+
+Whatever the files hold is first two times of each cell, counted in layers or steps: when it begins
+to burn and when it is burnt. These are resampled, and then counted out step by step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.landscape.grid import Place, Rule, check_same, check_square, resampled
+from emberwatch.landscape.layers import Layer
+
+UNBURNT, BURNING, BURNT = 0, 1, 2
+
+Kind = Literal["arrival", "mask", "burning", "states"]
+
+_SECONDS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+_SPELLINGS: Final = {
+    "sec": "s", "second": "s", "minute": "min", "hr": "h", "hour": "h", "day": "d"
+}  # fmt: skip
+_MOST_STATES: Final = 1 << 31  # of a sequence, in bytes
+_EVEN: Final = 1e-3  # share by which steps of a time dimension may differ
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Times:
+    """When each cell of one fire begins to burn and is burnt, in steps; infinite if never."""
+
+    arrival: NDArray[np.float64]
+    burnt: NDArray[np.float64]
+    n_steps: int
+    place: Place
+    name: str
+    """Of the first layer, for errors."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Meaning:
+    """What the numbers in the layers mean."""
+
+    kind: Kind
+    step: float
+    """Seconds."""
+    unit: str | None = None
+    """Of arrival times."""
+    burning: int = 1
+    """Steps that a cell burns after its arrival."""
+    every: int = 1
+    codes: tuple[float, float, float] = (UNBURNT, BURNING, BURNT)
+    oblong: bool = False
+    missing_is_unburnt: bool = False
+
+
+def seconds(text: str) -> float:
+    """A length of time such as `10 min`."""
+    number, _, unit = text.strip().partition(" ")
+    try:
+        length = float(number) * _SECONDS[_unit(unit)]
+    except (KeyError, ValueError):
+        length = 0.0
+    if not 0.0 < length < math.inf:
+        raise InvalidArgumentError(
+            f"--step: expected a number and s, min, h or d, such as '10 min', got '{text}'"
+        )
+    return length
+
+
+def times(layers: Iterable[Layer], meaning: Meaning) -> Times:
+    """Reads the layers of one fire."""
+    if meaning.kind == "arrival":
+        return _of_arrival(list(layers), meaning)
+    return _of_stack(layers, meaning)
+
+
+def states(
+    fire: Times, shape: tuple[int, int], window: tuple[slice, slice], rule: Rule
+) -> NDArray[np.uint8]:
+    """The sequence (K, H, W): each step as the times say."""
+    arrival, burnt = fire.arrival[window], fire.burnt[window]
+    burns = np.isfinite(arrival)
+    if not burns.any():
+        raise InvalidArgumentError(f"{fire.name}: expected cells that burn, got none")
+    # A cell is burnt when the last part of it that burns at all is.
+    last = resampled(np.where(burns, burnt, -np.inf), shape, rule, latest=True)
+    arrival = resampled(arrival, shape, rule)
+    burnt = np.where(np.isfinite(arrival), last, np.inf)
+    if not np.isfinite(arrival).any():
+        raise InvalidArgumentError(
+            f"--resample: expected cells that burn on {shape[0]} x {shape[1]} cells, got none; "
+            "use 'earliest'"
+        )
+    if fire.n_steps * arrival.size > _MOST_STATES:
+        raise InvalidArgumentError(
+            f"{fire.name}: expected at most {_MOST_STATES} bytes of states, got {fire.n_steps} "
+            f"steps of {shape[0]} x {shape[1]} cells; use a longer --step or --every, or a "
+            "smaller grid"
+        )
+    sequence = np.empty((fire.n_steps, *shape), np.uint8)
+    for k, step in enumerate(sequence):
+        np.add(arrival <= k, burnt <= k, out=step, dtype=np.uint8, casting="unsafe")
+    return sequence
+
+
+def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
+    layer = layers[0]
+    if len(layers) != 1:
+        raise InvalidArgumentError(
+            f"{layer.name}: expected one band of arrival times, got {len(layers)}; "
+            "choose with --band"
+        )
+    _check_square(layer, meaning)
+    arrival = np.where(np.isnan(layer.values), np.inf, layer.values)
+    negative = arrival < 0
+    if negative.any():
+        raise InvalidArgumentError(
+            f"{layer.name}: expected times of at least 0, got {_first(layer, negative)}; if that "
+            "means never, say --nodata"
+        )
+    finite = arrival[np.isfinite(arrival)]
+    if not finite.size:
+        raise InvalidArgumentError(f"{layer.name}: expected cells that burn, got none")
+    step = meaning.step / _SECONDS[_unit_of(layer, meaning)]
+    # A step shows the fire at its time: what begins later burns in the next one. Rounded, so that
+    # three steps are not a bit more than three.
+    steps = np.ceil((arrival - finite.min()) / step - 1e-6)
+    n_steps = int(steps[np.isfinite(steps)].max()) + 1
+    return _checked(steps, steps + meaning.burning, n_steps, layer)
+
+
+def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
+    first: Layer | None = None
+    arrival = burnt = np.empty(0)
+    dates, n_layers, mark = list[float](), 0, math.nan
+    for k, layer in enumerate(layers):
+        if first is None:
+            first = layer
+            _check_square(layer, meaning)
+            arrival = np.full(layer.place.shape, np.inf)
+            burnt = arrival.copy()
+        check_same(layer.place, layer.name, first.place, first.name)
+        if layer.time is not None:
+            dates.append(layer.time)
+            _check_dates(dates, layer)
+        mark = _add(layer, k, meaning, arrival, burnt, mark)
+        n_layers = k + 1
+    if first is None:
+        raise InvalidArgumentError("layers: expected at least 2, got none")
+    if meaning.kind == "mask":
+        burnt = np.ceil(arrival / meaning.every) + meaning.burning
+    else:
+        burnt = np.ceil(burnt / meaning.every)
+    arrival = np.ceil(arrival / meaning.every)
+    return _checked(arrival, burnt, (n_layers - 1) // meaning.every + 1, first)
+
+
+def _add(
+    layer: Layer,
+    k: int,
+    meaning: Meaning,
+    arrival: NDArray[np.float64],
+    burnt: NDArray[np.float64],
+    mark: float,
+) -> float:
+    """Notes what burns and is burnt in layer k; returns the number that marks a mask's cells."""
+    values = layer.values
+    missing = np.isnan(values)
+    if missing.any():
+        if not meaning.missing_is_unburnt:
+            raise InvalidArgumentError(
+                f"{layer.name}: expected a value in each cell, got none in {missing.sum()} cells, "
+                f"the first {_cell(missing)}; --missing-is-unburnt takes them as unburnt"
+            )
+        values[missing] = meaning.codes[0] if meaning.kind == "states" else 0.0
+    if meaning.kind == "states":
+        unburnt, burning, done = (values == code for code in meaning.codes)
+        known = unburnt | burning | done
+        if not known.all():
+            raise InvalidArgumentError(
+                f"{layer.name}: expected the codes {_numbers(meaning.codes)}, "
+                f"got {_first(layer, ~known)}"
+            )
+    else:
+        unburnt, done = values == 0, np.zeros(values.shape, bool)
+        if math.isnan(mark) and not unburnt.all():
+            mark = float(values[~unburnt][0])
+        burning = values == mark
+        if not (unburnt | burning).all():
+            raise InvalidArgumentError(
+                f"{layer.name}: expected 0 and one other number in all layers, {mark:.6g}, "
+                f"got {_first(layer, ~(unburnt | burning))}"
+            )
+        if meaning.kind == "burning":
+            done = unburnt & np.isfinite(arrival)
+            unburnt &= ~done
+    _check_order(layer, unburnt, burning, arrival, burnt)
+    arrival[(burning | done) & np.isinf(arrival)] = k
+    burnt[done & np.isinf(burnt)] = k
+    return mark
+
+
+def _check_order(
+    layer: Layer,
+    unburnt: NDArray[np.bool_],
+    burning: NDArray[np.bool_],
+    arrival: NDArray[np.float64],
+    burnt: NDArray[np.float64],
+) -> None:
+    """Refuses what cannot follow the layers before."""
+    for wrong, words in (
+        (burning & np.isfinite(burnt), "burnt cells to stay burnt, got {} that burn again"),
+        (unburnt & np.isfinite(arrival), "burning cells to burn on, got {} that are unburnt again"),
+    ):
+        if wrong.any():
+            told = words.format(wrong.sum())
+            raise InvalidArgumentError(f"{layer.name}: expected {told}, the first {_cell(wrong)}")
+
+
+def _check_dates(dates: list[float], layer: Layer) -> None:
+    steps = [after - before for before, after in pairwise(dates)]
+    if steps and steps[-1] <= 0:
+        raise InvalidArgumentError(
+            f"{layer.name}: expected a later time than {dates[-2]:.6g}, got {dates[-1]:.6g}"
+        )
+    if steps and abs(steps[-1] - steps[0]) > _EVEN * steps[0]:
+        raise InvalidArgumentError(
+            f"{layer.name}: expected steps of {steps[0]:.6g} in time, got {steps[-1]:.6g}"
+        )
+
+
+def _check_square(layer: Layer, meaning: Meaning) -> None:
+    if not meaning.oblong:
+        check_square(layer.place, layer.name)
+
+
+def _checked(
+    arrival: NDArray[np.float64], burnt: NDArray[np.float64], n_steps: int, layer: Layer
+) -> Times:
+    if n_steps < 2:
+        raise InvalidArgumentError(f"{layer.name}: expected at least 2 steps, got {n_steps}")
+    return Times(arrival=arrival, burnt=burnt, n_steps=n_steps, place=layer.place, name=layer.name)
+
+
+def _unit_of(layer: Layer, meaning: Meaning) -> str:
+    """What the times count: as the flag or the file says."""
+    in_file = _unit(layer.unit.partition(" since ")[0]) if layer.unit else None
+    if in_file not in _SECONDS:
+        in_file = None
+    unit = meaning.unit or in_file
+    if unit is None:
+        raise InvalidArgumentError(
+            f"--unit: expected s, min, h or d, as {layer.name} does not say what its times count, "
+            "got none"
+        )
+    if in_file is not None and unit != in_file:
+        raise InvalidArgumentError(f"--unit: expected {in_file}, as in {layer.name}, got {unit}")
+    return unit
+
+
+def _unit(text: str) -> str:
+    word = text.strip().lower()
+    word = word if word in _SECONDS else word.removesuffix("s")
+    return _SPELLINGS.get(word, word)
+
+
+def _cell(cells: NDArray[np.bool_]) -> str:
+    row, column = np.argwhere(cells)[0].tolist()
+    return f"in row {row}, column {column}"
+
+
+def _first(layer: Layer, cells: NDArray[np.bool_]) -> str:
+    return f"{layer.values[cells][0]:.6g} {_cell(cells)}"
+
+
+def _numbers(numbers: Iterable[float]) -> str:
+    return ", ".join(f"{number:.6g}" for number in numbers)

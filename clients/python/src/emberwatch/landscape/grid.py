@@ -1,0 +1,176 @@
+"""Where cells are: what layers must have in common, and how they become the wanted grid."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.errors import InvalidArgumentError
+
+MAX_SIDE: Final = 4096
+"""Most rows, and most columns, that the server takes."""
+
+Rule = Literal["earliest", "nearest"]
+
+_LIKE: Final = 1e-3  # share of a cell by which places may differ
+_SQUARE: Final = 0.02  # by how much the sides of a square cell may differ
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Place:
+    """The grid of a file on the ground."""
+
+    shape: tuple[int, int]
+    """Rows and columns."""
+    corner: tuple[float, float] | None = None
+    """x and y of the first cell's outer corner; None if the file does not say."""
+    cell: tuple[float, float] = (1.0, 1.0)
+    """Width and height of a cell; a negative height means that the first row is in the north."""
+    projection: str | None = None
+    """As well-known text."""
+    is_in_degrees: bool = False
+    metres: float = 1.0
+    """Length of a unit of x and y; cells without a projection count in metres."""
+
+    def sides(self) -> tuple[float, float]:
+        """Width and height of a cell in one unit, in the middle of the grid."""
+        width, height = abs(self.cell[0]), abs(self.cell[1])
+        if self.is_in_degrees and self.corner is not None:
+            middle = self.corner[1] + self.cell[1] * self.shape[0] / 2
+            width *= math.cos(math.radians(middle))
+        return width, height
+
+
+def check_same(place: Place, name: str, first: Place, first_name: str) -> None:
+    """Refuses a layer whose cells are not those of the first."""
+    if place.projection != first.projection:
+        raise InvalidArgumentError(
+            f"{name}: expected the projection of {first_name}, {_projection(first)}, "
+            f"got {_projection(place)}"
+        )
+    if place.shape != first.shape:
+        raise InvalidArgumentError(
+            f"{name}: expected {_size(first)} cells as in {first_name}, got {_size(place)}"
+        )
+    apart = np.subtract(_extent(place), _extent(first))
+    if (np.abs(apart) > _LIKE * abs(first.cell[0])).any():
+        raise InvalidArgumentError(
+            f"{name}: expected the extent of {first_name}, {_extent(first)}, got {_extent(place)}"
+        )
+
+
+def check_square(place: Place, name: str) -> None:
+    """Refuses a layer whose cells are not square on the ground."""
+    width, height = place.sides()
+    if not (1 - _SQUARE) * height <= width <= (1 + _SQUARE) * height:
+        unit = " degrees of latitude" if place.is_in_degrees else ""
+        raise InvalidArgumentError(
+            f"{name}: expected square cells, got {width:.6g} x {height:.6g}{unit}; reproject it "
+            "(gdalwarp), or take them as squares with --oblong"
+        )
+
+
+def crop(place: Place, wanted: tuple[int, int, int, int] | None) -> tuple[slice, slice]:
+    """The rows and columns of the input to use."""
+    height, width = place.shape
+    if wanted is None:
+        return slice(0, height), slice(0, width)
+    top, left, rows, columns = wanted
+    if (
+        min(top, left) < 0
+        or min(rows, columns) < 1
+        or top + rows > height
+        or left + columns > width
+    ):
+        raise InvalidArgumentError(
+            f"--crop: expected TOP,LEFT,HEIGHT,WIDTH within {height} x {width} cells, "
+            f"got {','.join(map(str, wanted))}"
+        )
+    return slice(top, top + rows), slice(left, left + columns)
+
+
+def target_shape(
+    place: Place,
+    shape: tuple[int, int],
+    *,
+    height: int | None,
+    width: int | None,
+    cell: float | None,
+) -> tuple[int, int]:
+    """Rows and columns of the result; `shape` is what is left of the input after cropping."""
+    rows, columns = shape
+    if cell is not None:
+        if place.corner is None or place.is_in_degrees:
+            raise InvalidArgumentError(
+                f"--cell: expected a grid in metres, got {_projection(place)}; use --height"
+            )
+        share = place.sides()[1] * place.metres / cell
+        height, width = max(1, round(rows * share)), max(1, round(columns * share))
+    elif height is not None and width is not None:
+        stretch = (columns / width) / (rows / height)
+        if not 1 - _SQUARE <= stretch <= 1 + _SQUARE:
+            raise InvalidArgumentError(
+                f"--height, --width: expected the proportions of {rows} x {columns} cells, "
+                f"got {height} x {width}; use --crop, or give one of the two"
+            )
+    elif height is not None:
+        width = max(1, round(columns * height / rows))
+    elif width is not None:
+        height = max(1, round(rows * width / columns))
+    else:
+        height, width = rows, columns
+    if max(height, width or 0) > MAX_SIDE:
+        raise InvalidArgumentError(
+            f"grid: expected at most {MAX_SIDE} x {MAX_SIDE} cells, as the server takes, got "
+            f"{height} x {width}; use --height, --width, --cell or --crop"
+        )
+    return height, width or 0
+
+
+def resampled(
+    times: NDArray[np.float64], shape: tuple[int, int], rule: Rule, *, latest: bool = False
+) -> NDArray[np.float64]:
+    """Times of larger or smaller cells.
+
+    `"nearest"` takes the input cell in the middle of each, `"earliest"` the least of all input
+    cells that it overlaps (`latest`: the greatest).
+    """
+    for axis, new in enumerate(shape):
+        old = len(times) if axis == 0 else times[0].size
+        if old == new:
+            continue
+        if rule == "nearest":
+            at = ((np.arange(new) + 0.5) * old / new).astype(np.intp)
+            times = times.take(at, axis=axis)
+        else:
+            reduce = np.max if latest else np.min
+            # In whole numbers, so that edges that coincide do not overlap by rounding.
+            edges = [(i * old // new, -(-(i + 1) * old // new)) for i in range(new)]
+            parts = [
+                reduce(times[(slice(None),) * axis + (slice(*edge),)], axis=axis) for edge in edges
+            ]
+            times = np.stack(parts, axis=axis)
+    return times
+
+
+def _extent(place: Place) -> tuple[float, float, float, float]:
+    """Left, bottom, right and top."""
+    (x, y), (width, height) = place.corner or (0.0, 0.0), place.cell
+    rows, columns = place.shape
+    ys = y, y + height * rows
+    return x, min(ys), x + width * columns, max(ys)
+
+
+def _size(place: Place) -> str:
+    return f"{place.shape[0]} x {place.shape[1]}"
+
+
+def _projection(place: Place) -> str:
+    if place.projection is None:
+        return "none" if place.corner is not None else "no place on the ground"
+    quoted = place.projection.split('"')
+    return quoted[1] if len(quoted) > 1 else place.projection

@@ -1,0 +1,256 @@
+"""Files as layers: one array of numbers each, with the place of its cells.
+
+GeoTIFF, ESRI ASCII grid and NetCDF are read by GDAL through rasterio, NumPy files by NumPy. One
+layer is in memory at a time.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+import warnings
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.landscape.grid import Place
+
+_DRIVERS: Final = {
+    ".tif": ("GTiff", "a GeoTIFF"),
+    ".tiff": ("GTiff", "a GeoTIFF"),
+    ".asc": ("AAIGrid", "an ESRI ASCII grid"),
+    ".nc": ("netCDF", "a NetCDF file"),
+}
+_NUMPY: Final = (".npy", ".npz")
+_KNOWN: Final = ", ".join((*_DRIVERS, *_NUMPY))
+#: Files that say where the cells of others are, which GDAL reads with them.
+_BESIDE: Final = (".prj", ".tfw", ".xml")
+_MOST_CELLS: Final = 1 << 27  # of a layer: 1 GiB as numbers
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """What to take of each file."""
+
+    variable: str | None = None
+    band: int | None = None
+    nodata: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layer:
+    """One raster."""
+
+    name: str
+    """File and band, for errors."""
+    values: NDArray[np.float64]
+    """Shape (rows, columns), the first row in the north; NaN where the file has no value."""
+    place: Place
+    unit: str | None
+    """What a number counts, in the file's words."""
+    time: float | None
+    """Where the file has a time dimension: the layer's place on it."""
+
+
+def stacks(inputs: Sequence[Path], *, one_file_each: bool) -> list[list[Path]]:
+    """The files of each sequence: of each folder, by the numbers in their names, and the rest.
+
+    `one_file_each` makes each file a sequence of its own.
+    """
+    found, loose = list[list[Path]](), list[Path]()
+    for path in inputs:
+        if not path.exists():
+            raise InvalidArgumentError(f"{path}: expected a file or folder, got none")
+        if path.is_dir():
+            files = sorted((file for file in path.iterdir() if _is_layer(file)), key=_by_number)
+            if not files:
+                raise InvalidArgumentError(f"{path}: expected rasters in this folder, got none")
+            found.append(files)
+        else:
+            loose.append(path)
+    found += [loose] if loose else []
+    files = [file for stack in found for file in stack]
+    known = set[Path]()
+    for file in files:
+        if file.suffix.lower() not in (*_DRIVERS, *_NUMPY):
+            raise InvalidArgumentError(f"{file}: expected one of {_KNOWN}, got '{file.suffix}'")
+        if file.resolve() in known:
+            raise InvalidArgumentError(f"{file}: expected each file once, got it twice")
+        known.add(file.resolve())
+    return [[file] for file in files] if one_file_each else found
+
+
+def read(files: Sequence[Path], choice: Choice) -> Iterator[Layer]:
+    """The layers of these files, in order."""
+    for file in files:
+        reader = _read_numpy if file.suffix.lower() in _NUMPY else _read_raster
+        for layer in reader(file, choice):
+            values = layer.values
+            for missing in choice.nodata:
+                values[values == missing] = np.nan
+            yield layer
+
+
+def _is_layer(file: Path) -> bool:
+    return not file.name.startswith(".") and file.suffix.lower() not in _BESIDE
+
+
+def _by_number(file: Path) -> list[tuple[int, str]]:
+    """Orders `step_2` before `step_10`."""
+    parts = re.findall(r"\d+|\D+", file.name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+
+def _read_numpy(file: Path, choice: Choice) -> Iterator[Layer]:
+    array = _array(file, choice)
+    if array.dtype.kind not in "biuf" or array.ndim not in (2, 3) or not array.size:
+        raise InvalidArgumentError(
+            f"{file}: expected numbers of shape (rows, columns) or (layers, rows, columns), "
+            f"got {array.dtype} {array.shape}"
+        )
+    array = array.reshape(-1, *array.shape[-2:])
+    for band in _bands(file, len(array), choice):
+        yield Layer(
+            name=f"{file}, layer {band}" if len(array) > 1 else str(file),
+            values=array[band - 1].astype(np.float64),
+            place=Place(shape=(array.shape[1], array.shape[2])),
+            unit=None,
+            time=None,
+        )
+
+
+def _array(file: Path, choice: Choice) -> NDArray[Any]:
+    try:
+        loaded: Any = np.load(file, allow_pickle=False)
+        if hasattr(loaded, "dtype"):
+            if choice.variable is not None:
+                raise InvalidArgumentError(
+                    f"--variable: expected none for {file}, which has one array, "
+                    f"got '{choice.variable}'"
+                )
+            return loaded
+        with loaded:
+            return loaded[_variable(file, list(loaded), choice.variable)]
+    except InvalidArgumentError:
+        raise
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InvalidArgumentError(f"{file}: expected a NumPy file, got: {error}") from None
+
+
+def _read_raster(file: Path, choice: Choice) -> Iterator[Layer]:
+    rasterio = _rasterio(file)
+    driver, kind = _DRIVERS[file.suffix.lower()]
+    # What has no place is a grid without one; GDAL's other warnings are of no use to people.
+    with warnings.catch_warnings(action="ignore"):
+        try:
+            with rasterio.open(_address(rasterio, file, driver, choice), driver=driver) as source:
+                place = _place(file, source)
+                for band in _bands(file, source.count, choice):
+                    yield _layer(file, source, place, band)
+        except rasterio.errors.RasterioError as error:
+            words = error.__cause__ or error
+            raise InvalidArgumentError(f"{file}: expected {kind}, got: {words}") from None
+
+
+def _rasterio(file: Path) -> Any:
+    try:
+        rasterio = importlib.import_module("rasterio")
+        importlib.import_module("rasterio.errors")
+    except ImportError as error:
+        raise InvalidArgumentError(
+            f"{file}: expected rasterio to read it with, got: {error}; "
+            "pip install emberwatch[landscape]"
+        ) from None
+    return rasterio
+
+
+def _address(rasterio: Any, file: Path, driver: str, choice: Choice) -> str:
+    """What GDAL opens: the file, or one variable of it."""
+    if driver != "netCDF":
+        if choice.variable is not None:
+            raise InvalidArgumentError(
+                f"--variable: expected none for {file}, which has no variables, "
+                f"got '{choice.variable}'"
+            )
+        return str(file)
+    with rasterio.open(file, driver=driver) as source:
+        names = [address.rpartition(":")[2] for address in source.subdatasets]
+        if source.count:
+            names = [source.tags(1)["NETCDF_VARNAME"]]
+    return f'NETCDF:"{file}":{_variable(file, names, choice.variable)}'
+
+
+def _variable(file: Path, names: list[str], wanted: str | None) -> str:
+    if wanted in names:
+        return wanted
+    known = ", ".join(sorted(names)) or "none"
+    if wanted is not None:
+        raise InvalidArgumentError(f"--variable: expected one of {file} ({known}), got '{wanted}'")
+    if len(names) != 1:
+        raise InvalidArgumentError(
+            f"{file}: expected one variable, got {len(names)} ({known}); choose with --variable"
+        )
+    return names[0]
+
+
+def _bands(file: Path, count: int, choice: Choice) -> Sequence[int]:
+    if choice.band is None:
+        return range(1, count + 1)
+    if not 1 <= choice.band <= count:
+        raise InvalidArgumentError(f"--band: expected 1 to {count} for {file}, got {choice.band}")
+    return [choice.band]
+
+
+def _place(file: Path, source: Any) -> Place:
+    """Where the cells are; a file that does not say so has the identity as its transform."""
+    if source.width * source.height > _MOST_CELLS:
+        raise InvalidArgumentError(
+            f"{file}: expected at most {_MOST_CELLS} cells, got {source.height} x {source.width}"
+        )
+    shape, transform, crs = (source.height, source.width), source.transform, source.crs
+    if transform.is_identity:
+        return Place(shape=shape)
+    if transform.b or transform.d:
+        raise InvalidArgumentError(f"{file}: expected rows from west to east, got a rotated grid")
+    return Place(
+        shape=shape,
+        corner=(transform.c, transform.f),
+        cell=(transform.a, transform.e),
+        projection=crs.to_wkt() if crs else None,
+        is_in_degrees=bool(crs and crs.is_geographic),
+        metres=crs.linear_units_factor[1] if crs and crs.is_projected else 1.0,
+    )
+
+
+def _layer(file: Path, source: Any, place: Place, band: int) -> Layer:
+    dtype = source.dtypes[band - 1]
+    if dtype.startswith("complex"):
+        raise InvalidArgumentError(f"{file}: expected real numbers, got {dtype}")
+    masked: Any = source.read(band, masked=True, out_dtype="float64")
+    values = masked.filled(np.nan) * source.scales[band - 1] + source.offsets[band - 1]
+    if place.cell[1] > 0 and place.corner is not None:  # the first row is in the south
+        values = values[::-1].copy()
+    return Layer(
+        name=f"{file}, band {band}" if source.count > 1 else str(file),
+        values=values,
+        place=place,
+        unit=source.units[band - 1] or None,
+        time=_time(file, source.tags(), source.tags(band)),
+    )
+
+
+def _time(file: Path, tags: dict[str, str], of_band: dict[str, str]) -> float | None:
+    extra = tags.get("NETCDF_DIM_EXTRA", "{}").strip("{}").split(",")
+    if len(extra) > 1:
+        raise InvalidArgumentError(
+            f"{file}: expected a variable of time, rows and columns, got it over {', '.join(extra)}"
+            " as well"
+        )
+    value = of_band.get(f"NETCDF_DIM_{extra[0]}")
+    return None if value is None else float(value)

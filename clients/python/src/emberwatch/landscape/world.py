@@ -1,0 +1,74 @@
+"""What `emberwatch-server --states` reads: sequences in one `.npz`, described by a `.toml`."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import IO, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberwatch.errors import InvalidArgumentError
+from emberwatch.model import Color, color_from_hex
+
+
+class State(NamedTuple):
+    """A state as the description has it."""
+
+    name: str
+    color: str
+    reward: float
+
+
+STATES: Final = (
+    State("unburnt", "#3b6ea5", 0.0),
+    State("burning", "#c8371b", 1.0),
+    State("burnt", "#4a4a4a", 0.0),
+)
+COLORS: Final[tuple[Color, ...]] = tuple(color_from_hex(state.color) for state in STATES)
+# As in the wildfire model: the sensor errs in 2 % of the cells, either way alike.
+_RIGHT, _WRONG = 0.98, 0.01
+
+
+def description(name: str, step: str) -> str:
+    """The text of the `.toml`."""
+    lines = [f"name = {json.dumps(name)}", f"step = {json.dumps(step)} # that one step lasts"]
+    for state in STATES:
+        row = ", ".join(str(_RIGHT if other is state else _WRONG) for other in STATES)
+        lines += ["", "[[states]]", f'name = "{state.name}"', f'color = "{state.color}"']
+        lines += [f"observed_as = [{row}]", f"reward = {state.reward}"]
+    for state in STATES:
+        lines += ["", "[[observations]]", f'name = "{state.name}"', f'color = "{state.color}"']
+    return "\n".join(lines) + "\n"
+
+
+def outputs(out: Path, *, force: bool) -> tuple[Path, Path]:
+    """The files to write, none of which may be there already without `force`."""
+    if out.suffix != ".npz":
+        raise InvalidArgumentError(f"--out: expected a .npz, got {out}")
+    files = out, out.with_suffix(".toml")
+    for file in files:
+        if file.exists() and not force:
+            raise InvalidArgumentError(f"--out: expected no {file}, got one; --force replaces it")
+    return files
+
+
+def write(out: Path, sequences: Sequence[NDArray[np.uint8]], text: str) -> None:
+    """Writes both files, each beside itself first, so that none is ever half written."""
+    arrays = {f"states_{number:03}": states for number, states in enumerate(sequences)}
+    out.parent.mkdir(parents=True, exist_ok=True)
+    _replace(out, lambda file: np.savez_compressed(file, **arrays))  # pyright: ignore
+    _replace(out.with_suffix(".toml"), lambda file: file.write(text.encode()))
+
+
+def _replace(path: Path, fill: Callable[[IO[bytes]], object]) -> None:
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with beside.open("wb") as file:
+            fill(file)
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)

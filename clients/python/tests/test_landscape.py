@@ -1,0 +1,256 @@
+"""Rasters of fires become recorded worlds: the same fire from each format, kind and grid."""
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from rasters import ARRIVAL, NEVER, ascii_grid, geotiff, masks, netcdf
+
+from emberwatch.landscape.__main__ import main
+
+ROOT = Path(__file__).parents[3]
+STEP = ("--step", "10 min")
+ARRIVALS = ("--kind", "arrival", *STEP, "--burning", "2")
+#: The steps of 10 minutes in which cells burn first: 35 minutes are over in step 4.
+BEGIN = np.where(ARRIVAL == NEVER, 99, np.ceil(ARRIVAL / 10))
+#: The states of all six steps, where a cell burns for two.
+FIRE = np.array([(BEGIN <= k) + (BEGIN + 2 <= k).astype(int) for k in range(6)], np.uint8)
+
+
+def imported(out: Path, *flags: object) -> list[NDArray[np.uint8]]:
+    """The sequences that the command makes."""
+    main([str(flag) for flag in (*flags, "--out", out)])
+    with np.load(out) as file:
+        assert list(file) == [f"states_{number:03}" for number in range(len(file))]
+        return [file[name] for name in file]
+
+
+def one(out: Path, *flags: object) -> NDArray[np.uint8]:
+    (sequence,) = imported(out, *flags)
+    assert sequence.dtype == np.uint8
+    return sequence
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "new" / "world.npz"
+
+
+def test_arrival_times_are_the_same_from_each_format(tmp_path: Path, out: Path) -> None:
+    np.save(tmp_path / "fire.npy", np.where(ARRIVAL == NEVER, np.nan, ARRIVAL))
+    files = [
+        (geotiff(tmp_path / "fire.tif"), "--unit", "min"),
+        (geotiff(tmp_path / "inf.tif", np.where(ARRIVAL == NEVER, np.inf, ARRIVAL)), "--unit=min"),
+        (ascii_grid(tmp_path / "fire.asc"), "--unit", "min"),
+        (netcdf(tmp_path / "fire.nc", at=ARRIVAL),),
+        (netcdf(tmp_path / "up.nc", at=ARRIVAL, southward=False),),
+        (
+            netcdf(
+                tmp_path / "hours.nc", at=np.where(ARRIVAL < 0, NEVER, ARRIVAL / 60), unit="hours"
+            ),
+        ),
+        (tmp_path / "fire.npy", "--unit", "min"),
+    ]
+    for file, *unit in files:
+        np.testing.assert_array_equal(one(out, file, *ARRIVALS, *unit, "--force"), FIRE, str(file))
+
+
+def test_files_upside_down_are_turned(tmp_path: Path, out: Path) -> None:
+    file = geotiff(tmp_path / "fire.tif", ARRIVAL[::-1], cell=(30, -30))
+    np.testing.assert_array_equal(one(out, file, *ARRIVALS, "--unit", "min"), FIRE)
+
+
+def test_scale_and_offset_of_a_band_count(tmp_path: Path, out: Path) -> None:
+    import rasterio
+
+    file = geotiff(tmp_path / "fire.tif", np.where(ARRIVAL == NEVER, NEVER, ARRIVAL / 5 + 2))
+    with rasterio.open(file, "r+") as opened:
+        opened.scales, opened.offsets = [5.0], [-10.0]
+    np.testing.assert_array_equal(one(out, file, *ARRIVALS, "--unit", "min"), FIRE)
+
+
+def test_the_first_step_is_that_of_the_earliest_arrival(tmp_path: Path, out: Path) -> None:
+    later = np.where(ARRIVAL == NEVER, NEVER, ARRIVAL + 1234)
+    file = geotiff(tmp_path / "fire.tif", later)
+    np.testing.assert_array_equal(one(out, file, *ARRIVALS, "--unit", "min"), FIRE)
+
+
+def test_undeclared_numbers_for_never_can_be_named(tmp_path: Path, out: Path) -> None:
+    file = geotiff(tmp_path / "fire.tif", nodata=None)
+    flags = (*ARRIVALS, "--unit", "min", "--nodata", -1, "--nodata", NEVER)
+    np.testing.assert_array_equal(one(out, file, *flags), FIRE)
+
+
+def test_each_file_of_arrival_times_is_a_sequence(tmp_path: Path, out: Path) -> None:
+    second = np.where(ARRIVAL == NEVER, NEVER, ARRIVAL * 2)
+    files = geotiff(tmp_path / "b.tif"), geotiff(tmp_path / "a.tif", second)
+    first, other = imported(out, *files, *ARRIVALS, "--unit", "min")
+    np.testing.assert_array_equal(first, FIRE)
+    assert other.shape == (11, 3, 4)
+
+
+def test_masks_are_the_same_from_files_bands_and_time(tmp_path: Path, out: Path) -> None:
+    layers = masks()
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for k, layer in enumerate(layers):
+        geotiff(folder / f"step_{k + 8}.tif", layer, nodata=None)  # step_10 comes after step_9
+    (folder / "step_8.tif.aux.xml").write_text("<PAMDataset/>")
+    np.savez(tmp_path / "fire.npz", burnt=layers.astype(bool), other=np.zeros(3))
+    inputs = [
+        (folder,),
+        (geotiff(tmp_path / "bands.tif", *layers * 255, nodata=None),),
+        (netcdf(tmp_path / "fire.nc", times=[0, 600, 1200, 1800], mask=layers),),
+        (tmp_path / "fire.npz", "--variable", "burnt"),
+    ]
+    flags = ("--kind", "mask", *STEP, "--burning", 2, "--force")
+    for given in inputs:
+        np.testing.assert_array_equal(one(out, *given, *flags), FIRE[:4], str(given[0]))
+
+
+def test_masks_of_what_burns_now_and_codes_say_what_is_burnt(tmp_path: Path, out: Path) -> None:
+    burning = geotiff(tmp_path / "burning.tif", *(FIRE == 1), nodata=None)
+    np.testing.assert_array_equal(one(out, burning, "--kind", "burning", *STEP), FIRE)
+    codes = np.array([7, 3, 5], np.uint8)[FIRE]
+    file = geotiff(tmp_path / "codes.tif", *codes, nodata=None)
+    flags = ("--kind", "states", *STEP, "--codes", "7,3,5", "--force")
+    np.testing.assert_array_equal(one(out, file, *flags), FIRE)
+
+
+def test_each_folder_is_a_sequence(tmp_path: Path, out: Path) -> None:
+    for name, n_layers in (("a", 3), ("b", 4)):
+        (tmp_path / name).mkdir()
+        geotiff(tmp_path / name / "fire.tif", *masks(n_layers), nodata=None)
+    flags = ("--kind", "mask", *STEP, "--burning", 2)
+    first, second = imported(out, tmp_path / "a", tmp_path / "b", *flags)
+    np.testing.assert_array_equal(first, FIRE[:3])
+    np.testing.assert_array_equal(second, FIRE[:4])
+
+
+def test_cells_without_a_value_can_be_unburnt(tmp_path: Path, out: Path) -> None:
+    file = geotiff(tmp_path / "fire.tif", *masks(), nodata=0)
+    flags = ("--kind", "mask", *STEP, "--burning", 2, "--missing-is-unburnt")
+    np.testing.assert_array_equal(one(out, file, *flags), FIRE[:4])
+
+
+def test_every_second_layer_makes_a_step(tmp_path: Path, out: Path) -> None:
+    file = geotiff(tmp_path / "fire.tif", *FIRE, nodata=None)
+    flags = ("--kind", "states", "--step", "20 min", "--every", 2)
+    np.testing.assert_array_equal(one(out, file, *flags), FIRE[::2])
+
+
+@pytest.mark.parametrize("flags", [("--height", 3), ("--width", 4), ("--cell", 60)])
+def test_a_larger_cell_burns_from_its_first_to_its_last(
+    tmp_path: Path, out: Path, flags: tuple[object, ...]
+) -> None:
+    states = np.zeros((5, 6, 8), np.uint8)
+    states[1:, 0, 0], states[3:, 0, 0] = 1, 2  # burns in steps 1 and 2
+    states[2:, 1, 1], states[4:, 1, 1] = 1, 2  # burns in steps 2 and 3
+    file = geotiff(tmp_path / "fire.tif", *states, nodata=None)
+    small = one(out, file, "--kind", "states", *STEP, *flags)
+    assert small.shape == (5, 3, 4)
+    assert small[:, 0, 0].tolist() == [0, 1, 1, 1, 2]
+    assert not small[:, 1:].any() and not small[:, :, 1:].any()
+
+
+def test_nearest_takes_the_middle_cell_and_smaller_cells_repeat_it(
+    tmp_path: Path, out: Path
+) -> None:
+    states = np.zeros((3, 3, 3), np.uint8)
+    states[1:, 1, 1], states[1:, 0, 0] = 1, 2
+    file = geotiff(tmp_path / "fire.tif", *states, nodata=None)
+    flags = ("--kind", "states", *STEP, "--resample", "nearest", "--force")
+    assert one(out, file, *flags, "--height", 1).ravel().tolist() == [0, 1, 1]
+    doubled = states.repeat(2, axis=1).repeat(2, axis=2)
+    np.testing.assert_array_equal(one(out, file, *flags, "--height", 6), doubled)
+    flags = (*flags, "--resample", "earliest")
+    np.testing.assert_array_equal(one(out, file, *flags, "--height", 6), doubled)
+
+
+def test_a_part_of_the_input_can_be_used(tmp_path: Path, out: Path) -> None:
+    file = geotiff(tmp_path / "fire.tif")
+    part = one(out, file, *ARRIVALS, "--unit", "min", "--crop", "1,0,2,3")
+    np.testing.assert_array_equal(part, FIRE[:, 1:, :3])
+
+
+def test_oblong_cells_can_be_taken_as_squares(tmp_path: Path, out: Path) -> None:
+    file = ascii_grid(tmp_path / "fire.asc", side="dx 30\ndy 40")
+    flags = (*ARRIVALS, "--unit", "min", "--oblong")
+    np.testing.assert_array_equal(one(out, file, *flags), FIRE)
+
+
+def test_the_description_has_the_states_of_the_sequences(tmp_path: Path, out: Path) -> None:
+    one(out, geotiff(tmp_path / "f.tif"), *ARRIVALS, "--unit", "min", "--name", 'a "fire" \\')
+    text = tomllib.loads(out.with_suffix(".toml").read_text("utf-8"))
+    assert text.keys() == {"name", "step", "states", "observations"}
+    assert (text["name"], text["step"]) == ('a "fire" \\', "10 min")
+    names = ["unburnt", "burning", "burnt"]
+    assert [state["name"] for state in text["states"]] == names
+    assert [observation["name"] for observation in text["observations"]] == names
+    assert [state["reward"] for state in text["states"]] == [0, 1, 0]
+    for number, state in enumerate(text["states"]):
+        assert state.keys() == {"name", "color", "observed_as", "reward"}
+        assert np.argmax(state["observed_as"]) == number
+        assert sum(state["observed_as"]) == pytest.approx(1)
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
+    file = geotiff(tmp_path / "fire.tif")
+    outputs = [tmp_path / "a" / "world.npz", tmp_path / "b" / "world.npz"]
+    for output in outputs:
+        one(output, file, *ARRIVALS, "--unit", "min")
+    assert outputs[0].read_bytes() == outputs[1].read_bytes()
+    assert sorted(path.name for path in outputs[0].parent.iterdir()) == ["world.npz", "world.toml"]
+
+
+def test_the_picture_shows_the_states(tmp_path: Path, out: Path) -> None:
+    file, picture = geotiff(tmp_path / "fire.tif"), tmp_path / "fire.png"
+    one(out, file, *ARRIVALS, "--unit", "min", "--picture", picture)
+    colors = Image.open(picture).convert("RGB").getcolors(1 << 20) or []
+    most = {color for count, color in colors if count > 1000}
+    assert {(0x3B, 0x6E, 0xA5), (0xC8, 0x37, 0x1B), (0x4A, 0x4A, 0x4A)} <= most
+
+
+def test_it_says_what_came_out(
+    tmp_path: Path, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one(out, geotiff(tmp_path / "fire.tif"), *ARRIVALS, "--unit", "min")
+    words = "6 steps of 3 x 4 cells: at most 4 burn, at step 2; 75.0 % have burnt at the end"
+    assert words in capsys.readouterr().out
+
+
+def test_the_page_has_the_flags_of_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    page = (ROOT / "docs" / "landscapes.md").read_text("utf-8")
+    options = page[page.index("## Options") : page.index("## Time and grid")]
+    in_help = set(re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, re.MULTILINE))
+    in_page = {
+        flag
+        for row in re.findall(r"(?m)^\| `.*?\|", options)
+        for flag in re.findall(r"--[a-z-]+", row)
+    }
+    assert in_help == in_page and len(in_help) > 15
+
+
+def test_the_package_needs_no_rasterio() -> None:
+    code = "import sys, emberwatch, emberwatch.landscape; assert 'rasterio' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_landscape_that_ships_is_what_its_description_says() -> None:
+    folder = ROOT / "config" / "landscapes" / "jacksboro"
+    text = tomllib.loads((folder / "jacksboro.toml").read_text("utf-8"))
+    with np.load(folder / "jacksboro.npz") as file:
+        sequences = [file[name] for name in file]
+    assert len({sequence.shape[1:] for sequence in sequences}) == 1
+    for states in sequences:
+        assert states.dtype == np.uint8 and states.max() < len(text["states"])
+        assert (np.diff(states.astype(int), axis=0) >= 0).all()
+        assert (states[-1] == 1).any()

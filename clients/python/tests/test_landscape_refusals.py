@@ -1,0 +1,341 @@
+"""What the importer refuses: one line each that says what was expected and what was got."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rasters import ARRIVAL, NEVER, ascii_grid, geotiff, masks, netcdf
+
+from emberwatch.landscape.__main__ import main
+
+ARRIVALS = ("--kind", "arrival", "--step", "10 min", "--burning", "2", "--unit", "min")
+MASKS = ("--kind", "mask", "--step", "10 min", "--burning", "2")
+BURNING = ("--kind", "burning", "--step", "10 min")
+STATES = ("--kind", "states", "--step", "10 min")
+
+Flags = tuple[object, ...]
+
+
+def two(folder: Path, **second: object) -> Flags:
+    """Two masks, the second with a property of its own."""
+    first = geotiff(folder / "a.tif", masks()[0], nodata=None)
+    return first, geotiff(folder / "b.tif", masks()[1], **({"nodata": None} | second)), *MASKS  # type: ignore
+
+
+def text(path: Path, words: str) -> Path:
+    path.write_text(words)
+    return path
+
+
+def stack(folder: Path, *layers: object) -> Path:
+    return geotiff(folder / "stack.tif", *np.array(layers, np.float32), nodata=None)
+
+
+def array(folder: Path, values: np.ndarray) -> Path:
+    np.save(folder / "fire.npy", values)
+    return folder / "fire.npy"
+
+
+def cut(path: Path) -> Path:
+    path.write_bytes(path.read_bytes()[:-150])
+    return path
+
+
+def folder_with(folder: Path, name: str) -> Path:
+    geotiff(folder / "fire.tif", *masks(), nodata=None)
+    text(folder / name, "hello")
+    return folder
+
+
+def large(folder: Path) -> Path:
+    """A raster of more rows than the server takes."""
+    values = np.zeros((4097, 1), np.uint8)
+    return geotiff(folder / "large.tif", values, values + 1, nodata=None, dtype="uint8")
+
+
+ONE, NONE = np.eye(3, 4), np.zeros((3, 4))
+
+#: What is wrong, the flags for a folder, and words of the error.
+CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
+    "no file": (lambda f: (f / "no.tif", *ARRIVALS), "expected a file or folder, got none"),
+    "empty folder": (lambda f: (f, *MASKS), "expected rasters in this folder, got none"),
+    "extension": (lambda f: (text(f / "fire.grd", ""), *MASKS), ".npz, got '.grd'"),
+    "no extension": (lambda f: (text(f / "fire", ""), *MASKS), ".npz, got ''"),
+    "file in folder": (lambda f: (folder_with(f, "notes.txt"), *MASKS), "got '.txt'"),
+    "same file twice": (
+        lambda f: (geotiff(f / "a.tif"), f / "." / "a.tif", *MASKS),
+        "a.tif: expected each file once, got it twice",
+    ),
+    "no GeoTIFF": (lambda f: (text(f / "a.tif", "hello"), *ARRIVALS), "expected a GeoTIFF, got"),
+    "cut GeoTIFF": (lambda f: (cut(geotiff(f / "a.tif")), *ARRIVALS), "expected a GeoTIFF, got"),
+    "no NetCDF": (lambda f: (text(f / "a.nc", "CDF\1"), *ARRIVALS), "expected a NetCDF file, got"),
+    "no ASCII grid": (
+        lambda f: (text(f / "a.asc", "ncols 3\nrows"), *ARRIVALS),
+        "expected an ESRI ASCII grid, got",
+    ),
+    "cut ASCII grid": (
+        lambda f: (cut(ascii_grid(f / "a.asc", ARRIVAL.repeat(9, axis=0))), *ARRIVALS),
+        "expected an ESRI ASCII grid, got",
+    ),
+    "no NumPy file": (
+        lambda f: (text(f / "a.npz", "hello"), *MASKS),
+        "expected a NumPy file, got",
+    ),
+    "objects": (
+        lambda f: (array(f, np.array([{}], object)), *MASKS),
+        "expected a NumPy file, got",
+    ),
+    "words": (lambda f: (array(f, np.array([["a"]])), *MASKS), "(layers, rows, columns), got <U1"),
+    "four dimensions": (lambda f: (array(f, np.zeros((2, 2, 2, 2))), *MASKS), "(2, 2, 2, 2)"),
+    "complex numbers": (
+        lambda f: (geotiff(f / "a.tif", ARRIVAL, dtype="complex64", nodata=None), *ARRIVALS),
+        "expected real numbers, got complex64",
+    ),
+    "three bands": (
+        lambda f: (geotiff(f / "a.tif", ARRIVAL, ARRIVAL, ARRIVAL), *ARRIVALS),
+        "expected one band of arrival times, got 3; choose with --band",
+    ),
+    "band out of range": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--band", 2),
+        "--band: expected 1 to 1 for ",
+    ),
+    "several variables": (
+        lambda f: (netcdf(f / "a.nc", at=ARRIVAL, wind=ARRIVAL), *ARRIVALS),
+        "expected one variable, got 2 (at, wind); choose with --variable",
+    ),
+    "unknown variable": (
+        lambda f: (netcdf(f / "a.nc", at=ARRIVAL), *ARRIVALS, "--variable", "lat"),
+        "a.nc (at), got 'lat'",
+    ),
+    "variable of a GeoTIFF": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--variable", "at"),
+        "which has no variables, got 'at'",
+    ),
+    "fourth dimension": (
+        lambda f: (
+            netcdf(f / "a.nc", at=np.zeros((2, 2, 3, 4)), times=[0, 1], extra=True),
+            *MASKS,
+        ),
+        "expected a variable of time, rows and columns, got it over",
+    ),
+    "other size": (
+        lambda f: (
+            geotiff(f / "a.tif", ONE, nodata=None),
+            geotiff(f / "b.tif", ONE[:2], nodata=None),
+            *MASKS,
+        ),
+        "b.tif: expected 3 x 4 cells as in ",
+    ),
+    "other extent": (
+        lambda f: two(f, corner=(500_030, 4_000_000)),
+        "b.tif: expected the extent of",
+    ),
+    "other cells": (lambda f: two(f, cell=(31, 31)), "b.tif: expected the extent of"),
+    "other projection": (
+        lambda f: two(f, crs="EPSG:32611"),
+        "WGS 84 / UTM zone 10N, got WGS 84 / UTM zone 11N",
+    ),
+    "no projection": (lambda f: two(f, crs=None), "WGS 84 / UTM zone 10N, got none"),
+    "oblong cells": (
+        lambda f: (ascii_grid(f / "a.asc", side="dx 30\ndy 40"), *ARRIVALS),
+        "expected square cells, got 30 x 40",
+    ),
+    "degrees": (
+        lambda f: (geotiff(f / "a.tif", crs="EPSG:4326", corner=(0, 60), cell=(1, 1)), *ARRIVALS),
+        "degrees of latitude; reproject it",
+    ),
+    "rotated grid": (
+        lambda f: (rotated(f / "a.tif"), *ARRIVALS),
+        "expected rows from west to east, got a rotated grid",
+    ),
+    "missing data": (
+        lambda f: (geotiff(f / "a.tif", ONE, ONE, nodata=0), *MASKS),
+        "expected a value in each cell, got none in 9 cells, the first in row 0, column 1",
+    ),
+    "NaN": (
+        lambda f: (stack(f, ONE, np.where(ONE == 1, np.nan, 0)), *STATES),
+        "band 2: expected a value in each cell, got none in 3 cells",
+    ),
+    "mask that shrinks": (
+        lambda f: (stack(f, ONE, NONE), *MASKS),
+        "band 2: expected burning cells to burn on, got 3 that are unburnt again, "
+        "the first in row 0, column 0",
+    ),
+    "burns again": (
+        lambda f: (stack(f, ONE, NONE, ONE), *BURNING),
+        "band 3: expected burnt cells to stay burnt, got 3 that burn again",
+    ),
+    "burnt cell that burns": (
+        lambda f: (stack(f, ONE, 2 * ONE, ONE), *STATES),
+        "band 3: expected burnt cells to stay burnt, got 3 that burn again",
+    ),
+    "unburnt again": (
+        lambda f: (stack(f, ONE, 2 * ONE, NONE), *STATES),
+        "band 3: expected burning cells to burn on, got 3 that are unburnt again",
+    ),
+    "time backwards": (
+        lambda f: (netcdf(f / "a.nc", times=[0, 600, 300, 900], mask=masks()), *MASKS),
+        "expected a later time than 600, got 300",
+    ),
+    "uneven time": (
+        lambda f: (netcdf(f / "a.nc", times=[0, 600, 1200, 2400], mask=masks()), *MASKS),
+        "expected steps of 600 in time, got 1200",
+    ),
+    "mask of three numbers": (
+        lambda f: (stack(f, ONE, 2 * ONE), *MASKS),
+        "band 2: expected 0 and one other number in all layers, 1, got 2 in row 0, column 0",
+    ),
+    "unknown code": (
+        lambda f: (stack(f, ONE, 3 * ONE), *STATES),
+        "band 2: expected the codes 0, 1, 2, got 3 in row 0, column 0",
+    ),
+    "negative time": (
+        lambda f: (geotiff(f / "a.tif", nodata=None), *ARRIVALS),
+        "expected times of at least 0, got -9999 in row 0, column 3; if that means never",
+    ),
+    "no fire in times": (
+        lambda f: (geotiff(f / "a.tif", np.full((3, 4), NEVER)), *ARRIVALS),
+        "expected cells that burn, got none",
+    ),
+    "no fire in masks": (lambda f: (stack(f, NONE, NONE), *MASKS), "cells that burn, got none"),
+    "no fire in the crop": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--crop", "2,0,1,1"),
+        "expected cells that burn, got none",
+    ),
+    "no fire in the middle": (
+        lambda f: (stack(f, ONE, ONE), *MASKS, "--resample=nearest", "--height=1", "--oblong"),
+        "--resample: expected cells that burn on 1 x 1 cells, got none",
+    ),
+    "one layer": (lambda f: (stack(f, ONE), *MASKS), "expected at least 2 steps, got 1"),
+    "one step": (
+        lambda f: (geotiff(f / "a.tif", ONE - 1, nodata=-1), *ARRIVALS),
+        "expected at least 2 steps, got 1",
+    ),
+    "too many steps": (
+        lambda f: (geotiff(f / "a.tif", np.where(ARRIVAL < 0, NEVER, ARRIVAL * 1e9)), *ARRIVALS),
+        "bytes of states, got 4999999",
+    ),
+    "too large": (lambda f: (large(f), *MASKS), "at most 4096 x 4096 cells, as the server takes"),
+    "too large a wish": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--height", 4097),
+        "at most 4096 x 4096 cells, as the server takes, got 4097 x 5463",
+    ),
+    "other proportions": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--height", 3, "--width", 3),
+        "expected the proportions of 3 x 4 cells, got 3 x 3",
+    ),
+    "crop outside": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--crop", "1,0,3,4"),
+        "--crop: expected TOP,LEFT,HEIGHT,WIDTH within 3 x 4 cells, got 1,0,3,4",
+    ),
+    "metres of no place": (
+        lambda f: (array(f, masks()), *MASKS, "--cell", 60),
+        "--cell: expected a grid in metres, got no place on the ground",
+    ),
+    "cell and height": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--cell", 60, "--height", 3),
+        "--cell: expected neither --height nor --width beside it",
+    ),
+    "other grid": (
+        lambda f: (geotiff(f / "a.tif"), geotiff(f / "b.tif", ARRIVAL[:2]), *ARRIVALS),
+        "b.tif: expected 3 x 4 cells as the first sequence, got 2 x 4",
+    ),
+    "no unit": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS[:-2]),
+        "--unit: expected s, min, h or d, as ",
+    ),
+    "other unit": (
+        lambda f: (netcdf(f / "a.nc", at=ARRIVAL, unit="s"), *ARRIVALS),
+        "--unit: expected s, as in ",
+    ),
+    "no burning": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS[:4]),
+        "--burning: expected the steps that a cell burns, as --kind arrival does not",
+    ),
+    "flag of another kind": (
+        lambda f: (stack(f, ONE), *STATES, "--burning", 2),
+        "--burning: expected --kind arrival or mask beside it, got states",
+    ),
+    "step without unit": (
+        lambda f: (stack(f, ONE), "--kind", "states", "--step", "10"),
+        "--step: expected a number and s, min, h or d, such as '10 min', got '10'",
+    ),
+    "step of nothing": (
+        lambda f: (stack(f, ONE), "--kind", "states", "--step", "nan min"),
+        "such as '10 min', got 'nan min'",
+    ),
+    "picture that is none": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--picture", f / "a.gif"),
+        "--picture: expected a .png, got ",
+    ),
+    "unknown kind": (lambda f: (geotiff(f / "a.tif"), "--kind", "fire"), "invalid choice: 'fire'"),
+    "codes": (
+        lambda f: (geotiff(f / "a.tif"), *STATES, "--codes", "0,1,1"),
+        "expected three different numbers, got 0,1,1",
+    ),
+    "no steps": (lambda f: (geotiff(f / "a.tif"), *MASKS, "--every", 0), "expected at least 1"),
+}
+
+
+def rotated(path: Path) -> Path:
+    import rasterio
+
+    geotiff(path)
+    with rasterio.open(path, "r+") as file:
+        file.transform = rasterio.Affine(30, 5, 0, 5, -30, 0)
+    return path
+
+
+def refused(flags: Flags, capsys: pytest.CaptureFixture[str]) -> str:
+    """The last line of what the command says as it ends."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(flag) for flag in flags])
+    assert ended.value.code == 2
+    *before, line = capsys.readouterr().err.splitlines()
+    assert not before or before[0].startswith("usage: "), "one error"
+    return line
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_broken_input_is_refused(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, (flags, words) = tmp_path / "in", CASES[case]
+    folder.mkdir()
+    out = tmp_path / "out" / "world.npz"
+    line = refused((*flags(folder), "--out", out), capsys)
+    assert words in line and "Traceback" not in line
+    assert not out.parent.exists(), "nothing is written"
+
+
+def test_output_that_is_there_is_kept_without_force(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, file = tmp_path / "world.npz", geotiff(tmp_path / "a.tif")
+    for there in (out, out.with_suffix(".toml")):
+        there.write_text("mine")
+        line = refused((file, *ARRIVALS, "--out", out), capsys)
+        assert f"--out: expected no {there}, got one; --force replaces it" in line
+        assert there.read_text() == "mine"
+        there.unlink()
+    line = refused((file, *ARRIVALS, "--out", tmp_path / "world.zip"), capsys)
+    assert "--out: expected a .npz, got " in line
+
+
+def test_a_missing_library_names_the_extra(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = geotiff(tmp_path / "a.tif")
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    line = refused((file, *ARRIVALS, "--out", tmp_path / "world.npz"), capsys)
+    assert "expected rasterio to read it with" in line
+    assert line.endswith("pip install emberwatch[landscape]")
+
+
+def test_an_output_that_cannot_be_written_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = geotiff(tmp_path / "a.tif")
+    assert "a.tif" in refused((file, *ARRIVALS, "--out", file / "world.npz"), capsys)

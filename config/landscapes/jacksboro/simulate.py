@@ -1,0 +1,109 @@
+"""Simulates the fires of this landscape: PyTorchFire on the terrain of the Jacksboro Fault.
+
+pip install "pytorchfire==1.0.3.post2" matplotlib rasterio torch
+python simulate.py RAW
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import rasterio
+import torch
+from matplotlib import cbook
+from pytorchfire import WildfireModel
+from pytorchfire.utils import calculate_slope
+from rasterio.transform import from_bounds
+from rasterio.warp import Resampling, calculate_default_transform, reproject
+
+CELL = 180.0  # metres: twice the 3 arc seconds of the terrain
+PROJECTION = "EPSG:32616"
+MARGIN = 6  # cells that lie outside the terrain after its projection
+N_STEPS = 400
+#: Of each fire: where it begins (share of rows and columns), wind in m/s, where it blows to in
+#: degrees from the east towards the north, seed.
+FIRES = (
+    ((0.55, 0.30), 6.0, 20.0, 1),
+    ((0.35, 0.65), 4.0, 230.0, 2),
+    ((0.75, 0.60), 7.0, 110.0, 3),
+    ((0.30, 0.30), 5.0, 320.0, 5),
+)
+#: As Alexandridis et al. (2008, doi 10.1016/j.amc.2008.06.046), but cells burn longer and slower.
+PARAMETERS = {"a": 0.078, "p_h": 0.06, "c_1": 0.045, "c_2": 0.131, "p_continue": 0.85}
+#: Assumed: ground steeper than so many degrees is forest, the rest is farmed.
+STEEP, FOREST, FARMED = 5.0, 0.4, -0.4
+
+
+def main(raw: Path) -> None:
+    """Writes a GeoTIFF of states for each fire, a band for each step."""
+    torch.set_num_threads(1)
+    terrain, transform = projected_terrain()
+    slope = calculate_slope(torch.from_numpy(terrain), torch.tensor(CELL))
+    for number, fire in enumerate(FIRES):
+        states = simulated(slope, *fire)
+        folder = raw / str(number)
+        folder.mkdir(parents=True, exist_ok=True)
+        profile = {"driver": "GTiff", "dtype": "uint8", "compress": "deflate"}
+        n_steps, height, width = states.shape
+        profile |= {"interleave": "band", "crs": PROJECTION, "transform": transform}
+        shape = {"count": n_steps, "height": height, "width": width}
+        with rasterio.open(folder / "fire.tif", "w", **profile, **shape) as file:
+            file.write(states)
+
+
+def projected_terrain() -> tuple[np.ndarray, rasterio.Affine]:
+    """Elevation in metres on square cells, and where they are."""
+    file = cbook.get_sample_data("jacksboro_fault_dem.npz")
+    elevation = file["elevation"].astype(np.float32)
+    # The file has the northern edge as `ymin`.
+    west, north, east, south = (float(file[key]) for key in ("xmin", "ymin", "xmax", "ymax"))
+    rows, columns = elevation.shape
+    bounds = (west, south, east, north)
+    source = {
+        "src_crs": "EPSG:4326",
+        "src_transform": from_bounds(*bounds, columns, rows),
+    }
+    transform, width, height = calculate_default_transform(
+        "EPSG:4326", PROJECTION, columns, rows, *bounds, resolution=CELL
+    )
+    terrain = np.zeros((height, width), np.float32)
+    target = {"dst_crs": PROJECTION, "dst_transform": transform}
+    reproject(elevation, terrain, **source, **target, resampling=Resampling.bilinear)
+    inner = terrain[MARGIN:-MARGIN, MARGIN:-MARGIN].copy()
+    return inner, transform * rasterio.Affine.translation(MARGIN, MARGIN)
+
+
+def simulated(
+    slope: torch.Tensor,
+    start: tuple[float, float],
+    wind: float,
+    towards: float,
+    seed: int,
+) -> np.ndarray:
+    """States of one fire, shape (steps, rows, columns): 0 unburnt, 1 burning, 2 burnt."""
+    shape = slope.shape[:2]
+    ignition = torch.zeros(shape, dtype=torch.bool)
+    row, column = int(start[0] * shape[0]), int(start[1] * shape[1])
+    ignition[row : row + 3, column : column + 3] = True
+    steepest = slope.abs().amax(dim=(2, 3))
+    world = {
+        "p_veg": torch.where(steepest > STEEP, FOREST, FARMED),
+        "wind_velocity": torch.full(shape, wind),
+        "wind_towards_direction": torch.full(shape, towards),
+        "slope": slope,
+        "initial_ignition": ignition,
+    }
+    model = WildfireModel(world, {name: torch.tensor(x) for name, x in PARAMETERS.items()})
+    model.eval()
+    model.reset(seed)
+    states = np.empty((N_STEPS, *shape), np.uint8)
+    with torch.no_grad():
+        for step in states:
+            burning, burnt = model.state.numpy()
+            step[:] = burning + 2 * burnt
+            model.compute()
+    return states
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
