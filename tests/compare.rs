@@ -18,7 +18,9 @@ const WHAT: &str = "compare --seeds 3..5 --steps 5 --shooting-samples 16 --beam-
 const WORLDS: &str = "--height 6 --width 9 --moves 5 --burn-in 60";
 
 const HEADER: &str = "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
-                      mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated";
+                      mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated,\
+                      steps_to_detection,burning_cells_at_detection,recent_steps,\
+                      burning_seen_share,front_distance,grid_seen_share";
 
 fn agent(arguments: &[&str]) -> Ended {
     let words = arguments.iter().flat_map(|flags| flags.split_whitespace());
@@ -35,7 +37,7 @@ fn rows(path: &Path) -> Vec<Vec<String>> {
     assert_eq!(lines.next(), Some(HEADER));
     let rows = lines.map(|line| {
         let mut fields: Vec<String> = line.split(',').map(String::from).collect();
-        assert_eq!(fields.len(), 14, "{line}");
+        assert_eq!(fields.len(), 20, "{line}");
         let millis: f64 = fields.remove(8).parse().expect("a time");
         assert!(millis >= 0.0);
         fields

@@ -1,6 +1,8 @@
 //! The benchmark: every policy on the same worlds, scored against the hidden states.
 
 use crate::benchmark::arena::Arena;
+use crate::benchmark::brier::brier_score;
+use crate::benchmark::merit::{Found, MeritTally};
 use crate::benchmark::report::{PolicyRun, Snapshot};
 use crate::benchmark::team::Team;
 use crate::config::AgentConfig;
@@ -10,12 +12,13 @@ use crate::learning::learned::Learned;
 use crate::planning::policy::{EstimatorKind, Policy};
 use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Turn};
+use crate::server::client::start;
 use crate::server::feed::Feed;
 use anyhow::{Context, Result, ensure};
+use protocol::Model;
 use protocol::control::ServerInfo;
 use protocol::message::WorldResult;
-use protocol::path::fly;
-use protocol::{Grid, Model};
+use protocol::path::{Flight, fly};
 use std::ops::Range;
 use std::time::Duration;
 
@@ -34,6 +37,8 @@ pub struct Comparison {
     pub seeds: Range<u64>,
     /// Scored steps of each world.
     pub steps: u64,
+    /// Steps for which a cell counts as seen after a visit, at least 1.
+    pub recent_steps: u32,
     pub config: AgentConfig,
     /// What was learned, for policies that act on it.
     pub learned: Learned,
@@ -68,6 +73,9 @@ struct Runs {
 struct World {
     seed: u64,
     tally: Tally,
+    /// This step's, until all robots have flown.
+    flights: Vec<Flight>,
+    merit: MeritTally,
     snapshot: Option<Snapshot>,
 }
 
@@ -214,9 +222,12 @@ impl Match<'_> {
         let agents = agents.flat_map(|&seed| (0..n_agents).map(move |number| (seed, number)));
         let seen = arena.reset(self.seeds)?;
         let robot = |(agent, seen)| Robot::at(self.agent(arena, agent)?, seen);
+        let (target, recent_steps) = (arena.model().target_state(), self.comparison.recent_steps);
         let world = |&seed: &u64| World {
             seed,
             tally: Tally::default(),
+            flights: Vec::new(),
+            merit: MeritTally::new(arena.shape(), target as u8, recent_steps),
             snapshot: None,
         };
         Ok(Runs {
@@ -239,8 +250,9 @@ impl Match<'_> {
         let is_last = step + 1 == self.comparison.steps;
         let target = arena.model().target_state();
         let (first_world, shown) = (arena.worlds().start, feed.turn(robots.len()));
-        let crew = (arena.n_robots() / n_agents) as u32;
-        let first_robot = first_world * arena.n_robots() as u32;
+        let n_robots = arena.n_robots();
+        let crew = (n_robots / n_agents) as u32;
+        let first_robot = first_world * n_robots as u32;
         rollout::step(
             robots,
             |robot| robot,
@@ -248,6 +260,7 @@ impl Match<'_> {
             |paths| arena.step(self.seeds, paths, step + 1),
             |index, robot, turn| {
                 let world = &mut worlds[index / n_agents];
+                world.fly(robot, &turn, n_robots);
                 world.look(robot, turn, target, (index % n_agents == 0, is_last));
                 if shown.contains(&index) {
                     let world = first_world + (index / n_agents) as u32;
@@ -268,6 +281,23 @@ impl Match<'_> {
 }
 
 impl World {
+    /// Takes in what an agent's robots flew; with those of the last agent the step is complete.
+    fn fly(&mut self, robot: &Robot, turn: &Turn, n_robots: usize) {
+        let shape = robot.agent.belief().shape();
+        let flown = robot.results().zip(&turn.plans);
+        let flown = flown.map(|(result, plan)| fly(shape, start(result), &plan.moves));
+        self.flights.extend(flown);
+        if self.flights.len() == n_robots {
+            let result = &robot.observation().world;
+            let found = Found {
+                n_hits: result.n_hits,
+                n_burning: result.n_target_cells,
+            };
+            self.merit.update(&self.flights, found, turn.truth.as_ref());
+            self.flights.clear();
+        }
+    }
+
     fn look(
         &mut self,
         robot: &Robot,
@@ -309,7 +339,7 @@ impl World {
 
 impl Contestant {
     fn policy_run(&self, world: World, info: &ServerInfo) -> PolicyRun {
-        let (tally, policy) = (world.tally, &self.policy);
+        let (tally, policy, merit) = (world.tally, &self.policy, world.merit.merit());
         let steps = tally.rewards.len() as u64;
         let mean = |sum: f64| sum / steps.max(1) as f64;
         let share = |n: u64, of: u64| n as f64 / of.max(1) as f64;
@@ -329,6 +359,12 @@ impl Contestant {
             robots: info.n_robots,
             team: self.team.label().into(),
             mean_repeated: share(n_repeated, tally.n_visited_each),
+            steps_to_detection: merit.steps_to_detection,
+            burning_cells_at_detection: merit.burning_cells_at_detection,
+            recent_steps: Some(world.merit.recent_steps()),
+            burning_seen_share: merit.burning_seen_share,
+            front_distance: merit.front_distance,
+            grid_seen_share: Some(merit.grid_seen_share),
             is_added: false,
             rewards: tally.rewards,
         }
@@ -344,34 +380,5 @@ impl Tally {
         self.n_hits += u64::from(result.n_hits);
         self.n_fire += u64::from(result.n_target_cells);
         self.brier += brier;
-    }
-}
-
-/// Brier score of a belief: the mean over all cells of `(p - 1[x = target])^2`, where `p` is the
-/// probability of the state that pays most, which the belief numbers `own`. 0 is perfect; the share
-/// `q` of such cells, told of each cell alike, scores `q (1 - q)`.
-pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize, own: usize) -> f64 {
-    let squared = |(&p, &state): (&f32, &u8)| {
-        let miss = f64::from(p) - f64::from(u8::from(usize::from(state) == target));
-        miss * miss
-    };
-    let sum: f64 = belief.probability(own).iter().zip(truth).map(squared).sum();
-    sum / truth.len() as f64
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use protocol::Shape;
-
-    #[test]
-    fn a_brier_score_is_the_mean_squared_miss() {
-        let shape = Shape::new(1, 4).expect("test shape");
-        let truth = Grid::from_shape_vec((1, 4), vec![2, 0, 1, 0]).expect("test grid");
-        let certain = Belief::from_states(&truth, 3).expect("test states");
-        assert_eq!(brier_score(&certain, &truth, 2, 2), 0.0);
-        let uniform = Belief::uniform(3, shape);
-        let expected = (4.0 / 9.0 + 3.0 / 9.0) / 4.0;
-        assert!((brier_score(&uniform, &truth, 2, 0) - expected).abs() < 1e-6);
     }
 }
