@@ -109,6 +109,34 @@ fn a_comparison_repeats_to_the_bit_on_any_server() {
 }
 
 #[test]
+fn without_hidden_states_what_needs_them_is_empty() {
+    let folder = TempDir::new().expect("a folder");
+    let path = |name: &str| folder.path().join(name);
+    let worlds = "--model wildfire-small --height 12 --width 14 --moves 8 --burn-in 300";
+    let policies = "--policies beam_exploit,coverage";
+    let mut expected = compare_to(&path("truth.csv"), &[worlds, policies]);
+    // Brier score, burning cells seen and distance to the front.
+    for row in &mut expected {
+        assert!(
+            [16, 17].iter().all(|&column| !row[column].is_empty()),
+            "{row:?}"
+        );
+        [8, 16, 17].map(|column| row[column].clear());
+    }
+    let server = Server::start(&format!("{worlds} --worlds 2"));
+    let csv = path("blind.csv");
+    let places = format!(
+        "--csv {} --instance {}",
+        csv.display(),
+        server.instance.name()
+    );
+    let ended = agent(&[WHAT, policies, &places]);
+    assert_eq!(rows(&csv), expected);
+    let told = "no hidden states were published";
+    assert!(ended.stdout.contains(told), "{}", ended.stdout);
+}
+
+#[test]
 fn teams_meet_the_worlds_of_one_robot_and_one_robot_is_each_team() {
     let folder = TempDir::new().expect("a folder");
     let path = |name: &str| folder.path().join(name);

@@ -25,8 +25,6 @@ use std::time::Duration;
 /// The policy of the team that is told the true states.
 const ORACLE: &str = "oracle_beam";
 
-const SHOWS_TRUTH: &str = "invariant: an arena shows hidden states";
-
 /// What is compared.
 #[derive(Debug, Clone)]
 pub struct Comparison {
@@ -91,7 +89,8 @@ struct Tally {
     n_visited_each: u64,
     n_fire: u64,
     planning: Duration,
-    brier: f64,
+    /// Where the hidden states are published.
+    brier: Option<f64>,
 }
 
 /// Runs every policy on every world; `progress` is told of each policy and of each world step.
@@ -197,6 +196,14 @@ impl Match<'_> {
             !(policy.is_decided && team.is_joint() && arena.n_robots() > 1),
             "it decides for one robot: expected --team alone or shared, got {}",
             team.label()
+        );
+        let is_told = matches!(
+            policy.estimator,
+            EstimatorKind::Truth | EstimatorKind::NextTruth
+        );
+        ensure!(
+            arena.shows_truth() || !is_told,
+            "it needs the truth channel: start the server with --publish-truth"
         );
         self.agent(arena, (self.seeds[0], 0)).map(drop)
     }
@@ -312,28 +319,30 @@ impl World {
             return;
         }
         let agent = &robot.agent;
-        let truth = turn.truth.as_ref().expect(SHOWS_TRUTH);
-        let brier = brier_score(agent.belief(), truth, target, agent.target(target));
+        let brier = turn.truth.as_ref().map(|truth| {
+            let own = agent.target(target);
+            brier_score(agent.belief(), truth, target, own)
+        });
         self.tally.add(&robot.observation().world, brier);
         if is_last && agent.policy().estimator.knows_model() {
-            self.snapshot = Some(self.snapshot(robot, turn));
+            self.snapshot = self.snapshot(robot, turn);
         }
     }
 
-    fn snapshot(&self, robot: &Robot, turn: Turn) -> Snapshot {
+    fn snapshot(&self, robot: &Robot, turn: Turn) -> Option<Snapshot> {
         let (agent, observation) = (&robot.agent, robot.observation());
         let (shape, start) = (agent.belief().shape(), turn.before.cell());
         let moves = &turn.plans[0].moves;
         let mut path_cells = vec![start];
         path_cells.extend((1..=moves.len()).map(|n| fly(shape, start, &moves[..n]).end));
-        Snapshot {
+        Some(Snapshot {
             seed: self.seed,
             step: observation.world.step,
-            truth: turn.truth.expect(SHOWS_TRUTH),
+            truth: turn.truth?,
             frame: observation.frame.clone(),
             path_cells,
             belief: agent.belief().clone(),
-        }
+        })
     }
 }
 
@@ -341,6 +350,8 @@ impl Contestant {
     fn policy_run(&self, world: World, info: &ServerInfo) -> PolicyRun {
         let (tally, policy, merit) = (world.tally, &self.policy, world.merit.merit());
         let steps = tally.rewards.len() as u64;
+        let brier = tally.brier;
+        let brier = brier.filter(|_| policy.estimator != EstimatorKind::None);
         let mean = |sum: f64| sum / steps.max(1) as f64;
         let share = |n: u64, of: u64| n as f64 / of.max(1) as f64;
         let n_repeated = tally.n_visited_each - tally.n_visited;
@@ -354,7 +365,7 @@ impl Contestant {
             hit_rate: share(tally.n_hits, tally.n_visited),
             mean_fire_cells: mean(tally.n_fire as f64),
             mean_plan_millis: mean(tally.planning.as_secs_f64() * 1e3),
-            brier: (policy.estimator != EstimatorKind::None).then(|| mean(tally.brier)),
+            brier: brier.map(mean),
             moves: info.n_moves,
             robots: info.n_robots,
             team: self.team.label().into(),
@@ -372,13 +383,13 @@ impl Contestant {
 }
 
 impl Tally {
-    fn add(&mut self, result: &WorldResult, brier: f64) {
+    fn add(&mut self, result: &WorldResult, brier: Option<f64>) {
         self.rewards.push(result.reward as f32);
         self.fire_cells.push(result.n_target_cells as f32);
         self.reward += result.reward;
         self.n_visited += u64::from(result.n_visited);
         self.n_hits += u64::from(result.n_hits);
         self.n_fire += u64::from(result.n_target_cells);
-        self.brier += brier;
+        self.brier = brier.map(|brier| self.brier.unwrap_or_default() + brier);
     }
 }

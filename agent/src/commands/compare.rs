@@ -310,7 +310,9 @@ fn draw_step(directory: &Path, arena: &mut Arena, results: &Results) -> Result<(
         return Ok(());
     }
     let Some(snapshot) = &results.snapshot else {
-        tracing::warn!("no snapshot: no policy among these has a belief of its own");
+        tracing::warn!(
+            "no snapshot: it needs a policy with a belief of its own, and published hidden states"
+        );
         return Ok(());
     };
     let Some(observation) = arena.full_observation(snapshot.seed, snapshot.step)? else {
