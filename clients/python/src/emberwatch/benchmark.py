@@ -44,6 +44,9 @@ _PATHS: Final = "emberwatch/Wildfire-v0"
 
 _DIRECTIONS: Final = np.array(DIRECTIONS, np.int64)
 
+#: A busy machine may keep the hidden states back for longer than a learner would wait, seconds.
+_TIMEOUT: Final = 30.0
+
 #: Keywords of the environment that an evaluation sets itself.
 _SET: Final = ("reward", "num_envs", "max_episode_steps", "autoreset_mode")
 
@@ -136,8 +139,8 @@ def evaluate(
         deterministic: Passed on to Stable-Baselines3.
         batch: Worlds at a time, in the order of the seeds.
         recent_steps: Steps for which a cell counts as seen after a visit, in the figures of merit.
-            Those that need the hidden states are None where a running server does not publish
-            them, or hides its model.
+            Those that need the hidden states are None with `truth=False`, and where a running
+            server does not publish them or hides its model.
         csv: A file to write rows to. Rows of this policy that it has already are kept, and not
             run again; those of other policies are kept. A changed policy needs another name.
         progress: Where to write how far it is; None: nowhere.
@@ -150,6 +153,7 @@ def evaluate(
     chosen = _check(name, seeds, steps, batch, recent_steps, env, keywords)
     act = _acting(policy, deterministic)
     keywords["burn_in"] = burn_in
+    keywords.setdefault("timeout", _TIMEOUT)
     if keywords.setdefault("truth", _publishes(keywords.get("instance"))):
         batch = min(batch, wire.TRUTH_BUFFER)
     if estimator is None:
