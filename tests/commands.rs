@@ -196,8 +196,7 @@ fn a_server_that_does_not_fit_is_refused_with_what_is_missing() {
     check_against(
         "--reveal-model false",
         "run SERVER --world 1 => no such world | worlds 0 to 0
-run SERVER => does not reveal its model | --model FILE
-compare SERVER --policies coverage => comparing needs the hidden states | --publish-truth",
+run SERVER => does not reveal its model | --model FILE",
     );
     check_against(
         "--reveal-model false --publish-truth",
@@ -213,7 +212,8 @@ run SERVER --policy clairvoyant_beam => only `compare` has them",
     );
     check_against(
         "",
-        "run SERVER --policy oracle_beam => oracle_beam | --publish-truth",
+        "run SERVER --policy oracle_beam => oracle_beam | --publish-truth
+compare SERVER --policies coverage,oracle_beam => oracle_beam | --publish-truth",
     );
 }
 

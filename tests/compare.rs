@@ -18,7 +18,9 @@ const WHAT: &str = "compare --seeds 3..5 --steps 5 --shooting-samples 16 --beam-
 const WORLDS: &str = "--height 6 --width 9 --moves 5 --burn-in 60";
 
 const HEADER: &str = "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
-                      mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated";
+                      mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated,\
+                      steps_to_detection,burning_cells_at_detection,recent_steps,\
+                      burning_seen_share,front_distance,grid_seen_share";
 
 fn agent(arguments: &[&str]) -> Ended {
     let words = arguments.iter().flat_map(|flags| flags.split_whitespace());
@@ -35,7 +37,7 @@ fn rows(path: &Path) -> Vec<Vec<String>> {
     assert_eq!(lines.next(), Some(HEADER));
     let rows = lines.map(|line| {
         let mut fields: Vec<String> = line.split(',').map(String::from).collect();
-        assert_eq!(fields.len(), 14, "{line}");
+        assert_eq!(fields.len(), 20, "{line}");
         let millis: f64 = fields.remove(8).parse().expect("a time");
         assert!(millis >= 0.0);
         fields
@@ -104,6 +106,34 @@ fn a_comparison_repeats_to_the_bit_on_any_server() {
     }
     let other_seed = compare_to(&path("seed.csv"), &[WORLDS, "--agent-seed 5"]);
     assert_ne!(other_seed, first, "planners draw from the agent's seed");
+}
+
+#[test]
+fn without_hidden_states_what_needs_them_is_empty() {
+    let folder = TempDir::new().expect("a folder");
+    let path = |name: &str| folder.path().join(name);
+    let worlds = "--model wildfire-small --height 12 --width 14 --moves 8 --burn-in 300";
+    let policies = "--policies beam_exploit,coverage";
+    let mut expected = compare_to(&path("truth.csv"), &[worlds, policies]);
+    // Brier score, burning cells seen and distance to the front.
+    for row in &mut expected {
+        assert!(
+            [16, 17].iter().all(|&column| !row[column].is_empty()),
+            "{row:?}"
+        );
+        [8, 16, 17].map(|column| row[column].clear());
+    }
+    let server = Server::start(&format!("{worlds} --worlds 2"));
+    let csv = path("blind.csv");
+    let places = format!(
+        "--csv {} --instance {}",
+        csv.display(),
+        server.instance.name()
+    );
+    let ended = agent(&[WHAT, policies, &places]);
+    assert_eq!(rows(&csv), expected);
+    let told = "no hidden states were published";
+    assert!(ended.stdout.contains(told), "{}", ended.stdout);
 }
 
 #[test]

@@ -33,7 +33,8 @@ const LEASE: Duration = Duration::from_secs(3600);
 pub struct Arena {
     instance: Instance,
     client: Client,
-    truth: TruthFeed,
+    /// Where the hidden states are published.
+    truth: Option<TruthFeed>,
     model: Model,
     main: Range<u32>,
     scouts: Range<u32>,
@@ -66,14 +67,13 @@ impl Arena {
         };
         let client = Client::acquire(instance, &claim)?;
         let info = client.info();
-        ensure!(
-            info.publish_truth,
-            unfit("the hidden states, for scores: --publish-truth")
-        );
         let model = info.model.as_ref();
         let model = model.with_context(|| unfit("the model, for filters: --reveal-model true"))?;
         let model = Model::from_toml(model)?;
-        let truth = TruthFeed::open(instance, client.shape())?;
+        let truth = info
+            .publish_truth
+            .then(|| TruthFeed::open(instance, client.shape()));
+        let truth = truth.transpose()?;
         Ok(Self {
             instance: instance.clone(),
             client,
@@ -105,6 +105,11 @@ impl Arena {
     /// What the server said of itself.
     pub fn info(&self) -> &ServerInfo {
         self.client.info()
+    }
+
+    /// Whether the hidden states are published.
+    pub fn shows_truth(&self) -> bool {
+        self.truth.is_some()
     }
 
     /// Number of main worlds: how many seeds are run at a time.
@@ -139,7 +144,7 @@ impl Arena {
         };
         let main: Vec<WorldSeed> = orders(self.main.start).collect();
         self.client.reset(&main)?;
-        let truth = self.truth.states(self.range(&self.main, seeds), seeds, 0)?;
+        let truth = self.states(self.range(&self.main, seeds), seeds, 0)?;
         if !self.scouts.is_empty() {
             let scouts: Vec<WorldSeed> = orders(self.scouts.start).collect();
             self.client.reset(&scouts)?;
@@ -153,17 +158,22 @@ impl Arena {
     pub fn step(&mut self, seeds: &[u64], paths: &[Vec<Move>], step: u64) -> Result<Vec<Seen>> {
         let worlds = self.range(&self.main, seeds);
         let observations = self.client.step(self.robots(&worlds), paths)?;
-        let truth = self.truth.states(worlds, seeds, step)?;
+        let truth = self.states(worlds, seeds, step)?;
         Ok(self.seen(observations, &truth))
     }
 
     /// The hidden states at `step` before the main worlds get there, from the scouts.
+    ///
+    /// # Errors
+    /// Also where they are not published.
     pub fn foresee(&mut self, seeds: &[u64], step: u64) -> Result<Vec<Grid<u8>>> {
         let worlds = self.range(&self.scouts, seeds);
         let robots = self.robots(&worlds);
         let paths = vec![self.any_path(); robots.len()];
         self.client.step(robots, &paths)?;
-        self.truth.states(worlds, seeds, step)
+        let states = self.states(worlds, seeds, step)?;
+        let states = states.into_iter().collect::<Option<_>>();
+        states.context("scouts: expected published hidden states, got none")
     }
 
     /// What a robot that sees every cell would have seen of a seed's world at a step, at least 1;
@@ -210,6 +220,20 @@ impl Arena {
         registry::agent(policy, config, task)
     }
 
+    /// The hidden states of worlds at a step, where they are published.
+    fn states(
+        &self,
+        worlds: Range<u32>,
+        seeds: &[u64],
+        step: u64,
+    ) -> Result<Vec<Option<Grid<u8>>>> {
+        let Some(truth) = &self.truth else {
+            return Ok(vec![None; worlds.len()]);
+        };
+        let states = truth.states(worlds, seeds, step)?;
+        Ok(states.into_iter().map(Some).collect())
+    }
+
     fn any_path(&self) -> Vec<Move> {
         vec![Move::Up; self.info().n_moves]
     }
@@ -223,11 +247,11 @@ impl Arena {
         worlds.start * team..worlds.end * team
     }
 
-    fn seen(&self, observations: Vec<Observation>, truths: &[Grid<u8>]) -> Vec<Seen> {
+    fn seen(&self, observations: Vec<Observation>, truths: &[Option<Grid<u8>>]) -> Vec<Seen> {
         let mut observations = observations.into_iter();
         let agents = truths.iter().flat_map(|truth| vec![truth; self.n_agents()]);
         let seen = agents.map(|truth| Seen {
-            truth: Some(truth.clone()),
+            truth: truth.clone(),
             ..Seen::new(observations.by_ref().take(self.crew))
         });
         seen.collect()

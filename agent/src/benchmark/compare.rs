@@ -1,6 +1,8 @@
 //! The benchmark: every policy on the same worlds, scored against the hidden states.
 
 use crate::benchmark::arena::Arena;
+use crate::benchmark::brier::brier_score;
+use crate::benchmark::merit::{Found, MeritTally};
 use crate::benchmark::report::{PolicyRun, Snapshot};
 use crate::benchmark::team::Team;
 use crate::config::AgentConfig;
@@ -10,19 +12,18 @@ use crate::learning::learned::Learned;
 use crate::planning::policy::{EstimatorKind, Policy};
 use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Turn};
+use crate::server::client::start;
 use crate::server::feed::Feed;
 use anyhow::{Context, Result, ensure};
+use protocol::Model;
 use protocol::control::ServerInfo;
 use protocol::message::WorldResult;
-use protocol::path::fly;
-use protocol::{Grid, Model};
+use protocol::path::{Flight, fly};
 use std::ops::Range;
 use std::time::Duration;
 
 /// The policy of the team that is told the true states.
 const ORACLE: &str = "oracle_beam";
-
-const SHOWS_TRUTH: &str = "invariant: an arena shows hidden states";
 
 /// What is compared.
 #[derive(Debug, Clone)]
@@ -34,6 +35,8 @@ pub struct Comparison {
     pub seeds: Range<u64>,
     /// Scored steps of each world.
     pub steps: u64,
+    /// Steps for which a cell counts as seen after a visit, at least 1.
+    pub recent_steps: u32,
     pub config: AgentConfig,
     /// What was learned, for policies that act on it.
     pub learned: Learned,
@@ -68,6 +71,9 @@ struct Runs {
 struct World {
     seed: u64,
     tally: Tally,
+    /// This step's, until all robots have flown.
+    flights: Vec<Flight>,
+    merit: MeritTally,
     snapshot: Option<Snapshot>,
 }
 
@@ -83,7 +89,8 @@ struct Tally {
     n_visited_each: u64,
     n_fire: u64,
     planning: Duration,
-    brier: f64,
+    /// Where the hidden states are published.
+    brier: Option<f64>,
 }
 
 /// Runs every policy on every world; `progress` is told of each policy and of each world step.
@@ -190,6 +197,14 @@ impl Match<'_> {
             "it decides for one robot: expected --team alone or shared, got {}",
             team.label()
         );
+        let is_told = matches!(
+            policy.estimator,
+            EstimatorKind::Truth | EstimatorKind::NextTruth
+        );
+        ensure!(
+            arena.shows_truth() || !is_told,
+            "it needs the truth channel: start the server with --publish-truth"
+        );
         self.agent(arena, (self.seeds[0], 0)).map(drop)
     }
 
@@ -214,9 +229,12 @@ impl Match<'_> {
         let agents = agents.flat_map(|&seed| (0..n_agents).map(move |number| (seed, number)));
         let seen = arena.reset(self.seeds)?;
         let robot = |(agent, seen)| Robot::at(self.agent(arena, agent)?, seen);
+        let (target, recent_steps) = (arena.model().target_state(), self.comparison.recent_steps);
         let world = |&seed: &u64| World {
             seed,
             tally: Tally::default(),
+            flights: Vec::new(),
+            merit: MeritTally::new(arena.shape(), target as u8, recent_steps),
             snapshot: None,
         };
         Ok(Runs {
@@ -239,8 +257,9 @@ impl Match<'_> {
         let is_last = step + 1 == self.comparison.steps;
         let target = arena.model().target_state();
         let (first_world, shown) = (arena.worlds().start, feed.turn(robots.len()));
-        let crew = (arena.n_robots() / n_agents) as u32;
-        let first_robot = first_world * arena.n_robots() as u32;
+        let n_robots = arena.n_robots();
+        let crew = (n_robots / n_agents) as u32;
+        let first_robot = first_world * n_robots as u32;
         rollout::step(
             robots,
             |robot| robot,
@@ -248,6 +267,7 @@ impl Match<'_> {
             |paths| arena.step(self.seeds, paths, step + 1),
             |index, robot, turn| {
                 let world = &mut worlds[index / n_agents];
+                world.fly(robot, &turn, n_robots);
                 world.look(robot, turn, target, (index % n_agents == 0, is_last));
                 if shown.contains(&index) {
                     let world = first_world + (index / n_agents) as u32;
@@ -268,6 +288,23 @@ impl Match<'_> {
 }
 
 impl World {
+    /// Takes in what an agent's robots flew; with those of the last agent the step is complete.
+    fn fly(&mut self, robot: &Robot, turn: &Turn, n_robots: usize) {
+        let shape = robot.agent.belief().shape();
+        let flown = robot.results().zip(&turn.plans);
+        let flown = flown.map(|(result, plan)| fly(shape, start(result), &plan.moves));
+        self.flights.extend(flown);
+        if self.flights.len() == n_robots {
+            let result = &robot.observation().world;
+            let found = Found {
+                n_hits: result.n_hits,
+                n_burning: result.n_target_cells,
+            };
+            self.merit.update(&self.flights, found, turn.truth.as_ref());
+            self.flights.clear();
+        }
+    }
+
     fn look(
         &mut self,
         robot: &Robot,
@@ -282,35 +319,39 @@ impl World {
             return;
         }
         let agent = &robot.agent;
-        let truth = turn.truth.as_ref().expect(SHOWS_TRUTH);
-        let brier = brier_score(agent.belief(), truth, target, agent.target(target));
+        let brier = turn.truth.as_ref().map(|truth| {
+            let own = agent.target(target);
+            brier_score(agent.belief(), truth, target, own)
+        });
         self.tally.add(&robot.observation().world, brier);
         if is_last && agent.policy().estimator.knows_model() {
-            self.snapshot = Some(self.snapshot(robot, turn));
+            self.snapshot = self.snapshot(robot, turn);
         }
     }
 
-    fn snapshot(&self, robot: &Robot, turn: Turn) -> Snapshot {
+    fn snapshot(&self, robot: &Robot, turn: Turn) -> Option<Snapshot> {
         let (agent, observation) = (&robot.agent, robot.observation());
         let (shape, start) = (agent.belief().shape(), turn.before.cell());
         let moves = &turn.plans[0].moves;
         let mut path_cells = vec![start];
         path_cells.extend((1..=moves.len()).map(|n| fly(shape, start, &moves[..n]).end));
-        Snapshot {
+        Some(Snapshot {
             seed: self.seed,
             step: observation.world.step,
-            truth: turn.truth.expect(SHOWS_TRUTH),
+            truth: turn.truth?,
             frame: observation.frame.clone(),
             path_cells,
             belief: agent.belief().clone(),
-        }
+        })
     }
 }
 
 impl Contestant {
     fn policy_run(&self, world: World, info: &ServerInfo) -> PolicyRun {
-        let (tally, policy) = (world.tally, &self.policy);
+        let (tally, policy, merit) = (world.tally, &self.policy, world.merit.merit());
         let steps = tally.rewards.len() as u64;
+        let brier = tally.brier;
+        let brier = brier.filter(|_| policy.estimator != EstimatorKind::None);
         let mean = |sum: f64| sum / steps.max(1) as f64;
         let share = |n: u64, of: u64| n as f64 / of.max(1) as f64;
         let n_repeated = tally.n_visited_each - tally.n_visited;
@@ -324,11 +365,17 @@ impl Contestant {
             hit_rate: share(tally.n_hits, tally.n_visited),
             mean_fire_cells: mean(tally.n_fire as f64),
             mean_plan_millis: mean(tally.planning.as_secs_f64() * 1e3),
-            brier: (policy.estimator != EstimatorKind::None).then(|| mean(tally.brier)),
+            brier: brier.map(mean),
             moves: info.n_moves,
             robots: info.n_robots,
             team: self.team.label().into(),
             mean_repeated: share(n_repeated, tally.n_visited_each),
+            steps_to_detection: merit.steps_to_detection,
+            burning_cells_at_detection: merit.burning_cells_at_detection,
+            recent_steps: Some(world.merit.recent_steps()),
+            burning_seen_share: merit.burning_seen_share,
+            front_distance: merit.front_distance,
+            grid_seen_share: Some(merit.grid_seen_share),
             is_added: false,
             rewards: tally.rewards,
         }
@@ -336,42 +383,13 @@ impl Contestant {
 }
 
 impl Tally {
-    fn add(&mut self, result: &WorldResult, brier: f64) {
+    fn add(&mut self, result: &WorldResult, brier: Option<f64>) {
         self.rewards.push(result.reward as f32);
         self.fire_cells.push(result.n_target_cells as f32);
         self.reward += result.reward;
         self.n_visited += u64::from(result.n_visited);
         self.n_hits += u64::from(result.n_hits);
         self.n_fire += u64::from(result.n_target_cells);
-        self.brier += brier;
-    }
-}
-
-/// Brier score of a belief: the mean over all cells of `(p - 1[x = target])^2`, where `p` is the
-/// probability of the state that pays most, which the belief numbers `own`. 0 is perfect; the share
-/// `q` of such cells, told of each cell alike, scores `q (1 - q)`.
-pub fn brier_score(belief: &Belief, truth: &Grid<u8>, target: usize, own: usize) -> f64 {
-    let squared = |(&p, &state): (&f32, &u8)| {
-        let miss = f64::from(p) - f64::from(u8::from(usize::from(state) == target));
-        miss * miss
-    };
-    let sum: f64 = belief.probability(own).iter().zip(truth).map(squared).sum();
-    sum / truth.len() as f64
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use protocol::Shape;
-
-    #[test]
-    fn a_brier_score_is_the_mean_squared_miss() {
-        let shape = Shape::new(1, 4).expect("test shape");
-        let truth = Grid::from_shape_vec((1, 4), vec![2, 0, 1, 0]).expect("test grid");
-        let certain = Belief::from_states(&truth, 3).expect("test states");
-        assert_eq!(brier_score(&certain, &truth, 2, 2), 0.0);
-        let uniform = Belief::uniform(3, shape);
-        let expected = (4.0 / 9.0 + 3.0 / 9.0) / 4.0;
-        assert!((brier_score(&uniform, &truth, 2, 0) - expected).abs() < 1e-6);
+        self.brier = brier.map(|brier| self.brier.unwrap_or_default() + brier);
     }
 }

@@ -5,6 +5,7 @@ use super::worlds::WorldFlags;
 use agent::acting::registry::needs_checkpoint;
 use agent::benchmark::arena::Arena;
 use agent::benchmark::compare::{Comparison, Results, compare};
+use agent::benchmark::merit::RECENT_STEPS;
 use agent::benchmark::report::added::{check_settings, check_worlds, read_csv};
 use agent::benchmark::report::{
     PolicyRun, draw_ladder, draw_rewards, draw_snapshot, draw_teams, figures::FIRE_CELLS_PER_STEP,
@@ -66,6 +67,9 @@ pub struct CompareCommand {
     /// Write rewards step by step for TensorBoard into this directory, a run of each policy
     #[arg(long, value_name = "DIR")]
     tensorboard: Option<PathBuf>,
+    /// Steps for which a cell counts as seen after a visit, in the figures of merit
+    #[arg(long, value_name = "STEPS", default_value_t = RECENT_STEPS, value_parser = clap::value_parser!(u32).range(1..))]
+    recent_steps: u32,
     #[command(flatten)]
     worlds: WorldFlags,
     #[command(flatten)]
@@ -101,6 +105,7 @@ impl CompareCommand {
                 teams: self.team.clone(),
                 seeds: self.worlds.seeds.clone(),
                 steps: self.worlds.steps,
+                recent_steps: self.recent_steps,
                 config: config.clone(),
                 learned: learned.clone(),
             };
@@ -146,6 +151,7 @@ impl CompareCommand {
         let policies = comparison.policies.iter();
         let policies: Vec<&str> = policies.map(|policy| &*policy.name).collect();
         let (seeds, steps) = (&comparison.seeds, comparison.steps);
+        let steps = (steps, comparison.recent_steps);
         check_settings(&added, &policies, seeds, steps, n_moves).context("--add")?;
         Ok(added)
     }
@@ -304,7 +310,9 @@ fn draw_step(directory: &Path, arena: &mut Arena, results: &Results) -> Result<(
         return Ok(());
     }
     let Some(snapshot) = &results.snapshot else {
-        tracing::warn!("no snapshot: no policy among these has a belief of its own");
+        tracing::warn!(
+            "no snapshot: it needs a policy with a belief of its own, and published hidden states"
+        );
         return Ok(());
     };
     let Some(observation) = arena.full_observation(snapshot.seed, snapshot.step)? else {

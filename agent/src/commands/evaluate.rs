@@ -6,6 +6,7 @@ use super::worlds::WorldFlags;
 use agent::benchmark::arena::Arena;
 use agent::benchmark::compare::Comparison;
 use agent::benchmark::evaluate::{Examination, Marks, examine, score_of_frequencies};
+use agent::benchmark::merit::RECENT_STEPS;
 use agent::benchmark::report::{render_table, statistics::Estimate, write_csv};
 use agent::benchmark::team::Team;
 use agent::config::{AgentConfig, AgentFlags};
@@ -101,6 +102,7 @@ impl EvaluateCommand {
             teams: vec![Team::Alone],
             seeds: self.worlds.seeds.clone(),
             steps: self.worlds.steps,
+            recent_steps: RECENT_STEPS,
             config,
             learned,
         };

@@ -84,6 +84,14 @@ pub fn cell(robot: &RobotResult) -> Cell {
     }
 }
 
+/// Where a robot's last path began.
+pub fn start(robot: &RobotResult) -> Cell {
+    Cell {
+        row: robot.start_row as usize,
+        col: robot.start_col as usize,
+    }
+}
+
 impl Client {
     /// Acquires robots, which stay where they are, and observes them.
     pub fn acquire_and_observe(

@@ -48,6 +48,12 @@ pub fn run(policy: &str, estimator: &str, world_seed: u64, mean_reward: f64) -> 
         robots: 1,
         team: "alone".into(),
         mean_repeated: 0.0,
+        steps_to_detection: None,
+        burning_cells_at_detection: None,
+        recent_steps: None,
+        burning_seen_share: None,
+        front_distance: None,
+        grid_seen_share: None,
         is_added: false,
         rewards: Vec::new(),
     }

@@ -104,7 +104,8 @@ fn rows_of_files_without_teams_are_of_a_robot_alone() {
     );
     let text = std::fs::read_to_string(&path).expect("readable");
     let without = |line: &str| {
-        line.rsplitn(4, ',')
+        // Without team and figures of merit.
+        line.rsplitn(10, ',')
             .last()
             .map(String::from)
             .expect("a row")
@@ -117,7 +118,7 @@ fn rows_of_files_without_teams_are_of_a_robot_alone() {
         (1, 1, "alone")
     );
     assert_eq!(runs[0].mean_repeated, 0.0);
-    check_settings(&runs, &["other"], &(0..1), 4, 64).expect("the same worlds");
+    check_settings(&runs, &["other"], &(0..1), (4, 10), 64).expect("the same worlds");
 }
 
 #[test]
@@ -133,6 +134,81 @@ fn each_team_has_a_folder_of_events() {
     assert_eq!(
         (&*names[0], &*names[5]),
         ("beam-alone_1".as_ref(), "beam-joint_4".as_ref())
+    );
+}
+
+/// Three worlds: `beam` sees a half, 0.7 and 0.9 of the fire and misses it in none, `coverage` sees 0.3 of it and
+/// detects it in two.
+fn with_merit() -> Vec<PolicyRun> {
+    let mut runs = three_policies();
+    for (run, seen) in runs[3..6].iter_mut().zip([0.5, 0.7, 0.9]) {
+        run.steps_to_detection = Some(run.world_seed);
+        run.burning_cells_at_detection = Some(100);
+        run.burning_seen_share = Some(seen);
+        run.front_distance = Some(12.5);
+    }
+    for run in &mut runs[..3] {
+        run.steps_to_detection = (run.world_seed > 1).then_some(40);
+        run.burning_cells_at_detection = run.steps_to_detection.map(|_| 300);
+        run.burning_seen_share = Some(0.3);
+    }
+    for run in &mut runs[..6] {
+        (run.recent_steps, run.grid_seen_share) = (Some(25), Some(0.5));
+    }
+    runs
+}
+
+#[test]
+fn figures_of_merit_say_in_how_many_worlds_fire_was_detected() {
+    let table = render_table(&with_merit(), "coverage");
+    assert!(table.contains("in the last 25 steps"), "{table}");
+    // 1, 2 and 3 steps: sqrt(2 / 2 / 3) = 0.6. Seen 50, 70, 90 %: sqrt(800 / 2 / 3) = 11.5, also less 30 %.
+    assert_eq!(
+        row(&table, "beam", 1).join(" "),
+        "beam 3 of 3 2.0 ± 0.6 100.0 ± 0.0 70.0 ± 11.5 +40.0 ± 11.5 12.5 ± 0.0 50.0 ± 0.0"
+    );
+    // The world without a detection has no time; without a front there is no distance.
+    assert_eq!(
+        row(&table, "coverage", 1).join(" "),
+        "coverage 2 of 3 40.0 ± 0.0 300.0 ± 0.0 30.0 ± 0.0 baseline - 50.0 ± 0.0"
+    );
+    // Rows of an old file.
+    assert_eq!(row(&table, "oracle_beam", 1)[1..], ["-"; 7]);
+    assert!(!render_table(&three_policies(), "coverage").contains("merit"));
+}
+
+#[test]
+fn figures_of_merit_say_that_no_hidden_states_were_published() {
+    let mut runs = with_merit();
+    assert!(!render_table(&runs, "coverage").contains("no hidden states"));
+    for run in &mut runs {
+        (run.burning_seen_share, run.front_distance) = (None, None);
+    }
+    let table = render_table(&runs, "coverage");
+    assert!(table.contains("no hidden states were published"), "{table}");
+    assert_eq!(row(&table, "beam", 1)[4..7], ["-", "-", "-"]);
+}
+
+#[test]
+fn figures_of_merit_fit_a_terminal() {
+    let mut runs = with_merit();
+    for run in &mut runs {
+        run.policy = "shooting_exploit_only".into();
+        run.steps_to_detection = run.steps_to_detection.map(|steps| 500 * steps);
+        run.burning_cells_at_detection = Some(1000 * run.world_seed as u32);
+    }
+    let table = render_table(&runs, "coverage");
+    let merit = table.split("\n\n").nth(2).expect("the third part");
+    assert!(
+        merit.lines().all(|line| line.chars().count() <= 120),
+        "{merit}"
+    );
+    assert!(
+        table
+            .split("\n\n")
+            .nth(3)
+            .is_some_and(|part| part.starts_with('|')),
+        "{table}"
     );
 }
 
@@ -200,7 +276,9 @@ fn csv_rows_read_back_as_the_same_numbers() {
     let text = std::fs::read_to_string(&path).expect("readable");
     assert!(text.starts_with(
         "policy,estimator,world_seed,steps,mean_reward,mean_distinct_cells,hit_rate,\
-         mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated\n"
+         mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated,\
+         steps_to_detection,burning_cells_at_detection,recent_steps,burning_seen_share,front_distance,\
+         grid_seen_share\n"
     ));
     let mut reader = csv::Reader::from_reader(text.as_bytes());
     let rows: Vec<_> = reader.records().map(|row| row.expect("a row")).collect();

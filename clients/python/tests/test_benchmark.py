@@ -20,6 +20,14 @@ from emberwatch.programs import find
 
 WORLDS: dict[str, Any] = {"height": 7, "width": 9, "n_moves": 6, "model": LIVELY, "burn_in": 60}
 SCALE: dict[str, Any] = {"seeds": range(3, 7), "steps": 12, "progress": None}
+MERIT = (
+    "steps_to_detection",
+    "burning_cells_at_detection",
+    "recent_steps",
+    "burning_seen_share",
+    "front_distance",
+    "grid_seen_share",
+)
 
 
 def walk(seed: int) -> Callable[[Any], NDArray[np.int64]]:
@@ -62,10 +70,12 @@ def test_random_moves_score_as_a_random_walk(tmp_path: Path) -> None:
         assert error > 0 and abs(difference.mean()) < 4 * error, value
 
 
+@pytest.mark.parametrize(("robots", "recent_steps"), [(1, 10), (3, 2)])
 def test_paths_flown_again_score_the_same_to_the_digit(
-    tmp_path: Path, server: Callable[..., Server]
+    tmp_path: Path, server: Callable[..., Server], robots: int, recent_steps: int
 ) -> None:
     settings = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn_in": 60}
+    settings["robots"] = robots
     running = server(worlds=5, publish_truth="true", coverage="client", **settings)
     file = tmp_path / "beam.recording"
     recorder = subprocess.Popen(
@@ -76,21 +86,27 @@ def test_paths_flown_again_score_the_same_to_the_digit(
             while not client.status().n_observers:
                 pass
         csv = tmp_path / "theirs.csv"
-        done = compare("--policies=beam_exploit", f"--instance={running.instance}", f"--csv={csv}")
+        flags = [f"--instance={running.instance}", f"--csv={csv}", "--team=joint"]
+        flags += [f"--recent-steps={recent_steps}"]
+        done = compare("--policies=beam_exploit", *flags)
         assert done.returncode == 0, done.stderr
     finally:
         recorder.terminate()
         recorder.wait(20)
     samples = (record.sample for record in recording.read(file))
     frames = [sample for sample in samples if isinstance(sample, emberwatch.Frame)]
-    paths = {(frame.result.seed, frame.result.step): frame.robots[0].path for frame in frames}
+    paths = {
+        (frame.result.seed, frame.result.step): [robot.path for robot in frame.robots]
+        for frame in frames
+    }
     steps = iter(range(1, 13))
 
     def again(_: Any) -> NDArray[np.int64]:
         step = next(steps)
-        return np.array([paths[seed, step] for seed in range(3, 7)], np.int64)
+        return np.concatenate([paths[seed, step] for seed in range(3, 7)]).astype(np.int64)
 
-    rows = evaluate(again, name="again", env=WILDFIRE, **{**WORLDS, **SCALE})
+    keywords = {**WORLDS, **SCALE, "robots": robots, "recent_steps": recent_steps}
+    rows = evaluate(again, name="again", env=WILDFIRE, **keywords)
     theirs = read(csv)
     assert len(rows) == len(theirs) == 4
     for mine, other in zip(rows, theirs, strict=True):
@@ -102,8 +118,10 @@ def test_paths_flown_again_score_the_same_to_the_digit(
             "hit_rate",
             "mean_fire_cells",
             "moves",
+            *MERIT,
         ):
             assert getattr(mine, value) == getattr(other, value), value
+        assert None not in [getattr(mine, value) for value in MERIT]
 
 
 def test_rows_stand_beside_the_ladder(tmp_path: Path) -> None:
@@ -128,6 +146,7 @@ def test_rows_stand_beside_the_ladder(tmp_path: Path) -> None:
         ),
         ({"steps": 11}, "expected steps 12, as those compared have, got 11"),
         ({"n_moves": 5}, "expected moves of a path 6, as those compared have, got 5"),
+        ({"recent_steps": 9}, "expected --recent-steps 10, as those compared have, got 9"),
         ({"burn_in": 61}, "burning cells of world 3 (model, grid, burn-in)"),
         ({"width": 8}, "burning cells of world 3 (model, grid, burn-in)"),
         ({"name": "random_walk"}, 'policy "random_walk": expected a name that no policy compared'),
@@ -239,6 +258,7 @@ def test_a_summary_says_which_worlds_are_for_tests() -> None:
         ({"seeds": [-1]}, "seed: expected an integer"),
         ({"steps": 0}, "steps: expected at least 1, got 0"),
         ({"batch": 0}, "batch: expected at least 1, got 0"),
+        ({"recent_steps": 0}, "recent_steps: expected at least 1, got 0"),
         ({"env": "CartPole-v1"}, f"env: expected '{MOVES}' or '{WILDFIRE}', got 'CartPole-v1'"),
     ],
     ids=str,
@@ -253,6 +273,23 @@ def test_what_cannot_be_evaluated_is_named(changes: dict[str, Any], problem: str
 def test_a_csv_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(InvalidArgumentError, match="csv: expected a file, got the folder"):
         score(tmp_path)
+
+
+@pytest.mark.parametrize("flags", [{}, {"publish_truth": "true", "reveal_model": "false"}], ids=str)
+def test_without_hidden_states_or_their_names_the_other_figures_are_there(
+    tmp_path: Path, server: Callable[..., Server], flags: dict[str, str]
+) -> None:
+    settings = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn_in": 60}
+    running = server(worlds=4, **settings, **flags)
+    keywords = {**SCALE, "burn_in": 60, "instance": running.instance, "observation": "frame"}
+    rows = evaluate(walk(0), name="mine", csv=tmp_path / "mine.csv", **keywords)
+    whole = score()
+    of_truth = ("burning_seen_share", "front_distance")
+    for row, other in zip(rows, whole, strict=True):
+        assert [getattr(row, value) for value in of_truth] == [None, None]
+        for value in set(MERIT) - {*of_truth}:
+            assert getattr(row, value) == getattr(other, value), value
+    assert read(tmp_path / "mine.csv") == rows
 
 
 def test_worlds_of_teams_are_not_taken_for_worlds_of_one_robot(

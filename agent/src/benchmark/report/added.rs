@@ -31,7 +31,7 @@ pub fn check_settings(
     added: &[PolicyRun],
     policies: &[&str],
     seeds: &Range<u64>,
-    steps: u64,
+    (steps, recent_steps): (u64, u32),
     moves: usize,
 ) -> Result<()> {
     for group in groups(added) {
@@ -52,6 +52,9 @@ pub fn check_settings(
         for run in &group.runs {
             same(policy, "steps", steps, run.steps)?;
             same(policy, "moves of a path", moves, run.moves)?;
+            if let Some(got) = run.recent_steps {
+                same(policy, "--recent-steps", recent_steps, got)?;
+            }
         }
     }
     Ok(())

@@ -6,7 +6,9 @@
 pub mod added;
 pub mod events;
 pub mod figures;
+mod merit;
 mod number;
+mod plain_table;
 mod policy_run;
 mod rewards;
 pub mod statistics;

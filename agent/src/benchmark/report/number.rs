@@ -27,6 +27,17 @@ pub fn with_error(estimate: Option<Estimate>, decimals: usize) -> String {
     }
 }
 
+/// As [`with_error`], with the sign of what is not negative.
+pub(super) fn signed(estimate: Option<Estimate>, decimals: usize) -> String {
+    let text = with_error(estimate, decimals);
+    let sign = if estimate.is_some() && !text.starts_with('-') {
+        "+"
+    } else {
+        ""
+    };
+    format!("{sign}{text}")
+}
+
 /// Fixed decimals, without the sign of a negative zero.
 pub fn number(value: f64, decimals: usize) -> String {
     let text = format!("{value:.decimals$}");

@@ -40,6 +40,19 @@ pub struct PolicyRun {
     /// Share of the visits to distinct cells that a teammate made in the same step, in `0..1`.
     #[serde(default)]
     pub mean_repeated: f64,
+    /// Steps until a robot first visited a burning cell; `None`: never. This and what follows is
+    /// defined in `docs/figures-of-merit.md`, and missing in old files.
+    pub steps_to_detection: Option<u64>,
+    /// Burning cells of the world in that step.
+    pub burning_cells_at_detection: Option<u32>,
+    /// Steps for which a cell counts as seen after a visit.
+    pub recent_steps: Option<u32>,
+    /// Share of the burning cells that were seen in the last steps.
+    pub burning_seen_share: Option<f64>,
+    /// Moves from the nearest robot to the nearest burning cell that was not.
+    pub front_distance: Option<f64>,
+    /// Share of the grid that was ever seen.
+    pub grid_seen_share: Option<f64>,
     /// Whether it comes from a file.
     #[serde(skip)]
     pub is_added: bool,
@@ -87,6 +100,12 @@ impl Group<'_> {
     pub(super) fn by_seed(&self, value: impl Fn(&PolicyRun) -> f64) -> BTreeMap<u64, f64> {
         let pair = |run: &&PolicyRun| (run.world_seed, value(run));
         self.runs.iter().map(pair).collect()
+    }
+
+    /// By seed, of the runs that have the value.
+    pub(super) fn known(&self, value: impl Fn(&PolicyRun) -> Option<f64>) -> BTreeMap<u64, f64> {
+        let pair = |run: &&PolicyRun| Some((run.world_seed, value(run)?));
+        self.runs.iter().filter_map(pair).collect()
     }
 
     /// Whether there is more than a robot alone in its world.

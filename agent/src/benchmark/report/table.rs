@@ -1,15 +1,17 @@
 //! The comparison as text: fits a terminal, and pastes into Markdown as a table.
 
-use crate::benchmark::report::number::{NOTHING, decimals, number, with_error};
+use crate::benchmark::report::merit::merit_table;
+use crate::benchmark::report::number::{NOTHING, decimals, number, signed, with_error};
+use crate::benchmark::report::plain_table::plain_table;
 use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun, groups};
 use crate::benchmark::report::statistics::{Estimate, median, ratio_of_means};
-use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+use comfy_table::Table;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// The policy that others are given as a percentage of: the best planner fed with the true state.
 const ORACLE: &str = "oracle_beam";
 
-/// Every policy over all worlds, then over the worlds with less and with more fire.
+/// Every policy over all worlds, its figures of merit, then the worlds with less and with more fire.
 ///
 /// Policies stand in the order given; `baseline` names the one that paired differences are to.
 pub fn render_table(runs: &[PolicyRun], baseline: &str) -> String {
@@ -19,8 +21,10 @@ pub fn render_table(runs: &[PolicyRun], baseline: &str) -> String {
     }
     let heading = heading(runs, &groups, baseline);
     let summary = summary(&groups, baseline);
+    let merit = merit_table(&groups, baseline);
+    let merit = merit.map_or(String::new(), |table| format!("{table}\n\n"));
     let split = split_by_fire(runs, &groups);
-    format!("{heading}\n\n{summary}\n\n{split}\n")
+    format!("{heading}\n\n{summary}\n\n{merit}{split}\n")
 }
 
 fn heading(runs: &[PolicyRun], groups: &[Group<'_>], baseline: &str) -> String {
@@ -201,30 +205,6 @@ fn split_table(groups: &[Group<'_>], less: &[(f64, u64)], more: &[(f64, u64)]) -
         table.add_row(row);
     }
     table
-}
-
-/// A Markdown table; all but the columns of names are right-aligned.
-fn plain_table(header: &[&str]) -> Table {
-    let mut table = Table::new();
-    table
-        .load_preset(presets::ASCII_MARKDOWN)
-        .set_content_arrangement(ContentArrangement::Disabled)
-        .set_header(header);
-    let numbers = table.column_iter_mut().zip(header);
-    for (column, _) in numbers.filter(|(_, name)| !["policy", "estimator", "team"].contains(name)) {
-        column.set_cell_alignment(CellAlignment::Right);
-    }
-    table
-}
-
-fn signed(estimate: Option<Estimate>, decimals: usize) -> String {
-    let text = with_error(estimate, decimals);
-    let sign = if estimate.is_some() && !text.starts_with('-') {
-        "+"
-    } else {
-        ""
-    };
-    format!("{sign}{text}")
 }
 
 fn mean(values: Vec<f64>, decimals: usize) -> String {

@@ -8,14 +8,12 @@ own policies, paired by world.
 
 from __future__ import annotations
 
-import csv as csv_files
-import itertools
 import math
 import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, TextIO, cast
 
@@ -24,9 +22,16 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from emberwatch import wire
 from emberwatch.arguments import as_seed
+from emberwatch.client import Client
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.observations import OF_BELIEF, OF_TEAM, names_of
+from emberwatch.merit import RECENT_STEPS, MeritTally
+from emberwatch.observations import OF_BELIEF, OF_TEAM, cells_of, names_of
+from emberwatch.rows import Row, RowFile
+from emberwatch.rows import read as read
+from emberwatch.settings import WorldSpec
+from emberwatch.view import DIRECTIONS
 
 #: Takes the stacked observations of some worlds; returns an action for each.
 Policy = Callable[[Any], Any]
@@ -37,50 +42,28 @@ FIRST_TRAINING_SEED: Final = 1000
 _MOVES: Final = "emberwatch/WildfireMoves-v0"
 _PATHS: Final = "emberwatch/Wildfire-v0"
 
+_DIRECTIONS: Final = np.array(DIRECTIONS, np.int64)
+
+#: A busy machine may keep the hidden states back for longer than a learner would wait, seconds.
+_TIMEOUT: Final = 30.0
+
 #: Keywords of the environment that an evaluation sets itself.
 _SET: Final = ("reward", "num_envs", "max_episode_steps", "autoreset_mode")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
-    """A policy on one world: a line of the CSV file, as `emberwatch-agent compare` writes it."""
-
-    policy: str
-    #: Where its belief came from: `none`, `known_model`, or a name of your own.
-    estimator: str
-    world_seed: int
-    #: Scored steps of the world.
-    steps: int
-    mean_reward: float
-    mean_distinct_cells: float
-    #: Distinct visited cells on target, as a share of the distinct visited cells.
-    hit_rate: float
-    #: Of the whole world: the same for every policy.
-    mean_fire_cells: float
-    mean_plan_millis: float
-    #: Empty: only the agent program scores beliefs.
-    brier: str
-    #: Moves of a path.
-    moves: int
-    #: Robots of the world; the numbers above are those of all of them together.
-    robots: int = 1
-    #: What they share: `alone`, `shared` (what they see), or a word of your own.
-    team: str = "alone"
-    #: Share of their visits to cells that another robot visited in the same step.
-    mean_repeated: float = 0.0
-
-
-#: Columns that a file may lack.
-_OF_TEAMS: Final = ("robots", "team", "mean_repeated")
-_HEADER: Final = [field.name for field in fields(Row)]
 
 
 class _Tally:
     """Sums over the steps of some worlds."""
 
-    def __init__(self, n_moves: int, n_worlds: int, n_robots: int) -> None:
-        self.n_moves: Final = n_moves
-        self.n_robots: Final = n_robots
+    def __init__(self, spec: WorldSpec, n_worlds: int, recent_steps: int) -> None:
+        self.n_moves: Final = spec.n_moves
+        self.n_robots: Final = spec.n_robots
+        self.recent_steps: Final = recent_steps
+        self._shape = (n_worlds, spec.height, spec.width)
+        self._knows_target = spec.model is not None
+        target = 0 if spec.model is None else spec.model.target_state
+        self.merit: Final = MeritTally(
+            n_worlds, self._shape[1:], target=target, recent_steps=recent_steps
+        )
         self.reward = np.zeros(n_worlds)
         self.n_visited, self.n_visits, self.n_hits, self.n_fire = np.zeros((4, n_worlds), np.int64)
         self.seconds = 0.0
@@ -91,14 +74,37 @@ class _Tally:
         self.seconds += time.perf_counter() - begin
         return actions
 
-    def add(self, results: NDArray[np.void]) -> None:
-        """One step of all robots."""
+    def add(
+        self,
+        results: NDArray[np.void],
+        paths: NDArray[np.integer],
+        truths: NDArray[np.uint8] | None,
+    ) -> None:
+        """One step of all robots, and the hidden states of their worlds, where these are known."""
         worlds = results["world"][:: self.n_robots]
         self.reward += worlds["reward"]
         self.n_visited += worlds["n_visited"]
         self.n_visits += results["robot"]["n_visited"].reshape(-1, self.n_robots).sum(1, np.int64)
         self.n_hits += worlds["n_hits"]
         self.n_fire += worlds["n_target_cells"]
+        self.merit.update(
+            self._visited(results["robot"], paths),
+            cells_of(results["robot"]).reshape(-1, self.n_robots, 2),
+            n_hits=worlds["n_hits"],
+            n_burning=worlds["n_target_cells"],
+            states=None if truths is None or not self._knows_target else truths[:: self.n_robots],
+        )
+
+    def _visited(self, robots: NDArray[np.void], paths: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Cells that some robot of each world visited, `(n_worlds, H, W)`."""
+        visited = np.zeros(self._shape, np.bool_)
+        worlds = np.arange(len(robots)) // self.n_robots
+        last = np.array(self._shape[1:], np.int64) - 1
+        cells = np.stack((robots["start_row"], robots["start_col"]), 1).astype(np.int64)
+        for moves in paths.T:
+            cells = (cells + _DIRECTIONS[moves]).clip(0, last)
+            visited[worlds, cells[:, 0], cells[:, 1]] = True
+        return visited
 
 
 def evaluate(
@@ -112,6 +118,7 @@ def evaluate(
     estimator: str | None = None,
     deterministic: bool = True,
     batch: int = 32,
+    recent_steps: int = RECENT_STEPS,
     csv: str | os.PathLike[str] | None = None,
     progress: TextIO | None = sys.stderr,
     **keywords: Any,
@@ -131,6 +138,9 @@ def evaluate(
             a belief, else `none`.
         deterministic: Passed on to Stable-Baselines3.
         batch: Worlds at a time, in the order of the seeds.
+        recent_steps: Steps for which a cell counts as seen after a visit, in the figures of merit.
+            Those that need the hidden states are None with `truth=False`, and where a running
+            server does not publish them or hides its model.
         csv: A file to write rows to. Rows of this policy that it has already are kept, and not
             run again; those of other policies are kept. A changed policy needs another name.
         progress: Where to write how far it is; None: nowhere.
@@ -140,24 +150,29 @@ def evaluate(
     Returns:
         A row for each seed, in order.
     """
-    chosen = _check(name, seeds, steps, batch, env, keywords)
+    chosen = _check(name, seeds, steps, batch, recent_steps, env, keywords)
     act = _acting(policy, deterministic)
     keywords["burn_in"] = burn_in
+    keywords.setdefault("timeout", _TIMEOUT)
+    if keywords.setdefault("truth", _publishes(keywords.get("instance"))):
+        batch = min(batch, wire.TRUTH_BUFFER)
     if estimator is None:
         has_belief = OF_BELIEF & set(names_of(keywords.get("observation")))
         estimator = "known_model" if has_belief else "none"
-    file = None if csv is None else _File(Path(csv))
+    file = None if csv is None else RowFile(Path(csv))
     robots = keywords.get("robots") or 1
     shares = robots > 1 and bool(OF_TEAM & set(names_of(keywords.get("observation"))))
     team = "shared" if shares else "alone"
     kind = (name, estimator, robots, team)
-    done = {} if file is None else file.done(kind, steps, _n_moves(env, keywords))
+    done: dict[int, Row] = {}
+    if file is not None:
+        done = file.done(kind, steps, _n_moves(env, keywords), recent_steps)
     missing = [seed for seed in chosen if seed not in done]
     report = _Progress(progress, name, chosen, len(missing) * steps)
     for first in range(0, len(missing), batch):
         part = missing[first : first + batch]
         getattr(policy, "begin", _nothing)(len(part))
-        tally = _play(env, keywords, act, part, steps, report)
+        tally = _play(env, keywords, act, part, steps, recent_steps, report)
         rows = _rows(tally, part, steps, kind)
         done |= {row.world_seed: row for row in rows}
         if file is not None:
@@ -170,6 +185,14 @@ def _make(env: str, keywords: dict[str, Any], n_worlds: int) -> Any:
     n_robots = keywords.get("robots") or 1
     make: Any = {"num_envs": n_worlds * n_robots, "max_episode_steps": -1, **keywords}
     return gymnasium.make_vec(env, autoreset_mode=AutoresetMode.DISABLED, **make)
+
+
+def _publishes(instance: str | None) -> bool:
+    """Whether there are hidden states to be had: a private server publishes them."""
+    if instance is None:
+        return True
+    with Client(instance) as client:
+        return client.info.publish_truth
 
 
 def _n_moves(env: str, keywords: dict[str, Any]) -> int:
@@ -185,6 +208,7 @@ def _play(
     act: Policy,
     seeds: Sequence[int],
     steps: int,
+    recent_steps: int,
     report: _Progress,
 ) -> _Tally:
     """Flies so many paths in some worlds."""
@@ -196,16 +220,20 @@ def _play(
                 f"robots: expected {worlds.unwrapped.world_spec.n_robots}, as the server's worlds "
                 f"have, got {n_robots}"
             )
-        tally = _Tally(worlds.unwrapped.n_moves, len(seeds), n_robots)
+        tally = _Tally(worlds.unwrapped.world_spec, len(seeds), recent_steps)
         seen, _ = worlds.reset(seed=np.repeat(seeds, n_robots).tolist())
         n_actions = tally.n_moves if env == _MOVES else 1
+        truncated = np.zeros(worlds.num_envs, np.bool_)
         for _ in range(steps):
-            for _ in range(n_actions - 1):
-                seen, *_ = worlds.step(tally.timed(act, seen))
-            seen, _, _, truncated, _ = worlds.step(tally.timed(act, seen))
+            flown: list[NDArray[np.integer]] = []
+            for _ in range(n_actions):
+                # A copy: a policy may use its array again.
+                flown.append(np.array(tally.timed(act, seen)))
+                seen, _, _, truncated, _ = worlds.step(flown[-1])
             if truncated.any():
                 raise InvalidArgumentError("instance: expected a server without --max-steps")
-            tally.add(worlds.unwrapped.results)
+            paths = np.stack(flown, axis=1).reshape(len(truncated), -1)
+            tally.add(worlds.unwrapped.results, paths, worlds.unwrapped.truths)
             report.add(len(seeds))
     finally:
         worlds.close()
@@ -232,6 +260,8 @@ def _rows(
             robots=robots,
             team=team,
             mean_repeated=1.0 - int(tally.n_visited[index]) / int(tally.n_visits[index]),
+            recent_steps=tally.recent_steps,
+            **asdict(tally.merit.merit(index)),
         )
         for index, seed in enumerate(seeds)
     ]
@@ -242,6 +272,7 @@ def _check(
     seeds: Iterable[int],
     steps: int,
     batch: int,
+    recent_steps: int,
     env: str,
     keywords: dict[str, Any],
 ) -> list[int]:
@@ -250,7 +281,8 @@ def _check(
         raise InvalidArgumentError(f"name: expected a name for the table, got {name!r}")
     if env not in (_MOVES, _PATHS):
         raise InvalidArgumentError(f"env: expected {_MOVES!r} or {_PATHS!r}, got {env!r}")
-    for what, number in (("steps", steps), ("batch", batch)):
+    numbers = {"steps": steps, "batch": batch, "recent_steps": recent_steps}
+    for what, number in numbers.items():
         if not isinstance(number, int | np.integer) or number < 1:  # pyright: ignore[reportUnnecessaryIsInstance]
             raise InvalidArgumentError(f"{what}: expected at least 1, got {number!r}")
     for what in _SET:
@@ -278,75 +310,6 @@ def _acting(policy: Any, deterministic: bool) -> Policy:
 
 def _nothing(_n_worlds: int) -> None:
     """What a policy without `begin` does."""
-
-
-class _File:
-    """Rows in a CSV file, which is replaced whole whenever some are added."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        if path.is_dir():
-            raise InvalidArgumentError(f"csv: expected a file, got the folder {path}")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._rows = read(path) if path.exists() else []
-
-    def done(self, kind: tuple[str, str, int, str], steps: int, n_moves: int) -> dict[int, Row]:
-        """What a policy has done already, by seed."""
-        own = [
-            row for row in self._rows if (row.policy, row.estimator, row.robots, row.team) == kind
-        ]
-        for row in own:
-            if (row.steps, row.moves) != (steps, n_moves):
-                raise InvalidArgumentError(
-                    f"csv: {self._path} has {row.steps} steps of {row.moves} moves of "
-                    f"{row.policy!r} on world {row.world_seed}, expected {steps} of "
-                    f"{n_moves}: choose another file or name"
-                )
-        return {row.world_seed: row for row in own}
-
-    def add(self, rows: Sequence[Row]) -> None:
-        for row, other in itertools.product(rows, self._rows):
-            same = (row.world_seed, row.steps) == (other.world_seed, other.steps)
-            if same and row.mean_fire_cells != other.mean_fire_cells:
-                raise InvalidArgumentError(
-                    f"csv: {self._path} has {other.mean_fire_cells} burning cells of world "
-                    f"{row.world_seed} ({other.policy!r}), got {row.mean_fire_cells} (another "
-                    "model, grid or burn-in): choose another file"
-                )
-        self._rows += rows
-        self._rows.sort(
-            key=lambda row: (row.policy, row.world_seed, row.estimator, row.robots, row.team)
-        )
-        temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}.tmp")
-        with temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv_files.writer(file, lineterminator="\n")
-            writer.writerow(_HEADER)
-            writer.writerows(astuple(row) for row in self._rows)
-        temporary.replace(self._path)
-
-
-def read(path: str | os.PathLike[str]) -> list[Row]:
-    """The rows of a CSV file of `evaluate` or `emberwatch-agent compare`."""
-    try:
-        with Path(path).open(newline="", encoding="utf-8") as file:
-            lines = csv_files.DictReader(file)
-            if lines.fieldnames not in (_HEADER, _HEADER[: -len(_OF_TEAMS)]):
-                raise ValueError(lines.fieldnames)
-            return [_row(line) for line in lines]
-    except (ValueError, TypeError) as error:
-        raise InvalidArgumentError(
-            f"csv: expected {path} to have the columns {','.join(_HEADER)}, got {error}"
-        ) from None
-
-
-def _row(line: dict[str, Any]) -> Row:
-    kinds: dict[Any, Callable[[str], Any]] = {"int": int, "float": float, "str": str}
-    values = {
-        field.name: kinds[field.type](line[field.name])
-        for field in fields(Row)
-        if field.name in line
-    }
-    return Row(**values)
 
 
 class _Progress:

@@ -160,6 +160,14 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         return self._results.copy()
 
     @property
+    def truths(self) -> NDArray[np.uint8] | None:
+        """The hidden states of each robot's world, where they are read; as `results`.
+
+        `(num_envs, H, W)`; not to be written to.
+        """
+        return self._truths
+
+    @property
     def is_open(self) -> bool:
         """Whether there has been a reset since it was made or closed."""
         return self._session.is_open

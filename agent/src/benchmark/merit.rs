@@ -1,0 +1,348 @@
+//! The field's figures of merit of one run, as `docs/figures-of-merit.md` defines them. Pure.
+//!
+//! They need no model: only which state is the target, and for two of them the hidden states.
+
+use protocol::path::Flight;
+use protocol::{Cell, Grid, Shape};
+
+/// Steps for which a cell counts as seen after a visit, unless told otherwise.
+pub const RECENT_STEPS: u32 = 10;
+
+/// The figures of one run; `None` where there was nothing to measure.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Merit {
+    /// Steps until a robot first visited a burning cell.
+    pub steps_to_detection: Option<u64>,
+    /// Burning cells of the world in that step.
+    pub burning_cells_at_detection: Option<u32>,
+    /// Share of the burning cells that a robot visited in the last steps: mean over steps with fire.
+    pub burning_seen_share: Option<f64>,
+    /// Moves from the nearest robot to the nearest burning cell that is not among these: mean over
+    /// steps that have one.
+    pub front_distance: Option<f64>,
+    /// Share of all cells that a robot ever visited.
+    pub grid_seen_share: f64,
+}
+
+/// What a step paid, as the server counts it.
+#[derive(Debug, Clone, Copy)]
+pub struct Found {
+    /// Distinct burning cells that the robots visited.
+    pub n_hits: u32,
+    /// Burning cells of the world.
+    pub n_burning: u32,
+}
+
+/// The figures of a run while it goes on.
+#[derive(Debug, Clone)]
+pub struct MeritTally {
+    shape: Shape,
+    target: u8,
+    recent_steps: u32,
+    step: u32,
+    /// The step of the last visit to each cell, row-major; 0: never.
+    last_visits: Vec<u32>,
+    n_seen: usize,
+    /// Step and burning cells.
+    detection: Option<(u32, u32)>,
+    burning_seen: Mean,
+    distance: Mean,
+}
+
+/// A mean of what is there.
+#[derive(Debug, Clone, Copy, Default)]
+struct Mean {
+    sum: f64,
+    n: u32,
+}
+
+impl MeritTally {
+    /// Before the first step. `target`: the state that burns; `recent_steps`: at least 1.
+    pub fn new(shape: Shape, target: u8, recent_steps: u32) -> Self {
+        Self {
+            shape,
+            target,
+            recent_steps,
+            step: 0,
+            last_visits: vec![0; shape.n_cells()],
+            n_seen: 0,
+            detection: None,
+            burning_seen: Mean::default(),
+            distance: Mean::default(),
+        }
+    }
+
+    /// One step: a flight of each robot, at least one, and the hidden states that it met, shape `[H, W]`, where
+    /// they are known.
+    pub fn update(&mut self, flights: &[Flight], found: Found, states: Option<&Grid<u8>>) {
+        self.step += 1;
+        for &cell in flights.iter().flat_map(|flight| &flight.visited) {
+            self.n_seen += usize::from(self.last_visits[cell] == 0);
+            self.last_visits[cell] = self.step;
+        }
+        if self.detection.is_none() && found.n_hits > 0 {
+            self.detection = Some((self.step, found.n_burning));
+        }
+        if let Some(states) = states {
+            self.watch(flights, states);
+        }
+    }
+
+    pub fn recent_steps(&self) -> u32 {
+        self.recent_steps
+    }
+
+    /// The figures of the steps so far.
+    pub fn merit(&self) -> Merit {
+        Merit {
+            steps_to_detection: self.detection.map(|(step, _)| step.into()),
+            burning_cells_at_detection: self.detection.map(|(_, n_burning)| n_burning),
+            burning_seen_share: self.burning_seen.get(),
+            front_distance: self.distance.get(),
+            grid_seen_share: self.n_seen as f64 / self.last_visits.len() as f64,
+        }
+    }
+
+    fn watch(&mut self, flights: &[Flight], states: &Grid<u8>) {
+        let states = states.as_slice().expect("invariant: grids are row-major");
+        let forgotten = self.step.saturating_sub(self.recent_steps);
+        // Without a branch: the compiler makes vector code of it.
+        let (mut n_burning, mut n_seen) = (0_u32, 0_u32);
+        for (&state, &visit) in states.iter().zip(&self.last_visits) {
+            let burns = u32::from(state == self.target);
+            n_burning += burns;
+            n_seen += burns & u32::from(visit > forgotten);
+        }
+        if n_burning > 0 {
+            let share = f64::from(n_seen) / f64::from(n_burning);
+            self.burning_seen.add(share);
+        }
+        if n_seen < n_burning {
+            let is_front =
+                |cell: usize| states[cell] == self.target && self.last_visits[cell] <= forgotten;
+            let ends = flights.iter().map(|flight| flight.end);
+            let nearest = ends.fold(usize::MAX, |best, end| {
+                nearest(self.shape, end, best, is_front)
+            });
+            self.distance.add(nearest as f64);
+        }
+    }
+}
+
+impl Mean {
+    fn add(&mut self, value: f64) {
+        self.sum += value;
+        self.n += 1;
+    }
+
+    fn get(self) -> Option<f64> {
+        (self.n > 0).then(|| self.sum / f64::from(self.n))
+    }
+}
+
+/// Moves from a cell to the nearest of some, or `best` if none is nearer: row by row, the near ones first.
+fn nearest(shape: Shape, from: Cell, mut best: usize, is_one: impl Fn(usize) -> bool) -> usize {
+    let (height, width) = shape.dim();
+    for row_moves in 0..height {
+        if row_moves >= best {
+            break;
+        }
+        let above = from.row.checked_sub(row_moves);
+        let below = Some(from.row + row_moves).filter(|&row| row_moves > 0 && row < height);
+        for row in above.into_iter().chain(below) {
+            let reach = best - row_moves;
+            let last = from.col.saturating_add(reach).min(width - 1);
+            for col in from.col.saturating_sub(reach)..=last {
+                if is_one(row * width + col) {
+                    best = best.min(row_moves + from.col.abs_diff(col));
+                }
+            }
+        }
+    }
+    best
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const FIRE: u8 = 2;
+
+    /// A row of cells: `#` burns.
+    fn world(row: &str) -> Grid<u8> {
+        let states = row.bytes().map(|cell| u8::from(cell == b'#') * FIRE);
+        Grid::from_shape_vec((1, row.len()), states.collect()).expect("test world")
+    }
+
+    fn flight(visited: &[usize]) -> Flight {
+        let col = *visited.last().expect("a cell");
+        Flight {
+            visited: visited.to_vec(),
+            end: Cell { row: 0, col },
+        }
+    }
+
+    /// The figures of steps: the world, and the cells that each robot visits.
+    fn merit(recent_steps: u32, steps: &[(&str, &[&[usize]])]) -> Merit {
+        let shape = Shape::new(1, steps[0].0.len()).expect("test shape");
+        let mut tally = MeritTally::new(shape, FIRE, recent_steps);
+        for (row, robots) in steps {
+            let flights: Vec<Flight> = robots.iter().map(|visited| flight(visited)).collect();
+            let states = world(row);
+            let burns = |cell: &usize| states[[0, *cell]] == FIRE;
+            let mut visited = robots.concat();
+            visited.sort_unstable();
+            visited.dedup();
+            let found = Found {
+                n_hits: visited.iter().filter(|cell| burns(cell)).count() as u32,
+                n_burning: (0..row.len()).filter(burns).count() as u32,
+            };
+            tally.update(&flights, found, Some(&states));
+        }
+        tally.merit()
+    }
+
+    #[test]
+    fn fire_is_detected_by_the_first_visit_to_a_cell_that_burns_then() {
+        // Visited before it burns, missed, found when two cells burn.
+        let got = merit(
+            9,
+            &[("....", &[&[0, 1]]), (".#..", &[&[2]]), (".##.", &[&[2]])],
+        );
+        assert_eq!(
+            (got.steps_to_detection, got.burning_cells_at_detection),
+            (Some(3), Some(2))
+        );
+        // Later finds change nothing.
+        let got = merit(9, &[("#...", &[&[0]]), ("####", &[&[1]])]);
+        assert_eq!(
+            (got.steps_to_detection, got.burning_cells_at_detection),
+            (Some(1), Some(1))
+        );
+    }
+
+    #[test]
+    fn what_is_never_detected_has_no_time() {
+        let got = merit(9, &[("...#", &[&[0]]), ("...#", &[&[1]])]);
+        assert_eq!(
+            (got.steps_to_detection, got.burning_cells_at_detection),
+            (None, None)
+        );
+        assert_eq!(got.burning_seen_share, Some(0.0));
+        // 3 moves, then 2.
+        assert_eq!(got.front_distance, Some(2.5));
+    }
+
+    #[test]
+    fn a_world_without_fire_has_no_share_and_no_front() {
+        let got = merit(9, &[("....", &[&[0]]), ("....", &[&[1, 2]])]);
+        let expected = Merit {
+            steps_to_detection: None,
+            burning_cells_at_detection: None,
+            burning_seen_share: None,
+            front_distance: None,
+            grid_seen_share: 0.75,
+        };
+        assert_eq!(got, expected);
+        // Steps without fire do not count: those with it are half seen.
+        let got = merit(9, &[("....", &[&[0]]), ("#..#", &[&[1]])]);
+        assert_eq!(got.burning_seen_share, Some(0.5));
+    }
+
+    #[test]
+    fn fire_that_is_all_seen_has_no_front() {
+        let got = merit(9, &[("##..", &[&[1, 0]]), ("##..", &[&[2, 3]])]);
+        assert_eq!(got.burning_seen_share, Some(1.0));
+        assert_eq!((got.front_distance, got.grid_seen_share), (None, 1.0));
+    }
+
+    #[test]
+    fn cells_are_seen_for_the_last_steps_alone() {
+        let steps: [(&str, &[&[usize]]); 3] =
+            [("#..#", &[&[0]]), ("#..#", &[&[1]]), ("#..#", &[&[2]])];
+        // Of two burning cells one is seen: in all of 3 steps, in the first two, in the first.
+        let shares = [3, 2, 1].map(|recent_steps| merit(recent_steps, &steps).burning_seen_share);
+        let thirds = [1.5, 1.0, 0.5].map(|sum| Some(sum / 3.0));
+        assert_eq!(shares, thirds);
+        // To cell 3 from 0 and 1; in the third step cell 0 is 2 moves away, cell 3 one.
+        assert_eq!(
+            merit(2, &steps).front_distance,
+            Some((3.0 + 2.0 + 1.0) / 3.0)
+        );
+        // In the second step cell 0, which is forgotten, is nearer than cell 3.
+        assert_eq!(
+            merit(1, &steps).front_distance,
+            Some((3.0 + 1.0 + 1.0) / 3.0)
+        );
+        // Where a robot has ever been does not depend on it.
+        assert_eq!(merit(1, &steps).grid_seen_share, 0.75);
+    }
+
+    #[test]
+    fn the_robots_of_a_team_see_together() {
+        let got = merit(9, &[("#....#.#", &[&[0, 1], &[4, 5]])]);
+        assert_eq!(got.burning_seen_share, Some(2.0 / 3.0));
+        assert_eq!(got.burning_cells_at_detection, Some(3));
+        // From cell 5 to 7, not from cell 1.
+        assert_eq!(got.front_distance, Some(2.0));
+        assert_eq!(got.grid_seen_share, 0.5);
+    }
+
+    #[test]
+    fn distances_count_moves_in_rows_and_columns() {
+        let shape = Shape::new(3, 4).expect("test shape");
+        let mut states = Grid::zeros((3, 4));
+        states[[2, 3]] = FIRE;
+        let mut tally = MeritTally::new(shape, FIRE, 1);
+        let found = Found {
+            n_hits: 0,
+            n_burning: 1,
+        };
+        tally.update(&[flight(&[1])], found, Some(&states));
+        assert_eq!(tally.merit().front_distance, Some(4.0));
+    }
+
+    #[test]
+    fn a_run_that_ends_early_is_measured_until_then() {
+        let steps: [(&str, &[&[usize]]); 2] = [("#..#", &[&[0]]), ("#..#", &[&[1]])];
+        let got = merit(1, &steps[..1]);
+        assert_eq!(got.burning_seen_share, Some(0.5));
+        assert_eq!(got.grid_seen_share, 0.25);
+    }
+
+    #[test]
+    fn without_hidden_states_the_rest_is_measured() {
+        let shape = Shape::new(1, 4).expect("test shape");
+        let mut tally = MeritTally::new(shape, FIRE, 1);
+        let found = Found {
+            n_hits: 1,
+            n_burning: 7,
+        };
+        tally.update(&[flight(&[0, 1])], found, None);
+        let expected = Merit {
+            steps_to_detection: Some(1),
+            burning_cells_at_detection: Some(7),
+            burning_seen_share: None,
+            front_distance: None,
+            grid_seen_share: 0.5,
+        };
+        assert_eq!(tally.merit(), expected);
+    }
+
+    #[test]
+    fn the_nearest_of_some_cells_is_that_of_a_plain_scan() {
+        let shape = Shape::new(5, 7).expect("test shape");
+        for seed in 0..500 {
+            let drawn = |index: usize| protocol::randomness::split_mix(seed, index as u64);
+            let is_one = |cell: usize| drawn(cell) % (seed + 2) == 0;
+            let from = shape.cell(drawn(99) as usize % shape.n_cells());
+            let moves = |cell: Cell| from.row.abs_diff(cell.row) + from.col.abs_diff(cell.col);
+            let ones = (0..shape.n_cells()).filter(|&cell| is_one(cell));
+            let expected = ones.map(|cell| moves(shape.cell(cell))).min();
+            for best in [usize::MAX, 4] {
+                let expected = expected.map_or(best, |moves| moves.min(best));
+                assert_eq!(nearest(shape, from, best, is_one), expected, "seed {seed}");
+            }
+        }
+    }
+}
