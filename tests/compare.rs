@@ -1,6 +1,7 @@
 //! `emberwatch-agent` from end to end: comparisons that repeat to the bit, and a second model.
 
 use crate::harness::{Ended, Server, repository, run};
+use env_server::world::{Source, World};
 use protocol::{Dynamics, Model, Shape};
 use std::path::Path;
 use std::time::Duration;
@@ -242,9 +243,9 @@ fn the_road_ice_model_keeps_all_its_states() {
     let text = std::fs::read_to_string(repository().join("config/models/road-ice.toml"));
     let model = Model::from_toml(&text.expect("the model file")).expect("a valid model");
     let shape = Shape::new(24, 40).expect("a shape");
-    let dynamics = Dynamics::new(&model, shape).expect("a model that fits");
+    let source = Source::Simulated(Dynamics::new(&model, shape).expect("a model that fits"));
     for seed in 0..4 {
-        let world = env_server::world::World::new(dynamics.clone(), seed, 5_000);
+        let world = World::new(source.clone(), seed, 5_000);
         let mut counts = [0; 4];
         world
             .states()

@@ -28,6 +28,7 @@ mod lease;
 mod mirror;
 mod places;
 mod python;
+mod recorded_worlds;
 mod recording;
 mod replays;
 mod restart;

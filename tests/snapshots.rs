@@ -16,7 +16,7 @@ use tempfile::TempDir;
 
 const N_MOVES: usize = 6;
 
-fn server_command(server: &Server, arguments: &[&str]) -> Ended {
+pub fn server_command(server: &Server, arguments: &[&str]) -> Ended {
     let instance = ["--instance", server.instance.name()];
     run(
         "emberwatch-server",

@@ -1,6 +1,7 @@
 //! The server's settings and their checks.
 
-use crate::world::Start;
+use crate::states_file::{StatesError, StatesFile};
+use crate::world::{Recorded, Start};
 use protocol::channels::{ChannelError, Instance, MAX_ROBOT_NUMBERS, MAX_ROBOTS, MAX_TEAM_CELLS};
 use protocol::control::CoverageRule;
 use protocol::grid::ShapeError;
@@ -11,6 +12,7 @@ use protocol::{Model, Shape};
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
 use std::path::Path;
+use std::sync::Arc;
 use thiserror::Error;
 
 /// Most worlds of one server.
@@ -35,6 +37,12 @@ pub struct ServerConfig {
     /// A built-in model (`wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`), or the path of
     /// a model file.
     pub model: String,
+    /// A states file: worlds show its sequences, and model, grid and burn-in are not used; empty: none.
+    pub states: String,
+    /// Whether seeds also choose among the symmetries of the grid.
+    pub states_symmetries: bool,
+    /// Largest recorded step with which an episode begins; each seed draws its own.
+    pub states_offset: u64,
     /// Grid height, cells.
     pub height: usize,
     /// Grid width, cells.
@@ -76,8 +84,20 @@ pub struct ServerConfig {
 pub struct Checked {
     pub config: ServerConfig,
     pub instance: Instance,
+    /// Of recorded worlds an unchanging one.
     pub model: Model,
     pub shape: Shape,
+    pub recorded: Option<CheckedStates>,
+}
+
+/// What recorded worlds show.
+#[derive(Debug, Clone)]
+pub struct CheckedStates {
+    /// Their description in TOML.
+    pub description: String,
+    /// CRC-32 of the sequences.
+    pub checksum: u32,
+    pub recorded: Arc<Recorded>,
 }
 
 /// Why settings were refused.
@@ -104,6 +124,8 @@ pub enum ConfigError {
     Shape(#[from] ShapeError),
     #[error(transparent)]
     Model(#[from] ModelError),
+    #[error(transparent)]
+    States(#[from] StatesError),
 }
 
 impl Default for ServerConfig {
@@ -114,6 +136,9 @@ impl Default for ServerConfig {
             robots: 1,
             deadline_millis: 0,
             model: WILDFIRE.into(),
+            states: String::new(),
+            states_symmetries: false,
+            states_offset: 0,
             height: 64,
             width: 64,
             moves: 64,
@@ -136,29 +161,21 @@ impl Default for ServerConfig {
 }
 
 impl ServerConfig {
-    /// Checks every setting.
+    /// Checks every setting; a states file decides model, grid and burn-in.
     ///
     /// # Errors
     /// If a setting is wrong; the error names the first, what it must be and what it is.
-    pub fn check(self) -> Result<Checked, ConfigError> {
+    pub fn check(mut self) -> Result<Checked, ConfigError> {
         let instance = Instance::new(&self.instance)?;
+        self.check_ranges()?;
+        let (model, recorded) = match self.states.is_empty() {
+            true => (None, None),
+            false => self
+                .read_states()
+                .map(|(model, it)| (Some(model), Some(it)))?,
+        };
         let shape = Shape::new(self.height, self.width)?;
-        in_range("worlds", u64::from(self.worlds), 1, u64::from(MAX_WORLDS))?;
         self.check_robots(shape)?;
-        in_range("moves", self.moves as u64, 1, MAX_MOVES as u64)?;
-        in_range("lease_millis", self.lease_millis, 100, 86_400_000)?;
-        in_range("threads", self.threads as u64, 0, 256)?;
-        in_range("burn_in", self.burn_in, 0, 1 << 40)?;
-        in_range("history", self.history.into(), 1, 1_000_000)?;
-        in_range("snapshot_keep", self.snapshot_keep.into(), 1, 1_000_000)?;
-        if (self.snapshot_every == 0) != self.snapshot_dir.is_empty() {
-            let got = format!("{} and {:?}", self.snapshot_every, self.snapshot_dir);
-            return Err(ConfigError::Range {
-                setting: "snapshot_every and snapshot_dir",
-                expected: "both or neither".into(),
-                got,
-            });
-        }
         if let Start::At(cell) = self.start
             && !shape.contains(cell)
         {
@@ -169,14 +186,43 @@ impl ServerConfig {
                 got: cell.to_string(),
             });
         }
-        let model = self.read_model()?;
+        let model = model.map_or_else(|| self.read_model(), Ok)?;
         model.check_on(shape)?;
         Ok(Checked {
             config: self,
             instance,
             model,
             shape,
+            recorded,
         })
+    }
+
+    fn check_ranges(&self) -> Result<(), ConfigError> {
+        in_range("worlds", u64::from(self.worlds), 1, u64::from(MAX_WORLDS))?;
+        in_range("moves", self.moves as u64, 1, MAX_MOVES as u64)?;
+        in_range("lease_millis", self.lease_millis, 100, 86_400_000)?;
+        in_range("threads", self.threads as u64, 0, 256)?;
+        in_range("burn_in", self.burn_in, 0, 1 << 40)?;
+        in_range("history", self.history.into(), 1, 1_000_000)?;
+        in_range("snapshot_keep", self.snapshot_keep.into(), 1, 1_000_000)?;
+        let needs = |setting, expected: &str, got| {
+            let expected = expected.into();
+            Err(ConfigError::Range {
+                setting,
+                expected,
+                got,
+            })
+        };
+        if (self.snapshot_every == 0) != self.snapshot_dir.is_empty() {
+            let got = format!("{} and {:?}", self.snapshot_every, self.snapshot_dir);
+            return needs("snapshot_every and snapshot_dir", "both or neither", got);
+        }
+        if self.states.is_empty() && (self.states_symmetries || self.states_offset > 0) {
+            let got = format!("{} and {}", self.states_symmetries, self.states_offset);
+            let settings = "states_symmetries and states_offset";
+            return needs(settings, "none without a states file", got);
+        }
+        Ok(())
     }
 
     fn check_robots(&self, shape: Shape) -> Result<(), ConfigError> {
@@ -197,6 +243,28 @@ impl ServerConfig {
         let wrong = |error: &dyn Display| file_error("config file", path, error);
         let text = read_text(path).map_err(|error| wrong(&error))?;
         toml::from_str(&text).map_err(|error| wrong(&error))
+    }
+
+    /// The states file, which decides some of the settings.
+    fn read_states(&mut self) -> Result<(Model, CheckedStates), ConfigError> {
+        let file = StatesFile::read(Path::new(&self.states))?;
+        (self.height, self.width) = file.shape.dim();
+        (self.burn_in, self.model) = (0, String::new());
+        let checksum = file.sequences.checksum();
+        let (symmetries, offset) = (self.states_symmetries, self.states_offset);
+        let recorded = Recorded::new(file.sequences.arrays, file.shape, symmetries, offset);
+        let recorded = recorded.map_err(|most| ConfigError::Range {
+            setting: "states_offset",
+            expected: format!("0 to {most}, as the shortest sequence allows"),
+            got: offset.to_string(),
+        })?;
+        let description = toml::to_string(&file.description);
+        let states = CheckedStates {
+            description: description.expect("invariant: a description was read from TOML"),
+            checksum,
+            recorded: Arc::new(recorded),
+        };
+        Ok((file.model, states))
     }
 
     fn read_model(&self) -> Result<Model, ConfigError> {

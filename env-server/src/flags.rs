@@ -30,6 +30,15 @@ pub struct ServerFlags {
     /// [default: wildfire]
     #[arg(long)]
     pub model: Option<String>,
+    /// Worlds show the recorded states of this .npz or .npy file or folder, which decides model, grid and burn-in
+    #[arg(long, value_name = "FILE|FOLDER")]
+    pub states: Option<String>,
+    /// Seeds choose among the symmetries of the grid, too
+    #[arg(long, num_args = 0..=1, default_missing_value = "true", value_name = "BOOL")]
+    pub states_symmetries: Option<bool>,
+    /// Episodes begin at a recorded step of 0 to this, drawn from the seed [default: 0]
+    #[arg(long, value_name = "STEPS")]
+    pub states_offset: Option<u64>,
     /// Grid height in cells [default: 64]
     #[arg(long)]
     pub height: Option<usize>,
@@ -114,6 +123,12 @@ impl ServerFlags {
         set(&mut config.robots, &self.robots);
         set(&mut config.deadline_millis, &self.deadline_ms);
         set(&mut config.model, &self.model);
+        set(&mut config.states, &self.states);
+        set(&mut config.states_symmetries, &self.states_symmetries);
+        set(&mut config.states_offset, &self.states_offset);
+        if !config.states.is_empty() {
+            self.check_beside_states()?;
+        }
         set(&mut config.height, &self.height);
         set(&mut config.width, &self.width);
         set(&mut config.moves, &self.moves);
@@ -132,6 +147,28 @@ impl ServerFlags {
         set(&mut config.snapshot_dir, &self.snapshot_dir);
         set(&mut config.snapshot_keep, &self.snapshot_keep);
         Ok(config)
+    }
+
+    /// Refuses what a states file decides.
+    fn check_beside_states(&self) -> Result<(), ConfigError> {
+        let numbers = [
+            ("height", self.height.map(|it| it as u64)),
+            ("width", self.width.map(|it| it as u64)),
+            ("burn_in", self.burn_in),
+        ];
+        let mut given: Vec<_> = numbers
+            .into_iter()
+            .filter_map(|(setting, value)| Some((setting, value?.to_string())))
+            .collect();
+        given.extend(self.model.clone().map(|model| ("model", model)));
+        match given.into_iter().next() {
+            None => Ok(()),
+            Some((setting, got)) => Err(ConfigError::Range {
+                setting,
+                expected: "no flag beside a states file, which decides it".into(),
+                got,
+            }),
+        }
     }
 }
 

@@ -12,4 +12,5 @@ pub mod recording;
 pub mod server;
 pub mod simulator;
 pub mod snapshot;
+pub mod states_file;
 pub mod world;

@@ -10,6 +10,7 @@ use protocol::Model;
 use protocol::channels::Instance;
 use protocol::control::ServerInfo;
 use protocol::message::Status;
+use protocol::model::{Description, ModelError};
 use std::ops::Range;
 
 /// What to do on one world.
@@ -96,6 +97,13 @@ pub(super) fn info_of(instance: &Instance, worlds: &Range<u32>) -> Result<Server
     Ok(info)
 }
 
+/// The states of recorded worlds as a model in which they do not change, if the server reveals them.
+pub fn recorded_states(info: &ServerInfo) -> Result<Option<Model>, ModelError> {
+    let recorded = info.recorded_world.as_ref();
+    let description = recorded.and_then(|recorded| recorded.description.as_deref());
+    description.map(Description::model_of).transpose()
+}
+
 /// A server's model, or the one given.
 pub(super) fn model_of(
     instance: &Instance,
@@ -113,12 +121,16 @@ pub(super) fn model_of(
         }
         (Some(given), _) => given.clone(),
         (None, Some(revealed)) => revealed,
+        (None, None) if info.recorded_world.is_some() => bail!(
+            "instance {:?} has recorded worlds, without a model: expected --model FILE",
+            instance.name()
+        ),
         (None, None) => bail!(
             "instance {:?} does not reveal its model: expected --model FILE",
             instance.name()
         ),
     };
-    let (expected, got) = (info.n_observations, model.file().observations.len());
+    let (expected, got) = (info.n_observations, model.n_observations());
     ensure!(
         got == expected,
         "model: expected the server's {expected} observations, got {got}"

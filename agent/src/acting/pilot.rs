@@ -1,14 +1,15 @@
 //! An agent that flies robots of one world through a connection: attach, step, catch up.
 
 use crate::acting::handover::{catch_up, leave, resume, take_over_left};
-use crate::acting::mission::{Company, Mission, info_of, model_of};
-use crate::acting::registry::{self, Task};
+use crate::acting::mission::{Company, Mission, info_of, model_of, recorded_states};
+use crate::acting::registry::{self, Task, needs_model};
 use crate::estimation::Prior;
 use crate::estimation::belief::Belief;
 use crate::estimation::first_belief::first_belief;
 use crate::planning::Plan;
 use crate::planning::policy::{EstimatorKind, Policy};
 use crate::planning::team::robot_seed;
+use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Seen};
 use crate::server::client::{Client, Observation, shape_of};
 use crate::server::errors::is_late;
@@ -17,6 +18,7 @@ use crate::server::info::is_belief_left;
 use crate::server::truth::TruthFeed;
 use anyhow::{Result, ensure};
 use protocol::connection::ConnectionError;
+use protocol::control::{ServerInfo, WorldSeed};
 use protocol::message::WorldResult;
 use protocol::{Cell, Grid, Model};
 use std::cell::RefCell;
@@ -34,6 +36,10 @@ pub struct Pilot {
     truth: Option<TruthFeed>,
     /// Knows all robots that are planned for, those that others fly among them.
     robot: Robot,
+    model: Model,
+    policy: Policy,
+    /// The belief before an episode's first frame, once it was needed.
+    prior: Option<Belief>,
     /// The numbers of these.
     seen: Range<u32>,
     feed: Feed,
@@ -50,8 +56,15 @@ impl Pilot {
     pub fn attach(mission: &Mission) -> Result<Self> {
         let info = info_of(&mission.instance, &mission.worlds())?;
         let numbers = mission.numbers(&info)?;
-        let model = model_of(&mission.instance, &info, mission.model.as_ref())?;
+        let recorded = recorded_states(&info)?.filter(|_| mission.model.is_none());
+        let is_recorded = recorded.is_some();
+        let given = || model_of(&mission.instance, &info, mission.model.as_ref());
+        let model = recorded.map_or_else(given, Ok)?;
         let policy = Policy::named(&mission.policy, &model)?;
+        ensure!(
+            !is_recorded || !policy.estimator.knows_model(),
+            needs_model(&policy)
+        );
         ensure!(
             policy.estimator != EstimatorKind::NextTruth,
             "policy {:?} needs worlds that run one step ahead: only `compare` has them",
@@ -64,17 +77,15 @@ impl Pilot {
         );
         let shape = shape_of(&info)?;
         // What takes long is done before the lease begins to run, and not at all where a belief was left.
-        let prior = if policy.estimator.knows_model() {
+        if policy.estimator.knows_model() {
             let any = Belief::from_initial(&model, shape);
             if let Some(attached) = Self::go_on(mission, &numbers, &model, &policy, &any)? {
                 return Ok(attached);
             }
-            mission.config.prior(info.burn_in)
-        } else {
-            Prior::Initial
-        };
-        let prior = first_belief(prior, &model, shape, mission.config.seed)?;
+        }
+        let prior = prior(mission, &info, &model, &policy)?;
         let mut attached = Self::acquire(mission, &numbers, &model, &policy, &prior)?;
+        attached.prior = Some(prior);
         if !resume(&mut attached.client, numbers.start, &mut attached.robot)? {
             attached.begin()?;
         }
@@ -138,21 +149,16 @@ impl Pilot {
             policy = policy.name,
             "acting"
         );
-        let config = &mission.config;
-        let task = Task {
-            model,
-            shape: client.shape(),
-            n_moves: client.info().n_moves,
-            prior,
-            seed: robot_seed(config.planner_seed(seed), first as usize),
-            learned: &mission.learned,
-        };
-        let agent = registry::agent(policy, config, task)?;
+        let parts = (model, policy, prior);
+        let agent = agent(mission, &client, parts, (seed, first))?;
         let is_told = policy.estimator == EstimatorKind::Truth;
         Ok(Self {
             truth: is_told.then(|| open_truth(mission, &client)).transpose()?,
             feed: Feed::open(&mission.instance, agent.belief()),
             robot: Robot::new(agent, seen),
+            model: model.clone(),
+            policy: policy.clone(),
+            prior: None,
             seen: robots,
             client,
             warned: None,
@@ -167,9 +173,37 @@ impl Pilot {
         self.robot.begin(truth.as_ref(), look)
     }
 
-    /// One step of the rollout; returns the reward, or `None` if no path was flown: it is time to stop, or the world has
-    /// moved on without, and the agent has caught up. The last belief is shown in any case.
-    pub fn step(&mut self, is_last: bool, stop: &AtomicBool) -> Result<Option<f64>> {
+    /// Begins the world's next episode.
+    fn begin_next(&mut self, mission: &Mission) -> Result<()> {
+        let prior = match self.prior.take() {
+            Some(prior) => prior,
+            None => prior(mission, self.client.info(), &self.model, &self.policy)?,
+        };
+        let (world, seed) = (mission.world, None);
+        self.client.reset(&[WorldSeed { world, seed }])?;
+        let seen = Seen::new(self.client.observe(self.seen.clone())?);
+        let seed = seen.observation.world.seed;
+        tracing::info!(world, seed, "the episode was truncated: the next begins");
+        let first = self.seen.start % self.client.info().n_robots;
+        let parts = (&self.model, &self.policy, &prior);
+        let agent = agent(mission, &self.client, parts, (seed, first))?;
+        self.robot = Robot::new(agent, seen);
+        self.prior = Some(prior);
+        self.begin()
+    }
+
+    /// One step of the rollout, of the next episode if one has ended; returns the reward, or `None` if no path was
+    /// flown: it is time to stop, or the world has moved on without, and the agent has caught up. The last belief is
+    /// shown in any case.
+    pub fn step(
+        &mut self,
+        mission: &Mission,
+        is_last: bool,
+        stop: &AtomicBool,
+    ) -> Result<Option<f64>> {
+        if self.robot.observation().world.truncated != 0 {
+            self.begin_next(mission)?;
+        }
         let (own, is_planned) = (self.own(), self.is_planned());
         let n_before = is_planned[..own.start].iter().filter(|it| **it).count();
         let flown = n_before..n_before + own.len();
@@ -258,6 +292,39 @@ impl Pilot {
         };
         self.seen.clone().enumerate().map(is_planned).collect()
     }
+}
+
+/// The belief before the first frame.
+fn prior(mission: &Mission, info: &ServerInfo, model: &Model, policy: &Policy) -> Result<Belief> {
+    let prior = match policy.estimator.knows_model() {
+        true => mission.config.prior(info.burn_in),
+        false => Prior::Initial,
+    };
+    Ok(first_belief(
+        prior,
+        model,
+        shape_of(info)?,
+        mission.config.seed,
+    )?)
+}
+
+/// An agent before its first frame, of a world's seed and the number of its first robot there.
+fn agent(
+    mission: &Mission,
+    client: &Client,
+    (model, policy, prior): (&Model, &Policy, &Belief),
+    (seed, first): (u64, u32),
+) -> Result<Agent> {
+    let config = &mission.config;
+    let task = Task {
+        model,
+        shape: client.shape(),
+        n_moves: client.info().n_moves,
+        prior,
+        seed: robot_seed(config.planner_seed(seed), first as usize),
+        learned: &mission.learned,
+    };
+    registry::agent(policy, config, task)
 }
 
 /// Plans for some of the robots that an agent knows.

@@ -173,6 +173,15 @@ pub fn needs_checkpoint(policy: &Policy, kind: &str) -> String {
     )
 }
 
+/// The words for a policy that filters with a model, on recorded worlds.
+pub fn needs_model(policy: &Policy) -> String {
+    format!(
+        "policy {:?} filters with a model, and recorded worlds have none: expected --model FILE, or a policy that \
+         needs none, such as coverage or learned_beam",
+        policy.name
+    )
+}
+
 fn same_observations(task: &Task<'_>, got: usize) -> Result<()> {
     let expected = task.model.n_observations();
     ensure!(

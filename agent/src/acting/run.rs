@@ -21,7 +21,8 @@ pub struct Summary {
     pub reward: f64,
 }
 
-/// Acts until the steps are done or `stop` is set. Waits for a server that ends, however often.
+/// Acts until the steps are done or `stop` is set, in one episode after the other. Waits for a server that ends,
+/// however often.
 pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
     let (mut summary, mut is_in_step) = (Summary::default(), true);
     let mut pilot = Pilot::attach(mission)?;
@@ -30,7 +31,7 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
         last: summary,
     };
     while !stop.load(Ordering::Relaxed) && (mission.steps == 0 || summary.steps < mission.steps) {
-        match pilot.step(summary.steps + 1 == mission.steps, stop) {
+        match pilot.step(mission, summary.steps + 1 == mission.steps, stop) {
             Ok(Some(reward)) => {
                 summary.steps += 1;
                 summary.reward += reward;

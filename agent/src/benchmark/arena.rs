@@ -4,7 +4,8 @@
 //! *scouts* of the same seeds, kept one step ahead for clairvoyant policies (a world does not depend
 //! on the path, so a scout shows the future lawfully); and one *spare*, for full observations.
 
-use crate::acting::registry::{self, Task};
+use crate::acting::mission::recorded_states;
+use crate::acting::registry::{self, Task, needs_model};
 use crate::benchmark::team::Team;
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
@@ -67,9 +68,11 @@ impl Arena {
         };
         let client = Client::acquire(instance, &claim)?;
         let info = client.info();
-        let model = info.model.as_ref();
+        let model = match recorded_states(info)? {
+            None => info.model.as_deref().map(Model::from_toml).transpose()?,
+            recorded => recorded,
+        };
         let model = model.with_context(|| unfit("the model, for filters: --reveal-model true"))?;
-        let model = Model::from_toml(model)?;
         let truth = info
             .publish_truth
             .then(|| TruthFeed::open(instance, client.shape()));
@@ -96,6 +99,11 @@ impl Arena {
 
     pub fn model(&self) -> &Model {
         &self.model
+    }
+
+    /// Whether its worlds were recorded, so that they have no model.
+    pub fn is_recorded(&self) -> bool {
+        self.info().recorded_world.is_some()
     }
 
     pub fn shape(&self) -> Shape {
@@ -209,6 +217,10 @@ impl Arena {
         (seed, number): (u64, usize),
         learned: &Learned,
     ) -> Result<Agent> {
+        ensure!(
+            !(self.is_recorded() && policy.estimator.knows_model()),
+            needs_model(policy)
+        );
         let task = Task {
             model: &self.model,
             shape: self.shape(),

@@ -34,7 +34,8 @@ pub struct CompareCommand {
     /// The policies, separated by commas [default: the ladder; of teams: beam_exploit]
     #[arg(long, value_delimiter = ',')]
     policies: Vec<String>,
-    /// The policy that others are paired against [default: shooting_exploit; of teams: the first policy]
+    /// The policy that others are paired against [default: shooting_exploit; of teams: the first policy; of
+    /// recorded worlds: coverage]
     #[arg(long)]
     baseline: Option<String>,
     /// Robots of each world, separated by commas, each on worlds of its own [default: 1, or the running server's]
@@ -101,10 +102,10 @@ impl CompareCommand {
                 tracing::info!("watch at {}", dashboard.url());
             }
             let comparison = Comparison {
-                policies: self.policies(arena.model(), &learned)?,
+                policies: self.policies_on(arena, &learned)?,
                 teams: self.team.clone(),
                 seeds: self.worlds.seeds.clone(),
-                steps: self.worlds.steps,
+                steps: self.worlds.steps(arena.info())?,
                 recent_steps: self.recent_steps,
                 config: config.clone(),
                 learned: learned.clone(),
@@ -116,6 +117,7 @@ impl CompareCommand {
             if let Some(directory) = &self.figures {
                 draw_step(directory, arena, &results)?;
             }
+            report.is_recorded = arena.is_recorded();
             report.add(axis_label(arena.model()), results);
         }
         self.tell(&report, added.unwrap_or_default(), &config)
@@ -127,7 +129,7 @@ impl CompareCommand {
         // What was measured is kept in any case.
         let added = if fits.is_ok() { added } else { Vec::new() };
         let all = [&*report.runs, &*added].concat();
-        write(&render_table(&all, self.baseline()))?;
+        write(&render_table(&all, self.baseline(report.is_recorded)))?;
         if let Some(path) = &self.csv {
             write_csv(path, &all)?;
         }
@@ -170,6 +172,15 @@ impl CompareCommand {
         folders.into_iter().flatten().try_for_each(make_folder)
     }
 
+    /// The policies on an arena's worlds; of the ladder those that need no model, if there is none.
+    fn policies_on(&self, arena: &Arena, learned: &Learned) -> Result<Vec<Policy>> {
+        let mut policies = self.policies(arena.model(), learned)?;
+        if arena.is_recorded() && self.policies.is_empty() && !self.has_teams() {
+            policies.retain(|policy| !policy.estimator.knows_model());
+        }
+        Ok(policies)
+    }
+
     fn policies(&self, model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
         let named = |name: &String| Policy::named(name, model);
         let policies = match self.policies.as_slice() {
@@ -186,7 +197,7 @@ impl CompareCommand {
             "policies: expected each name once, got {:?} twice",
             twice.map_or("", |(_, policy)| &policy.name)
         );
-        named(&self.baseline().to_owned()).context("--baseline")?;
+        named(&self.baseline(false).to_owned()).context("--baseline")?;
         for policy in &policies {
             let kind = match policy.estimator {
                 EstimatorKind::Learned | EstimatorKind::LearnedSpatial
@@ -210,10 +221,11 @@ impl CompareCommand {
         self.robots.iter().any(|&robots| robots > 1) || self.team != [Team::Alone]
     }
 
-    fn baseline(&self) -> &str {
+    fn baseline(&self, is_recorded: bool) -> &str {
         match (&self.baseline, self.has_teams()) {
             (Some(name), _) => name,
             (None, true) => self.policies.first().map_or(OF_TEAMS, String::as_str),
+            (None, false) if is_recorded => "coverage",
             (None, false) => "shooting_exploit",
         }
     }
@@ -234,6 +246,7 @@ struct Report {
     /// The same for all numbers of robots.
     fire_cells: Vec<f32>,
     axis_label: String,
+    is_recorded: bool,
 }
 
 impl Report {

@@ -64,6 +64,7 @@ impl EvaluateCommand {
         let learned = Learned::read(checkpoints, &self.device.open()?)?;
         let mut worlds = self.worlds.open(false, Some(1), |_| Ok(()))?;
         let arena = &mut worlds.arena;
+        let steps = self.worlds.steps(arena.info())?;
         let policies = examined(&learned).into_iter();
         let policies = policies.map(|name| Policy::named(name, arena.model()));
         let policies = policies.collect::<Result<Vec<_>, _>>()?;
@@ -71,7 +72,7 @@ impl EvaluateCommand {
             let examination = Examination {
                 guide,
                 seeds: self.worlds.seeds.clone(),
-                steps: self.worlds.steps,
+                steps,
                 config: &config,
                 policies: &policies,
                 learned: &learned,
@@ -101,7 +102,7 @@ impl EvaluateCommand {
             policies: names.into_iter().map(named).collect::<Result<_, _>>()?,
             teams: vec![Team::Alone],
             seeds: self.worlds.seeds.clone(),
-            steps: self.worlds.steps,
+            steps: self.worlds.steps(arena.info())?,
             recent_steps: RECENT_STEPS,
             config,
             learned,

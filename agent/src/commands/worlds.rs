@@ -6,6 +6,7 @@ use agent::server::launch::OwnServer;
 use anyhow::{Result, ensure};
 use clap::Args;
 use protocol::channels::Instance;
+use protocol::control::ServerInfo;
 use protocol::{Model, Shape};
 use std::ops::Range;
 use std::path::PathBuf;
@@ -15,6 +16,9 @@ const MAX_SEEDS: u64 = 100_000;
 
 /// Burn-in of the benchmark, steps.
 const BENCHMARK_BURN_IN: u64 = 25_000;
+
+/// Scored steps of the benchmark.
+const BENCHMARK_STEPS: u64 = 1500;
 
 /// Flags that say which worlds.
 #[derive(Debug, Args)]
@@ -27,11 +31,11 @@ pub struct WorldFlags {
     /// World seeds, first..end
     #[arg(long, value_parser = parse_seeds, default_value = "0..8")]
     pub seeds: Range<u64>,
-    /// Scored steps of each world
-    #[arg(long, default_value_t = 1500, value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
-    pub steps: u64,
+    /// Scored steps of each world [default: 1500, or as many as the shortest episode has]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
+    steps: Option<u64>,
     /// Steps simulated before the first scored one [default: 25000, or the running server's]
-    #[arg(long)]
+    #[arg(long, conflicts_with = "states")]
     burn_in: Option<u64>,
     /// The server's program, if it is not beside this one
     #[arg(long, value_name = "PROGRAM", conflicts_with = "instance")]
@@ -56,6 +60,15 @@ pub struct GridFlags {
     /// Moves in a path, for the server that is started
     #[arg(long, default_value_t = 64, conflicts_with = "instance")]
     moves: usize,
+    /// A .npz or .npy file or folder of recorded states in the place of a model, for the server that is started
+    #[arg(long, value_name = "FILE|FOLDER", conflicts_with_all = ["instance", "model", "height", "width"])]
+    states: Option<String>,
+    /// World seeds choose among the symmetries of the grid, too
+    #[arg(long, requires = "states")]
+    states_symmetries: bool,
+    /// Episodes begin at a recorded step of 0 to this
+    #[arg(long, value_name = "STEPS", requires = "states", default_value_t = 0)]
+    states_offset: u64,
 }
 
 /// Worlds, and the server that was started for them: dropped, it stops.
@@ -82,7 +95,7 @@ impl WorldFlags {
                 (instance, None)
             }
             None => {
-                check(&self.grid.check()?)?;
+                self.grid.check()?.as_ref().map_or(Ok(()), check)?;
                 let mut arguments = self.server_arguments(needs_scouts);
                 arguments.extend(robot_arguments(n_robots.unwrap_or(1)));
                 let server = OwnServer::start(self.server.clone(), &arguments)?;
@@ -103,6 +116,17 @@ impl WorldFlags {
             "--robots: expected the running server's {got}, got {asked}"
         );
         Ok(Worlds { arena, _own: own })
+    }
+
+    /// Scored steps, as many as were asked for or as the benchmark has, if episodes are as long.
+    pub fn steps(&self, info: &ServerInfo) -> Result<u64> {
+        let longest = info.shortest_episode().unwrap_or(u64::MAX);
+        let steps = self.steps.unwrap_or(BENCHMARK_STEPS.min(longest));
+        ensure!(
+            steps <= longest,
+            "--steps: expected at most {longest}, as the shortest episode has, got {steps}"
+        );
+        Ok(steps)
     }
 
     /// Number of worlds.
@@ -133,25 +157,37 @@ fn robot_arguments(n_robots: u32) -> Vec<String> {
 }
 
 impl GridFlags {
-    /// The model, if it can be simulated on the grid.
-    pub fn check(&self) -> Result<Model> {
+    /// The model, if it can be simulated on the grid; recorded states have none.
+    pub fn check(&self) -> Result<Option<Model>> {
+        if self.states.is_some() {
+            return Ok(None);
+        }
         let model = model_named(&self.model)?;
         model.check_on(Shape::new(self.height, self.width)?)?;
-        Ok(model)
+        Ok(Some(model))
     }
 
     /// The flags of a server with these worlds.
     pub fn arguments(&self, worlds: u32, seed: u64, burn_in: u64) -> Vec<String> {
         let settings = [
             ("--worlds", worlds.to_string()),
-            ("--model", self.model.clone()),
-            ("--height", self.height.to_string()),
-            ("--width", self.width.to_string()),
             ("--moves", self.moves.to_string()),
             ("--seed", seed.to_string()),
-            ("--burn-in", burn_in.to_string()),
         ];
-        let pairs = settings.into_iter();
+        let of_worlds = match &self.states {
+            Some(states) => vec![
+                ("--states", states.clone()),
+                ("--states-symmetries", self.states_symmetries.to_string()),
+                ("--states-offset", self.states_offset.to_string()),
+            ],
+            None => vec![
+                ("--model", self.model.clone()),
+                ("--height", self.height.to_string()),
+                ("--width", self.width.to_string()),
+                ("--burn-in", burn_in.to_string()),
+            ],
+        };
+        let pairs = settings.into_iter().chain(of_worlds);
         pairs
             .flat_map(|(flag, value)| [flag.to_owned(), value])
             .collect()

@@ -4,6 +4,7 @@ use crate::album::Album;
 use crate::entry::States;
 use protocol::Model;
 use protocol::control::{CoverageRule, ServerInfo, ServerStatus};
+use protocol::model::Description;
 use serde::Serialize;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use tokio::sync::watch;
@@ -113,9 +114,15 @@ impl Scene {
 }
 
 impl Info {
-    /// Reads the model, if the server reveals it; one that makes no sense counts as hidden.
+    /// Reads the model or the description of recorded worlds, if the server reveals it; one that makes no sense counts
+    /// as hidden.
     pub fn new(info: &ServerInfo) -> Self {
-        let model = info.model.as_deref().map(Model::from_toml);
+        let recorded = info.recorded_world.as_ref();
+        let description = recorded.and_then(|recorded| recorded.description.as_deref());
+        let model = match info.model.as_deref() {
+            Some(model) => Some(Model::from_toml(model)),
+            None => description.map(Description::model_of),
+        };
         let model = model.and_then(Result::ok);
         let file = model.as_ref().map(Model::file);
         let names = |of: fn(&protocol::model::StateEntry) -> &String| {

@@ -24,6 +24,7 @@ fn damaged() -> Vec<u8> {
         n_observations: 3,
         observations: vec!["normal".into(), "latent".into(), "fire".into()],
         model: None,
+        recorded_world: None,
         burn_in: 0,
         max_steps: 0,
         max_clients: 16,

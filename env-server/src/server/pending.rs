@@ -52,7 +52,8 @@ impl Server {
 
     /// Warns of the first world in which there is nothing to find.
     fn warn_of_barren(&mut self, world: usize, episode: &Episode) {
-        if self.has_warned_of_barren || episode.result().n_target_cells > 0 {
+        let is_recorded = self.simulator.is_recorded();
+        if self.has_warned_of_barren || is_recorded || episode.result().n_target_cells > 0 {
             return;
         }
         self.has_warned_of_barren = true;

@@ -5,7 +5,8 @@ use super::outcome::{Outcome, PendingReply, ServerStats, malformed, refusal};
 use super::state::{ResetJob, Simulator, Slot, cells};
 use protocol::channels::MAX_CLIENTS;
 use protocol::control::{
-    LeaseInfo, Reply, Request, ServerInfo, ServerStatus, WorldSeed, WorldStatus, parse,
+    LeaseInfo, RecordedWorld, Reply, Request, ServerInfo, ServerStatus, WorldSeed, WorldStatus,
+    parse,
 };
 use protocol::message::{Status, VERSION, WorldResult};
 use protocol::randomness::{Purpose, stream};
@@ -244,6 +245,7 @@ impl Simulator {
 
     fn info(&self) -> ServerInfo {
         let (config, file) = (&self.checked.config, self.checked.model.file());
+        let recorded = &self.checked.recorded;
         ServerInfo {
             protocol: VERSION,
             build: env!("CARGO_PKG_VERSION").into(),
@@ -259,9 +261,13 @@ impl Simulator {
                 .iter()
                 .map(|observation| observation.name.clone())
                 .collect(),
-            model: config
-                .reveal_model
+            model: (config.reveal_model && recorded.is_none())
                 .then(|| toml::to_string(file).expect("invariant: model files serialise")),
+            recorded_world: recorded.as_ref().map(|states| RecordedWorld {
+                description: config.reveal_model.then(|| states.description.clone()),
+                n_sequences: states.recorded.n_sequences(),
+                n_steps: states.recorded.n_steps(),
+            }),
             burn_in: config.burn_in,
             max_steps: config.max_steps,
             max_clients: MAX_CLIENTS,

@@ -122,6 +122,11 @@ impl Simulator {
         &self.spec
     }
 
+    /// Whether its worlds were recorded.
+    pub fn is_recorded(&self) -> bool {
+        self.checked.recorded.is_some()
+    }
+
     /// Ends leases that have expired, and moves worlds whose deadline has passed; returns the pid of each such lease.
     pub fn tick(&mut self, now: Instant) -> Vec<u32> {
         let expired = self.leases.expire(now);

@@ -33,6 +33,7 @@ impl WorldSpec {
             config,
             model,
             shape,
+            recorded,
             ..
         } = checked;
         let mut rules = Rules::new(
@@ -44,6 +45,9 @@ impl WorldSpec {
         )?;
         (rules.history, rules.n_moves) = (config.history as usize, config.moves);
         rules.n_robots = config.robots as usize;
+        if let Some(states) = recorded {
+            rules = rules.with_recorded(states.recorded.clone());
+        }
         let settings = Settings::of(checked);
         Ok(Self { settings, rules })
     }
@@ -65,9 +69,19 @@ impl Settings {
             ("coverage", format!("{:?}", config.coverage).to_lowercase()),
             ("start", format!("{:?}", config.start).to_lowercase()),
         ];
+        let of_states = checked.recorded.iter().flat_map(|states| {
+            let n_sequences = states.recorded.n_sequences();
+            let sequences = format!("{n_sequences} sequences of CRC-32 {:08x}", states.checksum);
+            [
+                ("states", sequences),
+                ("states_symmetries", text(&config.states_symmetries)),
+                ("states_offset", text(&config.states_offset)),
+            ]
+        });
+        let others = others.into_iter().chain(of_states);
         Self {
             model: model.expect("invariant: a model was read from TOML"),
-            others: others.map(|(name, value)| (name.into(), value)).to_vec(),
+            others: others.map(|(name, value)| (name.into(), value)).collect(),
         }
     }
 

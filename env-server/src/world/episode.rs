@@ -38,7 +38,7 @@ impl Episode {
 
     /// A new world at k = 0 that was reset before.
     pub fn numbered(rules: &Rules, seed: u64, episode: u64) -> Self {
-        let world = World::new(rules.dynamics.clone(), seed, rules.burn_in);
+        let world = World::new(rules.source.clone(), seed, rules.burn_in);
         Self::beginning(rules, world, episode)
     }
 
@@ -47,7 +47,7 @@ impl Episode {
         let world = if self.beginning.seed() == seed {
             self.beginning.clone()
         } else {
-            World::new(rules.dynamics.clone(), seed, rules.burn_in)
+            World::new(rules.source.clone(), seed, rules.burn_in)
         };
         *self = Self::beginning(rules, world, self.result.episode.wrapping_add(1));
     }
@@ -69,7 +69,7 @@ impl Episode {
         self.result.hovered = flown.hovered;
         self.result.late = flown.late;
         self.result.n_target_cells = count(states, rules.target_state);
-        self.result.truncated = u16::from(rules.max_steps > 0 && step >= rules.max_steps);
+        self.result.truncated = u16::from(rules.truncates(self.result.seed, step));
         let states = states.as_slice().expect("invariant: states are row-major");
         pay(
             rules,
@@ -146,7 +146,7 @@ impl Episode {
         let world = |step, states| {
             let states = grid(states).expect("invariant: the length was checked");
             World::at(
-                rules.dynamics.clone(),
+                rules.source.clone(),
                 result.seed,
                 rules.burn_in,
                 step,

@@ -1,41 +1,60 @@
-//! The hidden state of one grid, a pure function of (model, seed, k).
+//! The hidden states of one world: simulated, a pure function of (model, seed, k), or recorded, of (sequences, seed, k).
 //!
-//! A world starts from the model's initial distribution, runs `burn_in` steps, and calls what it
+//! A simulated world starts from the model's initial distribution, runs `burn_in` steps, and calls what it
 //! reached k = 0. Its absolute step `burn_in + k` indexes the random streams, so that a world with
 //! burn-in B at k equals the one without burn-in at B + k.
 
+use super::recorded::Recorded;
 use protocol::{Dynamics, Grid};
+use std::sync::Arc;
+
+/// Where hidden states come from.
+#[derive(Debug, Clone)]
+pub enum Source {
+    Simulated(Dynamics),
+    Recorded(Arc<Recorded>),
+}
 
 /// The hidden states of one world at its present step.
 #[derive(Debug, Clone)]
 pub struct World {
-    dynamics: Dynamics,
+    source: Source,
     states: Grid<u8>,
     seed: u64,
     burn_in: u64,
     step: u64,
 }
 
+impl Source {
+    /// The last step of an episode, if it has one.
+    pub(super) fn last_step(&self, seed: u64) -> Option<u64> {
+        match self {
+            Self::Simulated(_) => None,
+            Self::Recorded(recorded) => Some(recorded.last_step(seed)),
+        }
+    }
+}
+
 impl World {
     /// Starts a world; simulates `burn_in` steps.
-    pub fn new(mut dynamics: Dynamics, seed: u64, burn_in: u64) -> Self {
-        let mut states = dynamics.initial(seed);
-        for n in 0..burn_in {
-            dynamics.step(seed, n, &mut states);
-        }
-        Self {
-            dynamics,
-            states,
-            seed,
-            burn_in,
-            step: 0,
-        }
+    pub fn new(mut source: Source, seed: u64, burn_in: u64) -> Self {
+        let states = match &mut source {
+            Source::Recorded(recorded) => recorded.states(seed, 0),
+            Source::Simulated(dynamics) => {
+                let mut states = dynamics.initial(seed);
+                for n in 0..burn_in {
+                    dynamics.step(seed, n, &mut states);
+                }
+                states
+            }
+        };
+        Self::at(source, seed, burn_in, 0, states)
     }
 
     /// A world at step k.
-    pub fn at(dynamics: Dynamics, seed: u64, burn_in: u64, step: u64, states: Grid<u8>) -> Self {
+    pub fn at(source: Source, seed: u64, burn_in: u64, step: u64, states: Grid<u8>) -> Self {
         Self {
-            dynamics,
+            source,
             states,
             seed,
             burn_in,
@@ -44,10 +63,16 @@ impl World {
     }
 
     /// Moves the world from k to k + 1 (paper eq. 4, each cell drawn from `Phi` of the states).
+    ///
+    /// # Panics
+    /// If a recorded sequence has ended.
     pub fn advance(&mut self) {
-        self.dynamics
-            .step(self.seed, self.absolute_step(), &mut self.states);
+        let n = self.absolute_step();
         self.step += 1;
+        match &mut self.source {
+            Source::Simulated(dynamics) => dynamics.step(self.seed, n, &mut self.states),
+            Source::Recorded(recorded) => recorded.show(self.seed, self.step, &mut self.states),
+        }
     }
 
     /// Hidden states, shape `[H, W]`.
@@ -78,7 +103,7 @@ mod tests {
     fn world(seed: u64, burn_in: u64, steps: u64) -> World {
         let shape = Shape::new(64, 48).expect("test shape");
         let dynamics = Dynamics::new(&Model::wildfire(), shape).expect("valid model");
-        let mut world = World::new(dynamics, seed, burn_in);
+        let mut world = World::new(Source::Simulated(dynamics), seed, burn_in);
         (0..steps).for_each(|_| world.advance());
         world
     }

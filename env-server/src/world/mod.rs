@@ -4,6 +4,7 @@ mod episode;
 mod flown;
 mod hidden;
 mod history;
+mod recorded;
 mod reward;
 mod robot;
 mod rules;
@@ -12,8 +13,9 @@ mod sensor;
 
 pub use episode::Episode;
 pub use flown::Flown;
-pub use hidden::World;
+pub use hidden::{Source, World};
 pub use history::{PastRobot, PastStep};
+pub use recorded::Recorded;
 pub use robot::Robot;
 pub use rules::{Rules, Start};
 pub use saved::{InvalidWorld, SavedRobot, SavedWorld};

@@ -1,11 +1,14 @@
 //! What all episodes of a server share: the model, the grid, and the settings that decide a world's future.
 
+use super::hidden::Source;
+use super::recorded::Recorded;
 use super::sensor::Sensor;
 use protocol::model::ModelError;
 use protocol::randomness::{Purpose, stream};
 use protocol::{Cell, Dynamics, Model, Shape};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Where the robots of a world are after a reset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -46,7 +49,7 @@ pub struct Rules {
     /// Robots of a world.
     pub n_robots: usize,
     pub(super) sensor: Sensor,
-    pub(super) dynamics: Dynamics,
+    pub(super) source: Source,
 }
 
 impl Rules {
@@ -74,8 +77,20 @@ impl Rules {
             n_moves: 0,
             n_robots: 1,
             sensor: Sensor::new(model),
-            dynamics: Dynamics::new(model, shape)?,
+            source: Source::Simulated(Dynamics::new(model, shape)?),
         })
+    }
+
+    /// The same, of worlds whose hidden states were recorded.
+    pub fn with_recorded(mut self, recorded: Arc<Recorded>) -> Self {
+        self.source = Source::Recorded(recorded);
+        self
+    }
+
+    /// Whether the episode of a seed is truncated at a step.
+    pub(super) fn truncates(&self, seed: u64, step: u64) -> bool {
+        let last = self.source.last_step(seed);
+        (self.max_steps > 0 && step >= self.max_steps) || last.is_some_and(|last| step >= last)
     }
 
     pub(super) fn start_cell(&self, seed: u64, robot: usize) -> Cell {

@@ -56,7 +56,12 @@ impl SavedWorld {
             let fine = usize::from(most) < n_states;
             expect(what, fine, &format!("states below {n_states}"), &most)?;
         }
-        let WorldResult { step, episode, .. } = self.result;
+        let WorldResult {
+            step,
+            episode,
+            seed,
+            ..
+        } = self.result;
         for (what, got) in [("step", step), ("episode", episode)] {
             let expected = format!("at most {MAX_COUNT}");
             expect(what, got <= MAX_COUNT, &expected, &got)?;
@@ -68,7 +73,7 @@ impl SavedWorld {
         let expected = format!("bits below {n_robots}");
         expect("robots that stayed", fine, &expected, &stayed)?;
         let ends = [self.result.terminated, self.result.truncated];
-        let expected = [0, u16::from(rules.max_steps > 0 && step >= rules.max_steps)];
+        let expected = [0, u16::from(rules.truncates(seed, step))];
         let (expected, got) = (format!("{expected:?}"), format!("{ends:?}"));
         expect("ends", expected == got, &expected, &got)?;
         let got = self.robots.len();

@@ -4,6 +4,7 @@
 //! [`transition`] applies the same operator to beliefs; [`path`] and [`frame`] are a robot's moves and observations.
 
 mod check;
+mod description;
 pub mod dynamics;
 pub mod file;
 pub mod frame;
@@ -16,6 +17,7 @@ pub mod randomness;
 pub mod transition;
 pub mod vectors;
 
+pub use description::{DescribedState, Description};
 pub use file::{
     KernelEntry, MAX_KERNEL_SIDE, MAX_VALUES, ModelError, ModelFile, ObservationEntry, StateEntry,
     parse_color,

@@ -18,6 +18,8 @@ pub enum Purpose {
     Sensor,
     /// The robot's start cell, where it is random.
     Start,
+    /// The recorded step at which a recorded world begins.
+    Offset,
     /// A planner's random numbers; indexed by step.
     Planner,
     /// Worlds simulated to find a filter's first prior.
@@ -45,6 +47,7 @@ impl Purpose {
             Self::Transition => b"transition",
             Self::Sensor => b"sensor",
             Self::Start => b"start",
+            Self::Offset => b"offset",
             Self::Planner => b"planner",
             Self::Prior => b"prior",
             Self::Learner => b"learner",

@@ -186,8 +186,11 @@ pub struct ServerInfo {
     pub n_observations: usize,
     /// Names of the observations.
     pub observations: Vec<String>,
-    /// The model as TOML, if the server reveals it.
+    /// The model as TOML, if there is one and the server reveals it.
     pub model: Option<String>,
+    /// What worlds show whose hidden states were recorded.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub recorded_world: Option<RecordedWorld>,
     /// Steps simulated from the initial distribution before k = 0.
     pub burn_in: u64,
     /// Episode length; 0: never truncated.
@@ -202,6 +205,26 @@ pub struct ServerInfo {
     pub lease_millis: u64,
     /// How long a world waits for the paths of its other held robots from the first path on; 0: no deadline.
     pub deadline_millis: u64,
+}
+
+impl ServerInfo {
+    /// Steps of the shortest episode, if any is truncated.
+    pub fn shortest_episode(&self) -> Option<u64> {
+        let recorded = self.recorded_world.as_ref().map(|it| it.n_steps);
+        let truncated = Some(self.max_steps).filter(|&steps| steps > 0);
+        recorded.into_iter().chain(truncated).min()
+    }
+}
+
+/// Sequences of recorded hidden states.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RecordedWorld {
+    /// The description of its states as TOML, if the server reveals it.
+    pub description: Option<String>,
+    /// Number of sequences.
+    pub n_sequences: usize,
+    /// Steps of the shortest episode.
+    pub n_steps: u64,
 }
 
 /// Which cells a server's steps observe.

@@ -1,11 +1,12 @@
 //! The JSON of the control channel and of decisions.
 
 use proptest::collection::vec;
+use proptest::option;
 use proptest::prelude::*;
 use proptest::sample::select;
 use protocol::control::{
-    CoverageRule, LeaseInfo, Reply, Request, ServerInfo, ServerStatus, WorldInfo, WorldSeed,
-    WorldStatus,
+    CoverageRule, LeaseInfo, RecordedWorld, Reply, Request, ServerInfo, ServerStatus, WorldInfo,
+    WorldSeed, WorldStatus,
 };
 use protocol::decisions::{self, Decision};
 use protocol::message::Status;
@@ -144,9 +145,19 @@ fn reply() -> impl Strategy<Value = Reply> {
 fn server_info() -> impl Strategy<Value = ServerInfo> {
     let rules = [CoverageRule::Path, CoverageRule::Full, CoverageRule::Client];
     let numbers = (any::<[u32; 4]>(), any::<[usize; 5]>(), any::<[u64; 4]>());
-    let texts = (".*", vec(".*", 0..4), any::<Option<String>>());
+    let texts = (
+        ".*",
+        vec(".*", 0..4),
+        any::<Option<String>>(),
+        option::of(recorded_world()),
+    );
     (numbers, texts, select(rules.to_vec()), any::<bool>()).prop_map(
-        |((small, sizes, long), (build, observations, model), coverage, publish_truth)| {
+        |(
+            (small, sizes, long),
+            (build, observations, model, recorded_world),
+            coverage,
+            publish_truth,
+        )| {
             ServerInfo {
                 protocol: small[0],
                 build,
@@ -159,6 +170,7 @@ fn server_info() -> impl Strategy<Value = ServerInfo> {
                 n_observations: sizes[3],
                 observations,
                 model,
+                recorded_world,
                 burn_in: long[0],
                 max_steps: long[1],
                 max_clients: sizes[4],
@@ -169,6 +181,16 @@ fn server_info() -> impl Strategy<Value = ServerInfo> {
             }
         },
     )
+}
+
+fn recorded_world() -> impl Strategy<Value = RecordedWorld> {
+    any::<(Option<String>, usize, u64)>().prop_map(|(description, n_sequences, n_steps)| {
+        RecordedWorld {
+            description,
+            n_sequences,
+            n_steps,
+        }
+    })
 }
 
 fn server_status() -> impl Strategy<Value = ServerStatus> {

@@ -4,7 +4,7 @@ use super::target::{Kind, Seed, Target};
 use super::{files, messages, requests, worlds};
 
 /// All of them.
-pub const TARGETS: [Target; 11] = [
+pub const TARGETS: [Target; 12] = [
     message("step_request", requests::step, requests::step_seeds),
     message(
         "control_request",
@@ -26,6 +26,7 @@ pub const TARGETS: [Target; 11] = [
     message("decision", messages::decision, messages::decision_seeds),
     file("model", files::model, files::model_seeds),
     file("checkpoint", files::checkpoint, files::checkpoint_seeds),
+    file("states", worlds::states, worlds::states_seeds),
     file("snapshot", worlds::snapshot, worlds::snapshot_seeds),
     file("recording", worlds::recording, worlds::recording_seeds),
 ];

@@ -1,15 +1,21 @@
-//! Files of worlds: snapshots and recordings.
+//! Files of worlds: snapshots, recordings and recorded states.
 
 use super::target::Seed;
 use env_server::config::ServerConfig;
 use env_server::snapshot::{NewEpisode, SnapshotWorld, WorldSpec, decode, encode};
+use env_server::states_file::Sequences;
 use env_server::world::{Episode, Flown};
+use ndarray::{Array3, Axis};
+use ndarray_npy::WriteNpyExt;
 use protocol::Move;
 use protocol::control::ServerInfo;
 use protocol::message::{FrameHeader, RobotResult, VERSION};
 use protocol::observer::Sample;
 use protocol::recording::{Event, Reader, Record, Writer};
+use std::io::{Cursor, Write};
 use std::sync::OnceLock;
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, ZipWriter};
 
 /// Bytes in front of a snapshot's body.
 const HEADER_BYTES: usize = 24;
@@ -169,4 +175,39 @@ pub fn recording_seeds() -> Vec<Seed> {
     drop(writer);
     let cut = bytes[..bytes.len() - 5].to_vec();
     vec![("frame", bytes), ("cut", cut)]
+}
+
+/// Recorded states of three kinds, an archive or one array: refused, or all sequences have one shape.
+pub fn states(bytes: &[u8]) -> bool {
+    let mut sequences = Sequences::new(3);
+    let added = match bytes.starts_with(b"\x93NUMPY") {
+        true => sequences.add_array("one", bytes.len() as u64, bytes),
+        false => sequences.add_archive(Cursor::new(bytes)),
+    };
+    let shape = |array: &Array3<u8>| [1, 2].map(|axis| array.len_of(Axis(axis)));
+    for array in &sequences.arrays {
+        assert!(array.len_of(Axis(0)) >= 2 && array.iter().all(|&state| state < 3));
+        assert_eq!(shape(array), shape(&sequences.arrays[0]));
+        assert!(array.as_slice().is_some() && array.len() <= 2000 * bytes.len());
+    }
+    added.is_ok()
+}
+
+pub fn states_seeds() -> Vec<Seed> {
+    let array = |n_recorded: usize| {
+        let states = Array3::from_shape_fn((n_recorded, 2, 3), |(k, row, col)| {
+            ((k + row + col) % 3) as u8
+        });
+        let mut bytes = Vec::new();
+        states.write_npy(&mut bytes).expect("into memory");
+        bytes
+    };
+    let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
+    let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
+    for (name, n_recorded) in [("states_000.npy", 2), ("states_001.npy", 3)] {
+        archive.start_file(name, options).expect("a new member");
+        archive.write_all(&array(n_recorded)).expect("into memory");
+    }
+    let archive = archive.finish().expect("into memory").into_inner();
+    vec![("array", array(4)), ("archive", archive)]
 }

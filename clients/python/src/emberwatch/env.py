@@ -106,6 +106,9 @@ class WildfireEnv(WorldEnv):
       `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `start`
       (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the private server. With `instance`
       they may be left out, or must agree.
+    * `states`: recorded states in the place of a model (a `.npz` or `.npy` file or a folder, see
+      `docs/recorded-worlds.md`), which decide `height`, `width` and `burn_in`;
+      `states_symmetries` (False), `states_offset` (0). The last recorded step truncates.
     * `truth`: reveal the hidden states in `info` and pictures (False).
     * `timeout`: how long to wait for a step, or until the running server is there, seconds (5).
     * `render_mode`: `"rgb_array"`, `"human"` (a window, or the terminal) or `"ansi"`.

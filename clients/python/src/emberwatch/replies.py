@@ -14,6 +14,17 @@ _Record = TypeVar("_Record")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedWorld:
+    """What a server tells of recorded hidden states."""
+
+    #: Their names, colours, rewards and readings as TOML text; None if the server hides it.
+    description: str | None
+    n_sequences: int
+    #: Steps of the shortest episode.
+    n_steps: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ServerInfo:
     """How a server describes itself (PROTOCOL.md section 6, `hello`)."""
 
@@ -28,7 +39,7 @@ class ServerInfo:
     n_robots: int
     n_observations: int
     observations: tuple[str, ...]
-    #: The model as TOML text; None if the server hides it.
+    #: The model as TOML text; None if the server hides it or its worlds were recorded.
     model: str | None
     burn_in: int
     #: Steps until an episode is truncated; 0: never.
@@ -40,6 +51,8 @@ class ServerInfo:
     lease_millis: int
     #: How long the other robots have after the first path of a step; 0: as long as they hold it.
     deadline_millis: int
+    #: None of simulated worlds.
+    recorded_world: RecordedWorld | None = None
 
     @property
     def shape(self) -> Shape:
@@ -179,6 +192,10 @@ def record(kind: type[_Record], keys: Any) -> _Record:
     given = cast("Mapping[str, Any]", keys)
     values: dict[str, Any] = {}
     for name, types in _types(kind).items():
+        if name == "recorded_world":  # the one key that may be missing
+            nested = given.get(name)
+            values[name] = None if nested is None else record(RecordedWorld, nested)
+            continue
         if name not in given:
             raise _wrong(f"a key {name!r}, got {sorted(given)}")
         value = _as_tuples(given[name])

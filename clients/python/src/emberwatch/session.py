@@ -257,7 +257,7 @@ class Session:
         """Warns once of worlds in which there is nothing to find."""
         worlds = answer.worlds
         barren = np.flatnonzero((worlds["n_target_cells"] == 0) & (worlds["step"] == 0))
-        if self._has_warned or not len(barren):
+        if self._has_warned or self.settings.states is not None or not len(barren):
             return
         self._has_warned = True
         _warn(
@@ -309,7 +309,7 @@ class SessionOwner:
 
     @property
     def model(self) -> Model | None:
-        """The model behind the worlds; None if a running server hides it."""
+        """The model behind the worlds; None if a running server hides it, or they were recorded."""
         return self._session.spec.model
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from inspect import signature
@@ -30,6 +31,9 @@ class WorldArguments(TypedDict, total=False):
     robots: int | None
     takeover: bool
     model: str | Path | None
+    states: str | Path | None
+    states_symmetries: bool
+    states_offset: int
     height: int | None
     width: int | None
     n_moves: int | None
@@ -50,6 +54,9 @@ class Settings:
     robots: int | None = None
     takeover: bool = False
     model: str | Path | None = None
+    states: str | Path | None = None
+    states_symmetries: bool = False
+    states_offset: int = 0
     height: int | None = None
     width: int | None = None
     n_moves: int | None = None
@@ -101,6 +108,7 @@ class Settings:
             "worlds": n_worlds,
             "robots": self.robots,
             "model": self.model,
+            "states": self.states,
             "height": self.height,
             "width": self.width,
             "moves": self.n_moves,
@@ -108,6 +116,10 @@ class Settings:
             "start": self.start,
             "publish-truth": str(self.truth).lower(),
         }
+        if self.states_symmetries:
+            flags["states-symmetries"] = "true"
+        if self.states_offset:
+            flags["states-offset"] = self.states_offset
         return [f"--{flag}={value}" for flag, value in flags.items() if value is not None]
 
 
@@ -115,7 +127,7 @@ class Settings:
 class WorldSpec:
     """What an environment must know of its worlds before they are there."""
 
-    #: None if a running server hides it.
+    #: None if a running server hides it, or the worlds were recorded.
     model: Model | None
     height: int
     width: int
@@ -148,13 +160,15 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
     robots = _robots(settings, n_rows, settings.robots or 1)
     n_worlds = len(robots) // (settings.robots or 1)
     checked: dict[str, Any] = check_settings(settings.server_flags(n_worlds))
-    model = Model.checked(checked["model"])
+    states = checked["states"]
+    model = None if states else Model.checked(checked["model"])
+    n_observations = _n_described(Path(states)) if model is None else model.n_observations
     spec = WorldSpec(
         model=model,
         height=checked["height"],
         width=checked["width"],
         n_moves=checked["moves"],
-        n_observations=model.n_observations,
+        n_observations=n_observations,
         burn_in=checked["burn_in"],
         n_robots=checked["robots"],
     )
@@ -165,8 +179,12 @@ def running_spec(
     settings: Settings, n_rows: int | None, info: ServerInfo
 ) -> tuple[WorldSpec, range]:
     """A running server's worlds, which the settings must agree with, and the robots to fly."""
-    if settings.start is not None:
-        raise InvalidArgumentError("start: expected None, as the running server has its own")
+    own = ("start", None), ("states", None), ("states_symmetries", False), ("states_offset", 0)
+    for name, default in own:
+        if getattr(settings, name) != default:
+            raise InvalidArgumentError(
+                f"{name}: expected {default}, as the running server has its own"
+            )
     if settings.model is not None and info.model is not None:
         raise InvalidArgumentError("model: expected None, as the running server reveals its own")
     for name in ("height", "width", "n_moves", "burn_in", "robots"):
@@ -197,6 +215,12 @@ def running_spec(
         n_robots=info.n_robots,
     )
     return spec, robots
+
+
+def _n_described(states: Path) -> int:
+    """Observations of recorded worlds whose states file the server has accepted."""
+    path = states / "states.toml" if states.is_dir() else states.with_suffix(".toml")
+    return len(tomllib.loads(path.read_text("utf-8"))["observations"])
 
 
 def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:

@@ -1,0 +1,138 @@
+"""Recorded worlds through Gymnasium: the truth is what was recorded, to the last step."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from environments import MOVES, WILDFIRE, serving
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+
+import emberwatch
+from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.programs import Program, unused_instance
+
+States = NDArray[np.uint8]
+
+DESCRIPTION = """
+name = "lab"
+step = "10 min"
+states = [
+    { name = "unburnt", color = "#000000", observed_as = [0.9, 0.1] },
+    { name = "burning", color = "#ff0000", observed_as = [0.1, 0.9], reward = 1.0 },
+    { name = "burnt", color = "#777777", observed_as = [1.0, 0.0] },
+]
+observations = [{ name = "cold", color = "#000000" }, { name = "hot", color = "#ff0000" }]
+"""
+
+#: By number, as docs/recorded-worlds.md has them.
+SYMMETRIES: list[Callable[[States], States]] = [
+    lambda a: a,
+    lambda a: a[::-1],
+    lambda a: a[:, ::-1],
+    lambda a: a[::-1, ::-1],
+    lambda a: a.T,
+    lambda a: a.T[::-1],
+    lambda a: a.T[:, ::-1],
+    lambda a: a.T[::-1, ::-1],
+]
+
+
+@pytest.fixture
+def sequences() -> list[States]:
+    random = np.random.default_rng(5)
+    return [random.integers(0, 3, (length, 4, 4), np.uint8) for length in (5, 7)]
+
+
+@pytest.fixture
+def states(tmp_path: Path, sequences: list[States]) -> Path:
+    """A states file with a description beside it."""
+    path = tmp_path / "lab.npz"
+    np.savez_compressed(path, states_000=sequences[0], states_001=sequences[1])
+    path.with_suffix(".toml").write_text(DESCRIPTION)
+    return path
+
+
+def test_a_recorded_world_passes_the_checker(states: Path) -> None:
+    for name in (WILDFIRE, MOVES):
+        env: Any = gymnasium.make(name, states=states, n_moves=3, states_symmetries=True)
+        check_env(env.unwrapped, skip_render_check=True)
+        env.close()
+
+
+def test_episodes_show_what_was_recorded(states: Path, sequences: list[States]) -> None:
+    world: dict[str, Any] = {"states": states, "states_symmetries": True, "states_offset": 2}
+    env: Any = gymnasium.make(WILDFIRE, n_moves=3, truth=True, render_mode="rgb_array", **world)
+    session = env.unwrapped
+    assert session.model is None
+    assert session.world_spec.n_observations == 2
+    offsets = set[int]()
+    for seed in range(16):
+        _, info = env.reset(seed=seed)
+        shown, over = [info["truth"]], False
+        while not over:
+            _, _, terminated, over, info = env.step(env.action_space.sample())
+            assert not terminated
+            shown.append(info["truth"])
+        turned = SYMMETRIES[seed // 2 % 8]
+        expected = [turned(states) for states in sequences[seed % 2]]
+        offset = len(expected) - len(shown)
+        np.testing.assert_array_equal(shown, expected[offset:])
+        offsets.add(offset)
+        assert env.render() is not None
+    assert offsets == {0, 1, 2}
+    env.close()
+
+
+def test_vectors_begin_the_next_episode_at_the_end_of_a_sequence(states: Path) -> None:
+    envs: Any = gymnasium.make_vec(WILDFIRE, num_envs=2, states=states, n_moves=3)
+    envs.reset(seed=0)
+    ends: list[NDArray[np.bool_]] = []
+    for _ in range(20):
+        _, _, terminations, truncations, _ = envs.step(envs.action_space.sample())
+        assert not terminations.any()
+        ends.append(truncations)
+    # The first episodes are those of seeds 0 and 1; a reset takes a step of its own.
+    assert [int(np.argmax(of_world)) for of_world in np.transpose(ends)] == [3, 5]
+    assert np.sum(ends, axis=0).min() >= 2
+    envs.close()
+
+
+def test_a_running_server_tells_of_its_recorded_world(states: Path) -> None:
+    instance = unused_instance()
+    server = Program("emberwatch-server", [f"--instance={instance}", f"--states={states}"])
+    try:
+        with server.wait_for(lambda: emberwatch.connect(instance)) as client:
+            recorded = client.info.recorded_world
+            assert recorded is not None
+            assert (recorded.n_sequences, recorded.n_steps) == (2, 4)
+            assert recorded.description is not None
+            assert "10 min" in recorded.description
+        env: Any = gymnasium.make(WILDFIRE, instance=instance)
+        observation, _ = env.reset(seed=1)
+        assert env.unwrapped.model is None
+        assert observation["frame"].shape[:2] == (4, 4)
+        env.close()
+    finally:
+        server.stop()
+    with serving() as simulated, emberwatch.connect(simulated) as client:
+        assert client.info.recorded_world is None
+
+
+def test_what_does_not_fit_is_refused(tmp_path: Path, states: Path) -> None:
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({"height": 4}, "height: expected no flag beside a states file"),
+        ({"states_offset": 4}, "states_offset: expected 0 to 3"),
+        ({"observation": "belief"}, "reveals its model"),
+        ({"states": tmp_path / "none.npz"}, "description"),
+        ({"instance": "lab"}, "lab"),
+    ]
+    usual: dict[str, Any] = {"states": states, "timeout": 0.1}
+    for keywords, words in wrong:
+        with pytest.raises((InvalidArgumentError, EmberwatchError), match=words):
+            gymnasium.make(WILDFIRE, **(usual | keywords))
+    with pytest.raises(InvalidArgumentError, match="expected none without a states file"):
+        gymnasium.make(WILDFIRE, states_offset=3)

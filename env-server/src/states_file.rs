@@ -1,0 +1,296 @@
+//! States files: recorded hidden states as NumPy arrays, and their description. docs/recorded-worlds.md has the form.
+//!
+//! Memory grows with what is there, not with what is claimed, and each array stays where it was read to.
+
+use ndarray::{Array3, ArrayView3};
+use ndarray_npy::{ViewNpyError, ViewNpyExt};
+use protocol::grid::Shape;
+use protocol::model::{Description, Model};
+use protocol::program::read_text;
+use std::ffi::OsStr;
+use std::fmt::Display;
+use std::fs::File;
+use std::io::{BufReader, Read, Seek};
+use std::path::{Path, PathBuf};
+use thiserror::Error;
+use zip::ZipArchive;
+
+/// Most bytes of all arrays together: 4 GiB.
+const MAX_BYTES: u64 = 1 << 32;
+
+/// Longest header of an array. NumPy's has 128 bytes; a long one may nest deeper than a parser's stack.
+const MAX_HEADER_BYTES: usize = 512;
+
+/// What a states file holds.
+#[derive(Debug)]
+pub struct StatesFile {
+    pub description: Description,
+    /// The description's states, unchanging.
+    pub model: Model,
+    pub shape: Shape,
+    pub sequences: Sequences,
+}
+
+/// Sequences of one shape `[H, W]`, whose values are states.
+#[derive(Debug, Default)]
+pub struct Sequences {
+    /// Each of shape `[K, H, W]`, row-major, K at least 2.
+    pub arrays: Vec<Array3<u8>>,
+    n_states: usize,
+    n_bytes: u64,
+    checksum: crc32fast::Hasher,
+}
+
+/// A states file that is refused.
+#[derive(Debug, Error)]
+#[error("states file {path}: {problem}")]
+pub struct StatesError {
+    path: String,
+    problem: String,
+}
+
+impl StatesFile {
+    /// Reads a `.npz` or `.npy` file or a folder of these, and the description beside or in it.
+    ///
+    /// # Errors
+    /// If the system refuses, or something is wrong; the error names the first problem.
+    pub fn read(path: &Path) -> Result<Self, StatesError> {
+        read(path).map_err(|problem| StatesError {
+            path: path.display().to_string(),
+            problem,
+        })
+    }
+}
+
+impl Sequences {
+    /// None yet, of so many states.
+    pub fn new(n_states: usize) -> Self {
+        Self {
+            n_states,
+            ..Self::default()
+        }
+    }
+
+    /// CRC-32 of shapes and values, in order.
+    pub fn checksum(&self) -> u32 {
+        self.checksum.clone().finalize()
+    }
+
+    /// Adds the arrays of a `.npz` archive in the order of their names.
+    ///
+    /// # Errors
+    /// If one is refused; the text names the first problem.
+    pub fn add_archive(&mut self, archive: impl Read + Seek) -> Result<(), String> {
+        let unfit = |error| format!("expected a .npz archive: {error}");
+        let mut archive = ZipArchive::new(archive).map_err(unfit)?;
+        let mut names: Vec<String> = archive.file_names().map(String::from).collect();
+        names.sort_by(|a, b| bare(a).cmp(bare(b)));
+        for name in &names {
+            if !name.ends_with(".npy") {
+                return Err(format!("expected arrays alone, got the member {name:?}"));
+            }
+            let member = archive.by_name(name);
+            let member = member.map_err(|error| format!("array {:?}: {error}", bare(name)))?;
+            let n_bytes = member.size();
+            self.add_array(bare(name), n_bytes, member)?;
+        }
+        match names.is_empty() {
+            true => Err("expected at least one array, got none".into()),
+            false => Ok(()),
+        }
+    }
+
+    /// Adds one array in NumPy's format, of so many bytes.
+    ///
+    /// # Errors
+    /// If it is refused; the text says why.
+    pub fn add_array(&mut self, name: &str, n_bytes: u64, from: impl Read) -> Result<(), String> {
+        let about = |problem: String| format!("array {name:?}: {problem}");
+        self.n_bytes = self.n_bytes.saturating_add(n_bytes);
+        if self.n_bytes > MAX_BYTES {
+            let got = self.n_bytes;
+            let expected = format!("expected at most {MAX_BYTES} bytes with those before it");
+            return Err(about(format!("{expected}, got {got}")));
+        }
+        let array = read_bytes(from, n_bytes).and_then(decode).map_err(about)?;
+        self.check(&array).map_err(about)?;
+        let (n_recorded, height, width) = array.dim();
+        for length in [n_recorded, height, width] {
+            self.checksum.update(&(length as u64).to_le_bytes());
+        }
+        self.checksum.update(cells(&array));
+        self.arrays.push(array);
+        Ok(())
+    }
+
+    fn check(&self, array: &Array3<u8>) -> Result<(), String> {
+        let (n_recorded, height, width) = array.dim();
+        let shape = Shape::new(height, width).map_err(|error| error.to_string())?;
+        if n_recorded < 2 {
+            return Err(format!(
+                "expected at least 2 recorded steps, got {n_recorded}"
+            ));
+        }
+        if let Some(first) = self.arrays.first().map(shape_of)
+            && first != shape
+        {
+            return Err(format!(
+                "expected {first} cells as the first array has, got {shape}"
+            ));
+        }
+        let cells = cells(array);
+        let most = cells.iter().fold(0, |most, &state| state.max(most));
+        if usize::from(most) < self.n_states {
+            return Ok(());
+        }
+        let wrong = cells.iter().position(|&state| state == most);
+        let (step, cell) = (wrong.unwrap_or(0) / shape.n_cells(), wrong.unwrap_or(0));
+        let cell = shape.cell(cell % shape.n_cells());
+        Err(format!(
+            "expected states below {}, as the description has, got {most} in cell {cell} of recorded step {step}",
+            self.n_states
+        ))
+    }
+}
+
+fn read(path: &Path) -> Result<StatesFile, String> {
+    let at = |path: &Path, error: &dyn Display| format!("{}: {error}", path.display());
+    let (files, description) = match path.is_dir() {
+        true => (files_of(path)?, path.join("states.toml")),
+        false => (vec![path.to_owned()], path.with_extension("toml")),
+    };
+    if let Some(other) = files
+        .iter()
+        .find(|file| !is_array(file) && !is_archive(file))
+    {
+        let expected = "expected a .npz or .npy file, or a folder of these";
+        return Err(format!(
+            "{expected}, got {:?}",
+            other.file_name().unwrap_or_default()
+        ));
+    }
+    let text = read_text(&description)
+        .map_err(|error| format!("description {}", at(&description, &error)))?;
+    let wrong = |error: &dyn Display| format!("description {}", at(&description, error));
+    let description: Description = toml::from_str(&text).map_err(|error| wrong(&error))?;
+    let model = description.unchanging().map_err(|error| wrong(&error))?;
+    let mut sequences = Sequences::new(model.n_states());
+    for file in &files {
+        let added = add_file(&mut sequences, file);
+        added.map_err(|problem| match file == path {
+            true => problem,
+            false => at(Path::new(file.file_name().unwrap_or_default()), &problem),
+        })?;
+    }
+    Ok(StatesFile {
+        description,
+        model,
+        shape: shape_of(&sequences.arrays[0]),
+        sequences,
+    })
+}
+
+/// The arrays and archives in a folder, in the order of their names.
+fn files_of(folder: &Path) -> Result<Vec<PathBuf>, String> {
+    let entries = std::fs::read_dir(folder).map_err(|error| error.to_string())?;
+    let paths = entries.map(|entry| entry.map(|entry| entry.path()));
+    let paths: Result<Vec<PathBuf>, _> = paths.collect();
+    let mut files = paths.map_err(|error| error.to_string())?;
+    files.retain(|file| is_array(file) || is_archive(file));
+    files.sort();
+    match files.is_empty() {
+        true => Err("expected .npz or .npy files in the folder, got none".into()),
+        false => Ok(files),
+    }
+}
+
+fn add_file(sequences: &mut Sequences, path: &Path) -> Result<(), String> {
+    let opened = File::open(path).and_then(|file| Ok((file.metadata()?, file)));
+    let (metadata, file) = opened.map_err(|error| error.to_string())?;
+    if !metadata.is_file() {
+        return Err("expected a regular file, got something else".into());
+    }
+    match is_archive(path) {
+        true => sequences.add_archive(BufReader::new(file)),
+        false => {
+            let name = path.file_stem().unwrap_or_default().to_string_lossy();
+            sequences.add_array(&name, metadata.len(), file)
+        }
+    }
+}
+
+fn is_array(path: &Path) -> bool {
+    path.extension() == Some(OsStr::new("npy"))
+}
+
+fn is_archive(path: &Path) -> bool {
+    path.extension() == Some(OsStr::new("npz"))
+}
+
+/// An array's name without the ending of its member.
+fn bare(name: &str) -> &str {
+    name.strip_suffix(".npy").unwrap_or(name)
+}
+
+fn shape_of(array: &Array3<u8>) -> Shape {
+    let (_, height, width) = array.dim();
+    Shape::new(height, width).expect("invariant: it was checked")
+}
+
+fn cells(array: &Array3<u8>) -> &[u8] {
+    array.as_slice().expect("invariant: arrays are row-major")
+}
+
+fn read_bytes(from: impl Read, n_bytes: u64) -> Result<Vec<u8>, String> {
+    let mut bytes = Vec::new();
+    let read = from.take(n_bytes + 1).read_to_end(&mut bytes);
+    let got = read.map_err(|error| error.to_string())?;
+    match got as u64 == n_bytes {
+        true => Ok(bytes),
+        false => Err(format!("expected {n_bytes} bytes, got {got} or more")),
+    }
+}
+
+/// The array in a `.npy` file's bytes, in their memory if they are row-major.
+fn decode(mut bytes: Vec<u8>) -> Result<Array3<u8>, String> {
+    check_header(&bytes)?;
+    let view = ArrayView3::<u8>::view_npy(&bytes).map_err(|error| describe(&error))?;
+    if !view.is_standard_layout() {
+        return Ok(view.as_standard_layout().into_owned());
+    }
+    let (dim, n_cells) = (view.dim(), view.len());
+    bytes.drain(..bytes.len() - n_cells);
+    Ok(Array3::from_shape_vec(dim, bytes).expect("invariant: the view had as many cells"))
+}
+
+fn check_header(bytes: &[u8]) -> Result<(), String> {
+    let length = match bytes {
+        [_, _, _, _, _, _, 1, _, low, high, ..] => u16::from_le_bytes([*low, *high]).into(),
+        [_, _, _, _, _, _, _, _, a, b, c, d, ..] => u32::from_le_bytes([*a, *b, *c, *d]),
+        _ => 0,
+    };
+    match length as usize > MAX_HEADER_BYTES {
+        true => Err(format!(
+            "expected a NumPy array with a header of at most {MAX_HEADER_BYTES} bytes, got {length}"
+        )),
+        false => Ok(()),
+    }
+}
+
+fn describe(error: &ViewNpyError) -> String {
+    match error {
+        ViewNpyError::WrongDescriptor(got) => {
+            format!("expected dtype '|u1' (uint8), got {got}")
+        }
+        ViewNpyError::WrongNdim(_, got) => {
+            format!("expected three axes [K, H, W], got {got}")
+        }
+        ViewNpyError::MissingBytes(n_bytes) => {
+            format!("cut short: expected {n_bytes} bytes more")
+        }
+        ViewNpyError::ExtraBytes(n_bytes) => {
+            format!("expected the array alone, got {n_bytes} bytes behind it")
+        }
+        other => format!("expected a NumPy array: {other}"),
+    }
+}

@@ -1,0 +1,123 @@
+//! The description of a recorded world in TOML: a model file without a transition.
+
+use super::file::{KernelEntry, ModelError, ModelFile, ObservationEntry, StateEntry};
+use super::parameters::Model;
+use serde::{Deserialize, Serialize};
+
+/// What a recorded world says of its states.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Description {
+    /// Name shown to people.
+    pub name: String,
+    /// What one step means in time, for people.
+    pub step: String,
+    /// The states, in the order of their values.
+    pub states: Vec<DescribedState>,
+    /// The observations, in the order of their values.
+    pub observations: Vec<ObservationEntry>,
+}
+
+/// One state of a description; keys and ranges are those of a [`StateEntry`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DescribedState {
+    /// Name, unique among the states.
+    pub name: String,
+    /// Colour in pictures, `#rrggbb`.
+    pub color: String,
+    /// Reward for each distinct visited cell in this state.
+    #[serde(default)]
+    pub reward: f64,
+    /// `P(y | this state)`, one entry per observation (eq. 1).
+    pub observed_as: Vec<f64>,
+}
+
+impl Description {
+    /// The model with these states in which each cell stays as it is: names, sensor and rewards are the recorded
+    /// world's, and the transition is not.
+    ///
+    /// # Errors
+    /// If an entry is wrong; the error names it, what it must be and what it is.
+    pub fn unchanging(&self) -> Result<Model, ModelError> {
+        let share = 1.0 / self.states.len().max(1) as f64;
+        let state = |state: &DescribedState| StateEntry {
+            name: state.name.clone(),
+            color: state.color.clone(),
+            initial: share,
+            reward: state.reward,
+            bias: 0.0,
+            observed_as: state.observed_as.clone(),
+        };
+        let stays = |state: &DescribedState| KernelEntry {
+            from: state.name.clone(),
+            to: state.name.clone(),
+            scale: 1.0,
+            weights: vec![vec![1.0]],
+        };
+        Model::new(ModelFile {
+            name: self.name.clone(),
+            kernel_size: [1, 1],
+            states: self.states.iter().map(state).collect(),
+            observations: self.observations.clone(),
+            kernel: self.states.iter().map(stays).collect(),
+        })
+    }
+
+    /// The unchanging model of a description's text.
+    ///
+    /// # Errors
+    /// If it is not a description, or an entry is wrong.
+    pub fn model_of(text: &str) -> Result<Model, ModelError> {
+        let description: Self =
+            toml::from_str(text).map_err(|error| ModelError::Toml(error.to_string()))?;
+        description.unchanging()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TEXT: &str = r##"
+        name = "two"
+        step = "10 min"
+        states = [
+            { name = "a", color = "#000000", observed_as = [1.0] },
+            { name = "b", color = "#ffffff", observed_as = [1.0], reward = 2.0 },
+        ]
+        observations = [{ name = "x", color = "#123abc" }]
+    "##;
+
+    #[test]
+    fn a_description_is_a_model_whose_cells_stay_as_they_are() {
+        let model = Description::model_of(TEXT).expect("valid");
+        assert_eq!(model.kernel().dim(), (2, 2, 1, 1));
+        let kernel: Vec<f64> = model.kernel().iter().copied().collect();
+        assert_eq!(kernel, [1.0, 0.0, 0.0, 1.0]);
+        assert_eq!(model.reward().to_vec(), [0.0, 2.0]);
+        assert_eq!((model.name(), model.target_state()), ("two", 1));
+    }
+
+    #[test]
+    fn keys_of_a_transition_are_refused() {
+        for (wrong, words) in [
+            (
+                TEXT.replace("step = \"10 min\"", ""),
+                "missing field `step`",
+            ),
+            (
+                TEXT.replace("reward = 2.0", "bias = 2.0"),
+                "unknown field `bias`",
+            ),
+            (format!("kernel = []\n{TEXT}"), "unknown field `kernel`"),
+            (
+                TEXT.replace("2.0", "inf"),
+                "state \"b\": reward: expected a finite number, got inf",
+            ),
+        ] {
+            let error = Description::model_of(&wrong).expect_err(words).to_string();
+            assert!(error.contains(words), "{error:?} does not say {words:?}");
+        }
+    }
+}

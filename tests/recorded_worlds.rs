@@ -1,0 +1,377 @@
+//! Recorded worlds: what was recorded is what the truth channel shows, and agents act there without a model.
+
+use crate::commands::{AGENT, LIMIT, SERVER, check};
+use crate::harness::{PATIENCE, Paths, Server, eventually, fly, new_instance, reset, run};
+use crate::recording::{read, read_whole, start_recorder, start_replay, stop, text, truths};
+use crate::snapshots::server_command;
+use agent::server::client::Client;
+use agent::server::truth::TruthFeed;
+use ndarray::{Array3, ArrayView2, Axis};
+use ndarray_npy::WriteNpyExt;
+use protocol::channels::Instance;
+use protocol::connection::ConnectionError;
+use protocol::message::Status;
+use protocol::model::Description;
+use protocol::recording::Event;
+use protocol::{Connection, Grid, Shape};
+use std::fs::File;
+use tempfile::TempDir;
+
+const N_MOVES: usize = 4;
+
+/// Each state is observed as itself.
+const DESCRIPTION: &str = r##"
+name = "lab"
+step = "10 min"
+states = [
+    { name = "unburnt", color = "#000000", observed_as = [1.0, 0.0, 0.0] },
+    { name = "burning", color = "#ff0000", observed_as = [0.0, 1.0, 0.0], reward = 1.0 },
+    { name = "burnt", color = "#777777", observed_as = [0.0, 0.0, 1.0] },
+]
+observations = [
+    { name = "dark", color = "#000000" },
+    { name = "hot", color = "#ff0000" },
+    { name = "grey", color = "#777777" },
+]
+"##;
+
+/// Sequences of such lengths in a folder; no two recorded steps are alike.
+struct Place {
+    folder: TempDir,
+    sequences: Vec<Array3<u8>>,
+}
+
+impl Place {
+    fn new(lengths: &[usize], (height, width): (usize, usize)) -> Self {
+        let folder = TempDir::new().expect("a folder");
+        let sequence = |(index, &length): (usize, &usize)| {
+            // Digits to the base 3 of a hash: no symmetry, and no step like another.
+            Array3::from_shape_fn((length, height, width), |(k, row, col)| {
+                let number = ((index * 97 + k) * height + row) * width + col;
+                let hash = (number as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+                ((hash >> 40) % 3) as u8
+            })
+        };
+        let sequences: Vec<_> = lengths.iter().enumerate().map(sequence).collect();
+        for (index, states) in sequences.iter().enumerate() {
+            let file = File::create(folder.path().join(format!("{index}.npy")));
+            states.write_npy(file.expect("create")).expect("write");
+        }
+        std::fs::write(folder.path().join("states.toml"), DESCRIPTION).expect("write");
+        Self { folder, sequences }
+    }
+
+    fn flags(&self, more: &str) -> String {
+        let folder = self.folder.path().display();
+        format!("--states {folder} --moves {N_MOVES} --publish-truth {more}")
+    }
+
+    /// A recorded step as docs/recorded-worlds.md has symmetries, cell by cell.
+    fn states(&self, seed: u64, n_symmetries: u64, recorded_step: usize) -> Grid<u8> {
+        let n_sequences = self.sequences.len() as u64;
+        let symmetry = seed / n_sequences % n_symmetries;
+        let sequence = &self.sequences[(seed % n_sequences) as usize];
+        let states = sequence.index_axis(Axis(0), recorded_step);
+        turned(states, symmetry)
+    }
+
+    fn last(&self, seed: u64) -> usize {
+        let index = seed as usize % self.sequences.len();
+        self.sequences[index].len_of(Axis(0)) - 1
+    }
+}
+
+fn turned(states: ArrayView2<'_, u8>, symmetry: u64) -> Grid<u8> {
+    let (height, width) = states.dim();
+    let dim = if symmetry < 4 {
+        (height, width)
+    } else {
+        (width, height)
+    };
+    Grid::from_shape_fn(dim, |(row, col)| {
+        let row = if symmetry & 1 == 0 {
+            row
+        } else {
+            dim.0 - 1 - row
+        };
+        let col = if symmetry & 2 == 0 {
+            col
+        } else {
+            dim.1 - 1 - col
+        };
+        states[if symmetry < 4 { [row, col] } else { [col, row] }]
+    })
+}
+
+/// What the truth channel and full frames show of a whole episode; it ends truncated.
+fn episode(client: &mut Client, truth: &TruthFeed, seed: u64) -> Vec<Grid<u8>> {
+    reset(client, seed);
+    let first = client.observe(0..1).expect("observe").remove(0);
+    assert_eq!((first.world.step, first.world.truncated), (0, 0));
+    let mut shown = truth.states(0..1, &[seed], 0).expect("truth");
+    let mut paths = Paths::new(seed);
+    loop {
+        let seen = fly(client, paths.next(N_MOVES));
+        let states = truth.states(0..1, &[seed], seen.world.step).expect("truth");
+        assert_eq!(seen.frame.values(), states[0], "sensors that never err");
+        let n_burning = states[0].iter().filter(|&&state| state == 1).count();
+        assert_eq!(seen.world.n_target_cells as usize, n_burning);
+        shown.extend(states);
+        if seen.world.truncated != 0 {
+            return shown;
+        }
+    }
+}
+
+#[test]
+fn what_was_recorded_comes_back_in_every_symmetry_and_at_every_offset() {
+    for (side, n_symmetries) in [((4, 4), 8), ((3, 5), 4)] {
+        let place = Place::new(&[5, 8], side);
+        for (flags, most_offset) in [("", 0), ("--states-offset 3", 3)] {
+            let flags = format!("--coverage full --states-symmetries {flags}");
+            let server = Server::start(&place.flags(&flags));
+            let shape = Shape::new(side.0, side.1).expect("a shape");
+            let truth = TruthFeed::open(&server.instance, shape).expect("truth");
+            let mut client = server.acquire(0..1);
+            let mut offsets = Vec::new();
+            for seed in 0..2 * n_symmetries {
+                let shown = episode(&mut client, &truth, seed);
+                let offset = place.last(seed) + 1 - shown.len();
+                assert!(offset <= most_offset, "seed {seed}: {offset}");
+                for (k, states) in shown.iter().enumerate() {
+                    let expected = place.states(seed, n_symmetries, offset + k);
+                    assert_eq!(*states, expected, "seed {seed}, step {k}");
+                }
+                offsets.push(offset);
+            }
+            offsets.sort_unstable();
+            offsets.dedup();
+            assert_eq!(offsets.len() > 1, most_offset > 0, "{offsets:?}");
+            let over = client.step(0..1, &Paths::new(1).take(N_MOVES, 1));
+            let over = over.expect_err("the episode is over");
+            let ConnectionError::Refused { status, .. } = over else {
+                panic!("expected a refusal, got {over}");
+            };
+            assert_eq!(status, Status::EpisodeOver);
+        }
+    }
+}
+
+#[test]
+fn hello_tells_of_the_recorded_world_and_keeps_what_it_shall() {
+    let place = Place::new(&[6, 9], (3, 5));
+    let server = Server::start(&place.flags("--states-offset 2"));
+    let info = server.info();
+    let recorded = info.recorded_world.expect("it is one");
+    assert_eq!((recorded.n_sequences, recorded.n_steps), (2, 3));
+    assert_eq!((info.height, info.width, info.burn_in), (3, 5, 0));
+    assert_eq!(
+        (info.model, info.observations),
+        (None, ["dark", "hot", "grey"].map(String::from).to_vec())
+    );
+    let model = Description::model_of(&recorded.description.expect("revealed"));
+    assert_eq!(model.expect("valid").name(), "lab");
+    let server = Server::start(&place.flags("--reveal-model false"));
+    let recorded = server.info().recorded_world.expect("it is one");
+    assert_eq!(recorded.description, None);
+    let server = Server::start("--height 5 --width 7 --burn-in 20");
+    assert_eq!(server.info().recorded_world, None);
+}
+
+#[test]
+fn max_steps_truncate_before_the_last_recorded_step() {
+    let place = Place::new(&[6], (3, 5));
+    let server = Server::start(&place.flags("--coverage full --max-steps 3"));
+    let shape = Shape::new(3, 5).expect("a shape");
+    let truth = TruthFeed::open(&server.instance, shape).expect("truth");
+    assert_eq!(episode(&mut server.acquire(0..1), &truth, 7).len(), 1 + 3);
+}
+
+#[test]
+fn a_restored_world_goes_on_and_another_states_file_is_refused() {
+    let (place, other) = (Place::new(&[9, 12], (4, 4)), Place::new(&[9, 13], (4, 4)));
+    let folder = TempDir::new().expect("a folder");
+    let file = folder.path().join("lab.snapshot");
+    let settings = "--states-symmetries --states-offset 3 --start random --robots 2";
+    let server = Server::start(&place.flags(settings));
+    let future = |client: &mut Client| -> Vec<_> {
+        let mut paths = Paths::new(5);
+        let steps = (0..3).map(|_| client.step(0..2, &paths.take(N_MOVES, 2)).expect("step"));
+        steps.collect()
+    };
+    let mut client = server.acquire(0..2);
+    reset(&mut client, 21);
+    future(&mut client);
+    let written = server_command(&server, &["snapshot", text(&file)]);
+    assert_eq!(written.code, Some(0), "{}", written.stderr);
+    let went_on = future(&mut client);
+    let restore = ["restore", text(&file), "--takeover"];
+    let restored = server_command(&server, &restore);
+    assert_eq!(restored.code, Some(0), "{}", restored.stderr);
+    assert_eq!(future(&mut server.acquire(0..2)), went_on);
+    let again = Server::start(&place.flags(&format!("{settings} --restore {}", text(&file))));
+    assert_eq!(future(&mut again.acquire(0..2)), went_on);
+    for (place, settings, words) in [
+        (&other, settings, "states: expected 2 sequences of CRC-32 "),
+        (
+            &place,
+            "--robots 2 --start random --states-offset 3",
+            "states_symmetries: expected false as this server's, got true",
+        ),
+        (
+            &place,
+            "--robots 2 --start random --states-symmetries",
+            "states_offset: expected 0 as this server's, got 3",
+        ),
+    ] {
+        let server = Server::start(&place.flags(settings));
+        let refused = server_command(&server, &restore);
+        assert_eq!(refused.code, Some(1), "{words}");
+        assert!(
+            refused.stderr.contains(words),
+            "{words}: {}",
+            refused.stderr
+        );
+    }
+}
+
+#[test]
+fn a_recording_and_its_replay_show_what_was_recorded() {
+    let place = Place::new(&[7], (3, 5));
+    let folder = TempDir::new().expect("a folder");
+    let file = folder.path().join("lab.recording");
+    let server = Server::start(&place.flags("--states-symmetries"));
+    let recorder = start_recorder(&server.instance, &file, &["--truth"]);
+    let mut client = server.acquire(0..1);
+    reset(&mut client, 2);
+    let mut paths = Paths::new(1);
+    while fly(&mut client, paths.next(N_MOVES)).world.truncated == 0 {}
+    let is_last = |step| step == place.last(2) as u64;
+    let has_all = || {
+        truths(&read(&file).0)
+            .iter()
+            .any(|it| is_last(it.header.step))
+    };
+    assert!(eventually(PATIENCE, has_all));
+    stop(recorder);
+    let records = read_whole(&file);
+    let expected = |step: u64| place.states(2, 4, step as usize);
+    let mut n_seen = 0;
+    for sample in truths(&records).iter().filter(|it| it.header.seed == 2) {
+        let states = Grid::from_shape_vec((3, 5), sample.payload.clone()).expect("a grid");
+        assert_eq!(states, expected(sample.header.step));
+        n_seen += 1;
+    }
+    assert_eq!(n_seen, 7);
+    let Event::Server(info) = &records[0].event else {
+        panic!("expected a server, got {:?}", records[0]);
+    };
+    assert_eq!(info.recorded_world, server.info().recorded_world);
+    let again: Instance = new_instance();
+    let replay = start_replay(&again, &file, &["--loop"]);
+    replay.wait_for_words("replaying", PATIENCE);
+    let connection = Connection::open(&again, "tests", PATIENCE).expect("connect");
+    assert_eq!(connection.info().recorded_world, info.recorded_world);
+}
+
+#[test]
+fn agents_act_without_a_model_in_one_episode_after_the_other() {
+    let place = Place::new(&[24, 30], (5, 6));
+    let folder = TempDir::new().expect("a folder");
+    let settings = folder.path().join("agent.toml");
+    std::fs::write(
+        &settings,
+        "[learning]\nwindow = 4\nblock_windows = 2\nstreams = 4\n",
+    )
+    .expect("write");
+    let out = folder.path().join("out");
+    let server = Server::start(&place.flags("--worlds 3"));
+    let instance = format!("--instance {}", server.instance.name());
+    let act = |words: &str| {
+        let words = format!("{words} {instance}");
+        let ended = run(AGENT, &words.split_whitespace().collect::<Vec<_>>(), LIMIT);
+        assert_eq!(ended.code, Some(0), "{words}: {}", ended.stderr);
+        ended
+    };
+    let settings = settings.display();
+    act(&format!(
+        "train --worlds 2 --steps 400 --out {} --config {settings}",
+        out.display()
+    ));
+    let checkpoint = format!(
+        "--checkpoint {}",
+        out.join("checkpoint.safetensors").display()
+    );
+    for policy in [
+        "coverage",
+        "oracle_beam",
+        "random_walk",
+        "learned_beam",
+        "learned_spatial_beam",
+    ] {
+        let ended = act(&format!("run --policy {policy} --steps 70 {checkpoint}"));
+        assert!(ended.stderr.contains("steps=70"), "{}", ended.stderr);
+        let n_ends = ended.stderr.matches("the next begins").count();
+        assert!(n_ends >= 2, "{policy}: {}", ended.stderr);
+    }
+    let ladder = act(&format!("compare --seeds 0..2 {checkpoint}")).stdout;
+    for policy in ["coverage", "learned_beam", "clairvoyant_beam"] {
+        assert!(ladder.contains(policy), "{ladder}");
+    }
+    assert!(
+        ladder.contains("2 worlds, 23 steps each") && !ladder.contains("| beam_"),
+        "{ladder}"
+    );
+    let refuse =
+        |words: &str, expected: &[&str]| check(AGENT, &format!("{words} {instance}"), expected);
+    let no_model = ["filters with a model, and recorded worlds have none"];
+    refuse("run", &[&["\"beam_exploit\""], &no_model[..]].concat());
+    refuse("run --policy spatial_beam", &no_model);
+    refuse(
+        "compare --policies coverage,shooting_explore --seeds 0..1",
+        &no_model,
+    );
+    refuse(
+        "compare --seeds 0..1 --steps 24",
+        &["--steps: expected at most 23, as the shortest episode has, got 24"],
+    );
+    refuse(
+        "serve-decisions",
+        &["has recorded worlds, without a model: expected --model FILE"],
+    );
+}
+
+#[test]
+fn settings_that_a_states_file_decides_are_refused_as_flags() {
+    let place = Place::new(&[3], (3, 5));
+    let states = format!("--states {}", place.folder.path().display());
+    for (flag, setting) in [
+        ("--height 3", "height"),
+        ("--width 5", "width"),
+        ("--burn-in 0", "burn_in"),
+        ("--model wildfire", "model"),
+    ] {
+        let words = format!("{setting}: expected no flag beside a states file");
+        check(SERVER, &format!("{states} {flag}"), &[&words]);
+    }
+    check(
+        SERVER,
+        "--states-offset 3",
+        &["expected none without a states file"],
+    );
+    check(
+        SERVER,
+        &format!("{states} --states-offset 2"),
+        &["states_offset: expected 0 to 1"],
+    );
+    check(
+        SERVER,
+        "--states no/such.npz",
+        &["states file no/such.npz: description no/such.toml: No such file"],
+    );
+    check(
+        AGENT,
+        &format!("compare {states} --height 3"),
+        &["'--states <FILE|FOLDER>' cannot be used with '--height"],
+    );
+}
