@@ -180,11 +180,11 @@ fn broken_files_are_refused_each_by_its_problem() {
     );
     array(
         &npy(&sequence(0, (2, 0, 4))),
-        "expected height and width in 1..=4096, got 0 x 4",
+        "grid shape: expected height and width in 1..=4096, got 0 x 4",
     );
     array(
         &npy(&sequence(0, (2, 1, 4097))),
-        "expected height and width in 1..=4096, got 1 x 4097",
+        "grid shape: expected height and width in 1..=4096, got 1 x 4097",
     );
     array(
         &header("(2, 3, 4)", "(2, 3, 5)"),
@@ -199,7 +199,7 @@ fn broken_files_are_refused_each_by_its_problem() {
     array(&header("False", "[[[[[[[["), "expected a NumPy array: ");
     array(
         &header("False", &"[".repeat(60_000)),
-        "a header of at most 512 bytes, got 60054",
+        "expected a NumPy array with a header of at most 512 bytes, got 60058",
     );
     array(
         &whole[..whole.len() - 1],
