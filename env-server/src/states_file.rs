@@ -264,9 +264,9 @@ fn decode(mut bytes: Vec<u8>) -> Result<Array3<u8>, String> {
 }
 
 fn check_header(bytes: &[u8]) -> Result<(), String> {
-    let length = match bytes {
-        [_, _, _, _, _, _, 1, _, low, high, ..] => u16::from_le_bytes([*low, *high]).into(),
-        [_, _, _, _, _, _, _, _, a, b, c, d, ..] => u32::from_le_bytes([*a, *b, *c, *d]),
+    let length = match bytes.strip_prefix(b"\x93NUMPY") {
+        Some([1, _, low, high, ..]) => u16::from_le_bytes([*low, *high]).into(),
+        Some([_, _, a, b, c, d, ..]) => u32::from_le_bytes([*a, *b, *c, *d]),
         _ => 0,
     };
     match length as usize > MAX_HEADER_BYTES {

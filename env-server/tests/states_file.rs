@@ -105,7 +105,7 @@ fn archives_stored_or_deflated_are_read_in_the_order_of_names() {
 fn an_array_is_a_sequence_in_either_order_of_memory() {
     let rows = sequence(0, (4, 3, 5));
     let file = read("lab.npy", &npy(&rows)).expect("valid");
-    assert_eq!(file.sequences.arrays, [rows.clone()]);
+    assert_eq!(file.sequences.arrays, std::slice::from_ref(&rows));
     let mut columns = Array3::zeros(ndarray::ShapeBuilder::f(rows.dim()));
     columns.assign(&rows);
     let bytes = npy(&columns);
@@ -180,11 +180,11 @@ fn broken_files_are_refused_each_by_its_problem() {
     );
     array(
         &npy(&sequence(0, (2, 0, 4))),
-        "expected height and width in 1..=4096, got 0 x 4",
+        "grid shape: expected height and width in 1..=4096, got 0 x 4",
     );
     array(
         &npy(&sequence(0, (2, 1, 4097))),
-        "expected height and width in 1..=4096, got 1 x 4097",
+        "grid shape: expected height and width in 1..=4096, got 1 x 4097",
     );
     array(
         &header("(2, 3, 4)", "(2, 3, 5)"),
@@ -199,7 +199,7 @@ fn broken_files_are_refused_each_by_its_problem() {
     array(&header("False", "[[[[[[[["), "expected a NumPy array: ");
     array(
         &header("False", &"[".repeat(60_000)),
-        "a header of at most 512 bytes, got 60054",
+        "expected a NumPy array with a header of at most 512 bytes, got 60058",
     );
     array(
         &whole[..whole.len() - 1],
@@ -392,6 +392,6 @@ fn a_thousand_steps_of_256_x_256_cells_load_within_a_second_and_twice_their_size
         let file = StatesFile::read(&path).expect("valid");
         eprintln!("{method}: {:?}", start.elapsed());
         assert!(start.elapsed().as_secs_f64() < 1.0);
-        assert_eq!(file.sequences.arrays, [states.clone()]);
+        assert_eq!(file.sequences.arrays, std::slice::from_ref(&states));
     }
 }

@@ -1,6 +1,6 @@
 //! docs/model-file.md: its example is a model, and it names every key with its limits.
 
-use protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
+use protocol::model::{Description, MAX_KERNEL_SIDE, MAX_VALUES};
 use protocol::program::MAX_TEXT_BYTES;
 use protocol::{Model, Shape};
 use std::collections::BTreeSet;
@@ -9,7 +9,11 @@ use toml::{Table, Value};
 const PAGE: &str = include_str!("../../docs/model-file.md");
 
 fn example() -> &'static str {
-    let (_, example) = PAGE.split_once("```toml\n").expect("an example");
+    example_of(PAGE)
+}
+
+fn example_of(page: &'static str) -> &'static str {
+    let (_, example) = page.split_once("```toml\n").expect("an example");
     let (example, _) = example.split_once("```").expect("its end");
     example
 }
@@ -50,6 +54,16 @@ fn the_example_is_a_model_that_uses_every_key() {
     assert_eq!(model.check_on(shape), Ok(()));
     let written: Table = example().parse().expect("TOML");
     assert_eq!(keys("", &written), documented());
+}
+
+#[test]
+fn the_example_of_recorded_worlds_is_a_description_with_every_key() {
+    let page = include_str!("../../docs/recorded-worlds.md");
+    let description: Description = toml::from_str(example_of(page)).expect("a description");
+    description.unchanging().expect("valid");
+    let written: Table = example_of(page).parse().expect("TOML");
+    let parsed = Table::try_from(description).expect("descriptions serialise");
+    assert_eq!(keys("", &written), keys("", &parsed));
 }
 
 #[test]
