@@ -8,10 +8,12 @@ use toml::{Table, Value};
 
 const PAGE: &str = include_str!("../../docs/model-file.md");
 
-fn example() -> &'static str {
-    let (_, example) = PAGE.split_once("```toml\n").expect("an example");
-    let (example, _) = example.split_once("```").expect("its end");
-    example
+/// A model for all cells, and one by the cell's own state.
+fn examples() -> Vec<&'static str> {
+    let begun = PAGE.split("```toml\n").skip(1);
+    begun
+        .map(|rest| rest.split_once("```").expect("its end").0)
+        .collect()
 }
 
 /// The keys of a table and of the tables in it; those below are named with what they are of.
@@ -44,19 +46,26 @@ fn documented() -> BTreeSet<String> {
 }
 
 #[test]
-fn the_example_is_a_model_that_uses_every_key() {
-    let model = Model::from_toml(example()).expect("a model");
-    let shape = Shape::new(64, 64).expect("test shape");
-    assert_eq!(model.check_on(shape), Ok(()));
-    let written: Table = example().parse().expect("TOML");
-    assert_eq!(keys("", &written), documented());
+fn the_examples_are_models_that_use_every_key() {
+    let mut used = BTreeSet::new();
+    for example in examples() {
+        let model = Model::from_toml(example).expect("a model");
+        let shape = Shape::new(64, 64).expect("test shape");
+        assert_eq!(model.check_on(shape), Ok(()));
+        used.extend(keys("", &example.parse().expect("TOML")));
+    }
+    assert_eq!(used, documented());
 }
 
 #[test]
 fn every_key_of_the_parser_is_on_the_page() {
-    let file = Model::wildfire().file().clone();
-    let parsed = Table::try_from(file).expect("models serialise");
-    assert_eq!(documented(), keys("", &parsed));
+    let mut parsed = BTreeSet::new();
+    for name in ["wildfire", "wildfire-burnout"] {
+        let model = Model::built_in(name).expect("a built-in model");
+        let file = Table::try_from(model.file().clone()).expect("models serialise");
+        parsed.extend(keys("", &file));
+    }
+    assert_eq!(documented(), parsed);
 }
 
 #[test]
