@@ -226,6 +226,27 @@ fn one_kernel_for_each_state_is_that_of_all_where_states_are_known() {
 }
 
 #[test]
+fn a_prediction_is_that_of_the_python_filter() {
+    let json: serde_json::Value =
+        serde_json::from_str(include_str!("data/own_state.json")).expect("JSON");
+    let array = |key: &str| {
+        let numbers = serde_json::from_value::<Vec<Vec<Vec<f64>>>>(json[key].clone());
+        let numbers = numbers.expect("numbers").concat().concat();
+        Array3::from_shape_vec((3, 4, 5), numbers).expect("3 x 4 x 5 numbers")
+    };
+    let (belief, expected) = (array("belief"), array("prediction"));
+    let mut predicted = Array3::zeros(belief.dim());
+    let mut transition = Transition::new(&burnout(), shape(4, 5)).expect("a model");
+    transition.apply(&belief, &mut predicted);
+    let differences = predicted - expected;
+    assert!(
+        differences
+            .iter()
+            .all(|difference| difference.abs() < 1e-12)
+    );
+}
+
+#[test]
 fn a_prediction_is_the_average_over_simulated_next_steps() {
     // Neighbours of an unburnt cell weigh alike in every state, so that eq. 3 divides by the same sum
     // whatever they are: the mean field is exact for cells that are independent.

@@ -194,6 +194,12 @@ def test_phi_is_its_formula_for_any_model(model: Model, height: int, width: int,
     assert_near(transition.apply(belief), formula(model, belief), 1e-12)
 
 
+def test_phi_by_own_state_is_that_of_the_rust_filter() -> None:
+    file = json.loads((REPOSITORY / "protocol/tests/data/own_state.json").read_text())
+    got = phi(Model.checked("wildfire-burnout"), np.array(file["belief"]))
+    assert_near(got, file["prediction"], 1e-12)
+
+
 @settings(deadline=None)
 @given(any_model(), st.integers(1, 9), st.integers(1, 9), st.integers(0, 2**32))
 def test_beliefs_stay_on_the_simplex(model: Model, height: int, width: int, key: int) -> None:

@@ -103,7 +103,7 @@ enum Fast {
         /// The taps with `q > 0`.
         taps: Vec<FastTap>,
         /// `f` as a table over bytes, unless it maps every state to itself.
-        likeliest: Option<[u8; 256]>,
+        likeliest: Option<Box<[u8; 256]>>,
     },
     /// By the cell's own state.
     Own(Vec<FastOwn>),
@@ -376,13 +376,13 @@ fn on_grid(shape: Shape, stride: usize) -> Vec<u64> {
 }
 
 /// `f` over all bytes, marks unchanged.
-fn table_unless_identity(likeliest: &[usize]) -> Option<[u8; 256]> {
+fn table_unless_identity(likeliest: &[usize]) -> Option<Box<[u8; 256]>> {
     let mut table: [u8; 256] = std::array::from_fn(|byte| byte as u8);
     let identity = table;
     for (from, &to) in likeliest.iter().enumerate() {
         table[from] = to as u8;
     }
-    (table != identity).then_some(table)
+    (table != identity).then(|| Box::new(table))
 }
 
 #[cfg(test)]

@@ -60,9 +60,10 @@ enum Kernels<T> {
 /// What a cell in one state itself turns into.
 #[derive(Debug, Clone)]
 enum Own<T> {
-    /// Whatever its neighbours, the probability of each next state.
-    Fixed(Vec<T>),
-    Weighed(Rows<T>),
+    /// Whatever its neighbours, the probability of each next state that is possible.
+    Fixed(Vec<(usize, T)>),
+    /// The rows of the next states that are possible.
+    Weighed(Vec<(usize, Row<T>)>),
 }
 
 /// One next state's part of eq. 2.
@@ -223,11 +224,16 @@ impl Layout {
 
 impl<T: NdFloat> Own<T> {
     fn new(rows: Rows<T>) -> Self {
-        if rows.iter().any(|row| !row.terms.is_empty()) {
-            return Self::Weighed(rows);
-        }
+        let sees_neighbours = rows.iter().any(|row| !row.terms.is_empty());
         let total = rows.iter().fold(T::zero(), |sum, row| sum + row.bias);
-        Self::Fixed(rows.iter().map(|row| row.bias / total).collect())
+        let is_possible = |row: &Row<T>| row.bias > T::zero() || !row.terms.is_empty();
+        let possible = rows.into_iter().enumerate();
+        let possible = possible.filter(|(_, row)| is_possible(row));
+        if sees_neighbours {
+            Self::Weighed(possible.collect())
+        } else {
+            Self::Fixed(possible.map(|(to, row)| (to, row.bias / total)).collect())
+        }
     }
 
     /// Adds what becomes of the cells that are in this state with probability `p`.
@@ -241,15 +247,15 @@ impl<T: NdFloat> Own<T> {
     ) {
         match self {
             Self::Fixed(probabilities) => {
-                for (next, &probability) in next.iter_mut().zip(probabilities) {
-                    for (next, &p) in next.iter_mut().zip(p) {
+                for &(to, probability) in probabilities {
+                    for (next, &p) in next[to].iter_mut().zip(p) {
                         *next += p * probability;
                     }
                 }
             }
             Self::Weighed(rows) => {
                 let mut total = [T::zero(); LANES];
-                for (weight, row) in weights.iter_mut().zip(rows) {
+                for (weight, (_, row)) in weights.iter_mut().zip(rows) {
                     *weight = row.weigh(sums);
                     for (total, &weight) in total.iter_mut().zip(&*weight) {
                         *total += weight;
@@ -259,8 +265,9 @@ impl<T: NdFloat> Own<T> {
                 for (factor, total) in factor.iter_mut().zip(total) {
                     *factor /= total;
                 }
-                for (next, weight) in next.iter_mut().zip(weights) {
-                    for ((next, &mut weight), &factor) in next.iter_mut().zip(weight).zip(&factor) {
+                for ((to, _), weight) in rows.iter().zip(weights) {
+                    let lanes = next[*to].iter_mut().zip(&*weight).zip(&factor);
+                    for ((next, &weight), &factor) in lanes {
                         *next += weight * factor;
                     }
                 }

@@ -47,8 +47,9 @@ class Model:
     observation_colors: tuple[Color, ...]
     """By observed value."""
     kernels: NDArray[np.float64]
-    """``w[next state, state of the neighbour, row, col]``, the centre is the cell itself, rows grow
-    downward: of all cells, shape (1, S, S, KH, KW), or by the cell's own state, (S, S, S, KH, KW)."""
+    """``w[next state, state of the neighbour, row, col]``; the centre is the cell itself, rows grow
+    downward. One for all cells, shape (1, S, S, KH, KW), or one for each state that a cell itself
+    is in, shape (S, S, S, KH, KW)."""
     bias: NDArray[np.float64]
     """``b``, added to each next state's weight, shape (S,)."""
     observation_matrix: NDArray[np.float64]
