@@ -51,6 +51,11 @@ fn wrong_model_files_are_refused_by_path_and_entry() {
     check_file("--model", "name = ", &["model file"]);
     check("name =", "colour = 1\nname =", &["unknown field `colour`"]);
     check(
+        "[[kernel]]",
+        "[[kernel]]\nown = \"normal\"",
+        &["own in every entry, or in none, got 1 of 6"],
+    );
+    check(
         "[0.98, 0.01, 0.01]",
         "[0.98, 0.01, 0.02]",
         &["normal", "sum"],
@@ -166,6 +171,7 @@ fn the_documented_files_are_accepted() {
         "config/models/wildfire-sparse.toml",
         "config/models/wildfire-latent.toml",
         "config/models/wildfire-small.toml",
+        "config/models/wildfire-burnout.toml",
     ] {
         let path: PathBuf = repository().join(file);
         let path = path.to_str().expect("a plain path");

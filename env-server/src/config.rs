@@ -34,8 +34,8 @@ pub struct ServerConfig {
     /// How long a world waits for the paths of its other held robots from the first path on, milliseconds; 0: no
     /// deadline.
     pub deadline_millis: u64,
-    /// A built-in model (`wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`), or the path of
-    /// a model file.
+    /// A built-in model (`wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`,
+    /// `wildfire-burnout`), or the path of a model file.
     pub model: String,
     /// A states file: worlds show its sequences, and model, grid and burn-in are not used; empty: none.
     pub states: String,

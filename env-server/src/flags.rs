@@ -26,8 +26,8 @@ pub struct ServerFlags {
     /// no deadline [default: 0]
     #[arg(long, value_name = "MILLIS")]
     pub deadline_ms: Option<u64>,
-    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small` or the path of a model file
-    /// [default: wildfire]
+    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`, `wildfire-burnout` or the path of
+    /// a model file [default: wildfire]
     #[arg(long)]
     pub model: Option<String>,
     /// Worlds show the recorded states of this .npz or .npy file or folder, which decides model, grid and burn-in

@@ -13,17 +13,30 @@ fn square(side: usize) -> Shape {
     Shape::new(side, side).expect("bench shape")
 }
 
+/// The default model, and one whose kernels see the cell's own state.
+fn models() -> [(Model, &'static str); 2] {
+    let burnout = Model::built_in("wildfire-burnout").expect("bench model");
+    [(Model::wildfire(), ""), (burnout, "_burnout")]
+}
+
+fn product<const N: usize>(
+    sides: [usize; N],
+) -> impl Iterator<Item = (usize, (Model, &'static str))> {
+    let with_models = |side| models().into_iter().map(move |model| (side, model));
+    sides.into_iter().flat_map(with_models)
+}
+
 fn dynamics_step(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("dynamics_step");
-    for side in [64, 256, 1024] {
+    for (side, (model, suffix)) in product([64, 256, 1024]) {
         let shape = square(side);
-        let mut dynamics = Dynamics::new(&Model::wildfire(), shape).expect("bench model");
+        let mut dynamics = Dynamics::new(&model, shape).expect("bench model");
         let mut states = dynamics.initial(1);
         let burn_in = if side > 256 { BURN_IN / 10 } else { BURN_IN };
         (0..burn_in).for_each(|n| dynamics.step(1, n, &mut states));
         let mut n = burn_in;
         group.throughput(Throughput::Elements(shape.n_cells() as u64));
-        group.bench_function(format!("{side}"), |bencher| {
+        group.bench_function(format!("{side}{suffix}"), |bencher| {
             bencher.iter(|| {
                 dynamics.step(1, n, &mut states);
                 n += 1;
@@ -35,13 +48,13 @@ fn dynamics_step(criterion: &mut Criterion) {
 
 fn transition_apply(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("transition_apply");
-    for side in [64, 256] {
+    for (side, (model, suffix)) in product([64, 256]) {
         let shape = square(side);
-        let mut transition = Transition::new(&Model::wildfire(), shape).expect("bench model");
+        let mut transition = Transition::new(&model, shape).expect("bench model");
         let mut belief = Probabilities::from_elem((3, side, side), 1.0 / 3.0);
         let mut predictor = belief.clone();
         group.throughput(Throughput::Elements(shape.n_cells() as u64));
-        group.bench_function(format!("{side}"), |bencher| {
+        group.bench_function(format!("{side}{suffix}"), |bencher| {
             bencher.iter(|| {
                 transition.apply(&belief, &mut predictor);
                 std::mem::swap(&mut belief, &mut predictor);

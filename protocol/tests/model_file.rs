@@ -8,14 +8,16 @@ use toml::{Table, Value};
 
 const PAGE: &str = include_str!("../../docs/model-file.md");
 
-fn example() -> &'static str {
-    example_of(PAGE)
+/// A model for all cells, and one by the cell's own state.
+fn examples() -> Vec<&'static str> {
+    examples_of(PAGE)
 }
 
-fn example_of(page: &'static str) -> &'static str {
-    let (_, example) = page.split_once("```toml\n").expect("an example");
-    let (example, _) = example.split_once("```").expect("its end");
-    example
+fn examples_of(page: &'static str) -> Vec<&'static str> {
+    let begun = page.split("```toml\n").skip(1);
+    begun
+        .map(|rest| rest.split_once("```").expect("its end").0)
+        .collect()
 }
 
 /// The keys of a table and of the tables in it; those below are named with what they are of.
@@ -48,29 +50,37 @@ fn documented() -> BTreeSet<String> {
 }
 
 #[test]
-fn the_example_is_a_model_that_uses_every_key() {
-    let model = Model::from_toml(example()).expect("a model");
-    let shape = Shape::new(64, 64).expect("test shape");
-    assert_eq!(model.check_on(shape), Ok(()));
-    let written: Table = example().parse().expect("TOML");
-    assert_eq!(keys("", &written), documented());
+fn the_examples_are_models_that_use_every_key() {
+    let mut used = BTreeSet::new();
+    for example in examples() {
+        let model = Model::from_toml(example).expect("a model");
+        let shape = Shape::new(64, 64).expect("test shape");
+        assert_eq!(model.check_on(shape), Ok(()));
+        used.extend(keys("", &example.parse().expect("TOML")));
+    }
+    assert_eq!(used, documented());
 }
 
 #[test]
 fn the_example_of_recorded_worlds_is_a_description_with_every_key() {
     let page = include_str!("../../docs/recorded-worlds.md");
-    let description: Description = toml::from_str(example_of(page)).expect("a description");
+    let example = examples_of(page)[0];
+    let description: Description = toml::from_str(example).expect("a description");
     description.unchanging().expect("valid");
-    let written: Table = example_of(page).parse().expect("TOML");
+    let written: Table = example.parse().expect("TOML");
     let parsed = Table::try_from(description).expect("descriptions serialise");
     assert_eq!(keys("", &written), keys("", &parsed));
 }
 
 #[test]
 fn every_key_of_the_parser_is_on_the_page() {
-    let file = Model::wildfire().file().clone();
-    let parsed = Table::try_from(file).expect("models serialise");
-    assert_eq!(documented(), keys("", &parsed));
+    let mut parsed = BTreeSet::new();
+    for name in ["wildfire", "wildfire-burnout"] {
+        let model = Model::built_in(name).expect("a built-in model");
+        let file = Table::try_from(model.file().clone()).expect("models serialise");
+        parsed.extend(keys("", &file));
+    }
+    assert_eq!(documented(), parsed);
 }
 
 #[test]

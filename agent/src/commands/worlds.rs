@@ -47,8 +47,8 @@ pub struct WorldFlags {
 /// Flags of a server that is started.
 #[derive(Debug, Args)]
 pub struct GridFlags {
-    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small` or a model file, for the server
-    /// that is started
+    /// `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`, `wildfire-burnout` or a model
+    /// file, for the server that is started
     #[arg(long, default_value = "wildfire", conflicts_with = "instance")]
     model: String,
     /// Grid height in cells, for the server that is started

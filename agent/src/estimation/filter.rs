@@ -130,7 +130,8 @@ fn kind(checksum: u32) -> String {
 }
 
 fn known_checksum(model: &Model) -> u32 {
-    let numbers = model.kernel().iter().chain(model.bias()).copied();
+    let weights = model.kernels().iter().flatten();
+    let numbers = weights.chain(model.bias()).copied();
     checksum(numbers, model.likelihood())
 }
 
@@ -148,7 +149,7 @@ fn parameters(tables: &Tables, belief: &Belief) -> (Transition, Array2<f64>, u32
     let kernel = kernel.expect("invariant: S x S kernels");
     let likelihood = tables.likelihood_array();
     let checksum = checksum(kernel.iter().copied(), &likelihood);
-    let transition = Transition::of_weights(&kernel, &vec![0.0; n_states], belief.shape());
+    let transition = Transition::of_weights(&[kernel], &vec![0.0; n_states], belief.shape());
     (transition, likelihood, checksum)
 }
 

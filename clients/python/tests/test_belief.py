@@ -36,19 +36,20 @@ def golden(name: str) -> dict[str, NDArray[np.generic]]:
 def model_of(
     *, kernel: NDArray, bias: NDArray, matrix: NDArray, initial: NDArray | None = None
 ) -> Model:
-    """A model of any shape, by way of a model file."""
+    """A model of any shape, by way of a model file; a kernel of five axes is by own state."""
     n_states, n_observations = matrix.shape
     initial = np.full(n_states, 1 / n_states) if initial is None else initial
-    lines = ['name = "test"', f"kernel_size = {list(kernel.shape[2:])}"]
+    lines = ['name = "test"', f"kernel_size = {list(kernel.shape[-2:])}"]
     for s in range(n_states):
         lines += ["[[states]]", f'name = "s{s}"', 'color = "#000000"']
         lines += [f"initial = {float(initial[s])!r}", f"bias = {float(bias[s])!r}"]
         lines += [f"observed_as = {matrix[s].tolist()}"]
     for o in range(n_observations):
         lines += ["[[observations]]", f'name = "o{o}"', 'color = "#000000"']
-    for to, start in np.ndindex(n_states, n_states):
+    for *own, to, start in np.ndindex(kernel.shape[:-2]):
         lines += ["[[kernel]]", f'from = "s{start}"', f'to = "s{to}"']
-        lines += [f"weights = {kernel[to, start].tolist()}"]
+        lines += [f'own = "s{o}"' for o in own]
+        lines += [f"weights = {kernel[*own, to, start].tolist()}"]
     return Model.from_toml("\n".join(lines))
 
 
@@ -145,25 +146,39 @@ def test_masked_posteriors_along_a_path_are_the_authors() -> None:
 
 
 def formula(model: Model, belief: NDArray) -> NDArray[np.float64]:
-    """Eqs. 2-4 as they stand."""
-    _, _, kernel_height, kernel_width = model.kernel.shape
+    """Eqs. 2-4 as they stand, by the cell's own state where the model has a kernel for each."""
+    if model.sees_own_state:
+        return sum(
+            belief[own] * _formula_of(model.kernels[own], model.bias, belief, own=own)
+            for own in range(model.n_states)
+        )
+    return _formula_of(model.kernel, model.bias, belief)
+
+
+def _formula_of(
+    kernel: NDArray, bias: NDArray, belief: NDArray, own: int | None = None
+) -> NDArray[np.float64]:
+    _, _, kernel_height, kernel_width = kernel.shape
     out = np.zeros_like(belief)
     for to, i, j in np.ndindex(belief.shape):
-        out[to, i, j] = model.bias[to]
-        for start, a, c in np.ndindex(model.kernel.shape[1:]):
+        out[to, i, j] = bias[to]
+        for start, a, c in np.ndindex(kernel.shape[1:]):
             row, col = i + a - kernel_height // 2, j + c - kernel_width // 2
-            if 0 <= row < belief.shape[1] and 0 <= col < belief.shape[2]:
-                out[to, i, j] += model.kernel[to, start, a, c] * belief[start, row, col]
+            if own is not None and (row, col) == (i, j):
+                out[to, i, j] += kernel[to, start, a, c] * (start == own)
+            elif 0 <= row < belief.shape[1] and 0 <= col < belief.shape[2]:
+                out[to, i, j] += kernel[to, start, a, c] * belief[start, row, col]
     return out / out.sum(axis=0)
 
 
 @st.composite
 def any_model(draw: st.DrawFn) -> Model:
-    """Random weights, a third of them zero, random biases, any S, O and kernel."""
+    """Random weights, a third of them zero, random biases, any S, O and kernel, or one by state."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     n_states, n_observations = draw(st.integers(2, 6)), draw(st.integers(1, 5))
     size = 2 * draw(st.integers(0, 3)) + 1, 2 * draw(st.integers(0, 3)) + 1
-    kernel = rng.choice([0.0, 0.25, rng.random()], (n_states, n_states, *size))
+    own = (n_states,) if draw(st.booleans()) else ()
+    kernel = rng.choice([0.0, 0.25, rng.random()], (*own, n_states, n_states, *size))
     bias = rng.random(n_states) + 1e-3
     matrix = rng.dirichlet(np.ones(n_observations), n_states)
     return model_of(kernel=kernel, bias=bias, matrix=matrix)
@@ -177,6 +192,12 @@ def test_phi_is_its_formula_for_any_model(model: Model, height: int, width: int,
     transition = Transition(model, height=height, width=width)
     transition.apply(np.ones_like(belief))  # leaves nothing behind
     assert_near(transition.apply(belief), formula(model, belief), 1e-12)
+
+
+def test_phi_by_own_state_is_that_of_the_rust_filter() -> None:
+    file = json.loads((REPOSITORY / "protocol/tests/data/own_state.json").read_text())
+    got = phi(Model.checked("wildfire-burnout"), np.array(file["belief"]))
+    assert_near(got, file["prediction"], 1e-12)
 
 
 @settings(deadline=None)

@@ -3,7 +3,7 @@
 use super::file::{
     KernelEntry, MAX_KERNEL_SIDE, MAX_VALUES, ModelError, ModelFile, StateEntry, parse_color,
 };
-use ndarray::{Array1, Array2, Array4};
+use ndarray::{Array1, Array2, Array3, Array4};
 use std::ops::RangeInclusive;
 
 /// Range of weights and biases that are not zero, and of the size of rewards: no sum or product of
@@ -141,7 +141,8 @@ impl Checker<'_> {
         Ok(likelihood)
     }
 
-    pub fn kernel(&self, file: &ModelFile) -> Result<Array4<f64>, ModelError> {
+    /// One kernel for all cells, or one for each state that a cell itself can be in.
+    pub fn kernels(&self, file: &ModelFile) -> Result<Vec<Array4<f64>>, ModelError> {
         let [height, width] = file.kernel_size;
         let odd = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
         if !odd(height) || !odd(width) {
@@ -153,18 +154,36 @@ impl Checker<'_> {
             );
         }
         let n_states = file.states.len();
-        let mut kernel = Array4::zeros((n_states, n_states, height, width));
-        let mut filled = Array2::from_elem((n_states, n_states), false);
+        let n_kernels = self.n_kernels(file)?;
+        let mut kernels = vec![Array4::zeros((n_states, n_states, height, width)); n_kernels];
+        let mut filled = Array3::from_elem((n_kernels, n_states, n_states), false);
         for entry in &file.kernel {
-            let block = [self.state(file, &entry.to)?, self.state(file, &entry.from)?];
-            if std::mem::replace(&mut filled[block], true) {
+            let own = match &entry.own {
+                Some(own) => self.state(file, own)?,
+                None => 0,
+            };
+            let (to, from) = (self.state(file, &entry.to)?, self.state(file, &entry.from)?);
+            if std::mem::replace(&mut filled[[own, to, from]], true) {
                 return self.wrong(entry.what(), "one entry for each pair of states", "two");
             }
             for (row, col, weight) in self.weights(entry, file.kernel_size)? {
-                kernel[[block[0], block[1], row, col]] = weight;
+                kernels[own][[to, from, row, col]] = weight;
             }
         }
-        Ok(kernel)
+        Ok(kernels)
+    }
+
+    fn n_kernels(&self, file: &ModelFile) -> Result<usize, ModelError> {
+        let names_own = |entry: &&KernelEntry| entry.own.is_some();
+        let n_named = file.kernel.iter().filter(names_own).count();
+        if n_named == 0 {
+            return Ok(1);
+        }
+        if n_named < file.kernel.len() {
+            let got = format!("{n_named} of {}", file.kernel.len());
+            return self.wrong("kernel".into(), "own in every entry, or in none", got);
+        }
+        Ok(file.states.len())
     }
 
     fn weights(

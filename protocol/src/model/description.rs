@@ -50,6 +50,7 @@ impl Description {
             observed_as: state.observed_as.clone(),
         };
         let stays = |state: &DescribedState| KernelEntry {
+            own: None,
             from: state.name.clone(),
             to: state.name.clone(),
             scale: 1.0,

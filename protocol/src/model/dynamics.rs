@@ -27,6 +27,11 @@
 //! one above less `q[t] / 256` of each "tap `t`, outcome `f`". In the wildfire 24 of 256 escape, and a
 //! third of those are rejected (`mixture.rs` has the tables).
 //!
+//! # Kernels that see the cell's own state
+//! Each own state has a mixture of its own. Its centre tap has one parent state alone, so that `f` is the
+//! likeliest outcome there, and needs not be that of a neighbour in the same state. A cell whose weights
+//! depend on no neighbour is never rejected, and one that stays as it is for certain takes its byte alone.
+//!
 //! # Random numbers
 //! Two words of the step's ChaCha8 stream key two SplitMix64 generators, as in the sensor: one gives
 //! a byte for every home (see [`Dynamics`]), the other 32 bits for each draw, band by band, round by
@@ -34,12 +39,15 @@
 
 use super::file::{MAX_VALUES, ModelError};
 use super::grid::{Grid, Shape};
-use super::lanes::{FastTap, LANES, blend, fast_taps, fill, high_bits, list_lanes, transposed};
+use super::lanes::{
+    FastOwn, FastTap, LANES, blend, blend_own, fast_taps, fill, high_bits, list_lanes, transposed,
+};
 use super::mixture::{Draw, Mixture, REJECTED, invert, uniform};
 use super::parameters::Model;
 use super::randomness::{Purpose, split_mix, stream};
 use super::vectors::vectorised;
 use rand::Rng;
+use std::iter::zip;
 use std::sync::Arc;
 
 /// Rounds of drawing parents before a cell's kernel is summed. The wildfire rejects about 1 in 30,
@@ -78,15 +86,27 @@ pub struct Dynamics {
 struct Tables {
     n_states: usize,
     initial: Vec<f64>,
-    mixture: Mixture,
-    /// The taps with `q > 0`.
-    fast: Vec<FastTap>,
-    /// `f` as a table over bytes, unless it maps every state to itself.
-    likeliest: Option<[u8; 256]>,
+    /// One, or one for each state that a cell itself can be in.
+    mixtures: Vec<Mixture>,
+    fast: Fast,
     /// `None`: every cell's kernel is summed.
     draw: Option<Draw>,
     /// Where each tap reads in `parents`, relative to a cell's home.
     offsets: Vec<usize>,
+}
+
+/// What the random bytes stand for.
+#[derive(Debug)]
+enum Fast {
+    /// In every cell.
+    Alike {
+        /// The taps with `q > 0`.
+        taps: Vec<FastTap>,
+        /// `f` as a table over bytes, unless it maps every state to itself.
+        likeliest: Option<Box<[u8; 256]>>,
+    },
+    /// By the cell's own state.
+    Own(Vec<FastOwn>),
 }
 
 impl Dynamics {
@@ -148,7 +168,10 @@ impl Dynamics {
                 let randoms = &mut self.randoms[..n_undecided.next_multiple_of(2) * 4];
                 fill(randoms, draw_key, n_words);
                 n_words += randoms.len() / 8;
-                n_undecided = self.draw_parents(n_undecided);
+                n_undecided = match self.tables.fast {
+                    Fast::Alike { .. } => self.draw_parents::<false>(n_undecided),
+                    Fast::Own(_) => self.draw_parents::<true>(n_undecided),
+                };
                 if n_undecided == 0 {
                     break;
                 }
@@ -178,10 +201,21 @@ impl Dynamics {
     #[inline(always)]
     fn decide_most(&mut self, first: usize, end: usize) {
         let (chunks, _) = self.next[first..end].as_chunks_mut();
-        for (home, lanes) in (first..).step_by(LANES).zip(chunks) {
-            blend(lanes, &self.tables.fast, &self.parents[home..]);
-            if let Some(likeliest) = &self.tables.likeliest {
-                *lanes = lanes.map(|parent| likeliest[usize::from(parent)]);
+        let chunks = (first..).step_by(LANES).zip(chunks);
+        match &self.tables.fast {
+            Fast::Alike { taps, likeliest } => {
+                for (home, lanes) in chunks {
+                    blend(lanes, taps, &self.parents[home..]);
+                    if let Some(likeliest) = likeliest {
+                        *lanes = lanes.map(|parent| likeliest[usize::from(parent)]);
+                    }
+                }
+            }
+            Fast::Own(tables) => {
+                let centre = self.tables.centre();
+                for (home, lanes) in chunks {
+                    blend_own(lanes, tables, &self.parents[home..], centre);
+                }
             }
         }
     }
@@ -204,7 +238,8 @@ impl Dynamics {
 
     /// One round: draws parent and outcome for every listed cell, and keeps the rejected ones.
     #[inline(never)] // Within its caller LLVM runs out of registers: 10 % more a step.
-    fn draw_parents(&mut self, n_undecided: usize) -> usize {
+    fn draw_parents<const OWN: bool>(&mut self, n_undecided: usize) -> usize {
+        let centre = self.tables.centre();
         let Some(draw) = &self.tables.draw else {
             return n_undecided;
         };
@@ -216,7 +251,12 @@ impl Dynamics {
             let home = undecided[index];
             let mark = next[home as usize];
             let random = u32::from_le_bytes(randoms[index]);
-            let state = draw.outcome(mark, random, parents, home);
+            let own = if OWN {
+                parents[home as usize + centre]
+            } else {
+                0
+            };
+            let state = draw.outcome(own, mark, random, parents, home);
             next[home as usize] = state;
             // Branch-free: no rejection is predictable.
             undecided[n_rejected] = home;
@@ -230,10 +270,17 @@ impl Dynamics {
         let tables = &self.tables;
         for (index, &home) in self.undecided[..n_undecided].iter().enumerate() {
             let mut sums = [0.0; MAX_VALUES];
+            let mixture = match tables.fast {
+                Fast::Alike { .. } => &tables.mixtures[0],
+                Fast::Own(_) => {
+                    let own = self.parents[home as usize + tables.centre()];
+                    &tables.mixtures[usize::from(own)]
+                }
+            };
             for (tap, offset) in tables.offsets.iter().enumerate() {
                 let parent = self.parents[home as usize + offset];
                 if parent != REJECTED {
-                    let weights = tables.mixture.weights(tap, usize::from(parent));
+                    let weights = mixture.weights(tap, usize::from(parent));
                     sums.iter_mut().zip(weights).for_each(|(sum, w)| *sum += w);
                 }
             }
@@ -258,27 +305,56 @@ impl Tables {
         let (n_states, _, kernel_height, kernel_width) = model.kernel().dim();
         let taps = (0..kernel_height).flat_map(|a| (0..kernel_width).map(move |c| (a, c)));
         let offsets: Vec<usize> = taps.map(|(a, c)| a * stride + c).collect();
-        let mixture = Mixture::new(model);
-        let likeliest = mixture.likeliest();
-        let mut counts = mixture.fast_counts(&likeliest);
-        let draw = Draw::new(&mixture, &offsets, &likeliest, &counts);
-        if draw.is_none() {
-            // Summed kernels follow the whole distribution: no byte may stand for part of it.
-            counts.fill(0);
-        }
+        let mixtures = Mixture::of_model(model);
+        let draw = Draw::new(&mixtures, &offsets);
+        // Summed kernels follow the whole distribution: no byte may stand for part of it.
+        let by_bytes = if draw.is_some() { &mixtures[..] } else { &[] };
+        let fast = if model.sees_own_state() {
+            let states = by_bytes.iter().enumerate();
+            Fast::Own(states.map(|(own, m)| fast_own(own, m, &offsets)).collect())
+        } else {
+            let taps = |m: &Mixture| fast_taps(0, zip(m.counts().to_vec(), offsets.clone()));
+            Fast::Alike {
+                taps: by_bytes.iter().flat_map(taps).collect(),
+                likeliest: table_unless_identity(mixtures[0].likeliest(0)),
+            }
+        };
         Self {
             n_states,
             initial: model.initial().to_vec(),
-            fast: fast_taps(&counts, &offsets),
-            likeliest: table_unless_identity(&likeliest),
-            mixture,
+            fast,
+            mixtures,
             draw,
             offsets,
         }
     }
 
+    /// Where the cell itself lies, relative to its home.
+    fn centre(&self) -> usize {
+        self.offsets[self.offsets.len() / 2]
+    }
+
     fn n_rounds(&self) -> usize {
         if self.draw.is_some() { ROUNDS } else { 0 }
+    }
+}
+
+/// What the bytes stand for in cells of one own state.
+fn fast_own(own: usize, mixture: &Mixture, offsets: &[usize]) -> FastOwn {
+    let centre = offsets.len() / 2;
+    let count = mixture.counts()[centre];
+    let neighbours = (0..offsets.len()).filter(|&tap| tap != centre);
+    let taps = neighbours
+        .clone()
+        .map(|tap| (mixture.counts()[tap], offsets[tap]));
+    let likeliest = neighbours.take(1).flat_map(|tap| mixture.likeliest(tap));
+    let changes = likeliest.enumerate().filter(|(from, to)| from != *to);
+    FastOwn {
+        own: own as u8,
+        likeliest: mixture.likeliest(centre)[own] as u8,
+        count,
+        neighbours: fast_taps(count, taps),
+        changes: changes.map(|(from, &to)| (from as u8, to as u8)).collect(),
     }
 }
 
@@ -300,13 +376,13 @@ fn on_grid(shape: Shape, stride: usize) -> Vec<u64> {
 }
 
 /// `f` over all bytes, marks unchanged.
-fn table_unless_identity(likeliest: &[usize]) -> Option<[u8; 256]> {
+fn table_unless_identity(likeliest: &[usize]) -> Option<Box<[u8; 256]>> {
     let mut table: [u8; 256] = std::array::from_fn(|byte| byte as u8);
     let identity = table;
     for (from, &to) in likeliest.iter().enumerate() {
         table[from] = to as u8;
     }
-    (table != identity).then_some(table)
+    (table != identity).then(|| Box::new(table))
 }
 
 #[cfg(test)]
@@ -316,15 +392,21 @@ mod tests {
     #[test]
     fn wider_vectors_change_no_cell() {
         let shape = Shape::new(40, 70).expect("test shape");
-        let mut dynamics = Dynamics::new(&Model::wildfire(), shape).expect("wildfire");
-        let mut states = dynamics.initial(3);
-        for n in 0..300 {
-            let mut portable = states.clone();
-            let cells = portable.as_slice_mut().expect("row-major");
-            dynamics.advance(keys(3, n), cells);
-            dynamics.step(3, n, &mut states);
-            assert_eq!(states, portable);
+        for name in ["wildfire", "wildfire-burnout"] {
+            let model = Model::built_in(name).expect(name);
+            let mut dynamics = Dynamics::new(&model, shape).expect(name);
+            let mut states = dynamics.initial(3);
+            for n in 0..300 {
+                let mut portable = states.clone();
+                let cells = portable.as_slice_mut().expect("row-major");
+                dynamics.advance(keys(3, n), cells);
+                dynamics.step(3, n, &mut states);
+                assert_eq!(states, portable);
+            }
+            assert!(
+                states.iter().any(|&state| state == 2),
+                "{name}: no such state"
+            );
         }
-        assert!(states.iter().any(|&state| state == 2), "no fire was seen");
     }
 }

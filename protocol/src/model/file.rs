@@ -64,6 +64,9 @@ pub struct ObservationEntry {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KernelEntry {
+    /// Name of the state that the cell itself is in at k; in all entries of a file, or in none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub own: Option<String>,
     /// Name of the state at k.
     pub from: String,
     /// Name of the state at k + 1.
@@ -160,7 +163,11 @@ pub enum ModelError {
 impl KernelEntry {
     /// Names the entry in errors.
     pub(super) fn what(&self) -> String {
-        format!("kernel from {:?} to {:?}", self.from, self.to)
+        let pair = format!("from {:?} to {:?}", self.from, self.to);
+        match &self.own {
+            Some(own) => format!("kernel of {own:?} {pair}"),
+            None => format!("kernel {pair}"),
+        }
     }
 }
 

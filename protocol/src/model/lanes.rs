@@ -16,21 +16,34 @@ pub(crate) struct FastTap {
     last: [u8; LANES],
 }
 
-/// The taps that bytes stand for, with the last byte value of each.
-pub(crate) fn fast_taps(counts: &[usize], offsets: &[usize]) -> Vec<FastTap> {
-    let mut end = 0;
-    let mut taps = Vec::new();
-    for (&count, &offset) in counts.iter().zip(offsets) {
+/// What bytes stand for in cells of one own state: first the centre, then the other taps.
+#[derive(Debug)]
+pub(crate) struct FastOwn {
+    pub(crate) own: u8,
+    /// The state that the cell itself leads to.
+    pub(crate) likeliest: u8,
+    /// How many byte values stand for it.
+    pub(crate) count: usize,
+    pub(crate) neighbours: Vec<FastTap>,
+    /// Where a neighbour's state mostly leads to another: that state, and the other.
+    pub(crate) changes: Vec<(u8, u8)>,
+}
+
+/// The taps that bytes from `first` on stand for, with the last byte value of each.
+pub(crate) fn fast_taps(first: usize, taps: impl Iterator<Item = (usize, usize)>) -> Vec<FastTap> {
+    let mut end = first;
+    let mut fast = Vec::new();
+    for (count, offset) in taps {
         end += count;
         if count > 0 {
             let last = u8::try_from(end - 1).expect("invariant: fast probabilities sum to <= 1");
-            taps.push(FastTap {
+            fast.push(FastTap {
                 offset,
                 last: [last; LANES],
             });
         }
     }
-    taps
+    fast
 }
 
 /// Words `first..` of the SplitMix64 generator of a key; `bytes` are whole words.
@@ -58,6 +71,41 @@ pub(crate) fn blend(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
         }
     }
     *lanes = states;
+}
+
+/// The same where the cell's own state, which lies under `centre`, tells what bytes stand for.
+#[inline(always)]
+pub(crate) fn blend_own(lanes: &mut [u8; LANES], fast: &[FastOwn], parents: &[u8], centre: usize) {
+    let own: &[u8; LANES] = parents[centre..]
+        .first_chunk()
+        .expect("invariant: a whole chunk of places is under every tap");
+    let mut next = [ESCAPED; LANES];
+    for table in fast {
+        let mut states = *lanes;
+        blend(&mut states, &table.neighbours, parents);
+        let before = states;
+        for &(from, to) in &table.changes {
+            replace(&mut states, to, |lane| before[lane] == from);
+        }
+        if let Some(last) = table.count.checked_sub(1) {
+            replace(&mut states, table.likeliest, |lane| {
+                usize::from(lanes[lane]) <= last
+            });
+        }
+        for lane in 0..LANES {
+            let chosen = u8::from(own[lane] == table.own).wrapping_neg();
+            next[lane] ^= (next[lane] ^ states[lane]) & chosen;
+        }
+    }
+    *lanes = next;
+}
+
+#[inline(always)]
+fn replace(lanes: &mut [u8; LANES], by: u8, is_chosen: impl Fn(usize) -> bool) {
+    for (lane, state) in lanes.iter_mut().enumerate() {
+        let chosen = u8::from(is_chosen(lane)).wrapping_neg();
+        *state ^= (*state ^ by) & chosen;
+    }
 }
 
 /// The high bit of every lane, that of lane `8 w + b` at position `8 b + w`: an order that takes one

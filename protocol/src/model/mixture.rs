@@ -2,6 +2,7 @@
 //! and draws of a tap and its outcome from them.
 
 use super::parameters::Model;
+use ndarray::Array4;
 
 /// Mark of a cell to be drawn again, and of what lies off the grid: a cell with such a parent is
 /// rejected. Odd, and its high bit is set, as in no state.
@@ -14,17 +15,22 @@ pub(crate) const ESCAPED: u8 = 254;
 /// stay in any cache.
 const MOST_RULES: usize = 1 << 16;
 
-/// The weights of eq. 2 as a mixture over taps.
+/// The weights of eq. 2 as a mixture over taps: of all cells, or of those in one state themselves.
 #[derive(Debug, Clone)]
 pub(crate) struct Mixture {
     n_states: usize,
     n_taps: usize,
-    /// `w[m, n, t]` as `[tap][from][to]`, the bias in the centre tap.
+    /// `w[m, n, t]` as `[tap][from][to]`, the bias in the centre tap. Where the cell's own state is known,
+    /// the centre has its weights in place of all others.
     weights: Vec<f64>,
     /// `most[t]`, the largest column sum of each tap.
     most: Vec<f64>,
     /// `C`, the sum of `most`.
     total: f64,
+    /// `f`: the state that each state mostly leads to under each tap, `[tap][from]`.
+    likeliest: Vec<Vec<usize>>,
+    /// `q`: how many of 256 byte values stand for each tap.
+    counts: Vec<usize>,
 }
 
 /// Draws of a tap and its outcome, from the residual distribution or from the whole.
@@ -35,7 +41,8 @@ pub(crate) struct Mixture {
 /// look-ups decide a cell. The wildfire has 53 rules in its residual distribution.
 #[derive(Debug)]
 pub(crate) struct Draw {
-    /// Two alias tables of one length, a power of two: the residual distribution, then the whole.
+    /// For each mixture two alias tables, all of one length, a power of two: the residual distribution,
+    /// then the whole.
     slots: Vec<Slot>,
     log_n_slots: u32,
     /// Outcomes, in rows of a power of two.
@@ -62,37 +69,60 @@ struct Slot {
 }
 
 impl Mixture {
-    pub(crate) fn new(model: &Model) -> Self {
-        let (n_states, _, kernel_height, kernel_width) = model.kernel().dim();
+    /// One for all cells, or one for each state that a cell itself can be in.
+    pub(crate) fn of_model(model: &Model) -> Vec<Self> {
+        let kernels = model.kernels().iter().enumerate();
+        let own = |state| model.sees_own_state().then_some(state);
+        kernels
+            .map(|(state, kernel)| Self::new(kernel, &model.bias().to_vec(), own(state)))
+            .collect()
+    }
+
+    fn new(kernel: &Array4<f64>, bias: &[f64], own: Option<usize>) -> Self {
+        let (n_states, _, kernel_height, kernel_width) = kernel.dim();
         let n_taps = kernel_height * kernel_width;
         // Eq. 3 cancels a common factor; taken out, no sum of weights overflows.
-        let largest = model.kernel().iter().chain(model.bias()).copied();
-        let largest = largest.fold(0.0, f64::max);
+        let largest = kernel.iter().chain(bias).copied().fold(0.0, f64::max);
         let mut weights = Vec::with_capacity(n_taps * n_states * n_states);
         for tap in 0..n_taps {
             let (row, col) = (tap / kernel_width, tap % kernel_width);
-            for from in 0..n_states {
+            let is_centre = tap == n_taps / 2;
+            for parent in 0..n_states {
+                let from = own.filter(|_| is_centre).unwrap_or(parent);
                 weights.extend((0..n_states).map(|to| {
-                    let bias = if tap == n_taps / 2 {
-                        model.bias()[to]
-                    } else {
-                        0.0
-                    };
-                    (model.kernel()[[to, from, row, col]] + bias) / largest
+                    let bias = if is_centre { bias[to] } else { 0.0 };
+                    (kernel[[to, from, row, col]] + bias) / largest
                 }));
             }
         }
+        Self::of_weights(n_states, n_taps, weights, own)
+    }
+
+    fn of_weights(n_states: usize, n_taps: usize, weights: Vec<f64>, own: Option<usize>) -> Self {
         let column_sums: Vec<f64> = weights.chunks(n_states).map(|w| w.iter().sum()).collect();
         let largest = |sums: &[f64]| sums.iter().copied().fold(0.0, f64::max);
         let most: Vec<f64> = column_sums.chunks(n_states).map(largest).collect();
         let total = most.iter().sum();
-        Self {
+        let mut mixture = Self {
             n_states,
             n_taps,
             weights,
             most,
             total,
-        }
+            likeliest: Vec::new(),
+            counts: Vec::new(),
+        };
+        let centre = n_taps / 2;
+        mixture.likeliest = if own.is_some() {
+            let neighbours = mixture.likeliest_under((0..n_taps).filter(|&tap| tap != centre));
+            let mut likeliest = vec![neighbours; n_taps];
+            likeliest[centre] = mixture.likeliest_under(std::iter::once(centre));
+            likeliest
+        } else {
+            vec![mixture.likeliest_under(0..n_taps); n_taps]
+        };
+        mixture.counts = mixture.fast_counts();
+        mixture
     }
 
     /// The weight of each next state, given the tap and its parent's state.
@@ -100,13 +130,19 @@ impl Mixture {
         &self.weights[(tap * self.n_states + from) * self.n_states..][..self.n_states]
     }
 
-    /// `f`: the state that each state mostly leads to.
-    pub(crate) fn likeliest(&self) -> Vec<usize> {
-        let sum = |from, to| {
-            (0..self.n_taps)
-                .map(|tap| self.weights(tap, from)[to])
-                .sum()
-        };
+    /// `f` under a tap.
+    pub(crate) fn likeliest(&self, tap: usize) -> &[usize] {
+        &self.likeliest[tap]
+    }
+
+    /// `q` by tap.
+    pub(crate) fn counts(&self) -> &[usize] {
+        &self.counts
+    }
+
+    /// The state that each state mostly leads to under some taps.
+    fn likeliest_under(&self, taps: impl Iterator<Item = usize> + Clone) -> Vec<usize> {
+        let sum = |from, to| taps.clone().map(|tap| self.weights(tap, from)[to]).sum();
         let likeliest = |from| {
             let sums: Vec<f64> = (0..self.n_states).map(|to| sum(from, to)).collect();
             let better = |best, to| if sums[to] > sums[best] { to } else { best };
@@ -117,7 +153,7 @@ impl Mixture {
 
     /// For each state of the parent under a tap, where each outcome's part of the tap's interval ends;
     /// `taken` has gone from the likeliest outcome's.
-    fn ends(&self, tap: usize, likeliest: &[usize], taken: f64) -> Vec<Vec<f64>> {
+    fn ends(&self, tap: usize, taken: f64) -> Vec<Vec<f64>> {
         let of_parent = |(from, &likeliest): (usize, &usize)| {
             let mut end = 0.0;
             let weights = self.weights(tap, from).iter().enumerate();
@@ -128,58 +164,76 @@ impl Mixture {
             });
             ends.collect()
         };
-        likeliest.iter().enumerate().map(of_parent).collect()
+        let likeliest = self.likeliest[tap].iter();
+        likeliest.enumerate().map(of_parent).collect()
     }
 
-    /// `q`: how many of 256 byte values stand for each tap.
-    pub(crate) fn fast_counts(&self, likeliest: &[usize]) -> Vec<usize> {
-        let count = |tap| {
-            let certain = likeliest.iter().enumerate();
+    fn fast_counts(&self) -> Vec<usize> {
+        let count = |tap: usize| {
+            let certain = self.likeliest[tap].iter().enumerate();
             let certain = certain.map(|(from, &to)| self.weights(tap, from)[to]);
             (256.0 * certain.fold(f64::INFINITY, f64::min) / self.total) as usize
         };
         (0..self.n_taps).map(count).collect()
     }
+
+    /// The distribution of tap and outcome as rules, less `taken[t] / 256` of "tap `t`, likeliest outcome".
+    fn rules(
+        &self,
+        offsets: &[usize],
+        taken: &[usize],
+        outcomes: &mut Vec<u8>,
+    ) -> Vec<(f64, Rule)> {
+        let mut rules = Vec::new();
+        for (tap, &offset) in offsets.iter().enumerate() {
+            let taken = taken[tap] as f64 / 256.0;
+            let ends = self.ends(tap, taken);
+            let length = self.most[tap] / self.total - taken;
+            add_rules(&ends, length, offset, &mut rules, outcomes);
+        }
+        rules
+    }
 }
 
 impl Draw {
-    /// The distribution of tap and outcome less `counts[t] / 256` of "tap `t`, likeliest outcome",
-    /// and the whole distribution; the taps read at `offsets`. `None` if the rules would be too many.
-    pub(crate) fn new(
-        mixture: &Mixture,
-        offsets: &[usize],
-        likeliest: &[usize],
-        counts: &[usize],
-    ) -> Option<Self> {
-        let n_weights = mixture.weights.iter().filter(|&&w| w > 0.0).count();
-        if n_weights + mixture.n_taps > MOST_RULES {
+    /// What the bytes leave of each mixture, and the whole of it; the taps read at `offsets`. `None` if the
+    /// rules would be too many.
+    pub(crate) fn new(mixtures: &[Mixture], offsets: &[usize]) -> Option<Self> {
+        let weights = mixtures.iter().flat_map(|mixture| &mixture.weights);
+        let n_weights = weights.filter(|&&weight| weight > 0.0).count();
+        if n_weights + mixtures.len() * offsets.len() > MOST_RULES {
             return None;
         }
         let mut outcomes = Vec::new();
-        let [residual, whole] = [counts, &vec![0; counts.len()]].map(|counts| {
-            let mut rules = Vec::new();
-            for (tap, &offset) in offsets.iter().enumerate() {
-                let taken = counts[tap] as f64 / 256.0;
-                let ends = mixture.ends(tap, likeliest, taken);
-                let length = mixture.most[tap] / mixture.total - taken;
-                add_rules(&ends, length, offset, &mut rules, &mut outcomes);
+        let none = vec![0; offsets.len()];
+        let mut tables = Vec::new();
+        for mixture in mixtures {
+            for taken in [mixture.counts(), &none] {
+                tables.push(mixture.rules(offsets, taken, &mut outcomes));
             }
-            rules
-        });
-        let n_slots = residual.len().max(whole.len()).next_power_of_two();
-        let slots = [residual, whole].map(|rules| alias_table(&rules, n_slots));
+        }
+        let most_rules = tables.iter().map(Vec::len).max().unwrap_or(0);
+        let n_slots = most_rules.next_power_of_two();
+        let slots = tables.iter().map(|rules| alias_table(rules, n_slots));
         Some(Self {
-            slots: slots.concat(),
+            slots: slots.flatten().collect(),
             log_n_slots: n_slots.trailing_zeros(),
             outcomes,
-            mask: (row_length(mixture.n_states) - 1) as u8,
+            mask: (row_length(mixtures[0].n_states) - 1) as u8,
         })
     }
 
-    /// Draws again for the cell at `home` that bears `mark`: a state, or [`REJECTED`].
+    /// Draws from a mixture again for the cell at `home` that bears `mark`: a state, or [`REJECTED`].
     #[inline]
-    pub(crate) fn outcome(&self, mark: u8, random: u32, parents: &[u8], home: u32) -> u8 {
-        let table = usize::from(mark & 1) << self.log_n_slots;
+    pub(crate) fn outcome(
+        &self,
+        mixture: u8,
+        mark: u8,
+        random: u32,
+        parents: &[u8],
+        home: u32,
+    ) -> u8 {
+        let table = usize::from(mixture << 1 | mark & 1) << self.log_n_slots;
         let slot = &self.slots[(u64::from(random) << self.log_n_slots >> 32) as usize | table];
         let within = random << self.log_n_slots;
         let rule = slot.rules[usize::from(within >= slot.threshold)];

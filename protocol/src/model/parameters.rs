@@ -10,7 +10,7 @@ use super::grid::{Cell, Shape};
 use ndarray::{Array1, Array2, Array4, Axis};
 
 /// The built-in models by name.
-const BUILT_IN: [(&str, &str); 4] = [
+const BUILT_IN: [(&str, &str); 5] = [
     (
         "wildfire",
         include_str!("../../../config/models/wildfire.toml"),
@@ -27,13 +27,17 @@ const BUILT_IN: [(&str, &str); 4] = [
         "wildfire-small",
         include_str!("../../../config/models/wildfire-small.toml"),
     ),
+    (
+        "wildfire-burnout",
+        include_str!("../../../config/models/wildfire-burnout.toml"),
+    ),
 ];
 
 /// A checked model: every model that exists can be simulated and filtered.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Model {
     file: ModelFile,
-    kernel: Array4<f64>,
+    kernels: Vec<Array4<f64>>,
     bias: Array1<f64>,
     likelihood: Array2<f64>,
     initial: Array1<f64>,
@@ -46,8 +50,8 @@ impl Model {
         Self::built_in("wildfire").expect("invariant: the wildfire is built in")
     }
 
-    /// The built-in model of a name: `wildfire`, `wildfire-sparse`, `wildfire-latent` or
-    /// `wildfire-small` (`config/models`).
+    /// The built-in model of a name: `wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small` or
+    /// `wildfire-burnout` (`config/models`).
     pub fn built_in(name: &str) -> Option<Self> {
         let (_, text) = BUILT_IN.iter().find(|(known, _)| *known == name)?;
         let model = Self::from_toml(text);
@@ -75,7 +79,7 @@ impl Model {
     pub fn new(file: ModelFile) -> Result<Self, ModelError> {
         let check = Checker { model: &file.name };
         check.counts_and_names(&file)?;
-        let kernel = check.kernel(&file)?;
+        let kernels = check.kernels(&file)?;
         let bias = check.per_state(&file, "bias", |state| state.bias, 0.0)?;
         let reward = check.per_state(&file, "reward", |state| state.reward, f64::NEG_INFINITY)?;
         let initial = check.per_state(&file, "initial", |state| state.initial, 0.0)?;
@@ -84,7 +88,7 @@ impl Model {
         let initial = &initial / initial.sum();
         Ok(Self {
             file,
-            kernel,
+            kernels,
             bias,
             likelihood,
             initial,
@@ -97,10 +101,19 @@ impl Model {
     /// # Errors
     /// If it can; the error names the first such cell.
     pub fn check_on(&self, shape: Shape) -> Result<(), ModelError> {
-        let column_sums = self.kernel.sum_axis(Axis(0));
-        let least = column_sums.fold_axis(Axis(0), f64::INFINITY, |a, b| a.min(*b));
+        (0..self.kernels.len()).try_for_each(|own| self.check_kernel_on(own, shape))
+    }
+
+    fn check_kernel_on(&self, own: usize, shape: Shape) -> Result<(), ModelError> {
+        let kernel = &self.kernels[own];
+        let column_sums = kernel.sum_axis(Axis(0));
+        let mut least = column_sums.fold_axis(Axis(0), f64::INFINITY, |a, b| a.min(*b));
         let (kernel_height, kernel_width) = least.dim();
-        let largest = self.kernel.iter().chain(&self.bias).copied();
+        if self.sees_own_state() {
+            let (row, col) = (kernel_height / 2, kernel_width / 2);
+            least[[row, col]] = column_sums[[own, row, col]];
+        }
+        let largest = kernel.iter().chain(&self.bias).copied();
         let largest = largest.fold(f64::MIN_POSITIVE, f64::max);
         // Cells further than a kernel from the edges are all alike: look at one of them.
         let distinct = |side: usize, kernel: usize| {
@@ -159,9 +172,20 @@ impl Model {
         self.file.observations.len()
     }
 
-    /// Transition weights `w[to, from, row, col]`, shape `[S, S, KH, KW]`, all `>= 0` (eq. 2).
+    /// Whether a cell's weights depend on the state that it is in itself.
+    pub fn sees_own_state(&self) -> bool {
+        self.kernels.len() > 1
+    }
+
+    /// Transition weights `w[to, from, row, col]`, shape `[S, S, KH, KW]`, all `>= 0` (eq. 2): one kernel
+    /// for all cells, or one for each state that a cell itself can be in.
+    pub fn kernels(&self) -> &[Array4<f64>] {
+        &self.kernels
+    }
+
+    /// The first of [`Model::kernels`]: that of all cells, unless [`Model::sees_own_state`].
     pub fn kernel(&self) -> &Array4<f64> {
-        &self.kernel
+        &self.kernels[0]
     }
 
     /// Transition bias `b[to]`, shape `[S]`, all `>= 0` (eq. 2).
@@ -211,6 +235,7 @@ impl Model {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::KernelEntry;
 
     #[test]
     fn built_in_models_have_their_names_and_fit_the_grid() {
@@ -222,7 +247,7 @@ mod tests {
             assert_eq!(model.check_on(shape), Ok(()), "{name}");
             n_models += 1;
         }
-        assert_eq!(n_models, 4);
+        assert_eq!(n_models, 5);
         assert_eq!(Model::built_in("wildfire-dense"), None);
     }
 
@@ -364,10 +389,58 @@ mod tests {
     }
 
     #[test]
+    fn kernels_of_own_states_are_checked() {
+        let check = |change: fn(&mut ModelFile), expected: &str| {
+            let mut file = burnout().file;
+            change(&mut file);
+            let error = Model::new(file).and_then(|model| {
+                let shape = Shape::new(2, 2).expect("test shape");
+                model.check_on(shape)
+            });
+            let error = error.expect_err(expected).to_string();
+            assert!(
+                error.contains(expected),
+                "{error:?} does not say {expected:?}"
+            );
+        };
+        check(
+            |f| f.kernel[1].own = None,
+            "kernel: expected own in every entry, or in none, got 7 of 8",
+        );
+        check(
+            |f| f.kernel[1].own = Some("ash".into()),
+            "names state \"ash\"",
+        );
+        check(
+            |f| f.kernel.push(f.kernel[7].clone()),
+            "kernel of \"burnt\" from \"burnt\" to \"unburnt\": expected one entry for each",
+        );
+        check(|f| f.kernel[2].scale = -1.0, "expected finite weights >= 0");
+        // Burning cells have no weight left; those of others in the centre are no help.
+        check(
+            |f| {
+                f.kernel
+                    .retain(|entry| entry.own.as_deref() != Some("burning"));
+                let unburnt = f.kernel[0].clone();
+                f.kernel.push(KernelEntry {
+                    own: Some("burning".into()),
+                    ..unburnt
+                });
+            },
+            "transition weights of cell (0, 0) can sum to zero",
+        );
+    }
+
+    fn burnout() -> Model {
+        Model::built_in("wildfire-burnout").expect("built in")
+    }
+
+    #[test]
     fn a_model_file_survives_toml() {
-        let model = Model::wildfire();
-        let text = toml::to_string(model.file()).expect("models serialise");
-        assert_eq!(Model::from_toml(&text), Ok(model));
+        for model in [Model::wildfire(), burnout()] {
+            let text = toml::to_string(model.file()).expect("models serialise");
+            assert_eq!(Model::from_toml(&text), Ok(model));
+        }
         assert!(matches!(
             Model::from_toml("name = 3"),
             Err(ModelError::Toml(_))

@@ -5,6 +5,10 @@
 //! convolution), then divided by its sum over `m` (eq. 3). [`super::dynamics`] draws realised states
 //! from the same operator.
 //!
+//! Where the weights see the cell's own state `o`, `phi[m | o]` has the weights of `o`, and its centre tap
+//! sees `o` itself: `u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]`. This is a mean field: it takes the
+//! cell and its neighbours for independent, as the filter does.
+//!
 //! Two things make it fast, both without a change of meaning. The belief is copied into planes with
 //! a margin of zeros, so no cell is special. And taps of one state that weigh alike (the eight
 //! neighbours in most of the wildfire kernel) are added up before they are multiplied, once for all
@@ -16,7 +20,7 @@ use super::file::ModelError;
 use super::grid::Shape;
 use super::parameters::Model;
 use super::vectors::vectorised;
-use ndarray::{Array3, Array4, NdFloat};
+use ndarray::{Array3, Array4, NdFloat, s};
 
 /// Cells computed at once, four AVX2 registers of `f32`. Independent sums hide the latency of adds.
 const LANES: usize = 32;
@@ -31,14 +35,35 @@ pub struct Transition<T = f32> {
     layout: Layout,
     /// Groups of taps that weigh alike: where each reads, relative to a cell's place in `planes`.
     groups: Vec<Vec<usize>>,
-    /// For each next state its bias and its weight for some of the groups.
-    rows: Vec<Row<T>>,
+    kernels: Kernels<T>,
     /// The belief with a margin of zeros.
     planes: Vec<T>,
     /// The inputs of each group, added up.
     sums: Vec<[T; LANES]>,
     /// The weight of each next state, before eq. 3 divides.
     weights: Vec<[T; LANES]>,
+    /// The same in one own state.
+    own_weights: Vec<[T; LANES]>,
+}
+
+/// For each next state its bias and its weight for some of the groups.
+type Rows<T> = Vec<Row<T>>;
+
+#[derive(Debug, Clone)]
+enum Kernels<T> {
+    /// Of every cell.
+    Alike(Rows<T>),
+    /// By the cell's own state.
+    Own(Vec<Own<T>>),
+}
+
+/// What a cell in one state itself turns into.
+#[derive(Debug, Clone)]
+enum Own<T> {
+    /// Whatever its neighbours, the probability of each next state that is possible.
+    Fixed(Vec<(usize, T)>),
+    /// The rows of the next states that are possible.
+    Weighed(Vec<(usize, Row<T>)>),
 }
 
 /// One next state's part of eq. 2.
@@ -67,31 +92,24 @@ impl<T: NdFloat> Transition<T> {
     pub fn new(model: &Model, shape: Shape) -> Result<Self, ModelError> {
         model.check_on(shape)?;
         let bias = model.bias().to_vec();
-        Ok(Self::of_weights(model.kernel(), &bias, shape))
+        Ok(Self::of_weights(model.kernels(), &bias, shape))
     }
 
-    /// Lays out weights `w[m, n, a, c]`, shape `[S, S, KH, KW]` with odd sides, and biases `b[m]` for a grid.
+    /// Lays out weights `w[m, n, a, c]`, shape `[S, S, KH, KW]` with odd sides, and biases `b[m]` for a grid:
+    /// one kernel for all cells, or one for each state that a cell itself can be in.
     /// All are finite and 0 or more; where a cell's weights can all be 0, its prediction is NaN.
-    pub fn of_weights(kernel: &Array4<f64>, bias: &[f64], shape: Shape) -> Self {
-        let (n_states, _, kernel_height, kernel_width) = kernel.dim();
+    pub fn of_weights(kernels: &[Array4<f64>], bias: &[f64], shape: Shape) -> Self {
+        let (n_states, _, kernel_height, kernel_width) = kernels[0].dim();
         let layout = Layout::new(shape, kernel_height, kernel_width);
-        // Eq. 3 cancels a common factor; taken out, no weight overflows T.
-        let largest = kernel.iter().chain(bias).copied().fold(0.0, f64::max);
-        let scaled = |weight: f64| T::from(weight / largest).expect("invariant: f64 casts to T");
-        let row = |&bias| Row {
-            bias: scaled(bias),
-            terms: Vec::new(),
+        let sees_own_state = kernels.len() > 1;
+        let (columns, groups): (Vec<_>, Vec<_>) =
+            taps_that_weigh_alike(kernels, layout).into_iter().unzip();
+        let rows = |own: usize| rows(own, &kernels[own], bias, sees_own_state, &columns);
+        let kernels = if sees_own_state {
+            Kernels::Own((0..n_states).map(|own| Own::new(rows(own))).collect())
+        } else {
+            Kernels::Alike(rows(0))
         };
-        let mut rows: Vec<Row<T>> = bias.iter().map(row).collect();
-        let mut groups = Vec::new();
-        for (column, offsets) in taps_that_weigh_alike(kernel, layout) {
-            for (row, weight) in rows.iter_mut().zip(column) {
-                if weight > 0.0 {
-                    row.terms.push((groups.len(), scaled(weight)));
-                }
-            }
-            groups.push(offsets);
-        }
         Self {
             shape,
             n_states,
@@ -99,8 +117,9 @@ impl<T: NdFloat> Transition<T> {
             planes: vec![T::zero(); n_states * layout.plane],
             sums: vec![[T::zero(); LANES]; groups.len()],
             weights: vec![[T::zero(); LANES]; n_states],
+            own_weights: vec![[T::zero(); LANES]; n_states],
             groups,
-            rows,
+            kernels,
         }
     }
 
@@ -145,8 +164,20 @@ impl<T: NdFloat> Transition<T> {
         for (sum, offsets) in self.sums.iter_mut().zip(&self.groups) {
             *sum = add_up(&self.planes[at..], offsets);
         }
-        for (weight, row) in self.weights.iter_mut().zip(&self.rows) {
-            *weight = row.weigh(&self.sums);
+        match &self.kernels {
+            Kernels::Alike(rows) => {
+                for (weight, row) in self.weights.iter_mut().zip(rows) {
+                    *weight = row.weigh(&self.sums);
+                }
+            }
+            Kernels::Own(kernels) => {
+                self.weights.fill([T::zero(); LANES]);
+                let centre = at + self.layout.above * self.layout.stride + self.layout.left;
+                for (plane, own) in self.planes.chunks_exact(self.layout.plane).zip(kernels) {
+                    let p = lanes_from(plane, centre);
+                    own.add(p, &self.sums, &mut self.own_weights, &mut self.weights);
+                }
+            }
         }
     }
 
@@ -191,6 +222,60 @@ impl Layout {
     }
 }
 
+impl<T: NdFloat> Own<T> {
+    fn new(rows: Rows<T>) -> Self {
+        let sees_neighbours = rows.iter().any(|row| !row.terms.is_empty());
+        let total = rows.iter().fold(T::zero(), |sum, row| sum + row.bias);
+        let is_possible = |row: &Row<T>| row.bias > T::zero() || !row.terms.is_empty();
+        let possible = rows.into_iter().enumerate();
+        let possible = possible.filter(|(_, row)| is_possible(row));
+        if sees_neighbours {
+            Self::Weighed(possible.collect())
+        } else {
+            Self::Fixed(possible.map(|(to, row)| (to, row.bias / total)).collect())
+        }
+    }
+
+    /// Adds what becomes of the cells that are in this state with probability `p`.
+    #[inline(always)]
+    fn add(
+        &self,
+        p: &[T; LANES],
+        sums: &[[T; LANES]],
+        weights: &mut [[T; LANES]],
+        next: &mut [[T; LANES]],
+    ) {
+        match self {
+            Self::Fixed(probabilities) => {
+                for &(to, probability) in probabilities {
+                    for (next, &p) in next[to].iter_mut().zip(p) {
+                        *next += p * probability;
+                    }
+                }
+            }
+            Self::Weighed(rows) => {
+                let mut total = [T::zero(); LANES];
+                for (weight, (_, row)) in weights.iter_mut().zip(rows) {
+                    *weight = row.weigh(sums);
+                    for (total, &weight) in total.iter_mut().zip(&*weight) {
+                        *total += weight;
+                    }
+                }
+                let mut factor = *p;
+                for (factor, total) in factor.iter_mut().zip(total) {
+                    *factor /= total;
+                }
+                for ((to, _), weight) in rows.iter().zip(weights) {
+                    let lanes = next[*to].iter_mut().zip(&*weight).zip(&factor);
+                    for ((next, &weight), &factor) in lanes {
+                        *next += weight * factor;
+                    }
+                }
+            }
+        }
+    }
+}
+
 impl<T: NdFloat> Row<T> {
     #[inline(always)]
     fn weigh(&self, sums: &[[T; LANES]]) -> [T; LANES] {
@@ -204,33 +289,68 @@ impl<T: NdFloat> Row<T> {
     }
 }
 
+/// Eq. 2 for the cells in state `own`, or for all; `columns` are the weights of the groups.
+fn rows<T: NdFloat>(
+    own: usize,
+    kernel: &Array4<f64>,
+    bias: &[f64],
+    sees_own_state: bool,
+    columns: &[Vec<f64>],
+) -> Rows<T> {
+    // Eq. 3 cancels a common factor; taken out, no weight overflows T.
+    let largest = kernel.iter().chain(bias).copied().fold(0.0, f64::max);
+    let scaled = |weight: f64| T::from(weight / largest).expect("invariant: f64 casts to T");
+    let (n_states, _, height, width) = kernel.dim();
+    let row = |to: usize| {
+        let centre = kernel[[to, own, height / 2, width / 2]];
+        let weights = columns.iter().map(|column| column[own * n_states + to]);
+        let terms = weights.enumerate().filter(|&(_, weight)| weight > 0.0);
+        Row {
+            bias: scaled(bias[to] + if sees_own_state { centre } else { 0.0 }),
+            terms: terms
+                .map(|(group, weight)| (group, scaled(weight)))
+                .collect(),
+        }
+    };
+    (0..n_states).map(row).collect()
+}
+
+/// The [`LANES`] values from a place on.
+#[inline(always)]
+fn lanes_from<T>(planes: &[T], at: usize) -> &[T; LANES] {
+    planes[at..]
+        .first_chunk()
+        .expect("invariant: the layout has room for LANES cells at every tap")
+}
+
 /// The sum of the [`LANES`] values at each of the offsets.
 #[inline(always)]
 fn add_up<T: NdFloat>(planes: &[T], offsets: &[usize]) -> [T; LANES] {
     let mut sum = [T::zero(); LANES];
     for &offset in offsets {
-        let lanes: &[T; LANES] = planes[offset..]
-            .first_chunk()
-            .expect("invariant: the layout has room for LANES cells at every tap");
-        for (sum, &lane) in sum.iter_mut().zip(lanes) {
+        for (sum, &lane) in sum.iter_mut().zip(lanes_from(planes, offset)) {
             *sum += lane;
         }
     }
     sum
 }
 
-/// The taps of each state by the column of weights `w[.., n, a, c]` they share: `(column, offsets)`.
-/// Taps without weight are left out.
-fn taps_that_weigh_alike(kernel: &Array4<f64>, layout: Layout) -> Vec<(Vec<f64>, Vec<usize>)> {
-    let (n_states, _, kernel_height, kernel_width) = kernel.dim();
+/// The taps of each state, or of all, by the column of weights `w[.., n, a, c]` they share, one kernel's after the
+/// other's: `(column, offsets)`. Taps without weight are left out, as is the centre where it sees the
+/// cell's own state.
+fn taps_that_weigh_alike(kernels: &[Array4<f64>], layout: Layout) -> Vec<(Vec<f64>, Vec<usize>)> {
+    let (n_states, _, kernel_height, kernel_width) = kernels[0].dim();
+    let is_own = |tap| kernels.len() > 1 && tap == (kernel_height / 2, kernel_width / 2);
     let mut groups: Vec<(Vec<f64>, Vec<usize>)> = Vec::new();
     for from in 0..n_states {
-        let first = groups.len();
+        // Sums within one state alone keep what all kernels alike have always predicted, to the bit.
+        let first = if kernels.len() > 1 { 0 } else { groups.len() };
         for (row, col) in (0..kernel_height).flat_map(|a| (0..kernel_width).map(move |c| (a, c))) {
-            let column: Vec<f64> = (0..n_states)
-                .map(|to| kernel[[to, from, row, col]])
-                .collect();
-            if column.iter().all(|&weight| weight == 0.0) {
+            let columns = kernels
+                .iter()
+                .map(|kernel| kernel.slice(s![.., from, row, col]));
+            let column: Vec<f64> = columns.flat_map(|column| column.to_vec()).collect();
+            if is_own((row, col)) || column.iter().all(|&weight| weight == 0.0) {
                 continue;
             }
             let offset = from * layout.plane + row * layout.stride + col;

@@ -1,6 +1,6 @@
 //! Model files: refused, or they run.
 
-use crate::models::random_model;
+use crate::models::{random_model, random_own_model};
 use ndarray::{Array3, Axis};
 use proptest::collection::vec;
 use proptest::prelude::*;
@@ -63,9 +63,12 @@ proptest! {
 
     #[test]
     fn model_files_survive_toml(key in any::<u64>(), n_states in 2usize..6, side in (0usize..3, 0usize..3)) {
-        let model = random_model(key, n_states, [2 * side.0 + 1, 2 * side.1 + 1]);
-        let text = toml::to_string(model.file()).expect("models serialise");
-        prop_assert_eq!(Model::from_toml(&text), Ok(model));
+        let kernel_size = [2 * side.0 + 1, 2 * side.1 + 1];
+        let key = key >> 1;
+        for model in [random_model(key, n_states, kernel_size), random_own_model(key, n_states, kernel_size)] {
+            let text = toml::to_string(model.file()).expect("models serialise");
+            prop_assert_eq!(Model::from_toml(&text), Ok(model));
+        }
     }
 }
 

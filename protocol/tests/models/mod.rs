@@ -32,6 +32,7 @@ pub fn model(
                 .collect()
         };
         file.kernel.push(KernelEntry {
+            own: None,
             from: name(from),
             to: name(to),
             scale: 1.0,
@@ -52,6 +53,29 @@ pub fn random_model(key: u64, n_states: usize, [height, width]: [usize; 2]) -> M
         }
     };
     model(n_states, [height, width], weight, |to| unit(key + 2, to))
+}
+
+/// The same with a kernel for each state that a cell itself is in; in some of them neighbours don't count.
+#[allow(dead_code, reason = "not every test binary uses it")]
+pub fn random_own_model(key: u64, n_states: usize, kernel_size: [usize; 2]) -> Model {
+    let mut file = random_model(key, n_states, kernel_size).file().clone();
+    file.kernel.clear();
+    for own in 0..n_states {
+        let of_all = random_model(key + 10 * own as u64, n_states, kernel_size);
+        let ignores_neighbours = own > 0 && split_mix(key, own as u64).is_multiple_of(2);
+        for entry in &of_all.file().kernel {
+            let mut entry = entry.clone();
+            entry.own = Some(format!("s{own}"));
+            for (row, weights) in entry.weights.iter_mut().enumerate() {
+                for (col, weight) in weights.iter_mut().enumerate() {
+                    let is_centre = [row, col] == kernel_size.map(|side| side / 2);
+                    *weight *= f64::from(u8::from(is_centre || !ignores_neighbours));
+                }
+            }
+            file.kernel.push(entry);
+        }
+    }
+    Model::new(file).expect("test models are valid")
 }
 
 /// A number in `[0, 1)`.

@@ -136,6 +136,10 @@ class Transition:
     (A, C) the centre of the kernel and ``x`` zero outside the grid (eq. 2), then divided by its sum
     over ``m`` (eq. 3).
 
+    Where the weights see the cell's own state ``o``, ``phi[m | o]`` has the weights of ``o``, its
+    centre tap sees ``o`` itself, and ``u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]``: a mean
+    field, which takes neighbours for independent, as the filter does.
+
     It keeps work space: share none between threads. The beliefs lie in rows with a margin of
     zeros, end to end, so that a neighbour is a shifted slice. Taps with the same
     weights are added up before they are multiplied, and those without weight are left out.
@@ -153,10 +157,12 @@ class Transition:
         self._rows = (n_worlds or 1, height + kernel_height - 1)
         n_rows = self._rows[0] * self._rows[1]
         self._length = (n_rows - kernel_height) * self._stride + width
-        # A common factor, which eq. 3 cancels.
-        largest = max(model.kernel.max(), model.bias.max()) or 1.0
-        self._groups = [_grouped_taps(w / largest) for w in model.kernel.swapaxes(0, 1)]
-        self._bias = (model.bias / largest)[:, None]
+        kernels, biases = _scaled(model)
+        # One column of weights for each tap: one kernel's after the other's.
+        joined = np.moveaxis(kernels, 2, 0).reshape(n_states, -1, *kernels.shape[3:])
+        self._groups = [_grouped_taps(weights) for weights in joined]
+        self._bias = biases.reshape(-1, 1)
+        self._n_kernels = len(kernels)
         top, left = kernel_height // 2, kernel_width // 2
         self._planes = np.zeros((n_states, *self._rows, self._stride))
         self._inside = self._planes[:, :, top : top + height, left : left + width]
@@ -166,24 +172,28 @@ class Transition:
         """``Phi(belief)``, a new array of the same shape; each cell's sum is one."""
         if belief.shape != self._shape:
             raise InvalidArgumentError(f"belief: expected shape {self._shape}, got {belief.shape}")
-        n_states, *_, height, width = self._shape
+        _, *_, height, width = self._shape
         self._inside[:] = belief.reshape(self._inside.shape)
         n_rows = self._rows[0] * self._rows[1]
-        out = np.empty((n_states, n_rows * self._stride))
+        out = np.empty((len(self._bias), n_rows * self._stride))
         weights = out[:, : self._length]
         weights[:] = self._bias
         for plane, (columns, groups) in zip(self._planes, self._groups, strict=True):
             for total, group in zip(self._sums, groups, strict=False):
                 self._add_up(plane.ravel(), group, total)
             weights += columns @ self._sums[: len(groups)]
-        on_grid = out.reshape(n_states, *self._rows, self._stride)[:, :, :height, :width]
-        totals = on_grid.sum(axis=0)
+        rows = out.reshape(self._n_kernels, -1, *self._rows, self._stride)
+        on_grid = rows[:, :, :, :height, :width]
+        totals = on_grid.sum(axis=1)
         if not totals.all():
-            _, row, col = (int(at) for at in np.argwhere(totals == 0.0)[0])
+            *_, row, col = (int(at) for at in np.argwhere(totals == 0.0)[0])
             raise InvalidArgumentError(
                 f"model: transition weights of cell ({row}, {col}): expected a positive sum"
             )
-        beliefs = np.divide(on_grid, totals, out=np.empty(on_grid.shape))
+        if self._n_kernels > 1:
+            shares = self._inside / totals
+            return np.einsum("o...,om...->m...", shares, on_grid).reshape(self._shape)
+        beliefs = np.divide(on_grid[0], totals[0], out=np.empty(on_grid.shape[1:]))
         return beliefs.reshape(self._shape)
 
     def _add_up(
@@ -223,6 +233,22 @@ def _grouped_taps(
             groups.setdefault(column, []).append((row, col))
     columns = np.array(list(groups), dtype=np.float64).reshape(len(groups), len(kernel))
     return np.ascontiguousarray(columns.T), list(groups.values())
+
+
+def _scaled(model: Model) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Kernels (K, S, S, KH, KW) and the biases (K, S) of each without a factor that eq. 3 cancels.
+
+    Kernels that see the cell's own state have no weight in the centre: it is a part of the bias.
+    """
+    largest = np.array([max(w.max(), model.bias.max()) or 1.0 for w in model.kernels])
+    kernels = model.kernels / largest[:, None, None, None, None]
+    biases = model.bias / largest[:, None]
+    if model.sees_own_state:
+        row, col = kernels.shape[3] // 2, kernels.shape[4] // 2
+        own = np.arange(len(kernels))
+        biases += kernels[own, :, own, row, col]
+        kernels[:, :, :, row, col] = 0.0
+    return kernels, biases
 
 
 def _distribution(prior: NDArray[np.floating], *, n_states: int) -> NDArray[np.float64]:

@@ -102,7 +102,8 @@ class WildfireEnv(WorldEnv):
     * `reward`: `"share"`, `"team"` or `"marginal"`.
     * `takeover`: take the world from its holder (False).
     * `model`: `"wildfire"` (the default), `"wildfire-sparse"`, `"wildfire-latent"`,
-      `"wildfire-small"` (for learning on 12 x 12 to 32 x 32 cells) or the path of a model file;
+      `"wildfire-small"` (for learning on 12 x 12 to 32 x 32 cells), `"wildfire-burnout"` (what has
+      burnt doesn't burn again until it has regrown) or the path of a model file;
       `height`, `width` (64), `n_moves` (64, T), `burn_in` (10,000), `start`
       (`"corner"`, `"centre"`, `"random"` or `"ROW,COL"`): of the private server. With `instance`
       they may be left out, or must agree.

@@ -46,9 +46,10 @@ class Model:
     """By observed value."""
     observation_colors: tuple[Color, ...]
     """By observed value."""
-    kernel: NDArray[np.float64]
-    """``w[next state, state of the neighbour, row, col]``, shape (S, S, KH, KW); the centre is the
-    cell itself, rows grow downward."""
+    kernels: NDArray[np.float64]
+    """``w[next state, state of the neighbour, row, col]``; the centre is the cell itself, rows grow
+    downward. One for all cells, shape (1, S, S, KH, KW), or one for each state that a cell itself
+    is in, shape (S, S, S, KH, KW)."""
     bias: NDArray[np.float64]
     """``b``, added to each next state's weight, shape (S,)."""
     observation_matrix: NDArray[np.float64]
@@ -89,6 +90,16 @@ class Model:
         return cls.checked("wildfire")
 
     @property
+    def kernel(self) -> NDArray[np.float64]:
+        """The first of the kernels: that of all cells, unless `sees_own_state`."""
+        return self.kernels[0]
+
+    @property
+    def sees_own_state(self) -> bool:
+        """Whether a cell's weights depend on the state that it is in itself."""
+        return len(self.kernels) > 1
+
+    @property
     def n_states(self) -> int:
         return len(self.state_names)
 
@@ -123,10 +134,12 @@ def _fields(file: dict[str, Any]) -> dict[str, Any]:
     """The fields of `Model` but the text."""
     states, observations = file["states"], file["observations"]
     names = tuple(state["name"] for state in states)
-    kernel = np.zeros((len(states), len(states), *file["kernel_size"]))
+    n_kernels = len(states) if any("own" in entry for entry in file["kernel"]) else 1
+    kernels = np.zeros((n_kernels, len(states), len(states), *file["kernel_size"]))
     for entry in file["kernel"]:
         weights = entry.get("scale", 1.0) * np.array(entry["weights"], np.float64)
-        kernel[names.index(entry["to"]), names.index(entry["from"])] = weights
+        own = names.index(entry["own"]) if n_kernels > 1 else 0
+        kernels[own, names.index(entry["to"]), names.index(entry["from"])] = weights
     matrix = np.array([state["observed_as"] for state in states], np.float64)
     initial = np.array([state["initial"] for state in states], np.float64)
     return {
@@ -137,7 +150,7 @@ def _fields(file: dict[str, Any]) -> dict[str, Any]:
         "observation_colors": tuple(
             color_from_hex(observation["color"]) for observation in observations
         ),
-        "kernel": kernel,
+        "kernels": kernels,
         "bias": np.array([state.get("bias", 0.0) for state in states], np.float64),
         "observation_matrix": matrix / matrix.sum(axis=1, keepdims=True),
         "initial": initial / initial.sum(),

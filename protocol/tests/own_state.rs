@@ -1,0 +1,345 @@
+//! Kernels that see the cell's own state, against their formula as it stands in docs/model-file.md, and the
+//! worlds of `wildfire-burnout` against a simulation by the formula. All seeds are fixed.
+
+mod models;
+
+use models::{random_own_model, unit};
+use ndarray::{Array3, Axis};
+use proptest::prelude::*;
+use protocol::{Dynamics, Grid, Model, Probabilities, Shape, Transition};
+use std::collections::BTreeMap;
+
+fn shape(height: usize, width: usize) -> Shape {
+    Shape::new(height, width).expect("test shape")
+}
+
+/// `p`: each state's probability in each cell, from the entries of the model's file.
+fn formula(model: &Model, p: &Array3<f64>) -> Array3<f64> {
+    let (n_states, height, width) = p.dim();
+    let mut next = Array3::zeros(p.dim());
+    for (row, col) in ndarray::indices((height, width)) {
+        for own in 0..n_states {
+            let weights = weights(model, p, own, (row, col));
+            let total: f64 = weights.iter().sum();
+            for (to, weight) in weights.iter().enumerate() {
+                next[[to, row, col]] += p[[own, row, col]] * weight / total;
+            }
+        }
+    }
+    next
+}
+
+fn weights(model: &Model, p: &Array3<f64>, own: usize, (row, col): (usize, usize)) -> Vec<f64> {
+    let file = model.file();
+    let state = |name: &str| model.state_named(name).expect("a state");
+    let mut weights: Vec<f64> = file.states.iter().map(|state| state.bias).collect();
+    let [up, left] = file.kernel_size.map(|side| side / 2);
+    for entry in &file.kernel {
+        let (from, to) = (state(&entry.from), state(&entry.to));
+        if entry.own.as_deref().map(state) != Some(own) {
+            continue;
+        }
+        for (a, values) in entry.weights.iter().enumerate() {
+            for (c, value) in values.iter().enumerate() {
+                let x = if (a, c) == (up, left) {
+                    f64::from(u8::from(from == own))
+                } else {
+                    let at = ((row + a).wrapping_sub(up), (col + c).wrapping_sub(left));
+                    p.get([from, at.0, at.1]).copied().unwrap_or(0.0)
+                };
+                weights[to] += entry.scale * value * x;
+            }
+        }
+    }
+    weights
+}
+
+fn one_hot(n_states: usize, states: &Grid<u8>) -> Array3<f64> {
+    let (height, width) = states.dim();
+    Array3::from_shape_fn((n_states, height, width), |(state, row, col)| {
+        f64::from(u8::from(usize::from(states[[row, col]]) == state))
+    })
+}
+
+fn random_states(key: u64, n_states: usize, (height, width): (usize, usize)) -> Grid<u8> {
+    Grid::from_shape_fn((height, width), |(row, col)| {
+        (unit(key, row * width + col) * n_states as f64) as u8
+    })
+}
+
+fn random_belief(key: u64, n_states: usize, (height, width): (usize, usize)) -> Array3<f64> {
+    let mut belief = Array3::from_shape_fn((n_states, height, width), |(state, row, col)| {
+        unit(key, (state * height + row) * width + col)
+    });
+    let sums = belief.sum_axis(Axis(0));
+    belief /= &sums;
+    belief
+}
+
+/// Chi-square of counts by cell class and outcome, in standard deviations. Outcomes expected fewer than
+/// 10 times share a bin; with d degrees of freedom the sum has mean d and variance 2d.
+fn z<'a>(classes: impl Iterator<Item = (&'a [f64], &'a [f64])>) -> f64 {
+    let (mut sum, mut freedom) = (0.0, 0.0);
+    let mut term = |observed: f64, expected: f64| {
+        sum += (observed - expected).powi(2) / expected;
+        freedom += 1.0;
+    };
+    let mut n_classes = 0.0;
+    for (observed, expected) in classes {
+        let mut rare = (0.0, 0.0);
+        for (&observed, &expected) in observed.iter().zip(expected) {
+            if expected == 0.0 {
+                assert_eq!(observed, 0.0, "an impossible outcome");
+            } else if expected < 10.0 {
+                rare = (rare.0 + observed, rare.1 + expected);
+            } else {
+                term(observed, expected);
+            }
+        }
+        if rare.1 > 0.0 {
+            term(rare.0, rare.1);
+        }
+        n_classes += 1.0;
+    }
+    let freedom: f64 = freedom - n_classes;
+    (sum - freedom) / (2.0 * freedom.max(1.0)).sqrt()
+}
+
+/// Steps `states` often and compares each cell's outcomes with the formula: 5 standard deviations are
+/// exceeded by chance with probability < 1e-3, and all seeds are fixed.
+fn check_draws(model: &Model, states: &Grid<u8>, n_draws: u64) {
+    let (height, width) = states.dim();
+    let mut dynamics = Dynamics::new(model, shape(height, width)).expect("test model");
+    let mut counts = Array3::<f64>::zeros((model.n_states(), height, width));
+    let mut next = states.clone();
+    for n in 0..n_draws {
+        next.assign(states);
+        dynamics.step(11, n, &mut next);
+        for ((row, col), &state) in next.indexed_iter() {
+            counts[[usize::from(state), row, col]] += 1.0;
+        }
+    }
+    let expected = formula(model, &one_hot(model.n_states(), states)) * n_draws as f64;
+    let by_cell = |counts: &Array3<f64>| -> Vec<Vec<f64>> {
+        counts
+            .lanes(Axis(0))
+            .into_iter()
+            .map(|cell| cell.to_vec())
+            .collect()
+    };
+    let (counts, expected) = (by_cell(&counts), by_cell(&expected));
+    let z = z(counts
+        .iter()
+        .map(Vec::as_slice)
+        .zip(expected.iter().map(Vec::as_slice)));
+    assert!(z.abs() < 5.0, "{z} standard deviations");
+}
+
+fn burnout() -> Model {
+    Model::built_in("wildfire-burnout").expect("a built-in model")
+}
+
+#[test]
+fn burnout_steps_are_drawn_from_the_formula() {
+    check_draws(&burnout(), &random_states(1, 3, (5, 6)), 200_000);
+    check_draws(&burnout(), &random_states(2, 3, (3, 70)), 40_000);
+    check_draws(&burnout(), &random_states(3, 3, (92, 91)), 2_000);
+    for state in 0..3 {
+        check_draws(&burnout(), &Grid::from_elem((1, 1), state), 200_000);
+    }
+}
+
+#[test]
+fn random_models_are_drawn_from_the_formula() {
+    for (key, n_states, kernel_size, side, n_draws) in [
+        (4, 4, [5, 5], (7, 5), 100_000),
+        (6, 6, [3, 7], (4, 3), 100_000),
+        (8, 2, [1, 1], (2, 3), 100_000),
+        // Too many weights for tables: kernels are summed.
+        (14, 24, [3, 3], (2, 2), 20_000),
+    ] {
+        let model = random_own_model(key, n_states, kernel_size);
+        check_draws(&model, &random_states(key + 1, n_states, side), n_draws);
+    }
+}
+
+proptest! {
+    // No file of failures: tests leave the source tree alone.
+    #![proptest_config(ProptestConfig { cases: 100, failure_persistence: None, ..Default::default() })]
+
+    #[test]
+    fn predictions_are_those_of_the_formula(
+        key in 0_u64..1_000_000,
+        n_states in 2_usize..6,
+        half_kernel in (0_usize..3, 0_usize..3),
+        side in (1_usize..15, 1_usize..40),
+    ) {
+        let kernel_size = [2 * half_kernel.0 + 1, 2 * half_kernel.1 + 1];
+        let model = random_own_model(key, n_states, kernel_size);
+        let shape = shape(side.0, side.1);
+        let belief = random_belief(key, n_states, side);
+        let expected = formula(&model, &belief);
+
+        let mut double = Array3::zeros(belief.dim());
+        Transition::new(&model, shape).expect("biased").apply(&belief, &mut double);
+        prop_assert!((&double - &expected).iter().all(|difference| difference.abs() < 1e-12));
+
+        let mut single = Probabilities::zeros(belief.dim());
+        let belief = belief.mapv(|p| p as f32);
+        Transition::new(&model, shape).expect("biased").apply(&belief, &mut single);
+        prop_assert!(single.sum_axis(Axis(0)).iter().all(|sum| (sum - 1.0).abs() < 1e-6));
+        let differences = single.mapv(f64::from) - expected;
+        prop_assert!(differences.iter().all(|difference| difference.abs() < 2e-6));
+    }
+}
+
+#[test]
+fn one_kernel_for_each_state_is_that_of_all_where_states_are_known() {
+    let plain = models::random_model(5, 3, [3, 3]);
+    let mut file = plain.file().clone();
+    file.kernel = (0..3)
+        .flat_map(|own| {
+            let of_own = |entry: &protocol::model::KernelEntry| {
+                let own = Some(format!("s{own}"));
+                protocol::model::KernelEntry {
+                    own,
+                    ..entry.clone()
+                }
+            };
+            plain.file().kernel.iter().map(of_own).collect::<Vec<_>>()
+        })
+        .collect();
+    let own = Model::new(file).expect("test models are valid");
+    let states = one_hot(3, &random_states(9, 3, (6, 9)));
+    let predict = |model: &Model| {
+        let mut out = Array3::zeros(states.dim());
+        let mut transition = Transition::new(model, shape(6, 9)).expect("biased");
+        transition.apply(&states, &mut out);
+        out
+    };
+    let differences = predict(&own) - predict(&plain);
+    assert!(
+        differences
+            .iter()
+            .all(|difference| difference.abs() < 1e-12)
+    );
+}
+
+#[test]
+fn a_prediction_is_that_of_the_python_filter() {
+    let json: serde_json::Value =
+        serde_json::from_str(include_str!("data/own_state.json")).expect("JSON");
+    let array = |key: &str| {
+        let numbers = serde_json::from_value::<Vec<Vec<Vec<f64>>>>(json[key].clone());
+        let numbers = numbers.expect("numbers").concat().concat();
+        Array3::from_shape_vec((3, 4, 5), numbers).expect("3 x 4 x 5 numbers")
+    };
+    let (belief, expected) = (array("belief"), array("prediction"));
+    let mut predicted = Array3::zeros(belief.dim());
+    let mut transition = Transition::new(&burnout(), shape(4, 5)).expect("a model");
+    transition.apply(&belief, &mut predicted);
+    let differences = predicted - expected;
+    assert!(
+        differences
+            .iter()
+            .all(|difference| difference.abs() < 1e-12)
+    );
+}
+
+#[test]
+fn a_prediction_is_the_average_over_simulated_next_steps() {
+    // Neighbours of an unburnt cell weigh alike in every state, so that eq. 3 divides by the same sum
+    // whatever they are: the mean field is exact for cells that are independent.
+    let (model, side) = (burnout(), (4, 5));
+    let belief = random_belief(3, 3, side);
+    let mut predicted = Array3::zeros(belief.dim());
+    let mut transition = Transition::new(&model, shape(4, 5)).expect("a model");
+    transition.apply(&belief, &mut predicted);
+    let n_draws = 20_000;
+    let mut average = Array3::<f64>::zeros(belief.dim());
+    for draw in 0..n_draws {
+        let states = Grid::from_shape_fn(side, |(row, col)| {
+            let uniform = unit(17, (draw * 4 + row) * 5 + col);
+            u8::from(uniform >= belief[[0, row, col]])
+                + u8::from(uniform >= belief[[0, row, col]] + belief[[1, row, col]])
+        });
+        average += &formula(&model, &one_hot(3, &states));
+    }
+    average /= n_draws as f64;
+    // A probability's standard error is at most .5 / sqrt(n): 60 of them within 4.5.
+    let worst = (&average - &predicted)
+        .iter()
+        .fold(0.0, |worst, x| f64::max(worst, x.abs()));
+    assert!(worst < 4.5 * 0.5 / (n_draws as f64).sqrt(), "{worst}");
+}
+
+/// Outcomes by the cell's own state and which neighbours burn, and those that the formula expects.
+type Classes = BTreeMap<(u8, Vec<bool>), [[f64; 3]; 2]>;
+
+#[test]
+fn worlds_that_burn_out_move_as_the_formula_says() {
+    let model = burnout();
+    let mut classes = Classes::new();
+    let mut dynamics = Dynamics::new(&model, shape(24, 33)).expect("a model");
+    for seed in 0..6 {
+        let mut states = dynamics.initial(seed);
+        for n in 0..1_200 {
+            let before = states.clone();
+            dynamics.step(seed, n, &mut states);
+            if n >= 200 && n % 4 == 0 {
+                count(&model, &before, &states, &mut classes);
+            }
+        }
+    }
+    let seen = |own| classes.keys().filter(|class| class.0 == own).count();
+    assert!(
+        seen(0) > 50 && seen(1) > 1 && seen(2) > 1,
+        "too few classes"
+    );
+    let tables = classes
+        .values()
+        .map(|[observed, expected]| (&observed[..], &expected[..]));
+    let z = z(tables);
+    assert!(z.abs() < 5.0, "{z} standard deviations");
+}
+
+/// Counts cells away from the edges.
+fn count(model: &Model, before: &Grid<u8>, after: &Grid<u8>, classes: &mut Classes) {
+    let known = one_hot(3, before);
+    for (row, col) in (1..23).flat_map(|row| (1..32).map(move |col| (row, col))) {
+        let own = before[[row, col]];
+        let burns = |(a, c): (usize, usize)| before[[row + a - 1, col + c - 1]] == 1;
+        let neighbours = ndarray::indices((3, 3))
+            .into_iter()
+            .filter(|&at| at != (1, 1));
+        let class = (own, neighbours.map(burns).collect());
+        let [observed, expected] = classes.entry(class).or_default();
+        observed[usize::from(after[[row, col]])] += 1.0;
+        let weights = weights(model, &known, usize::from(own), (row, col));
+        let total: f64 = weights.iter().sum();
+        for (expected, weight) in expected.iter_mut().zip(weights) {
+            *expected += weight / total;
+        }
+    }
+}
+
+#[test]
+fn a_trajectory_is_the_same_on_every_platform() {
+    // Pinned: if one changes, so does every published seed.
+    let hash_after = |model: &Model, shape: Shape, n_steps: u64| {
+        let mut dynamics = Dynamics::new(model, shape).expect("test model");
+        let mut states = dynamics.initial(7);
+        (0..n_steps).for_each(|n| dynamics.step(7, n, &mut states));
+        let hash = |hash: u64, &state: &u8| (hash ^ u64::from(state)).wrapping_mul(0x100_0000_01b3);
+        states.iter().fold(0xcbf2_9ce4_8422_2325, hash)
+    };
+    assert_eq!(
+        hash_after(&burnout(), shape(64, 64), 1000),
+        15_190_413_380_503_145_369
+    );
+    let random = random_own_model(4, 4, [5, 5]);
+    assert_eq!(
+        hash_after(&random, shape(7, 5), 10_000),
+        16_987_252_199_630_661_834
+    );
+}
