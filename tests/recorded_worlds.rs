@@ -369,9 +369,38 @@ fn settings_that_a_states_file_decides_are_refused_as_flags() {
         "--states no/such.npz",
         &["states file no/such.npz: description no/such.toml: No such file"],
     );
-    check(
-        AGENT,
-        &format!("compare {states} --height 3"),
-        &["'--states <FILE|FOLDER>' cannot be used with '--height"],
+    for (command, flag) in [("compare", "--height"), ("train --out x", "--burn-in")] {
+        check(
+            AGENT,
+            &format!("{command} {states} {flag} 3"),
+            &["--states <FILE|FOLDER>", "cannot be used with", flag],
+        );
+    }
+}
+
+#[test]
+fn the_landscape_that_ships_is_a_states_file() {
+    let states = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../config/landscapes/jacksboro/jacksboro.npz"
     );
+    let ended = run(SERVER, &["--check", "--states", states], LIMIT);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+}
+
+#[test]
+fn a_pipe_is_no_states_file() {
+    let folder = TempDir::new().expect("a folder");
+    std::fs::write(folder.path().join("states.toml"), DESCRIPTION).expect("write");
+    let pipe = folder.path().join("0.npy");
+    rustix::fs::mknodat(
+        rustix::fs::CWD,
+        &pipe,
+        rustix::fs::FileType::Fifo,
+        rustix::fs::Mode::RUSR,
+        0,
+    )
+    .expect("a pipe");
+    let states = format!("--states {}", folder.path().display());
+    check(SERVER, &states, &["0.npy: expected a regular file"]);
 }

@@ -205,11 +205,12 @@ fn files_of(folder: &Path) -> Result<Vec<PathBuf>, String> {
 }
 
 fn add_file(sequences: &mut Sequences, path: &Path) -> Result<(), String> {
-    let opened = File::open(path).and_then(|file| Ok((file.metadata()?, file)));
-    let (metadata, file) = opened.map_err(|error| error.to_string())?;
+    // Before it is opened, which waits for a writer where it is a pipe.
+    let metadata = std::fs::metadata(path).map_err(|error| error.to_string())?;
     if !metadata.is_file() {
         return Err("expected a regular file, got something else".into());
     }
+    let file = File::open(path).map_err(|error| error.to_string())?;
     match is_archive(path) {
         true => sequences.add_archive(BufReader::new(file)),
         false => {

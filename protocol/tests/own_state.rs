@@ -150,6 +150,27 @@ fn burnout_steps_are_drawn_from_the_formula() {
 }
 
 #[test]
+fn what_is_said_of_another_state_in_the_centre_means_nothing() {
+    let model = random_own_model(3, 3, [3, 3]);
+    let mut file = model.file().clone();
+    for entry in &mut file.kernel {
+        if entry.own.as_ref() != Some(&entry.from) {
+            entry.weights[1][1] = 1e60;
+        }
+    }
+    let shape = shape(4, 5);
+    let belief = random_belief(3, 3, (4, 5)).mapv(|p| p as f32);
+    let predicted = |model: &Model| {
+        let mut out = Array3::zeros(belief.dim());
+        let transition = Transition::<f32>::new(model, shape);
+        transition.expect("a model").apply(&belief, &mut out);
+        out
+    };
+    let other = Model::new(file).expect("a model");
+    assert_eq!(predicted(&other), predicted(&model));
+}
+
+#[test]
 fn random_models_are_drawn_from_the_formula() {
     for (key, n_states, kernel_size, side, n_draws) in [
         (4, 4, [5, 5], (7, 5), 100_000),

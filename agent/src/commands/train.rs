@@ -64,7 +64,7 @@ pub struct TrainCommand {
     #[arg(long, default_value_t = TRAINING_SEED, conflicts_with = "instance")]
     seed: u64,
     /// Burn-in of the server that is started [default: 25000; of preset paper: 0]
-    #[arg(long, conflicts_with = "instance")]
+    #[arg(long, conflicts_with_all = ["instance", "states"])]
     burn_in: Option<u64>,
     #[command(flatten)]
     grid: GridFlags,

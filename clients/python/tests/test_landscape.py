@@ -13,6 +13,7 @@ from PIL import Image
 from rasters import ARRIVAL, NEVER, ascii_grid, geotiff, masks, netcdf
 
 from emberwatch.landscape.__main__ import main
+from emberwatch.landscape.world import description
 
 ROOT = Path(__file__).parents[3]
 STEP = ("--step", "10 min")
@@ -29,6 +30,11 @@ def imported(out: Path, *flags: object) -> list[NDArray[np.uint8]]:
     with np.load(out) as file:
         assert list(file) == [f"states_{number:03}" for number in range(len(file))]
         return [file[name] for name in file]
+
+
+def test_any_name_is_told_in_toml() -> None:
+    name = 'fire "\U0001f525" \\ \x7f\n'
+    assert tomllib.loads(description(name, "1 h"))["name"] == name
 
 
 def one(out: Path, *flags: object) -> NDArray[np.uint8]:

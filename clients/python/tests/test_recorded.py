@@ -111,6 +111,9 @@ def test_a_running_server_tells_of_its_recorded_world(states: Path) -> None:
             assert (recorded.n_sequences, recorded.n_steps) == (2, 4)
             assert recorded.description is not None
             assert "10 min" in recorded.description
+        for setting in ({"states": states}, {"states_offset": 1}, {"states_symmetries": True}):
+            with pytest.raises(InvalidArgumentError, match="the running server has its own"):
+                gymnasium.make(WILDFIRE, instance=instance, **setting)
         env: Any = gymnasium.make(WILDFIRE, instance=instance)
         observation, _ = env.reset(seed=1)
         assert env.unwrapped.model is None
@@ -128,7 +131,6 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, states: Path) -> None:
         ({"states_offset": 4}, "states_offset: expected 0 to 3"),
         ({"observation": "belief"}, "reveals its model"),
         ({"states": tmp_path / "none.npz"}, "description"),
-        ({"instance": "lab"}, "lab"),
     ]
     usual: dict[str, Any] = {"states": states, "timeout": 0.1}
     for keywords, words in wrong:

@@ -166,7 +166,13 @@ impl Checker<'_> {
             if std::mem::replace(&mut filled[[own, to, from]], true) {
                 return self.wrong(entry.what(), "one entry for each pair of states", "two");
             }
+            // A cell's own centre is in its own state: what is said of another there means nothing.
+            let is_void =
+                |tap| entry.own.is_some() && own != from && tap == (height / 2, width / 2);
             for (row, col, weight) in self.weights(entry, file.kernel_size)? {
+                if is_void((row, col)) {
+                    continue;
+                }
                 kernels[own][[to, from, row, col]] = weight;
             }
         }

@@ -196,7 +196,11 @@ mod tests {
 
     #[test]
     fn an_unfinished_segment_is_waited_for_but_not_without_end() {
-        let files = files_of_test("unfinished");
+        // Where nothing stays in the way of others if this process is killed.
+        let files = ChannelFiles {
+            shared: std::env::temp_dir(),
+            ..files_of_test("unfinished")
+        };
         let young = id(std::process::id(), Duration::ZERO);
         let segment = files
             .shared

@@ -35,7 +35,7 @@ _RIGHT, _WRONG = 0.98, 0.01
 
 def description(name: str, step: str) -> str:
     """The text of the `.toml`."""
-    lines = [f"name = {json.dumps(name)}", f"step = {json.dumps(step)} # that one step lasts"]
+    lines = [f"name = {_quoted(name)}", f"step = {_quoted(step)} # that one step lasts"]
     for state in STATES:
         row = ", ".join(str(_RIGHT if other is state else _WRONG) for other in STATES)
         lines += ["", "[[states]]", f'name = "{state.name}"', f'color = "{state.color}"']
@@ -43,6 +43,11 @@ def description(name: str, step: str) -> str:
     for state in STATES:
         lines += ["", "[[observations]]", f'name = "{state.name}"', f'color = "{state.color}"']
     return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    # TOML has JSON's escapes, but neither surrogates nor a bare U+007F.
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def outputs(out: Path, *, force: bool) -> tuple[Path, Path]:
