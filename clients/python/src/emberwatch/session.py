@@ -257,8 +257,7 @@ class Session:
         """Warns once of worlds in which there is nothing to find."""
         worlds = answer.worlds
         barren = np.flatnonzero((worlds["n_target_cells"] == 0) & (worlds["step"] == 0))
-        is_recorded = self._opened().client.info.recorded_world is not None
-        if self._has_warned or is_recorded or not len(barren):
+        if self._has_warned or self.spec.is_recorded or not len(barren):
             return
         self._has_warned = True
         _warn(

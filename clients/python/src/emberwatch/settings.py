@@ -136,6 +136,8 @@ class WorldSpec:
     burn_in: int
     #: Robots of a world.
     n_robots: int
+    #: Whether hidden states come from a states file, not from a model.
+    is_recorded: bool
 
     @property
     def shape(self) -> Shape:
@@ -171,6 +173,7 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
         n_observations=n_observations,
         burn_in=checked["burn_in"],
         n_robots=checked["robots"],
+        is_recorded=bool(states),
     )
     return spec, robots
 
@@ -213,6 +216,7 @@ def running_spec(
         n_observations=info.n_observations,
         burn_in=info.burn_in,
         n_robots=info.n_robots,
+        is_recorded=info.recorded_world is not None,
     )
     return spec, robots
 
