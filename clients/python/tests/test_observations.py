@@ -70,6 +70,32 @@ def test_a_window_shows_the_belief_around_the_robot() -> None:
     env.close()
 
 
+def test_a_window_shows_what_was_last_seen_around_the_robot() -> None:
+    with serving(reveal_model=False, model=LIVELY) as instance:
+        keywords = {"instance": instance, "window": 5}
+        env = make(MOVES, **keywords, observation=("recent", "frame", "visited", "robot", "move"))
+        margin = ((2, 2), (2, 2))
+        for seed, n_moves in ((5, 300), (6, 10)):  # a reset forgets
+            seen, _ = env.reset(seed=seed)
+            expected = np.zeros((*seen["visited"].shape[:2], 3))
+            for action in actions(env, n_moves):
+                row, col = seen["robot"]
+                window = (slice(row, row + 5), slice(col, col + 5))
+                unvisited = seen["visited"] == 0
+                shown = np.rint(255 * expected) * unvisited
+                shown = np.pad(shown, (*margin, (0, 0)))[window]
+                assert np.abs(seen["recent"][..., :3] - shown).max() <= 1
+                assert np.array_equal(
+                    seen["recent"][..., 3], np.pad(seen["visited"][..., 0], margin)[window]
+                )
+                seen = env.step(action)[0]
+                if seen["move"] == 0:  # a path is complete
+                    expected *= 0.5 ** (1 / 16)
+                    expected[seen["frame"][..., 0] != 255] = 0
+                    expected[seen["frame"] == np.arange(3)] = 1
+        env.close()
+
+
 def test_a_belief_goes_on_where_a_world_is_resumed() -> None:
     with serving(model=LIVELY) as instance:
         first = make(instance=instance, observation=("frame", "belief"))

@@ -34,6 +34,7 @@ IMAGE = {"height": 36, "width": 40, "n_moves": 4, "burn_in": 10, "model": LIVELY
         (MOVES, {"observation": ("frame", "age", "visited", "robot", "move")}),
         (MOVES, {"reward": "move"}),
         (MOVES, {"observation": "local", "window": 37}),
+        (MOVES, {"observation": "recent", "window": 37}),
         (MOVES, {"observation": ("image", "belief", "local"), "window": 37}),
         (OBJECTIVE, {"prior": "initial"}),
         (OBJECTIVE, {"prior": "uniform", "planner": "shooting", "truth": True}),

@@ -42,7 +42,17 @@ PARTS = ("frame", "robot", "age")
 ALL: dict[str, dict[str, Any]] = {
     WILDFIRE: {"observation": ("frame", "image", "robot", "age", "belief")},
     MOVES: {
-        "observation": ("frame", "image", "robot", "age", "belief", "local", "visited", "move")
+        "observation": (
+            "frame",
+            "image",
+            "robot",
+            "age",
+            "belief",
+            "local",
+            "recent",
+            "visited",
+            "move",
+        )
     },
     OBJECTIVE: {"prior": "initial"},
 }

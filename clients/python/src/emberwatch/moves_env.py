@@ -45,10 +45,13 @@ class WildfireMovesEnv(WorldEnv):
     | `visited` | `Box(0, 255, (H, W, 1), uint8)` | 255 in the cells that this path has visited |
     | `move` | `Discrete(T)` | moves made of this path |
     | `local` | `Box(0, 255, (L, L, 5), uint8)` | the belief around the robot, L = `window` |
+    | `recent` | `Box(0, 255, (L, L, O + 3), uint8)` | what frames alone told of the same cells |
 
     The channels of `local`, times 255: the probability of the state that pays most, and the
     entropy of the belief divided by log S, both 0 where this path has been; 1 where it has been;
-    1 off the grid; and the share of the path's moves that are left, everywhere alike.
+    1 off the grid; and the share of the path's moves that are left, everywhere alike. `recent`
+    needs no model: its first channels are the value last observed in a cell, one of O channels,
+    1 if seen in the last frame and half of it for each 16 steps since; the last three are the same.
 
     ## Rewards
 

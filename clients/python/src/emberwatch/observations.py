@@ -13,25 +13,24 @@ from emberwatch import wire
 from emberwatch.belief import Filters
 from emberwatch.errors import InvalidArgumentError
 from emberwatch.flights import Flights
+from emberwatch.last_seen import LastSeen
 from emberwatch.prior import prior_of
 from emberwatch.settings import WorldSpec
-from emberwatch.window import CHANNELS, Windows
+from emberwatch.window import N_OF_BELIEF, N_OF_PATH, Windows, of_belief
 
 Part: TypeAlias = Literal["frame", "image", "robot", "age", "belief", "team", "others"]
-MovesPart: TypeAlias = Literal[Part, "local", "visited", "move"]
+MovesPart: TypeAlias = Literal[Part, "local", "recent", "visited", "move"]
 
 #: One part makes a plain observation, several make a flat dictionary.
 Parts: TypeAlias = Part | Sequence[Part]
 MovesParts: TypeAlias = MovesPart | Sequence[MovesPart]
 
-#: Age of a cell that was not seen for this many steps or more.
-MAX_AGE: Final = 255
-
-#: Cells along a side of the part `local`, unless told otherwise.
+#: Cells along a side of the parts `local` and `recent`, unless told otherwise.
 WINDOW: Final = 15
 
-#: Parts that a filter is needed for, and those about other robots.
+#: Parts that a filter is needed for, those from memory of frames, and those about other robots.
 OF_BELIEF: Final = frozenset(("belief", "local"))
+_OF_MEMORY: Final = frozenset(("age", "recent"))
 OF_TEAM: Final = frozenset(("team", "others"))
 
 
@@ -60,7 +59,7 @@ class Observations:
             )
         self._names, self._is_plain = names, isinstance(parts, str)
         self._spec, self._n_rows, self._flights = spec, n_rows, flights
-        self._side, self._first = window, first
+        self._first = first
         #: Whether there are parts about other robots.
         self.shows_team = bool(OF_TEAM & set(names))
         if OF_BELIEF & set(names) and spec.model is None:
@@ -73,11 +72,15 @@ class Observations:
             if self._is_plain
             else spaces.Dict({name: known[name] for name in names})
         )
-        self._ages: NDArray[np.uint8] | None = None
-        if "age" in names:
-            self._ages = np.full((n_rows, spec.height, spec.width), MAX_AGE, np.uint8)
+        grid = (spec.height, spec.width, spec.n_observations)
+        self._last_seen = LastSeen(n_rows, *grid) if _OF_MEMORY & set(names) else None
         self._filters: Filters | None = None
-        self._windows: Windows | None = None
+        channels = {"local": N_OF_BELIEF, "recent": spec.n_observations}
+        self._windows = {
+            name: Windows(spec, n_rows, window, channels[name])
+            for name in names
+            if name in channels
+        }
         self._beliefs = np.empty(0, np.uint8)
         # By observed value, the last for none.
         self._one_hot = 255 * np.eye(spec.n_observations + 1, dtype=np.uint8)
@@ -87,29 +90,27 @@ class Observations:
 
         `frames` are those of all rows, `(n_rows, H, W)`.
         """
-        if self._ages is not None:
-            is_seen = frames[begun] != wire.UNOBSERVED
-            self._ages[begun] = np.where(is_seen, np.uint8(0), np.uint8(MAX_AGE))
+        if self._last_seen is not None:
+            self._last_seen.reset(begun, frames)
         if OF_BELIEF & set(self._names):
-            filters = self._filters = self._filters or self._first_beliefs()
-            filters.reset(np.flatnonzero(begun).tolist(), frames)
-            self._show(filters, begun)
+            self._filters = self._filters or self._first_beliefs()
+            self._filters.reset(np.flatnonzero(begun).tolist(), frames)
+        self._show(begun)
 
     def update(self, moved: NDArray[np.bool_], frames: NDArray[np.uint8]) -> None:
         """One step of the rows `moved`; `frames` are those of all."""
-        if self._ages is not None:
-            ages = self._ages
-            ages[moved] += ages[moved] < MAX_AGE
-            ages[moved[:, np.newaxis, np.newaxis] & (frames != wire.UNOBSERVED)] = 0
+        if self._last_seen is not None:
+            self._last_seen.update(moved, frames)
         if self._filters is not None:
             self._filters.update(frames, moved)
-            self._show(self._filters, moved)
+        self._show(moved)
 
     def visit(self, indices: NDArray[np.intp]) -> None:
         """Some robots have made a move."""
-        if self._windows is not None and self._flights is not None:
+        if self._flights is not None:
             rows, cols = self._flights.robots[indices].T
-            self._windows.visit(indices, rows, cols)
+            for windows in self._windows.values():
+                windows.visit(indices, rows, cols)
 
     def all(
         self,
@@ -146,13 +147,13 @@ class Observations:
             return np.repeat(seen, self._n_rows // len(seen), axis=0)[..., np.newaxis]
         if name == "others":
             return self._others(robots if teams is None else cells_of(teams.robots))
-        if self._ages is not None and name == "age":
-            return self._ages[..., np.newaxis].copy()
+        if self._last_seen is not None and name == "age":
+            return self._last_seen.ages[..., np.newaxis].copy()
         if self._filters is not None and name == "belief":
             return self._beliefs.copy()
         assert self._flights is not None
-        if self._windows is not None and name == "local":
-            return self._windows.around(self._flights)
+        if name in self._windows:
+            return self._windows[name].around(self._flights)
         if name == "visited":
             return self._flights.visited[..., np.newaxis].copy()
         return self._flights.n_made.copy()
@@ -172,17 +173,18 @@ class Observations:
         spec = self._spec
         assert spec.model is not None
         grid = {"height": spec.height, "width": spec.width, "burn_in": spec.burn_in}
-        filters = Filters(spec.model, prior_of(None, spec.model, **grid), self._n_rows)
-        if "local" in self._names:
-            self._windows = Windows(spec.model, spec, self._n_rows, self._side)
-        return filters
+        return Filters(spec.model, prior_of(None, spec.model, **grid), self._n_rows)
 
-    def _show(self, filters: Filters, rows: NDArray[np.bool_]) -> None:
-        if "belief" in self._names:
-            beliefs = np.rint(255.0 * filters.predictor.transpose(1, 2, 3, 0))
+    def _show(self, rows: NDArray[np.bool_]) -> None:
+        """Shows what is known before a path to the rows that begin one."""
+        if self._filters is not None and "belief" in self._names:
+            beliefs = np.rint(255.0 * self._filters.predictor.transpose(1, 2, 3, 0))
             self._beliefs = beliefs.astype(np.uint8)
-        if self._windows is not None:
-            self._windows.begin(filters, rows)
+        for name, windows in self._windows.items():
+            if name == "recent" and self._last_seen is not None:
+                windows.begin(rows, self._last_seen.fading(rows))
+            elif self._filters is not None and self._spec.model is not None:
+                windows.begin(rows, of_belief(self._spec.model, self._filters, rows))
 
 
 def team_frames(frames: NDArray[np.uint8], n_robots: int) -> NDArray[np.uint8]:
@@ -228,9 +230,14 @@ def _spaces(spec: WorldSpec, window: int | None) -> dict[str, spaces.Space[Any]]
         return known
     if not isinstance(window, int | np.integer) or window < 3 or window % 2 == 0:  # pyright: ignore[reportUnnecessaryIsInstance]
         raise InvalidArgumentError(f"window: expected an odd number from 3 on, got {window!r}")
+
+    def around(n_of_world: int) -> spaces.Box:
+        return spaces.Box(0, 255, (window, window, n_of_world + N_OF_PATH), np.uint8)
+
     return {
         **known,
-        "local": spaces.Box(0, 255, (window, window, len(CHANNELS)), np.uint8),
+        "local": around(N_OF_BELIEF),
+        "recent": around(spec.n_observations),
         "visited": image(1),
         "move": spaces.Discrete(spec.n_moves),
     }
