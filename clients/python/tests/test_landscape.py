@@ -87,6 +87,17 @@ def test_the_first_step_is_that_of_the_earliest_arrival(tmp_path: Path, out: Pat
     np.testing.assert_array_equal(one(out, file, *ARRIVALS, "--unit", "min"), FIRE)
 
 
+def test_what_burns_before_the_begin_burns_from_step_0(tmp_path: Path, out: Path) -> None:
+    before = np.where(ARRIVAL == 0, -2147.5, ARRIVAL)
+    file = geotiff(tmp_path / "fire.tif", before)
+    flags = (*ARRIVALS, "--unit", "min", "--begin")
+    np.testing.assert_array_equal(one(out, file, *flags, 0), FIRE)
+    later = np.where(ARRIVAL <= 20, 0, BEGIN - 2)
+    burns = np.where(ARRIVAL == NEVER, 99, later)
+    expected = [(burns <= k) + (burns + 2 <= k).astype(int) for k in range(4)]
+    np.testing.assert_array_equal(one(out, file, *flags, 20, "--force"), expected)
+
+
 def test_undeclared_numbers_for_never_can_be_named(tmp_path: Path, out: Path) -> None:
     file = geotiff(tmp_path / "fire.tif", nodata=None)
     flags = (*ARRIVALS, "--unit", "min", "--nodata", -1, "--nodata", NEVER)

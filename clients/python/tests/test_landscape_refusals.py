@@ -276,6 +276,22 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         lambda f: (geotiff(f / "a.tif", nodata=None), *ARRIVALS),
         "expected times of at least 0, got -9999 in row 0, column 3; if that means never",
     ),
+    "negative time before the begin": (
+        lambda f: (geotiff(f / "a.tif", nodata=None), *ARRIVALS, "--begin", 0),
+        "expected times of at least 0, got -9999 in row 0, column 3; if that means never",
+    ),
+    "begin of layers": (
+        lambda f: (stack(f, ONE), *STATES, "--begin", 2),
+        "--begin: expected --kind arrival beside it, got states",
+    ),
+    "begin that is none": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--begin", "nan"),
+        "--begin: expected a number, got nan",
+    ),
+    "begin after all": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--begin", 999),
+        "expected at least 2 steps, got 1",
+    ),
     "no fire in times": (
         lambda f: (geotiff(f / "a.tif", np.full((3, 4), NEVER)), *ARRIVALS),
         "expected cells that burn, got none",

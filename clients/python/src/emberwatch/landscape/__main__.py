@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from datetime import datetime
 from importlib.util import find_spec
@@ -34,6 +35,7 @@ examples:
 """
 #: Flags that mean something for some kinds only.
 _ONLY_FOR: Final = {
+    "begin": ("arrival",),
     "burning": ("arrival", "mask"),
     "codes": ("states",),
     "every": ("mask", "burning", "states"),
@@ -72,6 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--step", required=True, metavar="TIME", help="what one step lasts, such as '10 min'")
     add("--unit", choices=("s", "min", "h", "d"), help="what times count [as the file says]")
+    add("--begin", type=float, metavar="X", help="arrival time of step 0 [the earliest]")
     add("--burning", type=_whole, metavar="N", help="steps that a cell burns (arrival, mask)")
     add("--every", type=_whole, metavar="N", help="make a step of each so many layers [1]")
     add("--codes", type=_codes, metavar="U,B,D", help="unburnt, burning, burnt [0,1,2]")
@@ -141,12 +144,15 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
         )
     if flags.cell is not None and (flags.height, flags.width) != (None, None):
         raise InvalidArgumentError("--cell: expected neither --height nor --width beside it")
+    if flags.begin is not None and not math.isfinite(flags.begin):
+        raise InvalidArgumentError(f"--begin: expected a number, got {flags.begin}")
     if flags.cell is not None and not 0 < flags.cell < float("inf"):
         raise InvalidArgumentError(f"--cell: expected metres above 0, got {flags.cell}")
     return Meaning(
         kind=flags.kind,
         step=length(flags.step),
         unit=flags.unit,
+        begin=flags.begin,
         burning=flags.burning or 1,
         every=flags.every or 1,
         codes=flags.codes or (0, 1, 2),

@@ -51,6 +51,8 @@ class Meaning:
     """Seconds."""
     unit: str | None = None
     """Of arrival times, or of the times of layers."""
+    begin: float | None = None
+    """The arrival time of step 0, which earlier ones count as; None: the earliest."""
     burning: int = 1
     """Steps that a cell burns after its arrival."""
     every: int = 1
@@ -105,10 +107,11 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
     _check_square(layer, meaning)
     arrival = np.where(np.isnan(layer.values), np.inf, layer.values)
     negative = arrival < 0
-    if negative.any():
+    # Where each cell has a time, a negative one may mean never.
+    if negative.any() and (meaning.begin is None or not np.isinf(arrival).any()):
         raise InvalidArgumentError(
             f"{layer.name}: expected times of at least 0, got {_first(layer, negative)}; if that "
-            "means never, say --nodata"
+            "means never, say --nodata; if it burnt before, --begin 0"
         )
     finite = arrival[np.isfinite(arrival)]
     if not finite.size:
@@ -120,12 +123,13 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
             "got none"
         )
     step = meaning.step / SECONDS[unit]
+    begin = float(finite.min()) if meaning.begin is None else meaning.begin
     # A step shows the fire at its time: what begins later burns in the next one. Rounded, so that
     # three steps are not a bit more than three.
-    steps = np.ceil((arrival - finite.min()) / step - 1e-6)
+    steps = np.ceil((np.maximum(arrival, begin) - begin) / step - 1e-6)
     n_steps = int(steps[np.isfinite(steps)].max()) + 1
-    begin = layer.clock.date(float(finite.min()) * SECONDS[unit])
-    return _checked(steps, steps + meaning.burning, n_steps, layer, begin)
+    date = layer.clock.date(begin * SECONDS[unit])
+    return _checked(steps, steps + meaning.burning, n_steps, layer, date)
 
 
 def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
