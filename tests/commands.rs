@@ -84,6 +84,9 @@ run --preset lab => --preset | default, paper
 run --prior none => --prior | simulated, initial, uniform
 run --beam-width 0 => beam_width: expected 1 to 10000, got 0
 run --shooting-samples 0 => shooting_samples: expected 1 to 1000000, got 0
+run --instance nobody --policy ash => policy: expected one of random_walk | beam_STATE | got "ash"
+run --instance nobody --policy beam_ash --wait 0 => no server on instance "nobody"
+run --instance nobody --policy beam_ash --model wildfire => policy: expected one of | got "beam_ash"
 serve-decisions --instance nobody --wait 0 => no server on instance "nobody"
 serve-decisions --instance a/b => instance name | "a/b"
 serve-decisions --world x => --world | 'x'
@@ -122,6 +125,8 @@ compare --height 0 => height and width in 1..=4096, got 0 x 64
 compare --model no.toml => model file no.toml | No such file
 compare --server no/such => start no/such | No such file
 compare --instance nobody --wait 0 => no server on instance "nobody"
+compare --instance nobody --policies coverage,ash => policy: expected one of random_walk | got "ash"
+compare --instance nobody --baseline ash => --baseline | expected one of | got "ash"
 compare --instance x --height 9 => --instance | --height
 compare TINY --csv /proc/no/file.csv => create /proc/no
 compare TINY --csv / => --csv: expected a file, got the folder /
@@ -207,7 +212,7 @@ run SERVER => does not reveal its model | --model FILE",
         "compare SERVER --policies clairvoyant_beam => 2 worlds for these policies, it has 1
 compare SERVER --policies coverage --burn-in 7 => expected the running server's 20, got 7
 run SERVER --robot 1 => robots: expected some of the world's 0..1, got 1..2
-run SERVER --policy ash => policy: expected one of | got \"ash\"
+run SERVER --policy beam_ash => policy: expected one of | got \"beam_ash\"
 run SERVER --policy clairvoyant_beam => only `compare` has them",
     );
     check_against(

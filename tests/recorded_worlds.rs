@@ -285,7 +285,7 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     )
     .expect("write");
     let out = folder.path().join("out");
-    let server = Server::start(&place.flags("--worlds 3"));
+    let server = Server::start(&place.flags("--worlds 5 --coverage client"));
     let instance = format!("--instance {}", server.instance.name());
     let act = |words: &str| {
         let words = format!("{words} {instance}");
@@ -313,6 +313,16 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
         assert!(ended.stderr.contains("steps=70"), "{}", ended.stderr);
         let n_ends = ended.stderr.matches("the next begins").count();
         assert!(n_ends >= 2, "{policy}: {}", ended.stderr);
+    }
+    let figures = folder.path().join("figures");
+    let draw = format!("--figures {}", figures.display());
+    for policies in ["", "--policies random_walk,coverage"] {
+        act(&format!(
+            "compare --seeds 0..2 --steps 9 {checkpoint} {draw} {policies}"
+        ));
+        let bytes = std::fs::read(figures.join("snapshot.png")).expect("a snapshot");
+        assert!(bytes.starts_with(b"\x89PNG"));
+        std::fs::remove_file(figures.join("snapshot.png")).expect("remove");
     }
     let ladder = act(&format!("compare --seeds 0..2 {checkpoint}")).stdout;
     for policy in ["coverage", "learned_beam", "clairvoyant_beam"] {

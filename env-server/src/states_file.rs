@@ -1,9 +1,10 @@
 //! States files: recorded hidden states as NumPy arrays, and their description. docs/recorded-worlds.md has the form.
 //!
-//! Memory grows with what is there, not with what is claimed, and each array stays where it was read to.
+//! An array's header is checked before its values are read or inflated. Memory grows with what is there, not with what
+//! is claimed, and each array stays where it was read to.
 
-use ndarray::{Array3, ArrayView3};
-use ndarray_npy::{ViewNpyError, ViewNpyExt};
+use ndarray::{Array3, ShapeBuilder};
+use ndarray_npy::npy::header::Header;
 use protocol::grid::Shape;
 use protocol::model::{Description, Model};
 use protocol::program::read_text;
@@ -20,6 +21,9 @@ const MAX_BYTES: u64 = 1 << 32;
 
 /// Longest header of an array. NumPy's has 128 bytes; a long one may nest deeper than a parser's stack.
 const MAX_HEADER_BYTES: usize = 512;
+
+/// K, H and W.
+type Dim = (usize, usize, usize);
 
 /// What a states file holds.
 #[derive(Debug)]
@@ -112,8 +116,7 @@ impl Sequences {
             let expected = format!("expected at most {MAX_BYTES} bytes with those before it");
             return Err(about(format!("{expected}, got {got}")));
         }
-        let array = read_bytes(from, n_bytes).and_then(decode).map_err(about)?;
-        self.check(&array).map_err(about)?;
+        let array = self.read_array(n_bytes, from).map_err(about)?;
         let (n_recorded, height, width) = array.dim();
         for length in [n_recorded, height, width] {
             self.checksum.update(&(length as u64).to_le_bytes());
@@ -123,8 +126,31 @@ impl Sequences {
         Ok(())
     }
 
-    fn check(&self, array: &Array3<u8>) -> Result<(), String> {
-        let (n_recorded, height, width) = array.dim();
+    fn read_array(&self, n_bytes: u64, from: impl Read) -> Result<Array3<u8>, String> {
+        let mut from = from.take(n_bytes + 1);
+        let header = read_header(&mut from)?;
+        let n_values = n_bytes.saturating_sub(n_bytes + 1 - from.limit());
+        let dim = checked_dim(&header, n_values)?;
+        self.check_dim(dim)?;
+        let mut values = Vec::new();
+        let read = from.read_to_end(&mut values);
+        let got = read.map_err(|error| error.to_string())? as u64;
+        if got != n_values {
+            let got = n_bytes - n_values + got;
+            return Err(format!("expected {n_bytes} bytes, got {got} or more"));
+        }
+        let layout = dim.set_f(header.layout.is_fortran());
+        let array = Array3::from_shape_vec(layout, values)
+            .expect("invariant: there are as many values as cells");
+        let array = match array.is_standard_layout() {
+            true => array,
+            false => array.as_standard_layout().into_owned(),
+        };
+        self.check_states(&array)?;
+        Ok(array)
+    }
+
+    fn check_dim(&self, (n_recorded, height, width): Dim) -> Result<(), String> {
         let shape = Shape::new(height, width).map_err(|error| error.to_string())?;
         if n_recorded < 2 {
             return Err(format!(
@@ -138,7 +164,11 @@ impl Sequences {
                 "expected {first} cells as the first array has, got {shape}"
             ));
         }
-        let cells = cells(array);
+        Ok(())
+    }
+
+    fn check_states(&self, array: &Array3<u8>) -> Result<(), String> {
+        let (shape, cells) = (shape_of(array), cells(array));
         let most = cells.iter().fold(0, |most, &state| state.max(most));
         if usize::from(most) < self.n_states {
             return Ok(());
@@ -242,56 +272,50 @@ fn cells(array: &Array3<u8>) -> &[u8] {
     array.as_slice().expect("invariant: arrays are row-major")
 }
 
-fn read_bytes(from: impl Read, n_bytes: u64) -> Result<Vec<u8>, String> {
-    let mut bytes = Vec::new();
-    let read = from.take(n_bytes + 1).read_to_end(&mut bytes);
-    let got = read.map_err(|error| error.to_string())?;
-    match got as u64 == n_bytes {
-        true => Ok(bytes),
-        false => Err(format!("expected {n_bytes} bytes, got {got} or more")),
-    }
-}
-
-/// The array in a `.npy` file's bytes, in their memory if they are row-major.
-fn decode(mut bytes: Vec<u8>) -> Result<Array3<u8>, String> {
-    check_header(&bytes)?;
-    let view = ArrayView3::<u8>::view_npy(&bytes).map_err(|error| describe(&error))?;
-    if !view.is_standard_layout() {
-        return Ok(view.as_standard_layout().into_owned());
-    }
-    let (dim, n_cells) = (view.dim(), view.len());
-    bytes.drain(..bytes.len() - n_cells);
-    Ok(Array3::from_shape_vec(dim, bytes).expect("invariant: the view had as many cells"))
-}
-
-fn check_header(bytes: &[u8]) -> Result<(), String> {
-    let length = match bytes.strip_prefix(b"\x93NUMPY") {
+fn read_header(from: &mut impl Read) -> Result<Header, String> {
+    let mut start = Vec::new();
+    let read = from.by_ref().take(12).read_to_end(&mut start);
+    read.map_err(|error| error.to_string())?;
+    let length = match start.strip_prefix(b"\x93NUMPY") {
         Some([1, _, low, high, ..]) => u16::from_le_bytes([*low, *high]).into(),
-        Some([_, _, a, b, c, d, ..]) => u32::from_le_bytes([*a, *b, *c, *d]),
+        Some([_, _, a, b, c, d]) => u32::from_le_bytes([*a, *b, *c, *d]),
         _ => 0,
     };
-    match length as usize > MAX_HEADER_BYTES {
-        true => Err(format!(
+    if length as usize > MAX_HEADER_BYTES {
+        return Err(format!(
             "expected a NumPy array with a header of at most {MAX_HEADER_BYTES} bytes, got {length}"
-        )),
-        false => Ok(()),
+        ));
     }
+    Header::from_reader(&mut start.as_slice().chain(from))
+        .map_err(|error| format!("expected a NumPy array: {error}"))
 }
 
-fn describe(error: &ViewNpyError) -> String {
-    match error {
-        ViewNpyError::WrongDescriptor(got) => {
-            format!("expected dtype '|u1' (uint8), got {got}")
-        }
-        ViewNpyError::WrongNdim(_, got) => {
-            format!("expected three axes [K, H, W], got {got}")
-        }
-        ViewNpyError::MissingBytes(n_bytes) => {
-            format!("cut short: expected {n_bytes} bytes more")
-        }
-        ViewNpyError::ExtraBytes(n_bytes) => {
-            format!("expected the array alone, got {n_bytes} bytes behind it")
-        }
-        other => format!("expected a NumPy array: {other}"),
+/// The axes of an array of so many bytes behind its header.
+fn checked_dim(header: &Header, n_values: u64) -> Result<Dim, String> {
+    let dtype = &header.type_descriptor;
+    if !matches!(
+        dtype.as_string().map(|name| &**name),
+        Some("|u1" | "u1" | "B")
+    ) {
+        return Err(format!("expected dtype '|u1' (uint8), got {dtype}"));
+    }
+    let &[n_recorded, height, width] = &*header.shape else {
+        let got = header.shape.len();
+        return Err(format!("expected three axes [K, H, W], got {got}"));
+    };
+    let n_cells = height.checked_mul(width);
+    let n_cells = n_cells.and_then(|n_cells| n_cells.checked_mul(n_recorded));
+    let n_cells = n_cells
+        .ok_or_else(|| format!("expected a NumPy array: too many cells, {:?}", header.shape))?
+        as u64;
+    if n_cells > n_values {
+        let missing = n_cells - n_values;
+        return Err(format!("cut short: expected {missing} bytes more"));
+    }
+    match n_values - n_cells {
+        0 => Ok((n_recorded, height, width)),
+        behind => Err(format!(
+            "expected the array alone, got {behind} bytes behind it"
+        )),
     }
 }

@@ -1,11 +1,11 @@
 //! States files as NumPy writes them, and broken ones: one error each.
 
 use env_server::config::ServerConfig;
-use env_server::states_file::StatesFile;
+use env_server::states_file::{Sequences, StatesFile};
 use ndarray::{Array, Array3, Array4, ArrayView3, Dimension};
 use ndarray_npy::{WritableElement, WriteNpyExt};
 use std::fs::{create_dir, write};
-use std::io::{Cursor, Write};
+use std::io::{Cursor, Read, Write};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use zip::write::SimpleFileOptions;
@@ -323,19 +323,58 @@ fn what_is_no_file_is_refused() {
 #[test]
 fn what_is_claimed_takes_no_memory_before_it_is_checked() {
     // A member that says that it has 3 GiB, twice: neither is there.
-    let bytes = npy(&sequence(0, (2, 3, 4)));
+    let header = HEADER.replace("(2, 3, 4)", "(196608, 128, 128)");
+    let bytes = npy_with(&header);
+    let claimed = (3_u32 << 30) + 10 + header.len() as u32;
     let mut archive = stored(&[("a.npy", bytes.clone()), ("b.npy", bytes)]);
     let central = archive.windows(4).position(|word| word == b"PK\x01\x02");
     let mut at = central.expect("a directory");
     for _ in 0..2 {
-        archive[at + 24..at + 28].copy_from_slice(&(3_u32 << 30).to_le_bytes());
+        archive[at + 24..at + 28].copy_from_slice(&claimed.to_le_bytes());
         at += 46 + "a.npy".len();
     }
     let error = read("lab.npz", &archive).expect_err("neither is there");
     assert!(
-        error.contains("array \"a\": expected 3221225472 bytes, got "),
+        error.contains(&format!("array \"a\": expected {claimed} bytes, got ")),
         "{error}"
     );
+}
+
+#[test]
+fn a_header_is_checked_before_the_values_are_read() {
+    let with = |bytes: &[u8]| {
+        let values = bytes.len() as u64 + (1 << 30);
+        let cut = bytes.chain(Broken);
+        let added = Sequences::new(3).add_array("one", values, cut);
+        added.expect_err("the values break off")
+    };
+    let zeros = |header: &str| npy_with(header)[..10 + header.len()].to_vec();
+    for (from, to, words) in [
+        ("|u1", "<f4", "expected dtype '|u1' (uint8), got '<f4'"),
+        (
+            "(2, 3, 4)",
+            "(2, 3)",
+            "expected three axes [K, H, W], got 2",
+        ),
+        ("(2, 3, 4)", "(2, 3, 4)", "expected the array alone, got "),
+        ("(2, 3, 4)", "(9, 32768, 32768)", "cut short: expected "),
+        ("(2, 3, 4)", "(1, 32768, 32768)", "grid shape: expected "),
+        ("(2, 3, 4)", "(1, 1, 1073741824)", "grid shape: expected "),
+    ] {
+        let error = with(&zeros(&HEADER.replace(from, to)));
+        assert!(error.contains(words), "{error:?} does not say {words:?}");
+    }
+    let right = with(&zeros(&HEADER.replace("(2, 3, 4)", "(64, 4096, 4096)")));
+    assert_eq!(right, "array \"one\": broken");
+}
+
+/// A reader that ends in an error.
+struct Broken;
+
+impl Read for Broken {
+    fn read(&mut self, _: &mut [u8]) -> std::io::Result<usize> {
+        Err(std::io::Error::other("broken"))
+    }
 }
 
 #[test]

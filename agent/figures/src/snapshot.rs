@@ -1,12 +1,12 @@
 //! One step as the paper draws it: the hidden truth, what could be seen, what was seen along the
-//! path, and the belief in each state.
+//! path, and the belief in each state, if there is one.
 
 use crate::legend::{Legend, Named, draw_path, draw_robot, draw_start};
 use crate::palette::{Color, MUTED, sequential, unlike};
 use crate::panels::{Layout, TITLE_ROOM};
 use crate::svg::{Align, MARGIN, Point, Svg, WIDTH};
 use crate::text::TextStyle;
-use ndarray::{ArrayView2, ArrayView3};
+use ndarray::ArrayView2;
 
 /// Upper edge of the legend, below the title.
 const LEGEND_TOP: f64 = 76.0;
@@ -32,17 +32,17 @@ pub struct Snapshot<'a> {
     pub frame: ArrayView2<'a, u8>,
     /// The robot's cells (row, column), the start first.
     pub path: Vec<(usize, usize)>,
-    /// The belief after the frame, shape `[S, H, W]`.
-    pub belief: ArrayView3<'a, f32>,
+    /// What the belief calls each of its states, and its probabilities after the frame, shape `[H, W]`.
+    pub beliefs: Vec<(String, ArrayView2<'a, f32>)>,
 }
 
 impl Snapshot<'_> {
-    /// The page as SVG; it grows in height with the number of states.
+    /// The page as SVG; it grows in height with the number of beliefs.
     ///
     /// # Panics
-    /// If its parts are of different grids, or the belief is about fewer states.
+    /// If its parts are of different grids.
     pub fn svg(&self) -> String {
-        let n_panels = 3 + self.states.len();
+        let n_panels = 3 + self.beliefs.len();
         let layout = Layout::new(self.truth.dim(), n_panels, (MARGIN, WIDTH - 2.0 * MARGIN));
         let unobserved = self.unobserved();
         let corner = (layout.left(), LEGEND_TOP);
@@ -52,13 +52,15 @@ impl Snapshot<'_> {
         self.draw_title(&mut page, layout.left());
         legend.draw(&mut page);
         self.draw_worlds(&mut page, &layout, top);
-        for (state, entry) in self.states.iter().enumerate() {
-            let title = format!("belief: {}", entry.name);
-            draw_panel(&mut page, &layout, (3 + state, top), &title, |row, col| {
-                sequential(self.belief[[state, row, col]])
+        for (index, (state, belief)) in self.beliefs.iter().enumerate() {
+            let title = format!("belief: {state}");
+            draw_panel(&mut page, &layout, (3 + index, top), &title, |row, col| {
+                sequential(belief[[row, col]])
             });
         }
-        draw_color_bar(&mut page, (layout.left(), top + layout.height() + 34.0));
+        if !self.beliefs.is_empty() {
+            draw_color_bar(&mut page, (layout.left(), top + layout.height() + 34.0));
+        }
         page.finish()
     }
 

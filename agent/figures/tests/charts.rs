@@ -222,7 +222,11 @@ fn snapshot(step: &Step) -> Snapshot<'_> {
         observation: step.truth.view(),
         frame: step.frame.view(),
         path: vec![(0, 0), (step.truth.nrows() - 1, 0)],
-        belief: step.belief.view(),
+        beliefs: ["normal", "latent", "fire"]
+            .into_iter()
+            .map(String::from)
+            .zip(step.belief.outer_iter())
+            .collect(),
     }
 }
 
@@ -235,6 +239,9 @@ fn snapshots_show_each_cell_in_its_colour() {
         assert!(texts.contains(&"belief: fire".into()));
         page.path.clear();
         check(&page.svg());
+        page.beliefs.clear();
+        let texts = check(&page.svg());
+        assert!(!texts.iter().any(|text| text.starts_with("belief")));
     }
     let step = step(2, 3);
     let svg = snapshot(&step).svg();

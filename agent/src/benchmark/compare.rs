@@ -49,7 +49,7 @@ pub struct Results {
     pub runs: Vec<PolicyRun>,
     /// Cells in the state that pays most, per step, means over worlds: the same for all policies.
     pub fire_cells: Vec<f32>,
-    /// The end of the first world's run of the last policy with a belief of its own: of its first robot.
+    /// The end of the first world's run, of its first robot, with the last policy whose snapshot tells most.
     pub snapshot: Option<Snapshot>,
 }
 
@@ -131,7 +131,8 @@ pub fn compare(
                 results.add_fire(share, &worlds);
             }
             if batch[0] == comparison.seeds.start {
-                results.snapshot = worlds[0].snapshot.take().or(results.snapshot);
+                let both = [results.snapshot, worlds[0].snapshot.take()];
+                results.snapshot = both.into_iter().flatten().max_by_key(Snapshot::rank);
             }
             let runs = worlds.into_iter();
             let runs = runs.map(|world| contestant.policy_run(world, arena.info()));
@@ -324,14 +325,16 @@ impl World {
             brier_score(agent.belief(), truth, target, own)
         });
         self.tally.add(&robot.observation().world, brier);
-        if is_last && agent.policy().estimator.knows_model() {
-            self.snapshot = self.snapshot(robot, turn);
+        if is_last {
+            self.snapshot = self.snapshot(robot, turn, target);
         }
     }
 
-    fn snapshot(&self, robot: &Robot, turn: Turn) -> Option<Snapshot> {
+    fn snapshot(&self, robot: &Robot, turn: Turn, target: usize) -> Option<Snapshot> {
         let (agent, observation) = (&robot.agent, robot.observation());
         let (shape, start) = (agent.belief().shape(), turn.before.cell());
+        let estimator = agent.policy().estimator;
+        let is_own = estimator.knows_model() || estimator.is_learned();
         let moves = &turn.plans[0].moves;
         let mut path_cells = vec![start];
         path_cells.extend((1..=moves.len()).map(|n| fly(shape, start, &moves[..n]).end));
@@ -341,7 +344,8 @@ impl World {
             truth: turn.truth?,
             frame: observation.frame.clone(),
             path_cells,
-            belief: agent.belief().clone(),
+            belief: is_own.then(|| agent.belief().clone()),
+            learned_target: estimator.is_learned().then(|| agent.target(target)),
         })
     }
 }

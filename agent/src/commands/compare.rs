@@ -80,6 +80,7 @@ pub struct CompareCommand {
 impl CompareCommand {
     /// Runs the comparison and writes what it gave.
     pub fn run(&self) -> Result<()> {
+        self.check_names()?;
         let config = self.settings.effective()?;
         self.make_places()?;
         let checkpoints = self.checkpoint.iter().map(PathBuf::as_path);
@@ -179,6 +180,15 @@ impl CompareCommand {
             policies.retain(|policy| !policy.estimator.knows_model());
         }
         Ok(policies)
+    }
+
+    /// Refuses what no server can fly before one is waited for.
+    fn check_names(&self) -> Result<()> {
+        let mut policies = self.policies.iter();
+        policies.try_for_each(|name| Policy::check_name(name))?;
+        let mut baseline = self.baseline.iter();
+        let checked = baseline.try_for_each(|name| Policy::check_name(name));
+        checked.context("--baseline")
     }
 
     fn policies(&self, model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
@@ -323,9 +333,7 @@ fn draw_step(directory: &Path, arena: &mut Arena, results: &Results) -> Result<(
         return Ok(());
     }
     let Some(snapshot) = &results.snapshot else {
-        tracing::warn!(
-            "no snapshot: it needs a policy with a belief of its own, and published hidden states"
-        );
+        tracing::warn!("no snapshot: it needs published hidden states");
         return Ok(());
     };
     let Some(observation) = arena.full_observation(snapshot.seed, snapshot.step)? else {

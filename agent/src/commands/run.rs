@@ -5,6 +5,7 @@ use agent::acting::mission::{Company, Mission};
 use agent::acting::run::run;
 use agent::config::AgentFlags;
 use agent::learning::learned::Learned;
+use agent::planning::policy::Policy;
 use anyhow::{Context, Result};
 use clap::Args;
 use network::DeviceKind;
@@ -64,6 +65,11 @@ impl RunCommand {
     /// Runs the mission.
     pub fn run(&self) -> Result<()> {
         let model = self.model.as_deref().map(model_named).transpose()?;
+        // What no server can fly needs none to be refused.
+        match &model {
+            Some(model) => Policy::named(&self.policy, model).map(drop),
+            None => Policy::check_name(&self.policy),
+        }?;
         let mission = Mission {
             instance: Instance::new(&self.instance)?,
             world: self.world,

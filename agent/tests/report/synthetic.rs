@@ -181,7 +181,8 @@ pub fn scene(model: Model, height: usize, width: usize) -> Scene {
         truth,
         frame,
         path_cells,
-        belief: Belief::from_probabilities(belief).expect("test belief"),
+        belief: Some(Belief::from_probabilities(belief).expect("test belief")),
+        learned_target: None,
     };
     Scene {
         model,

@@ -33,7 +33,11 @@ class Server:
         """Starts it and waits until it answers and, if asked, until its worlds are ready."""
         self.instance = instance
         arguments = {"instance": instance, **settings}
-        flags = [f"--{name.replace('_', '-')}={value}" for name, value in arguments.items()]
+        flags = [
+            f"--{name.replace('_', '-')}={value}"
+            for name, value in arguments.items()
+            if value is not None
+        ]
         self.program = Program("emberwatch-server", flags)
         self._held = ExitStack()
         self._held.callback(self.program.stop)

@@ -51,6 +51,8 @@ def netcdf(
     path: Path,
     *,
     times: Sequence[float] | None = None,
+    time_unit: str | None = None,
+    calendar: str | None = None,
     unit: str = "min",
     southward: bool = True,
     extra: bool = False,
@@ -72,6 +74,10 @@ def netcdf(
         axis[:] = places
         if name in "xy":
             axis.units, axis.standard_name = "m", f"projection_{name}_coordinate"
+        if name == "time" and time_unit is not None:
+            axis.units = time_unit
+        if name == "time" and calendar is not None:
+            axis.calendar = calendar
     for name, values in arrays.items():
         variable = file.createVariable(name, "f4", tuple(dimensions), fill_value=NEVER)
         variable[:] = values if southward else values[..., ::-1, :]

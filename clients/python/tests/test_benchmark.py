@@ -30,6 +30,19 @@ MERIT = (
 )
 
 
+#: The state that pays most is the second, which a description alone says.
+DESCRIPTION = """
+name = "lab"
+step = "10 min"
+states = [
+    { name = "unburnt", color = "#000000", observed_as = [0.9, 0.1] },
+    { name = "burning", color = "#ff0000", observed_as = [0.1, 0.9], reward = 1.0 },
+    { name = "burnt", color = "#777777", observed_as = [1.0, 0.0] },
+]
+observations = [{ name = "cold", color = "#000000" }, { name = "hot", color = "#ff0000" }]
+"""
+
+
 def walk(seed: int) -> Callable[[Any], NDArray[np.int64]]:
     """Random moves in as many worlds as are shown."""
     rng = np.random.default_rng(seed)
@@ -70,11 +83,35 @@ def test_random_moves_score_as_a_random_walk(tmp_path: Path) -> None:
         assert error > 0 and abs(difference.mean()) < 4 * error, value
 
 
-@pytest.mark.parametrize(("robots", "recent_steps"), [(1, 10), (3, 2)])
+@pytest.fixture
+def states(tmp_path: Path) -> Path:
+    """Recorded worlds of 12 and 15 steps, in which the second of three states pays most."""
+    path = tmp_path / "lab.npz"
+    random = np.random.default_rng(5)
+    sequences = [random.integers(0, 3, (length, 7, 9), np.uint8) for length in (13, 16)]
+    np.savez(path, states_000=sequences[0], states_001=sequences[1])
+    path.with_suffix(".toml").write_text(DESCRIPTION)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("robots", "recent_steps", "policy"),
+    [(1, 10, "beam_exploit"), (3, 2, "beam_exploit"), (1, 3, "coverage"), (2, 10, "coverage")],
+)
 def test_paths_flown_again_score_the_same_to_the_digit(
-    tmp_path: Path, server: Callable[..., Server], robots: int, recent_steps: int
+    tmp_path: Path,
+    server: Callable[..., Server],
+    states: Path,
+    robots: int,
+    recent_steps: int,
+    policy: str,
 ) -> None:
     settings = {"height": 7, "width": 9, "moves": 6, "model": LIVELY, "burn_in": 60}
+    worlds = WORLDS
+    if policy == "coverage":  # needs no model, as recorded worlds have none
+        settings = {"height": None, "width": None, "moves": 6, "burn_in": None}
+        settings |= {"states": states, "states_symmetries": "true"}
+        worlds = {"n_moves": 6, "states": states, "states_symmetries": True}
     settings["robots"] = robots
     running = server(worlds=5, publish_truth="true", coverage="client", **settings)
     file = tmp_path / "beam.recording"
@@ -88,7 +125,7 @@ def test_paths_flown_again_score_the_same_to_the_digit(
         csv = tmp_path / "theirs.csv"
         flags = [f"--instance={running.instance}", f"--csv={csv}", "--team=joint"]
         flags += [f"--recent-steps={recent_steps}"]
-        done = compare("--policies=beam_exploit", *flags)
+        done = compare(f"--policies={policy}", *flags)
         assert done.returncode == 0, done.stderr
     finally:
         recorder.terminate()
@@ -105,7 +142,7 @@ def test_paths_flown_again_score_the_same_to_the_digit(
         step = next(steps)
         return np.concatenate([paths[seed, step] for seed in range(3, 7)]).astype(np.int64)
 
-    keywords = {**WORLDS, **SCALE, "robots": robots, "recent_steps": recent_steps}
+    keywords = {**worlds, **SCALE, "robots": robots, "recent_steps": recent_steps}
     rows = evaluate(again, name="again", env=WILDFIRE, **keywords)
     theirs = read(csv)
     assert len(rows) == len(theirs) == 4
@@ -290,6 +327,12 @@ def test_without_hidden_states_or_their_names_the_other_figures_are_there(
         for value in set(MERIT) - {*of_truth}:
             assert getattr(row, value) == getattr(other, value), value
     assert read(tmp_path / "mine.csv") == rows
+
+
+def test_more_steps_than_recorded_are_refused(states: Path) -> None:
+    keywords = {**SCALE, "n_moves": 6, "states": states, "observation": "frame", "seeds": [0, 1]}
+    with pytest.raises(InvalidArgumentError, match="steps: expected at most 12, .*, got 13"):
+        evaluate(walk(0), name="mine", **(keywords | {"steps": 13}))
 
 
 def test_worlds_of_teams_are_not_taken_for_worlds_of_one_robot(

@@ -23,7 +23,7 @@ HEIGHT, WIDTH, SCALE = 3, 5, 10
 #: Left and upper edges of the four panels, pixels: they are 150 wide, with 16 between.
 LEFTS, TOP = [14, 180, 346, 512], 68
 INFO = document.examples()[1] | {"height": HEIGHT, "width": WIDTH, "n_moves": 2, "n_worlds": 2}
-INFO |= {"n_robots": 1, "deadline_millis": 0}
+INFO |= {"n_robots": 1, "deadline_millis": 0, "recorded_world": None}
 SEEN = np.full((HEIGHT, WIDTH), 255, np.uint8)
 SEEN[0, :2], SEEN[1, 1] = [0, 1], 2
 TRUTH = np.arange(HEIGHT * WIDTH, dtype=np.uint8).reshape(HEIGHT, WIDTH) % 3
@@ -198,6 +198,23 @@ def test_what_is_not_recorded_is_left_out(studio: Studio) -> None:
     words = studio.film([server(model=None), *both(1)])
     assert "the belief is left out, as the server hid its model" in words
     assert studio.pictures()[0][0].shape[1] == 2 * 150 + 16 + 28
+
+
+def test_recorded_worlds_have_the_colours_of_their_description(studio: Studio) -> None:
+    colors = np.array([[0, 0, 255], [0, 255, 0], [255, 0, 255]], np.uint8)
+    lines = ['name = "lab"', 'step = "1 h"']
+    for kind, more in (("states", "observed_as = [0.2, 0.3, 0.5]"), ("observations", "")):
+        for number, color in enumerate(colors.tolist()):
+            hexadecimal = "".join(f"{channel:02x}" for channel in color)
+            lines += [f"[[{kind}]]", f'name = "{number}"', f'color = "#{hexadecimal}"', more]
+    recorded = {"description": "\n".join(lines), "n_sequences": 1, "n_steps": 9}
+    records = [server(model=None, recorded_world=recorded), *both(1)]
+    words = studio.film(records)
+    assert "the belief is left out, as recorded worlds have no model" in words
+    image = studio.still(records, 1)
+    assert (cells(image, 0) == colors[TRUTH]).all()
+    seen = SEEN < 255
+    assert (cells(image, 1)[seen] == colors[SEEN[seen]]).all()
 
 
 def test_a_hidden_model_is_given(studio: Studio, tmp_path: Path) -> None:

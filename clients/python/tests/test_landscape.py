@@ -87,6 +87,17 @@ def test_the_first_step_is_that_of_the_earliest_arrival(tmp_path: Path, out: Pat
     np.testing.assert_array_equal(one(out, file, *ARRIVALS, "--unit", "min"), FIRE)
 
 
+def test_what_burns_before_the_begin_burns_from_step_0(tmp_path: Path, out: Path) -> None:
+    before = np.where(ARRIVAL == 0, -2147.5, ARRIVAL)
+    file = geotiff(tmp_path / "fire.tif", before)
+    flags = (*ARRIVALS, "--unit", "min", "--begin")
+    np.testing.assert_array_equal(one(out, file, *flags, 0), FIRE)
+    later = np.where(ARRIVAL <= 20, 0, BEGIN - 2)
+    burns = np.where(ARRIVAL == NEVER, 99, later)
+    expected = [(burns <= k) + (burns + 2 <= k).astype(int) for k in range(4)]
+    np.testing.assert_array_equal(one(out, file, *flags, 20, "--force"), expected)
+
+
 def test_undeclared_numbers_for_never_can_be_named(tmp_path: Path, out: Path) -> None:
     file = geotiff(tmp_path / "fire.tif", nodata=None)
     flags = (*ARRIVALS, "--unit", "min", "--nodata", -1, "--nodata", NEVER)
@@ -149,6 +160,102 @@ def test_every_second_layer_makes_a_step(tmp_path: Path, out: Path) -> None:
     file = geotiff(tmp_path / "fire.tif", *FIRE, nodata=None)
     flags = ("--kind", "states", "--step", "20 min", "--every", 2)
     np.testing.assert_array_equal(one(out, file, *flags), FIRE[::2])
+
+
+def test_a_step_shows_the_last_layer_at_or_before_its_time(tmp_path: Path, out: Path) -> None:
+    states = np.zeros((4, 1, 4), np.uint8)
+    for k in range(1, 4):
+        states[k:, 0, k] = 1
+    cases: list[tuple[list[float], str | None, tuple[object, ...], list[int]]] = [
+        ([0, 10, 20, 30], "minutes", ("--step", "10 min"), [0, 1, 2, 3]),
+        ([0, 10, 20, 30], "minutes since 2020-08-01", ("--step", "20 min"), [0, 2]),
+        ([0, 10, 20, 30], "minutes", ("--step", "15 min"), [0, 1, 3]),
+        ([0, 10, 20, 30], "minutes", ("--step", "5 min"), [0, 0, 1, 1, 2, 2, 3]),
+        ([600, 1200, 3000, 3600], "seconds", ("--step", "10 min"), [0, 1, 1, 1, 2, 3]),
+        ([7, 7.3333, 7.6667, 9], "hours", ("--step", "20 min"), [0, 1, 2, 2, 2, 2, 3]),
+        ([0, 600, 1800, 2400], None, ("--step", "10 min", "--unit", "s"), [0, 1, 1, 2, 3]),
+        ([0, 10, 20, 30], None, ("--step", "7 d"), [0, 1, 2, 3]),
+    ]
+    for times, unit, flags, shown in cases:
+        file = netcdf(tmp_path / "fire.nc", times=times, time_unit=unit, state=states)
+        got = one(out, file, "--kind", "states", *flags, "--oblong", "--force")
+        np.testing.assert_array_equal(got, states[shown], str((times, unit, flags)))
+
+
+def test_files_that_count_from_days_of_their_own_follow_each_other(
+    tmp_path: Path, out: Path
+) -> None:
+    folder = tmp_path / "days"
+    folder.mkdir()
+    for day, part in ((1, FIRE[:2]), (2, FIRE[2:4])):
+        unit = f"hours since 2020-08-0{day} 00:00:00"
+        netcdf(folder / f"{day}.nc", times=[0, 12], time_unit=unit, state=part)
+    flags = ("--kind", "states", "--step", "12 h")
+    np.testing.assert_array_equal(one(out, folder, *flags), FIRE[:4])
+
+
+@pytest.mark.parametrize(
+    ("unit", "calendar", "begin"),
+    [
+        ("minutes since 2020-08-01", None, "2020-08-01 01:30:00 UTC"),
+        ("minutes since 2020-8-1 0:0:0.0", "gregorian", "2020-08-01 01:30:00 UTC"),
+        ("minutes since 2020-08-01T12:00:00Z", None, "2020-08-01 13:30:00 UTC"),
+        ("minutes since 2020-08-01 12:00 -07:00", None, "2020-08-01 20:30:00 UTC"),
+        ("minutes since 2020-08-01 12:00 -0330", None, "2020-08-01 17:00:00 UTC"),
+        ("minutes since 2020-08-01", "noleap", None),
+        ("minutes since 2020-02-31", None, None),
+        ("minutes since ignition", None, None),
+        ("minutes since 1-1-1", None, None),
+        ("minutes", None, None),
+    ],
+    ids=str,
+)
+def test_the_description_says_when_a_sequence_begins(
+    tmp_path: Path, out: Path, unit: str, calendar: str | None, begin: str | None
+) -> None:
+    times = {"times": [90, 100, 110, 120], "time_unit": unit, "calendar": calendar}
+    one(
+        out,
+        netcdf(tmp_path / "fire.nc", **times, mask=masks()),
+        "--kind=mask",
+        *STEP,
+        "--burning=2",
+    )
+    lines = out.with_suffix(".toml").read_text("utf-8").splitlines()
+    expected = [] if begin is None else [f"# states_000 begins at {begin}"]
+    assert [line for line in lines if line.startswith("#")] == expected
+
+
+def test_each_sequence_of_arrival_times_has_its_begin(tmp_path: Path, out: Path) -> None:
+    unit = "minutes since 2020-08-01 12:00"
+    later = np.where(ARRIVAL == NEVER, NEVER, ARRIVAL + 5)
+    files = [
+        netcdf(tmp_path / "a.nc", at=ARRIVAL),
+        netcdf(tmp_path / "b.nc", at=later, unit=unit),
+    ]
+    imported(out, *files, *ARRIVALS)
+    text = out.with_suffix(".toml").read_text("utf-8")
+    assert re.findall("(?m)^# .*", text) == ["# states_001 begins at 2020-08-01 12:05:00 UTC"]
+    assert tomllib.loads(text)["step"] == "10 min"
+
+
+def test_sequences_of_other_cells_can_be_taken_together(tmp_path: Path, out: Path) -> None:
+    files = (
+        geotiff(tmp_path / "a.tif"),
+        geotiff(tmp_path / "b.tif", cell=(60, 60), crs="EPSG:32611"),
+    )
+    for states in imported(out, *files, *ARRIVALS, "--unit", "min", "--mixed"):
+        np.testing.assert_array_equal(states, FIRE)
+
+
+def test_fires_in_other_places_are_sequences_of_like_cells(tmp_path: Path, out: Path) -> None:
+    files = [
+        geotiff(tmp_path / "a.tif"),
+        geotiff(tmp_path / "b.tif", corner=(100_000, 3_000_000)),
+        geotiff(tmp_path / "c.tif", ARRIVAL.repeat(2, axis=0).repeat(2, axis=1), cell=(15, 15)),
+    ]
+    for states in imported(out, *files, *ARRIVALS, "--unit", "min", "--cell", 30):
+        np.testing.assert_array_equal(states, FIRE)
 
 
 @pytest.mark.parametrize("flags", [("--height", 3), ("--width", 4), ("--cell", 60)])

@@ -1,6 +1,7 @@
 """What the importer refuses: one line each that says what was expected and what was got."""
 
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -49,6 +50,28 @@ def folder_with(folder: Path, name: str) -> Path:
     return folder
 
 
+def claim(path: Path, shape: tuple[int, ...]) -> Path:
+    """The header of an array of bytes that are not there."""
+    with path.open("wb") as file:
+        header = {"descr": "|u1", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)
+    return path
+
+
+def packed(path: Path, member: Path) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.write(member, "states.npy")
+    return path
+
+
+def days(folder: Path, *units: str | None) -> list[Path]:
+    """Two layers a file, at 0 and 1 of each unit."""
+    return [
+        netcdf(folder / f"{k}.nc", times=[0, 1], time_unit=unit, mask=masks()[2 * k : 2 * k + 2])
+        for k, unit in enumerate(units)
+    ]
+
+
 def large(folder: Path) -> Path:
     """A raster of more rows than the server takes."""
     values = np.zeros((4097, 1), np.uint8)
@@ -85,7 +108,23 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
     ),
     "objects": (
         lambda f: (array(f, np.array([{}], object)), *MASKS),
-        "expected a NumPy file, got",
+        "(layers, rows, columns), got object (1,)",
+    ),
+    "claimed rows": (
+        lambda f: (claim(f / "a.npy", (1 << 20, 1 << 20)), *MASKS),
+        "a.npy: expected at most 134217728 cells, got 1048576 x 1048576",
+    ),
+    "claimed layers": (
+        lambda f: (claim(f / "a.npy", (1 << 20, 64, 128)), *MASKS),
+        "a.npy: expected at most 4294967296 bytes of numbers, got 8589934592: uint8 (1048576,",
+    ),
+    "claimed layers of an archive": (
+        lambda f: (packed(f / "a.npz", claim(f / "a.npy", (1 << 40, 2, 2))), *MASKS),
+        "a.npz: expected at most 4294967296 bytes of numbers, got 4398046511104",
+    ),
+    "no array in an archive": (
+        lambda f: (packed(f / "a.npz", text(f / "a.npy", "hello, world")), *MASKS),
+        "a.npz: expected a NumPy file, got",
     ),
     "words": (lambda f: (array(f, np.array([["a"]])), *MASKS), "(layers, rows, columns), got <U1"),
     "four dimensions": (lambda f: (array(f, np.zeros((2, 2, 2, 2))), *MASKS), "(2, 2, 2, 2)"),
@@ -183,6 +222,48 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         lambda f: (netcdf(f / "a.nc", times=[0, 600, 1200, 2400], mask=masks()), *MASKS),
         "expected steps of 600 in time, got 1200",
     ),
+    "dates backwards": (
+        lambda f: (
+            *days(f, "hours since 2020-08-02", "hours since 2020-08-01"),
+            *MASKS,
+        ),
+        "band 1: expected a later time than 2020-08-02 01:00:00+00:00, got 2020-08-01 00:00:00",
+    ),
+    "dates of another calendar": (
+        lambda f: (*days(f, "hours since 2020-08-01", "hours since start"), *MASKS),
+        "expected times in 'hours since 2020-08-01' (standard) as in ",
+    ),
+    "times of no unit after hours": (
+        lambda f: (*days(f, "hours", None), *MASKS),
+        "expected times in 'hours' (standard) as in ",
+    ),
+    "layer without a time after layers with times": (
+        lambda f: (*days(f, "hours"), netcdf(f / "a.nc", mask=masks()[3]), *MASKS),
+        "a.nc: expected times in 'hours' (standard) as in ",
+    ),
+    "every layer beside times": (
+        lambda f: (days(f, "hours", None)[0], *MASKS, "--every", 2),
+        "tells the times of its layers and --step chooses among them, got 2",
+    ),
+    "step of all layers": (
+        lambda f: (days(f, "min", None)[0], *MASKS),
+        "expected at least 2 steps, got 1",
+    ),
+    "fire behind the last step": (
+        lambda f: (
+            netcdf(f / "a.nc", times=[0, 10, 15], time_unit="min", mask=[NONE, NONE, ONE]),
+            *MASKS,
+        ),
+        "expected cells that burn, got none",
+    ),
+    "unit of layers without times": (
+        lambda f: (stack(f, NONE, ONE), *MASKS, "--unit", "s"),
+        "--unit: expected none, as ",
+    ),
+    "other unit of layers": (
+        lambda f: (days(f, "hours", None)[0], *MASKS, "--unit", "s"),
+        "--unit: expected h, as in ",
+    ),
     "mask of three numbers": (
         lambda f: (stack(f, ONE, 2 * ONE), *MASKS),
         "band 2: expected 0 and one other number in all layers, 1, got 2 in row 0, column 0",
@@ -194,6 +275,22 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
     "negative time": (
         lambda f: (geotiff(f / "a.tif", nodata=None), *ARRIVALS),
         "expected times of at least 0, got -9999 in row 0, column 3; if that means never",
+    ),
+    "negative time before the begin": (
+        lambda f: (geotiff(f / "a.tif", nodata=None), *ARRIVALS, "--begin", 0),
+        "expected times of at least 0, got -9999 in row 0, column 3; if that means never",
+    ),
+    "begin of layers": (
+        lambda f: (stack(f, ONE), *STATES, "--begin", 2),
+        "--begin: expected --kind arrival beside it, got states",
+    ),
+    "begin that is none": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--begin", "nan"),
+        "--begin: expected a number, got nan",
+    ),
+    "begin after all": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--begin", 999),
+        "expected at least 2 steps, got 1",
     ),
     "no fire in times": (
         lambda f: (geotiff(f / "a.tif", np.full((3, 4), NEVER)), *ARRIVALS),
@@ -241,6 +338,30 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
     "other grid": (
         lambda f: (geotiff(f / "a.tif"), geotiff(f / "b.tif", ARRIVAL[:2]), *ARRIVALS),
         "b.tif: expected 3 x 4 cells as the first sequence, got 2 x 4",
+    ),
+    "sequences of other cells": (
+        lambda f: (geotiff(f / "a.tif"), geotiff(f / "b.tif", cell=(31, 31)), *ARRIVALS),
+        "b.tif: expected cells of 30 x 30 on the ground as in the first sequence, got 31 x 31",
+    ),
+    "sequences of another scale": (
+        lambda f: (
+            geotiff(f / "a.tif"),
+            geotiff(f / "b.tif", ARRIVAL.repeat(2, axis=0).repeat(2, axis=1)),
+            *(*ARRIVALS, "--height", 3),
+        ),
+        "b.tif: expected cells of 30 x 30 on the ground as in the first sequence, got 60 x 60",
+    ),
+    "sequences of other projections": (
+        lambda f: (geotiff(f / "a.tif"), geotiff(f / "b.tif", crs="EPSG:32611"), *ARRIVALS),
+        "b.tif: expected the projection of the first sequence, WGS 84 / UTM zone 10N, got WGS 84",
+    ),
+    "sequences with and without a place": (
+        lambda f: (
+            ascii_grid(f / "a.asc"),
+            array(f, np.where(ARRIVAL < 0, np.nan, ARRIVAL)),
+            *ARRIVALS,
+        ),
+        "expected the projection of the first sequence, none, got no place on the ground",
     ),
     "no unit": (
         lambda f: (geotiff(f / "a.tif"), *ARRIVALS[:-2]),

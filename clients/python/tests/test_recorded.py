@@ -129,11 +129,44 @@ def test_a_running_server_tells_of_its_recorded_world(states: Path) -> None:
         assert client.info.recorded_world is None
 
 
+def test_pictures_have_the_colours_of_the_description(states: Path) -> None:
+    instance = unused_instance()
+    flags = [f"--instance={instance}", f"--states={states}", "--publish-truth=true"]
+    server = Program("emberwatch-server", flags)
+    keywords: list[dict[str, Any]] = [{"states": states}, {"instance": instance}]
+    try:
+        server.wait_for(lambda: emberwatch.connect(instance)).close()
+        for world in keywords:
+            env: Any = gymnasium.make(WILDFIRE, truth=True, render_mode="rgb_array", **world)
+            _, info = env.reset(seed=1)
+            colors = np.array([[0, 0, 0], [255, 0, 0], [0x77, 0x77, 0x77]], np.uint8)
+            truth = colors[info["truth"]].repeat(128, axis=0).repeat(128, axis=1)
+            shown = env.render()[:512, -512:]
+            corners = (slice(4, None, 128), slice(4, None, 128))  # the robot is in a middle
+            np.testing.assert_array_equal(shown[corners], truth[corners], str(world))
+            env.close()
+    finally:
+        server.stop()
+
+
+def test_moves_are_paid_by_the_description(states: Path) -> None:
+    env: Any = gymnasium.make(MOVES, states=states, n_moves=3, reward="move")
+    paths: Any = gymnasium.make(WILDFIRE, states=states, n_moves=3)
+    path = [3, 1, 2]
+    for seed in range(4):
+        env.reset(seed=seed)
+        paths.reset(seed=seed)
+        expected = float(paths.step(np.array(path))[1])
+        assert sum(float(env.step(move)[1]) for move in path) == expected
+    env.close()
+    paths.close()
+
+
 def test_what_does_not_fit_is_refused(tmp_path: Path, states: Path) -> None:
     wrong: list[tuple[dict[str, Any], str]] = [
         ({"height": 4}, "height: expected no flag beside a states file"),
         ({"states_offset": 4}, "states_offset: expected 0 to 3"),
-        ({"observation": "belief"}, "reveals its model"),
+        ({"observation": "belief"}, "expected simulated worlds, as recorded ones have no model"),
         ({"states": tmp_path / "none.npz"}, "description"),
     ]
     usual: dict[str, Any] = {"states": states, "timeout": 0.1}

@@ -38,8 +38,30 @@ pub struct Snapshot {
     pub frame: Frame,
     /// The robot's cells, the start first.
     pub path_cells: Vec<Cell>,
-    /// The posterior after the frame.
-    pub belief: Belief,
+    /// The posterior after the frame, if the policy has a belief of its own.
+    pub belief: Option<Belief>,
+    /// The state that pays most in a belief whose states were learned; `None`: they are the model's.
+    pub learned_target: Option<usize>,
+}
+
+impl Snapshot {
+    /// How much it tells: more with a belief, most if its states are the model's.
+    pub fn rank(&self) -> u8 {
+        match (&self.belief, self.learned_target) {
+            (None, _) => 0,
+            (Some(_), Some(_)) => 1,
+            (Some(_), None) => 2,
+        }
+    }
+
+    /// What the belief's panel calls a state.
+    fn state_name(&self, model: &Model, state: usize) -> String {
+        match self.learned_target {
+            None => model.file().states[state].name.clone(),
+            Some(target) if target == state => "what pays most".into(),
+            Some(_) => format!("learned state {state}"),
+        }
+    }
 }
 
 /// Puts a page at `path`: as SVG where the path ends so, else as PNG.
@@ -167,7 +189,7 @@ pub fn draw_rewards(
     save(path, &svg)
 }
 
-/// Draws a step; the picture grows in height with the number of states. `observation`: what the sensor would
+/// Draws a step; the picture grows in height with the states of the belief. `observation`: what the sensor would
 /// have shown of each cell.
 pub fn draw_snapshot(
     path: &Path,
@@ -181,6 +203,8 @@ pub fn draw_snapshot(
         .observations
         .iter()
         .map(|it| named(&it.name, &it.color));
+    let belief = snapshot.belief.as_ref().map(Belief::view);
+    let beliefs = belief.iter().flat_map(|belief| belief.outer_iter());
     let page = figures::Snapshot {
         title: format!("{}, step k = {}", model.name(), snapshot.step),
         note: format!(
@@ -197,7 +221,10 @@ pub fn draw_snapshot(
             .iter()
             .map(|cell| (cell.row, cell.col))
             .collect(),
-        belief: snapshot.belief.view(),
+        beliefs: beliefs
+            .enumerate()
+            .map(|(state, belief)| (snapshot.state_name(model, state), belief))
+            .collect(),
     };
     save(path, &page.svg())
 }

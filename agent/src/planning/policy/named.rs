@@ -1,6 +1,6 @@
 //! What a policy is, and policies by name.
 
-use super::names::{known_names, ladder_names};
+use super::names::{is_of_model, known_names, ladder_names, names_of_any_model};
 use crate::planning::action::{Action, ActionSet};
 use crate::planning::objective::{BEAM_BONUS, Objective, Target};
 use protocol::Model;
@@ -183,6 +183,20 @@ impl Policy {
         })
     }
 
+    /// Checks a name before the model is known.
+    ///
+    /// # Errors
+    /// If it is a policy's under no model.
+    pub fn check_name(name: &str) -> Result<(), UnknownPolicy> {
+        if is_of_model(name) || Self::named(name, &Model::wildfire()).is_ok() {
+            return Ok(());
+        }
+        Err(UnknownPolicy {
+            name: name.into(),
+            expected: names_of_any_model().join(", "),
+        })
+    }
+
     /// What a high-level decision chooses among (the paper's actions `a_k`): the probability of each
     /// state in the model's order, then `entropy`; each named by its target, with the bonus of
     /// `shooting_*` and `beam_*`.
@@ -302,6 +316,23 @@ mod tests {
             let error = Policy::named(wrong, &model).expect_err(wrong).to_string();
             assert!(
                 error.contains("shooting_latent") && error.ends_with(&format!("got {wrong:?}")),
+                "{error}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_name_is_checked_before_its_model_is_known() {
+        for model in Model::built_in_names().filter_map(Model::built_in) {
+            for name in known_names(&model) {
+                assert_eq!(Policy::check_name(&name), Ok(()));
+            }
+        }
+        for wrong in ["", "bem_exploit", "beam_", "act_", "oracle_exploit", "fire"] {
+            let error = Policy::check_name(wrong).expect_err(wrong).to_string();
+            assert!(
+                error.contains("coverage, shooting_explore, shooting_exploit, ")
+                    && error.contains("shooting_STATE, beam_STATE, act_ACTION, got"),
                 "{error}"
             );
         }

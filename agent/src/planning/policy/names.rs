@@ -49,6 +49,28 @@ pub(super) fn ladder_names(model: &Model) -> Vec<String> {
     names
 }
 
+/// Those that each model has, and patterns of those that it may have.
+pub(super) fn names_of_any_model() -> Vec<String> {
+    let model = Model::wildfire();
+    let is_of_state = |name: &String| {
+        let (_, rest) = name.split_once('_').unwrap_or_default();
+        model.state_named(rest).is_some()
+    };
+    let mut names = known_names(&model);
+    names.retain(|name| !name.starts_with("act_") && !is_of_state(name));
+    names.extend(["shooting_STATE", "beam_STATE", "act_ACTION"].map(String::from));
+    names
+}
+
+/// Whether the name fits one of these patterns.
+pub(super) fn is_of_model(name: &str) -> bool {
+    let families = ["shooting_", "beam_", "act_"];
+    let mut rests = families
+        .iter()
+        .filter_map(|family| name.strip_prefix(family));
+    rests.any(|rest| !rest.is_empty())
+}
+
 pub(super) fn known_names(model: &Model) -> Vec<String> {
     let mut names = ladder_names(model);
     names.extend(["beam_explore", "beam_exploit_only", "clairvoyant_shooting"].map(String::from));

@@ -67,7 +67,9 @@ class AgentSession(Session):
         if self.spec.n_robots > 1:
             raise _no_team()
         if self.spec.model is None:
-            raise InvalidArgumentError("model: expected one, as the server does not reveal its own")
+            has_none = "recorded worlds have none"
+            hides = has_none if self.spec.is_recorded else "the server does not reveal its own"
+            raise InvalidArgumentError(f"model: expected one, as {hides}")
         n_objectives = self.spec.model.n_states + 1
         #: Of one world.
         self.action_space: Final = spaces.Discrete(n_objectives)

@@ -44,6 +44,9 @@ _PATHS: Final = "emberwatch/Wildfire-v0"
 
 _DIRECTIONS: Final = np.array(DIRECTIONS, np.int64)
 
+#: Of `emberwatch-agent compare`.
+_BURN_IN: Final = 25_000
+
 #: A busy machine may keep the hidden states back for longer than a learner would wait, seconds.
 _TIMEOUT: Final = 30.0
 
@@ -59,8 +62,9 @@ class _Tally:
         self.n_robots: Final = spec.n_robots
         self.recent_steps: Final = recent_steps
         self._shape = (n_worlds, spec.height, spec.width)
-        self._knows_target = spec.model is not None
-        target = 0 if spec.model is None else spec.model.target_state
+        described = spec.described
+        self._knows_target = described is not None
+        target = 0 if described is None else described.target_state
         self.merit: Final = MeritTally(
             n_worlds, self._shape[1:], target=target, recent_steps=recent_steps
         )
@@ -113,7 +117,7 @@ def evaluate(
     name: str,
     seeds: Iterable[int] = range(8),
     steps: int = 1500,
-    burn_in: int = 25_000,
+    burn_in: int | None = None,
     env: str = _MOVES,
     estimator: str | None = None,
     deterministic: bool = True,
@@ -132,7 +136,8 @@ def evaluate(
         name: What the table calls it.
         seeds: The worlds. Those below 1000 are test worlds.
         steps: Scored steps, thus paths, of each world.
-        burn_in: Steps before the first scored one.
+        burn_in: Steps before the first scored one; None: 25,000, or as the running server has it.
+            Recorded worlds have none.
         env: What it acts in: `"emberwatch/WildfireMoves-v0"` or `"emberwatch/Wildfire-v0"`.
         estimator: What the table says of its belief; None: `known_model` where `observation` has
             a belief, else `none`.
@@ -140,7 +145,8 @@ def evaluate(
         batch: Worlds at a time, in the order of the seeds.
         recent_steps: Steps for which a cell counts as seen after a visit, in the figures of merit.
             Those that need the hidden states are None with `truth=False`, and where a running
-            server does not publish them or hides its model.
+            server does not publish them, or hides its model or the description of recorded
+            worlds.
         csv: A file to write rows to. Rows of this policy that it has already are kept, and not
             run again; those of other policies are kept. A changed policy needs another name.
         progress: Where to write how far it is; None: nowhere.
@@ -152,6 +158,8 @@ def evaluate(
     """
     chosen = _check(name, seeds, steps, batch, recent_steps, env, keywords)
     act = _acting(policy, deterministic)
+    if burn_in is None and (keywords.get("instance"), keywords.get("states")) == (None, None):
+        burn_in = _BURN_IN
     keywords["burn_in"] = burn_in
     keywords.setdefault("timeout", _TIMEOUT)
     if keywords.setdefault("truth", _publishes(keywords.get("instance"))):
@@ -224,14 +232,16 @@ def _play(
         seen, _ = worlds.reset(seed=np.repeat(seeds, n_robots).tolist())
         n_actions = tally.n_moves if env == _MOVES else 1
         truncated = np.zeros(worlds.num_envs, np.bool_)
-        for _ in range(steps):
+        for step in range(1, steps + 1):
             flown: list[NDArray[np.integer]] = []
             for _ in range(n_actions):
                 # A copy: a policy may use its array again.
                 flown.append(np.array(tally.timed(act, seen)))
                 seen, _, _, truncated, _ = worlds.step(flown[-1])
-            if truncated.any():
-                raise InvalidArgumentError("instance: expected a server without --max-steps")
+            if truncated.any() and step < steps:
+                raise InvalidArgumentError(
+                    f"steps: expected at most {step}, as episodes of these worlds have, got {steps}"
+                )
             paths = np.stack(flown, axis=1).reshape(len(truncated), -1)
             tally.add(worlds.unwrapped.results, paths, worlds.unwrapped.truths)
             report.add(len(seeds))

@@ -19,7 +19,8 @@ class Flights:
     def __init__(self, spec: WorldSpec, n_rows: int, *, pays: bool) -> None:
         """`pays`: each cell pays when it is first visited, what its hidden state pays."""
         self.spec: Final = spec
-        self._reward = None if spec.model is None or not pays else spec.model.reward
+        described = spec.described
+        self._reward = None if described is None or not pays else described.reward
         self._last_cell = np.array((spec.height - 1, spec.width - 1), np.int64)
         #: Row and column of each robot.
         self.robots = np.zeros((n_rows, 2), np.int64)

@@ -29,11 +29,11 @@ MAX_VALUES = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Model:
-    """A model; make one with `named` or `from_toml`.
+class Description:
+    """What is known of states and observations: of recorded worlds, that is all.
 
-    S is the number of states, O that of observations, (KH, KW) the kernel's size, both odd. Two
-    models are equal if all they say is, whatever their files look like.
+    S is the number of states, O that of observations. Two descriptions are equal if all they say
+    is, whatever their files look like.
     """
 
     name: str
@@ -46,31 +46,80 @@ class Model:
     """By observed value."""
     observation_colors: tuple[Color, ...]
     """By observed value."""
+    observation_matrix: NDArray[np.float64]
+    """``O[state, observed value]``, each row a distribution, shape (S, O)."""
+    reward: NDArray[np.float64]
+    """What a step pays for each distinct visited cell by its state, shape (S,)."""
+    toml: str
+    """Text of the file, for other programs."""
+
+    @classmethod
+    def from_toml(cls, text: str) -> Self:
+        """Reads the text of a file that a server has accepted."""
+        try:
+            return cls(**cls._fields(tomllib.loads(text)), toml=text)
+        except (AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+            kind = cls.__name__.lower()
+            raise InvalidArgumentError(
+                f"{kind}: expected a file that `emberwatch-server --check` accepts, got {error!r}"
+            ) from None
+
+    @property
+    def n_states(self) -> int:
+        return len(self.state_names)
+
+    @property
+    def n_observations(self) -> int:
+        return len(self.observation_names)
+
+    @property
+    def target_state(self) -> int:
+        """The state that pays most, the first of them: fire in the wildfire model."""
+        return int(np.argmax(self.reward))
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and self._values() == other._values()
+
+    def __hash__(self) -> int:
+        return hash(self.name)
+
+    def _values(self) -> list[object]:
+        values = [getattr(self, field.name) for field in fields(self) if field.name != "toml"]
+        return [value.tolist() if isinstance(value, np.ndarray) else value for value in values]
+
+    @staticmethod
+    def _fields(file: dict[str, Any]) -> dict[str, Any]:
+        """All fields but the text."""
+        states, observations = file["states"], file["observations"]
+        matrix = np.array([state["observed_as"] for state in states], np.float64)
+        return {
+            "name": file["name"],
+            "state_names": tuple(state["name"] for state in states),
+            "state_colors": tuple(color_from_hex(state["color"]) for state in states),
+            "observation_names": tuple(observation["name"] for observation in observations),
+            "observation_colors": tuple(
+                color_from_hex(observation["color"]) for observation in observations
+            ),
+            "observation_matrix": matrix / matrix.sum(axis=1, keepdims=True),
+            "reward": np.array([state.get("reward", 0.0) for state in states], np.float64),
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Model(Description):
+    """A model; make one with `named` or `from_toml`.
+
+    (KH, KW) is the kernel's size, both odd.
+    """
+
     kernels: NDArray[np.float64]
     """``w[next state, state of the neighbour, row, col]``; the centre is the cell itself, rows grow
     downward. One for all cells, shape (1, S, S, KH, KW), or one for each state that a cell itself
     is in, shape (S, S, S, KH, KW)."""
     bias: NDArray[np.float64]
     """``b``, added to each next state's weight, shape (S,)."""
-    observation_matrix: NDArray[np.float64]
-    """``O[state, observed value]``, each row a distribution, shape (S, O)."""
     initial: NDArray[np.float64]
     """Distribution of a cell at the start of the burn-in, shape (S,)."""
-    reward: NDArray[np.float64]
-    """What a step pays for each distinct visited cell by its state, shape (S,)."""
-    toml: str
-    """Text of the model file, for other programs."""
-
-    @classmethod
-    def from_toml(cls, text: str) -> Self:
-        """Reads the text of a model file that a server has accepted."""
-        try:
-            return cls(**_fields(tomllib.loads(text)), toml=text)
-        except (AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
-            raise InvalidArgumentError(
-                f"model: expected a file that `emberwatch-server --check --model FILE` accepts, "
-                f"got {error!r}"
-            ) from None
 
     @classmethod
     def named(cls, name: str | PathLike[str]) -> Self:
@@ -99,28 +148,22 @@ class Model:
         """Whether a cell's weights depend on the state that it is in itself."""
         return len(self.kernels) > 1
 
-    @property
-    def n_states(self) -> int:
-        return len(self.state_names)
-
-    @property
-    def n_observations(self) -> int:
-        return len(self.observation_names)
-
-    @property
-    def target_state(self) -> int:
-        """The state that pays most, the first of them: fire in the wildfire model."""
-        return int(np.argmax(self.reward))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Model) and self._values() == other._values()
-
-    def __hash__(self) -> int:
-        return hash(self.name)
-
-    def _values(self) -> list[object]:
-        values = [getattr(self, field.name) for field in fields(self) if field.name != "toml"]
-        return [value.tolist() if isinstance(value, np.ndarray) else value for value in values]
+    @staticmethod
+    def _fields(file: dict[str, Any]) -> dict[str, Any]:
+        states, described = file["states"], Description._fields(file)
+        names = described["state_names"]
+        n_kernels = len(states) if any("own" in entry for entry in file["kernel"]) else 1
+        kernels = np.zeros((n_kernels, len(states), len(states), *file["kernel_size"]))
+        for entry in file["kernel"]:
+            weights = entry.get("scale", 1.0) * np.array(entry["weights"], np.float64)
+            own = names.index(entry["own"]) if n_kernels > 1 else 0
+            kernels[own, names.index(entry["to"]), names.index(entry["from"])] = weights
+        initial = np.array([state["initial"] for state in states], np.float64)
+        return described | {
+            "kernels": kernels,
+            "bias": np.array([state.get("bias", 0.0) for state in states], np.float64),
+            "initial": initial / initial.sum(),
+        }
 
 
 def built_in_models() -> dict[str, Traversable]:
@@ -128,34 +171,6 @@ def built_in_models() -> dict[str, Traversable]:
     folder = resources.files("emberwatch") / "models"
     files = {file.name.removesuffix(".toml"): file for file in folder.iterdir()}
     return dict(sorted(files.items()))
-
-
-def _fields(file: dict[str, Any]) -> dict[str, Any]:
-    """The fields of `Model` but the text."""
-    states, observations = file["states"], file["observations"]
-    names = tuple(state["name"] for state in states)
-    n_kernels = len(states) if any("own" in entry for entry in file["kernel"]) else 1
-    kernels = np.zeros((n_kernels, len(states), len(states), *file["kernel_size"]))
-    for entry in file["kernel"]:
-        weights = entry.get("scale", 1.0) * np.array(entry["weights"], np.float64)
-        own = names.index(entry["own"]) if n_kernels > 1 else 0
-        kernels[own, names.index(entry["to"]), names.index(entry["from"])] = weights
-    matrix = np.array([state["observed_as"] for state in states], np.float64)
-    initial = np.array([state["initial"] for state in states], np.float64)
-    return {
-        "name": file["name"],
-        "state_names": names,
-        "state_colors": tuple(color_from_hex(state["color"]) for state in states),
-        "observation_names": tuple(observation["name"] for observation in observations),
-        "observation_colors": tuple(
-            color_from_hex(observation["color"]) for observation in observations
-        ),
-        "kernels": kernels,
-        "bias": np.array([state.get("bias", 0.0) for state in states], np.float64),
-        "observation_matrix": matrix / matrix.sum(axis=1, keepdims=True),
-        "initial": initial / initial.sum(),
-        "reward": np.array([state.get("reward", 0.0) for state in states], np.float64),
-    }
 
 
 def color_from_hex(text: str) -> Color:

@@ -183,6 +183,6 @@ def moves_settings(environment: type, reward: str, world: WorldArguments) -> Set
 
 def moves_flights(spec: WorldSpec, n_rows: int, reward: str) -> Flights:
     """The flights of robots that are paid for each move, or for the path."""
-    if reward == "move" and spec.model is None:
+    if reward == "move" and spec.described is None:
         raise InvalidArgumentError("reward='move': expected a server that reveals its model")
     return Flights(spec, n_rows, pays=reward == "move")

@@ -63,9 +63,10 @@ class Observations:
         #: Whether there are parts about other robots.
         self.shows_team = bool(OF_TEAM & set(names))
         if OF_BELIEF & set(names) and spec.model is None:
-            raise InvalidArgumentError(
-                "observation: expected a server that reveals its model, for the belief"
-            )
+            needs = "a server that reveals its model"
+            if spec.is_recorded:
+                needs = "simulated worlds, as recorded ones have no model"
+            raise InvalidArgumentError(f"observation: expected {needs}, for the belief")
         #: The space of one robot's observation.
         self.space = (
             known[names[0]]

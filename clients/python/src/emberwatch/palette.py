@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.model import MAX_VALUES, Color, Model, color_from_hex
+from emberwatch.model import MAX_VALUES, Color, Description, color_from_hex
 from emberwatch.wire import UNOBSERVED
 
 DARK: Final[Color] = (0x14, 0x14, 0x14)
@@ -47,12 +47,12 @@ class Palette:
     """Of a path over observed cells: dark or light, whichever is further from all of them."""
 
     @classmethod
-    def of(cls, source: Model | int, *, on_paper: bool = False) -> Self:
-        """The model's colours, or of a number of observations eight colours in turn.
+    def of(cls, source: Description | int, *, on_paper: bool = False) -> Self:
+        """The described colours, or of a number of observations eight colours in turn.
 
         `on_paper` makes what was not observed light if it can be, as the page around it.
         """
-        if isinstance(source, Model):
+        if isinstance(source, Description):
             states, observations = source.state_colors, source.observation_colors
         else:
             states = tuple(

@@ -8,6 +8,7 @@ from functools import cache
 from typing import Any, NamedTuple, TypeVar, cast, get_origin, get_type_hints
 
 from emberwatch.errors import EmberwatchError
+from emberwatch.model import Description
 from emberwatch.wire import Shape
 
 _Record = TypeVar("_Record")
@@ -53,6 +54,12 @@ class ServerInfo:
     deadline_millis: int
     #: None of simulated worlds.
     recorded_world: RecordedWorld | None = None
+
+    @property
+    def recorded_states(self) -> Description | None:
+        """What recorded worlds say of their states; None if there are none, or it is hidden."""
+        text = None if self.recorded_world is None else self.recorded_world.description
+        return None if text is None else Description.from_toml(text)
 
     @property
     def shape(self) -> Shape:

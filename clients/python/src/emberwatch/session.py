@@ -83,11 +83,12 @@ class Session:
             raise InvalidArgumentError(
                 f"truth: expected at most {wire.TRUTH_BUFFER} worlds, got {n_worlds}"
             )
-        model = self.spec.model
-        if model is not None and not model.reward.any():
+        described = self.spec.described
+        if described is not None and not described.reward.any():
+            kind = "model" if self.spec.description is None else "description"
             _warn(
-                f"model {model.name!r}: no state pays: every reward will be 0; give a state "
-                "a `reward` in the model file"
+                f"{kind} {described.name!r}: no state pays: every reward will be 0; give a state "
+                f"a `reward` in the {kind}'s file"
             )
 
     @property
@@ -297,9 +298,13 @@ class Session:
         if spec != self.spec:
             raise InvalidArgumentError(
                 f"instance {client.instance!r}: expected the server as it was when the environment "
-                f"was made, {replace(self.spec, model=None)}, got {replace(spec, model=None)} or "
-                "another model: make the environment again"
+                f"was made, {_told(self.spec)}, got {_told(spec)} or another model: make the "
+                "environment again"
             )
+
+
+def _told(spec: WorldSpec) -> WorldSpec:
+    return replace(spec, model=None, description=None)
 
 
 class SessionOwner:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from inspect import signature
@@ -12,7 +11,7 @@ from typing import Any, Final, TypedDict, cast, get_type_hints
 import numpy as np
 
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.model import Model
+from emberwatch.model import Description, Model
 from emberwatch.ports import STEP_TIMEOUT
 from emberwatch.programs import check_settings
 from emberwatch.replies import ServerInfo
@@ -138,6 +137,13 @@ class WorldSpec:
     n_robots: int
     #: Whether hidden states come from a states file, not from a model.
     is_recorded: bool
+    #: What recorded worlds say of their states; None if a running server hides it.
+    description: Description | None = None
+
+    @property
+    def described(self) -> Description | None:
+        """What states are called and pay."""
+        return self.description or self.model
 
     @property
     def shape(self) -> Shape:
@@ -163,17 +169,17 @@ def private_spec(settings: Settings, n_rows: int | None) -> tuple[WorldSpec, ran
     n_worlds = len(robots) // (settings.robots or 1)
     checked: dict[str, Any] = check_settings(settings.server_flags(n_worlds))
     states = checked["states"]
-    model = None if states else Model.checked(checked["model"])
-    n_observations = _n_described(Path(states)) if model is None else model.n_observations
+    described = _description(Path(states)) if states else Model.checked(checked["model"])
     spec = WorldSpec(
-        model=model,
+        model=described if isinstance(described, Model) else None,
         height=checked["height"],
         width=checked["width"],
         n_moves=checked["moves"],
-        n_observations=n_observations,
+        n_observations=described.n_observations,
         burn_in=checked["burn_in"],
         n_robots=checked["robots"],
         is_recorded=bool(states),
+        description=described if states else None,
     )
     return spec, robots
 
@@ -217,14 +223,15 @@ def running_spec(
         burn_in=info.burn_in,
         n_robots=info.n_robots,
         is_recorded=info.recorded_world is not None,
+        description=info.recorded_states,
     )
     return spec, robots
 
 
-def _n_described(states: Path) -> int:
-    """Observations of recorded worlds whose states file the server has accepted."""
+def _description(states: Path) -> Description:
+    """That of recorded worlds whose states file the server has accepted."""
     path = states / "states.toml" if states.is_dir() else states.with_suffix(".toml")
-    return len(tomllib.loads(path.read_text("utf-8"))["observations"])
+    return Description.from_toml(path.read_text("utf-8"))
 
 
 def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:

@@ -33,7 +33,7 @@ class View:
                 f"got {render_mode!r}"
             )
         self.mode: Final = render_mode
-        self._palette = Palette.of(spec.n_observations if spec.model is None else spec.model)
+        self._palette = Palette.of(spec.described or spec.n_observations)
         self._screen: Screen | None = None
 
     def draw(

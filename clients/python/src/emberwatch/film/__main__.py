@@ -147,7 +147,10 @@ def _survey(flags: argparse.Namespace, selection: Selection) -> tuple[ServerInfo
     if flags.step is not None and len(episodes) > 1:
         said.append(f"--step: recorded in {len(episodes)} episodes; showing the first")
     if server.model is None and flags.model is None:
-        said.append("the belief is left out, as the server hid its model; give --model")
+        hides = "the server hid its model"
+        if server.recorded_world is not None:
+            hides = "recorded worlds have no model"
+        said.append(f"the belief is left out, as {hides}; give --model")
     for warning in said:
         print(f"{_NAME}: warning: {warning}", file=sys.stderr)
     return server, has_truth, n_steps + n_gaps

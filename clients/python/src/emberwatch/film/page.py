@@ -60,12 +60,14 @@ class Page:
     ) -> None:
         """Lays out and draws what all pictures of a world share; no model leaves the belief out."""
         height, width = server.height, server.width
-        self._name = f"{model.name if model else 'hidden model'}, world {world}"
+        described = server.recorded_states or model
+        self._name = f"{described.name if described else 'hidden model'}, world {world}"
         self._scale = scale or min(max(_LONG_SIDE // max(height, width), 1), _MOST_SCALE)
         self._grid = height * self._scale, width * self._scale
         self._room = max(_LEAST_ROOM, self._grid[1])
-        palette = Palette.of(model or server.n_observations, on_paper=True)
-        self._panels = _panels(palette, server.observations, model, has_truth=has_truth)
+        palette = Palette.of(described or server.n_observations, on_paper=True)
+        names = (described.state_names if described else (), server.observations)
+        self._panels = _panels(palette, names, model, has_truth=has_truth)
         self.palette = _film_palette(palette)
         n_panels = len(self._panels)
         bottom = _TOP + self._grid[0] + 6
@@ -201,12 +203,14 @@ def _film_palette(palette: Palette) -> Image.Image:
 
 
 def _panels(
-    palette: Palette, names: Sequence[str], model: Model | None, *, has_truth: bool
+    palette: Palette,
+    names: tuple[Sequence[str], Sequence[str]],
+    model: Model | None,
+    *,
+    has_truth: bool,
 ) -> list[_Panel]:
-    states = list[tuple[_Mark, str]](
-        zip(palette.states, model.state_names if model else (), strict=False)
-    )
-    seen = list[tuple[_Mark, str]](zip(palette.observations, names, strict=True))
+    states = list[tuple[_Mark, str]](zip(palette.states, names[0], strict=False))
+    seen = list[tuple[_Mark, str]](zip(palette.observations, names[1], strict=True))
     if has_truth and seen == states:
         seen = []  # said once
     truth = _Panel(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
+from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -12,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import EmberwatchError, InvalidArgumentError
-from emberwatch.landscape.fire import BURNING, BURNT, Meaning, seconds, states, times
-from emberwatch.landscape.grid import crop, target_shape
+from emberwatch.landscape.dates import length
+from emberwatch.landscape.fire import BURNING, BURNT, Meaning, states, times
+from emberwatch.landscape.grid import Place, check_alike, crop, of_world, target_shape
 from emberwatch.landscape.layers import Choice, read, stacks
 from emberwatch.landscape.world import description, outputs, write
 
@@ -32,7 +35,7 @@ examples:
 """
 #: Flags that mean something for some kinds only.
 _ONLY_FOR: Final = {
-    "unit": ("arrival",),
+    "begin": ("arrival",),
     "burning": ("arrival", "mask"),
     "codes": ("states",),
     "every": ("mask", "burning", "states"),
@@ -70,9 +73,8 @@ def _parser() -> argparse.ArgumentParser:
         "what has burnt so far; burning: layers of what burns now; states: layers of codes",
     )
     add("--step", required=True, metavar="TIME", help="what one step lasts, such as '10 min'")
-    add(
-        "--unit", choices=("s", "min", "h", "d"), help="what arrival times count [as the file says]"
-    )
+    add("--unit", choices=("s", "min", "h", "d"), help="what times count [as the file says]")
+    add("--begin", type=float, metavar="X", help="arrival time of step 0 [the earliest]")
     add("--burning", type=_whole, metavar="N", help="steps that a cell burns (arrival, mask)")
     add("--every", type=_whole, metavar="N", help="make a step of each so many layers [1]")
     add("--codes", type=_codes, metavar="U,B,D", help="unburnt, burning, burnt [0,1,2]")
@@ -92,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
         "[earliest]",
     )
     add("--oblong", action="store_true", help="take cells that are not square as squares")
+    add("--mixed", action="store_true", help="take sequences whose cells differ on the ground")
     add("--name", help="of the world [the output's]")
     add("--picture", type=Path, metavar="FILE.png", help="draw what came out")
     add("--force", action="store_true", help="replace the output")
@@ -103,22 +106,21 @@ def _import(flags: argparse.Namespace) -> None:
     files = outputs(flags.out, force=flags.force)
     _check_picture(flags)
     choice = Choice(variable=flags.variable, band=flags.band, nodata=tuple(flags.nodata or ()))
-    sequences = list[NDArray[np.uint8]]()
+    sequences, begins = list[NDArray[np.uint8]](), list[datetime | None]()
+    first: Place | None = None
     for stack in stacks(flags.inputs, one_file_each=meaning.kind == "arrival"):
         fire = times(read(stack, choice), meaning)
         window = crop(fire.place, flags.crop)
         left: Any = fire.arrival[window].shape
         sides = {"height": flags.height, "width": flags.width, "cell": flags.cell}
         shape = target_shape(fire.place, left, **sides)
-        if sequences and shape != sequences[0].shape[1:]:
-            height, width = sequences[0].shape[1:]
-            raise InvalidArgumentError(
-                f"{fire.name}: expected {height} x {width} cells as the first sequence, "
-                f"got {shape[0]} x {shape[1]}; use --height and --width"
-            )
+        place = of_world(fire.place, window, shape)
+        first = first or place
+        check_alike(place, fire.name, first, mixed=flags.mixed)
         sequences.append(states(fire, shape, window, flags.resample))
+        begins.append(fire.begin)
     name = flags.name or flags.out.stem
-    write(files[0], sequences, description(name, flags.step))
+    write(files[0], sequences, description(name, flags.step, begins))
     for states_of_fire in sequences:
         print(_told(states_of_fire))
     print(f"{files[0]}: {files[0].stat().st_size} bytes, sequences: {len(sequences)}; {files[1]}")
@@ -142,12 +144,15 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
         )
     if flags.cell is not None and (flags.height, flags.width) != (None, None):
         raise InvalidArgumentError("--cell: expected neither --height nor --width beside it")
+    if flags.begin is not None and not math.isfinite(flags.begin):
+        raise InvalidArgumentError(f"--begin: expected a number, got {flags.begin}")
     if flags.cell is not None and not 0 < flags.cell < float("inf"):
         raise InvalidArgumentError(f"--cell: expected metres above 0, got {flags.cell}")
     return Meaning(
         kind=flags.kind,
-        step=seconds(flags.step),
+        step=length(flags.step),
         unit=flags.unit,
+        begin=flags.begin,
         burning=flags.burning or 1,
         every=flags.every or 1,
         codes=flags.codes or (0, 1, 2),

@@ -9,26 +9,23 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import pairwise
+from datetime import datetime
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
+from emberwatch.landscape.dates import SECONDS, unit_of
 from emberwatch.landscape.grid import Place, Rule, check_same, check_square, resampled
 from emberwatch.landscape.layers import Layer
+from emberwatch.landscape.schedule import Schedule
 
 UNBURNT, BURNING, BURNT = 0, 1, 2
 
 Kind = Literal["arrival", "mask", "burning", "states"]
 
-_SECONDS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
-_SPELLINGS: Final = {
-    "sec": "s", "second": "s", "minute": "min", "hr": "h", "hour": "h", "day": "d"
-}  # fmt: skip
 _MOST_STATES: Final = 1 << 31  # of a sequence, in bytes
-_EVEN: Final = 1e-3  # share by which steps of a time dimension may differ
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +38,8 @@ class Times:
     place: Place
     name: str
     """Of the first layer, for errors."""
+    begin: datetime | None = None
+    """When step 0 is, if the files say."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,27 +50,15 @@ class Meaning:
     step: float
     """Seconds."""
     unit: str | None = None
-    """Of arrival times."""
+    """Of arrival times, or of the times of layers."""
+    begin: float | None = None
+    """The arrival time of step 0, which earlier ones count as; None: the earliest."""
     burning: int = 1
     """Steps that a cell burns after its arrival."""
     every: int = 1
     codes: tuple[float, float, float] = (UNBURNT, BURNING, BURNT)
     oblong: bool = False
     missing_is_unburnt: bool = False
-
-
-def seconds(text: str) -> float:
-    """A length of time such as `10 min`."""
-    number, _, unit = text.strip().partition(" ")
-    try:
-        length = float(number) * _SECONDS[_unit(unit)]
-    except (KeyError, ValueError):
-        length = 0.0
-    if not 0.0 < length < math.inf:
-        raise InvalidArgumentError(
-            f"--step: expected a number and s, min, h or d, such as '10 min', got '{text}'"
-        )
-    return length
 
 
 def times(layers: Iterable[Layer], meaning: Meaning) -> Times:
@@ -120,26 +107,36 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
     _check_square(layer, meaning)
     arrival = np.where(np.isnan(layer.values), np.inf, layer.values)
     negative = arrival < 0
-    if negative.any():
+    # Where each cell has a time, a negative one may mean never.
+    if negative.any() and (meaning.begin is None or not np.isinf(arrival).any()):
         raise InvalidArgumentError(
             f"{layer.name}: expected times of at least 0, got {_first(layer, negative)}; if that "
-            "means never, say --nodata"
+            "means never, say --nodata; if it burnt before, --begin 0"
         )
     finite = arrival[np.isfinite(arrival)]
     if not finite.size:
         raise InvalidArgumentError(f"{layer.name}: expected cells that burn, got none")
-    step = meaning.step / _SECONDS[_unit_of(layer, meaning)]
+    unit = unit_of(layer.clock, meaning.unit, layer.name)
+    if unit is None:
+        raise InvalidArgumentError(
+            f"--unit: expected s, min, h or d, as {layer.name} does not say what its times count, "
+            "got none"
+        )
+    step = meaning.step / SECONDS[unit]
+    begin = float(finite.min()) if meaning.begin is None else meaning.begin
     # A step shows the fire at its time: what begins later burns in the next one. Rounded, so that
     # three steps are not a bit more than three.
-    steps = np.ceil((arrival - finite.min()) / step - 1e-6)
+    steps = np.ceil((np.maximum(arrival, begin) - begin) / step - 1e-6)
     n_steps = int(steps[np.isfinite(steps)].max()) + 1
-    return _checked(steps, steps + meaning.burning, n_steps, layer)
+    date = layer.clock.date(begin * SECONDS[unit])
+    return _checked(steps, steps + meaning.burning, n_steps, layer, date)
 
 
 def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
     first: Layer | None = None
     arrival = burnt = np.empty(0)
-    dates, n_layers, mark = list[float](), 0, math.nan
+    schedule = Schedule(step=meaning.step, every=meaning.every, unit=meaning.unit)
+    mark = math.nan
     for k, layer in enumerate(layers):
         if first is None:
             first = layer
@@ -147,19 +144,15 @@ def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
             arrival = np.full(layer.place.shape, np.inf)
             burnt = arrival.copy()
         check_same(layer.place, layer.name, first.place, first.name)
-        if layer.time is not None:
-            dates.append(layer.time)
-            _check_dates(dates, layer)
+        schedule.add(layer.name, layer.time)
         mark = _add(layer, k, meaning, arrival, burnt, mark)
-        n_layers = k + 1
     if first is None:
         raise InvalidArgumentError("layers: expected at least 2, got none")
+    steps, n_steps = schedule.steps()
+    arrival, burnt = _at(arrival, steps), _at(burnt, steps)
     if meaning.kind == "mask":
-        burnt = np.ceil(arrival / meaning.every) + meaning.burning
-    else:
-        burnt = np.ceil(burnt / meaning.every)
-    arrival = np.ceil(arrival / meaning.every)
-    return _checked(arrival, burnt, (n_layers - 1) // meaning.every + 1, first)
+        burnt = arrival + meaning.burning
+    return _checked(arrival, burnt, n_steps, first, schedule.begin)
 
 
 def _add(
@@ -224,51 +217,34 @@ def _check_order(
             raise InvalidArgumentError(f"{layer.name}: expected {told}, the first {_cell(wrong)}")
 
 
-def _check_dates(dates: list[float], layer: Layer) -> None:
-    steps = [after - before for before, after in pairwise(dates)]
-    if steps and steps[-1] <= 0:
-        raise InvalidArgumentError(
-            f"{layer.name}: expected a later time than {dates[-2]:.6g}, got {dates[-1]:.6g}"
-        )
-    if steps and abs(steps[-1] - steps[0]) > _EVEN * steps[0]:
-        raise InvalidArgumentError(
-            f"{layer.name}: expected steps of {steps[0]:.6g} in time, got {steps[-1]:.6g}"
-        )
-
-
 def _check_square(layer: Layer, meaning: Meaning) -> None:
     if not meaning.oblong:
         check_square(layer.place, layer.name)
 
 
 def _checked(
-    arrival: NDArray[np.float64], burnt: NDArray[np.float64], n_steps: int, layer: Layer
+    arrival: NDArray[np.float64],
+    burnt: NDArray[np.float64],
+    n_steps: int,
+    layer: Layer,
+    begin: datetime | None,
 ) -> Times:
     if n_steps < 2:
         raise InvalidArgumentError(f"{layer.name}: expected at least 2 steps, got {n_steps}")
-    return Times(arrival=arrival, burnt=burnt, n_steps=n_steps, place=layer.place, name=layer.name)
+    return Times(
+        arrival=arrival,
+        burnt=burnt,
+        n_steps=n_steps,
+        place=layer.place,
+        name=layer.name,
+        begin=begin,
+    )
 
 
-def _unit_of(layer: Layer, meaning: Meaning) -> str:
-    """What the times count: as the flag or the file says."""
-    in_file = _unit(layer.unit.partition(" since ")[0]) if layer.unit else None
-    if in_file not in _SECONDS:
-        in_file = None
-    unit = meaning.unit or in_file
-    if unit is None:
-        raise InvalidArgumentError(
-            f"--unit: expected s, min, h or d, as {layer.name} does not say what its times count, "
-            "got none"
-        )
-    if in_file is not None and unit != in_file:
-        raise InvalidArgumentError(f"--unit: expected {in_file}, as in {layer.name}, got {unit}")
-    return unit
-
-
-def _unit(text: str) -> str:
-    word = text.strip().lower()
-    word = word if word in _SECONDS else word.removesuffix("s")
-    return _SPELLINGS.get(word, word)
+def _at(layers: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The steps of layers; infinite ones stay."""
+    numbers = np.where(np.isfinite(layers), layers, len(steps)).astype(np.intp)
+    return np.append(steps, np.inf)[numbers]
 
 
 def _cell(cells: NDArray[np.bool_]) -> str:

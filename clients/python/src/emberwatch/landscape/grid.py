@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -72,6 +72,44 @@ def check_square(place: Place, name: str) -> None:
             f"{name}: expected square cells, got {width:.6g} x {height:.6g}{unit}; reproject it "
             "(gdalwarp), or take them as squares with --oblong"
         )
+
+
+def check_alike(place: Place, name: str, first: Place, *, mixed: bool) -> None:
+    """Refuses a sequence whose world has another grid than the first one's.
+
+    `mixed` allows cells of another size or projection.
+    """
+    if place.shape != first.shape:
+        raise InvalidArgumentError(
+            f"{name}: expected {_size(first)} cells as the first sequence, got {_size(place)}; "
+            "use --height and --width"
+        )
+    if mixed:
+        return
+    if (place.projection, place.corner is None) != (first.projection, first.corner is None):
+        raise InvalidArgumentError(
+            f"{name}: expected the projection of the first sequence, {_projection(first)}, got "
+            f"{_projection(place)}; --mixed takes both"
+        )
+    sides = np.array([place.sides(), first.sides()])
+    if place.corner is not None and (np.abs(sides[0] / sides[1] - 1) > _SQUARE).any():
+        of_first, got = (f"{width:.6g} x {height:.6g}" for width, height in sides[::-1])
+        raise InvalidArgumentError(
+            f"{name}: expected cells of {of_first} on the ground as in the first sequence, got "
+            f"{got}; use --cell or --crop, or take both with --mixed"
+        )
+
+
+def of_world(place: Place, window: tuple[slice, slice], shape: tuple[int, int]) -> Place:
+    """The grid that a part of an input becomes."""
+    rows, columns = window
+    width = place.cell[0] * (columns.stop - columns.start) / shape[1]
+    height = place.cell[1] * (rows.stop - rows.start) / shape[0]
+    corner = place.corner and (
+        place.corner[0] + place.cell[0] * columns.start,
+        place.corner[1] + place.cell[1] * rows.start,
+    )
+    return replace(place, shape=shape, corner=corner, cell=(width, height))
 
 
 def crop(place: Place, wanted: tuple[int, int, int, int] | None) -> tuple[slice, slice]:

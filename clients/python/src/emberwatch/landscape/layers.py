@@ -1,24 +1,27 @@
 """Files as layers: one array of numbers each, with the place of its cells.
 
 GeoTIFF, ESRI ASCII grid and NetCDF are read by GDAL through rasterio, NumPy files by NumPy. One
-layer is in memory at a time.
+layer is in memory at a time, of NumPy files the whole array.
 """
 
 from __future__ import annotations
 
 import importlib
+import math
 import re
 import warnings
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 import numpy as np
+from numpy.lib.format import read_array_header_1_0, read_array_header_2_0, read_magic
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
+from emberwatch.landscape.dates import Clock, Time
 from emberwatch.landscape.grid import Place
 
 _DRIVERS: Final = {
@@ -32,6 +35,7 @@ _KNOWN: Final = ", ".join((*_DRIVERS, *_NUMPY))
 #: Files that say where the cells of others are, which GDAL reads with them.
 _BESIDE: Final = (".prj", ".tfw", ".xml")
 _MOST_CELLS: Final = 1 << 27  # of a layer: 1 GiB as numbers
+_MOST_BYTES: Final = 1 << 32  # of a NumPy array, all of which is in memory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,9 +56,9 @@ class Layer:
     values: NDArray[np.float64]
     """Shape (rows, columns), the first row in the north; NaN where the file has no value."""
     place: Place
-    unit: str | None
-    """What a number counts, in the file's words."""
-    time: float | None
+    clock: Clock = Clock()
+    """What a number counts, if it is a time."""
+    time: Time | None = None
     """Where the file has a time dimension: the layer's place on it."""
 
 
@@ -109,38 +113,64 @@ def _by_number(file: Path) -> list[tuple[int, str]]:
 
 def _read_numpy(file: Path, choice: Choice) -> Iterator[Layer]:
     array = _array(file, choice)
-    if array.dtype.kind not in "biuf" or array.ndim not in (2, 3) or not array.size:
-        raise InvalidArgumentError(
-            f"{file}: expected numbers of shape (rows, columns) or (layers, rows, columns), "
-            f"got {array.dtype} {array.shape}"
-        )
     array = array.reshape(-1, *array.shape[-2:])
     for band in _bands(file, len(array), choice):
         yield Layer(
             name=f"{file}, layer {band}" if len(array) > 1 else str(file),
             values=array[band - 1].astype(np.float64),
             place=Place(shape=(array.shape[1], array.shape[2])),
-            unit=None,
-            time=None,
         )
 
 
 def _array(file: Path, choice: Choice) -> NDArray[Any]:
     try:
-        loaded: Any = np.load(file, allow_pickle=False)
-        if hasattr(loaded, "dtype"):
-            if choice.variable is not None:
-                raise InvalidArgumentError(
-                    f"--variable: expected none for {file}, which has one array, "
-                    f"got '{choice.variable}'"
-                )
-            return loaded
-        with loaded:
-            return loaded[_variable(file, list(loaded), choice.variable)]
+        if zipfile.is_zipfile(file):
+            with np.load(file, allow_pickle=False) as arrays:
+                name = _variable(file, list(arrays), choice.variable)
+                members = arrays.zip.namelist()
+                with arrays.zip.open(name if name in members else f"{name}.npy") as member:
+                    _check_header(file, member)
+                return arrays[name]
+        if choice.variable is not None:
+            raise InvalidArgumentError(
+                f"--variable: expected none for {file}, which has one array, "
+                f"got '{choice.variable}'"
+            )
+        with file.open("rb") as opened:
+            _check_header(file, opened)
+        return np.load(file, allow_pickle=False)
     except InvalidArgumentError:
         raise
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InvalidArgumentError(f"{file}: expected a NumPy file, got: {error}") from None
+
+
+def _check_header(file: Path, opened: IO[bytes]) -> None:
+    """Refuses an array before its values are read."""
+    version = read_magic(opened)
+    header = {(1, 0): read_array_header_1_0, (2, 0): read_array_header_2_0}.get(version)
+    if header is None:
+        raise ValueError(f"version {version} of the format")
+    shape, _, dtype = header(opened)
+    if dtype.kind not in "biuf" or len(shape) not in (2, 3) or 0 in shape:
+        raise InvalidArgumentError(
+            f"{file}: expected numbers of shape (rows, columns) or (layers, rows, columns), "
+            f"got {dtype} {shape}"
+        )
+    _check_cells(file, *shape[-2:])
+    n_bytes = math.prod(shape) * dtype.itemsize
+    if n_bytes > _MOST_BYTES:
+        raise InvalidArgumentError(
+            f"{file}: expected at most {_MOST_BYTES} bytes of numbers, got {n_bytes}: {dtype} "
+            f"{shape}"
+        )
+
+
+def _check_cells(file: Path, height: int, width: int) -> None:
+    if height * width > _MOST_CELLS:
+        raise InvalidArgumentError(
+            f"{file}: expected at most {_MOST_CELLS} cells, got {height} x {width}"
+        )
 
 
 def _read_raster(file: Path, choice: Choice) -> Iterator[Layer]:
@@ -209,10 +239,7 @@ def _bands(file: Path, count: int, choice: Choice) -> Sequence[int]:
 
 def _place(file: Path, source: Any) -> Place:
     """Where the cells are; a file that does not say so has the identity as its transform."""
-    if source.width * source.height > _MOST_CELLS:
-        raise InvalidArgumentError(
-            f"{file}: expected at most {_MOST_CELLS} cells, got {source.height} x {source.width}"
-        )
+    _check_cells(file, source.height, source.width)
     shape, transform, crs = (source.height, source.width), source.transform, source.crs
     if transform.is_identity:
         return Place(shape=shape)
@@ -236,21 +263,32 @@ def _layer(file: Path, source: Any, place: Place, band: int) -> Layer:
     values = masked.filled(np.nan) * source.scales[band - 1] + source.offsets[band - 1]
     if place.cell[1] > 0 and place.corner is not None:  # the first row is in the south
         values = values[::-1].copy()
+    tags, of_band = source.tags(), source.tags(band)
+    dimension = _dimension(file, tags)
+    time = None
+    if f"NETCDF_DIM_{dimension}_VALUES" in tags:  # else the dimension only counts the layers
+        time = Time(float(of_band[f"NETCDF_DIM_{dimension}"]), _clock(dimension, tags, None))
     return Layer(
         name=f"{file}, band {band}" if source.count > 1 else str(file),
         values=values,
         place=place,
-        unit=source.units[band - 1] or None,
-        time=_time(file, source.tags(), source.tags(band)),
+        clock=_clock(of_band.get("NETCDF_VARNAME", ""), tags, source.units[band - 1]),
+        time=time,
     )
 
 
-def _time(file: Path, tags: dict[str, str], of_band: dict[str, str]) -> float | None:
+def _clock(variable: str, tags: dict[str, str], unit: str | None) -> Clock:
+    return Clock(
+        unit or tags.get(f"{variable}#units", ""), tags.get(f"{variable}#calendar", "standard")
+    )
+
+
+def _dimension(file: Path, tags: dict[str, str]) -> str:
+    """The one beside rows and columns, if any."""
     extra = tags.get("NETCDF_DIM_EXTRA", "{}").strip("{}").split(",")
     if len(extra) > 1:
         raise InvalidArgumentError(
             f"{file}: expected a variable of time, rows and columns, got it over {', '.join(extra)}"
             " as well"
         )
-    value = of_band.get(f"NETCDF_DIM_{extra[0]}")
-    return None if value is None else float(value)
+    return extra[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import IO, Final, NamedTuple
 
@@ -33,9 +34,12 @@ COLORS: Final[tuple[Color, ...]] = tuple(color_from_hex(state.color) for state i
 _RIGHT, _WRONG = 0.98, 0.01
 
 
-def description(name: str, step: str) -> str:
-    """The text of the `.toml`."""
+def description(name: str, step: str, begins: Sequence[datetime | None] = ()) -> str:
+    """The text of the `.toml`; `begins`: when step 0 of each sequence is, where that is known."""
     lines = [f"name = {_quoted(name)}", f"step = {_quoted(step)} # that one step lasts"]
+    for number, begin in enumerate(begins):
+        if begin is not None:
+            lines.append(f"# {_array(number)} begins at {begin:%Y-%m-%d %H:%M:%S} UTC")
     for state in STATES:
         row = ", ".join(str(_RIGHT if other is state else _WRONG) for other in STATES)
         lines += ["", "[[states]]", f'name = "{state.name}"', f'color = "{state.color}"']
@@ -43,6 +47,10 @@ def description(name: str, step: str) -> str:
     for state in STATES:
         lines += ["", "[[observations]]", f'name = "{state.name}"', f'color = "{state.color}"']
     return "\n".join(lines) + "\n"
+
+
+def _array(number: int) -> str:
+    return f"states_{number:03}"
 
 
 def _quoted(text: str) -> str:
@@ -63,7 +71,7 @@ def outputs(out: Path, *, force: bool) -> tuple[Path, Path]:
 
 def write(out: Path, sequences: Sequence[NDArray[np.uint8]], text: str) -> None:
     """Writes both files, each beside itself first, so that none is ever half written."""
-    arrays = {f"states_{number:03}": states for number, states in enumerate(sequences)}
+    arrays = {_array(number): states for number, states in enumerate(sequences)}
     out.parent.mkdir(parents=True, exist_ok=True)
     _replace(out, lambda file: np.savez_compressed(file, **arrays))  # pyright: ignore
     _replace(out.with_suffix(".toml"), lambda file: file.write(text.encode()))

@@ -1,0 +1,93 @@
+"""What times in files count, and from when: `hours since 2020-08-01 12:00`."""
+
+from __future__ import annotations
+
+import math
+import re
+from datetime import UTC, datetime, timedelta, timezone
+from typing import Final, NamedTuple
+
+from emberwatch.errors import InvalidArgumentError
+
+SECONDS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+"""Of each unit."""
+
+_SPELLINGS: Final = {
+    "sec": "s", "second": "s", "minute": "min", "hr": "h", "hour": "h", "day": "d"
+}  # fmt: skip
+#: Calendars whose dates are ours.
+_CALENDARS: Final = ("standard", "gregorian", "proleptic_gregorian")
+_GREGORIAN: Final = 1583  # the first year in which they mean the same days
+_DATE: Final = re.compile(
+    r"(\d{4})-(\d{1,2})-(\d{1,2})(?:[T ]+(\d{1,2})(?::(\d{1,2}))?(?::(\d{1,2})(?:\.\d*)?)?)?"
+    r"\s*(?:Z|UTC|GMT|([+-]\d{1,2})(?::?(\d{2}))?)?"
+)
+
+
+class Clock(NamedTuple):
+    """What the times in a file count, in its words."""
+
+    words: str = ""
+    calendar: str = "standard"
+
+    def unit(self) -> str | None:
+        """One of `SECONDS`; None if the file does not say."""
+        unit = _unit(self.words.partition(" since ")[0])
+        return unit if unit in SECONDS else None
+
+    def date(self, seconds: float) -> datetime | None:
+        """So long after the count was 0."""
+        epoch = self.epoch()
+        try:
+            return None if epoch is None else epoch + timedelta(seconds=seconds)
+        except OverflowError:
+            return None
+
+    def epoch(self) -> datetime | None:
+        """When the count is 0; None if the file does not say, or in another calendar."""
+        parts = _DATE.fullmatch(self.words.partition(" since ")[2].strip())
+        if parts is None or self.calendar.lower() not in _CALENDARS:
+            return None
+        *numbers, hours, minutes = (int(part) for part in parts.groups(default="0"))
+        if numbers[0] < _GREGORIAN:
+            return None
+        try:
+            ahead = timedelta(hours=hours, minutes=-minutes if hours < 0 else minutes)
+            return datetime(*numbers, tzinfo=timezone(ahead)).astimezone(UTC)
+        except ValueError:
+            return None
+
+
+class Time(NamedTuple):
+    """When a layer is."""
+
+    value: float
+    clock: Clock
+
+
+def length(text: str) -> float:
+    """Seconds of a length of time such as `10 min`."""
+    number, _, unit = text.strip().partition(" ")
+    try:
+        seconds = float(number) * SECONDS[_unit(unit)]
+    except (KeyError, ValueError):
+        seconds = 0.0
+    if not 0.0 < seconds < math.inf:
+        raise InvalidArgumentError(
+            f"--step: expected a number and s, min, h or d, such as '10 min', got '{text}'"
+        )
+    return seconds
+
+
+def unit_of(clock: Clock, wanted: str | None, name: str) -> str | None:
+    """What the times count, as the flag or the file says."""
+    in_file = clock.unit()
+    if None not in (wanted, in_file) and wanted != in_file:
+        raise InvalidArgumentError(f"--unit: expected {in_file}, as in {name}, got {wanted}")
+    return wanted or in_file
+
+
+def _unit(text: str) -> str:
+    word = text.strip().lower()
+    word = word if word in SECONDS else word.removesuffix("s")
+    return _SPELLINGS.get(word, word)
