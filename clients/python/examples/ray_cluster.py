@@ -57,6 +57,7 @@ class NodeServer:
         try:
             emberwatch.connect(self._instance).close()
         except EmberwatchError:
+            self._server.stop()
             self._start()
         return self._instance
 
@@ -76,10 +77,13 @@ class Servers:
     def instance(self, node: str) -> str:
         """The instance on a node."""
         if node not in self._servers:
-            here = NodeAffinitySchedulingStrategy(node, soft=False)
-            server = NodeServer.options(scheduling_strategy=here)
-            self._servers[node] = server.remote(self._n_worlds)
+            self._servers[node] = NodeServer.options(**on(node)).remote(self._n_worlds)
         return ray.get(self._servers[node].instance.remote())
+
+
+def on(node: str) -> dict[str, Any]:
+    """The options of an actor that runs on this node and nowhere else."""
+    return {"scheduling_strategy": NodeAffinitySchedulingStrategy(node, soft=False)}
 
 
 def make(settings: dict[str, Any]) -> gymnasium.vector.VectorEnv:
@@ -139,15 +143,14 @@ def train(algorithm: Algorithm, iterations: int, kills: bool) -> None:
     """Prints what each iteration made, and who made it; after kills goes on until all are back."""
     iteration = n_flying = 0
     while iteration < iterations or (kills and n_flying < algorithm.config.num_env_runners):
-        result = algorithm.train()
-        runners, seconds = result["env_runners"], result["timers"]["env_runner_sampling_timer"]
+        runners = algorithm.train()["env_runners"]
         steps = runners["num_env_steps_sampled_lifetime"]
         pay = runners.get("episode_return_mean", float("nan"))
         where = places(algorithm)
         words = [f"runners {sorted(where[server])} on server {server}" for server in sorted(where)]
         print(
-            f"iteration {iteration}: {steps:.0f} moves, sampled in {seconds:.2f} s, reward of an "
-            f"episode {pay:.1f}, {', '.join(words)}",
+            f"iteration {iteration}: {steps:.0f} moves, reward of an episode {pay:.1f}, "
+            f"{', '.join(words)}",
             flush=True,
         )
         if kills and iteration == 0:
@@ -176,7 +179,8 @@ def main() -> None:
         cluster.add_node(**node)
     ray.init(address=args.address or cluster.address, log_to_driver=False)
     register_env("wildfire", make)
-    servers = Servers.options(name="servers").remote(args.runners * args.worlds)
+    here = on(ray.get_runtime_context().get_node_id())
+    servers = Servers.options(name="servers", **here).remote(args.runners * args.worlds)
     config = (
         PPOConfig()
         .environment("wildfire", env_config={"runners": args.runners, "private": args.private})
