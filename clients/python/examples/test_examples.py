@@ -32,6 +32,12 @@ EXAMPLES = [
     ("rllib_ppo.py", "--iterations 1 --batch 500", r"iteration 0: 500\S* steps, reward of an epi"),
     ("rllib_team.py", "--iterations 1 --batch 500", r"iteration 0: 500\S* moves, reward of .* \d"),
     (
+        "ray_cluster.py",
+        "--iterations 3 --batch 800 --kill",
+        r"runner (\d+) is killed\n(?:.*\n)*server (\d+) is killed\n(?:.*\n)*"
+        r"iteration (?!.*\b(?:\1|\2)\b)\d+: .*(?:, runners \[\d+, \d+\] on server \d+){2}\n",
+    ),
+    (
         "supersuit_team.py",
         "--total-steps 400 --worlds 2 --steps 5",
         r"ppo_marginal: \d\S* \+- \S+ a step on 8 worlds\nvisited twice: \d",

@@ -1,0 +1,88 @@
+"""Steps a second of several processes, each with a private server or all with one that they share.
+
+Each process steps worlds of its own together, and all of them at the same time. Rounds take turns,
+so that a noisy machine is noisy for all. Prints the median over rounds, of all processes together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import statistics
+import time
+from multiprocessing.connection import Connection
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import emberwatch
+from emberwatch.programs import Program, unused_instance
+
+WILDFIRE = "emberwatch:emberwatch/Wildfire-v0"
+SEEN: dict[str, Any] = {"observation": "frame", "max_episode_steps": 2**31 - 1}
+
+
+def work(pipe: Connection, instance: str, process: int, n_worlds: int) -> None:
+    """Steps for as long as it is told and tells how fast, until it is told to end."""
+    shared = {"instance": instance, "world": process * n_worlds}
+    peers = {
+        "private": gymnasium.make_vec(WILDFIRE, n_worlds, **SEEN),
+        "shared": gymnasium.make_vec(WILDFIRE, n_worlds, **shared, **SEEN),
+    }
+    for envs in peers.values():
+        envs.reset(seed=1000)
+    paths = peers["private"].action_space.sample().astype(np.uint8)
+    pipe.send("ready")
+    for kind, seconds in iter(pipe.recv, None):
+        n_steps, began = 0, time.perf_counter()
+        while time.perf_counter() - began < seconds:
+            peers[kind].step(paths)
+            n_steps += n_worlds
+        pipe.send(n_steps / (time.perf_counter() - began))
+    for envs in peers.values():
+        envs.close()
+
+
+def main() -> None:
+    """Races numbers of processes."""
+    parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument("--processes", type=int, nargs="+", default=[1, 2, 4])
+    parser.add_argument("--worlds", type=int, default=8, help="of each process")
+    parser.add_argument("--seconds", type=float, default=0.5, help="of a round")
+    parser.add_argument("--rounds", type=int, default=7)
+    args = parser.parse_args()
+    instance, most = unused_instance(), max(args.processes)
+    server = Program(
+        "emberwatch-server", [f"--instance={instance}", f"--worlds={most * args.worlds}"]
+    )
+    server.wait_for(lambda: emberwatch.connect(instance)).close()
+    context = multiprocessing.get_context("spawn")
+    pipes, processes = [], []
+    for number in range(most):
+        pipe, end = context.Pipe()
+        processes.append(context.Process(target=work, args=(end, instance, number, args.worlds)))
+        processes[-1].start()
+        pipes.append(pipe)
+    for pipe in pipes:
+        pipe.recv()
+
+    rates: dict[tuple[int, str], list[float]] = {}
+    for _ in range(args.rounds):
+        for n_processes in args.processes:
+            for kind in ("private", "shared"):
+                for pipe in pipes[:n_processes]:
+                    pipe.send((kind, args.seconds))
+                rate = sum(pipe.recv() for pipe in pipes[:n_processes])
+                rates.setdefault((n_processes, kind), []).append(rate)
+    for (n_processes, kind), rounds in rates.items():
+        median, span = statistics.median(rounds), f"{min(rounds):.0f} to {max(rounds):.0f}"
+        print(f"{n_processes} {kind:8} {median:9.0f} steps/s ({span})")
+    for pipe, process in zip(pipes, processes, strict=True):
+        pipe.send(None)
+        process.join()
+    server.stop()
+
+
+if __name__ == "__main__":
+    main()

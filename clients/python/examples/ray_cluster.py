@@ -1,0 +1,206 @@
+"""RLlib's PPO on several machines, with one server on each, which the runners there share.
+
+Shared memory ends at the host, so each node of the cluster has a server of its own. A runner flies
+a part of its worlds that no other runner holds. Runners and servers may die: training goes on.
+
+    python ray_cluster.py --iterations 50                 # two nodes on this machine
+    python ray_cluster.py --address auto --runners 30     # a cluster that runs already
+    python ray_cluster.py --kill                          # kills a runner, and later a server
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import threading
+from collections import defaultdict
+from typing import Any
+
+import gymnasium
+import numpy as np
+import ray
+from gymnasium.wrappers.vector import TransformObservation
+from ray.cluster_utils import Cluster
+from ray.rllib.algorithms.algorithm import Algorithm
+from ray.rllib.algorithms.ppo import PPOConfig
+from ray.tune.registry import register_env
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+import emberwatch
+from emberwatch.errors import EmberwatchError
+from emberwatch.programs import Program, unused_instance
+from emberwatch.settings import Settings
+
+MOVES = "emberwatch/WildfireMoves-v0"
+WORLD: dict[str, Any] = {
+    "model": "wildfire-small",
+    "height": 16,
+    "width": 16,
+    "n_moves": 16,
+    "burn_in": 3000,
+}
+SEEN = {"observation": "local", "max_episode_steps": 96}
+
+
+@ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)
+class NodeServer:
+    """Keeps a server on its node, which ends with it."""
+
+    def __init__(self, n_worlds: int) -> None:
+        self._instance = unused_instance()
+        self._flags = [f"--instance={self._instance}", *Settings(**WORLD).server_flags(n_worlds)]
+        self._start()
+
+    def instance(self) -> str:
+        """The instance to attach to; starts another server if the last one has died."""
+        try:
+            emberwatch.connect(self._instance).close()
+        except EmberwatchError:
+            self._server.stop()
+            self._start()
+        return self._instance
+
+    def _start(self) -> None:
+        self._server = Program("emberwatch-server", self._flags)
+        self._server.wait_for(lambda: emberwatch.connect(self._instance)).close()
+
+
+@ray.remote(num_cpus=0)
+class Servers:
+    """Those of all nodes, made when a runner asks. They end with the training, however it ends."""
+
+    def __init__(self, n_worlds: int) -> None:
+        self._n_worlds = n_worlds
+        self._servers: dict[str, Any] = {}
+
+    def instance(self, node: str) -> str:
+        """The instance on a node."""
+        if node not in self._servers:
+            self._servers[node] = NodeServer.options(**on(node)).remote(self._n_worlds)
+        return ray.get(self._servers[node].instance.remote())
+
+
+def on(node: str) -> dict[str, Any]:
+    """The options of an actor that runs on this node and nowhere else."""
+    return {"scheduling_strategy": NodeAffinitySchedulingStrategy(node, soft=False)}
+
+
+def make(settings: dict[str, Any]) -> gymnasium.vector.VectorEnv:
+    """Makes all environments of a runner, in its process."""
+    n_worlds = settings["num_envs"]
+    if settings["private"]:
+        return scaled(gymnasium.make_vec(MOVES, n_worlds, **WORLD, **SEEN))
+    node = ray.get_runtime_context().get_node_id()
+    instance = ray.get(ray.get_actor("servers").instance.remote(node))
+    for part in range(settings["runners"]):
+        envs = gymnasium.make_vec(MOVES, n_worlds, instance=instance, world=part * n_worlds, **SEEN)
+        try:
+            envs.reset(options={"resume": True})  # takes these worlds
+            return scaled(envs)
+        except EmberwatchError as error:
+            envs.close()
+            if error.code != "busy":
+                raise
+    raise RuntimeError(f"instance {instance}: other clients hold its worlds")
+
+
+def scaled(envs: gymnasium.vector.VectorEnv) -> gymnasium.vector.VectorEnv:
+    """Windows as vectors of 0 to 1."""
+    length = int(np.prod(envs.single_observation_space.shape))
+    return TransformObservation(
+        envs,
+        lambda seen: seen.reshape(len(seen), length) / np.float32(255),
+        single_observation_space=gymnasium.spaces.Box(0, 1, (length,)),
+    )
+
+
+def places(algorithm: Algorithm) -> dict[int, list[int]]:
+    """The processes of the runners on each server, which is a process, too."""
+
+    def place(runner: Any) -> tuple[int, int]:
+        with emberwatch.connect(runner.env.unwrapped.instance) as client:
+            return client.info.pid, os.getpid()
+
+    group = algorithm.env_runner_group
+    found = defaultdict(list)
+    for server, runner in group.foreach_env_runner(place, local_env_runner=False):
+        found[server].append(runner)
+    return found
+
+
+def kill_soon(kind: str, pid: int) -> None:
+    """Kills a process of this machine while the next iteration samples."""
+
+    def kill() -> None:
+        os.kill(pid, signal.SIGKILL)
+        print(f"{kind} {pid} is killed", flush=True)
+
+    threading.Timer(0.2, kill).start()
+
+
+def train(algorithm: Algorithm, iterations: int, kills: bool) -> None:
+    """Prints what each iteration made, and who made it; after kills goes on until all are back."""
+    iteration = n_flying = 0
+    while iteration < iterations or (kills and n_flying < algorithm.config.num_env_runners):
+        runners = algorithm.train()["env_runners"]
+        steps = runners["num_env_steps_sampled_lifetime"]
+        pay = runners.get("episode_return_mean", float("nan"))
+        where = places(algorithm)
+        words = [f"runners {sorted(where[server])} on server {server}" for server in sorted(where)]
+        print(
+            f"iteration {iteration}: {steps:.0f} moves, reward of an episode {pay:.1f}, "
+            f"{', '.join(words)}",
+            flush=True,
+        )
+        if kills and iteration == 0:
+            kill_soon("runner", min(where.values(), key=len)[0])
+        if kills and iteration == 1:
+            kill_soon("server", min(where))
+        iteration, n_flying = iteration + 1, sum(map(len, where.values()))
+
+
+def main() -> None:
+    """Trains on a cluster, of two nodes on this machine if there is none."""
+    parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument("--address", help="of a running cluster; else two nodes here")
+    parser.add_argument("--iterations", type=int, default=20)
+    parser.add_argument("--runners", type=int, default=4, help="at most 15 on a node")
+    parser.add_argument("--worlds", type=int, default=8, help="of each runner")
+    parser.add_argument("--batch", type=int, default=4000, help="moves of an iteration")
+    parser.add_argument("--private", action="store_true", help="a server for each runner instead")
+    parser.add_argument("--kill", action="store_true", help="a runner and a server, on nodes here")
+    args = parser.parse_args()
+
+    cluster = None
+    if args.address is None:
+        node = {"num_cpus": (args.runners + 1) // 2, "object_store_memory": 100 * 2**20}
+        cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
+        cluster.add_node(**node)
+    ray.init(address=args.address or cluster.address, log_to_driver=False)
+    register_env("wildfire", make)
+    here = on(ray.get_runtime_context().get_node_id())
+    servers = Servers.options(name="servers", **here).remote(args.runners * args.worlds)
+    config = (
+        PPOConfig()
+        .environment("wildfire", env_config={"runners": args.runners, "private": args.private})
+        .env_runners(
+            num_env_runners=args.runners,
+            num_envs_per_env_runner=args.worlds,
+            gym_env_vectorize_mode="vector_entry_point",
+        )
+        .fault_tolerance(restart_failed_env_runners=True, restart_failed_sub_environments=True)
+        .training(train_batch_size=args.batch, minibatch_size=500, num_epochs=4, gamma=0.95)
+        .debugging(seed=1000)
+    )
+    algorithm = config.build_algo()
+    train(algorithm, args.iterations, args.kill)
+    algorithm.stop()
+    ray.kill(servers)
+    ray.shutdown()
+    if cluster is not None:
+        cluster.shutdown()
+
+
+if __name__ == "__main__":
+    main()
