@@ -2,6 +2,8 @@
 
 python ppo.py --imitate 60 --cpu-seconds 600 --out ppo --evaluate 0..32
 
+`--observation recent` shows what was last seen there instead: frames alone, no model, no filter.
+
 First the network may imitate beam search on the same belief, for the moves it chooses itself
 (DAgger: Ross, Gordon, Bagnell, 2011); then PPO improves on it. `--imitate 0` leaves that out.
 """
@@ -125,10 +127,10 @@ class Training:
             autoreset_mode="SameStep",
             max_episode_steps=args.n_moves * 50,
             reward="move",
-            observation=("local", *imitates),
+            observation=(args.observation, *imitates),
             **world(args),
         )
-        side, _, n_channels = self.envs.single_observation_space["local"].shape
+        side, _, n_channels = self.envs.single_observation_space[args.observation].shape
         self.network = Network(side, n_channels)
         self.rng = np.random.default_rng(args.seed)
         self.seen, _ = self.envs.reset(seed=args.seed)
@@ -142,6 +144,9 @@ class Training:
     def used(self) -> float:
         """Processor seconds used."""
         return time.process_time() - self.cpu
+
+    def windows(self) -> np.ndarray:
+        return self.seen[self.args.observation]
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
         begin = time.process_time()
@@ -163,7 +168,7 @@ class Training:
     def imitate(self) -> None:
         """Learns the first moves of beam search, wherever its own moves have led."""
         args = self.args
-        shape = self.envs.single_observation_space["local"].shape
+        shape = self.envs.single_observation_space[args.observation].shape
         windows, wanted = np.zeros((40_960, *shape), np.uint8), np.zeros(40_960, np.int64)
         optimizer = torch.optim.Adam(self.network.parameters(), 1e-3)
         n_known, round_, target = 0, 0, self.envs.unwrapped.model.target_state
@@ -175,10 +180,10 @@ class Training:
                 values = seen["belief"][..., target] / 255 + 0.02
                 best = first_moves(values, seen["robot"], seen["visited"], left, self.rng)
                 at = (n_known + np.arange(len(best))) % len(wanted)
-                windows[at], wanted[at] = seen["local"], best
+                windows[at], wanted[at] = self.windows(), best
                 n_known += len(best)
                 with torch.no_grad():
-                    logits, _ = self.network(torch.from_numpy(seen["local"]))
+                    logits, _ = self.network(torch.from_numpy(self.windows()))
                 own = Categorical(logits=logits).sample().numpy()
                 guided = self.rng.random(len(best)) < 1 - round_ / 20
                 self.step(np.where(guided, best, own))
@@ -220,7 +225,7 @@ class Training:
         back = names.argsort()
         windows, actions, log_probabilities, values, rewards, ends = [], [], [], [], [], []
         for _ in range(args.horizon):
-            window = turned(torch.from_numpy(self.seen["local"]), turns, mirrored)
+            window = turned(torch.from_numpy(self.windows()), turns, mirrored)
             with torch.no_grad():
                 logits, value = self.network(window)
             moves = Categorical(logits=logits)
@@ -228,7 +233,7 @@ class Training:
             reward, truncated, infos = self.step(back[action].numpy())
             earned, end = torch.from_numpy(reward).float(), torch.from_numpy(truncated)
             if truncated.any():  # the world would have gone on
-                last = np.stack([seen["local"] for seen in infos["final_obs"][truncated]])
+                last = np.stack([seen[args.observation] for seen in infos["final_obs"][truncated]])
                 with torch.no_grad():
                     last = turned(torch.from_numpy(last), turns, mirrored)
                     earned[end] += args.gamma * self.network(last)[1]
@@ -239,7 +244,7 @@ class Training:
             rewards.append(earned)
             ends.append(end.float())
         with torch.no_grad():
-            last = turned(torch.from_numpy(self.seen["local"]), turns, mirrored)
+            last = turned(torch.from_numpy(self.windows()), turns, mirrored)
             values.append(self.network(last)[1])
         advantages, advantage = [], torch.zeros(n)
         for at in reversed(range(args.horizon)):
@@ -334,6 +339,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--model", default="wildfire-small")
     for name, default in (("height", 16), ("width", 16), ("n-moves", 16), ("burn-in", 3000)):
         parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--observation", choices=("local", "recent"), default="local")
     parser.add_argument("--window", type=int, default=15, help="cells along a side")
     parser.add_argument("--worlds", type=int, default=64)
     parser.add_argument("--horizon", type=int, default=32, help="moves of a rollout")
@@ -366,7 +372,7 @@ def main() -> None:
         seeds=range(first, end),
         steps=args.steps,
         csv=args.out / "rows.csv",
-        observation="local",
+        observation=args.observation,
         **world(args),
     )
     print(summary(rows))
