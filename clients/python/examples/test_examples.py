@@ -33,9 +33,9 @@ EXAMPLES = [
     ("rllib_team.py", "--iterations 1 --batch 500", r"iteration 0: 500\S* moves, reward of .* \d"),
     (
         "ray_cluster.py",
-        "--iterations 3 --batch 800 --kill",
+        "--iterations 3 --runners 3 --batch 800 --kill",
         r"runner (\d+) is killed\n(?:.*\n)*server (\d+) is killed\n(?:.*\n)*"
-        r"iteration (?!.*\b(?:\1|\2)\b)\d+: .*(?:, runners \[\d+, \d+\] on server \d+){2}\n",
+        r"iteration (?!.*\b(?:\1|\2)\b)\d+: .*(?:, runners \[\d+(?:, \d+)?\] on server \d+){2}\n",
     ),
     (
         "supersuit_team.py",
