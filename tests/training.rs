@@ -294,13 +294,21 @@ fn episodes_that_end_are_begun_again() {
 fn a_checkpoint_is_compared_and_evaluated() {
     let place = Place::new();
     place.train("out", &format!("{WORLDS} --steps 80"));
-    let checkpoint = place.checkpoint("out");
-    let checkpoint = checkpoint.display();
+    place.train("own", &format!("{WORLDS} --steps 80 --learner own_filter"));
+    let [checkpoint, own] = ["out", "own"].map(|out| place.checkpoint(out));
+    let (checkpoint, own) = (checkpoint.display(), own.display());
+    let both = format!("--checkpoint {checkpoint} --checkpoint {own}");
     let worlds = "--seeds 3..5 --steps 5 --height 6 --width 9 --moves 5 --burn-in 60 \
                   --beam-width 4 --shooting-samples 16";
-    let compared = agent(&format!("compare --checkpoint {checkpoint} {worlds}"));
-    let evaluated = agent(&format!("evaluate --checkpoint {checkpoint} {worlds}"));
-    for policy in ["learned_shooting", "learned_beam"] {
+    let compared = agent(&format!("compare {both} {worlds}"));
+    let evaluated = agent(&format!("evaluate {both} {worlds}"));
+    for policy in [
+        "learned_shooting",
+        "learned_beam",
+        "learned_own_shooting",
+        "learned_own_beam",
+        "learned_own_spatial_beam",
+    ] {
         assert!(compared.stdout.contains(policy), "{}", compared.stdout);
         assert!(evaluated.stdout.contains(policy), "{}", evaluated.stdout);
     }
@@ -308,6 +316,7 @@ fn a_checkpoint_is_compared_and_evaluated() {
         "class frequencies",
         "known_model",
         "learned_filter - known_model",
+        "learned_own_filter - known_model",
     ] {
         assert!(evaluated.stdout.contains(row), "{}", evaluated.stdout);
     }
@@ -320,6 +329,23 @@ fn a_checkpoint_is_compared_and_evaluated() {
         &format!("run {flags}"),
         &["learned_beam", "--checkpoint FILE"],
     );
+    let flags = format!("--instance {name} --steps 5 --policy learned_own_spatial_beam");
+    agent(&format!("run {flags} --checkpoint {own}"));
+    check(
+        AGENT,
+        &format!("run {flags} --checkpoint {checkpoint}"),
+        &[
+            "learned_own_spatial_beam",
+            "--checkpoint FILE of an own_filter",
+        ],
+    );
+    check(
+        AGENT,
+        &place.words("own", &format!("{WORLDS} --steps 8 --resume")),
+        &["expected a checkpoint of learned_filter, got one of learned_own_filter"],
+    );
+    let resume = format!("{WORLDS} --steps 8 --resume --learner own_filter");
+    place.train("own", &resume);
 }
 
 #[test]
@@ -383,6 +409,7 @@ evaluate => --checkpoint
 evaluate --checkpoint no/such => checkpoint no/such: No such file
 compare --checkpoint no/such => checkpoint no/such: No such file
 compare --policies learned_beam => \"learned_beam\" needs what `train` learned: expected --checkpoint FILE of a filter
+compare --policies learned_own_beam => \"learned_own_beam\" needs | expected --checkpoint FILE of an own_filter
 ";
 
 #[test]

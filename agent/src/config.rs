@@ -49,10 +49,13 @@ pub struct AgentConfig {
 
 /// What `train` learns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "snake_case")]
+#[value(rename_all = "snake_case")]
 pub enum LearnerKind {
-    /// A Bayes filter of the model's own form, with unknown parameters
+    /// A Bayes filter of the paper's form, with unknown parameters
     Filter,
+    /// The same with a kernel for each state that a cell itself can be in
+    OwnFilter,
     /// The paper's Algorithm 1: a dynamic autoencoder, and a DQN that chooses objectives
     Autoencoder,
     /// A DQN that chooses among actions of beam search on the known model's belief

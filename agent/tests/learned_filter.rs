@@ -8,7 +8,7 @@ use agent::learning::filter::window::{Start, Window};
 use agent::learning::filter::{Trainer, Update};
 use agent::learning::replay::{Replay, Sighting};
 use protocol::randomness::split_mix;
-use protocol::{Frame, Model, Shape};
+use protocol::{Frame, Model, Probabilities, Shape};
 
 /// What a few cells of a made-up world show: no two frames see the same cells.
 fn sightings(shape: Shape, n_observations: usize, frame: u64) -> Vec<Sighting> {
@@ -44,12 +44,17 @@ fn belief(n_states: usize, shape: Shape, seed: u64) -> Vec<f32> {
     belief
 }
 
+fn burnout() -> Model {
+    Model::built_in("wildfire-burnout").expect("a built-in model")
+}
+
 #[test]
 fn with_the_true_parameters_it_is_the_known_model_filter() {
     let road_ice = include_str!("../../config/models/road-ice.toml");
     let models = [
         Model::wildfire(),
         Model::from_toml(road_ice).expect("valid"),
+        burnout(),
     ];
     for model in models {
         for (height, width) in [(1, 1), (5, 9), (20, 33), (64, 64)] {
@@ -136,28 +141,27 @@ fn check_gradients(dimensions: Dimensions, size: (usize, usize), from_belief: bo
 
 #[test]
 fn every_gradient_agrees_with_finite_differences() {
-    let dimensions = |n_states, n_observations, kernel| Dimensions {
-        n_states,
-        n_observations,
-        kernel,
-    };
-    for from_belief in [false, true] {
-        check_gradients(dimensions(3, 3, (3, 3)), (6, 7), from_belief);
-        check_gradients(dimensions(2, 3, (1, 5)), (4, 19), from_belief);
-        check_gradients(dimensions(4, 2, (5, 3)), (9, 70), from_belief);
-        check_gradients(dimensions(7, 4, (3, 1)), (3, 2), from_belief);
+    for (from_belief, sees_own_state) in
+        [(false, false), (true, false), (false, true), (true, true)]
+    {
+        let check = |n_states, n_observations, kernel, size| {
+            let dimensions = Dimensions {
+                n_states,
+                n_observations,
+                kernel,
+                sees_own_state,
+            };
+            check_gradients(dimensions, size, from_belief);
+        };
+        check(3, 3, (3, 3), (6, 7));
+        check(2, 3, (1, 5), (4, 19));
+        check(4, 2, (5, 3), (9, 70));
+        check(7, 4, (3, 1), (3, 2));
     }
 }
 
-#[test]
-fn a_window_ends_with_the_filters_prediction() {
+fn check_window(tables: Tables) {
     let shape = Shape::new(7, 18).expect("test shape");
-    let dimensions = Dimensions {
-        n_states: 3,
-        n_observations: 3,
-        kernel: (3, 3),
-    };
-    let tables: Tables = Parameters::first(dimensions, 2).tables();
     let mut filter = BayesFilter::learned(&tables, tables.prior(shape));
     let mut window = Window::new(tables, shape, 8);
     let frames: Vec<_> = (0..8).map(|number| sightings(shape, 3, number)).collect();
@@ -170,6 +174,31 @@ fn a_window_ends_with_the_filters_prediction() {
     let most = filter.belief().as_slice().iter().zip(&end);
     let most = most.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
     assert!(most < 1e-6, "{most}");
+}
+
+#[test]
+fn a_window_ends_with_the_filters_prediction() {
+    for sees_own_state in [false, true] {
+        check_window(Parameters::first(dimensions(sees_own_state), 2).tables());
+    }
+    check_window(Tables::of_model(&burnout()));
+}
+
+#[test]
+fn learning_begins_alike_for_every_own_state() {
+    let shape = Shape::new(12, 40).expect("test shape");
+    let prior = Probabilities::from_shape_vec((3, 12, 40), belief(3, shape, 0));
+    let prior = Belief::from_probabilities(prior.expect("as many")).expect("sums of one");
+    let [one, own] = [false, true].map(|sees_own_state| {
+        let tables = Parameters::first(dimensions(sees_own_state), 0).tables();
+        let mut filter = BayesFilter::learned(&tables, prior.clone());
+        filter.predict();
+        filter.belief().clone()
+    });
+    let pairs = one.as_slice().iter().zip(own.as_slice());
+    let most = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    // Weights differ by noise of 10 %.
+    assert!(most < 0.05, "{most}");
 }
 
 fn config() -> LearningConfig {
@@ -196,18 +225,28 @@ fn replay(shape: Shape, n_frames: u64) -> Replay {
     replay
 }
 
-fn trainer(shape: Shape, seed: u64) -> Trainer {
-    let dimensions = Dimensions {
+fn dimensions(sees_own_state: bool) -> Dimensions {
+    Dimensions {
         n_states: 3,
         n_observations: 3,
         kernel: (3, 3),
-    };
-    Trainer::new(Parameters::first(dimensions, seed), shape, config(), seed)
+        sees_own_state,
+    }
 }
 
-fn updates(n: usize, seed: u64) -> (Vec<Update>, Parameters) {
+fn trainer(shape: Shape, seed: u64) -> Trainer {
+    trainer_of(false, shape, seed)
+}
+
+fn trainer_of(sees_own_state: bool, shape: Shape, seed: u64) -> Trainer {
+    let parameters = Parameters::first(dimensions(sees_own_state), seed);
+    Trainer::new(parameters, shape, config(), seed)
+}
+
+fn updates(n: usize, sees_own_state: bool, seed: u64) -> (Vec<Update>, Parameters) {
     let shape = Shape::new(10, 12).expect("test shape");
-    let (mut trainer, mut replay) = (trainer(shape, seed), replay(shape, 40));
+    let mut trainer = trainer_of(sees_own_state, shape, seed);
+    let mut replay = replay(shape, 40);
     let update = |_| trainer.update(&mut replay, Some(2)).expect("finite");
     let updates: Vec<Update> = (0..n)
         .map(update)
@@ -218,24 +257,29 @@ fn updates(n: usize, seed: u64) -> (Vec<Update>, Parameters) {
 
 #[test]
 fn training_repeats_bit_for_bit_on_any_number_of_threads() {
-    let on = |n_threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(n_threads)
-            .build();
-        pool.expect("threads").install(|| updates(30, 1))
-    };
-    let (one, two) = (on(1), on(2));
-    assert_eq!(one, two);
-    assert_eq!(one, on(1));
-    assert_ne!(one.0, updates(30, 2).0, "another seed");
+    for sees_own_state in [false, true] {
+        let on = |n_threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new()
+                .num_threads(n_threads)
+                .build();
+            pool.expect("threads")
+                .install(|| updates(30, sees_own_state, 1))
+        };
+        let (one, two) = (on(1), on(2));
+        assert_eq!(one, two);
+        assert_eq!(one, on(1));
+        assert_ne!(one.0, updates(30, sees_own_state, 2).0, "another seed");
+    }
 }
 
 #[test]
 fn training_lowers_the_loss() {
-    let (updates, _) = updates(200, 3);
-    let mean = |part: &[Update]| part.iter().map(|u| u.loss).sum::<f64>() / part.len() as f64;
-    let (before, after) = (mean(&updates[..20]), mean(&updates[180..]));
-    assert!(after < before - 0.1, "{before} {after}");
+    for sees_own_state in [false, true] {
+        let (updates, _) = updates(200, sees_own_state, 3);
+        let mean = |part: &[Update]| part.iter().map(|u| u.loss).sum::<f64>() / part.len() as f64;
+        let (before, after) = (mean(&updates[..20]), mean(&updates[180..]));
+        assert!(after < before - 0.1, "{before} {after}");
+    }
 }
 
 #[test]

@@ -67,10 +67,12 @@ fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>> {
             let (state, nothing) = (task.model.target_state(), Correlations::default());
             Box::new(SpatialFilter::new(filter, state, nothing))
         }
-        EstimatorKind::Learned => Box::new(learned_filter(policy, task)?),
-        EstimatorKind::LearnedSpatial => {
-            let filter = learned_filter(policy, task)?;
-            let learned: &LearnedModel = present(policy, &task.learned.filter, "a filter")?;
+        EstimatorKind::Learned | EstimatorKind::LearnedOwn => {
+            Box::new(learned_filter(learned_model(policy, task)?, task))
+        }
+        EstimatorKind::LearnedSpatial | EstimatorKind::LearnedOwnSpatial => {
+            let learned = learned_model(policy, task)?;
+            let filter = learned_filter(learned, task);
             Box::new(SpatialFilter::new(
                 filter,
                 learned.target,
@@ -90,10 +92,10 @@ fn basis(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<Basis
     Ok(match policy.estimator {
         EstimatorKind::NextTruth => BasisKind::Predictor,
         EstimatorKind::Autoencoder if policy.is_decided => {
-            present(policy, &learned.network, "an autoencoder")?.basis
+            present(policy, learned.network.as_ref())?.basis
         }
         _ if policy.is_decided => {
-            let contents = present(policy, &learned.decisions, "decisions")?;
+            let contents = present(policy, learned.decisions.as_ref())?;
             contents.settings().context(CHECKPOINT)?.objective.belief
         }
         _ => config.objective.belief,
@@ -103,12 +105,12 @@ fn basis(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<Basis
 /// The DQN that chooses: the one learned beside the belief, or that of a known model's.
 fn decider(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<Box<dyn Decider>> {
     if policy.estimator != EstimatorKind::Autoencoder {
-        let contents = present(policy, &task.learned.decisions, "decisions")?;
+        let contents = present(policy, task.learned.decisions.as_ref())?;
         let mut decisions = Decisions::first(task.model, &config.decisions, config.seed);
         decisions.load(contents).context(CHECKPOINT)?;
         return Ok(Box::new(decisions));
     }
-    let network = present(policy, &task.learned.network, "an autoencoder")?.clone();
+    let network = present(policy, task.learned.network.as_ref())?.clone();
     let choices = Policy::network_choices(network.autoencoder.shape().n_states);
     let objectives = choices.iter().map(|choice| config.objective(choice));
     Ok(Box::new(NetworkDecider {
@@ -139,15 +141,19 @@ impl Decider for Decisions {
     }
 }
 
-fn learned_filter(policy: &Policy, task: &Task<'_>) -> Result<BayesFilter> {
-    let learned: &LearnedModel = present(policy, &task.learned.filter, "a filter")?;
+fn learned_model<'a>(policy: &Policy, task: &Task<'a>) -> Result<&'a LearnedModel> {
+    let learned = present(policy, task.learned.filter(policy.estimator))?;
     same_observations(task, learned.tables.dimensions.n_observations)?;
+    Ok(learned)
+}
+
+fn learned_filter(learned: &LearnedModel, task: &Task<'_>) -> BayesFilter {
     let prior = learned.tables.prior(task.shape);
-    Ok(BayesFilter::learned(&learned.tables, prior))
+    BayesFilter::learned(&learned.tables, prior)
 }
 
 fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<AutoencoderEstimator> {
-    let learned = present(policy, &task.learned.network, "an autoencoder")?;
+    let learned = present(policy, task.learned.network.as_ref())?;
     let shape = learned.autoencoder.shape();
     same_observations(task, shape.n_observations)?;
     ensure!(
@@ -159,14 +165,18 @@ fn autoencoder(policy: &Policy, task: &Task<'_>) -> Result<AutoencoderEstimator>
     AutoencoderEstimator::new(&learned.autoencoder).context(CHECKPOINT)
 }
 
-fn present<'a, T>(policy: &Policy, learned: &'a Option<T>, kind: &'static str) -> Result<&'a T> {
-    learned
-        .as_ref()
-        .with_context(|| needs_checkpoint(policy, kind))
+fn present<'a, T>(policy: &Policy, learned: Option<&'a T>) -> Result<&'a T> {
+    learned.with_context(|| needs_checkpoint(policy))
 }
 
 /// The words for a policy that was not given what was learned.
-pub fn needs_checkpoint(policy: &Policy, kind: &str) -> String {
+pub fn needs_checkpoint(policy: &Policy) -> String {
+    let kind = match policy.estimator {
+        EstimatorKind::Learned | EstimatorKind::LearnedSpatial => "a filter",
+        EstimatorKind::LearnedOwn | EstimatorKind::LearnedOwnSpatial => "an own_filter",
+        EstimatorKind::Autoencoder => "an autoencoder",
+        _ => "decisions",
+    };
     format!(
         "policy {:?} needs what `train` learned: expected --checkpoint FILE of {kind}",
         policy.name

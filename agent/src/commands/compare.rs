@@ -14,7 +14,9 @@ use agent::benchmark::report::{
 use agent::benchmark::team::Team;
 use agent::config::{AgentConfig, AgentFlags};
 use agent::learning::learned::Learned;
-use agent::planning::policy::{EstimatorKind, OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, Policy};
+use agent::planning::policy::{
+    EstimatorKind, OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, OF_OWN_FILTER, Policy,
+};
 use agent::server::launch::OwnDashboard;
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
@@ -44,9 +46,8 @@ pub struct CompareCommand {
     /// How the robots of a world act together, separated by commas
     #[arg(long, value_delimiter = ',', default_value = "alone")]
     team: Vec<Team>,
-    /// What `train` learned: a filter adds `learned_*` to the ladder, an autoencoder `autoencoder_*`,
-    /// decisions `dqn_beam`; may be
-    /// given for each
+    /// What `train` learned: a filter adds `learned_*` to the ladder, an own_filter `learned_own_*`, an autoencoder
+    /// `autoencoder_*`, decisions `dqn_beam`; may be given for each
     #[arg(long, value_name = "FILE")]
     checkpoint: Vec<PathBuf>,
     /// Where networks compute: cpu, cuda or metal
@@ -208,20 +209,8 @@ impl CompareCommand {
             twice.map_or("", |(_, policy)| &policy.name)
         );
         named(&self.baseline(false).to_owned()).context("--baseline")?;
-        for policy in &policies {
-            let kind = match policy.estimator {
-                EstimatorKind::Learned | EstimatorKind::LearnedSpatial
-                    if learned.filter.is_none() =>
-                {
-                    "a filter"
-                }
-                EstimatorKind::Autoencoder if learned.network.is_none() => "an autoencoder",
-                EstimatorKind::KnownModel if policy.is_decided && learned.decisions.is_none() => {
-                    "decisions"
-                }
-                _ => continue,
-            };
-            bail!(needs_checkpoint(policy, kind));
+        if let Some(policy) = policies.iter().find(|policy| !learned.suits(policy)) {
+            bail!(needs_checkpoint(policy));
         }
         Ok(policies)
     }
@@ -296,6 +285,9 @@ fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
     let is_known = |policy: &Policy| policy.estimator.knows_model();
     if learned.decisions.is_some() {
         insert(is_known, &OF_DECISIONS);
+    }
+    if learned.own_filter.is_some() {
+        insert(is_known, &OF_OWN_FILTER);
     }
     if learned.filter.is_some() {
         insert(is_known, &OF_FILTER);

@@ -12,7 +12,7 @@ use agent::benchmark::team::Team;
 use agent::config::{AgentConfig, AgentFlags};
 use agent::estimation::scoring::Score;
 use agent::learning::learned::Learned;
-use agent::planning::policy::{OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, Policy};
+use agent::planning::policy::{OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, OF_OWN_FILTER, Policy};
 use anyhow::Result;
 use clap::Args;
 use network::DeviceKind;
@@ -91,6 +91,9 @@ impl EvaluateCommand {
         if learned.filter.is_some() {
             names.extend(OF_FILTER);
         }
+        if learned.own_filter.is_some() {
+            names.extend(OF_OWN_FILTER);
+        }
         if learned.network.is_some() {
             names.extend(OF_AUTOENCODER);
         }
@@ -121,6 +124,9 @@ fn examined(learned: &Learned) -> Vec<&'static str> {
     let mut names = vec!["beam_exploit", "spatial_beam"];
     if learned.filter.is_some() {
         names.extend(["learned_beam", "learned_spatial_beam"]);
+    }
+    if learned.own_filter.is_some() {
+        names.extend(["learned_own_beam", "learned_own_spatial_beam"]);
     }
     if learned.network.is_some() {
         names.push("autoencoder_beam");

@@ -78,8 +78,8 @@ impl TrainCommand {
         let mut config = self.settings.effective()?;
         config.learner = self.learner.unwrap_or(config.learner);
         let n_worlds = self.worlds.unwrap_or(match config.learner {
-            LearnerKind::Filter | LearnerKind::Decisions => 16,
             LearnerKind::Autoencoder => 1,
+            _ => 16,
         });
         let last = self.world.checked_add(n_worlds);
         let last = last.context("--world: expected a world that a server may have")?;

@@ -140,16 +140,16 @@ fn parameters(tables: &Tables, belief: &Belief) -> (Transition, Array2<f64>, u32
     let n_states = dimensions.n_states;
     assert_eq!(belief.n_states(), n_states, "belief: expected other states");
     let (height, width) = dimensions.kernel;
-    let kernel = tables
-        .kernel
-        .iter()
-        .map(|&weight| f64::from(weight))
-        .collect();
-    let kernel = Array4::from_shape_vec((n_states, n_states, height, width), kernel);
-    let kernel = kernel.expect("invariant: S x S kernels");
+    let n_weights = n_states * n_states * height * width;
+    let kernel = |weights: &[f32]| {
+        let weights = weights.iter().map(|&weight| f64::from(weight)).collect();
+        let kernel = Array4::from_shape_vec((n_states, n_states, height, width), weights);
+        kernel.expect("invariant: S x S kernels")
+    };
+    let kernels: Vec<_> = tables.kernel.chunks_exact(n_weights).map(kernel).collect();
     let likelihood = tables.likelihood_array();
-    let checksum = checksum(kernel.iter().copied(), &likelihood);
-    let transition = Transition::of_weights(&[kernel], &vec![0.0; n_states], belief.shape());
+    let checksum = checksum(kernels.iter().flatten().copied(), &likelihood);
+    let transition = Transition::of_weights(&kernels, &vec![0.0; n_states], belief.shape());
     (transition, likelihood, checksum)
 }
 

@@ -34,13 +34,16 @@ pub struct Dimensions {
     pub n_observations: usize,
     /// Rows and columns of the kernel, odd.
     pub kernel: (usize, usize),
+    /// Whether each state that a cell itself can be in has a kernel of its own. The kind of a checkpoint tells it.
+    #[serde(skip)]
+    pub sees_own_state: bool,
 }
 
 /// The three tensors, in the order of [`Parameters::NAMES`]: free numbers, gradients or moments.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Parameters {
     pub dimensions: Dimensions,
-    /// `[S, S, KH, KW]`, `[S, O]` and `[S]`, row-major.
+    /// `[S, S, KH, KW]` or `[S, S, S, KH, KW]`, `[S, O]` and `[S]`, row-major.
     #[serde(skip)]
     pub tensors: [Vec<f32>; 3],
 }
@@ -49,7 +52,7 @@ pub struct Parameters {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tables<T = f32> {
     pub dimensions: Dimensions,
-    /// `w[to, from, row, col]`.
+    /// `w[to, from, row, col]`, or `w[own, to, from, row, col]`, whose centre only counts where `from` is `own`.
     pub kernel: Vec<T>,
     /// `P(y | x)`, shape `[S, O]`.
     pub likelihood: Vec<T>,
@@ -84,11 +87,20 @@ impl Dimensions {
     /// Shapes of the tensors, in the order of [`Parameters::NAMES`].
     pub fn shapes(&self) -> [Vec<usize>; 3] {
         let (states, (height, width)) = (self.n_states, self.kernel);
-        [
-            vec![states, states, height, width],
-            vec![states, self.n_observations],
-            vec![states],
-        ]
+        let mut kernel = vec![states, states, height, width];
+        if self.sees_own_state {
+            kernel.insert(0, states);
+        }
+        [kernel, vec![states, self.n_observations], vec![states]]
+    }
+
+    /// One for all cells, or one for each state that a cell itself can be in.
+    pub fn n_kernels(&self) -> usize {
+        if self.sees_own_state {
+            self.n_states
+        } else {
+            1
+        }
     }
 
     pub fn lengths(&self) -> [usize; 3] {
@@ -101,7 +113,7 @@ impl Parameters {
     pub const NAMES: [&'static str; 3] = ["kernel", "likelihood", "initial"];
 
     /// Where learning starts: states last, spread to neighbours, and look like the observation of
-    /// their own number, if there is one.
+    /// their own number, if there is one; alike for every state of the cell itself.
     pub fn first(dimensions: Dimensions, seed: u64) -> Self {
         let [n_kernel, n_likelihood, n_initial] = dimensions.lengths();
         // Uniform in -1..1.
@@ -205,8 +217,9 @@ impl Tables<f32> {
                 n_states: model.n_states(),
                 n_observations: model.n_observations(),
                 kernel: (height, width),
+                sees_own_state: model.sees_own_state(),
             },
-            kernel: model.kernel().iter().map(cast).collect(),
+            kernel: model.kernels().iter().flatten().map(cast).collect(),
             likelihood: model.likelihood().iter().map(cast).collect(),
             initial: model.initial().iter().map(cast).collect(),
         }
@@ -227,7 +240,8 @@ fn first_weight(dimensions: Dimensions, index: usize) -> f64 {
     let (height, width) = dimensions.kernel;
     let n_taps = height * width;
     let (pair, tap) = (index / n_taps, index % n_taps);
-    let is_own = pair / dimensions.n_states == pair % dimensions.n_states;
+    let (to, from) = (pair / dimensions.n_states, pair % dimensions.n_states);
+    let is_own = to % dimensions.n_states == from;
     let is_centre = tap == n_taps / 2;
     let near = if is_centre {
         OWN_WEIGHT
@@ -265,6 +279,7 @@ mod tests {
             n_states: 3,
             n_observations: 4,
             kernel: (3, 1),
+            sees_own_state: false,
         }
     }
 

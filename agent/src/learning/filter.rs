@@ -9,6 +9,7 @@
 //! by a prior on the state that pays most: it is seen almost surely.
 
 pub mod adam;
+mod correlation;
 mod layout;
 mod operator;
 pub mod trainer;

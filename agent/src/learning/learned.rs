@@ -1,23 +1,31 @@
 //! What checkpoints hold, by kind: all that policies on a learned belief need.
 
+use crate::estimation::parameters::Dimensions;
 use crate::learning::checkpoint::{self, Contents, wrong};
 use crate::learning::learner::{self, LearnedModel};
 use crate::learning::student::filter::SavedFilter;
 use crate::learning::student::{decisions, network};
-use crate::planning::policy::EstimatorKind;
+use crate::planning::policy::{EstimatorKind, Policy};
 use ::network::Device;
 use anyhow::{Context, Result, ensure};
 use std::path::Path;
 use std::sync::Arc;
 
 /// Kinds of checkpoints that policies act on.
-const KINDS: [&str; 3] = [learner::KIND, network::KIND, decisions::KIND];
+const KINDS: [&str; 4] = [
+    learner::KIND,
+    learner::OWN_KIND,
+    network::KIND,
+    decisions::KIND,
+];
 
 /// Everything that was learned.
 #[derive(Debug, Clone, Default)]
 pub struct Learned {
     /// A filter, for policies `learned_*`.
     pub filter: Option<LearnedModel>,
+    /// One whose kernels see the cell's own state, for policies `learned_own_*`.
+    pub own_filter: Option<LearnedModel>,
     /// An autoencoder and a DQN, for policies `autoencoder_*`.
     pub network: Option<Arc<network::Progress>>,
     /// Decisions, for `dqn_beam`; they fit a model or not.
@@ -46,14 +54,8 @@ impl Learned {
 
     fn add(&mut self, kind: &'static str, contents: Contents, device: &Device) -> Result<()> {
         let twice = match kind {
-            learner::KIND => {
-                let mut saved = contents.state::<SavedFilter>()?.learner;
-                let dimensions = saved.trainer.dimensions().check();
-                let dimensions =
-                    dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
-                saved.load(&contents, dimensions)?;
-                self.filter.replace(saved.learned()).is_some()
-            }
+            learner::KIND => self.filter.replace(filter(&contents, false)?).is_some(),
+            learner::OWN_KIND => self.own_filter.replace(filter(&contents, true)?).is_some(),
             decisions::KIND => self.decisions.replace(Arc::new(contents)).is_some(),
             _ => {
                 let network = network::Progress::read(&contents, device)?;
@@ -66,14 +68,43 @@ impl Learned {
 }
 
 impl Learned {
-    /// The state that pays most, as the one who learned an estimator's model found it.
-    pub fn target(&self, estimator: EstimatorKind) -> Option<usize> {
+    /// The filter of an estimator.
+    pub fn filter(&self, estimator: EstimatorKind) -> Option<&LearnedModel> {
         match estimator {
-            EstimatorKind::Learned | EstimatorKind::LearnedSpatial => {
-                self.filter.as_ref().map(|filter| filter.target)
+            EstimatorKind::Learned | EstimatorKind::LearnedSpatial => self.filter.as_ref(),
+            EstimatorKind::LearnedOwn | EstimatorKind::LearnedOwnSpatial => {
+                self.own_filter.as_ref()
             }
-            EstimatorKind::Autoencoder => self.network.as_ref().map(|network| network.target()),
             _ => None,
         }
     }
+
+    /// Whether what a policy acts on was learned, if anything has to be.
+    pub fn suits(&self, policy: &Policy) -> bool {
+        match policy.estimator {
+            EstimatorKind::Autoencoder => self.network.is_some(),
+            kind if kind.is_learned() => self.filter(kind).is_some(),
+            _ => !policy.is_decided || self.decisions.is_some(),
+        }
+    }
+
+    /// The state that pays most, as the one who learned an estimator's model found it.
+    pub fn target(&self, estimator: EstimatorKind) -> Option<usize> {
+        match estimator {
+            EstimatorKind::Autoencoder => self.network.as_ref().map(|network| network.target()),
+            _ => self.filter(estimator).map(|filter| filter.target),
+        }
+    }
+}
+
+fn filter(contents: &Contents, sees_own_state: bool) -> Result<LearnedModel> {
+    let mut saved = contents.state::<SavedFilter>()?.learner;
+    let dimensions = Dimensions {
+        sees_own_state,
+        ..saved.trainer.dimensions()
+    };
+    let dimensions = dimensions.check();
+    let dimensions = dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
+    saved.load(contents, dimensions)?;
+    Ok(saved.learned())
 }

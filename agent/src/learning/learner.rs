@@ -21,6 +21,9 @@ use std::collections::BTreeMap;
 /// How checkpoints of this learner call it.
 pub const KIND: &str = "learned_filter";
 
+/// The same where kernels see the cell's own state.
+pub const OWN_KIND: &str = "learned_own_filter";
+
 /// Names of tensors end so: parameters, means and means of squares.
 const SUFFIXES: [&str; 3] = ["", ".first_moment", ".second_moment"];
 
@@ -140,6 +143,15 @@ impl Learner {
         }
     }
 
+    /// How checkpoints call it.
+    pub fn kind(&self) -> &'static str {
+        if self.trainer.dimensions().sees_own_state {
+            OWN_KIND
+        } else {
+            KIND
+        }
+    }
+
     pub fn n_updates(&self) -> u64 {
         self.trainer.adam.n_steps
     }
@@ -231,6 +243,7 @@ mod tests {
         n_states: 3,
         n_observations: 2,
         kernel: (1, 3),
+        sees_own_state: false,
     };
 
     fn shape() -> Shape {

@@ -1,9 +1,9 @@
 //! Recent frames of one or more worlds, in blocks that learners run through.
 //!
 //! A *track* is what one robot saw in one episode, without gaps. It is cut into blocks of equal
-//! length; a block keeps the belief before its first frame, which the learner that runs through the block
-//! before it renews. Frames of a block that is not full yet are not replayed. The oldest blocks go
-//! when there is no room.
+//! length, the last of which may be shorter; a block keeps the belief before its first frame, which the learner that
+//! runs through the block before it renews. Frames of a block that is not full yet are not replayed while their
+//! track goes on. The oldest blocks go when there is no room.
 
 use crate::estimation::belief::Belief;
 use crate::learning::checkpoint::{check, check_counts, check_numbers, wrong};
@@ -21,7 +21,7 @@ pub struct Sighting {
     pub value: u8,
 }
 
-/// Consecutive frames of one track.
+/// Consecutive frames of one track, at least one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Block {
     pub frames: Vec<Vec<Sighting>>,
@@ -54,10 +54,14 @@ impl Replay {
         }
     }
 
-    /// Begins a new track of a world; frames of its open block are dropped.
+    /// Begins a new track of a world; the last block of the one before ends here.
     pub fn begin(&mut self, world: u32) {
         let block = self.new_block(None);
-        self.open.insert(world, block);
+        if let Some((number, last)) = self.open.insert(world, block)
+            && !last.frames.is_empty()
+        {
+            self.keep(number, last);
+        }
     }
 
     /// Whether the world's track was begun.
@@ -98,9 +102,8 @@ impl Replay {
             let next = following.0;
             if let Some((id, mut block)) = self.open.insert(world, following) {
                 block.next = next;
-                self.full.insert(id, block);
+                self.keep(id, block);
             }
-            self.drop_oldest();
         }
     }
 
@@ -108,12 +111,12 @@ impl Replay {
         self.full.len()
     }
 
-    /// Numbers of the full blocks, oldest first.
+    /// Numbers of the blocks that are full or ended, oldest first.
     pub fn blocks(&self) -> impl Iterator<Item = u64> + '_ {
         self.full.keys().copied()
     }
 
-    /// A full block that is still there.
+    /// Such a block that is still there.
     pub fn block(&self, number: u64) -> Option<&Block> {
         self.full.get(&number)
     }
@@ -146,11 +149,11 @@ impl Replay {
             let fits = number < other.n_opened;
             check(fits, "replay.blocks", "numbers of opened blocks", number)?;
             let (n_frames, most) = (block.frames.len(), self.block_length);
-            let fits = (n_frames == most) == is_full && n_frames <= most;
+            let expected = if is_full { 1..=most } else { 0..=most - 1 };
             check(
-                fits,
+                expected.contains(&n_frames),
                 "replay.frames",
-                format_args!("blocks of {most} frames"),
+                format_args!("blocks of {expected:?} frames"),
                 n_frames,
             )?;
             block.check(shape, n_states, n_observations)?;
@@ -159,6 +162,11 @@ impl Replay {
         (self.full, self.open, self.n_opened) = (other.full, other.open, other.n_opened);
         self.drop_oldest();
         Ok(())
+    }
+
+    fn keep(&mut self, number: u64, block: Block) {
+        self.full.insert(number, block);
+        self.drop_oldest();
     }
 
     fn drop_oldest(&mut self) {
@@ -271,17 +279,23 @@ mod tests {
     }
 
     #[test]
-    fn a_new_track_drops_what_was_not_full() {
+    fn a_track_ends_with_a_shorter_block() {
         let mut replay = replay(3);
         replay.begin(0);
         assert!(!replay.wants_belief(0));
         replay.push(0, &frame(7));
         replay.push(0, &frame(8));
-        let last = replay.blocks().last().and_then(|last| replay.block(last));
-        assert_eq!(
-            last.map(|block| (block.frames.len(), block.start.clone())),
-            Some((2, None))
-        );
+        let kept = replay.blocks().map(|number| {
+            let block = replay.block(number).expect("kept");
+            (number, block.frames.len(), block.start.clone())
+        });
+        let expected = [(1, 2, None), (2, 1, Some(belief(2))), (4, 2, None)];
+        assert_eq!(kept.collect::<Vec<_>>(), expected);
+        replay.hand_on(2, &[8.0]); // nobody to hand on to
+        replay.begin(0);
+        replay.begin(0);
+        assert_eq!(replay.blocks().last(), Some(4), "without frames no block");
+        assert_eq!(resumed(replay.clone()).expect("whole"), replay);
     }
 
     fn resumed(other: Replay) -> Result<Replay> {
@@ -328,8 +342,12 @@ mod tests {
             "replay.value: expected values below 9, got 9",
         );
         check(
-            |replay| drop(full(replay).frames.pop()),
-            "replay.frames: expected blocks of 2 frames, got 1",
+            |replay| full(replay).frames.clear(),
+            "replay.frames: expected blocks of 1..=2 frames, got 0",
+        );
+        check(
+            |replay| full(replay).frames.push(Vec::new()),
+            "replay.frames: expected blocks of 1..=2 frames, got 3",
         );
         check(
             |replay| replay.n_opened = 3,

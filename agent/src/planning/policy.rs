@@ -6,4 +6,4 @@ mod names;
 
 pub use list::list;
 pub use named::{EstimatorKind, PlannerKind, Policy, UnknownPolicy};
-pub use names::{OF_AUTOENCODER, OF_DECISIONS, OF_FILTER};
+pub use names::{OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, OF_OWN_FILTER};

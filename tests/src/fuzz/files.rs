@@ -98,15 +98,18 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         learned = Learned::from_bytes(&bytes);
     }
     let Ok(learned) = learned else { return false };
-    if let Some(filter) = learned.filter {
+    let one = (learned.filter, learner::KIND, dimensions(false));
+    let own = (learned.own_filter, learner::OWN_KIND, dimensions(true));
+    for (filter, kind, dimensions) in [one, own] {
+        let Some(filter) = filter else { continue };
         let likelihood = filter.tables.likelihood_array();
         let sums = likelihood.sum_axis(Axis(1));
         assert!(
             sums.iter().all(|sum| (sum - 1.0).abs() < 1e-3),
             "likelihoods sum to {sums}"
         );
-        let (_, contents) = decode(&[learner::KIND], &bytes).expect("read before");
-        if let Ok(mut student) = FilterStudent::resume(&contents, DIMENSIONS, worlds(), &config()) {
+        let (_, contents) = decode(&[kind], &bytes).expect("read before");
+        if let Ok(mut student) = FilterStudent::resume(&contents, dimensions, worlds(), &config()) {
             let again = student.contents().expect("no device");
             let saved: SavedFilter = again.state().expect("its state");
             // More takes its time. Numbers that are finite may be too large to work with.
@@ -119,11 +122,14 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
     true
 }
 
-const DIMENSIONS: Dimensions = Dimensions {
-    n_states: 2,
-    n_observations: 2,
-    kernel: (1, 3),
-};
+fn dimensions(sees_own_state: bool) -> Dimensions {
+    Dimensions {
+        n_states: 2,
+        n_observations: 2,
+        kernel: (1, 3),
+        sees_own_state,
+    }
+}
 
 /// Worlds of three cells.
 fn worlds() -> Worlds {
@@ -185,7 +191,11 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
         ..decisions().to_contents()
     };
     vec![
-        ("filter", encoded(learner::KIND, filter())),
+        ("filter", encoded(learner::KIND, filter(dimensions(false)))),
+        (
+            "own_filter",
+            encoded(learner::OWN_KIND, filter(dimensions(true))),
+        ),
         ("autoencoder", encoded(network::KIND, small)),
         // Asked for 30 GiB once.
         ("autoencoder_large", encoded(network::KIND, large)),
@@ -194,9 +204,9 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
 }
 
 /// A learner that has seen some frames.
-fn filter() -> Contents {
+fn filter(dimensions: Dimensions) -> Contents {
     let (shape, config) = (worlds().shape, config());
-    let mut learner = Learner::new(DIMENSIONS, shape, &config);
+    let mut learner = Learner::new(dimensions, shape, &config);
     let belief = Belief::uniform(2, shape);
     learner.begin(0);
     for value in [0, 1, 1, 0, 1] {

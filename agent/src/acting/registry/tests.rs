@@ -114,13 +114,18 @@ fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
 #[test]
 fn every_policy_plans_on_the_belief_that_settings_say() {
     let network = network(DqnInput::AfterFrame, BasisKind::Predictor, |_| true);
-    let dimensions = crate::estimation::parameters::Dimensions {
-        n_states: 3,
-        n_observations: 3,
-        kernel: (3, 3),
+    let filter = |sees_own_state| {
+        let dimensions = crate::estimation::parameters::Dimensions {
+            n_states: 3,
+            n_observations: 3,
+            kernel: (3, 3),
+            sees_own_state,
+        };
+        Some(Learner::new(dimensions, shape(), &AgentConfig::default()).learned())
     };
     let learned = Learned {
-        filter: Some(Learner::new(dimensions, shape(), &AgentConfig::default()).learned()),
+        filter: filter(false),
+        own_filter: filter(true),
         network: Some(Arc::new(network)),
         decisions: None,
     };
@@ -130,6 +135,7 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
         "act_exploit_at_0_3",
         "oracle_beam",
         "learned_beam",
+        "learned_own_spatial_beam",
         "autoencoder_explore",
         "autoencoder_beam",
     ] {

@@ -4,99 +4,104 @@
 //! `g = dL/du`: `h = dL/dv = (g - sum_m g[m] u[m]) / sum_m v`; `dL/dw[m, n, a] = sum_cells h[m]
 //! p[n, . + a]`; `dL/dp` is the correlation of `h` with the kernel turned and its states exchanged.
 //!
-//! [`protocol::Transition`] computes the forward part too; it gains from weights that are zero or
-//! alike, of which a learned kernel has none, and does not know derivatives.
+//! Where each state `o` that a cell itself can be in has a kernel of its own, whose centre sees `o` itself:
+//! `u[m] = sum_o p[o] q[o, m]` with `q[o, m] = v[o, m] / sum_m v[o, m]`. Backward, with `d[o] = sum_m g[m] q[o, m]`:
+//! `h[o, m] = p[o] (g[m] - d[o]) / sum_m v[o, m]`, and `dL/dp[o]` has `d[o]` too.
 
+use crate::learning::filter::correlation::{Base, Correlation, Region, load, store};
 use crate::learning::filter::layout::Layout;
 use crate::learning::filter::vector::{LANES, Lanes, Real};
-use std::array::from_fn;
 use std::ops::Range;
 
-/// Next states computed at once: with [`WIDE`] vectors of cells they fill the registers.
-const GROUP: usize = 3;
-
-/// Vectors of cells computed at once.
-const WIDE: usize = 4;
-
-/// Weights `w[to, from, row, col]` laid out for a grid.
+/// Weights `w[to, from, row, col]`, or `w[own, to, from, row, col]`, laid out for a grid.
 #[derive(Debug, Clone)]
 pub(super) struct Operator<T> {
     pub(super) layout: Layout,
-    weights: Vec<T>,
-    /// `w[from, to, KH - 1 - row, KW - 1 - col]`.
-    turned: Vec<T>,
+    forward: Correlation<T>,
+    backward: Correlation<T>,
+    /// Where kernels see the cell's own state: the weights of their centres, `[own, to]`.
+    centres: Option<Vec<T>>,
     mask: Vec<T>,
 }
 
 impl<T: Real> Operator<T> {
-    pub(super) fn new(layout: Layout, weights: &[T]) -> Self {
-        let mut operator = Self {
+    pub(super) fn new(layout: Layout, n_kernels: usize, weights: &[T]) -> Self {
+        let mut weights = weights.to_vec();
+        let centres = (n_kernels > 1).then(|| {
+            let centres = centres(&layout);
+            centres
+                .map(|(own, all)| {
+                    let weight = weights[own];
+                    all.for_each(|at| weights[at] = T::zero());
+                    weight
+                })
+                .collect()
+        });
+        let forward = Correlation::new(layout, layout.n_states, weights);
+        Self {
             layout,
-            weights: Vec::new(),
-            turned: vec![T::zero(); weights.len()],
+            backward: forward.turned(),
+            forward,
+            centres,
             mask: layout.mask(),
-        };
-        operator.set(weights);
-        operator
+        }
     }
 
-    /// Takes other weights of the same shape.
-    pub(super) fn set(&mut self, weights: &[T]) {
-        let (n_states, n_taps) = (self.layout.n_states, self.layout.n_taps());
-        self.weights = weights.to_vec();
-        for to in 0..n_states {
-            for from in 0..n_states {
-                let straight = &weights[(to * n_states + from) * n_taps..][..n_taps];
-                let turned = &mut self.turned[(from * n_states + to) * n_taps..][..n_taps];
-                let reversed = straight.iter().rev();
-                turned
-                    .iter_mut()
-                    .zip(reversed)
-                    .for_each(|(to, &from)| *to = from);
+    /// Planes of `v` and `h`.
+    pub(super) fn weighed_planes(&self) -> Vec<T> {
+        vec![T::zero(); self.forward.n_to() * self.layout.plane]
+    }
+
+    /// `u = Phi_w(p)` in planes. Of a kernel of all cells `factors` (one plane) gets `1 / sum_m v`, 0 beside the
+    /// grid; of others `v` is room.
+    #[inline(always)]
+    pub(super) fn forward<V: Lanes<T>>(
+        &self,
+        p: &[T],
+        u: &mut [T],
+        factors: &mut [T],
+        v: &mut [T],
+    ) {
+        for row in 0..self.layout.shape.height() {
+            match &self.centres {
+                None => {
+                    self.forward.row::<V>(p, u, Base::Zero, row);
+                    self.normalise::<V>(u, factors, row);
+                }
+                Some(centres) => {
+                    self.forward.row::<V>(p, v, Base::Biases(centres), row);
+                    self.mix::<V>(p, v, u, row);
+                }
             }
         }
     }
 
-    /// `u = Phi_w(p)` in planes; `factors` (one plane) gets `1 / sum_m v`, 0 beside the grid.
-    #[inline(always)]
-    pub(super) fn forward<V: Lanes<T>>(&self, p: &[T], u: &mut [T], factors: &mut [T]) {
-        for row in 0..self.layout.shape.height() {
-            self.correlate::<V>(&self.weights, p, u, row);
-            self.normalise::<V>(u, factors, row);
-        }
-    }
-
-    /// `h` from `g` and `u`, in some rows and columns.
+    /// `h` from `g` in some rows and columns; `g` becomes `d`, and `u` is no more, where kernels see the cell's own state.
     #[inline(always)]
     pub(super) fn backward_normalise<V: Lanes<T>>(
         &self,
-        g: &[T],
-        u: &[T],
+        p: &[T],
+        u: &mut [T],
         factors: &[T],
-        h: &mut [T],
+        (g, h): (&mut [T], &mut [T]),
         region: &Region,
     ) {
-        let plane = self.layout.plane;
         for row in region.rows.clone() {
-            for at in region.places(&self.layout, row) {
-                let mut mean = V::splat(T::zero());
-                for state in 0..self.layout.n_states {
-                    let (g, u) = (
-                        load::<T, V>(g, state * plane + at),
-                        load(u, state * plane + at),
-                    );
-                    mean = g.multiply_add(u, mean);
+            match &self.centres {
+                None => {
+                    let places = region.places(&self.layout, row);
+                    self.unnormalise::<V>(g, u, factors, h, places);
                 }
-                let factor: V = load(factors, at);
-                for state in 0..self.layout.n_states {
-                    let g: V = load(g, state * plane + at);
-                    store(g.minus(mean).times(factor), h, state * plane + at);
+                Some(centres) => {
+                    // Whole rows: h is 0 where g is.
+                    self.forward.row::<V>(p, h, Base::Biases(centres), row);
+                    self.unmix::<V>(p, u, g, h, row);
                 }
             }
         }
     }
 
-    /// Adds `dL/dw` of some rows and columns of `h` to `gradient`.
+    /// Adds `dL/dw` of some rows and columns of `h` to `gradient`; [`Self::end_gradient`] is still to come.
     #[inline(always)]
     pub(super) fn add_weight_gradient<V: Lanes<T>>(
         &self,
@@ -105,246 +110,153 @@ impl<T: Real> Operator<T> {
         region: &Region,
         gradient: &mut [f64],
     ) {
-        let Layout { n_states, .. } = self.layout;
-        for from in 0..n_states {
-            for kernel_row in 0..self.layout.kernel_height {
-                let mut to = 0;
-                while to < n_states {
-                    let corner = (to, from, kernel_row);
-                    match n_states - to {
-                        1 => self.taps::<V, 1>(p, h, region, corner, gradient),
-                        2 => self.taps::<V, 2>(p, h, region, corner, gradient),
-                        _ => self.taps::<V, GROUP>(p, h, region, corner, gradient),
-                    }
-                    to += GROUP;
-                }
-            }
+        self.forward
+            .add_weight_gradient::<V>(p, h, region, gradient);
+    }
+
+    /// A centre that sees the cell's own state has the sum of `h` as its derivative. As beliefs sum to one, that is the sum
+    /// of what the states that it could see have.
+    pub(super) fn end_gradient(&self, gradient: &mut [f64]) {
+        if self.centres.is_none() {
+            return;
+        }
+        for (own, all) in centres(&self.layout) {
+            let sum: f64 = all.clone().map(|at| gradient[at]).sum();
+            all.for_each(|at| gradient[at] = 0.0);
+            gradient[own] = sum;
         }
     }
 
-    /// `dL/dp` from `h`, in some rows.
+    /// `dL/dp` from `h`, and from `d` in `g`, in some rows.
     #[inline(always)]
     pub(super) fn backward_correlate<V: Lanes<T>>(&self, h: &[T], g: &mut [T], rows: Range<usize>) {
+        let base = match self.centres {
+            None => Base::Zero,
+            Some(_) => Base::Planes,
+        };
         for row in rows {
-            self.correlate::<V>(&self.turned, h, g, row);
-        }
-    }
-
-    /// One row of eq. 2.
-    #[inline(always)]
-    fn correlate<V: Lanes<T>>(&self, weights: &[T], from: &[T], to: &mut [T], row: usize) {
-        let n_states = self.layout.n_states;
-        let mut first = 0;
-        while first < n_states {
-            match n_states - first {
-                1 => self.group::<V, 1>(weights, from, to, row, first),
-                2 => self.group::<V, 2>(weights, from, to, row, first),
-                _ => self.group::<V, GROUP>(weights, from, to, row, first),
-            }
-            first += GROUP;
-        }
-    }
-
-    /// The same for the next states from `first` on.
-    #[inline(always)]
-    fn group<V: Lanes<T>, const G: usize>(
-        &self,
-        weights: &[T],
-        from: &[T],
-        to: &mut [T],
-        row: usize,
-        first: usize,
-    ) {
-        let columns = self.layout.columns();
-        let mut col = 0;
-        while col + WIDE * LANES <= columns {
-            self.block::<V, G, WIDE>(weights, from, to, (row, col), first);
-            col += WIDE * LANES;
-        }
-        while col < columns {
-            self.block::<V, G, 1>(weights, from, to, (row, col), first);
-            col += LANES;
-        }
-    }
-
-    /// The same for `B` vectors of cells.
-    #[inline(always)]
-    fn block<V: Lanes<T>, const G: usize, const B: usize>(
-        &self,
-        weights: &[T],
-        from: &[T],
-        to: &mut [T],
-        (row, col): (usize, usize),
-        first: usize,
-    ) {
-        let layout = &self.layout;
-        let (n_states, n_taps) = (layout.n_states, layout.n_taps());
-        let mut sums = [[V::splat(T::zero()); B]; G];
-        for state in 0..n_states {
-            for a in 0..layout.kernel_height {
-                for c in 0..layout.kernel_width {
-                    let at = state * layout.plane + (row + a) * layout.stride + c + col;
-                    let tap = state * n_taps + a * layout.kernel_width + c;
-                    let weight = |g: usize| weights[(first + g) * n_states * n_taps + tap];
-                    let taps: [V; G] = from_fn(|g| V::splat(weight(g)));
-                    let cells: [V; B] = from_fn(|b| load(from, at + b * LANES));
-                    for (&tap, sums) in taps.iter().zip(&mut sums) {
-                        for (&cells, sum) in cells.iter().zip(sums) {
-                            *sum = tap.multiply_add(cells, *sum);
-                        }
-                    }
-                }
-            }
-        }
-        for (g, sums) in sums.iter().enumerate() {
-            let at = (first + g) * layout.plane + layout.row(row) + col;
-            for (b, sum) in sums.iter().enumerate() {
-                store(*sum, to, at + b * LANES);
-            }
+            self.backward.row::<V>(h, g, base, row);
         }
     }
 
     /// One row of eq. 3.
     #[inline(always)]
     fn normalise<V: Lanes<T>>(&self, u: &mut [T], factors: &mut [T], row: usize) {
-        let layout = &self.layout;
-        for col in (0..layout.columns()).step_by(LANES) {
-            let at = layout.row(row) + col;
-            let mask: V = load(&self.mask, col);
-            // Beside the grid the sum may be 0, where no factor is wanted.
-            let mut total = V::splat(T::one()).minus(mask);
-            for state in 0..layout.n_states {
-                total = total.plus(load(u, state * layout.plane + at));
-            }
-            let factor = mask.over(total);
+        for col in (0..self.layout.columns()).step_by(LANES) {
+            let at = self.layout.row(row) + col;
+            let factor: V = self.factor(u, 0, at, col);
             store(factor, factors, at);
-            for state in 0..layout.n_states {
-                let at = state * layout.plane + at;
+            for state in 0..self.layout.n_states {
+                let at = state * self.layout.plane + at;
                 let weights: V = load(u, at);
                 store(weights.times(factor), u, at);
             }
         }
     }
 
-    /// The gradients of one row of the kernel between `from` and `G` next states, three taps a time.
+    /// The reverse of [`Self::normalise`]: `h`.
     #[inline(always)]
-    fn taps<V: Lanes<T>, const G: usize>(
+    fn unnormalise<V: Lanes<T>>(
         &self,
-        p: &[T],
-        h: &[T],
-        region: &Region,
-        corner: (usize, usize, usize),
-        gradient: &mut [f64],
+        g: &[T],
+        u: &[T],
+        factors: &[T],
+        h: &mut [T],
+        places: impl Iterator<Item = usize>,
     ) {
-        let mut first = 0;
-        while first + 3 <= self.layout.kernel_width {
-            self.some_taps::<V, G, 3>(p, h, region, corner, first, gradient);
-            first += 3;
-        }
-        while first < self.layout.kernel_width {
-            self.some_taps::<V, G, 1>(p, h, region, corner, first, gradient);
-            first += 1;
+        let Layout {
+            n_states, plane, ..
+        } = self.layout;
+        for at in places {
+            let mut mean = V::splat(T::zero());
+            for state in 0..n_states {
+                let (g, u): (V, V) = (load(g, state * plane + at), load(u, state * plane + at));
+                mean = g.multiply_add(u, mean);
+            }
+            let factor: V = load(factors, at);
+            for state in 0..n_states {
+                let g: V = load(g, state * plane + at);
+                store(g.minus(mean).times(factor), h, state * plane + at);
+            }
         }
     }
 
+    /// One row of `u` from `v`, by the cell's own state.
     #[inline(always)]
-    fn some_taps<V: Lanes<T>, const G: usize, const C: usize>(
-        &self,
-        p: &[T],
-        h: &[T],
-        region: &Region,
-        (to, from, kernel_row): (usize, usize, usize),
-        first: usize,
-        gradient: &mut [f64],
-    ) {
-        let layout = &self.layout;
-        let tap = from * layout.plane + kernel_row * layout.stride + first;
-        let origin = layout.row(0);
-        let mut sums = [[V::splat(T::zero()); C]; G];
-        for row in region.rows.clone() {
-            for at in region.places(layout, row) {
-                let cells: [V; C] = from_fn(|c| load(p, tap + at - origin + c));
-                for (g, sums) in sums.iter_mut().enumerate() {
-                    let h: V = load(h, (to + g) * layout.plane + at);
-                    for (&cells, sum) in cells.iter().zip(sums) {
-                        *sum = cells.multiply_add(h, *sum);
-                    }
+    fn mix<V: Lanes<T>>(&self, p: &[T], v: &[T], u: &mut [T], row: usize) {
+        let Layout {
+            n_states, plane, ..
+        } = self.layout;
+        for col in (0..self.layout.columns()).step_by(LANES) {
+            let at = self.layout.row(row) + col;
+            for state in 0..n_states {
+                store(V::splat(T::zero()), u, state * plane + at);
+            }
+            for own in 0..n_states {
+                let first = own * n_states;
+                let p: V = load(p, own * plane + at);
+                let share = p.times(self.factor(v, first, at, col));
+                for state in 0..n_states {
+                    let v: V = load(v, (first + state) * plane + at);
+                    let sum: V = load(u, state * plane + at);
+                    store(v.multiply_add(share, sum), u, state * plane + at);
                 }
             }
         }
-        for (g, sums) in sums.iter().enumerate() {
-            let entry = ((to + g) * layout.n_states + from) * layout.n_taps();
-            let entry = entry + kernel_row * layout.kernel_width + first;
-            for (gradient, &sum) in gradient[entry..].iter_mut().zip(sums) {
-                *gradient += total(sum);
+    }
+
+    /// The reverse of [`Self::mix`]: `h` in the place of `v`, and `d` in that of `g`.
+    #[inline(always)]
+    fn unmix<V: Lanes<T>>(&self, p: &[T], d: &mut [T], g: &mut [T], h: &mut [T], row: usize) {
+        let Layout {
+            n_states, plane, ..
+        } = self.layout;
+        for col in (0..self.layout.columns()).step_by(LANES) {
+            let at = self.layout.row(row) + col;
+            for own in 0..n_states {
+                let first = own * n_states;
+                let factor: V = self.factor(h, first, at, col);
+                let mut mean = V::splat(T::zero());
+                for state in 0..n_states {
+                    let (g, v): (V, V) = (
+                        load(g, state * plane + at),
+                        load(h, (first + state) * plane + at),
+                    );
+                    mean = g.multiply_add(v.times(factor), mean);
+                }
+                store(mean, d, own * plane + at);
+                let share = factor.times(load(p, own * plane + at));
+                for state in 0..n_states {
+                    let g: V = load(g, state * plane + at);
+                    store(g.minus(mean).times(share), h, (first + state) * plane + at);
+                }
+            }
+            for state in 0..n_states {
+                let d: V = load(d, state * plane + at);
+                store(d, g, state * plane + at);
             }
         }
     }
-}
 
-/// The rows and vectors of columns outside of which a gradient is zero.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(super) struct Region {
-    pub(super) rows: Range<usize>,
-    pub(super) cols: Range<usize>,
-}
-
-impl Region {
-    pub(super) fn add(&mut self, row: usize, col: usize) {
-        self.rows = widened(&self.rows, row..row + 1);
-        let col = col / LANES * LANES;
-        self.cols = widened(&self.cols, col..col + LANES);
-    }
-
-    /// The cells that the kernel reaches from these.
-    pub(super) fn reached(&self, layout: &Layout) -> Self {
-        if self.rows.is_empty() {
-            return Self::default();
-        }
-        let (above, left) = (layout.above, layout.left);
-        let rows = self.rows.start.saturating_sub(above)
-            ..(self.rows.end + above).min(layout.shape.height());
-        let first = self.cols.start.saturating_sub(left) / LANES * LANES;
-        let end = (self.cols.end + left).next_multiple_of(LANES);
-        Self {
-            rows,
-            cols: first..end.min(layout.columns()),
-        }
-    }
-
-    /// Places of the vectors in a row.
+    /// `1 / sum_m v` of the planes from `first` on, 0 beside the grid.
     #[inline(always)]
-    fn places(&self, layout: &Layout, row: usize) -> impl Iterator<Item = usize> + use<> {
-        let start = layout.row(row);
-        self.cols.clone().step_by(LANES).map(move |col| start + col)
+    fn factor<V: Lanes<T>>(&self, v: &[T], first: usize, at: usize, col: usize) -> V {
+        let mask: V = load(&self.mask, col);
+        // Beside the grid the sum may be 0, where no factor is wanted.
+        let mut total = V::splat(T::one()).minus(mask);
+        for state in first..first + self.layout.n_states {
+            total = total.plus(load(v, state * self.layout.plane + at));
+        }
+        mask.over(total)
     }
 }
 
-fn widened(range: &Range<usize>, other: Range<usize>) -> Range<usize> {
-    if range.is_empty() {
-        return other;
-    }
-    range.start.min(other.start)..range.end.max(other.end)
-}
-
-#[inline(always)]
-fn load<T, V: Lanes<T>>(planes: &[T], at: usize) -> V {
-    let lanes = planes[at..].first_chunk();
-    V::load(lanes.expect("invariant: the layout has room for whole vectors"))
-}
-
-#[inline(always)]
-fn store<T, V: Lanes<T>>(numbers: V, planes: &mut [T], at: usize) {
-    let lanes = planes[at..].first_chunk_mut();
-    numbers.store(lanes.expect("invariant: the layout has room for whole vectors"));
-}
-
-#[inline(always)]
-fn total<T: Real, V: Lanes<T>>(numbers: V) -> f64 {
-    let mut lanes = [T::zero(); LANES];
-    numbers.store(&mut lanes);
-    let lanes = lanes.iter();
-    lanes
-        .map(|lane| lane.to_f64().expect("invariant: floats cast"))
-        .sum()
+/// For each own state and each next one, the place of the weight of the centre that sees the own state, and of those of
+/// all states that it could see.
+fn centres(layout: &Layout) -> impl Iterator<Item = (usize, impl Iterator<Item = usize> + Clone)> {
+    let (n_states, n_taps) = (layout.n_states, layout.n_taps());
+    (0..n_states * n_states).map(move |weighed| {
+        let place = move |from| (weighed * n_states + from) * n_taps + n_taps / 2;
+        (place(weighed / n_states), (0..n_states).map(place))
+    })
 }

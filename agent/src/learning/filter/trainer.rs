@@ -181,11 +181,10 @@ impl Trainer {
 
     /// Gives streams at the end of a block, or whose block is gone, another one.
     fn place_streams(&mut self, replay: &Replay) {
-        let n_windows = self.config.block_windows;
         for index in 0..self.streams.len() {
             let stream = &self.streams[index];
-            let block = stream.block.filter(|_| stream.n_done < n_windows);
-            if block.is_none_or(|number| replay.block(number).is_none()) {
+            let block = stream.block.and_then(|number| replay.block(number));
+            if block.is_none_or(|block| stream.n_done >= self.n_windows(block)) {
                 let (number, block) = self.next_block(replay);
                 let stream = &mut self.streams[index];
                 (stream.block, stream.n_done) = (Some(number), 0);
@@ -194,6 +193,11 @@ impl Trainer {
                 }
             }
         }
+    }
+
+    /// Windows of a block, the last of which may be shorter.
+    fn n_windows(&self, block: &Block) -> usize {
+        block.frames.len().div_ceil(self.config.window)
     }
 
     /// The next block of the lap, or the first of a new lap through all blocks.
@@ -228,20 +232,23 @@ impl Trainer {
                     None if first == 0 => Start::Initial,
                     _ => Start::Belief(&stream.belief),
                 };
-                Some(window.run(start, &block.frames[first..first + length], &mut stream.end))
+                let end = block.frames.len().min(first + length);
+                Some(window.run(start, &block.frames[first..end], &mut stream.end))
             })
         });
         outcomes.collect()
     }
 
     fn move_streams(&mut self, replay: &mut Replay) {
+        let length = self.config.window;
         for stream in &mut self.streams {
             std::mem::swap(&mut stream.belief, &mut stream.end);
             stream.n_done += 1;
-            if let Some(block) = stream.block
-                && stream.n_done == self.config.block_windows
+            if let Some(number) = stream.block
+                && let Some(block) = replay.block(number)
+                && stream.n_done * length >= block.frames.len()
             {
-                replay.hand_on(block, &stream.belief);
+                replay.hand_on(number, &stream.belief);
             }
         }
     }

@@ -7,8 +7,9 @@
 //! only the region where they are not is computed.
 
 use crate::estimation::parameters::Tables;
+use crate::learning::filter::correlation::Region;
 use crate::learning::filter::layout::Layout;
-use crate::learning::filter::operator::{Operator, Region};
+use crate::learning::filter::operator::Operator;
 use crate::learning::filter::vector::{Lanes, Real, Vectorised, on_widest};
 use crate::learning::replay::Sighting;
 use protocol::Shape;
@@ -44,7 +45,7 @@ pub struct Window<T> {
     seen: Vec<Seen>,
     /// Predictors of the seen cells before their correction, S of each.
     predictors: Vec<T>,
-    /// `dL/dp` or `dL/du`, and `dL/dv`.
+    /// `dL/dp` or `dL/du`; `dL/dv`, and forward room for `v`.
     by_belief: Vec<T>,
     by_weights: Vec<T>,
 }
@@ -63,21 +64,23 @@ impl<T: Real> Window<T> {
     pub fn new(tables: Tables<T>, shape: Shape, n_frames: usize) -> Self {
         let dimensions = tables.dimensions;
         let layout = Layout::new(shape, dimensions.n_states, dimensions.kernel);
+        let operator = Operator::new(layout, dimensions.n_kernels(), &tables.kernel);
         Self {
-            operator: Operator::new(layout, &tables.kernel),
+            by_weights: operator.weighed_planes(),
+            operator,
             tables,
             planes: vec![layout.planes(); n_frames + 1],
             factors: vec![vec![T::zero(); layout.plane]; n_frames + 1],
             seen: Vec::new(),
             predictors: Vec::new(),
             by_belief: layout.planes(),
-            by_weights: layout.planes(),
         }
     }
 
     /// Takes other parameters of the same dimensions.
     pub fn set(&mut self, tables: &Tables<T>) {
-        self.operator.set(&tables.kernel);
+        let n_kernels = tables.dimensions.n_kernels();
+        self.operator = Operator::new(self.layout(), n_kernels, &tables.kernel);
         self.tables.clone_from(tables);
     }
 
@@ -153,8 +156,9 @@ impl<T: Real> Window<T> {
     fn predict<V: Lanes<T>>(&mut self, frame: usize) {
         let (before, after) = self.planes.split_at_mut(frame + 1);
         let factors = &mut self.factors[frame + 1];
+        let weights = &mut self.by_weights;
         self.operator
-            .forward::<V>(&before[frame], &mut after[0], factors);
+            .forward::<V>(&before[frame], &mut after[0], factors, weights);
     }
 
     #[inline(always)]
@@ -207,13 +211,14 @@ impl<T: Real> Window<T> {
         region: &Region,
         outcome: &mut Outcome,
     ) -> Region {
-        let (u, p) = (&self.planes[frame], &self.planes[frame - 1]);
+        let (before, after) = self.planes.split_at_mut(frame);
+        let (p, u, factors) = (&before[frame - 1], &mut after[0], &self.factors[frame]);
         let operator = &self.operator;
-        let h = &mut self.by_weights;
-        operator.backward_normalise::<V>(&self.by_belief, u, &self.factors[frame], h, region);
+        let (g, h) = (&mut self.by_belief, &mut self.by_weights);
+        operator.backward_normalise::<V>(p, u, factors, (g, h), region);
         operator.add_weight_gradient::<V>(p, h, region, &mut outcome.gradient[0]);
         let reached = region.reached(&operator.layout);
-        operator.backward_correlate::<V>(h, &mut self.by_belief, reached.rows.clone());
+        operator.backward_correlate::<V>(h, g, reached.rows.clone());
         reached
     }
 
@@ -264,6 +269,7 @@ impl<T: Real> Vectorised for Pass<'_, T> {
             .layout()
             .unload(&window.planes[n_frames], self.end, cast);
         window.backward::<V>(n_frames, &mut outcome);
+        window.operator.end_gradient(&mut outcome.gradient[0]);
         if matches!(self.start, Start::Initial) {
             window.add_initial_gradient(&mut outcome);
         }

@@ -11,10 +11,10 @@ use crate::estimation::BayesFilter;
 use crate::estimation::belief::Belief;
 use crate::estimation::parameters::{Dimensions, Tables};
 use crate::learning::checkpoint::Contents;
-use crate::learning::learner::{KIND, LearnedModel, Learner};
+use crate::learning::learner::{LearnedModel, Learner};
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
-use crate::planning::policy::{PlannerKind, Policy};
+use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::planning::{Objective, Plan, Target};
 use crate::rollout::agent::numbered_states;
 use crate::rollout::{self, Robot};
@@ -96,7 +96,7 @@ impl FilterStudent {
         let tables = &self.learned.tables;
         let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape));
         let names = numbered_states(tables.dimensions.n_states);
-        let (policy, config) = (Policy::learned(PlannerKind::Beam), &self.config);
+        let (policy, config) = (self.policy(), &self.config);
         let worlds = &self.worlds;
         worlds.robot(config, &policy, Box::new(filter), names, observation)
     }
@@ -111,6 +111,15 @@ impl FilterStudent {
             robot,
             is_walking: false,
         })
+    }
+
+    /// What robots that don't walk at random act by.
+    fn policy(&self) -> Policy {
+        let estimator = match self.learned.tables.dimensions.sees_own_state {
+            false => EstimatorKind::Learned,
+            true => EstimatorKind::LearnedOwn,
+        };
+        Policy::learned(estimator, PlannerKind::Beam)
     }
 
     /// Worlds whose robots walk at random: all at first, some for good; none of a frozen student.
@@ -128,7 +137,7 @@ impl FilterStudent {
 
 impl Student for FilterStudent {
     fn kind(&self) -> &'static str {
-        KIND
+        self.learner.kind()
     }
 
     fn columns(&self) -> &'static [&'static str] {
@@ -181,7 +190,7 @@ impl Student for FilterStudent {
         }
         let objective = Objective {
             target: Target::State(self.learned.target),
-            ..self.config.objective(&Policy::learned(PlannerKind::Beam))
+            ..self.config.objective(&self.policy())
         };
         let mut tick = Tick::default();
         rollout::step(

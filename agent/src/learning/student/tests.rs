@@ -9,7 +9,7 @@ use crate::learning::student::filter::FilterStudent;
 use crate::learning::student::network::{NetworkStudent, Progress};
 use crate::learning::student::{Student, Worlds};
 use crate::planning::action::ActionSet;
-use crate::planning::policy::{PlannerKind, Policy};
+use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::planning::{BasisKind, Objective, PlanningProblem, Target};
 use crate::rollout::Robot;
 use crate::server::client::Observation;
@@ -127,10 +127,11 @@ fn students_plan_on_the_belief_that_settings_say() {
             n_states: 3,
             n_observations: 3,
             kernel: (3, 3),
+            sees_own_state: false,
         };
         let student = FilterStudent::new(dimensions, worlds(), config);
         check(student, basis, |belief, target, step| {
-            let policy = Policy::learned(PlannerKind::Beam);
+            let policy = Policy::learned(EstimatorKind::Learned, PlannerKind::Beam);
             let objective = Objective {
                 target: Target::State(target),
                 ..config.objective(&policy)
@@ -149,7 +150,7 @@ fn students_plan_on_the_belief_that_settings_say() {
         let decisions = Decisions::first(&model, &config.decisions, 0);
         let student = DecisionsStudent::new(decisions, filter, &model, worlds(), config);
         let actions = ActionSet::beam(&model);
-        let beam = Policy::learned(PlannerKind::Beam);
+        let beam = Policy::learned(EstimatorKind::Learned, PlannerKind::Beam);
         check(student, basis, |belief, _, step| {
             let path = |action: &crate::planning::action::Action| {
                 let random = (config.planner_seed(0), step);

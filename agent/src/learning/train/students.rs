@@ -13,7 +13,7 @@ use crate::learning::train::training::Training;
 use crate::server::client::Client;
 use anyhow::{Context, Result, bail};
 use protocol::Model;
-use protocol::control::{CoverageRule, ServerInfo};
+use protocol::control::CoverageRule;
 use std::path::Path;
 
 /// What the settings say that learns, going on from a checkpoint's contents if there are any.
@@ -32,8 +32,7 @@ pub fn student(
     };
     let of_file = || format!("checkpoint {}", place.display());
     Ok(match config.learner {
-        LearnerKind::Filter => {
-            warn_of_short_episodes(info, config);
+        LearnerKind::Filter | LearnerKind::OwnFilter => {
             let dimensions = dimensions(config, worlds.n_observations)?;
             Box::new(match contents {
                 Some(contents) => FilterStudent::resume(contents, dimensions, worlds, config)
@@ -75,17 +74,6 @@ pub fn student(
     })
 }
 
-/// The filter learns from full blocks, and a block does not go beyond its episode.
-fn warn_of_short_episodes(info: &ServerInfo, config: &AgentConfig) {
-    let frames = (config.learning.window * config.learning.block_windows) as u64;
-    if let Some(steps) = info.shortest_episode().filter(|&steps| steps < frames) {
-        tracing::warn!(
-            "learning.window times learning.block_windows: expected at most {steps}, the steps of the shortest episode, \
-             got {frames}: episodes shorter than that teach nothing"
-        );
-    }
-}
-
 fn dimensions(config: &AgentConfig, n_observations: usize) -> Result<Dimensions> {
     let learning = config.learning;
     let n_states = match learning.states {
@@ -97,6 +85,7 @@ fn dimensions(config: &AgentConfig, n_observations: usize) -> Result<Dimensions>
         n_states,
         n_observations,
         kernel,
+        sees_own_state: config.learner == LearnerKind::OwnFilter,
     };
     dimensions.check()
 }

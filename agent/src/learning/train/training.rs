@@ -48,6 +48,7 @@ impl Training {
         let n_worlds = self.worlds.len();
         let kind = match self.config.learner {
             LearnerKind::Filter => learner::KIND,
+            LearnerKind::OwnFilter => learner::OWN_KIND,
             LearnerKind::Autoencoder if n_worlds != 1 => {
                 bail!(
                     "--worlds: expected 1 for the autoencoder, which follows one world, got {n_worlds}"

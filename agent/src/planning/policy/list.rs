@@ -31,7 +31,9 @@ fn description(policy: &Policy, model: &Model) -> String {
         EstimatorKind::None | EstimatorKind::KnownModel => "",
         EstimatorKind::Spatial => "; corrections reach neighbours",
         EstimatorKind::Learned => "; learned filter, needs --checkpoint",
-        EstimatorKind::LearnedSpatial => "; learned, reaching neighbours, needs --checkpoint",
+        EstimatorKind::LearnedSpatial => "; learned, reaches neighbours, needs --checkpoint",
+        EstimatorKind::LearnedOwn => "; learned, by own state, needs --checkpoint",
+        EstimatorKind::LearnedOwnSpatial => "; by own state and neighbours, needs --checkpoint",
         EstimatorKind::Autoencoder => "; learned autoencoder, needs --checkpoint",
         EstimatorKind::Truth => "; told hidden states, needs --publish-truth",
         EstimatorKind::NextTruth => "; told the next states, only in `compare`",
@@ -79,7 +81,7 @@ mod tests {
         assert_eq!(
             line("clairvoyant_beam").map(str::trim),
             Some(
-                "clairvoyant_beam          beam search for fire, which pays most; told the next \
+                "clairvoyant_beam              beam search for fire, which pays most; told the next \
                  states, only in `compare`"
             )
         );

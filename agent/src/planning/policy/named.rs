@@ -18,6 +18,10 @@ pub enum EstimatorKind {
     Learned,
     /// The same, whose corrections reach the neighbours of visited cells.
     LearnedSpatial,
+    /// [`Self::Learned`] with a kernel for each state that a cell itself can be in.
+    LearnedOwn,
+    /// [`Self::LearnedSpatial`] with a kernel for each state that a cell itself can be in.
+    LearnedOwnSpatial,
     /// The paper's dynamic autoencoder (sections III.B and III.C).
     Autoencoder,
     /// The hidden state X_k, predicted one step ahead: an upper bound on estimation.
@@ -68,7 +72,11 @@ impl EstimatorKind {
     pub fn is_learned(self) -> bool {
         matches!(
             self,
-            Self::Learned | Self::LearnedSpatial | Self::Autoencoder
+            Self::Learned
+                | Self::LearnedSpatial
+                | Self::LearnedOwn
+                | Self::LearnedOwnSpatial
+                | Self::Autoencoder
         )
     }
 
@@ -80,6 +88,8 @@ impl EstimatorKind {
             Self::Spatial => "spatial_filter",
             Self::Learned => "learned_filter",
             Self::LearnedSpatial => "learned_spatial_filter",
+            Self::LearnedOwn => "learned_own_filter",
+            Self::LearnedOwnSpatial => "learned_own_spatial_filter",
             Self::Autoencoder => "autoencoder",
             Self::Truth => "truth",
             Self::NextTruth => "next_truth",
@@ -119,8 +129,8 @@ impl Policy {
     ///
     /// Names are `random_walk`, `coverage`, `shooting_*` and `beam_*` with `exploit` (the state that
     /// pays most), `exploit_only` (the same without the coverage bonus), `explore` (entropy) or the name
-    /// of a state, and `spatial_*`, `oracle_*`, `clairvoyant_*`, `learned_*` and `learned_spatial_*` with `shooting` or
-    /// `beam`. On the autoencoder's belief there are `autoencoder_exploit` and `autoencoder_explore`, which shoot,
+    /// of a state, and `spatial_*`, `oracle_*`, `clairvoyant_*`, `learned_*`, `learned_spatial_*`, `learned_own_*` and
+    /// `learned_own_spatial_*` with `shooting` or `beam`. On the autoencoder's belief there are `autoencoder_exploit` and `autoencoder_explore`, which shoot,
     /// `autoencoder_policy`, for which the DQN chooses among the paper's objectives, and `autoencoder_beam`.
     /// `dqn_beam` chooses among [`ActionSet::beam`] by a DQN; `act_*` always takes the action of that name.
     pub fn named(name: &str, model: &Model) -> Result<Self, UnknownPolicy> {
@@ -155,11 +165,10 @@ impl Policy {
                     "act" => Self::always(name, rest, model).ok_or_else(unknown)?,
                     "autoencoder" => Self::of_autoencoder(rest).ok_or_else(unknown)?,
                     "spatial" | "oracle" | "clairvoyant" | "learned" => {
-                        let (estimator, planner) = match (family, rest.strip_prefix("spatial_")) {
-                            ("learned", Some(planner)) => (EstimatorKind::LearnedSpatial, planner),
-                            ("learned", None) => (EstimatorKind::Learned, rest),
-                            ("spatial", _) => (EstimatorKind::Spatial, rest),
-                            ("oracle", _) => (EstimatorKind::Truth, rest),
+                        let (estimator, planner) = match family {
+                            "learned" => learned_filter(rest),
+                            "spatial" => (EstimatorKind::Spatial, rest),
+                            "oracle" => (EstimatorKind::Truth, rest),
                             _ => (EstimatorKind::NextTruth, rest),
                         };
                         let planner = planner_named(planner).ok_or_else(unknown)?;
@@ -210,18 +219,16 @@ impl Policy {
         states.chain([choice("entropy", Target::Entropy)]).collect()
     }
 
-    /// A planner on the learned belief; what it maximises is learned too.
-    pub fn learned(planner: PlannerKind) -> Self {
+    /// A planner on the belief of a learned filter; what it maximises is learned too.
+    pub fn learned(estimator: EstimatorKind, planner: PlannerKind) -> Self {
         // The agent puts the state that pays most, as learned, in the place of this one.
         let target = match planner {
             PlannerKind::RandomWalk => Target::Coverage,
             PlannerKind::Shooting | PlannerKind::Beam => Target::State(0),
         };
-        let (name, objective) = (
-            format!("learned_{}", planner.label()),
-            objective(planner, target),
-        );
-        Self::new(&name, EstimatorKind::Learned, planner, objective)
+        let filter = estimator.label().trim_end_matches("_filter");
+        let name = format!("{filter}_{}", planner.label());
+        Self::new(&name, estimator, planner, objective(planner, target))
     }
 
     /// Beam search on the known model's belief that always takes one action.
@@ -282,6 +289,19 @@ fn objective(planner: PlannerKind, target: Target) -> Objective {
             ..Objective::new(target)
         },
     }
+}
+
+/// The filter and the planner's name of a policy `learned_*`.
+fn learned_filter(name: &str) -> (EstimatorKind, &str) {
+    let kinds = [
+        ("own_spatial_", EstimatorKind::LearnedOwnSpatial),
+        ("own_", EstimatorKind::LearnedOwn),
+        ("spatial_", EstimatorKind::LearnedSpatial),
+        ("", EstimatorKind::Learned),
+    ];
+    let mut kinds = kinds.into_iter();
+    let found = kinds.find_map(|(prefix, kind)| Some((kind, name.strip_prefix(prefix)?)));
+    found.expect("invariant: every name begins with nothing")
 }
 
 fn planner_named(name: &str) -> Option<PlannerKind> {

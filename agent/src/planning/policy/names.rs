@@ -14,6 +14,14 @@ pub const OF_FILTER: [&str; 4] = [
     "learned_spatial_beam",
 ];
 
+/// The names that need the checkpoint of one whose kernels see the cell's own state.
+pub const OF_OWN_FILTER: [&str; 4] = [
+    "learned_own_shooting",
+    "learned_own_beam",
+    "learned_own_spatial_shooting",
+    "learned_own_spatial_beam",
+];
+
 /// The names that need the checkpoint of an autoencoder.
 pub const OF_AUTOENCODER: [&str; 4] = [
     "autoencoder_explore",
@@ -75,6 +83,7 @@ pub(super) fn known_names(model: &Model) -> Vec<String> {
     let mut names = ladder_names(model);
     names.extend(["beam_explore", "beam_exploit_only", "clairvoyant_shooting"].map(String::from));
     names.extend(OF_FILTER.map(String::from));
+    names.extend(OF_OWN_FILTER.map(String::from));
     names.extend(OF_DECISIONS.map(String::from));
     names.extend(
         ActionSet::beam(model)
