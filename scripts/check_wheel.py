@@ -1,4 +1,4 @@
-"""What a user does first with the installed package; for `scripts/wheel`, which leaves no compiler in PATH.
+"""What a user does first with the installed package; `scripts/wheel` leaves no compiler in PATH.
 
 Needs Pillow, for the Python of README.md, which it runs.
 """
