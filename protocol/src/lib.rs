@@ -25,3 +25,7 @@ pub use wire::{
     agent_belief, channels, cleanup, control, decisions, failed_connections, message, observer,
     payload, recording, responder, turn, wait,
 };
+
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
