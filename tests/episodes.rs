@@ -1,6 +1,7 @@
 //! Resets, episode ends and coverage, as every client sees them.
 
 use crate::harness::{PATIENCE, SMALL, Server, eventually, fly, new_instance, reset};
+use crate::random_robot::fly_at_random;
 use crate::wire::{RawClient, Wire, answer, control_header, step_body, step_header};
 use protocol::control::{Reply, Request, WorldInfo, WorldSeed};
 use protocol::message::{FLAG_FULL_COVERAGE, Operation, Status, StepRequest};
@@ -49,6 +50,15 @@ fn a_reset_starts_an_empty_frame_in_the_corner_and_answers_in_order() {
         (robot.coverage, world.reward, world.n_visited),
         (Coverage::Empty as u32, 0.0, 0)
     );
+}
+
+#[test]
+fn the_example_of_a_client_flies_an_episode() {
+    let server = Server::start(SMALL);
+    let rewards = fly_at_random(&server.instance, 5).expect("five steps");
+    let (world, robot, _) = server.observe(0);
+    assert_eq!((world.seed, world.step), (1000, 5));
+    assert_eq!((rewards.len(), rewards[4]), (5, robot.reward));
 }
 
 #[test]

@@ -2,7 +2,7 @@
 //!
 //! `cargo build --workspace` first: cargo does not build another package's programs for a test.
 //! `harness` runs programs; `wire` speaks the protocol byte by byte, `python` lets the Python package speak it;
-//! `mirror` steps a published world again; `learner` decides and `attacker` annoys; every other module is a group of
+//! `mirror` steps a published world again; `learner` decides and `attacker` annoys; `random_robot` is the example of a client; every other module is a group of
 //! facts. Each test has an instance, a folder and a deadline of its own. `cargo test -p tests -- --ignored` adds the
 //! long run of the hostile clients, and what needs Python (`scripts/test` installs it).
 
@@ -28,6 +28,9 @@ mod lease;
 mod mirror;
 mod places;
 mod python;
+#[expect(dead_code, reason = "the example's own main")]
+#[path = "../protocol/examples/random_robot.rs"]
+mod random_robot;
 mod recorded_worlds;
 mod recording;
 mod replays;

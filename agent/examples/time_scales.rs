@@ -1,7 +1,7 @@
 //! Draws the step sizes of autoencoder and DQN over a run of 25,000 iterations: those that vanish
 //! (`config/agent.toml`), and the authors' constants (`--preset paper`).
 //!
-//! `cargo run -p agent --example time_scales -- docs/time-scales.png`
+//! `cargo run -p emberwatch-agent --example time_scales -- docs/time-scales.png`
 
 use agent::benchmark::report::save;
 use agent::config::{AgentConfig, StepSize};

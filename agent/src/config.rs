@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
 /// Every setting with its default and meaning.
-const DEFAULTS: &str = include_str!("../../config/agent.toml");
+const DEFAULTS: &str = include_str!("../agent.toml");
 
 /// Where what the authors ran differs: moves clamped after the sum, a uniform first belief, the autoencoder and
 /// the DQN with steps of constant size.

@@ -9,7 +9,7 @@
 //! - [`rollout`] -- an agent, and the one step that all of these take
 //! - [`server`] -- the ends of the wire
 //! - [`config`] -- settings
-//! - [`file`] -- files written whole or not at all
+//! - [`mod@file`] -- files written whole or not at all
 //! - [`planning`] -- from a belief to a path
 //! - [`estimation`] -- from frames to a belief
 

@@ -2,7 +2,7 @@
 //! sensor, results and frames.
 //!
 //! Peer: the authors' PyTorch environment takes 1.1 ms for one 64 x 64 step on one CPU thread.
-//! `cargo bench -p env-server --bench step -- --warm-up-time 0.5 --measurement-time 1`
+//! `cargo bench -p emberwatch-server --bench step -- --warm-up-time 0.5 --measurement-time 1`
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use env_server::config::ServerConfig;

@@ -415,7 +415,7 @@ fn settings_follow_the_file_and_offsets_leave_a_step() {
     );
 }
 
-/// `cargo test --release -p env-server --test states_file -- --ignored --nocapture`
+/// `cargo test --release -p emberwatch-server --test states_file -- --ignored --nocapture`
 #[test]
 #[ignore = "measures"]
 fn a_thousand_steps_of_256_x_256_cells_load_within_a_second_and_twice_their_size() {

@@ -1,7 +1,7 @@
 //! One world transition and one predictor step, on one core.
 //!
 //! Peer: the authors' PyTorch environment takes 1.1 ms for one 64 x 64 step on one CPU thread.
-//! `cargo bench -p protocol --bench transition -- --warm-up-time 0.5 --measurement-time 1`
+//! `cargo bench -p emberwatch-protocol --bench transition -- --warm-up-time 0.5 --measurement-time 1`
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use protocol::{Dynamics, Model, Probabilities, Shape, Transition};

@@ -1,6 +1,6 @@
 //! Compares simulated worlds with the authors' simulator, statistic by statistic.
 //!
-//! `cargo run --release -p protocol --example world_statistics -- --runs 32`
+//! `cargo run --release -p emberwatch-protocol --example world_statistics -- --runs 32`
 //!
 //! Exits with 1 if any statistic differs by more than 3 combined standard errors. The reference has 7
 //! runs, and the statistics hang together: with other seeds, one just above 3 is no proof of an error.

@@ -1,5 +1,9 @@
-//! What the server and its clients agree on, in two folders: [`model`], the mathematics of the paper, and [`wire`], the
-//! messages and channels. `wire` depends on `model`, never the other way.
+//! What the server and its clients agree on: the mathematics of the paper ([`model`], [`grid`], [`path`], [`frame`],
+//! [`dynamics`], [`transition`]), and messages and channels.
+//!
+//! A client needs a [`Connection`] and the requests in [`control`] and [`message`]; `examples/random_robot.rs` is a whole
+//! one. An [`observer`] reads what a server publishes, a [`recording`] what a file holds of that. A [`responder`] serves
+//! decisions of its own. [`channels`] and [`failed_connections`] are for those who serve worlds.
 //!
 //! PROTOCOL.md describes the wire for other languages. Words: a *world* is the hidden state of one grid; a *step* `k`
 //! flies one path with each robot and moves the world once; a *frame* holds the observations of a step; a *lease* is the
@@ -8,7 +12,7 @@
 pub mod model;
 pub mod program;
 pub mod throttle;
-pub mod wire;
+mod wire;
 
 pub use model::dynamics::{self, Dynamics};
 pub use model::frame::{self, Coverage, Frame, UNOBSERVED};
@@ -21,3 +25,7 @@ pub use wire::{
     agent_belief, channels, cleanup, control, decisions, failed_connections, message, observer,
     payload, recording, responder, turn, wait,
 };
+
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

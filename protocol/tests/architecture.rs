@@ -1,5 +1,5 @@
 //! ARCHITECTURE.md names every room and file rightly; rooms use only those below them; no file depends on itself by
-//! way of others.
+//! way of others. The index of documents is complete.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -119,6 +119,20 @@ fn every_file_named_exists() {
         let exists = files.iter().any(is_end) || root().join(name).is_file();
         assert!(exists, "{name} does not exist");
     }
+}
+
+#[test]
+fn the_index_of_documents_is_complete() {
+    let folder = root().join("docs");
+    let index = std::fs::read_to_string(folder.join("README.md")).expect("an index");
+    let listed: BTreeSet<&str> = index.split('`').skip(1).step_by(2).collect();
+    let gone = listed.iter().find(|name| !root().join(name).is_file());
+    assert_eq!(gone, None);
+    let files = std::fs::read_dir(folder).expect("a folder");
+    let names = files.map(|file| format!("docs/{}", file.expect("a file").file_name().display()));
+    let mut pages = names.filter(|name| name.ends_with(".md") && name != "docs/README.md");
+    let missing = pages.find(|name| !listed.contains(name.as_str()));
+    assert_eq!(missing, None);
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! Charts: data in, SVG out, and PNG from that SVG, the same on every machine.
 //!
 //! [`Ladder`] has bars, [`Lines`] curves over one axis, [`Snapshot`] the cells of one step. Each makes a
-//! text; [`png`] turns it into pixels. [`svg`](crate::svg) draws, [`axis`](crate::axis) scales.
+//! text; [`png`] turns it into pixels. `svg` draws, `axis` scales.
 
 #![allow(
     missing_docs,

@@ -1,7 +1,7 @@
 //! A network with a layer more: a second GRU behind the first.
 //!
 //! Its gradients come from candle, its first values from a seed, and [`Adam`] finds its variables by name.
-//! `cargo run --release -p network --example second_gru`
+//! `cargo run --release -p emberwatch-network --example second_gru`
 
 use candle_core::{DType, Result, Tensor};
 use candle_nn::VarBuilder;

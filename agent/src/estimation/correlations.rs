@@ -1,6 +1,6 @@
 //! How much the paying state of a cell says of that of another one nearby: correlations, learned from what is seen.
 //!
-//! One number per pair of ages (steps since a cell was last seen, in [`N_AGES`] ranges) and per class of offsets, as
+//! One number per pair of ages (steps since a cell was last seen, in `N_AGES` ranges) and per class of offsets, as
 //! directions are not told apart. No hidden states are used: where a frame shows two cells near each other,
 //! the product of their innovations is an estimate of their covariance.
 

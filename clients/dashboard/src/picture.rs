@@ -1,6 +1,6 @@
 //! One picture for a browser: what it asked for, what it gets. Pure.
 //!
-//! A picture is a `u32` length, so many bytes of JSON (a [`Header`]), and the arrays that the JSON lists; the
+//! A picture is a `u32` length, so many bytes of JSON (a `Header`), and the arrays that the JSON lists; the
 //! JSON is padded with spaces and each array with zeros, so that all arrays begin at multiples of eight bytes.
 //! Numbers are little-endian.
 

@@ -11,25 +11,22 @@ use ndarray::{Array1, Array2, Array4, Axis};
 
 /// The built-in models by name.
 const BUILT_IN: [(&str, &str); 5] = [
-    (
-        "wildfire",
-        include_str!("../../../config/models/wildfire.toml"),
-    ),
+    ("wildfire", include_str!("../../models/wildfire.toml")),
     (
         "wildfire-sparse",
-        include_str!("../../../config/models/wildfire-sparse.toml"),
+        include_str!("../../models/wildfire-sparse.toml"),
     ),
     (
         "wildfire-latent",
-        include_str!("../../../config/models/wildfire-latent.toml"),
+        include_str!("../../models/wildfire-latent.toml"),
     ),
     (
         "wildfire-small",
-        include_str!("../../../config/models/wildfire-small.toml"),
+        include_str!("../../models/wildfire-small.toml"),
     ),
     (
         "wildfire-burnout",
-        include_str!("../../../config/models/wildfire-burnout.toml"),
+        include_str!("../../models/wildfire-burnout.toml"),
     ),
 ];
 

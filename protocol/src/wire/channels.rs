@@ -127,7 +127,7 @@ impl Instance {
     }
 
     /// The error for an instance without a server.
-    pub fn no_server(&self) -> ChannelError {
+    pub(crate) fn no_server(&self) -> ChannelError {
         ChannelError::NoServer {
             instance: self.0.clone(),
         }
@@ -206,7 +206,7 @@ impl Services<'_> {
     ///
     /// # Errors
     /// As [`Self::create_step`].
-    pub fn create_decisions(&self, world: u32) -> Result<ControlService, ChannelError> {
+    pub(crate) fn create_decisions(&self, world: u32) -> Result<ControlService, ChannelError> {
         self.create(Channel::Decisions(world))
     }
 
@@ -354,7 +354,7 @@ impl Services<'_> {
 }
 
 /// The process id of the service's server, running or dead.
-pub fn server_pid<Q: Header, R: Header>(service: &RequestResponse<Q, R>) -> Option<i32> {
+pub(crate) fn server_pid<Q: Header, R: Header>(service: &RequestResponse<Q, R>) -> Option<i32> {
     let mut pid = None;
     service.dynamic_config().list_servers(|server| {
         pid = server.node_id.pid::<Ipc>().ok().map(|id| id.value());

@@ -24,7 +24,7 @@ pub trait Wide: Sized {
     type Avx2: Lanes<Self>;
 }
 
-/// [`LANES`] numbers.
+/// `LANES` numbers.
 pub trait Lanes<T>: Copy {
     /// The same number in each lane.
     fn splat(number: T) -> Self;

@@ -1,0 +1,33 @@
+"""`python -m emberwatch --version`."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Final
+
+from emberwatch.release import VERSION
+
+_COMMANDS: Final = """
+commands, each with --help:
+  emberwatch-server                  simulates worlds
+  emberwatch-agent                   explores, learns, compares
+  emberwatch-dashboard               shows an instance or a recording in a browser
+  python -m emberwatch.film          films of recordings
+  python -m emberwatch.landscape     recorded worlds from rasters of fires
+"""
+
+
+def main() -> None:
+    """Prints the version, or what else can be run."""
+    parser = argparse.ArgumentParser(
+        prog="python -m emberwatch",
+        epilog=_COMMANDS,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"emberwatch {VERSION}")
+    parser.parse_args()
+    parser.print_help()
+
+
+if __name__ == "__main__":
+    main()

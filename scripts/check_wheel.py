@@ -1,0 +1,105 @@
+"""What a user does first with the installed package; `scripts/wheel` leaves no compiler in PATH.
+
+Needs Pillow, for the Python of README.md, which it runs.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import gymnasium
+
+import emberwatch
+from emberwatch.programs import Program, find, unused_instance
+
+ROOT = Path(__file__).resolve().parents[1]
+PROGRAMS = ("emberwatch-server", "emberwatch-agent", "emberwatch-dashboard")
+
+
+def output(*command: str) -> str:
+    """What a command prints, once it has succeeded."""
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, f"{command}: {done.stderr}"
+    return done.stdout
+
+
+def check_place() -> None:
+    """No compiler, and the package is the installed one."""
+    for name in ("cargo", "rustc", "cc", "gcc", "clang"):
+        assert shutil.which(name) is None, f"{name} is on the PATH"
+    assert Path(emberwatch.__file__).is_relative_to(sys.prefix), emberwatch.__file__
+
+
+def check_versions() -> None:
+    """One version of package and programs."""
+    version = output(sys.executable, "-m", "emberwatch", "--version").split()[-1]
+    for name in PROGRAMS:
+        path = find(name)
+        assert path.is_relative_to(sys.prefix), path
+        assert output(str(path), "--version").split() == [name, version]
+
+
+def check_readme() -> None:
+    """The Python of README.md draws a picture."""
+    code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert code is not None
+    exec(code[1], {})
+    assert Path("wildfire.png").stat().st_size > 1000
+
+
+def check_vector() -> None:
+    """Many worlds, one message."""
+    envs = gymnasium.make_vec("emberwatch/WildfireMoves-v0", num_envs=8)
+    envs.reset(seed=1000)
+    for _ in range(64):
+        rewards = envs.step(envs.action_space.sample())[1]
+    envs.close()
+    assert rewards.shape == (8,)
+
+
+def check_training() -> None:
+    """The agent learns a model for a few steps."""
+    flags = "train --steps 64 --worlds 2 --height 32 --width 32 --burn-in 500 --out learned"
+    output(str(find("emberwatch-agent")), *flags.split())
+    assert Path("learned/checkpoint.safetensors").stat().st_size > 100
+
+
+def check_dashboard() -> None:
+    """The page answers, beside a server."""
+    instance = unused_instance()
+    server = Program("emberwatch-server", [f"--instance={instance}", "--burn-in=100"])
+    server.wait_for(lambda: emberwatch.connect(instance)).close()
+    page = Program("emberwatch-dashboard", [f"--instance={instance}", "--listen=127.0.0.1:0"])
+    address, deadline = None, time.monotonic() + 30
+    while address is None:
+        address = re.search(r"http://\S+", page.output())
+        assert address is not None or time.monotonic() < deadline, page.output()
+        time.sleep(0.05)
+    with urllib.request.urlopen(address[0], timeout=30) as answer:
+        assert b"<html" in answer.read()
+    page.stop()
+    server.stop()
+
+
+def main() -> None:
+    for check in (
+        check_place,
+        check_versions,
+        check_readme,
+        check_vector,
+        check_training,
+        check_dashboard,
+    ):
+        start = time.monotonic()
+        check()
+        print(f"{check.__doc__}  {time.monotonic() - start:.1f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()
