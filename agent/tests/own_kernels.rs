@@ -10,7 +10,7 @@ use protocol::randomness::split_mix;
 use protocol::{Cell, Dynamics, Frame, Grid, Model, Move, Shape};
 
 const N_WORLDS: u32 = 4;
-const N_STEPS: u64 = 320;
+const N_STEPS: u64 = 500;
 const N_MOVES: u64 = 64;
 
 fn shape() -> Shape {
@@ -77,8 +77,8 @@ impl World {
 /// What a learner makes of random paths through worlds.
 fn learn(model: &Model, sees_own_state: bool) -> LearnedModel {
     let mut config = AgentConfig::default();
-    config.learning.steady_updates = 400;
-    config.learning.falling_updates = 240;
+    config.learning.steady_updates = 600;
+    config.learning.falling_updates = 400;
     let mut learner = Learner::new(dimensions(sees_own_state), shape(), &config);
     let worlds = 0..N_WORLDS;
     let mut worlds: Vec<World> = worlds
