@@ -35,7 +35,7 @@ fn description(policy: &Policy, model: &Model) -> String {
         EstimatorKind::LearnedOwn => "; learned, by own state, needs --checkpoint",
         EstimatorKind::LearnedOwnSpatial => "; by own state and neighbours, needs --checkpoint",
         EstimatorKind::Autoencoder => "; autoencoder, needs --checkpoint",
-        EstimatorKind::Truth => "; told hidden states, needs --publish-truth",
+        EstimatorKind::Truth => "; told the states, needs --publish-truth",
         EstimatorKind::NextTruth => "; told the next states, only in `compare`",
     };
     format!("{planner} for {}{belief}", goal(policy, model))
