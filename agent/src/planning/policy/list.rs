@@ -34,8 +34,8 @@ fn description(policy: &Policy, model: &Model) -> String {
         EstimatorKind::LearnedSpatial => "; learned, reaches neighbours, needs --checkpoint",
         EstimatorKind::LearnedOwn => "; learned, by own state, needs --checkpoint",
         EstimatorKind::LearnedOwnSpatial => "; by own state and neighbours, needs --checkpoint",
-        EstimatorKind::Autoencoder => "; learned autoencoder, needs --checkpoint",
-        EstimatorKind::Truth => "; told hidden states, needs --publish-truth",
+        EstimatorKind::Autoencoder => "; autoencoder, needs --checkpoint",
+        EstimatorKind::Truth => "; told the states, needs --publish-truth",
         EstimatorKind::NextTruth => "; told the next states, only in `compare`",
     };
     format!("{planner} for {}{belief}", goal(policy, model))
