@@ -336,7 +336,7 @@ fn a_checkpoint_is_compared_and_evaluated() {
         &format!("run {flags} --checkpoint {checkpoint}"),
         &[
             "learned_own_spatial_beam",
-            "--checkpoint FILE of an own_filter",
+            "--checkpoint FILE of a filter by own state",
         ],
     );
     check(
@@ -409,7 +409,7 @@ evaluate => --checkpoint
 evaluate --checkpoint no/such => checkpoint no/such: No such file
 compare --checkpoint no/such => checkpoint no/such: No such file
 compare --policies learned_beam => \"learned_beam\" needs what `train` learned: expected --checkpoint FILE of a filter
-compare --policies learned_own_beam => \"learned_own_beam\" needs | expected --checkpoint FILE of an own_filter
+compare --policies learned_own_beam => \"learned_own_beam\" needs | expected --checkpoint FILE of a filter by own state
 ";
 
 #[test]

@@ -173,7 +173,9 @@ fn present<'a, T>(policy: &Policy, learned: Option<&'a T>) -> Result<&'a T> {
 pub fn needs_checkpoint(policy: &Policy) -> String {
     let kind = match policy.estimator {
         EstimatorKind::Learned | EstimatorKind::LearnedSpatial => "a filter",
-        EstimatorKind::LearnedOwn | EstimatorKind::LearnedOwnSpatial => "an own_filter",
+        EstimatorKind::LearnedOwn | EstimatorKind::LearnedOwnSpatial => {
+            "a filter by own state (--learner own_filter)"
+        }
         EstimatorKind::Autoencoder => "an autoencoder",
         _ => "decisions",
     };

@@ -46,8 +46,8 @@ pub struct CompareCommand {
     /// How the robots of a world act together, separated by commas
     #[arg(long, value_delimiter = ',', default_value = "alone")]
     team: Vec<Team>,
-    /// What `train` learned: a filter adds `learned_*` to the ladder, an own_filter `learned_own_*`, an autoencoder
-    /// `autoencoder_*`, decisions `dqn_beam`; may be given for each
+    /// What `train` learned: a filter adds `learned_*` to the ladder, one by own state `learned_own_*`, an
+    /// autoencoder `autoencoder_*`, decisions `dqn_beam`; may be given for each
     #[arg(long, value_name = "FILE")]
     checkpoint: Vec<PathBuf>,
     /// Where networks compute: cpu, cuda or metal

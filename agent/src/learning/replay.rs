@@ -35,7 +35,7 @@ pub struct Block {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Replay {
     block_length: usize,
-    max_blocks: usize,
+    max_frames: usize,
     full: BTreeMap<u64, Block>,
     /// The block that each world's frames go into, by world.
     open: BTreeMap<u32, (u64, Block)>,
@@ -43,11 +43,11 @@ pub struct Replay {
 }
 
 impl Replay {
-    /// Room for `max_frames` frames, in blocks of `block_length`; for one block at least.
+    /// Room for `max_frames` frames, in blocks of at most `block_length`; for one block at least.
     pub fn new(block_length: usize, max_frames: usize) -> Self {
         Self {
             block_length,
-            max_blocks: (max_frames / block_length).max(1),
+            max_frames,
             full: BTreeMap::new(),
             open: BTreeMap::new(),
             n_opened: 0,
@@ -170,8 +170,10 @@ impl Replay {
     }
 
     fn drop_oldest(&mut self) {
-        while self.full.len() > self.max_blocks {
-            self.full.pop_first();
+        let mut n_frames: usize = self.full.values().map(|block| block.frames.len()).sum();
+        while n_frames > self.max_frames && self.full.len() > 1 {
+            let oldest = self.full.pop_first();
+            n_frames -= oldest.map_or(0, |(_, block)| block.frames.len());
         }
     }
 
@@ -264,6 +266,12 @@ mod tests {
     fn old_blocks_go_when_there_is_no_room() {
         let replay = replay(6);
         assert_eq!(replay.blocks().collect::<Vec<_>>(), [3, 4, 5]);
+        let mut short = Replay::new(2, 7);
+        for _ in 0..9 {
+            short.begin(0);
+            short.push(0, &frame(1));
+        }
+        assert_eq!(short.blocks().collect::<Vec<_>>(), [1, 2, 3, 4, 5, 6, 7]);
     }
 
     #[test]
@@ -289,7 +297,12 @@ mod tests {
             let block = replay.block(number).expect("kept");
             (number, block.frames.len(), block.start.clone())
         });
-        let expected = [(1, 2, None), (2, 1, Some(belief(2))), (4, 2, None)];
+        let expected = [
+            (0, 2, None),
+            (1, 2, None),
+            (2, 1, Some(belief(2))),
+            (4, 2, None),
+        ];
         assert_eq!(kept.collect::<Vec<_>>(), expected);
         replay.hand_on(2, &[8.0]); // nobody to hand on to
         replay.begin(0);
@@ -316,7 +329,7 @@ mod tests {
             }
         }
         let mut longer = replay(1);
-        longer.max_blocks = 9;
+        longer.max_frames += 9;
         (1..8).for_each(|value| see(&mut longer, value));
         assert_eq!(longer.n_blocks(), 8);
         let shorter = resumed(longer).expect("whole");

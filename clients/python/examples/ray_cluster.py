@@ -115,12 +115,13 @@ def scaled(envs: gymnasium.vector.VectorEnv) -> gymnasium.vector.VectorEnv:
     )
 
 
-def places(algorithm: Algorithm) -> dict[int, list[int]]:
-    """The processes of the runners on each server, which is a process, too."""
+def places(algorithm: Algorithm) -> dict[tuple[str, int], list[int]]:
+    """The processes of the runners on each server: its node, and its process."""
 
-    def place(runner: Any) -> tuple[int, int]:
+    def place(runner: Any) -> tuple[tuple[str, int], int]:
+        node = ray.get_runtime_context().get_node_id()
         with emberwatch.connect(runner.env.unwrapped.instance) as client:
-            return client.info.pid, os.getpid()
+            return (node, client.info.pid), os.getpid()
 
     group = algorithm.env_runner_group
     found = defaultdict(list)
@@ -142,21 +143,23 @@ def kill_soon(kind: str, pid: int) -> None:
 def train(algorithm: Algorithm, iterations: int, kills: bool) -> None:
     """Prints what each iteration made, and who made it; after kills goes on until all are back."""
     iteration = n_flying = 0
-    while iteration < iterations or (kills and n_flying < algorithm.config.num_env_runners):
+    victims = ["runner", "server"] if kills else []
+    n_runners = algorithm.config.num_env_runners
+    while iteration < iterations or (kills and (victims or n_flying < n_runners)):
         runners = algorithm.train()["env_runners"]
         steps = runners["num_env_steps_sampled_lifetime"]
         pay = runners.get("episode_return_mean", float("nan"))
         where = places(algorithm)
-        words = [f"runners {sorted(where[server])} on server {server}" for server in sorted(where)]
+        words = [f"runners {sorted(where[at])} on server {at[1]}" for at in sorted(where)]
         print(
             f"iteration {iteration}: {steps:.0f} moves, reward of an episode {pay:.1f}, "
             f"{', '.join(words)}",
             flush=True,
         )
-        if kills and iteration == 0:
-            kill_soon("runner", min(where.values(), key=len)[0])
-        if kills and iteration == 1:
-            kill_soon("server", min(where))
+        if victims and where:  # a busy machine may not answer in time
+            at = min(where, key=lambda server: len(where[server]))
+            victim = victims.pop(0)
+            kill_soon(victim, where[at][0] if victim == "runner" else at[1])
         iteration, n_flying = iteration + 1, sum(map(len, where.values()))
 
 
@@ -171,6 +174,8 @@ def main() -> None:
     parser.add_argument("--private", action="store_true", help="a server for each runner instead")
     parser.add_argument("--kill", action="store_true", help="a runner and a server, on nodes here")
     args = parser.parse_args()
+    if args.kill and args.address is not None:
+        parser.error("--kill: expected no --address, as it kills processes of this machine")
 
     cluster = None
     if args.address is None:

@@ -21,6 +21,9 @@ OBJECTIVE = "emberwatch/WildfireObjective-v0"
 #: Of its worlds every seed and every step looks different.
 LIVELY = str(Path(__file__).with_name("lively.toml"))
 
+#: A description of recorded worlds.
+RECORDED = Path(__file__).with_name("recorded.toml")
+
 #: Keywords of a small world behind a private server.
 SMALL: dict[str, Any] = {"height": 7, "width": 5, "n_moves": 4, "burn_in": 50, "model": LIVELY}
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from environments import LIVELY, MOVES, WILDFIRE
+from environments import LIVELY, MOVES, RECORDED, WILDFIRE
 from numpy.typing import NDArray
 from processes import Server
 
@@ -28,19 +28,6 @@ MERIT = (
     "front_distance",
     "grid_seen_share",
 )
-
-
-#: The state that pays most is the second, which a description alone says.
-DESCRIPTION = """
-name = "lab"
-step = "10 min"
-states = [
-    { name = "unburnt", color = "#000000", observed_as = [0.9, 0.1] },
-    { name = "burning", color = "#ff0000", observed_as = [0.1, 0.9], reward = 1.0 },
-    { name = "burnt", color = "#777777", observed_as = [1.0, 0.0] },
-]
-observations = [{ name = "cold", color = "#000000" }, { name = "hot", color = "#ff0000" }]
-"""
 
 
 def walk(seed: int) -> Callable[[Any], NDArray[np.int64]]:
@@ -90,7 +77,7 @@ def states(tmp_path: Path) -> Path:
     random = np.random.default_rng(5)
     sequences = [random.integers(0, 3, (length, 7, 9), np.uint8) for length in (13, 16)]
     np.savez(path, states_000=sequences[0], states_001=sequences[1])
-    path.with_suffix(".toml").write_text(DESCRIPTION)
+    path.with_suffix(".toml").write_bytes(RECORDED.read_bytes())
     return path
 
 

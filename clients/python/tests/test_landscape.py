@@ -202,6 +202,8 @@ def test_files_that_count_from_days_of_their_own_follow_each_other(
         ("minutes since 2020-08-01T12:00:00Z", None, "2020-08-01 13:30:00 UTC"),
         ("minutes since 2020-08-01 12:00 -07:00", None, "2020-08-01 20:30:00 UTC"),
         ("minutes since 2020-08-01 12:00 -0330", None, "2020-08-01 17:00:00 UTC"),
+        ("minutes since 2020-08-01 12:00 -00:30", None, "2020-08-01 14:00:00 UTC"),
+        ("minutes since 9999-12-31 23:00 -05:00", None, None),
         ("minutes since 2020-08-01", "noleap", None),
         ("minutes since 2020-02-31", None, None),
         ("minutes since ignition", None, None),

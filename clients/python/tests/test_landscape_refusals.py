@@ -218,6 +218,10 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         lambda f: (netcdf(f / "a.nc", times=[0, 600, 300, 900], mask=masks()), *MASKS),
         "expected a later time than 600, got 300",
     ),
+    "a time that is none": (
+        lambda f: (netcdf(f / "a.nc", times=[0, float("nan"), 1200, 1800], mask=masks()), *MASKS),
+        "band 2: expected a time, got nan",
+    ),
     "uneven time": (
         lambda f: (netcdf(f / "a.nc", times=[0, 600, 1200, 2400], mask=masks()), *MASKS),
         "expected steps of 600 in time, got 1200",

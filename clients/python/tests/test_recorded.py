@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from environments import MOVES, WILDFIRE, serving
+from environments import MOVES, RECORDED, WILDFIRE, serving
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
@@ -17,17 +17,6 @@ from emberwatch.errors import EmberwatchError, InvalidArgumentError
 from emberwatch.programs import Program, unused_instance
 
 States = NDArray[np.uint8]
-
-DESCRIPTION = """
-name = "lab"
-step = "10 min"
-states = [
-    { name = "unburnt", color = "#000000", observed_as = [0.9, 0.1] },
-    { name = "burning", color = "#ff0000", observed_as = [0.1, 0.9], reward = 1.0 },
-    { name = "burnt", color = "#777777", observed_as = [1.0, 0.0] },
-]
-observations = [{ name = "cold", color = "#000000" }, { name = "hot", color = "#ff0000" }]
-"""
 
 #: By number, as docs/recorded-worlds.md has them.
 SYMMETRIES: list[Callable[[States], States]] = [
@@ -55,7 +44,7 @@ def states(tmp_path: Path, sequences: list[States]) -> Path:
     """A states file with a description beside it."""
     path = tmp_path / "lab.npz"
     np.savez_compressed(path, states_000=sequences[0], states_001=sequences[1])
-    path.with_suffix(".toml").write_text(DESCRIPTION)
+    path.with_suffix(".toml").write_bytes(RECORDED.read_bytes())
     return path
 
 

@@ -43,6 +43,5 @@ class LastSeen:
 
     def fading(self, rows: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """A channel for each observation, `(n, H, W, n_observations)`: 255 where seen just now."""
-        strengths = _STRENGTHS[self.ages[rows]] * (self._values[rows] != wire.UNOBSERVED)
         is_value = self._values[rows][..., np.newaxis] == self._known
-        return is_value * strengths[..., np.newaxis]
+        return is_value * _STRENGTHS[self.ages[rows]][..., np.newaxis]

@@ -20,7 +20,7 @@ _CALENDARS: Final = ("standard", "gregorian", "proleptic_gregorian")
 _GREGORIAN: Final = 1583  # the first year in which they mean the same days
 _DATE: Final = re.compile(
     r"(\d{4})-(\d{1,2})-(\d{1,2})(?:[T ]+(\d{1,2})(?::(\d{1,2}))?(?::(\d{1,2})(?:\.\d*)?)?)?"
-    r"\s*(?:Z|UTC|GMT|([+-]\d{1,2})(?::?(\d{2}))?)?"
+    r"\s*(?:Z|UTC|GMT|([+-])(\d{1,2})(?::?(\d{2}))?)?"
 )
 
 
@@ -40,7 +40,7 @@ class Clock(NamedTuple):
         epoch = self.epoch()
         try:
             return None if epoch is None else epoch + timedelta(seconds=seconds)
-        except OverflowError:
+        except OverflowError:  # beyond the year 9999
             return None
 
     def epoch(self) -> datetime | None:
@@ -48,13 +48,15 @@ class Clock(NamedTuple):
         parts = _DATE.fullmatch(self.words.partition(" since ")[2].strip())
         if parts is None or self.calendar.lower() not in _CALENDARS:
             return None
-        *numbers, hours, minutes = (int(part) for part in parts.groups(default="0"))
+        *digits, sign, hours, minutes = parts.groups(default="0")
+        numbers = [int(part) for part in digits]
         if numbers[0] < _GREGORIAN:
             return None
         try:
-            ahead = timedelta(hours=hours, minutes=-minutes if hours < 0 else minutes)
-            return datetime(*numbers, tzinfo=timezone(ahead)).astimezone(UTC)
-        except ValueError:
+            ahead = timedelta(hours=int(hours), minutes=int(minutes))
+            zone = timezone(-ahead if sign == "-" else ahead)
+            return datetime(*numbers, tzinfo=zone).astimezone(UTC)
+        except (OverflowError, ValueError):  # no such day, or one beyond the years 1 to 9999
             return None
 
 

@@ -267,7 +267,10 @@ def _layer(file: Path, source: Any, place: Place, band: int) -> Layer:
     dimension = _dimension(file, tags)
     time = None
     if f"NETCDF_DIM_{dimension}_VALUES" in tags:  # else the dimension only counts the layers
-        time = Time(float(of_band[f"NETCDF_DIM_{dimension}"]), _clock(dimension, tags, None))
+        value = float(of_band[f"NETCDF_DIM_{dimension}"])
+        if not math.isfinite(value):
+            raise InvalidArgumentError(f"{file}, band {band}: expected a time, got {value}")
+        time = Time(value, _clock(dimension, tags, None))
     return Layer(
         name=f"{file}, band {band}" if source.count > 1 else str(file),
         values=values,
