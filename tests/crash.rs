@@ -1,18 +1,18 @@
 //! Agents that are killed or stopped in the middle of a step: the world stays exactly where it was.
 
 use crate::harness::{
-    PATIENCE, Paths, Program, Server, claim, eventually, fly, frames_until, path_of, seen_by,
-    seen_in, status, takeover,
+    PATIENCE, Paths, Program, Server, eventually, fly, frames_until, path_of, seen_by, seen_in,
+    status, takeover,
 };
 use crate::wire::{RawClient, Wire, answer, control_header, step_body, step_header};
-use agent::server::client::{Claim, Client};
-use protocol::Connection;
 use protocol::channels::{ChannelError, Instance};
+use protocol::client::Claim;
 use protocol::connection::ConnectionError;
 use protocol::control::{Reply, Request};
 use protocol::message::{FrameHeader, Status, StepRequest};
 use protocol::observer::{Observer, Sample};
 use protocol::payload::split_step_payload;
+use protocol::{Client, Connection};
 use rustix::process::Signal;
 use std::time::Duration;
 
@@ -112,9 +112,9 @@ fn a_stopped_agent_loses_its_lease_and_says_so_when_it_wakes() {
     assert!(eventually(PATIENCE, || holder(&server).is_none()));
     let long = Claim {
         time_to_live: Some(Duration::from_secs(3600)),
-        ..claim(0..1)
+        ..Claim::new(0..1)
     };
-    let mut next = Client::acquire(&server.instance, &long).expect("acquire");
+    let mut next = Client::acquire(server.connect(), &long).expect("acquire");
     let before = next.observe(0..1).expect("observe");
     agent.signal(Signal::CONT);
     let ended = agent.wait(PATIENCE);
@@ -177,7 +177,7 @@ fn agents_killed_one_after_the_other_change_no_world_and_use_up_no_limit() {
         before = server.step_of(0);
     }
     // From here on what the last one asked for is refused.
-    drop(Client::acquire(&server.instance, &takeover(0..1)).expect("take over"));
+    drop(Client::acquire(server.connect(), &takeover(0..1)).expect("take over"));
     let (world, _, frame) = server.observe(0);
     let last = world.step;
     let mut client = undisturbed.acquire(0..1);

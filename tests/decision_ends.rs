@@ -9,9 +9,10 @@ use agent::acting::decider::{Assignment, Decider};
 use agent::acting::mission::prepare;
 use agent::config::AgentConfig;
 use agent::planning::policy::{EstimatorKind, PlannerKind};
-use agent::server::client::{Claim, Client, shape_of};
 use agent::server::errors;
+use protocol::Client;
 use protocol::channels::{ChannelError, Instance};
+use protocol::client::Claim;
 use protocol::decisions::{Reply, Request};
 use protocol::message::Status;
 use rustix::process::Signal;
@@ -57,7 +58,7 @@ fn an_agent_renews_its_lease_when_a_third_of_it_has_passed_without_use() {
     let almost = due - Duration::from_millis(1);
     assert!(!decider.until_renewal(almost).is_zero());
     assert!(decider.until_renewal(due).is_zero());
-    let _thief = Client::acquire(&server.instance, &takeover(0..1)).expect("take over");
+    let _thief = Client::acquire(server.connect(), &takeover(0..1)).expect("take over");
     decider.keep_alive(almost).expect("nothing is asked");
     let lost = decider.keep_alive(due).expect_err("the lease is lost");
     let status = errors::refusal(&lost).map(|(status, ..)| status);
@@ -75,7 +76,7 @@ fn attach(server: &Server) -> Decider {
         config: AgentConfig::default(),
     };
     let (info, model) = prepare(&task.instance, &task.worlds, None).expect("a server");
-    let shape = shape_of(&info).expect("a grid");
+    let shape = info.shape().expect("a grid");
     let prior = task.config.prior(info.burn_in).belief(&model, shape, 0);
     Decider::attach(&task, model, prior.expect("a belief")).expect("attach")
 }
@@ -165,7 +166,7 @@ fn an_agent_whose_world_is_taken_says_so_and_ends_with_code_3() {
         let server = Server::start(&format!("{SMALL} --lease-millis {lease}"));
         let (agent, learner) = start_with_learner(&server.instance, "--takeover");
         let before = server.observe(0).0;
-        let _thief = Client::acquire(&server.instance, &theft).expect("take over");
+        let _thief = Client::acquire(server.connect(), &theft).expect("take over");
         if decides {
             let (status, detail, _) = learner.refused(&decide(&[Some(2)]));
             assert_eq!(status, Status::LeaseLost);

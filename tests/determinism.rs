@@ -1,9 +1,9 @@
 //! A world is a function of model, seed and k: nothing beside it, before it or around it counts.
 
-use crate::harness::{PATIENCE, Paths, Server, claim, fly, reset, takeover};
-use agent::server::client::{Client, Observation};
-use protocol::Move;
+use crate::harness::{PATIENCE, Paths, Server, fly, reset, takeover};
+use protocol::client::{Claim, Observation};
 use protocol::observer::Observer;
+use protocol::{Client, Move};
 
 /// Seeds, one world each.
 const N_SEEDS: u32 = 8;
@@ -126,10 +126,10 @@ fn worlds_do_not_notice_who_acts_on_them() {
     batches(&mut first, 0..4, &mut trajectories);
     first.release().expect("release");
     let mut second = server.acquire(0..N_SEEDS);
-    let claimed = Client::acquire(&server.instance, &claim(0..1));
+    let claimed = Client::acquire(server.connect(), &Claim::new(0..1));
     assert!(claimed.is_err(), "a refused claim in between");
     batches(&mut second, 4..8, &mut trajectories);
-    let mut third = Client::acquire(&server.instance, &takeover(0..N_SEEDS)).expect("take over");
+    let mut third = Client::acquire(server.connect(), &takeover(0..N_SEEDS)).expect("take over");
     let stale = second.step(0..1, &paths(99)[..1]);
     assert!(stale.is_err(), "a lost lease steps nothing");
     batches(&mut third, 8..N_STEPS, &mut trajectories);

@@ -4,6 +4,7 @@ use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly, frames_u
 use crate::wire::{RawClient, Wire, step_body, step_header};
 use agent::estimation::belief::Belief;
 use agent::estimation::{BayesFilter, Estimator};
+use agent::server::left_belief::{leave_belief, left_belief};
 use protocol::Model;
 use protocol::Move;
 use protocol::control::{LeftPart, Reply, Request, WorldSeed};
@@ -95,9 +96,7 @@ fn an_agent_that_finds_a_damaged_belief_begins_with_its_own() {
     let shape = client.shape();
     let filter = BayesFilter::known(&model, Belief::from_initial(&model, shape));
     let kind = filter.expect("a filter").kind().expect("its kind");
-    client
-        .leave_belief(0, &at, &kind, b"not whole")
-        .expect("leave");
+    leave_belief(&mut client, 0, &at, &kind, b"not whole").expect("leave");
     client.release().expect("release");
     let ended = run(&server, &[&policy[..], &["--steps", "10"]].concat()).wait(PATIENCE);
     assert_eq!(ended.code, Some(0), "{}", ended.stderr);
@@ -177,15 +176,18 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_robot_alone() 
     let server = Server::start("--height 5 --width 7 --moves 6 --burn-in 20 --worlds 2");
     let mut client = server.acquire(0..1);
     fly(&mut client, Paths::new(0).next(6));
-    assert_eq!(client.belief(0, "kind").expect("none yet"), None);
+    assert_eq!(left_belief(&mut client, 0, "kind").expect("none yet"), None);
     let bytes: Vec<u8> = (0..35 * 76 + 32_768).map(|n| n as u8).collect();
     let at = client.observe(0..1).expect("observe")[0].world;
-    client.leave_belief(0, &at, "kind", &bytes).expect("leave");
+    leave_belief(&mut client, 0, &at, "kind", &bytes).expect("leave");
     assert_eq!(
-        client.belief(0, "kind").expect("belief"),
+        left_belief(&mut client, 0, "kind").expect("belief"),
         Some(bytes.clone())
     );
-    assert_eq!(client.belief(0, "another kind").expect("belief"), None);
+    assert_eq!(
+        left_belief(&mut client, 0, "another kind").expect("belief"),
+        None
+    );
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(1, 1).lease;
     let part = |lease, robot, step, offset, length, data: &str| {
@@ -231,7 +233,10 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_robot_alone() 
     assert_eq!(wire.ask(&leave(lease, 1, 1, 2, "AQ==")), Reply::Done);
     assert!(matches!(wire.ask(&ask), Reply::Belief { data, .. } if data == "AAE="));
     fly(&mut client, Paths::new(1).next(6));
-    assert_eq!(client.belief(0, "kind").expect("another step"), None);
+    assert_eq!(
+        left_belief(&mut client, 0, "kind").expect("another step"),
+        None
+    );
 }
 
 #[test]

@@ -1,17 +1,17 @@
 //! Programs as children: started on names of their own, waited for with deadlines, killed on drop.
 
-use agent::server::client::{Claim, Client, Observation};
 use env_server::config::ServerConfig;
 use env_server::snapshot::{SnapshotWorld, WorldSpec, encode};
 use env_server::world::Episode;
 use protocol::channels::Instance;
+use protocol::client::{Claim, Observation};
 use protocol::connection::ConnectionError;
 use protocol::control::{Reply, Request, ServerInfo, ServerStatus, WorldSeed};
 use protocol::message::{FrameHeader, Operation, RobotResult, StepRequest, WorldResult};
 use protocol::observer::{Observer, Sample};
 use protocol::path::path_from_bytes;
 use protocol::payload::{RobotSample, split_frame_payload};
-use protocol::{Connection, Move};
+use protocol::{Client, Connection, Move};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -236,7 +236,7 @@ impl Server {
 
     /// A client that holds robots of it.
     pub fn acquire(&self, robots: Range<u32>) -> Client {
-        Client::acquire(&self.instance, &claim(robots)).expect("acquire")
+        Client::acquire(self.connect(), &Claim::new(robots)).expect("acquire")
     }
 
     /// What it answers to `hello`.
@@ -275,20 +275,11 @@ impl Server {
     }
 }
 
-/// A claim on robots that waits for nobody and takes from nobody.
-pub fn claim(robots: Range<u32>) -> Claim {
-    Claim {
-        robots,
-        takeover: false,
-        time_to_live: None,
-    }
-}
-
-/// The same claim, as a takeover.
+/// A claim on robots that are taken from their holders.
 pub fn takeover(robots: Range<u32>) -> Claim {
     Claim {
         takeover: true,
-        ..claim(robots)
+        ..Claim::new(robots)
     }
 }
 

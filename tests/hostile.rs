@@ -4,16 +4,16 @@
 //! `cargo test -p tests -- --ignored` sends a million messages, and thousands of observers.
 
 use crate::attacker::Attacker;
-use crate::harness::{PATIENCE, Paths, Program, Server, claim, eventually, fly};
+use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly};
 use crate::siege::{FLAGS, besiege};
 use crate::wire::{RawClient, Wire, answer, client, control_header, step_body, step_header};
-use agent::server::client::Client;
-use protocol::Connection;
 use protocol::channels::{Channel, MAX_CLIENTS, MAX_OBSERVERS, Services, create_node};
+use protocol::client::Claim;
 use protocol::connection::ConnectionError;
 use protocol::control::{MAX_CONTROL_BYTES, Reply, Request, WorldSeed};
 use protocol::message::{Status, StepRequest};
 use protocol::observer::Observer;
+use protocol::{Client, Connection};
 use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, prlimit};
 use std::time::Duration;
 
@@ -240,7 +240,7 @@ fn connections_that_are_left_half_open_take_no_more_than_their_places() {
             let crowded = Wire::try_open(&server.instance);
             assert!(crowded.is_err(), "a place too many");
         }
-        assert!(Client::acquire(&server.instance, &claim(1..3)).is_ok());
+        server.acquire(1..3);
     });
 }
 
@@ -290,7 +290,7 @@ fn a_client_that_is_stopped_in_the_middle_disturbs_nobody() {
         // And dies so.
         agent.signal(Signal::STOP);
         drop(agent);
-        let is_free = || Client::acquire(&server.instance, &claim(1..2)).is_ok();
+        let is_free = || Client::acquire(server.connect(), &Claim::new(1..2)).is_ok();
         assert!(eventually(PATIENCE, is_free));
     });
 }
@@ -419,5 +419,5 @@ fn clients_that_come_and_go_in_the_middle_of_everything_disturb_nobody() {
         }
         assert_eq!(fly(&mut bystander, Paths::new(0).next(6)).world.step, round);
     }
-    assert!(Client::acquire(&server.instance, &claim(1..3)).is_ok());
+    server.acquire(1..3);
 }

@@ -1,14 +1,14 @@
 //! Who may act: one holder a robot, ended by release, expiry or takeover; its world stays put.
 
 use crate::harness::{
-    ENDLESS, PATIENCE, Paths, SMALL, Server, claim, eventually, fly, new_instance, takeover,
+    ENDLESS, PATIENCE, Paths, SMALL, Server, eventually, fly, new_instance, takeover,
 };
 use crate::wire::{RawClient, Wire, control_header};
-use agent::server::client::{Claim, Client};
-use protocol::Connection;
+use protocol::client::Claim;
 use protocol::connection::ConnectionError;
 use protocol::control::{Reply, Request, ServerStatus, WorldSeed};
 use protocol::message::Status;
+use protocol::{Client, Connection};
 use std::time::Duration;
 
 fn check<T>(result: Result<T, ConnectionError>, expected: Status, expected_detail: u64) {
@@ -34,12 +34,12 @@ fn a_robot_has_one_holder_until_it_is_released() {
     let server = Server::start(&format!("{SMALL} --worlds 2"));
     let holder = server.acquire(0..1);
     check(
-        Client::acquire(&server.instance, &claim(0..1)),
+        Client::acquire(server.connect(), &Claim::new(0..1)),
         Status::Busy,
         us(),
     );
     check(
-        Client::acquire(&server.instance, &claim(0..2)),
+        Client::acquire(server.connect(), &Claim::new(0..2)),
         Status::Busy,
         us(),
     );
@@ -64,7 +64,7 @@ fn a_takeover_ends_the_former_lease_and_leaves_the_world_where_it_was() {
     let server = Server::start(SMALL);
     let mut former = server.acquire(0..1);
     let last = fly(&mut former, Paths::new(1).next(6));
-    let mut next = Client::acquire(&server.instance, &takeover(0..1)).expect("take over");
+    let mut next = Client::acquire(server.connect(), &takeover(0..1)).expect("take over");
     check(former.step(0..1, &paths(1)), Status::LeaseLost, us());
     check(
         former.reset(&[WorldSeed {
@@ -92,7 +92,7 @@ fn a_takeover_ends_the_former_lease_and_leaves_the_world_where_it_was() {
 fn a_takeover_of_some_worlds_leaves_the_others_with_their_holder() {
     let server = Server::start(&format!("{SMALL} --worlds 3"));
     let mut former = server.acquire(0..3);
-    let mut next = Client::acquire(&server.instance, &takeover(1..2)).expect("take over");
+    let mut next = Client::acquire(server.connect(), &takeover(1..2)).expect("take over");
     former.step(0..1, &paths(1)).expect("still held");
     former.step(2..3, &paths(1)).expect("still held");
     check(former.step(0..3, &paths(3)), Status::LeaseLost, us());
@@ -111,7 +111,7 @@ fn a_renewal_tells_of_the_robots_that_are_still_held() {
     let server = Server::start(&format!("{SMALL} --worlds 3"));
     let wire = Wire::open(&server.instance);
     let lease = wire.acquire(0, 3).lease;
-    let _next = Client::acquire(&server.instance, &takeover(1..2)).expect("take over");
+    let _next = Client::acquire(server.connect(), &takeover(1..2)).expect("take over");
     let Reply::Lease(renewed) = wire.ask(&Request::Renew { lease }) else {
         panic!("expected a lease");
     };
@@ -128,9 +128,9 @@ fn a_client_may_ask_for_a_lease_of_its_own_length() {
     let server = Server::start(SMALL);
     let short = Claim {
         time_to_live: Some(Duration::from_millis(150)),
-        ..claim(0..1)
+        ..Claim::new(0..1)
     };
-    let mut client = Client::acquire(&server.instance, &short).expect("acquire");
+    let mut client = Client::acquire(server.connect(), &short).expect("acquire");
     let is_free = || server.status().worlds[0].holder_pids == [None];
     assert!(eventually(PATIENCE, is_free));
     check(client.step(0..1, &paths(1)), Status::LeaseLost, 0);

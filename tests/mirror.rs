@@ -1,18 +1,18 @@
 //! A world as its published steps must make it, stepped in this process: no server, no clients, no time. And a world of
 //! a server that goes as fast as it is checked so.
 
-use crate::harness::{PATIENCE, Paths, Server, claim, frames_until};
-use agent::server::client::{Claim, Client};
+use crate::harness::{PATIENCE, Paths, Server, frames_until};
 use env_server::config::ServerConfig;
 use env_server::snapshot::WorldSpec;
 use env_server::world::{Episode, Flown, Robot, Rules};
+use protocol::client::Claim;
 use protocol::connection::ConnectionError;
 use protocol::control::ServerInfo;
 use protocol::message::{FrameHeader, Status, WorldResult};
 use protocol::observer::{Observer, Sample};
 use protocol::path::{path_from_bytes, path_to_bytes};
 use protocol::payload::{RobotSample, split_frame_payload};
-use protocol::{Coverage, Move};
+use protocol::{Client, Coverage, Move};
 use std::time::{Duration, Instant};
 
 /// A lease that ends by nothing but what a test does.
@@ -114,10 +114,10 @@ impl PacedWorld {
         frames_until(&observer, 0, 0);
         let claim = Claim {
             time_to_live: Some(LONG),
-            ..claim(robot..robot + 1)
+            ..Claim::new(robot..robot + 1)
         };
         Self {
-            client: Client::acquire(&server.instance, &claim).expect("acquire"),
+            client: Client::acquire(server.connect(), &claim).expect("acquire"),
             last: WorldResult::default(),
             observer,
             mirror: Mirror::of(&server.info()),

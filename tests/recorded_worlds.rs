@@ -4,7 +4,6 @@ use crate::commands::{AGENT, LIMIT, SERVER, check};
 use crate::harness::{PATIENCE, Paths, Server, eventually, fly, new_instance, reset, run};
 use crate::recording::{read, read_whole, start_recorder, start_replay, stop, text, truths};
 use crate::snapshots::server_command;
-use agent::server::client::Client;
 use agent::server::truth::TruthFeed;
 use ndarray::{Array3, ArrayView2, Axis};
 use ndarray_npy::WriteNpyExt;
@@ -13,7 +12,7 @@ use protocol::connection::ConnectionError;
 use protocol::message::Status;
 use protocol::model::Description;
 use protocol::recording::Event;
-use protocol::{Connection, Grid, Shape};
+use protocol::{Client, Connection, Grid, Shape};
 use std::fs::File;
 use tempfile::TempDir;
 

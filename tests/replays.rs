@@ -2,17 +2,17 @@
 
 use crate::commands::{SERVER, check};
 use crate::harness::{
-    PATIENCE, Paths, SMALL, Server, eventually, fly, frames_until, new_instance, run,
+    PATIENCE, Paths, SMALL, Server, eventually, fly, frames_until, new_instance, run, takeover,
 };
 use crate::recording::{
     frames, new_file, read, read_whole, start_recorder, start_replay, stop, take, truths,
     write_recording,
 };
-use protocol::Connection;
 use protocol::connection::ConnectionError;
 use protocol::control::{Reply, Request};
 use protocol::message::{FrameHeader, Operation, Status, StepRequest};
 use protocol::observer::{Observer, Sample};
+use protocol::{Client, Connection};
 use rustix::process::Signal;
 
 #[test]
@@ -64,7 +64,8 @@ fn a_replay_answers_for_its_server_and_lets_nobody_act() {
     let instance = new_instance();
     let replay = start_replay(&instance, &file, &["--loop"]);
     replay.wait_for_words("waiting for an observer", PATIENCE);
-    let mut connection = Connection::open(&instance, "tests", PATIENCE).expect("connect");
+    let connect = || Connection::open(&instance, "tests", PATIENCE).expect("connect");
+    let mut connection = connect();
     let info = connection.info();
     assert_eq!((info.height, info.n_moves, info.pid), (2, 1, replay.pid()));
     let observer = Observer::frames(&instance).expect("observe");
@@ -73,14 +74,8 @@ fn a_replay_answers_for_its_server_and_lets_nobody_act() {
         .into_iter()
         .map(|it| it.header.result.step);
     assert_eq!(steps.collect::<Vec<_>>(), [0, 1, 2, 0, 1, 2, 0]);
-    let acquire = Request::Acquire {
-        first_robot: 0,
-        n_robots: 1,
-        takeover: true,
-        ttl_millis: None,
-    };
-    match connection.control(&acquire, PATIENCE) {
-        Err(ConnectionError::Refused {
+    match Client::acquire(connect(), &takeover(0..1)).err() {
+        Some(ConnectionError::Refused {
             status, message, ..
         }) => {
             assert_eq!(status, Status::NotPermitted);

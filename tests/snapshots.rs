@@ -5,10 +5,12 @@ use crate::harness::{
     reset, run, small_spec, takeover,
 };
 use crate::wire::{RawClient, Wire, control_header};
-use agent::server::client::{Client, Observation};
 use env_server::snapshot::{Durability, Folder, SnapshotWorld, decode, encode};
+use protocol::Client;
 use protocol::channels::Instance;
-use protocol::control::{Reply, Request};
+use protocol::client::Observation;
+use protocol::connection::ConnectionError;
+use protocol::control::Request;
 use protocol::message::Status;
 use protocol::observer::Observer;
 use std::path::{Path, PathBuf};
@@ -186,26 +188,17 @@ fn a_file_that_is_none_is_refused_by_name_and_changes_nothing() {
         std::fs::write(&other, bytes).expect("write");
         let restore = ["restore", text(&other), "--takeover"];
         refused(&server_command(&server, &restore), words);
-        let wire = Wire::open(&server.instance);
-        let request = Request::Acquire {
-            first_robot: 0,
-            n_robots: 1,
-            takeover: true,
-            ttl_millis: None,
-        };
-        let Reply::Lease(lease) = wire.ask(&request) else {
-            panic!("expected a lease");
-        };
+        let mut client = Client::acquire(server.connect(), &takeover(0..1)).expect("take over");
         let request = Request::Restore {
-            lease: lease.lease,
+            lease: client.lease(),
             first_world: 0,
             n_worlds: 1,
             from: 0,
             path: text(&other).into(),
         };
-        let Reply::Error {
+        let Err(ConnectionError::Refused {
             status, message, ..
-        } = wire.ask(&request)
+        }) = client.connection_mut().control(&request, PATIENCE)
         else {
             panic!("expected a refusal of {words:?}");
         };
@@ -272,7 +265,7 @@ fn a_killed_server_comes_back_where_its_last_snapshot_left_it() {
     let mut at = 0;
     for round in 1..=3 {
         let server = Server::start_on(&instance, &flags);
-        let mut client = Client::acquire(&instance, &takeover(0..2)).expect("acquire");
+        let mut client = Client::acquire(server.connect(), &takeover(0..2)).expect("acquire");
         let stands = client.observe(0..2).expect("observe")[0].world.step;
         assert!(stands <= at && stands + 20 > at, "{stands} after {at}");
         for k in stands..25 * round {

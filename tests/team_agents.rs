@@ -1,11 +1,10 @@
 //! Agents that fly robots of one world: by one plan without a word between them, in a world that goes on without them.
 
-use crate::harness::{PATIENCE, Program, Server, claim, eventually, robots_of, run as run_program};
+use crate::harness::{PATIENCE, Program, Server, eventually, robots_of, run as run_program};
 use agent::acting::mission::{Company, Mission};
 use agent::acting::run::{Summary, run};
 use agent::config::AgentConfig;
 use agent::learning::learned::Learned;
-use agent::server::client::Client;
 use protocol::observer::Observer;
 use rustix::process::Signal;
 use std::ops::Range;
@@ -21,7 +20,7 @@ const STEPS: u64 = 40;
 fn fly(parts: &[Range<u32>], company: Company) -> (Vec<Vec<Vec<u8>>>, f64) {
     let server = Server::start(FLAGS);
     // Holds the world until each robot has its agent.
-    let _holder = Client::acquire(&server.instance, &claim(0..4)).expect("free robots");
+    let _holder = server.acquire(0..4);
     let frames = Observer::frames(&server.instance).expect("the channel");
     let mission = |robots: &Range<u32>| Mission {
         instance: server.instance.clone(),

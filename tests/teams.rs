@@ -3,10 +3,12 @@
 
 use crate::harness::{
     Ended, PATIENCE, Paths, Program, Server, eventually, frames_until, new_instance, robots_of,
+    takeover,
 };
 use crate::mirror::{Mirror, PacedWorld};
 use crate::recording::{frames, new_file, read_whole, start_recorder, stop};
 use crate::wire::{Pending, RawClient, Wire, answer, step_body, step_header};
+use protocol::Client;
 use protocol::control::{Reply, Request, WorldSeed};
 use protocol::message::{
     FLAG_TEAM_FRAMES, Operation, RobotResult, Status, StepReply, StepRequest, WorldResult,
@@ -250,14 +252,7 @@ fn a_path_that_is_withdrawn_is_never_flown() {
     let first = Flyer::new(&server, 0..2);
     let waiting = first.send(1);
     second.wait_for_paths(2);
-    let thief = Wire::open(&server.instance);
-    let take = Request::Acquire {
-        first_robot: 1,
-        n_robots: 1,
-        takeover: true,
-        ttl_millis: None,
-    };
-    assert_eq!(thief.ask(&take).status(), Status::Ok);
+    let thief = Client::acquire(server.connect(), &takeover(1..2)).expect("take over");
     let us = u64::from(std::process::id());
     assert_eq!(first.refusal(&waiting), (Status::LeaseLost, us));
     second.wait_for_paths(0);

@@ -6,7 +6,7 @@ use agent::config::AgentConfig;
 use agent::learning::learned::Learned;
 use agent::planning::policy::Policy;
 use agent::rollout::{self, Robot, Seen};
-use agent::server::client::Observation;
+use protocol::client::Observation;
 use protocol::message::{RobotResult, WorldResult};
 use protocol::path::fly;
 use protocol::randomness::split_mix;
@@ -152,5 +152,5 @@ fn who_missed_steps_believes_what_one_believes_who_saw_nothing_in_them() {
 }
 
 fn cells(robot: &Robot) -> Vec<Cell> {
-    robot.results().map(agent::server::client::cell).collect()
+    robot.results().map(RobotResult::cell).collect()
 }

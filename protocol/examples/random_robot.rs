@@ -6,17 +6,12 @@
 #![expect(clippy::print_stdout, reason = "what the robot found is the output")]
 
 use protocol::channels::Instance;
-use protocol::connection::{Connection, unexpected};
-use protocol::control::{Reply, Request, WorldSeed};
-use protocol::message::{Operation, StepRequest};
-use protocol::payload::write_step_body;
-use protocol::{Frame, Shape};
+use protocol::client::{Claim, STEP_TIMEOUT};
+use protocol::control::WorldSeed;
+use protocol::{Client, Connection, Move};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::error::Error;
-use std::time::Duration;
-
-const PATIENCE: Duration = Duration::from_secs(60);
 
 fn main() -> Result<(), Box<dyn Error>> {
     let name = std::env::args().nth(1).unwrap_or("default".into());
@@ -25,42 +20,19 @@ fn main() -> Result<(), Box<dyn Error>> {
 
 /// Begins an episode with robot 0, flies paths, and returns their rewards.
 pub fn fly_at_random(instance: &Instance, n_steps: u64) -> Result<Vec<f64>, Box<dyn Error>> {
-    let mut connection = Connection::open(instance, "random robot", PATIENCE)?;
-    let info = connection.info().clone();
-    let acquire = Request::Acquire {
-        first_robot: 0,
-        n_robots: 1,
-        takeover: false,
-        ttl_millis: None,
-    };
-    let lease = match connection.control(&acquire, PATIENCE)? {
-        Reply::Lease(lease) => lease.lease,
-        other => return Err(unexpected("acquire", &other).into()),
-    };
+    let connection = Connection::open(instance, "random robot", STEP_TIMEOUT)?;
+    let mut client = Client::acquire(connection, &Claim::new(0..1))?;
     let (world, seed) = (0, Some(1000));
-    let worlds = vec![WorldSeed { world, seed }];
-    connection.control(&Request::Reset { lease, worlds }, PATIENCE)?;
-
-    let mut rng = ChaCha8Rng::seed_from_u64(0);
+    client.reset(&[WorldSeed { world, seed }])?;
+    let (n_moves, mut rng) = (client.info().n_moves, ChaCha8Rng::seed_from_u64(0));
     let mut rewards = Vec::new();
-    for step in 0..n_steps {
-        let path: Vec<u8> = (0..info.n_moves).map(|_| rng.random_range(0..4)).collect();
-        let mut body = Vec::new();
-        write_step_body(&[step], &path, &mut body);
-        let request = StepRequest {
-            operation: Operation::Step as u32,
-            lease,
-            n_robots: 1,
-            n_moves: info.n_moves as u32,
-            ..StepRequest::default()
-        };
-        let answer = connection.step(request, &body, PATIENCE)?;
-        let shape = Shape::new(info.height, info.width)?;
-        let frame = Frame::from_bytes(shape, info.n_observations, &answer.frames)?;
-        let (n_seen, reward) = (frame.observed().count(), answer.robots[0].reward);
-        println!("step {}: saw {n_seen} cells, reward {reward}", step + 1);
+    for step in 1..=n_steps {
+        let path = (0..n_moves).map(|_| Move::from_low_bits(rng.random()));
+        let seen = &client.step(0..1, &[path.collect()])?[0];
+        let (n_cells, reward) = (seen.frame.observed().count(), seen.robot.reward);
+        println!("step {step}: saw {n_cells} cells, reward {reward}");
         rewards.push(reward);
     }
-    connection.control(&Request::Release { lease }, PATIENCE)?;
+    client.release()?;
     Ok(rewards)
 }

@@ -1,9 +1,10 @@
 //! What the server and its clients agree on: the mathematics of the paper ([`model`], [`grid`], [`path`], [`frame`],
 //! [`dynamics`], [`transition`]), and messages and channels.
 //!
-//! A client needs a [`Connection`] and the requests in [`control`] and [`message`]; `examples/random_robot.rs` is a whole
-//! one. An [`observer`] reads what a server publishes, a [`recording`] what a file holds of that. A [`responder`] serves
-//! decisions of its own. [`channels`] and [`failed_connections`] are for those who serve worlds.
+//! A [`Client`] flies robots; `examples/random_robot.rs` is a whole program. Below it, a [`Connection`] takes the
+//! requests in [`control`] and [`message`]. An [`observer`] reads what a server publishes, a [`recording`] what a file
+//! holds of that. A [`responder`] serves decisions of its own. [`channels`] and [`failed_connections`] are for those
+//! who serve worlds.
 //!
 //! PROTOCOL.md describes the wire for other languages. Words: a *world* is the hidden state of one grid; a *step* `k`
 //! flies one path with each robot and moves the world once; a *frame* holds the observations of a step; a *lease* is the
@@ -20,6 +21,7 @@ pub use model::grid::{self, Cell, Grid, Probabilities, Shape};
 pub use model::path::{self, Move};
 pub use model::transition::{self, Transition};
 pub use model::{Model, randomness, vectors};
+pub use wire::client::{self, Client};
 pub use wire::connection::{self, Connection};
 pub use wire::{
     agent_belief, channels, cleanup, control, decisions, failed_connections, message, observer,

@@ -12,16 +12,17 @@ use crate::learning::learned::Learned;
 use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::planning::{Objective, Plan};
 use crate::rollout::{self, Robot, Seen, in_parallel};
-use crate::server::client::{Client, Observation};
 use crate::server::errors::refused;
 use crate::server::feed::Feed;
+use crate::server::info::connect;
 use anyhow::Result;
-use protocol::Model;
 use protocol::channels::Instance;
+use protocol::client::{Claim, Observation};
 use protocol::connection::ConnectionError;
 use protocol::control::{ServerInfo, WorldSeed};
 use protocol::decisions::{AgentInfo, Decision};
 use protocol::message::{Status, VERSION};
+use protocol::{Client, Model, Move};
 use std::ops::Range;
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
@@ -69,8 +70,12 @@ struct Moving<'a> {
 impl Decider {
     /// Acquires the worlds where they stand and takes in their last frames.
     pub fn attach(task: &Assignment, model: Model, prior: Belief) -> Result<Self> {
-        let (client, observations) =
-            Client::acquire_and_observe(&task.instance, task.worlds.clone(), task.takeover)?;
+        let claim = Claim {
+            takeover: task.takeover,
+            ..Claim::new(task.worlds.clone())
+        };
+        let mut client = Client::acquire(connect(&task.instance)?, &claim)?;
+        let observations = client.observe(client.robots())?;
         let choices = Policy::choices(task.estimator, task.planner, &model);
         let mut decider = Self {
             last_use: Instant::now(),
@@ -150,7 +155,7 @@ impl Decider {
             |run| &mut *run.robot,
             Moving::plan,
             |paths| {
-                let observations = self.client.step_some(&worlds, paths)?;
+                let observations = step(&mut self.client, &worlds, paths)?;
                 self.last_use = Instant::now();
                 let seen = observations.into_iter();
                 Ok(seen.map(|observation| Seen::new([observation])).collect())
@@ -177,7 +182,7 @@ impl Decider {
 
     /// Checks that the server lives; renews the lease if it is time.
     pub fn keep_alive(&mut self, now: Instant) -> Result<()> {
-        self.client.check_server()?;
+        self.client.connection().check_server()?;
         if self.until_renewal(now).is_zero() {
             self.client.renew()?;
             self.last_use = now;
@@ -187,7 +192,7 @@ impl Decider {
 
     /// The server's process: readable when it has ended.
     pub fn server_process(&self) -> BorrowedFd<'_> {
-        self.client.server_process()
+        self.client.connection().server_process()
     }
 
     pub fn release(mut self) -> Result<()> {
@@ -274,6 +279,21 @@ fn moving<'a>(
     places.filter_map(run).collect()
 }
 
+/// Flies a path in each of these worlds, which ascend: one message for all that are consecutive.
+fn step(
+    client: &mut Client,
+    worlds: &[u32],
+    paths: &[Vec<Move>],
+) -> Result<Vec<Observation>, ConnectionError> {
+    let mut observations = Vec::with_capacity(worlds.len());
+    for run in worlds.chunk_by(|world, next| world + 1 == *next) {
+        let (first, n_worlds) = (run[0], run.len());
+        let paths = &paths[observations.len()..][..n_worlds];
+        observations.extend(client.step(first..first + n_worlds as u32, paths)?);
+    }
+    Ok(observations)
+}
+
 fn no_such_world(worlds: &Range<u32>, got: u32) -> ConnectionError {
     let (first, last) = (worlds.start, worlds.end - 1);
     let message = format!("no such world: the agent has worlds {first} to {last}, got {got}");
@@ -282,7 +302,7 @@ fn no_such_world(worlds: &Range<u32>, got: u32) -> ConnectionError {
 
 fn decision(robot: &Robot, n_moves: usize, objective: Option<u64>) -> Decision {
     let observation = robot.observation();
-    let (result, cell) = (&observation.world, observation.cell());
+    let (result, cell) = (&observation.world, observation.robot.cell());
     Decision {
         step: result.step,
         reward: result.reward,

@@ -6,7 +6,6 @@
 use crate::acting::decider::{Assignment, Decider};
 use crate::acting::mission::prepare;
 use crate::estimation::first_belief::first_belief;
-use crate::server::client::shape_of;
 use crate::server::errors::{is_outage, refusal};
 use anyhow::{Result, ensure};
 use protocol::Model;
@@ -72,7 +71,7 @@ impl Service {
             "serve-decisions flies one robot a world: expected a server with --robots 1, got {}",
             info.n_robots
         );
-        let shape = shape_of(&info)?;
+        let shape = info.shape()?;
         let prior = task.config.prior(info.burn_in);
         let prior = first_belief(prior, &model, shape, task.config.seed)?;
         let responder = Responder::open(&task.instance, task.worlds.start)?;

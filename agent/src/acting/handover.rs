@@ -2,8 +2,9 @@
 //! else from the frames that the server keeps.
 
 use crate::rollout::{Robot, Seen};
-use crate::server::client::Client;
+use crate::server::left_belief::{leave_belief, left_belief};
 use anyhow::Result;
+use protocol::Client;
 use protocol::connection::ConnectionError;
 use protocol::message::Status;
 
@@ -76,7 +77,7 @@ pub fn take_over_left(
     let Some(kind) = estimator.kind() else {
         return Ok(false);
     };
-    let Some(memory) = client.belief(number, &kind)? else {
+    let Some(memory) = left_belief(client, number, &kind)? else {
         return Ok(false);
     };
     let is_taken = estimator.remember(&memory);
@@ -96,7 +97,8 @@ pub fn leave(client: &mut Client, number: u32, robot: &Robot) -> Result<(), Conn
     let Some(kind) = agent.estimator().kind() else {
         return Ok(());
     };
-    match client.leave_belief(number, &present.world, &kind, &agent.estimator().memory()) {
+    let memory = agent.estimator().memory();
+    match leave_belief(client, number, &present.world, &kind, &memory) {
         // A server that keeps no beliefs, or none that is so long.
         Err(ConnectionError::Refused {
             status: Status::Malformed,

@@ -2,12 +2,12 @@
 
 use crate::config::AgentConfig;
 use crate::learning::learned::Learned;
-use crate::server::client::Claim;
 use crate::server::errors::refused;
-use crate::server::info::server_info;
+use crate::server::info::connect;
 use anyhow::{Result, bail, ensure};
 use protocol::Model;
 use protocol::channels::Instance;
+use protocol::client::Claim;
 use protocol::control::ServerInfo;
 use protocol::message::Status;
 use protocol::model::{Description, ModelError};
@@ -53,9 +53,8 @@ impl Mission {
 
     pub(super) fn claim(&self, numbers: &Range<u32>) -> Claim {
         Claim {
-            robots: numbers.clone(),
             takeover: self.takeover,
-            time_to_live: None,
+            ..Claim::new(numbers.clone())
         }
     }
 
@@ -89,7 +88,7 @@ pub fn prepare(
 
 /// What a server says of itself, if it has the worlds.
 pub(super) fn info_of(instance: &Instance, worlds: &Range<u32>) -> Result<ServerInfo> {
-    let info = server_info(instance)?;
+    let info = connect(instance)?.info().clone();
     if worlds.end > info.n_worlds {
         let (status, detail) = (Status::NoSuchWorld, info.n_worlds.into());
         return Err(refused(status, detail, status.explain(detail)).into());

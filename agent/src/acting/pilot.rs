@@ -11,16 +11,16 @@ use crate::planning::policy::{EstimatorKind, Policy};
 use crate::planning::team::robot_seed;
 use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Seen};
-use crate::server::client::{Client, Observation, shape_of};
 use crate::server::errors::is_late;
 use crate::server::feed::Feed;
-use crate::server::info::is_belief_left;
+use crate::server::info::{connect, is_belief_left};
 use crate::server::truth::TruthFeed;
 use anyhow::{Result, ensure};
+use protocol::client::Observation;
 use protocol::connection::ConnectionError;
 use protocol::control::{ServerInfo, WorldSeed};
 use protocol::message::WorldResult;
-use protocol::{Cell, Grid, Model};
+use protocol::{Cell, Client, Grid, Model};
 use std::cell::RefCell;
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -75,7 +75,7 @@ impl Pilot {
             "policy {:?} decides for one robot, not for a team",
             policy.name
         );
-        let shape = shape_of(&info)?;
+        let shape = info.shape()?;
         // What takes long is done before the lease begins to run, and not at all where a belief was left.
         if policy.estimator.knows_model() {
             let any = Belief::from_initial(&model, shape);
@@ -132,7 +132,8 @@ impl Pilot {
         policy: &Policy,
         prior: &Belief,
     ) -> Result<Self> {
-        let mut client = Client::acquire(&mission.instance, &mission.claim(numbers))?;
+        let connection = connect(&mission.instance)?;
+        let mut client = Client::acquire(connection, &mission.claim(numbers))?;
         client.share_frames(mission.company != Company::Alone);
         let team = client.info().n_robots;
         let (robots, first) = match mission.company {
@@ -303,7 +304,7 @@ fn prior(mission: &Mission, info: &ServerInfo, model: &Model, policy: &Policy) -
     Ok(first_belief(
         prior,
         model,
-        shape_of(info)?,
+        info.shape()?,
         mission.config.seed,
     )?)
 }

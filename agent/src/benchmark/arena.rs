@@ -14,13 +14,13 @@ use crate::planning::policy::Policy;
 use crate::planning::team::robot_seed;
 use crate::rollout::Seen;
 use crate::rollout::agent::Agent;
-use crate::server::client::{Claim, Client, Observation};
-use crate::server::info::server_info;
+use crate::server::info::connect;
 use crate::server::truth::TruthFeed;
 use anyhow::{Context, Result, ensure};
 use protocol::channels::Instance;
+use protocol::client::{Claim, Observation};
 use protocol::control::{CoverageRule, ServerInfo, WorldSeed};
-use protocol::{Grid, Model, Move, Shape};
+use protocol::{Client, Grid, Model, Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
 
@@ -49,10 +49,8 @@ impl Arena {
     pub fn open(instance: &Instance, n_seeds: u32, needs_scouts: bool) -> Result<Self> {
         let unfit =
             |needs: &str| format!("instance {:?}: comparing needs {needs}", instance.name());
-        let (n_worlds, team) = {
-            let info = server_info(instance)?;
-            (info.n_worlds, info.n_robots)
-        };
+        let connection = connect(instance)?;
+        let (n_worlds, team) = (connection.info().n_worlds, connection.info().n_robots);
         let per_main = if needs_scouts { 2 } else { 1 };
         let n_main = (n_worlds / per_main).min(n_seeds).min(MAX_BATCH);
         let needs =
@@ -66,7 +64,7 @@ impl Arena {
             // Simulating the prior may take long; closing the connection ends the lease all the same.
             time_to_live: Some(LEASE),
         };
-        let client = Client::acquire(instance, &claim)?;
+        let client = Client::acquire(connection, &claim)?;
         let info = client.info();
         let model = match recorded_states(info)? {
             None => info.model.as_deref().map(Model::from_toml).transpose()?,

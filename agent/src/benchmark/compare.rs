@@ -12,7 +12,6 @@ use crate::learning::learned::Learned;
 use crate::planning::policy::{EstimatorKind, Policy};
 use crate::rollout::agent::Agent;
 use crate::rollout::{self, Robot, Turn};
-use crate::server::client::start;
 use crate::server::feed::Feed;
 use anyhow::{Context, Result, ensure};
 use protocol::Model;
@@ -293,7 +292,7 @@ impl World {
     fn fly(&mut self, robot: &Robot, turn: &Turn, n_robots: usize) {
         let shape = robot.agent.belief().shape();
         let flown = robot.results().zip(&turn.plans);
-        let flown = flown.map(|(result, plan)| fly(shape, start(result), &plan.moves));
+        let flown = flown.map(|(result, plan)| fly(shape, result.start(), &plan.moves));
         self.flights.extend(flown);
         if self.flights.len() == n_robots {
             let result = &robot.observation().world;
@@ -332,7 +331,7 @@ impl World {
 
     fn snapshot(&self, robot: &Robot, turn: Turn, target: usize) -> Option<Snapshot> {
         let (agent, observation) = (&robot.agent, robot.observation());
-        let (shape, start) = (agent.belief().shape(), turn.before.cell());
+        let (shape, start) = (agent.belief().shape(), turn.before.robot.cell());
         let estimator = agent.policy().estimator;
         let is_own = estimator.knows_model() || estimator.is_learned();
         let moves = &turn.plans[0].moves;

@@ -17,14 +17,14 @@ use crate::learning::checkpoint::{self, Contents};
 use crate::learning::metrics::{FROZEN, METRICS, Metrics, Tick};
 use crate::learning::student::Student;
 use crate::rollout::Robot;
-use crate::server::client::{Claim, Client, Observation};
 use crate::server::feed::Feed;
-use crate::server::info::server_info;
+use crate::server::info::connect;
 use anyhow::{Result, bail};
-use protocol::Move;
 use protocol::channels::Instance;
+use protocol::client::{Claim, Observation};
 use protocol::connection::ConnectionError;
 use protocol::control::WorldSeed;
+use protocol::{Client, Move};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -105,13 +105,13 @@ impl Trainer {
         contents: Option<Contents>,
     ) -> Result<Self> {
         let place = training.out.join(CHECKPOINT);
-        let robots = training.robots(&server_info(instance)?)?;
+        let connection = connect(instance)?;
         let claim = Claim {
-            robots,
+            robots: training.robots(connection.info())?,
             takeover: training.takeover,
             time_to_live: Some(LEASE),
         };
-        let mut client = Client::acquire(instance, &claim)?;
+        let mut client = Client::acquire(connection, &claim)?;
         let mut student = student(training, &client, contents.as_ref(), &place)?;
         let metrics = metrics(training, &*student)?;
         let events = events(training, &*student)?;

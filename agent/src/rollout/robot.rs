@@ -5,9 +5,9 @@
 use crate::estimation::scoring::Score;
 use crate::planning::Plan;
 use crate::rollout::agent::Agent;
-use crate::server::client::{Observation, cell};
 use crate::server::feed::View;
 use anyhow::Result;
+use protocol::client::Observation;
 use protocol::message::RobotResult;
 use protocol::{Cell, Grid, Move};
 use rayon::prelude::*;
@@ -120,7 +120,7 @@ impl Robot {
         plan: impl FnOnce(&mut Agent, &[Cell], u64) -> Vec<Plan>,
     ) -> Vec<Plan> {
         let start = Instant::now();
-        let cells: Vec<Cell> = self.results().map(cell).collect();
+        let cells: Vec<Cell> = self.results().map(RobotResult::cell).collect();
         let plans = plan(&mut self.agent, &cells, self.observation.world.step);
         self.planning = start.elapsed();
         plans

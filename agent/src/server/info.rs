@@ -1,20 +1,20 @@
-//! What a server tells without a lease, from connections of their own.
+//! Connections of this program, and what a server tells on one without a lease.
 
-use crate::server::client::{CLIENT_NAME, STEP_TIMEOUT};
 use crate::server::errors::is_away;
 use protocol::Connection;
 use protocol::channels::Instance;
+use protocol::client::STEP_TIMEOUT;
 use protocol::connection::{ConnectionError, unexpected};
-use protocol::control::{Reply, Request, ServerInfo};
+use protocol::control::{Reply, Request};
 use std::time::{Duration, Instant};
 
 /// How long to wait between attempts to reach a server that is away.
 pub const RETRY_INTERVAL: Duration = Duration::from_millis(200);
 
-/// What a server says of itself, from a connection of its own.
-pub fn server_info(instance: &Instance) -> Result<ServerInfo, ConnectionError> {
-    let connection = Connection::open(instance, CLIENT_NAME, STEP_TIMEOUT)?;
-    Ok(connection.info().clone())
+/// Connects to an instance's server.
+pub fn connect(instance: &Instance) -> Result<Connection, ConnectionError> {
+    let name = concat!("emberwatch-agent ", env!("CARGO_PKG_VERSION"));
+    Connection::open(instance, name, STEP_TIMEOUT)
 }
 
 /// Waits until an instance has a server, and says so once if that is not at once; returns whether it has
@@ -26,7 +26,7 @@ pub fn wait_for_server(
 ) -> Result<bool, ConnectionError> {
     let (start, mut is_told) = (Instant::now(), false);
     while !is_over() {
-        match server_info(instance) {
+        match connect(instance) {
             Ok(_) => return Ok(true),
             Err(error) if is_away(&error) && start.elapsed() < limit => {
                 if !is_told {
@@ -48,7 +48,7 @@ pub fn is_belief_left(
     robot: u32,
     kind: &str,
 ) -> Result<bool, ConnectionError> {
-    let mut connection = Connection::open(instance, CLIENT_NAME, STEP_TIMEOUT)?;
+    let mut connection = connect(instance)?;
     let request = Request::Belief { robot, offset: 0 };
     match connection.control(&request, STEP_TIMEOUT) {
         Ok(Reply::Belief { info, .. }) => Ok(info.kind == kind),

@@ -1,62 +1,66 @@
 //! Beliefs that an agent leaves with the server for a robot's next agent.
 
-use crate::server::client::{Client, STEP_TIMEOUT, garbled};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
+use protocol::Client;
+use protocol::client::STEP_TIMEOUT;
 use protocol::connection::{ConnectionError, unexpected};
 use protocol::control::{LeftPart, MAX_BELIEF_PART, Reply, Request};
 use protocol::message::WorldResult;
 
-impl Client {
-    /// Leaves a belief about a robot's world, as it stands after a result, for the robot's next agent.
-    pub fn leave_belief(
-        &mut self,
-        robot: u32,
-        at: &WorldResult,
-        kind: &str,
-        bytes: &[u8],
-    ) -> Result<(), ConnectionError> {
-        for (index, part) in bytes.chunks(MAX_BELIEF_PART).enumerate() {
-            let request = Request::LeaveBelief(LeftPart {
-                lease: self.lease,
-                robot,
-                episode: at.episode,
-                step: at.step,
-                kind: kind.into(),
-                offset: (index * MAX_BELIEF_PART) as u64,
-                length: bytes.len() as u64,
-                data: BASE64.encode(part),
-            });
-            self.connection.control(&request, STEP_TIMEOUT)?;
-        }
-        Ok(())
+/// Leaves a belief about a robot's world, as it stands after a result, for the robot's next agent.
+pub fn leave_belief(
+    client: &mut Client,
+    robot: u32,
+    at: &WorldResult,
+    kind: &str,
+    bytes: &[u8],
+) -> Result<(), ConnectionError> {
+    for (index, part) in bytes.chunks(MAX_BELIEF_PART).enumerate() {
+        let request = Request::LeaveBelief(LeftPart {
+            lease: client.lease(),
+            robot,
+            episode: at.episode,
+            step: at.step,
+            kind: kind.into(),
+            offset: (index * MAX_BELIEF_PART) as u64,
+            length: bytes.len() as u64,
+            data: BASE64.encode(part),
+        });
+        client.connection_mut().control(&request, STEP_TIMEOUT)?;
     }
+    Ok(())
+}
 
-    /// The belief that was left for a robot's agent about its world as it stands, if it is of a kind.
-    pub fn belief(&mut self, robot: u32, kind: &str) -> Result<Option<Vec<u8>>, ConnectionError> {
-        let (mut first, mut bytes) = (None, Vec::new());
-        loop {
-            let offset = bytes.len() as u64;
-            let request = Request::Belief { robot, offset };
-            match self.connection.control(&request, STEP_TIMEOUT) {
-                Ok(Reply::Belief { info, data, .. }) if info.kind == kind => {
-                    let part = BASE64
-                        .decode(data)
-                        .map_err(|error| garbled("belief", &error))?;
-                    bytes.extend_from_slice(&part);
-                    let (is_last, is_whole) = (part.is_empty(), bytes.len() as u64 == info.length);
-                    if *first.get_or_insert_with(|| info.clone()) != info {
-                        return Ok(None); // Another one was left meanwhile.
-                    }
-                    if is_last || is_whole {
-                        return Ok(is_whole.then_some(bytes));
-                    }
+/// The belief that was left for a robot's agent about its world as it stands, if it is of a kind.
+pub fn left_belief(
+    client: &mut Client,
+    robot: u32,
+    kind: &str,
+) -> Result<Option<Vec<u8>>, ConnectionError> {
+    let (mut first, mut bytes) = (None, Vec::new());
+    loop {
+        let offset = bytes.len() as u64;
+        let request = Request::Belief { robot, offset };
+        match client.connection_mut().control(&request, STEP_TIMEOUT) {
+            Ok(Reply::Belief { info, data, .. }) if info.kind == kind => {
+                let part = BASE64.decode(data).map_err(|error| {
+                    let (what, problem) = ("belief", error.to_string());
+                    ConnectionError::Garbled { what, problem }
+                })?;
+                bytes.extend_from_slice(&part);
+                let (is_last, is_whole) = (part.is_empty(), bytes.len() as u64 == info.length);
+                if *first.get_or_insert_with(|| info.clone()) != info {
+                    return Ok(None); // Another one was left meanwhile.
                 }
-                // Of another kind, none, or a server that knows no beliefs.
-                Ok(Reply::Belief { .. }) | Err(ConnectionError::Refused { .. }) => return Ok(None),
-                Ok(other) => return Err(unexpected("belief", &other)),
-                Err(error) => return Err(error),
+                if is_last || is_whole {
+                    return Ok(is_whole.then_some(bytes));
+                }
             }
+            // Of another kind, none, or a server that knows no beliefs.
+            Ok(Reply::Belief { .. }) | Err(ConnectionError::Refused { .. }) => return Ok(None),
+            Ok(other) => return Err(unexpected("belief", &other)),
+            Err(error) => return Err(error),
         }
     }
 }

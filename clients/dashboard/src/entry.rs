@@ -101,7 +101,9 @@ impl Entry {
         let seen = (0..).zip(union).filter(|&(_, value)| value != UNOBSERVED);
         let mut seen: Vec<(u32, u8)> = seen.collect();
         seen.shrink_to_fit();
-        let are_inside = robots.iter().all(|robot| shape.contains(robot.start()));
+        let are_inside = robots
+            .iter()
+            .all(|robot| shape.contains(robot.result.start()));
         are_inside.then_some(Self {
             shape,
             result: header.result,
@@ -149,18 +151,11 @@ impl Entry {
 impl Robot {
     /// The cells of its path, the start first.
     pub fn path(&self, shape: Shape) -> Vec<Cell> {
-        let mut cells = vec![self.start()];
+        let mut cells = vec![self.result.start()];
         for step in &self.moves {
             cells.push(step.apply(cells[cells.len() - 1], shape));
         }
         cells
-    }
-
-    fn start(&self) -> Cell {
-        Cell {
-            row: self.result.start_row as usize,
-            col: self.result.start_col as usize,
-        }
     }
 }
 

@@ -3,9 +3,10 @@
 use anyhow::{Result, bail};
 use clap::Args;
 use env_server::snapshot::read;
-use protocol::Connection;
 use protocol::channels::Instance;
+use protocol::client::Claim;
 use protocol::control::{Reply, Request, WorldInfo};
+use protocol::{Client, Connection};
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -103,9 +104,8 @@ impl RestoreCommand {
         };
         let (first_world, n_worlds) = (self.first_world, self.worlds.unwrap_or(rest));
         let path = absolute(&self.file)?;
-        let mut server = connect(&self.instance)?;
         replace(
-            &mut server,
+            connect(&self.instance)?,
             first_world..first_world.saturating_add(n_worlds),
             self.takeover,
             |lease| Request::Restore {
@@ -122,10 +122,9 @@ impl RestoreCommand {
 impl ForkCommand {
     /// Acquires the robots of the world to replace, has it replaced, and releases them.
     pub fn run(&self) -> Result<()> {
-        let mut server = connect(&self.instance)?;
         let (from, to) = (self.from, self.to);
         replace(
-            &mut server,
+            connect(&self.instance)?,
             to..to.saturating_add(1),
             self.takeover,
             |lease| Request::Fork { lease, from, to },
@@ -135,23 +134,21 @@ impl ForkCommand {
 
 /// Replaces worlds under a lease on all their robots.
 fn replace(
-    server: &mut Connection,
+    server: Connection,
     worlds: std::ops::Range<u32>,
     takeover: bool,
     request: impl FnOnce(u64) -> Request,
 ) -> Result<()> {
     let team = server.info().n_robots;
-    let acquire = Request::Acquire {
-        first_robot: worlds.start.saturating_mul(team),
-        n_robots: (worlds.len() as u32).saturating_mul(team),
+    let claim = Claim {
+        robots: worlds.start.saturating_mul(team)..worlds.end.saturating_mul(team),
         takeover,
-        ttl_millis: Some(TIMEOUT.as_millis() as u64),
+        time_to_live: Some(TIMEOUT),
     };
-    let Reply::Lease(lease) = server.control(&acquire, TIMEOUT)? else {
-        bail!("expected a lease");
-    };
-    let replaced = server.control(&request(lease.lease), TIMEOUT);
-    server.control(&Request::Release { lease: lease.lease }, TIMEOUT)?;
+    let mut client = Client::acquire(server, &claim)?;
+    let request = request(client.lease());
+    let replaced = client.connection_mut().control(&request, TIMEOUT);
+    client.release()?;
     let Reply::Restored { worlds } = replaced? else {
         bail!("expected worlds that were replaced");
     };

@@ -73,9 +73,6 @@ impl Robot {
 
     /// Where it is.
     pub fn cell(&self) -> Cell {
-        Cell {
-            row: self.result.row as usize,
-            col: self.result.col as usize,
-        }
+        self.result.cell()
     }
 }

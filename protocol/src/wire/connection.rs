@@ -6,7 +6,7 @@ use super::channels::{
     Channel, Entries, Instance, Ipc, Services, StepService, create_node, ipc_error, server_pid,
 };
 use super::control::{Reply, Request, ServerInfo};
-use super::exchange::{Exchange, check_answer, check_status};
+use super::exchange::{Exchange, check_answer, check_status, garbled};
 use super::message::{
     ControlReply, ControlRequest, RobotResult, StepReply, StepRequest, VERSION, WorldResult,
 };
@@ -206,20 +206,17 @@ impl Connection {
                 })?;
         check_status(WHAT, reply.status, reply.detail, None)?;
         check_answer(WHAT, reply.version, (reply.sequence, self.sequence))?;
-        let garbled = |problem: String| ConnectionError::Garbled {
-            what: WHAT,
-            problem,
-        };
         let (worlds, robots, frames) = answer
-            .map_err(|expected| garbled(format!("expected a payload of {expected} bytes")))?;
+            .map_err(|expected| garbled(WHAT, format!("expected a payload of {expected} bytes")))?;
         let asked = (request.first_robot, request.n_robots, request.flags);
         let got = (reply.first_robot, reply.n_robots, reply.flags);
         let expected = worlds_of(request.first_robot, request.n_robots, self.info.n_robots).len();
         if asked != got || worlds.len() != expected {
-            return Err(garbled(format!(
+            let problem = format!(
                 "expected {expected} worlds, and robots and flags {asked:?}, got {} and {got:?}",
                 worlds.len()
-            )));
+            );
+            return Err(garbled(WHAT, problem));
         }
         Ok(StepAnswer {
             reply,
@@ -283,16 +280,10 @@ fn ask(
     };
     let detail = message.as_ref().map_or(0, |(detail, _)| *detail);
     check_status(WHAT, reply.status, detail, message.map(|(_, text)| text))?;
-    parsed.map_err(|error| ConnectionError::Garbled {
-        what: WHAT,
-        problem: error.to_string(),
-    })
+    parsed.map_err(|error| garbled(WHAT, error))
 }
 
 /// The error for a reply that answers another question.
 pub fn unexpected(what: &'static str, reply: &Reply) -> ConnectionError {
-    ConnectionError::Garbled {
-        what,
-        problem: format!("got the reply to something else: {reply:?}"),
-    }
+    garbled(what, format!("got the reply to something else: {reply:?}"))
 }

@@ -2,6 +2,7 @@
 
 use super::codes::{Status, VERSION};
 use crate::model::frame::Coverage;
+use crate::model::grid::{Shape, ShapeError};
 use serde::{Deserialize, Serialize};
 
 pub use super::json::{MAX_CONTROL_BYTES, parse};
@@ -208,6 +209,14 @@ pub struct ServerInfo {
 }
 
 impl ServerInfo {
+    /// Height and width of the grid.
+    ///
+    /// # Errors
+    /// If a side is outside `1..=MAX_SIDE`.
+    pub fn shape(&self) -> Result<Shape, ShapeError> {
+        Shape::new(self.height, self.width)
+    }
+
     /// Steps of the shortest episode, if any is truncated.
     pub fn shortest_episode(&self) -> Option<u64> {
         let recorded = self.recorded_world.as_ref().map(|it| it.n_steps);

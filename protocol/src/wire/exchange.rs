@@ -168,10 +168,7 @@ pub(super) fn check_status(
                 message,
             })
         }
-        Err(unknown) => Err(ConnectionError::Garbled {
-            what,
-            problem: unknown.to_string(),
-        }),
+        Err(unknown) => Err(garbled(what, unknown)),
     }
 }
 
@@ -188,5 +185,13 @@ pub(super) fn check_answer(
     } else {
         return Ok(());
     };
-    Err(ConnectionError::Garbled { what, problem })
+    Err(garbled(what, problem))
+}
+
+/// The error of an answer that makes no sense.
+pub(super) fn garbled(what: &'static str, problem: impl ToString) -> ConnectionError {
+    ConnectionError::Garbled {
+        what,
+        problem: problem.to_string(),
+    }
 }

@@ -4,6 +4,7 @@
 //! valid values than bit patterns is converted with `TryFrom` and checked. Variable parts travel
 //! as the `[u8]` payload behind the header.
 
+use crate::model::grid::Cell;
 use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 
@@ -132,6 +133,24 @@ pub struct RobotResult {
     pub coverage: u32,
     /// Moves that it flew; 0 after a reset, and in a step in which it hovered or was late.
     pub n_moves: u32,
+}
+
+impl RobotResult {
+    /// Where it is.
+    pub fn cell(&self) -> Cell {
+        Cell {
+            row: self.row as usize,
+            col: self.col as usize,
+        }
+    }
+
+    /// Where its path began, or where it stays.
+    pub fn start(&self) -> Cell {
+        Cell {
+            row: self.start_row as usize,
+            col: self.start_col as usize,
+        }
+    }
 }
 
 /// Header of a `control` request; the payload is JSON, a [`crate::wire::control::Request`].

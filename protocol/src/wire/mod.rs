@@ -1,13 +1,15 @@
 //! The wire: what travels between processes, and how.
 //!
 //! [`message`], [`payload`], [`control`] and [`decisions`] are the messages; [`channels`] the services that carry them;
-//! [`connection`] a client's side, [`responder`] the answering side, [`observer`] a reader's side. [`node`], [`turn`]
-//! and [`cleanup`] create and remove channels; [`wait`] is the bounded wait. [`recording`] keeps samples in a file.
+//! [`connection`] and [`client`] a client's side, [`responder`] the answering side, [`observer`] a reader's side.
+//! [`node`], [`turn`] and [`cleanup`] create and remove channels; [`wait`] is the bounded wait. [`recording`] keeps
+//! samples in a file.
 
 pub mod agent_belief;
 mod channel_files;
 pub mod channels;
 pub mod cleanup;
+pub mod client;
 mod codes;
 pub mod connection;
 pub mod control;

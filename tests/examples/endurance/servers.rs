@@ -2,7 +2,8 @@
 
 use crate::harness::{Paths, Server, new_instance, takeover};
 use crate::{say, spread};
-use agent::server::client::{Client, Observation};
+use protocol::Client;
+use protocol::client::Observation;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -31,7 +32,7 @@ pub fn kill(n_kills: usize) {
     for n in 0..=n_kills {
         let started = Instant::now();
         let server = Server::start_on(&instance, &flags);
-        let mut client = Client::acquire(&instance, &takeover(0..2)).expect("acquire");
+        let mut client = Client::acquire(server.connect(), &takeover(0..2)).expect("acquire");
         let mut seen = client.observe(0..2).expect("observe");
         waits.push(started.elapsed().as_secs_f64());
         let stands = seen[0].world.step;

@@ -69,12 +69,8 @@ pub fn frame(bytes: &[u8]) -> bool {
     let shape = Shape::new(header.height as usize, header.width as usize);
     let shape = shape.expect("its frames were split");
     let is_good = |robot: &RobotSample<'_>| {
-        let result = robot.result;
-        let (row, col) = (result.start_row as usize, result.start_col as usize);
-        is_frame(shape, robot.frame)
-            && row < shape.height()
-            && col < shape.width()
-            && is_path(shape, Cell { row, col }, robot.path)
+        let start = robot.result.start();
+        is_frame(shape, robot.frame) && shape.contains(start) && is_path(shape, start, robot.path)
     };
     robots.iter().filter(|robot| is_good(robot)).count() == header.n_robots as usize
 }

@@ -11,7 +11,7 @@ use crate::planning::PlanBasis;
 use crate::planning::policy::Policy;
 use crate::rollout::agent::{Agent, Setup};
 use crate::rollout::{Robot, Seen};
-use crate::server::client::Observation;
+use protocol::client::Observation;
 use protocol::connection::ConnectionError;
 use protocol::{Move, Shape};
 use std::ops::Range;
@@ -48,6 +48,9 @@ impl Worlds {
         Robot::new(agent, Seen::new([observation]))
     }
 }
+
+/// Which step of which run a robot saw, and from where: seed, episode, step k, row, column.
+pub type Place = [u64; 5];
 
 /// Flies a path with each robot; gives what they see then, in order.
 pub type Fly<'a> = &'a mut dyn FnMut(&[Vec<Move>]) -> Result<Vec<Observation>, ConnectionError>;
@@ -98,6 +101,13 @@ pub trait Student {
 
     /// Time spent so far, by part.
     fn times(&self) -> Vec<(&'static str, Duration)>;
+}
+
+/// The place of an observation.
+pub(super) fn place(observation: &Observation) -> Place {
+    let (world, robot) = (&observation.world, &observation.robot);
+    let [row, col] = [robot.row, robot.col].map(u64::from);
+    [world.seed, world.episode, world.step, row, col]
 }
 
 /// Observations without hidden states, as learners get them.

@@ -11,9 +11,9 @@ use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
 use crate::planning::action::{Action, ActionSet};
 use crate::planning::policy::Policy;
 use crate::rollout::{self, Robot};
-use crate::server::client::Observation;
 use ::network::{Dqn, SavedDqn, Track, Transition};
 use anyhow::Result;
+use protocol::client::Observation;
 use protocol::{Cell, Model};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -155,7 +155,11 @@ impl DecisionsStudent {
 }
 
 fn input(robot: &Robot, n_moves: usize) -> Vec<f32> {
-    spread_summary(robot.agent.belief(), robot.observation().cell(), n_moves)
+    spread_summary(
+        robot.agent.belief(),
+        robot.observation().robot.cell(),
+        n_moves,
+    )
 }
 
 impl Run {

@@ -18,8 +18,8 @@ use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::planning::{Objective, Plan, Target};
 use crate::rollout::agent::numbered_states;
 use crate::rollout::{self, Robot};
-use crate::server::client::Observation;
 use anyhow::Result;
+use protocol::client::Observation;
 use protocol::path;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -204,7 +204,7 @@ impl Student for FilterStudent {
             |index, run, turn| {
                 let (agent, observation) = (&run.robot.agent, run.robot.observation());
                 let path = &turn.plans[0].moves;
-                let visited = path::fly(self.worlds.shape, turn.before.cell(), path);
+                let visited = path::fly(self.worlds.shape, turn.before.robot.cell(), path);
                 let reward = observation.robot.reward;
                 self.learner.see(
                     first_world + index as u32,

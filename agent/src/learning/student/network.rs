@@ -18,12 +18,12 @@ use crate::estimation::{AutoencoderEstimator, Follower};
 use crate::learning::checkpoint::Contents;
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::reward::met;
-use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
+use crate::learning::student::base::{Fly, Look, Student, Worlds, place, without_truth};
 use crate::planning::policy::Policy;
 use crate::rollout::agent::numbered_states;
 use crate::rollout::{self, Robot};
-use crate::server::client::Observation;
 use ::network::{Transition, Window};
+use protocol::client::Observation;
 use protocol::path;
 use std::time::{Duration, Instant};
 
@@ -79,7 +79,7 @@ impl NetworkStudent {
 
     /// What the next action goes by.
     fn input(&self, robot: &Robot) -> Vec<f32> {
-        let cell = robot.observation().cell();
+        let cell = robot.observation().robot.cell();
         self.progress
             .input
             .of(follower(robot), cell, self.worlds.n_moves)
@@ -158,7 +158,7 @@ impl NetworkStudent {
                 tick.score = turn.score.unwrap_or_default();
                 tick.reward = robot.observation().robot.reward;
                 let path = &turn.plans[0].moves;
-                let cells = path::fly(self.worlds.shape, turn.before.cell(), path);
+                let cells = path::fly(self.worlds.shape, turn.before.robot.cell(), path);
                 let met = met(robot.agent.belief(), cells.visited.iter().copied());
                 self.progress.position.reward.add(&met, tick.reward);
                 look(index, robot);
@@ -193,7 +193,7 @@ impl Student for NetworkStudent {
     fn attach(&mut self, mut observations: Vec<Observation>) -> Result<usize> {
         let observation = observations.remove(0);
         let shown = self.progress.replay.frames().last();
-        let goes_on = self.progress.position.place == Some(observation.place())
+        let goes_on = self.progress.position.place == Some(place(&observation))
             && shown == Some(&observation.frame);
         if goes_on {
             let mut robot = self.robot(self.progress.position.follower.clone(), observation);

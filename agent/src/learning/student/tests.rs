@@ -12,7 +12,7 @@ use crate::planning::action::ActionSet;
 use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::planning::{BasisKind, Objective, PlanningProblem, Target};
 use crate::rollout::Robot;
-use crate::server::client::Observation;
+use protocol::client::Observation;
 use protocol::message::{RobotResult, WorldResult};
 use protocol::randomness::split_mix;
 use protocol::{Cell, Frame, Model, Move, Shape};

@@ -10,10 +10,9 @@ use crate::learning::student::filter::FilterStudent;
 use crate::learning::student::network::{self, NetworkStudent};
 use crate::learning::student::{Student, Worlds};
 use crate::learning::train::training::Training;
-use crate::server::client::Client;
 use anyhow::{Context, Result, bail};
-use protocol::Model;
 use protocol::control::CoverageRule;
+use protocol::{Client, Model};
 use std::path::Path;
 
 /// What the settings say that learns, going on from a checkpoint's contents if there are any.

@@ -1,7 +1,6 @@
 //! How far a recording has come, and which record may follow.
 
 use super::format::{Event, Record, Totals};
-use crate::model::grid::Shape;
 use crate::model::path::MAX_MOVES;
 use crate::wire::channels::{MAX_ROBOTS, MAX_TEAM_CELLS};
 use crate::wire::control::ServerInfo;
@@ -83,7 +82,7 @@ fn limits(server: Option<&Limits>) -> Result<&Limits, String> {
 
 impl Limits {
     fn of(info: &ServerInfo) -> Result<Self, String> {
-        let shape = Shape::new(info.height, info.width).map_err(|error| error.to_string())?;
+        let shape = info.shape().map_err(|error| error.to_string())?;
         let n_robots = info.n_robots as usize;
         if !(1..=MAX_ROBOTS).contains(&n_robots) || n_robots * shape.n_cells() > MAX_TEAM_CELLS {
             return Err(format!(

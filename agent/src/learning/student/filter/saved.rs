@@ -3,11 +3,12 @@
 use crate::estimation::belief::Belief;
 use crate::learning::checkpoint::check_belief;
 use crate::learning::learner::Learner;
+use crate::learning::student::base::{Place, place};
 use crate::rollout::Robot;
 use crate::rollout::agent::Agent;
-use crate::server::client::{Observation, Place};
 use anyhow::Result;
 use protocol::Shape;
+use protocol::client::Observation;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -33,7 +34,7 @@ impl SavedWorld {
     pub fn of(robot: &Robot) -> Self {
         let (agent, observation) = (&robot.agent, robot.observation());
         Self {
-            place: observation.place(),
+            place: place(observation),
             frame: observation.frame.as_bytes().to_vec(),
             belief: agent.belief().clone(),
             estimate: agent.estimate().cloned(),
@@ -43,7 +44,7 @@ impl SavedWorld {
     /// Whether a world shows what it showed then. That may be another server's: seeds, step, flight
     /// and noise of sensors would all have to be the same.
     pub fn is_of(&self, observation: &Observation) -> bool {
-        self.place == observation.place() && self.frame == observation.frame.as_bytes()
+        self.place == place(observation) && self.frame == observation.frame.as_bytes()
     }
 
     /// Whether any of these worlds shows what it showed then.

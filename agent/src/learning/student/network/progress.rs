@@ -8,11 +8,10 @@ use crate::learning::checkpoint::{
     Contents, check, check_belief, check_counts, check_numbers, wrong,
 };
 use crate::learning::reward::RewardEstimate;
-use crate::learning::student::base::Worlds;
+use crate::learning::student::base::{Place, Worlds, place};
 use crate::planning::BasisKind;
 use crate::planning::policy::Policy;
 use crate::rollout::Robot;
-use crate::server::client::Place;
 use ::network::{Autoencoder, Device, Dqn, NetworkError, NetworkShape, Replay, SavedDqn, Track};
 use anyhow::Result;
 use protocol::model::MAX_VALUES;
@@ -117,7 +116,7 @@ impl Progress {
             position: Position {
                 follower: follower(robot).clone(),
                 estimate: robot.agent.estimate().cloned(),
-                place: Some(robot.observation().place()),
+                place: Some(place(robot.observation())),
                 ..self.position.clone()
             },
         };

@@ -1,22 +1,17 @@
-//! The agent's end of the wire: acquire robots, fly paths, receive frames.
+//! A connection with a lease: acquire robots, fly paths, receive frames.
 
-use crate::server::errors::refused;
-use protocol::channels::Instance;
-use protocol::connection::{ConnectionError, StepAnswer, unexpected, worlds_of};
-use protocol::control::{Reply, Request, ServerInfo, WorldInfo, WorldSeed};
-use protocol::message::{
+use super::connection::{Connection, ConnectionError, StepAnswer, unexpected, worlds_of};
+use super::control::{Reply, Request, ServerInfo, WorldInfo, WorldSeed};
+use super::exchange::garbled;
+use super::message::{
     FLAG_FULL_COVERAGE, FLAG_TEAM_FRAMES, Operation, RobotResult, Status, StepRequest, WorldResult,
 };
-use protocol::path::path_to_bytes;
-use protocol::payload::write_step_body;
-use protocol::{Cell, Connection, Frame, Move, Shape};
-use std::fmt::Display;
+use super::payload::write_step_body;
+use crate::model::frame::Frame;
+use crate::model::grid::Shape;
+use crate::model::path::{Move, path_to_bytes};
 use std::ops::Range;
-use std::os::fd::BorrowedFd;
 use std::time::Duration;
-
-/// How this program names itself to servers.
-pub const CLIENT_NAME: &str = concat!("emberwatch-agent ", env!("CARGO_PKG_VERSION"));
 
 /// How long a step may take, beside the server's deadline.
 pub const STEP_TIMEOUT: Duration = Duration::from_secs(5);
@@ -24,19 +19,24 @@ pub const STEP_TIMEOUT: Duration = Duration::from_secs(5);
 /// How long anything else may take; resets simulate the burn-in of all their worlds.
 pub const CONTROL_TIMEOUT: Duration = Duration::from_secs(120);
 
-/// What a robot's world shows after a step, or when the robot is taken over.
+/// What a robot's world shows after a step, or when the robot is acquired.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Observation {
+    /// The world at its step k.
     pub world: WorldResult,
+    /// The robot: where it is, and what the step gave it.
     pub robot: RobotResult,
-    /// What the robot saw, or all robots of its world where a client asks for that.
+    /// What the robot saw, or all robots of its world where a client asks for that; shape `[H, W]`.
     pub frame: Frame,
 }
 
 /// A connection with a lease on consecutive robots, numbered through: robot r of world w is `w * R + r`.
+///
+/// Dropping it closes the connection, which ends the lease. Unless another is named, errors are a refusal, which changed
+/// nothing, a server that has ended, or no good answer in time.
 pub struct Client {
-    pub(super) connection: Connection,
-    pub(super) lease: u64,
+    connection: Connection,
+    lease: u64,
     robots: Range<u32>,
     /// The step of each world of these robots, as last seen.
     steps: Vec<u64>,
@@ -47,77 +47,33 @@ pub struct Client {
 /// Which robots to fly, and how to get them.
 #[derive(Debug, Clone)]
 pub struct Claim {
+    /// Their numbers, at least one.
     pub robots: Range<u32>,
-    /// Take them from their holder.
+    /// Take them from their holders.
     pub takeover: bool,
-    /// The lease ends this long after its last use; `None`: the server's default.
+    /// The lease ends this long after its last use, at least 0.1 s and at most a day; `None`: the server's default.
     pub time_to_live: Option<Duration>,
 }
 
-/// Which step of which run a world shows, and from where: seed, episode, step k, the robot's row and column.
-pub type Place = [u64; 5];
-
-impl Observation {
-    /// Which step of which run this is.
-    pub fn place(&self) -> Place {
-        let (world, [row, col]) = (&self.world, [self.robot.row, self.robot.col]);
-        [
-            world.seed,
-            world.episode,
-            world.step,
-            row.into(),
-            col.into(),
-        ]
-    }
-
-    /// Where the robot is.
-    pub fn cell(&self) -> Cell {
-        cell(&self.robot)
-    }
-}
-
-/// Where a robot is.
-pub fn cell(robot: &RobotResult) -> Cell {
-    Cell {
-        row: robot.row as usize,
-        col: robot.col as usize,
-    }
-}
-
-/// Where a robot's last path began.
-pub fn start(robot: &RobotResult) -> Cell {
-    Cell {
-        row: robot.start_row as usize,
-        col: robot.start_col as usize,
+impl Claim {
+    /// Robots that nobody else holds, for the server's default time.
+    pub fn new(robots: Range<u32>) -> Self {
+        Self {
+            robots,
+            takeover: false,
+            time_to_live: None,
+        }
     }
 }
 
 impl Client {
-    /// Acquires robots, which stay where they are, and observes them.
-    pub fn acquire_and_observe(
-        instance: &Instance,
-        robots: Range<u32>,
-        takeover: bool,
-    ) -> Result<(Self, Vec<Observation>), ConnectionError> {
-        let mut client = Self::acquire(
-            instance,
-            &Claim {
-                robots,
-                takeover,
-                time_to_live: None,
-            },
-        )?;
-        let observations = client.observe(client.robots())?;
-        Ok((client, observations))
-    }
-
-    /// Connects and acquires robots; they stay where they are.
+    /// Acquires robots, which stay where they are; returns when their worlds are out of their burn-in.
     ///
     /// # Errors
-    /// [`ConnectionError`]; a refusal names the holder of a robot that is taken.
-    pub fn acquire(instance: &Instance, claim: &Claim) -> Result<Self, ConnectionError> {
-        let mut connection = Connection::open(instance, CLIENT_NAME, CONTROL_TIMEOUT)?;
-        let shape = shape_of(connection.info())?;
+    /// A refusal as `Busy` names the holder of a robot that is taken.
+    pub fn acquire(mut connection: Connection, claim: &Claim) -> Result<Self, ConnectionError> {
+        let shape = connection.info().shape();
+        let shape = shape.map_err(|error| garbled("hello", error))?;
         let request = Request::Acquire {
             first_robot: claim.robots.start,
             n_robots: claim.robots.len() as u32,
@@ -148,6 +104,22 @@ impl Client {
         self.connection.info()
     }
 
+    /// The connection.
+    pub fn connection(&self) -> &Connection {
+        &self.connection
+    }
+
+    /// The connection, for requests that have no method here.
+    pub fn connection_mut(&mut self) -> &mut Connection {
+        &mut self.connection
+    }
+
+    /// The lease, for such requests.
+    pub fn lease(&self) -> u64 {
+        self.lease
+    }
+
+    /// Height and width of the grid.
     pub fn shape(&self) -> Shape {
         self.shape
     }
@@ -162,11 +134,11 @@ impl Client {
         worlds_of(robots.start, robots.len() as u32, self.info().n_robots)
     }
 
-    /// Flies a path with each of consecutive robots. Their world moves when everybody has sent a path who holds one of
-    /// its robots.
+    /// Flies a path of `n_moves` moves with each of consecutive robots of the lease. A world moves when all of its held
+    /// robots have a path, or at the server's deadline. Returns what each robot shows then.
     ///
     /// # Errors
-    /// [`ConnectionError`]; `Late` if the world has moved on without these paths.
+    /// A refusal as `Late` if a world has moved on without these paths, as `LeaseLost` if a robot is held no longer.
     pub fn step(
         &mut self,
         robots: Range<u32>,
@@ -176,7 +148,11 @@ impl Client {
         Ok(observations.expect("invariant: it is never over"))
     }
 
-    /// As [`Self::step`]; `None` if `is_over` before the world has moved, which is checked after each timeout.
+    /// As [`Self::step`]; `None` if `is_over` before the worlds have moved. That is checked each [`STEP_TIMEOUT`] and
+    /// deadline.
+    ///
+    /// # Errors
+    /// As [`Self::step`].
     pub fn step_until(
         &mut self,
         robots: Range<u32>,
@@ -186,25 +162,10 @@ impl Client {
         self.step_unless(robots, paths, 0, is_over)
     }
 
-    /// As [`Self::step`], with robots in ascending order: one message for all that are consecutive.
-    pub fn step_some(
-        &mut self,
-        robots: &[u32],
-        paths: &[Vec<Move>],
-    ) -> Result<Vec<Observation>, ConnectionError> {
-        let mut observations = Vec::with_capacity(robots.len());
-        for run in robots.chunk_by(|robot, next| robot + 1 == *next) {
-            let (first, n_robots) = (run[0], run.len());
-            let paths = &paths[observations.len()..][..n_robots];
-            observations.extend(self.step(first..first + n_robots as u32, paths)?);
-        }
-        Ok(observations)
-    }
-
-    /// As [`Self::step`], asking for full frames.
+    /// As [`Self::step`], with frames that show every cell.
     ///
     /// # Errors
-    /// A refusal, unless the server's coverage is `client` or `full`.
+    /// As [`Self::step`]; a refusal if the server's coverage is `path`.
     pub fn step_full(
         &mut self,
         robots: Range<u32>,
@@ -214,7 +175,10 @@ impl Client {
         Ok(observations.expect("invariant: it is never over"))
     }
 
-    /// What robots and their worlds show now, changing nothing.
+    /// What robots and their worlds show now, changing nothing; they may be others' as well.
+    ///
+    /// # Errors
+    /// A refusal if the server has no such robot.
     pub fn observe(&mut self, robots: Range<u32>) -> Result<Vec<Observation>, ConnectionError> {
         let request = self.request(Operation::Observe, &robots);
         let answer = self.connection.step(request, &[], STEP_TIMEOUT)?;
@@ -225,7 +189,7 @@ impl Client {
     /// What they showed at an earlier step k.
     ///
     /// # Errors
-    /// [`ConnectionError`]; a refusal as `NotKept` tells the nearest step that is kept.
+    /// A refusal as `NotKept` tells the nearest step that is kept.
     pub fn recall(
         &mut self,
         robots: Range<u32>,
@@ -238,7 +202,10 @@ impl Client {
         self.observations(&answer)
     }
 
-    /// Starts new episodes with the given seeds; returns when burn-in is done.
+    /// Starts new episodes with the given seeds; returns the worlds as they are when burn-in is done.
+    ///
+    /// # Errors
+    /// A refusal as `Busy` if another client holds a robot of these worlds, as `NoLease` if this one holds none.
     pub fn reset(&mut self, seeds: &[WorldSeed]) -> Result<Vec<WorldInfo>, ConnectionError> {
         let request = Request::Reset {
             lease: self.lease,
@@ -256,21 +223,18 @@ impl Client {
     }
 
     /// Extends the lease without acting.
+    ///
+    /// # Errors
+    /// A refusal as `LeaseLost` if none of the robots is held any longer.
     pub fn renew(&mut self) -> Result<(), ConnectionError> {
         let request = Request::Renew { lease: self.lease };
         self.connection.control(&request, STEP_TIMEOUT).map(|_| ())
     }
 
-    /// The server's process: readable when it has ended.
-    pub fn server_process(&self) -> BorrowedFd<'_> {
-        self.connection.server_process()
-    }
-
-    /// Checks whether the server lives, without asking it.
-    pub fn check_server(&self) -> Result<(), ConnectionError> {
-        self.connection.check_server()
-    }
-
+    /// Gives the robots back.
+    ///
+    /// # Errors
+    /// A refusal as `LeaseLost` if none of them is held any longer.
     pub fn release(mut self) -> Result<(), ConnectionError> {
         let request = Request::Release { lease: self.lease };
         self.connection.control(&request, STEP_TIMEOUT).map(|_| ())
@@ -318,7 +282,7 @@ impl Client {
         steps: &[u64],
         seen: Vec<Observation>,
     ) -> Result<Vec<Observation>, ConnectionError> {
-        let (team, first) = (self.info().n_robots, self.worlds_of(robots).start);
+        let (team, first) = (self.info().n_robots.max(1), self.worlds_of(robots).start);
         let has_flown = |(robot, seen): (u32, &Observation)| {
             let before = steps[(robot / team - first) as usize];
             let stayed = seen.world.hovered | seen.world.late;
@@ -329,7 +293,11 @@ impl Client {
             None => Ok(seen),
             Some((_, missed)) => {
                 let (status, detail) = (Status::Late, missed.world.step);
-                Err(refused(status, detail, status.explain(detail)))
+                Err(ConnectionError::Refused {
+                    status,
+                    detail,
+                    message: status.explain(detail),
+                })
             }
         }
     }
@@ -389,22 +357,9 @@ impl Client {
             Ok(Observation {
                 world: answer.worlds[world],
                 robot: *robot,
-                frame: frame.map_err(|error| garbled("step", &error))?,
+                frame: frame.map_err(|error| garbled("step", error))?,
             })
         };
         answer.robots.iter().enumerate().map(observation).collect()
     }
-}
-
-pub(super) fn garbled(what: &'static str, problem: &dyn Display) -> ConnectionError {
-    ConnectionError::Garbled {
-        what,
-        problem: problem.to_string(),
-    }
-}
-
-/// A server's grid.
-pub fn shape_of(info: &ServerInfo) -> Result<Shape, ConnectionError> {
-    let shape = Shape::new(info.height, info.width);
-    shape.map_err(|error| garbled("hello", &error))
 }
