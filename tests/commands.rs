@@ -4,7 +4,7 @@ use crate::harness::{Ended, PATIENCE, Program, SMALL, Server, new_instance, run}
 use agent::planning::policy;
 use protocol::Model;
 use rustix::process::Signal;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// How long a refusal may take.
 pub const LIMIT: Duration = Duration::from_secs(60);
@@ -69,6 +69,8 @@ run --wait soon => --wait | expected seconds
 run --wait=-1 => --wait | expected seconds
 run --instance a/b => instance name | "a/b"
 run --steps -1 => -1
+run --steps-per-second 0.5 => --steps-per-second | expected steps a second, 1 or more, got "0.5"
+run --steps-per-second inf => --steps-per-second | expected steps a second, 1 or more
 run --world x => --world | 'x'
 run --robot x => --robot | 'x'
 run --robots 0..2 => --team
@@ -320,6 +322,18 @@ fn an_agent_that_waits_can_be_stopped() {
         let ended = agent.wait(PATIENCE);
         assert_eq!(ended.code, Some(0), "{command}: {}", ended.stderr);
     }
+}
+
+#[test]
+fn an_agent_acts_as_slowly_as_it_is_told() {
+    let server = Server::start(SMALL);
+    let name = server.instance.name();
+    let flags = format!("run --instance {name} --steps 3 --steps-per-second 5");
+    let flags: Vec<&str> = flags.split_whitespace().collect();
+    let start = Instant::now();
+    let ended = run(AGENT, &flags, LIMIT);
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert!(start.elapsed() >= Duration::from_millis(400), "two pauses");
 }
 
 #[test]

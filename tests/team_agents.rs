@@ -9,6 +9,7 @@ use protocol::observer::Observer;
 use rustix::process::Signal;
 use std::ops::Range;
 use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 /// A lively world of four robots, whose server keeps all frames of these steps.
 const FLAGS: &str =
@@ -28,6 +29,7 @@ fn fly(parts: &[Range<u32>], company: Company) -> (Vec<Vec<Vec<u8>>>, f64) {
         robots: robots.clone(),
         company,
         policy: "beam_exploit".into(),
+        shortest_step: Duration::ZERO,
         steps: STEPS,
         takeover: true,
         model: None,

@@ -12,6 +12,7 @@ use protocol::control::ServerInfo;
 use protocol::message::Status;
 use protocol::model::{Description, ModelError};
 use std::ops::Range;
+use std::time::Duration;
 
 /// What to do on one world.
 #[derive(Debug, Clone)]
@@ -25,6 +26,8 @@ pub struct Mission {
     pub policy: String,
     /// Steps to act for; 0: until stopped.
     pub steps: u64,
+    /// A step begins this long after the one before, or later; a stop waits for that.
+    pub shortest_step: Duration,
     /// Take the robots from their holders.
     pub takeover: bool,
     /// The model, where the server does not reveal its own.

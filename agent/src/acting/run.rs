@@ -30,7 +30,10 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
         since: Instant::now(),
         last: summary,
     };
+    let mut due = Instant::now();
     while !stop.load(Ordering::Relaxed) && (mission.steps == 0 || summary.steps < mission.steps) {
+        std::thread::sleep(due.saturating_duration_since(Instant::now()));
+        due = Instant::now() + mission.shortest_step;
         match pilot.step(mission, summary.steps + 1 == mission.steps, stop) {
             Ok(Some(reward)) => {
                 summary.steps += 1;

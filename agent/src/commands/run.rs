@@ -14,6 +14,7 @@ use protocol::program::stop_on_signals;
 use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering::Relaxed;
+use std::time::Duration;
 
 /// Act on one world of a running server.
 #[derive(Args)]
@@ -45,6 +46,9 @@ pub struct RunCommand {
     /// Steps to act for; 0: until stopped
     #[arg(long, default_value_t = 0)]
     steps: u64,
+    /// Steps a second at most, for people who watch; without it: as many as possible
+    #[arg(long, value_name = "STEPS", value_parser = parse_rate)]
+    steps_per_second: Option<f64>,
     /// Take the robot from its holder
     #[arg(long)]
     takeover: bool,
@@ -84,6 +88,9 @@ impl RunCommand {
             },
             policy: self.policy.clone(),
             steps: self.steps,
+            shortest_step: self
+                .steps_per_second
+                .map_or(Duration::ZERO, |rate| Duration::from_secs_f64(1.0 / rate)),
             takeover: self.takeover,
             model,
             config: self.settings.effective()?,
@@ -100,5 +107,14 @@ impl RunCommand {
         let mean_reward = summary.reward / summary.steps.max(1) as f64;
         tracing::info!(steps = summary.steps, mean_reward, "done");
         Ok(())
+    }
+}
+
+/// A rate at which observers see that the agent lives, and at which it is stopped within a second.
+fn parse_rate(text: &str) -> Result<f64, String> {
+    let rate: f64 = text.parse().unwrap_or(f64::NAN);
+    match rate.is_finite() && rate >= 1.0 {
+        true => Ok(rate),
+        false => Err(format!("expected steps a second, 1 or more, got {text:?}")),
     }
 }

@@ -13,6 +13,9 @@ from pathlib import Path
 #: How long anything may take that should take much less, seconds.
 PATIENCE = 180.0
 
+#: More steps a second than an agent can make.
+FAST = 1_000_000
+
 _numbers = itertools.count()
 
 
@@ -105,11 +108,14 @@ class Programs:
         return subprocess.run(command, capture_output=True, timeout=PATIENCE).returncode == 0
 
     def agent(self, instance: str, **settings: object) -> Program:
-        """An agent that acts on a world, once it is there, until it is stopped."""
+        """An agent that acts on a world, once it is there, for some `steps` or until it is stopped.
+        It leaves the processor to the browser: its plans are cheap, and it acts slowly until then.
+        """
         eventually(lambda: self.is_serving(instance), "a server")
-        return self._keep(
-            Program(self._path("agent"), ["run", *flags({"instance": instance} | settings)])
-        )
+        pace = {} if "steps" in settings else {"steps_per_second": 10}
+        cheap = {"instance": instance, "beam_width": 5, "prior": "initial"}
+        settings = cheap | pace | settings
+        return self._keep(Program(self._path("agent"), ["run", *flags(settings)]))
 
     def record(self, instance: str, out: Path, *, steps: int) -> Program:
         """A recorder of hidden states too, of so many steps."""

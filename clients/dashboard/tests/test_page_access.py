@@ -116,10 +116,13 @@ def test_canvases_tell_what_they_show(watched):
 def test_it_fits(request, programs, open_page, theme, screen):
     """A picture of it is kept for people to look at."""
     server = programs.server(height=64, width=64, moves=64, burn_in=12000, publish_truth=True)
-    look = open_page(programs.dashboard(server.instance), color_scheme=theme, **screen)
+    dashboard = programs.dashboard(server.instance)
+    look = open_page(dashboard, color_scheme=theme, **screen)
+    look.eventually(lambda: look.picture(".shown"), "the world before its first step")
+    assert programs.agent(server.instance, steps=300).wait() == 0
     programs.agent(server.instance)
+    look.wait_for_steps()
     look.eventually(lambda: look.has("belief", "truth"), "a belief is shown")
-    look.wait_for_steps(300)
     assert look.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     is_phone = screen is PHONE
     if not is_phone:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from running import eventually
+from running import FAST, eventually
 from teams import write_recording
 
 SIZES = [
@@ -181,8 +181,9 @@ def test_with_a_recording(programs, open_page, tmp_path):
     eventually(lambda: programs.is_serving(server.instance), "a server")
     file = tmp_path / "with-a-rather-long-name.recording"
     recorder = programs.record(server.instance, file, steps=300)
-    programs.agent(server.instance)
+    agent = programs.agent(server.instance, steps_per_second=FAST)
     assert recorder.wait() == 0
+    agent.interrupt()
     look = open_page(programs.dashboard(recording=file))
     begin(look)
     look.at("speed").select_option("0")

@@ -3,7 +3,7 @@
 import zlib
 
 from emberwatch.recording import FILE_HEADER, RECORD_HEADER
-from running import eventually
+from running import FAST, eventually
 
 
 def test_a_recording_plays_to_its_end(programs, open_page, tmp_path):
@@ -11,8 +11,9 @@ def test_a_recording_plays_to_its_end(programs, open_page, tmp_path):
     eventually(lambda: programs.is_serving(server.instance), "a server")
     file = tmp_path / "short.recording"
     recorder = programs.record(server.instance, file, steps=500)
-    programs.agent(server.instance)
+    agent = programs.agent(server.instance, steps_per_second=FAST)
     assert recorder.wait() == 0
+    agent.interrupt()
     look = open_page(programs.dashboard(recording=file))
     look.eventually(lambda: look.picture(".source") == "recording", "a recording")
     look.at("speed").select_option("0")
@@ -58,8 +59,9 @@ def test_a_recording_that_begins_with_nothing_can_be_played_faster(programs, ope
     eventually(lambda: programs.is_serving(server.instance), "a server")
     file = tmp_path / "late.recording"
     recorder = programs.record(server.instance, file, steps=20)
-    programs.agent(server.instance)
+    agent = programs.agent(server.instance, steps_per_second=FAST)
     assert recorder.wait() == 0
+    agent.interrupt()
     file.write_bytes(delayed(file.read_bytes(), nanos=3600 * 10**9))
     look = open_page(programs.dashboard(recording=file))
     look.eventually(lambda: look.picture(".player.playing") is True, "it plays")

@@ -4,7 +4,7 @@ import os
 
 import emberwatch
 from emberwatch import OutlookReader
-from running import PATIENCE, eventually, unused_instance
+from running import FAST, PATIENCE, eventually, unused_instance
 
 
 def test_waits_for_a_server_and_then_shows_what_happens(programs, open_page):
@@ -99,7 +99,7 @@ def test_an_entry_that_is_no_longer_kept_is_told(programs, open_page):
     # Thousands of steps a second: a path costs a small world nothing.
     server = programs.server(height=4, width=4, moves=2, burn_in=0)
     look = open_page(programs.dashboard(server.instance))
-    programs.agent(server.instance, policy="random_walk")
+    programs.agent(server.instance, policy="random_walk", steps_per_second=FAST)
     look.wait_for_steps()
     look.page.keyboard.press("Space")
     # Not `settled_serial`: once the oldest is shown, its serial never settles.

@@ -131,13 +131,13 @@ def test_a_slow_browser_gets_fewer_pictures_and_the_newest(programs, open_page):
         socket.on("framereceived", lambda _: count(-1))
 
     look.page.on("websocket", watch)
-    look.slow_down(30)
+    look.slow_down(10)
     look.page.reload()
     look.eventually(lambda: look.picture(".shown"), "the world before its first step")
-    agent = programs.agent(server.instance, steps=4000)
+    agent = programs.agent(server.instance, steps=1000)
     assert agent.wait() == 0
-    look.eventually(lambda: look.picture(".shown.step") == 4000, "the newest step")
-    assert look.drawn() < 4000
+    look.eventually(lambda: look.picture(".shown.step") == 1000, "the newest step")
+    assert look.drawn() < 1000
     assert set(waiting) <= {0, 1, 2}, "no pictures were queued"
 
 

@@ -5,7 +5,6 @@
 
 use crate::learning::filter::layout::Layout;
 use crate::learning::filter::vector::{LANES, Lanes, Real};
-use std::array::from_fn;
 use std::ops::Range;
 
 /// Planes computed at once: with [`WIDE`] vectors of cells they fill the registers.
@@ -110,22 +109,29 @@ impl<T: Real> Correlation<T> {
         let n_taps = layout.n_taps();
         let place =
             |g: usize, b: usize| (first + g) * layout.plane + layout.row(row) + col + b * LANES;
-        let mut sums: [[V; B]; G] = match base {
-            Base::Zero => [[V::splat(T::zero()); B]; G],
-            Base::Biases(biases) => from_fn(|g| [V::splat(biases[first + g]); B]),
-            Base::Planes => from_fn(|g| from_fn(|b| load(to, place(g, b)))),
-        };
+        let mut sums = [[V::splat(T::zero()); B]; G];
+        for (g, sums) in sums.iter_mut().enumerate() {
+            for (b, sum) in sums.iter_mut().enumerate() {
+                match base {
+                    Base::Zero => {}
+                    Base::Biases(biases) => *sum = V::splat(biases[first + g]),
+                    Base::Planes => *sum = load(to, place(g, b)),
+                }
+            }
+        }
         for plane in 0..self.n_from {
             for a in 0..layout.kernel_height {
                 for c in 0..layout.kernel_width {
                     let at = plane * layout.plane + (row + a) * layout.stride + c + col;
                     let tap = plane * n_taps + a * layout.kernel_width + c;
-                    let weight = |g: usize| self.weights[(first + g) * self.n_from * n_taps + tap];
-                    let taps: [V; G] = from_fn(|g| V::splat(weight(g)));
-                    let cells: [V; B] = from_fn(|b| load(from, at + b * LANES));
-                    for (&tap, sums) in taps.iter().zip(&mut sums) {
+                    let mut cells = [V::splat(T::zero()); B];
+                    for (b, cells) in cells.iter_mut().enumerate() {
+                        *cells = load(from, at + b * LANES);
+                    }
+                    for (g, sums) in sums.iter_mut().enumerate() {
+                        let weight = self.weights[(first + g) * self.n_from * n_taps + tap];
                         for (&cells, sum) in cells.iter().zip(sums) {
-                            *sum = tap.multiply_add(cells, *sum);
+                            *sum = V::splat(weight).multiply_add(cells, *sum);
                         }
                     }
                 }
@@ -201,7 +207,10 @@ impl<T: Real> Correlation<T> {
         let mut sums = [[V::splat(T::zero()); C]; G];
         for row in region.rows.clone() {
             for at in region.places(layout, row) {
-                let cells: [V; C] = from_fn(|c| load(p, tap + at - origin + c));
+                let mut cells = [V::splat(T::zero()); C];
+                for (c, cells) in cells.iter_mut().enumerate() {
+                    *cells = load(p, tap + at - origin + c);
+                }
                 for (g, sums) in sums.iter_mut().enumerate() {
                     let h: V = load(h, (to + g) * layout.plane + at);
                     for (&cells, sum) in cells.iter().zip(sums) {

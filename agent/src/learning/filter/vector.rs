@@ -42,7 +42,8 @@ pub trait Lanes<T>: Copy {
     fn over(self, other: Self) -> Self;
 }
 
-/// A piece of work; implementations of `run` are `#[inline(always)]`, down to the innermost loop.
+/// A piece of work; implementations of `run` are `#[inline(always)]`, down to the innermost loop. Loads and sums in
+/// closures, as those of `array::from_fn`, are not always inlined: write loops.
 pub(super) trait Vectorised {
     /// What it computes in.
     type Number: Real;
@@ -221,8 +222,13 @@ mod x86 {
 
         #[inline(always)]
         fn load(numbers: &[f32; LANES]) -> Self {
-            let half = |first: usize| unsafe { _mm256_loadu_ps(numbers[first..].as_ptr()) };
-            Self(half(0), half(LANES / 2))
+            let (low, high) = numbers.split_at(LANES / 2);
+            unsafe {
+                Self(
+                    _mm256_loadu_ps(low.as_ptr()),
+                    _mm256_loadu_ps(high.as_ptr()),
+                )
+            }
         }
 
         #[inline(always)]
