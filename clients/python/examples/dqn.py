@@ -108,6 +108,8 @@ def main() -> None:
         "emberwatch/WildfireMoves-v0",
         reward="move",
         observation=("frame", "visited", "robot"),
+        model="wildfire-small",  # whose fires last on small grids
+        burn_in=3000,
         height=args.grid,
         width=args.grid,
         n_moves=args.moves,
