@@ -8,7 +8,7 @@ use protocol::client::Claim;
 use protocol::connection::ConnectionError;
 use protocol::control::{Reply, Request, ServerStatus, WorldSeed};
 use protocol::message::Status;
-use protocol::{Client, Connection};
+use protocol::{Client, Connection, Move};
 use std::time::Duration;
 
 fn check<T>(result: Result<T, ConnectionError>, expected: Status, expected_detail: u64) {
@@ -25,7 +25,7 @@ fn us() -> u64 {
     std::process::id().into()
 }
 
-fn paths(n_robots: usize) -> Vec<Vec<protocol::Move>> {
+fn paths(n_robots: usize) -> Vec<Vec<Move>> {
     vec![Paths::new(0).next(6); n_robots]
 }
 
@@ -178,4 +178,22 @@ fn a_seventeenth_client_is_told_the_limit_and_others_go_on() {
     fly(&mut holder, Paths::new(0).next(6));
     drop(others);
     server.connect();
+}
+
+#[test]
+fn paths_of_other_lengths_are_refused_though_their_sum_is_right() {
+    let server = Server::start(&format!("{SMALL} --worlds 3"));
+    let mut client = server.acquire(0..3);
+    let paths_of = |lengths: [usize; 3]| lengths.map(|length| vec![Move::Up; length]).to_vec();
+    check(
+        client.step(0..3, &paths_of([6, 5, 7])),
+        Status::WrongPathLength,
+        6,
+    );
+    check(
+        client.step(0..3, &paths_of([6, 6, 6])[..2]),
+        Status::WrongLength,
+        42,
+    );
+    assert_eq!(server.step_of(0), 0);
 }

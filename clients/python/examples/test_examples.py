@@ -13,7 +13,7 @@ FOLDER = Path(__file__).parent
 
 #: Each example, short arguments, and a line that it must print.
 EXAMPLES = [
-    ("dqn.py", "--total-steps 3000 --report-every 1000", r"moves 3000  reward per path (?!0\.00)"),
+    ("dqn.py", "--total-steps 3000 --report-every 1000", r"3000  reward per path (?!0\.00)\d"),
     (
         "sb3_moves.py",
         "--total-steps 600 --worlds 4 --steps 5 --out OUT",

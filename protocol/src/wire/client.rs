@@ -138,7 +138,8 @@ impl Client {
     /// robots have a path, or at the server's deadline. Returns what each robot shows then.
     ///
     /// # Errors
-    /// A refusal as `Late` if a world has moved on without these paths, as `LeaseLost` if a robot is held no longer.
+    /// A refusal as `Late` if a world has moved on without these paths, as `LeaseLost` if a robot is held no longer, as
+    /// `WrongPathLength` or `WrongLength` if there is not one path of `n_moves` moves for each robot.
     pub fn step(
         &mut self,
         robots: Range<u32>,
@@ -250,7 +251,9 @@ impl Client {
         is_over: &dyn Fn() -> bool,
     ) -> Result<Option<Vec<Observation>>, ConnectionError> {
         let mut request = self.request(Operation::Step, &robots);
-        request.n_moves = paths.first().map_or(0, Vec::len) as u32;
+        let n_moves = self.info().n_moves;
+        let wrong = paths.iter().map(Vec::len).find(|len| *len != n_moves);
+        request.n_moves = wrong.unwrap_or(n_moves) as u32; // The server refuses others.
         request.flags |= flags;
         let (steps, mut body) = (self.steps_of(&robots), Vec::new());
         let moves: Vec<u8> = paths.iter().flat_map(|path| path_to_bytes(path)).collect();
