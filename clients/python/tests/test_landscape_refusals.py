@@ -400,7 +400,26 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         lambda f: (geotiff(f / "a.tif"), *STATES, "--codes", "0,1,1"),
         "expected three different numbers, got 0,1,1",
     ),
-    "no steps": (lambda f: (geotiff(f / "a.tif"), *MASKS, "--every", 0), "expected at least 1"),
+    "a code that is no number": (
+        lambda f: (geotiff(f / "a.tif"), *STATES, "--codes", "0,1,nan"),
+        "argument --codes: expected three different numbers, got 0,1,nan",
+    ),
+    "codes of words": (
+        lambda f: (geotiff(f / "a.tif"), *STATES, "--codes", "a,b,c"),
+        "argument --codes: expected three different numbers, got a,b,c",
+    ),
+    "crop of words": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--crop", "1,0,x,4"),
+        "argument --crop: expected TOP,LEFT,HEIGHT,WIDTH, four whole numbers, got 1,0,x,4",
+    ),
+    "no steps": (
+        lambda f: (geotiff(f / "a.tif"), *MASKS, "--every", 0),
+        "argument --every: expected a whole number of at least 1, got 0",
+    ),
+    "half a step": (
+        lambda f: (geotiff(f / "a.tif"), *MASKS, "--every", 1.5),
+        "argument --every: expected a whole number of at least 1, got 1.5",
+    ),
 }
 
 

@@ -128,11 +128,13 @@ impl Policy {
     /// The policy of a name under a model.
     ///
     /// Names are `random_walk`, `coverage`, `shooting_*` and `beam_*` with `exploit` (the state that
-    /// pays most), `exploit_only` (the same without the coverage bonus), `explore` (entropy) or the name
-    /// of a state, and `spatial_*`, `oracle_*`, `clairvoyant_*`, `learned_*`, `learned_spatial_*`, `learned_own_*` and
-    /// `learned_own_spatial_*` with `shooting` or `beam`. On the autoencoder's belief there are `autoencoder_exploit` and `autoencoder_explore`, which shoot,
-    /// `autoencoder_policy`, for which the DQN chooses among the paper's objectives, and `autoencoder_beam`.
-    /// `dqn_beam` chooses among [`ActionSet::beam`] by a DQN; `act_*` always takes the action of that name.
+    /// pays most), `exploit_only` (the same without the coverage bonus), `explore` (entropy) or the
+    /// name of a state, and `spatial_*`, `oracle_*`, `clairvoyant_*`, `learned_*`,
+    /// `learned_spatial_*`, `learned_own_*` and `learned_own_spatial_*` with `shooting` or `beam`. On
+    /// the autoencoder's belief there are `autoencoder_exploit` and `autoencoder_explore`, which
+    /// shoot, `autoencoder_policy`, for which the DQN chooses among the paper's objectives, and
+    /// `autoencoder_beam`. `dqn_beam` chooses among [`ActionSet::beam`] by a DQN; `act_*` always takes
+    /// the action of that name.
     pub fn named(name: &str, model: &Model) -> Result<Self, UnknownPolicy> {
         let unknown = || UnknownPolicy {
             name: name.into(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Sequence
+from contextlib import closing
 from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
@@ -109,7 +110,8 @@ def _import(flags: argparse.Namespace) -> None:
     sequences, begins = list[NDArray[np.uint8]](), list[datetime | None]()
     first: Place | None = None
     for stack in stacks(flags.inputs, one_file_each=meaning.kind == "arrival"):
-        fire = times(read(stack, choice), meaning)
+        with closing(read(stack, choice)) as layers:
+            fire = times(layers, meaning)
         window = crop(fire.place, flags.crop)
         left: Any = fire.arrival[window].shape
         sides = {"height": flags.height, "width": flags.width, "cell": flags.cell}
@@ -181,24 +183,29 @@ def _told(sequence: NDArray[np.uint8]) -> str:
 
 
 def _whole(text: str) -> int:
-    number = int(text)
+    number = int(text) if text.isdecimal() else 0
     if number < 1:
-        raise argparse.ArgumentTypeError(f"expected at least 1, got {text}")
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text}")
     return number
 
 
 def _codes(text: str) -> tuple[float, ...]:
-    codes = tuple(float(part) for part in text.split(","))
-    if len(set(codes)) != len(codes) or len(codes) != BURNT + 1:
+    try:
+        codes = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        codes = ()
+    if len(codes) != BURNT + 1 or len(set(codes)) != len(codes) or not np.isfinite(codes).all():
         raise argparse.ArgumentTypeError(f"expected three different numbers, got {text}")
     return codes
 
 
 def _crop(text: str) -> tuple[int, ...]:
-    numbers = tuple(int(part) for part in text.split(","))
-    if len(numbers) != 4:
-        raise argparse.ArgumentTypeError(f"expected TOP,LEFT,HEIGHT,WIDTH, got {text}")
-    return numbers
+    parts = text.split(",")
+    if len(parts) != 4 or not all(part.isdecimal() for part in parts):
+        raise argparse.ArgumentTypeError(
+            f"expected TOP,LEFT,HEIGHT,WIDTH, four whole numbers, got {text}"
+        )
+    return tuple(int(part) for part in parts)
 
 
 if __name__ == "__main__":

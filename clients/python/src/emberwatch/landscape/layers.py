@@ -11,7 +11,8 @@ import math
 import re
 import warnings
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Final
@@ -90,15 +91,15 @@ def stacks(inputs: Sequence[Path], *, one_file_each: bool) -> list[list[Path]]:
     return [[file] for file in files] if one_file_each else found
 
 
-def read(files: Sequence[Path], choice: Choice) -> Iterator[Layer]:
-    """The layers of these files, in order."""
+def read(files: Sequence[Path], choice: Choice) -> Generator[Layer]:
+    """The layers of these files, in order; a file is open until its last, or until closed."""
     for file in files:
         reader = _read_numpy if file.suffix.lower() in _NUMPY else _read_raster
-        for layer in reader(file, choice):
-            values = layer.values
-            for missing in choice.nodata:
-                values[values == missing] = np.nan
-            yield layer
+        with closing(reader(file, choice)) as layers:
+            for layer in layers:
+                for missing in choice.nodata:
+                    layer.values[layer.values == missing] = np.nan
+                yield layer
 
 
 def _is_layer(file: Path) -> bool:
@@ -111,7 +112,7 @@ def _by_number(file: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
-def _read_numpy(file: Path, choice: Choice) -> Iterator[Layer]:
+def _read_numpy(file: Path, choice: Choice) -> Generator[Layer]:
     array = _array(file, choice)
     array = array.reshape(-1, *array.shape[-2:])
     for band in _bands(file, len(array), choice):
@@ -173,7 +174,7 @@ def _check_cells(file: Path, height: int, width: int) -> None:
         )
 
 
-def _read_raster(file: Path, choice: Choice) -> Iterator[Layer]:
+def _read_raster(file: Path, choice: Choice) -> Generator[Layer]:
     rasterio = _rasterio(file)
     driver, kind = _DRIVERS[file.suffix.lower()]
     # What has no place is a grid without one; GDAL's other warnings are of no use to people.
