@@ -1,5 +1,6 @@
 """What the importer refuses: one line each that says what was expected and what was got."""
 
+import io
 import sys
 import zipfile
 from collections.abc import Callable
@@ -483,3 +484,26 @@ def test_an_output_that_cannot_be_written_is_named(
 ) -> None:
     file = geotiff(tmp_path / "a.tif")
     assert "a.tif" in refused((file, *ARRIVALS, "--out", file / "world.npz"), capsys)
+
+
+@pytest.mark.parametrize("ending", [".npy", ".npz"])
+def test_damaged_numpy_files_are_refused_or_read(
+    ending: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = io.BytesIO()
+    np.save(whole, masks()) if ending == ".npy" else np.savez_compressed(whole, fire=masks())
+    rng = np.random.default_rng(7)
+    file, flags = tmp_path / f"fire{ending}", (*MASKS, "--out", tmp_path / "world.npz", "--force")
+    told = set[str]()
+    for _ in range(400):
+        damaged = np.frombuffer(whole.getvalue(), np.uint8).copy()
+        at = rng.integers(0, len(damaged), rng.integers(1, 6))
+        damaged[at] = rng.integers(0, 256, len(at))
+        file.write_bytes(damaged.tobytes())
+        try:
+            main([str(flag) for flag in (file, *flags)])
+        except SystemExit as ended:
+            assert ended.code == 2
+            (line,) = capsys.readouterr().err.splitlines()
+            told.add(line.partition("got: ")[2])
+    assert len(told) > 3, told

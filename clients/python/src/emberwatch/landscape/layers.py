@@ -18,7 +18,12 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
-from numpy.lib.format import read_array_header_1_0, read_array_header_2_0, read_magic
+from numpy.lib.format import (
+    read_array,
+    read_array_header_1_0,
+    read_array_header_2_0,
+    read_magic,
+)
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
@@ -125,29 +130,28 @@ def _read_numpy(file: Path, choice: Choice) -> Generator[Layer]:
 
 def _array(file: Path, choice: Choice) -> NDArray[Any]:
     try:
-        if zipfile.is_zipfile(file):
-            with np.load(file, allow_pickle=False) as arrays:
-                name = _variable(file, list(arrays), choice.variable)
-                members = arrays.zip.namelist()
-                with arrays.zip.open(name if name in members else f"{name}.npy") as member:
-                    _check_header(file, member)
-                return arrays[name]
-        if choice.variable is not None:
-            raise InvalidArgumentError(
-                f"--variable: expected none for {file}, which has one array, "
-                f"got '{choice.variable}'"
-            )
         with file.open("rb") as opened:
-            _check_header(file, opened)
-        return np.load(file, allow_pickle=False)
+            if zipfile.is_zipfile(opened):
+                with zipfile.ZipFile(opened) as archive:
+                    members = {name.removesuffix(".npy"): name for name in archive.namelist()}
+                    name = _variable(file, list(members), choice.variable)
+                    with archive.open(members[name]) as member:
+                        return _checked_array(file, member)
+            if choice.variable is not None:
+                raise InvalidArgumentError(
+                    f"--variable: expected none for {file}, which has one array, "
+                    f"got '{choice.variable}'"
+                )
+            return _checked_array(file, opened)
     except InvalidArgumentError:
         raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except Exception as error:  # of NumPy, zipfile, zlib and tokenize, for damaged bytes
         raise InvalidArgumentError(f"{file}: expected a NumPy file, got: {error}") from None
 
 
-def _check_header(file: Path, opened: IO[bytes]) -> None:
-    """Refuses an array before its values are read."""
+def _checked_array(file: Path, opened: IO[bytes]) -> NDArray[Any]:
+    """The array, whose header is checked before its values are read."""
+    opened.seek(0)
     version = read_magic(opened)
     header = {(1, 0): read_array_header_1_0, (2, 0): read_array_header_2_0}.get(version)
     if header is None:
@@ -165,6 +169,8 @@ def _check_header(file: Path, opened: IO[bytes]) -> None:
             f"{file}: expected at most {_MOST_BYTES} bytes of numbers, got {n_bytes}: {dtype} "
             f"{shape}"
         )
+    opened.seek(0)
+    return read_array(opened, allow_pickle=False)
 
 
 def _check_cells(file: Path, height: int, width: int) -> None:
