@@ -11,7 +11,7 @@ use protocol::program::read_text;
 use std::ffi::OsStr;
 use std::fmt::Display;
 use std::fs::File;
-use std::io::{BufReader, Read, Seek};
+use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 use zip::ZipArchive;
@@ -21,6 +21,9 @@ const MAX_BYTES: u64 = 1 << 32;
 
 /// Longest header of an array. NumPy's has 128 bytes; a long one may nest deeper than a parser's stack.
 const MAX_HEADER_BYTES: usize = 512;
+
+/// Longest end of a zip archive: a record of 22 bytes, and a comment.
+const MAX_ZIP_END_BYTES: u64 = 22 + u16::MAX as u64;
 
 /// K, H and W.
 type Dim = (usize, usize, usize);
@@ -84,10 +87,15 @@ impl Sequences {
     ///
     /// # Errors
     /// If one is refused; the text names the first problem.
-    pub fn add_archive(&mut self, archive: impl Read + Seek) -> Result<(), String> {
+    pub fn add_archive(&mut self, mut archive: impl Read + Seek) -> Result<(), String> {
+        let n_entries = n_entries(&mut archive).map_err(|error| error.to_string())?;
         let unfit = |error| format!("expected a .npz archive: {error}");
         let mut archive = ZipArchive::new(archive).map_err(unfit)?;
         let mut names: Vec<String> = archive.file_names().map(String::from).collect();
+        if let Some(got) = n_entries.filter(|&n| n != names.len()) {
+            let expected = format!("expected {} arrays, one of each name", names.len());
+            return Err(format!("{expected}, got {got}"));
+        }
         names.sort_by(|a, b| bare(a).cmp(bare(b)));
         for name in &names {
             if !name.ends_with(".npy") {
@@ -199,9 +207,9 @@ fn read(path: &Path) -> Result<StatesFile, String> {
             other.file_name().unwrap_or_default()
         ));
     }
-    let text = read_text(&description)
-        .map_err(|error| format!("description {}", at(&description, &error)))?;
     let wrong = |error: &dyn Display| format!("description {}", at(&description, error));
+    check_regular(&description).map_err(|error| wrong(&error))?;
+    let text = read_text(&description).map_err(|error| wrong(&error))?;
     let description: Description = toml::from_str(&text).map_err(|error| wrong(&error))?;
     let model = description.unchanging().map_err(|error| wrong(&error))?;
     let mut sequences = Sequences::new(model.n_states());
@@ -235,19 +243,37 @@ fn files_of(folder: &Path) -> Result<Vec<PathBuf>, String> {
 }
 
 fn add_file(sequences: &mut Sequences, path: &Path) -> Result<(), String> {
-    // Before it is opened, which waits for a writer where it is a pipe.
-    let metadata = std::fs::metadata(path).map_err(|error| error.to_string())?;
-    if !metadata.is_file() {
-        return Err("expected a regular file, got something else".into());
-    }
+    let n_bytes = check_regular(path)?;
     let file = File::open(path).map_err(|error| error.to_string())?;
     match is_archive(path) {
         true => sequences.add_archive(BufReader::new(file)),
         false => {
             let name = path.file_stem().unwrap_or_default().to_string_lossy();
-            sequences.add_array(&name, metadata.len(), file)
+            sequences.add_array(&name, n_bytes, file)
         }
     }
+}
+
+/// The length of a file that can be opened; where it is a pipe, that would wait for a writer.
+fn check_regular(path: &Path) -> Result<u64, String> {
+    let metadata = std::fs::metadata(path).map_err(|error| error.to_string())?;
+    match metadata.is_file() {
+        true => Ok(metadata.len()),
+        false => Err("expected a regular file, got something else".into()),
+    }
+}
+
+/// Entries as the end of an archive counts them, of which its reader keeps one for each name; `None` where it does not
+/// count so far, or where there is no such end.
+fn n_entries(archive: &mut (impl Read + Seek)) -> std::io::Result<Option<usize>> {
+    let n_bytes = archive.seek(SeekFrom::End(0))?;
+    archive.seek(SeekFrom::Start(n_bytes.saturating_sub(MAX_ZIP_END_BYTES)))?;
+    let mut end = Vec::new();
+    archive.read_to_end(&mut end)?;
+    let at = end.windows(4).rposition(|bytes| bytes == b"PK\x05\x06");
+    let count =
+        at.and_then(|at| Some(u16::from_le_bytes([*end.get(at + 10)?, *end.get(at + 11)?])));
+    Ok(count.filter(|&count| count != u16::MAX).map(usize::from))
 }
 
 fn is_array(path: &Path) -> bool {

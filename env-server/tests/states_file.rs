@@ -241,6 +241,15 @@ fn broken_files_are_refused_each_by_its_problem() {
     let mut damaged = deflated;
     damaged[place] ^= 0xff;
     check("lab.npz", &damaged, "array \"a\": ");
+    let mut twice = stored(&[("one.npy", whole.clone()), ("two.npy", whole.clone())]);
+    while let Some(at) = twice.windows(7).position(|name| name == b"two.npy") {
+        twice[at..at + 7].copy_from_slice(b"one.npy");
+    }
+    check(
+        "lab.npz",
+        &twice,
+        "expected 1 arrays, one of each name, got 2",
+    );
     check(
         "lab.tif",
         &whole,
@@ -318,6 +327,12 @@ fn what_is_no_file_is_refused() {
     assert!(StatesFile::read(&empty).is_ok());
     create_dir(empty.join("b.npy")).expect("make");
     check(&empty, "b.npy: expected a regular file, got something else");
+    std::fs::remove_file(empty.join("states.toml")).expect("remove");
+    create_dir(empty.join("states.toml")).expect("make");
+    check(
+        &empty,
+        "states.toml: expected a regular file, got something else",
+    );
 }
 
 #[test]

@@ -159,7 +159,7 @@ def test_cells_without_a_value_can_be_unburnt(tmp_path: Path, out: Path) -> None
 def test_every_second_layer_makes_a_step(tmp_path: Path, out: Path) -> None:
     file = geotiff(tmp_path / "fire.tif", *FIRE, nodata=None)
     flags = ("--kind", "states", "--step", "20 min", "--every", 2)
-    np.testing.assert_array_equal(one(out, file, *flags), FIRE[::2])
+    np.testing.assert_array_equal(one(out, file, *flags), FIRE[[0, 2, 4, 5]])
 
 
 def test_a_step_shows_the_last_layer_at_or_before_its_time(tmp_path: Path, out: Path) -> None:
@@ -168,8 +168,9 @@ def test_a_step_shows_the_last_layer_at_or_before_its_time(tmp_path: Path, out: 
         states[k:, 0, k] = 1
     cases: list[tuple[list[float], str | None, tuple[object, ...], list[int]]] = [
         ([0, 10, 20, 30], "minutes", ("--step", "10 min"), [0, 1, 2, 3]),
-        ([0, 10, 20, 30], "minutes since 2020-08-01", ("--step", "20 min"), [0, 2]),
+        ([0, 10, 20, 30], "minutes since 2020-08-01", ("--step", "20 min"), [0, 2, 3]),
         ([0, 10, 20, 30], "minutes", ("--step", "15 min"), [0, 1, 3]),
+        ([0, 10, 20, 30], "minutes", ("--step", "1 h"), [0, 3]),
         ([0, 10, 20, 30], "minutes", ("--step", "5 min"), [0, 0, 1, 1, 2, 2, 3]),
         ([600, 1200, 3000, 3600], "seconds", ("--step", "10 min"), [0, 1, 1, 1, 2, 3]),
         ([7, 7.3333, 7.6667, 9], "hours", ("--step", "20 min"), [0, 1, 2, 2, 2, 2, 3]),
@@ -291,7 +292,39 @@ def test_nearest_takes_the_middle_cell_and_smaller_cells_repeat_it(
 def test_a_part_of_the_input_can_be_used(tmp_path: Path, out: Path) -> None:
     file = geotiff(tmp_path / "fire.tif")
     part = one(out, file, *ARRIVALS, "--unit", "min", "--crop", "1,0,2,3")
-    np.testing.assert_array_equal(part, FIRE[:, 1:, :3])
+    np.testing.assert_array_equal(part, FIRE[1:5, 1:, :3])
+    part = one(out, file, *ARRIVALS, "--unit=min", "--crop", "1,0,2,3", "--begin=0", "--force")
+    np.testing.assert_array_equal(part, FIRE[:5, 1:, :3])
+
+
+def test_what_is_cropped_away_does_not_count(tmp_path: Path, out: Path) -> None:
+    layers = masks().astype(np.float32)
+    layers[:, 0, 0] = np.nan
+    file = geotiff(tmp_path / "fire.tif", *layers, nodata=None)
+    flags = ("--kind", "mask", *STEP, "--burning", 2, "--crop", "1,1,2,3")
+    np.testing.assert_array_equal(one(out, file, *flags), FIRE[:4, 1:, 1:])
+
+
+def test_rows_run_from_the_north_and_columns_from_the_west(tmp_path: Path, out: Path) -> None:
+    east, south = 500_000 + 4 * 30, 4_000_000 - 3 * 30
+    for values, corner, cell in (
+        (ARRIVAL[:, ::-1], (east, 4_000_000), (-30, 30)),
+        (ARRIVAL[::-1], (500_000, south), (30, -30)),
+        (ARRIVAL[::-1, ::-1], (east, south), (-30, -30)),
+    ):
+        file = geotiff(tmp_path / "fire.tif", values, corner=corner, cell=cell)
+        np.testing.assert_array_equal(one(out, file, *ARRIVALS, "--unit=min", "--force"), FIRE)
+        part = one(out, file, *ARRIVALS, "--unit=min", "--crop=0,1,2,3", "--begin=0", "--force")
+        np.testing.assert_array_equal(part, FIRE[: len(part), :2, 1:])
+
+
+def test_a_number_for_no_value_is_rounded_as_the_file_rounds(tmp_path: Path, out: Path) -> None:
+    for number in ("-9999.9", "-3.4028235e+38", "-3.40282347e+38"):
+        values = np.where(ARRIVAL == NEVER, float(number), ARRIVAL).astype(np.float32)
+        np.save(tmp_path / "fire.npy", values)
+        for file in (geotiff(tmp_path / "fire.tif", values, nodata=None), tmp_path / "fire.npy"):
+            flags = (*ARRIVALS, "--unit=min", f"--nodata={number}", "--force")
+            np.testing.assert_array_equal(one(out, file, *flags), FIRE)
 
 
 def test_oblong_cells_can_be_taken_as_squares(tmp_path: Path, out: Path) -> None:

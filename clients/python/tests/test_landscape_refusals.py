@@ -45,6 +45,21 @@ def cut(path: Path) -> Path:
     return path
 
 
+def edited(path: Path, old: str, new: str) -> Path:
+    path.write_text(path.read_text().replace(old, new))
+    return path
+
+
+def folder(path: Path) -> Path:
+    path.mkdir()
+    return path
+
+
+def linked(folder: Path) -> Path:
+    (folder / "a.tif").symlink_to("a.tif")
+    return folder
+
+
 def folder_with(folder: Path, name: str) -> Path:
     geotiff(folder / "fire.tif", *masks(), nodata=None)
     text(folder / name, "hello")
@@ -101,7 +116,19 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
     ),
     "cut ASCII grid": (
         lambda f: (cut(ascii_grid(f / "a.asc", ARRIVAL.repeat(9, axis=0))), *ARRIVALS),
-        "expected an ESRI ASCII grid, got",
+        "a.asc: expected 108 numbers for 27 x 4 cells, got 82",
+    ),
+    "ASCII grid without its last number": (
+        lambda f: (edited(ascii_grid(f / "a.asc"), "50.0", ""), *ARRIVALS),
+        "a.asc: expected 12 numbers for 3 x 4 cells, got 11",
+    ),
+    "ASCII grid of another width": (
+        lambda f: (edited(ascii_grid(f / "a.asc"), "20.0", "20.0 20.0"), *ARRIVALS),
+        "a.asc: expected 12 numbers for 3 x 4 cells, got 14",
+    ),
+    "word in an ASCII grid": (
+        lambda f: (edited(ascii_grid(f / "a.asc"), "35.0", "x"), *ARRIVALS),
+        "a.asc: expected numbers, got 'x'",
     ),
     "no NumPy file": (
         lambda f: (text(f / "a.npz", "hello"), *MASKS),
@@ -250,17 +277,6 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         lambda f: (days(f, "hours", None)[0], *MASKS, "--every", 2),
         "tells the times of its layers and --step chooses among them, got 2",
     ),
-    "step of all layers": (
-        lambda f: (days(f, "min", None)[0], *MASKS),
-        "expected at least 2 steps, got 1",
-    ),
-    "fire behind the last step": (
-        lambda f: (
-            netcdf(f / "a.nc", times=[0, 10, 15], time_unit="min", mask=[NONE, NONE, ONE]),
-            *MASKS,
-        ),
-        "expected cells that burn, got none",
-    ),
     "unit of layers without times": (
         lambda f: (stack(f, NONE, ONE), *MASKS, "--unit", "s"),
         "--unit: expected none, as ",
@@ -317,7 +333,7 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
     ),
     "too many steps": (
         lambda f: (geotiff(f / "a.tif", np.where(ARRIVAL < 0, NEVER, ARRIVAL * 1e9)), *ARRIVALS),
-        "bytes of states, got 4999999",
+        "bytes of states, got 4999999899 steps of 3 x 4",
     ),
     "too large": (lambda f: (large(f), *MASKS), "at most 4096 x 4096 cells, as the server takes"),
     "too large a wish": (
@@ -396,6 +412,22 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--picture", f / "a.gif"),
         "--picture: expected a .png, got ",
     ),
+    "picture in the place of a folder": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--picture", folder(f / "a.png")),
+        "--picture: expected a file, got the folder ",
+    ),
+    "name that is no text": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--name", "\udcff"),
+        r"--name: expected UTF-8, got '\udcff'",
+    ),
+    "cells of nothing": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--cell", "1e-320"),
+        "--cell: expected at least 0.001 metres, got 1e-320",
+    ),
+    "link to itself": (
+        lambda f: (linked(f), *ARRIVALS),
+        "a.tif: expected a GeoTIFF, got",
+    ),
     "unknown kind": (lambda f: (geotiff(f / "a.tif"), "--kind", "fire"), "invalid choice: 'fire'"),
     "codes": (
         lambda f: (geotiff(f / "a.tif"), *STATES, "--codes", "0,1,1"),
@@ -415,11 +447,15 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
     ),
     "no steps": (
         lambda f: (geotiff(f / "a.tif"), *MASKS, "--every", 0),
-        "argument --every: expected a whole number of at least 1, got 0",
+        "argument --every: expected a whole number of 1 to 999999999, got 0",
+    ),
+    "endless steps": (
+        lambda f: (geotiff(f / "a.tif"), *MASKS, "--every", "9" * 400),
+        "argument --every: expected a whole number of 1 to 999999999, got 999",
     ),
     "half a step": (
         lambda f: (geotiff(f / "a.tif"), *MASKS, "--every", 1.5),
-        "argument --every: expected a whole number of at least 1, got 1.5",
+        "argument --every: expected a whole number of 1 to 999999999, got 1.5",
     ),
 }
 
@@ -484,6 +520,9 @@ def test_an_output_that_cannot_be_written_is_named(
 ) -> None:
     file = geotiff(tmp_path / "a.tif")
     assert "a.tif" in refused((file, *ARRIVALS, "--out", file / "world.npz"), capsys)
+    flags = (*ARRIVALS, "--out", tmp_path / "world.npz", "--picture", file / "a.png")
+    assert "a.tif" in refused((file, *flags), capsys)
+    assert list(tmp_path.iterdir()) == [file], "nothing is written"
 
 
 @pytest.mark.parametrize("ending", [".npy", ".npz"])

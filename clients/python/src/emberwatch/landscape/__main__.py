@@ -9,7 +9,7 @@ from contextlib import closing
 from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from emberwatch.errors import EmberwatchError, InvalidArgumentError
 from emberwatch.landscape.dates import length
 from emberwatch.landscape.fire import BURNING, BURNT, Meaning, states, times
-from emberwatch.landscape.grid import Place, check_alike, crop, of_world, target_shape
+from emberwatch.landscape.grid import Place, check_alike, of_world, target_shape
 from emberwatch.landscape.layers import Choice, read, stacks
-from emberwatch.landscape.world import description, outputs, write
+from emberwatch.landscape.world import Fill, arrays, description, outputs, write
 
 _NAME: Final = "python -m emberwatch.landscape"
 _EXAMPLES: Final = """
@@ -81,7 +81,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--codes", type=_codes, metavar="U,B,D", help="unburnt, burning, burnt [0,1,2]")
     add("--variable", metavar="NAME", help="of a NetCDF or .npz file that has several")
     add("--band", type=_whole, metavar="N", help="the one band to take of each file [all]")
-    add("--nodata", type=float, action="append", metavar="X", help="a number for no value")
+    add(
+        "--nodata",
+        type=float,
+        action="append",
+        metavar="X",
+        help="a number for no value; --nodata=-1e30 where it has an exponent",
+    )
     add("--missing-is-unburnt", action="store_true", help="take cells without a value as unburnt")
     add("--crop", type=_crop, metavar="TOP,LEFT,HEIGHT,WIDTH", help="cells of the input to use")
     add("--height", type=_whole, metavar="N", help="rows of the world [the input's]")
@@ -105,6 +111,7 @@ def _parser() -> argparse.ArgumentParser:
 def _import(flags: argparse.Namespace) -> None:
     meaning = _meaning(flags)
     files = outputs(flags.out, force=flags.force)
+    name = _name(flags)
     _check_picture(flags)
     choice = Choice(variable=flags.variable, band=flags.band, nodata=tuple(flags.nodata or ()))
     sequences, begins = list[NDArray[np.uint8]](), list[datetime | None]()
@@ -112,24 +119,26 @@ def _import(flags: argparse.Namespace) -> None:
     for stack in stacks(flags.inputs, one_file_each=meaning.kind == "arrival"):
         with closing(read(stack, choice)) as layers:
             fire = times(layers, meaning)
-        window = crop(fire.place, flags.crop)
-        left: Any = fire.arrival[window].shape
-        sides = {"height": flags.height, "width": flags.width, "cell": flags.cell}
-        shape = target_shape(fire.place, left, **sides)
-        place = of_world(fire.place, window, shape)
+        shape = target_shape(fire.place, height=flags.height, width=flags.width, cell=flags.cell)
+        place = of_world(fire.place, shape)
         first = first or place
         check_alike(place, fire.name, first, mixed=flags.mixed)
-        sequences.append(states(fire, shape, window, flags.resample))
+        sequences.append(states(fire, shape, flags.resample))
         begins.append(fire.begin)
-    name = flags.name or flags.out.stem
-    write(files[0], sequences, description(name, flags.step, begins))
-    for states_of_fire in sequences:
-        print(_told(states_of_fire))
-    print(f"{files[0]}: {files[0].stat().st_size} bytes, sequences: {len(sequences)}; {files[1]}")
+    text = description(name, flags.step, begins).encode()
+    contents: dict[Path, Fill] = {
+        files[0]: arrays(sequences),
+        files[1]: lambda file: file.write(text),
+    }
     if flags.picture is not None:
         from emberwatch.landscape.picture import draw
 
-        draw(sequences, name).save(flags.picture)
+        image = draw(sequences, name)
+        contents[flags.picture] = lambda file: image.save(file, "PNG")
+    write(contents)
+    for states_of_fire in sequences:
+        print(_told(states_of_fire))
+    print(f"{files[0]}: {files[0].stat().st_size} bytes, sequences: {len(sequences)}; {files[1]}")
 
 
 def _meaning(flags: argparse.Namespace) -> Meaning:
@@ -148,8 +157,8 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
         raise InvalidArgumentError("--cell: expected neither --height nor --width beside it")
     if flags.begin is not None and not math.isfinite(flags.begin):
         raise InvalidArgumentError(f"--begin: expected a number, got {flags.begin}")
-    if flags.cell is not None and not 0 < flags.cell < float("inf"):
-        raise InvalidArgumentError(f"--cell: expected metres above 0, got {flags.cell}")
+    if flags.cell is not None and not 1e-3 <= flags.cell < math.inf:
+        raise InvalidArgumentError(f"--cell: expected at least 0.001 metres, got {flags.cell}")
     return Meaning(
         kind=flags.kind,
         step=length(flags.step),
@@ -157,10 +166,20 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
         begin=flags.begin,
         burning=flags.burning or 1,
         every=flags.every or 1,
+        crop=flags.crop,
         codes=flags.codes or (0, 1, 2),
         oblong=flags.oblong,
         missing_is_unburnt=flags.missing_is_unburnt,
     )
+
+
+def _name(flags: argparse.Namespace) -> str:
+    name: str = flags.name or flags.out.stem
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        raise InvalidArgumentError(f"--name: expected UTF-8, got {ascii(name)}") from None
+    return name
 
 
 def _check_picture(flags: argparse.Namespace) -> None:
@@ -168,6 +187,8 @@ def _check_picture(flags: argparse.Namespace) -> None:
         return
     if flags.picture.suffix != ".png":
         raise InvalidArgumentError(f"--picture: expected a .png, got {flags.picture}")
+    if flags.picture.is_dir():
+        raise InvalidArgumentError(f"--picture: expected a file, got the folder {flags.picture}")
     if find_spec("PIL") is None:
         raise InvalidArgumentError("--picture: expected Pillow; pip install emberwatch[landscape]")
 
@@ -183,9 +204,9 @@ def _told(sequence: NDArray[np.uint8]) -> str:
 
 
 def _whole(text: str) -> int:
-    number = int(text) if text.isdecimal() else 0
+    number = int(text) if text.isdecimal() and len(text) < 10 else 0
     if number < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text}")
+        raise argparse.ArgumentTypeError(f"expected a whole number of 1 to 999999999, got {text}")
     return number
 
 
@@ -201,7 +222,7 @@ def _codes(text: str) -> tuple[float, ...]:
 
 def _crop(text: str) -> tuple[int, ...]:
     parts = text.split(",")
-    if len(parts) != 4 or not all(part.isdecimal() for part in parts):
+    if len(parts) != 4 or not all(part.isdecimal() and len(part) < 10 for part in parts):
         raise argparse.ArgumentTypeError(
             f"expected TOP,LEFT,HEIGHT,WIDTH, four whole numbers, got {text}"
         )

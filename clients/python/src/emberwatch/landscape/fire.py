@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Final, Literal
 
@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
 from emberwatch.landscape.dates import SECONDS, unit_of
-from emberwatch.landscape.grid import Place, Rule, check_same, check_square, resampled
+from emberwatch.landscape.grid import (
+    Place,
+    Rule,
+    check_same,
+    check_square,
+    crop,
+    part,
+    resampled,
+)
 from emberwatch.landscape.layers import Layer
 from emberwatch.landscape.schedule import Schedule
 
@@ -56,6 +64,8 @@ class Meaning:
     burning: int = 1
     """Steps that a cell burns after its arrival."""
     every: int = 1
+    crop: tuple[int, ...] | None = None
+    """Top, left, height and width of what is used of each layer; None: all."""
     codes: tuple[float, float, float] = (UNBURNT, BURNING, BURNT)
     oblong: bool = False
     missing_is_unburnt: bool = False
@@ -68,11 +78,9 @@ def times(layers: Iterable[Layer], meaning: Meaning) -> Times:
     return _of_stack(layers, meaning)
 
 
-def states(
-    fire: Times, shape: tuple[int, int], window: tuple[slice, slice], rule: Rule
-) -> NDArray[np.uint8]:
+def states(fire: Times, shape: tuple[int, int], rule: Rule) -> NDArray[np.uint8]:
     """The sequence (K, H, W): each step as the times say."""
-    arrival, burnt = fire.arrival[window], fire.burnt[window]
+    arrival, burnt = fire.arrival, fire.burnt
     burns = np.isfinite(arrival)
     if not burns.any():
         raise InvalidArgumentError(f"{fire.name}: expected cells that burn, got none")
@@ -87,9 +95,9 @@ def states(
         )
     if fire.n_steps * arrival.size > _MOST_STATES:
         raise InvalidArgumentError(
-            f"{fire.name}: expected at most {_MOST_STATES} bytes of states, got {fire.n_steps} "
-            f"steps of {shape[0]} x {shape[1]} cells; use a longer --step or --every, or a "
-            "smaller grid"
+            f"{fire.name}: expected at most {_MOST_STATES} bytes of states, got "
+            f"{fire.n_steps:.15g} steps of {shape[0]} x {shape[1]} cells; use a longer --step or "
+            "--every, or a smaller grid"
         )
     sequence = np.empty((fire.n_steps, *shape), np.uint8)
     for k, step in enumerate(sequence):
@@ -105,6 +113,7 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
             "choose with --band"
         )
     _check_square(layer, meaning)
+    layer = _cropped(layer, meaning)
     arrival = np.where(np.isnan(layer.values), np.inf, layer.values)
     negative = arrival < 0
     # Where each cell has a time, a negative one may mean never.
@@ -133,17 +142,19 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
 
 
 def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
-    first: Layer | None = None
+    first, place = None, None
     arrival = burnt = np.empty(0)
     schedule = Schedule(step=meaning.step, every=meaning.every, unit=meaning.unit)
     mark = math.nan
     for k, layer in enumerate(layers):
-        if first is None:
-            first = layer
+        if first is None or place is None:
+            place = layer.place
             _check_square(layer, meaning)
-            arrival = np.full(layer.place.shape, np.inf)
+            first = _cropped(layer, meaning)
+            arrival = np.full(first.place.shape, np.inf)
             burnt = arrival.copy()
-        check_same(layer.place, layer.name, first.place, first.name)
+        check_same(layer.place, layer.name, place, first.name)
+        layer = _cropped(layer, meaning)
         schedule.add(layer.name, layer.time)
         mark = _add(layer, k, meaning, arrival, burnt, mark)
     if first is None:
@@ -217,6 +228,11 @@ def _check_order(
             raise InvalidArgumentError(f"{layer.name}: expected {told}, the first {_cell(wrong)}")
 
 
+def _cropped(layer: Layer, meaning: Meaning) -> Layer:
+    window = crop(layer.place, meaning.crop)
+    return replace(layer, values=layer.values[window], place=part(layer.place, window))
+
+
 def _check_square(layer: Layer, meaning: Meaning) -> None:
     if not meaning.oblong:
         check_square(layer.place, layer.name)
@@ -253,7 +269,7 @@ def _cell(cells: NDArray[np.bool_]) -> str:
 
 
 def _first(layer: Layer, cells: NDArray[np.bool_]) -> str:
-    return f"{layer.values[cells][0]:.6g} {_cell(cells)}"
+    return f"{layer.values[cells][0]:.9g} {_cell(cells)}"
 
 
 def _numbers(numbers: Iterable[float]) -> str:

@@ -27,9 +27,9 @@ class Place:
     shape: tuple[int, int]
     """Rows and columns."""
     corner: tuple[float, float] | None = None
-    """x and y of the first cell's outer corner; None if the file does not say."""
+    """x and y of the north-west corner; None if the file does not say."""
     cell: tuple[float, float] = (1.0, 1.0)
-    """Width and height of a cell; a negative height means that the first row is in the north."""
+    """Width and height of a cell."""
     projection: str | None = None
     """As well-known text."""
     is_in_degrees: bool = False
@@ -38,9 +38,9 @@ class Place:
 
     def sides(self) -> tuple[float, float]:
         """Width and height of a cell in one unit, in the middle of the grid."""
-        width, height = abs(self.cell[0]), abs(self.cell[1])
+        width, height = self.cell
         if self.is_in_degrees and self.corner is not None:
-            middle = self.corner[1] + self.cell[1] * self.shape[0] / 2
+            middle = self.corner[1] - height * self.shape[0] / 2
             width *= math.cos(math.radians(middle))
         return width, height
 
@@ -57,7 +57,7 @@ def check_same(place: Place, name: str, first: Place, first_name: str) -> None:
             f"{name}: expected {_size(first)} cells as in {first_name}, got {_size(place)}"
         )
     apart = np.subtract(_extent(place), _extent(first))
-    if (np.abs(apart) > _LIKE * abs(first.cell[0])).any():
+    if (np.abs(apart) > _LIKE * first.cell[0]).any():
         raise InvalidArgumentError(
             f"{name}: expected the extent of {first_name}, {_extent(first)}, got {_extent(place)}"
         )
@@ -100,19 +100,26 @@ def check_alike(place: Place, name: str, first: Place, *, mixed: bool) -> None:
         )
 
 
-def of_world(place: Place, window: tuple[slice, slice], shape: tuple[int, int]) -> Place:
-    """The grid that a part of an input becomes."""
+def of_world(place: Place, shape: tuple[int, int]) -> Place:
+    """The grid that an input becomes."""
+    width = place.cell[0] * place.shape[1] / shape[1]
+    height = place.cell[1] * place.shape[0] / shape[0]
+    return replace(place, shape=shape, cell=(width, height))
+
+
+def part(place: Place, window: tuple[slice, slice]) -> Place:
+    """The grid of these rows and columns."""
     rows, columns = window
-    width = place.cell[0] * (columns.stop - columns.start) / shape[1]
-    height = place.cell[1] * (rows.stop - rows.start) / shape[0]
     corner = place.corner and (
         place.corner[0] + place.cell[0] * columns.start,
-        place.corner[1] + place.cell[1] * rows.start,
+        place.corner[1] - place.cell[1] * rows.start,
     )
-    return replace(place, shape=shape, corner=corner, cell=(width, height))
+    return replace(
+        place, shape=(rows.stop - rows.start, columns.stop - columns.start), corner=corner
+    )
 
 
-def crop(place: Place, wanted: tuple[int, int, int, int] | None) -> tuple[slice, slice]:
+def crop(place: Place, wanted: tuple[int, ...] | None) -> tuple[slice, slice]:
     """The rows and columns of the input to use."""
     height, width = place.shape
     if wanted is None:
@@ -132,15 +139,10 @@ def crop(place: Place, wanted: tuple[int, int, int, int] | None) -> tuple[slice,
 
 
 def target_shape(
-    place: Place,
-    shape: tuple[int, int],
-    *,
-    height: int | None,
-    width: int | None,
-    cell: float | None,
+    place: Place, *, height: int | None, width: int | None, cell: float | None
 ) -> tuple[int, int]:
-    """Rows and columns of the result; `shape` is what is left of the input after cropping."""
-    rows, columns = shape
+    """Rows and columns of the world."""
+    rows, columns = place.shape
     if cell is not None:
         if place.corner is None or place.is_in_degrees:
             raise InvalidArgumentError(
@@ -199,8 +201,7 @@ def _extent(place: Place) -> tuple[float, float, float, float]:
     """Left, bottom, right and top."""
     (x, y), (width, height) = place.corner or (0.0, 0.0), place.cell
     rows, columns = place.shape
-    ys = y, y + height * rows
-    return x, min(ys), x + width * columns, max(ys)
+    return x, y - height * rows, x + width * columns, y
 
 
 def _size(place: Place) -> str:

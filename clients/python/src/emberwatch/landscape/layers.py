@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
 import re
 import warnings
 import zipfile
@@ -38,6 +39,10 @@ _DRIVERS: Final = {
 }
 _NUMPY: Final = (".npy", ".npz")
 _KNOWN: Final = ", ".join((*_DRIVERS, *_NUMPY))
+#: First words of the lines before an ESRI ASCII grid's numbers.
+_ASCII_HEADER: Final = frozenset(
+    "ncols nrows xllcorner yllcorner xllcenter yllcenter cellsize dx dy nodata_value".split()
+)
 #: Files that say where the cells of others are, which GDAL reads with them.
 _BESIDE: Final = (".prj", ".tfw", ".xml")
 _MOST_CELLS: Final = 1 << 27  # of a layer: 1 GiB as numbers
@@ -86,13 +91,13 @@ def stacks(inputs: Sequence[Path], *, one_file_each: bool) -> list[list[Path]]:
             loose.append(path)
     found += [loose] if loose else []
     files = [file for stack in found for file in stack]
-    known = set[Path]()
+    known = set[str]()
     for file in files:
         if file.suffix.lower() not in (*_DRIVERS, *_NUMPY):
             raise InvalidArgumentError(f"{file}: expected one of {_KNOWN}, got '{file.suffix}'")
-        if file.resolve() in known:
+        if os.path.realpath(file) in known:
             raise InvalidArgumentError(f"{file}: expected each file once, got it twice")
-        known.add(file.resolve())
+        known.add(os.path.realpath(file))
     return [[file] for file in files] if one_file_each else found
 
 
@@ -101,10 +106,7 @@ def read(files: Sequence[Path], choice: Choice) -> Generator[Layer]:
     for file in files:
         reader = _read_numpy if file.suffix.lower() in _NUMPY else _read_raster
         with closing(reader(file, choice)) as layers:
-            for layer in layers:
-                for missing in choice.nodata:
-                    layer.values[layer.values == missing] = np.nan
-                yield layer
+            yield from layers
 
 
 def _is_layer(file: Path) -> bool:
@@ -121,11 +123,23 @@ def _read_numpy(file: Path, choice: Choice) -> Generator[Layer]:
     array = _array(file, choice)
     array = array.reshape(-1, *array.shape[-2:])
     for band in _bands(file, len(array), choice):
+        stored = array[band - 1]
+        values = stored.astype(np.float64)
+        values[_is_missing(stored, choice.nodata)] = np.nan
         yield Layer(
             name=f"{file}, layer {band}" if len(array) > 1 else str(file),
-            values=array[band - 1].astype(np.float64),
+            values=values,
             place=Place(shape=(array.shape[1], array.shape[2])),
         )
+
+
+def _is_missing(stored: NDArray[Any], nodata: Sequence[float]) -> NDArray[np.bool_]:
+    """Where a file has one of these numbers, each rounded as the file has rounded its own."""
+    missing = np.zeros(stored.shape, np.bool_)
+    for number in nodata:
+        with np.errstate(over="ignore"):
+            missing |= stored == (stored.dtype.type(number) if stored.dtype.kind == "f" else number)
+    return missing
 
 
 def _array(file: Path, choice: Choice) -> NDArray[Any]:
@@ -188,8 +202,10 @@ def _read_raster(file: Path, choice: Choice) -> Generator[Layer]:
         try:
             with rasterio.open(_address(rasterio, file, driver, choice), driver=driver) as source:
                 place = _place(file, source)
+                if driver == "AAIGrid":
+                    _check_ascii(file, *place.shape)
                 for band in _bands(file, source.count, choice):
-                    yield _layer(file, source, place, band)
+                    yield _layer(file, source, place, band, choice.nodata)
         except rasterio.errors.RasterioError as error:
             words = error.__cause__ or error
             raise InvalidArgumentError(f"{file}: expected {kind}, got: {words}") from None
@@ -252,24 +268,50 @@ def _place(file: Path, source: Any) -> Place:
         return Place(shape=shape)
     if transform.b or transform.d:
         raise InvalidArgumentError(f"{file}: expected rows from west to east, got a rotated grid")
+    far = transform * (source.width, source.height)
     return Place(
         shape=shape,
-        corner=(transform.c, transform.f),
-        cell=(transform.a, transform.e),
+        corner=(min(transform.c, far[0]), max(transform.f, far[1])),
+        cell=(abs(transform.a), abs(transform.e)),
         projection=crs.to_wkt() if crs else None,
         is_in_degrees=bool(crs and crs.is_geographic),
         metres=crs.linear_units_factor[1] if crs and crs.is_projected else 1.0,
     )
 
 
-def _layer(file: Path, source: Any, place: Place, band: int) -> Layer:
+def _check_ascii(file: Path, height: int, width: int) -> None:
+    """Refuses what GDAL fills up, cuts or takes as 0."""
+    n_numbers = 0
+    with file.open(encoding="ascii", errors="replace") as lines:
+        for line in lines:
+            words = line.split()
+            if n_numbers == 0 and words and words[0].lower() in _ASCII_HEADER:
+                continue
+            for word in words:
+                try:
+                    float(word.replace(",", "."))
+                except ValueError:
+                    raise InvalidArgumentError(
+                        f"{file}: expected numbers, got '{word[:40]}'"
+                    ) from None
+            n_numbers += len(words)
+    if n_numbers != height * width:
+        raise InvalidArgumentError(
+            f"{file}: expected {height * width} numbers for {height} x {width} cells, "
+            f"got {n_numbers}"
+        )
+
+
+def _layer(file: Path, source: Any, place: Place, band: int, nodata: Sequence[float]) -> Layer:
     dtype = source.dtypes[band - 1]
     if dtype.startswith("complex"):
         raise InvalidArgumentError(f"{file}: expected real numbers, got {dtype}")
-    masked: Any = source.read(band, masked=True, out_dtype="float64")
-    values = masked.filled(np.nan) * source.scales[band - 1] + source.offsets[band - 1]
-    if place.cell[1] > 0 and place.corner is not None:  # the first row is in the south
-        values = values[::-1].copy()
+    stored: Any = source.read(band, masked=True)
+    values = stored.data.astype(np.float64) * source.scales[band - 1] + source.offsets[band - 1]
+    values[stored.mask | _is_missing(stored.data, nodata)] = np.nan
+    if place.corner is not None:  # else the first row is the first
+        southward, eastward = source.transform.e < 0, source.transform.a > 0
+        values = values[:: 1 if southward else -1, :: 1 if eastward else -1].copy()
     tags, of_band = source.tags(), source.tags(band)
     dimension = _dimension(file, tags)
     time = None

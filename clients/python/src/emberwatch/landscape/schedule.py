@@ -49,14 +49,13 @@ class Schedule:
         self._told = told
 
     def steps(self) -> tuple[NDArray[np.float64], int]:
-        """The first step that shows each layer, infinite if none does, and how many steps."""
+        """The first step that shows each layer, and how many steps there are."""
         if self._unit is None:
             after, step = np.arange(len(self._times), dtype=np.float64), self._every
         else:
             after, step = np.array(self._times) - self._times[0], self._step
-        n_steps = int(after[-1] / step + _EVEN) + 1
         steps = np.ceil(after / step - _EVEN)
-        return np.where(steps < n_steps, steps, np.inf), n_steps
+        return steps, int(steps[-1]) + 1
 
     def _check_flags(self) -> None:
         if self._unit is not None and self._every != 1:

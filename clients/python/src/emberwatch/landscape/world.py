@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from typing import IO, Final, NamedTuple
@@ -14,6 +15,9 @@ from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
 from emberwatch.model import Color, color_from_hex
+
+Fill = Callable[[IO[bytes]], object]
+"""Writes a file's bytes."""
 
 
 class State(NamedTuple):
@@ -69,19 +73,22 @@ def outputs(out: Path, *, force: bool) -> tuple[Path, Path]:
     return files
 
 
-def write(out: Path, sequences: Sequence[NDArray[np.uint8]], text: str) -> None:
-    """Writes both files, each beside itself first, so that none is ever half written."""
-    arrays = {_array(number): states for number, states in enumerate(sequences)}
-    out.parent.mkdir(parents=True, exist_ok=True)
-    _replace(out, lambda file: np.savez_compressed(file, **arrays))  # pyright: ignore
-    _replace(out.with_suffix(".toml"), lambda file: file.write(text.encode()))
+def arrays(sequences: Sequence[NDArray[np.uint8]]) -> Fill:
+    """What writes the `.npz`."""
+    named = {_array(number): states for number, states in enumerate(sequences)}
+    return lambda file: np.savez_compressed(file, **named)  # pyright: ignore
 
 
-def _replace(path: Path, fill: Callable[[IO[bytes]], object]) -> None:
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with beside.open("wb") as file:
-            fill(file)
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+def write(files: Mapping[Path, Fill]) -> None:
+    """Writes each file beside itself, and puts them in place when all are whole."""
+    with ExitStack() as stack:
+        renames = list[tuple[Path, Path]]()
+        for path, fill in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            beside = path.with_name(f".{path.name}.{os.getpid()}")
+            stack.callback(beside.unlink, missing_ok=True)
+            with beside.open("wb") as file:
+                fill(file)
+            renames.append((beside, path))
+        for beside, path in renames:
+            os.replace(beside, path)
