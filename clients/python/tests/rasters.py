@@ -56,9 +56,10 @@ def netcdf(
     unit: str = "min",
     southward: bool = True,
     extra: bool = False,
+    over: tuple[str, str, str] = ("time", "y", "x"),
     **variables: ArrayLike,
 ) -> Path:
-    """A NetCDF file of variables over rows and columns, or time, rows and columns."""
+    """A NetCDF file of variables over rows and columns, or what stands in `over`."""
     file = netCDF4.Dataset(path, "w")
     arrays = {name: np.asarray(values, "f4") for name, values in variables.items()}
     height, width = next(iter(arrays.values())).shape[-2:]
@@ -66,6 +67,7 @@ def netcdf(
     dimensions |= {"x": np.arange(width) * 30.0 + 15}
     if times is not None:
         dimensions = {"time": np.array(times)} | dimensions
+    dimensions |= {name: np.arange(2.0) for name in over if times and name not in dimensions}
     if extra:
         dimensions = {"level": np.arange(2.0)} | dimensions
     for name, places in dimensions.items():
@@ -78,8 +80,9 @@ def netcdf(
             axis.units = time_unit
         if name == "time" and calendar is not None:
             axis.calendar = calendar
+    names = tuple(dimensions) if times is None or extra else over
     for name, values in arrays.items():
-        variable = file.createVariable(name, "f4", tuple(dimensions), fill_value=NEVER)
+        variable = file.createVariable(name, "f4", names, fill_value=NEVER)
         variable[:] = values if southward else values[..., ::-1, :]
         variable.units = unit
     file.close()

@@ -1,5 +1,6 @@
 """Rasters of fires become recorded worlds: the same fire from each format, kind and grid."""
 
+import io
 import re
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from PIL import Image
 from rasters import ARRIVAL, NEVER, ascii_grid, geotiff, masks, netcdf
 
 from emberwatch.landscape.__main__ import main
-from emberwatch.landscape.world import description
+from emberwatch.landscape.world import arrays, description
 
 ROOT = Path(__file__).parents[3]
 STEP = ("--step", "10 min")
@@ -295,6 +296,28 @@ def test_a_part_of_the_input_can_be_used(tmp_path: Path, out: Path) -> None:
     np.testing.assert_array_equal(part, FIRE[1:5, 1:, :3])
     part = one(out, file, *ARRIVALS, "--unit=min", "--crop", "1,0,2,3", "--begin=0", "--force")
     np.testing.assert_array_equal(part, FIRE[:5, 1:, :3])
+
+
+def test_times_of_32_bits_fall_into_their_steps(tmp_path: Path, out: Path) -> None:
+    steps = np.arange(400).reshape(20, 20)
+    for unit, step, last in (("h", "6 min", 0.1), ("h", "10 min", 1 / 6), ("d", "1 h", 1 / 24)):
+        file = geotiff(tmp_path / "fire.tif", steps * last)
+        flags = ("--kind", "arrival", "--burning", 2, "--unit", unit, "--step", step, "--force")
+        got = one(out, file, *flags)
+        np.testing.assert_array_equal((got == 0).sum(axis=0), steps, f"{step}")
+
+
+def test_infinite_times_of_either_sign_are_never(tmp_path: Path, out: Path) -> None:
+    file = geotiff(tmp_path / "fire.tif", np.where(ARRIVAL == NEVER, -np.inf, ARRIVAL))
+    np.testing.assert_array_equal(one(out, file, *ARRIVALS, "--unit=min", "--begin=0"), FIRE)
+
+
+def test_sequences_are_named_in_order() -> None:
+    file = io.BytesIO()
+    arrays([np.zeros((2, 1, 1), np.uint8)] * 1001)(file)
+    file.seek(0)
+    names = list(np.load(file))
+    assert names == sorted(names) and (names[0], names[-1]) == ("states_0000", "states_1000")
 
 
 def test_what_is_cropped_away_does_not_count(tmp_path: Path, out: Path) -> None:

@@ -185,7 +185,7 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
             netcdf(f / "a.nc", at=np.zeros((2, 2, 3, 4)), times=[0, 1], extra=True),
             *MASKS,
         ),
-        "expected a variable of time, rows and columns, got it over",
+        "expected a variable of time, rows and columns, in this order, got it over level",
     ),
     "other size": (
         lambda f: (
@@ -322,8 +322,40 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--crop", "2,0,1,1"),
         "expected cells that burn, got none",
     ),
+    "members of an ensemble": (
+        lambda f: (
+            netcdf(f / "a.nc", at=np.zeros((2, 3, 4)), times=[0, 1], over=("member", "y", "x")),
+            *MASKS,
+        ),
+        "expected a variable of time, rows and columns, in this order, got it over member",
+    ),
+    "rows before times": (
+        lambda f: (
+            netcdf(f / "a.nc", at=np.zeros((2, 2, 2)), times=[0, 1], over=("y", "x", "time")),
+            *MASKS,
+        ),
+        "expected a variable of time, rows and columns, in this order, got it over y",
+    ),
+    "a height that stretches": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--height", 2),
+        "grid: expected the proportions of 3 x 4 cells, got 2 x 3; use --crop",
+    ),
+    "begin of layers at 0": (
+        lambda f: (geotiff(f / "a.tif"), *MASKS, "--begin", 0),
+        "--begin: expected --kind arrival beside it, got mask",
+    ),
+    "steps of nothing": (
+        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--step", "1e-310 s"),
+        "--step: expected a share of 50, the last time, got ",
+    ),
     "no fire in the middle": (
-        lambda f: (stack(f, ONE, ONE), *MASKS, "--resample=nearest", "--height=1", "--oblong"),
+        lambda f: (
+            stack(f, ONE, ONE),
+            *MASKS,
+            "--resample=nearest",
+            "--height=1",
+            "--crop=0,1,3,3",
+        ),
         "--resample: expected cells that burn on 1 x 1 cells, got none",
     ),
     "one layer": (lambda f: (stack(f, ONE), *MASKS), "expected at least 2 steps, got 1"),
@@ -501,6 +533,10 @@ def test_output_that_is_there_is_kept_without_force(
         assert f"--out: expected no {there}, got one; --force replaces it" in line
         assert there.read_text() == "mine"
         there.unlink()
+    picture = tmp_path / "a.png"
+    picture.write_text("mine")
+    line = refused((file, *ARRIVALS, "--out", out, "--picture", picture), capsys)
+    assert f"--picture: expected no {picture}, got one; --force replaces it" in line
     line = refused((file, *ARRIVALS, "--out", tmp_path / "world.zip"), capsys)
     assert "--out: expected a .npz, got " in line
 

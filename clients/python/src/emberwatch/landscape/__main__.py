@@ -19,7 +19,7 @@ from emberwatch.landscape.dates import length
 from emberwatch.landscape.fire import BURNING, BURNT, Meaning, states, times
 from emberwatch.landscape.grid import Place, check_alike, of_world, target_shape
 from emberwatch.landscape.layers import Choice, read, stacks
-from emberwatch.landscape.world import Fill, arrays, description, outputs, write
+from emberwatch.landscape.world import Fill, arrays, check_outputs, description, write
 
 _NAME: Final = "python -m emberwatch.landscape"
 _EXAMPLES: Final = """
@@ -110,9 +110,10 @@ def _parser() -> argparse.ArgumentParser:
 
 def _import(flags: argparse.Namespace) -> None:
     meaning = _meaning(flags)
-    files = outputs(flags.out, force=flags.force)
     name = _name(flags)
-    _check_picture(flags)
+    check_outputs(flags.out, flags.picture, force=flags.force)
+    if flags.picture is not None and find_spec("PIL") is None:
+        raise InvalidArgumentError("--picture: expected Pillow; pip install emberwatch[landscape]")
     choice = Choice(variable=flags.variable, band=flags.band, nodata=tuple(flags.nodata or ()))
     sequences, begins = list[NDArray[np.uint8]](), list[datetime | None]()
     first: Place | None = None
@@ -126,9 +127,10 @@ def _import(flags: argparse.Namespace) -> None:
         sequences.append(states(fire, shape, flags.resample))
         begins.append(fire.begin)
     text = description(name, flags.step, begins).encode()
+    description_file = flags.out.with_suffix(".toml")
     contents: dict[Path, Fill] = {
-        files[0]: arrays(sequences),
-        files[1]: lambda file: file.write(text),
+        flags.out: arrays(sequences),
+        description_file: lambda file: file.write(text),
     }
     if flags.picture is not None:
         from emberwatch.landscape.picture import draw
@@ -138,12 +140,14 @@ def _import(flags: argparse.Namespace) -> None:
     write(contents)
     for states_of_fire in sequences:
         print(_told(states_of_fire))
-    print(f"{files[0]}: {files[0].stat().st_size} bytes, sequences: {len(sequences)}; {files[1]}")
+    n_bytes = flags.out.stat().st_size
+    print(f"{flags.out}: {n_bytes} bytes, sequences: {len(sequences)}; {description_file}")
 
 
 def _meaning(flags: argparse.Namespace) -> Meaning:
     for name, kinds in _ONLY_FOR.items():
-        if flags.kind not in kinds and getattr(flags, name) not in (None, False):
+        given = getattr(flags, name)
+        if flags.kind not in kinds and given is not None and given is not False:
             flag = name.replace("_", "-")
             raise InvalidArgumentError(
                 f"--{flag}: expected --kind {' or '.join(kinds)} beside it, got {flags.kind}"
@@ -180,17 +184,6 @@ def _name(flags: argparse.Namespace) -> str:
     except UnicodeEncodeError:
         raise InvalidArgumentError(f"--name: expected UTF-8, got {ascii(name)}") from None
     return name
-
-
-def _check_picture(flags: argparse.Namespace) -> None:
-    if flags.picture is None:
-        return
-    if flags.picture.suffix != ".png":
-        raise InvalidArgumentError(f"--picture: expected a .png, got {flags.picture}")
-    if flags.picture.is_dir():
-        raise InvalidArgumentError(f"--picture: expected a file, got the folder {flags.picture}")
-    if find_spec("PIL") is None:
-        raise InvalidArgumentError("--picture: expected Pillow; pip install emberwatch[landscape]")
 
 
 def _told(sequence: NDArray[np.uint8]) -> str:

@@ -7,10 +7,15 @@ import re
 from datetime import UTC, datetime, timedelta, timezone
 from typing import Final, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from emberwatch.errors import InvalidArgumentError
 
 SECONDS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 """Of each unit."""
+EVEN: Final = 1e-3
+"""Share of a step by which times may differ, as 32-bit numbers do."""
 
 _SPELLINGS: Final = {
     "sec": "s", "second": "s", "minute": "min", "hr": "h", "hour": "h", "day": "d"
@@ -79,6 +84,18 @@ def length(text: str) -> float:
             f"--step: expected a number and s, min, h or d, such as '10 min', got '{text}'"
         )
     return seconds
+
+
+def steps_at(times: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+    """The first step that is not before each time, counted from 0; infinite ones stay."""
+    with np.errstate(over="ignore"):
+        steps = np.ceil(times / step - EVEN)
+    if (np.isinf(steps) & np.isfinite(times)).any():
+        raise InvalidArgumentError(
+            f"--step: expected a share of {times[np.isfinite(times)].max():.6g}, the last time, "
+            f"got {step:.6g}"
+        )
+    return steps
 
 
 def unit_of(clock: Clock, wanted: str | None, name: str) -> str | None:

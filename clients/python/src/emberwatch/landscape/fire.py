@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.landscape.dates import SECONDS, unit_of
+from emberwatch.landscape.dates import SECONDS, steps_at, unit_of
 from emberwatch.landscape.grid import (
     Place,
     Rule,
@@ -114,7 +114,7 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
         )
     _check_square(layer, meaning)
     layer = _cropped(layer, meaning)
-    arrival = np.where(np.isnan(layer.values), np.inf, layer.values)
+    arrival = np.where(np.isfinite(layer.values), layer.values, np.inf)
     negative = arrival < 0
     # Where each cell has a time, a negative one may mean never.
     if negative.any() and (meaning.begin is None or not np.isinf(arrival).any()):
@@ -133,9 +133,8 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
         )
     step = meaning.step / SECONDS[unit]
     begin = float(finite.min()) if meaning.begin is None else meaning.begin
-    # A step shows the fire at its time: what begins later burns in the next one. Rounded, so that
-    # three steps are not a bit more than three.
-    steps = np.ceil((np.maximum(arrival, begin) - begin) / step - 1e-6)
+    # A step shows the fire at its time: what begins later burns in the next one.
+    steps = steps_at(np.maximum(arrival, begin) - begin, step)
     n_steps = int(steps[np.isfinite(steps)].max()) + 1
     date = layer.clock.date(begin * SECONDS[unit])
     return _checked(steps, steps + meaning.burning, n_steps, layer, date)

@@ -150,25 +150,24 @@ def target_shape(
             )
         share = place.sides()[1] * place.metres / cell
         height, width = max(1, round(rows * share)), max(1, round(columns * share))
-    elif height is not None and width is not None:
-        stretch = (columns / width) / (rows / height)
-        if not 1 - _SQUARE <= stretch <= 1 + _SQUARE:
-            raise InvalidArgumentError(
-                f"--height, --width: expected the proportions of {rows} x {columns} cells, "
-                f"got {height} x {width}; use --crop, or give one of the two"
-            )
-    elif height is not None:
-        width = max(1, round(columns * height / rows))
-    elif width is not None:
-        height = max(1, round(rows * width / columns))
-    else:
+    elif height is None and width is None:
         height, width = rows, columns
-    if max(height, width or 0) > MAX_SIDE:
+    elif width is None:
+        width = max(1, round(columns * (height or 1) / rows))
+    elif height is None:
+        height = max(1, round(rows * width / columns))
+    height, width = height or 1, width or 1
+    if max(height, width) > MAX_SIDE:
         raise InvalidArgumentError(
             f"grid: expected at most {MAX_SIDE} x {MAX_SIDE} cells, as the server takes, got "
             f"{height} x {width}; use --height, --width, --cell or --crop"
         )
-    return height, width or 0
+    if not 1 - _SQUARE <= (columns / width) / (rows / height) <= 1 + _SQUARE:
+        raise InvalidArgumentError(
+            f"grid: expected the proportions of {rows} x {columns} cells, got {height} x {width}; "
+            "use --crop or another size"
+        )
+    return height, width
 
 
 def resampled(

@@ -43,6 +43,8 @@ _KNOWN: Final = ", ".join((*_DRIVERS, *_NUMPY))
 _ASCII_HEADER: Final = frozenset(
     "ncols nrows xllcorner yllcorner xllcenter yllcenter cellsize dx dy nodata_value".split()
 )
+#: Dimensions of NetCDF files that need not say that they are time.
+_TIMES: Final = frozenset(("time", "t", "dimt", "date", "step", "layer", "band"))
 #: Files that say where the cells of others are, which GDAL reads with them.
 _BESIDE: Final = (".prj", ".tfw", ".xml")
 _MOST_CELLS: Final = 1 << 27  # of a layer: 1 GiB as numbers
@@ -336,11 +338,22 @@ def _clock(variable: str, tags: dict[str, str], unit: str | None) -> Clock:
 
 
 def _dimension(file: Path, tags: dict[str, str]) -> str:
-    """The one beside rows and columns, if any."""
-    extra = tags.get("NETCDF_DIM_EXTRA", "{}").strip("{}").split(",")
-    if len(extra) > 1:
+    """The one beside rows and columns, if any: that of time."""
+    extra = [name for name in tags.get("NETCDF_DIM_EXTRA", "").strip("{}").split(",") if name]
+    wrong = [name for name in extra if not _is_time(name, tags)] or extra[1:]
+    if wrong:
         raise InvalidArgumentError(
-            f"{file}: expected a variable of time, rows and columns, got it over {', '.join(extra)}"
-            " as well"
+            f"{file}: expected a variable of time, rows and columns, in this order, got it over "
+            f"{', '.join(wrong)}"
         )
-    return extra[0]
+    return extra[0] if extra else ""
+
+
+def _is_time(name: str, tags: dict[str, str]) -> bool:
+    clock = _clock(name, tags, None)
+    return (
+        name.lower() in _TIMES
+        or tags.get(f"{name}#axis") == "T"
+        or tags.get(f"{name}#standard_name") == "time"
+        or clock.unit() is not None
+    )

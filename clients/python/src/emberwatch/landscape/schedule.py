@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.landscape.dates import SECONDS, Clock, Time, unit_of
-
-_EVEN: Final = 1e-3  # share of a step by which times may differ
+from emberwatch.landscape.dates import EVEN, SECONDS, Clock, Time, steps_at, unit_of
 
 
 class Schedule:
@@ -54,7 +51,7 @@ class Schedule:
             after, step = np.arange(len(self._times), dtype=np.float64), self._every
         else:
             after, step = np.array(self._times) - self._times[0], self._step
-        steps = np.ceil(after / step - _EVEN)
+        steps = steps_at(after, step)
         return steps, int(steps[-1]) + 1
 
     def _check_flags(self) -> None:
@@ -88,7 +85,7 @@ class Schedule:
             raise InvalidArgumentError(
                 f"{name}: expected a later time than {self._told}, got {told}"
             )
-        if self._unit is None and abs(step - first) > _EVEN * first:
+        if self._unit is None and abs(step - first) > EVEN * first:
             raise InvalidArgumentError(
                 f"{name}: expected steps of {first:.6g} in time, got {step:.6g}; --unit says what "
                 "the times count"

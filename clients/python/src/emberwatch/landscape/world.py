@@ -41,9 +41,9 @@ _RIGHT, _WRONG = 0.98, 0.01
 def description(name: str, step: str, begins: Sequence[datetime | None] = ()) -> str:
     """The text of the `.toml`; `begins`: when step 0 of each sequence is, where that is known."""
     lines = [f"name = {_quoted(name)}", f"step = {_quoted(step)} # that one step lasts"]
-    for number, begin in enumerate(begins):
+    for array, begin in zip(_arrays(len(begins)), begins, strict=True):
         if begin is not None:
-            lines.append(f"# {_array(number)} begins at {begin:%Y-%m-%d %H:%M:%S} UTC")
+            lines.append(f"# {array} begins at {begin:%Y-%m-%d %H:%M:%S} UTC")
     for state in STATES:
         row = ", ".join(str(_RIGHT if other is state else _WRONG) for other in STATES)
         lines += ["", "[[states]]", f'name = "{state.name}"', f'color = "{state.color}"']
@@ -53,8 +53,10 @@ def description(name: str, step: str, begins: Sequence[datetime | None] = ()) ->
     return "\n".join(lines) + "\n"
 
 
-def _array(number: int) -> str:
-    return f"states_{number:03}"
+def _arrays(n: int) -> list[str]:
+    """Names of so many arrays, whose order as texts, the server's, is their own."""
+    digits = max(3, len(str(n - 1)))
+    return [f"states_{number:0{digits}}" for number in range(n)]
 
 
 def _quoted(text: str) -> str:
@@ -62,20 +64,24 @@ def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def outputs(out: Path, *, force: bool) -> tuple[Path, Path]:
-    """The files to write, none of which may be there already without `force`."""
+def check_outputs(out: Path, picture: Path | None, *, force: bool) -> None:
+    """Refuses names of other files, and without `force` files that are there already."""
     if out.suffix != ".npz":
         raise InvalidArgumentError(f"--out: expected a .npz, got {out}")
-    files = out, out.with_suffix(".toml")
-    for file in files:
-        if file.exists() and not force:
-            raise InvalidArgumentError(f"--out: expected no {file}, got one; --force replaces it")
-    return files
+    if picture is not None and picture.suffix != ".png":
+        raise InvalidArgumentError(f"--picture: expected a .png, got {picture}")
+    for flag, file in (("out", out), ("out", out.with_suffix(".toml")), ("picture", picture)):
+        if file is not None and file.is_dir():
+            raise InvalidArgumentError(f"--{flag}: expected a file, got the folder {file}")
+        if file is not None and file.exists() and not force:
+            raise InvalidArgumentError(
+                f"--{flag}: expected no {file}, got one; --force replaces it"
+            )
 
 
 def arrays(sequences: Sequence[NDArray[np.uint8]]) -> Fill:
     """What writes the `.npz`."""
-    named = {_array(number): states for number, states in enumerate(sequences)}
+    named = dict(zip(_arrays(len(sequences)), sequences, strict=True))
     return lambda file: np.savez_compressed(file, **named)  # pyright: ignore
 
 
