@@ -193,23 +193,29 @@ fn a_restored_world_goes_on_and_another_states_file_is_refused() {
     let file = folder.path().join("lab.snapshot");
     let settings = "--states-symmetries --states-offset 3 --start random --robots 2";
     let server = Server::start(&place.flags(settings));
-    let future = |client: &mut Client| -> Vec<_> {
+    let shape = Shape::new(4, 4).expect("a shape");
+    let feed = |server: &Server| TruthFeed::open(&server.instance, shape).expect("truth");
+    let future = |client: &mut Client, truth: &TruthFeed| -> Vec<_> {
         let mut paths = Paths::new(5);
-        let steps = (0..3).map(|_| client.step(0..2, &paths.take(N_MOVES, 2)).expect("step"));
-        steps.collect()
+        let mut step = || {
+            let shown = client.step(0..2, &paths.take(N_MOVES, 2)).expect("step");
+            let states = truth.states(0..1, &[21], shown[0].world.step);
+            (shown, states.expect("truth"))
+        };
+        (0..3).map(|_| step()).collect()
     };
-    let mut client = server.acquire(0..2);
+    let (mut client, truth) = (server.acquire(0..2), feed(&server));
     reset(&mut client, 21);
-    future(&mut client);
+    future(&mut client, &truth);
     let written = server_command(&server, &["snapshot", text(&file)]);
     assert_eq!(written.code, Some(0), "{}", written.stderr);
-    let went_on = future(&mut client);
+    let went_on = future(&mut client, &truth);
     let restore = ["restore", text(&file), "--takeover"];
     let restored = server_command(&server, &restore);
     assert_eq!(restored.code, Some(0), "{}", restored.stderr);
-    assert_eq!(future(&mut server.acquire(0..2)), went_on);
+    assert_eq!(future(&mut server.acquire(0..2), &truth), went_on);
     let again = Server::start(&place.flags(&format!("{settings} --restore {}", text(&file))));
-    assert_eq!(future(&mut again.acquire(0..2)), went_on);
+    assert_eq!(future(&mut again.acquire(0..2), &feed(&again)), went_on);
     for (place, settings, words) in [
         (&other, settings, "states: expected 2 sequences of CRC-32 "),
         (
@@ -271,6 +277,20 @@ fn a_recording_and_its_replay_show_what_was_recorded() {
     replay.wait_for_words("replaying", PATIENCE);
     let connection = Connection::open(&again, "tests", PATIENCE).expect("connect");
     assert_eq!(connection.info().recorded_world, info.recorded_world);
+}
+
+#[test]
+fn a_server_takes_less_memory_than_twice_its_recorded_states() {
+    let place = Place::new(&[1000], (256, 256));
+    let server = Server::start(&place.flags(""));
+    let status = format!("/proc/{}/status", server.program.pid());
+    let status = std::fs::read_to_string(status).expect("a process");
+    let most = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+    let most = most
+        .and_then(|most| most.trim().strip_suffix(" kB"))
+        .expect("kilobytes");
+    let most: usize = most.parse().expect("a number");
+    assert!(most < 2 * 64_000, "{most} kB for 64,000 kB of states");
 }
 
 #[test]

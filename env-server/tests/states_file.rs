@@ -429,23 +429,3 @@ fn settings_follow_the_file_and_offsets_leave_a_step() {
         "{error}"
     );
 }
-
-/// `cargo test --release -p emberwatch-server --test states_file -- --ignored --nocapture`
-#[test]
-#[ignore = "measures"]
-fn a_thousand_steps_of_256_x_256_cells_load_within_a_second_and_twice_their_size() {
-    let states = sequence(0, (1000, 256, 256));
-    let view: ArrayView3<'_, u8> = states.view();
-    assert_eq!(view.len(), 65_536_000);
-    let bytes = npy(&states);
-    let folder = TempDir::new().expect("a folder");
-    for method in [CompressionMethod::Stored, CompressionMethod::Deflated] {
-        let archive = npz(&[("states_000.npy", bytes.clone())], method);
-        let path = file_in(&folder, "large.npz", &archive);
-        let start = std::time::Instant::now();
-        let file = StatesFile::read(&path).expect("valid");
-        eprintln!("{method}: {:?}", start.elapsed());
-        assert!(start.elapsed().as_secs_f64() < 1.0);
-        assert_eq!(file.sequences.arrays, std::slice::from_ref(&states));
-    }
-}

@@ -294,6 +294,77 @@ fn a_prediction_is_the_average_over_simulated_next_steps() {
     assert!(worst < 4.5 * 0.5 / (n_draws as f64).sqrt(), "{worst}");
 }
 
+/// Steps of the worlds whose statistics are taken.
+const N_STEPS: u64 = 300;
+
+/// What burns and what is burnt in a world over time: the share of its cells, and of pairs of neighbours.
+fn statistics(mut step: impl FnMut(u64) -> Grid<u8>) -> [f64; 4] {
+    let mut sums = [0.0; 4];
+    for n in 0..N_STEPS {
+        let states = step(n);
+        for state in 1..3 {
+            let of_cells = states.iter().filter(|&&it| it == state).count();
+            let pairs = states.windows([1, 2]);
+            let of_pairs = pairs
+                .into_iter()
+                .filter(|pair| pair.iter().all(|&it| it == state));
+            sums[2 * usize::from(state) - 2] += of_cells as f64;
+            sums[2 * usize::from(state) - 1] += of_pairs.count() as f64;
+        }
+    }
+    sums.map(|sum| sum / (N_STEPS as f64))
+}
+
+#[test]
+fn worlds_that_burn_out_are_those_of_a_simulation_by_the_formula() {
+    let model = burnout();
+    let mut dynamics = Dynamics::new(&model, shape(16, 20)).expect("a model");
+    let n_worlds = 48;
+    let (mut ours, mut theirs) = (Vec::new(), Vec::new());
+    for seed in 0..n_worlds {
+        let mut states = dynamics.initial(seed);
+        let mut others = states.clone();
+        ours.push(statistics(|n| {
+            dynamics.step(seed, n, &mut states);
+            states.clone()
+        }));
+        theirs.push(statistics(|n| {
+            others = drawn(&model, &others, seed * N_STEPS + n);
+            others.clone()
+        }));
+    }
+    for index in 0..4 {
+        let moments = |worlds: &[[f64; 4]]| {
+            let n = worlds.len() as f64;
+            let mean = worlds.iter().map(|world| world[index]).sum::<f64>() / n;
+            let squares = worlds.iter().map(|world| (world[index] - mean).powi(2));
+            (mean, squares.sum::<f64>() / (n * (n - 1.0)))
+        };
+        let ((mean, variance), (other, of_other)) = (moments(&ours), moments(&theirs));
+        let z = (mean - other) / (variance + of_other).sqrt();
+        assert!(
+            mean > 1.0 && z.abs() < 4.0,
+            "{index}: {mean} against {other}, {z} errors"
+        );
+    }
+}
+
+/// The next states, drawn from the formula cell by cell.
+fn drawn(model: &Model, states: &Grid<u8>, key: u64) -> Grid<u8> {
+    let known = one_hot(3, states);
+    Grid::from_shape_fn(states.dim(), |(row, col)| {
+        let own = usize::from(states[[row, col]]);
+        let weights = weights(model, &known, own, (row, col));
+        let total: f64 = weights.iter().sum();
+        let mut rest = total * unit(1 + key, row * states.dim().1 + col);
+        let next = weights.iter().position(|weight| {
+            rest -= weight;
+            rest < 0.0
+        });
+        next.unwrap_or(own) as u8
+    })
+}
+
 /// Outcomes by the cell's own state and which neighbours burn, and those that the formula expects.
 type Classes = BTreeMap<(u8, Vec<bool>), [[f64; 3]; 2]>;
 
