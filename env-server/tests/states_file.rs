@@ -2,7 +2,7 @@
 
 use env_server::config::ServerConfig;
 use env_server::states_file::{Sequences, StatesFile};
-use ndarray::{Array, Array3, Array4, ArrayView3, Dimension};
+use ndarray::{Array, Array3, Array4, Dimension};
 use ndarray_npy::{WritableElement, WriteNpyExt};
 use std::fs::{create_dir, write};
 use std::io::{Cursor, Read, Write};
