@@ -194,6 +194,28 @@ fn a_killed_recorder_leaves_whole_records_and_readers_say_where_they_end() {
 }
 
 #[test]
+fn a_recorder_that_is_told_to_stop_records_what_was_published_before() {
+    let server = Server::start(&format!("{SMALL} --publish-truth"));
+    let (_folder, file) = new_file();
+    let recorder = start_recorder(&server.instance, &file, &["--truth"]);
+    let mut client = server.acquire(0..1);
+    recorder.stop();
+    let mut paths = Paths::new(0);
+    for _ in 0..20 {
+        fly(&mut client, paths.next(6));
+    }
+    server.info(); // told after the last step was published
+    recorder.signal(Signal::TERM);
+    recorder.signal(Signal::CONT);
+    assert_eq!(recorder.wait(PATIENCE).code, Some(0));
+    let steps: Vec<u64> = frames(&read_whole(&file))
+        .iter()
+        .map(|frame| frame.header.result.step)
+        .collect();
+    assert!(steps.ends_with(&Vec::from_iter(1..=20)), "{steps:?}");
+}
+
+#[test]
 fn a_recorder_comes_before_the_server_and_stays_for_the_next() {
     let instance = new_instance();
     let (_folder, file) = new_file();

@@ -153,6 +153,7 @@ fn the_same_paths_give_the_same_bytes_whoever_sends_them_in_whatever_order() {
     let (_folder, file) = new_file();
     let recorder = start_recorder(&apart.instance, &file, &[]);
     assert!(fly(&apart, &[0..1, 1..2, 2..3, 3..4]) == expected);
+    apart.info(); // told after the last step was published
     stop(recorder);
     let in_parts = Server::start(FLAGS);
     assert!(fly(&in_parts, &[0..3, 3..4]) == expected);

@@ -5,7 +5,7 @@
 
 use anyhow::{Context, Result};
 use protocol::Connection;
-use protocol::channels::{ChannelError, Instance};
+use protocol::channels::{ChannelError, FRAME_BUFFER, Instance};
 use protocol::connection::ConnectionError;
 use protocol::control::ServerInfo;
 use protocol::message::{FrameHeader, TruthHeader};
@@ -103,8 +103,14 @@ pub fn record(options: &RecordOptions, stop: &AtomicBool) -> Result<RecordSummar
         true => tracing::info!(instance, "recording"),
         false => tracing::info!(instance, "no server yet; recording when there is one"),
     }
-    while !stop.load(Ordering::Relaxed) && !recorder.is_done() && recorder.writing.is_running() {
-        recorder.run_once(&frames, truths.as_ref())?;
+    while !stop.load(Ordering::Relaxed) && recorder.goes_on() {
+        recorder.run_once(&frames, truths.as_ref(), TICK)?;
+    }
+    // What was published before the stop may not have been read yet. A server that goes on must not keep it busy.
+    for _ in 0..FRAME_BUFFER {
+        if !recorder.goes_on() || !recorder.run_once(&frames, truths.as_ref(), Duration::ZERO)? {
+            break;
+        }
     }
     recorder.finish().with_context(file)
 }
@@ -136,13 +142,15 @@ struct Channel {
 }
 
 impl Recorder<'_> {
-    /// Waits for a frame; records it after the hidden states before it.
+    /// Waits for a frame; records it after the hidden states before it. Returns whether there was one.
     fn run_once(
         &mut self,
         frames: &Observer<FrameHeader>,
         truths: Option<&Observer<TruthHeader>>,
-    ) -> Result<()> {
-        let frame = frames.receive(TICK)?;
+        limit: Duration,
+    ) -> Result<bool> {
+        let frame = frames.receive(limit)?;
+        let is_there = frame.is_some();
         if let Some(truths) = truths {
             while let Some(sample) = truths.try_receive()? {
                 self.take_truth(truths.publisher(), sample);
@@ -151,7 +159,7 @@ impl Recorder<'_> {
         if let Some(sample) = frame {
             self.take_frame(frames.publisher(), sample);
         }
-        Ok(())
+        Ok(is_there)
     }
 
     fn take_truth(&mut self, publisher: Option<u32>, sample: Sample<TruthHeader>) {
@@ -257,8 +265,10 @@ impl Recorder<'_> {
         });
     }
 
-    fn is_done(&self) -> bool {
-        self.options.n_steps > 0 && self.n_steps >= self.options.n_steps
+    /// Whether there is more to record, and somebody who writes it.
+    fn goes_on(&self) -> bool {
+        let is_done = self.options.n_steps > 0 && self.n_steps >= self.options.n_steps;
+        !is_done && self.writing.is_running()
     }
 
     fn finish(self) -> Result<RecordSummary, RecordingError> {
