@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
@@ -61,6 +62,14 @@ def test_pettingzoo_finds_no_fault_in_paths() -> None:
     about = {str(warning.message).partition(" of ")[0] for warning in warned}
     assert all("bservation" in text or "ction" in text for text in about), about
     env.close()
+
+
+def test_without_pettingzoo_an_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pettingzoo", None)
+    monkeypatch.delitem(sys.modules, "emberwatch.parallel")
+    told = r"pip install emberwatch\[teams\]; got: .*pettingzoo"
+    with pytest.raises(ModuleNotFoundError, match=told):
+        emberwatch.parallel_env(robots=4)
 
 
 @pytest.mark.parametrize("action", ["move", "path"])

@@ -91,7 +91,14 @@ gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
 
 
 def parallel_env(**keywords: Any) -> WildfireParallelEnv:
-    """All robots of one world as a PettingZoo environment; see `WildfireParallelEnv`."""
-    from emberwatch.parallel import WildfireParallelEnv
+    """All robots of one world as a PettingZoo environment; see `WildfireParallelEnv`.
+
+    Raises `ModuleNotFoundError` without PettingZoo, which ``pip install emberwatch[teams]`` brings.
+    """
+    try:
+        from emberwatch.parallel import WildfireParallelEnv
+    except ModuleNotFoundError as error:
+        needed = "expected PettingZoo: pip install emberwatch[teams]"
+        raise ModuleNotFoundError(f"parallel_env: {needed}; got: {error}") from None
 
     return WildfireParallelEnv(**keywords)
