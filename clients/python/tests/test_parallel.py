@@ -185,9 +185,12 @@ def test_actions_of_other_agents_are_refused() -> None:
     env = team(robots=2)
     assert env.step({}) == ({}, {}, {}, {}, {})
     env.reset(seed=1)
-    for actions in ({}, {"robot_0": 1}, {"robot_0": 1, "robot_1": 1, "robot_2": 1}):
+    wrong: Any = ({}, {"robot_0": 1}, {"robot_0": 1, "robot_1": 1, 2: 1}, [1, 1], None)
+    for actions in wrong:
         with pytest.raises(InvalidArgumentError, match="actions: expected one for each of"):
             env.step(actions)
+    with pytest.raises(InvalidArgumentError, match="actions: expected all of one shape"):
+        env.step({"robot_0": 1, "robot_1": [1, 2]})
     with pytest.raises(InvalidArgumentError, match="action: expected 0 to 3, got 4"):
         env.step({"robot_0": 1, "robot_1": 4})
     env.close()

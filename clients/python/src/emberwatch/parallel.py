@@ -118,13 +118,17 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         dict[str, dict[str, Any]],
     ]:
         """A move or a path of each robot; raises as `WildfireEnv.step` does."""
-        if actions.keys() != set(self.agents):
+        given: Any = actions
+        if not isinstance(given, dict) or actions.keys() != set(self.agents):
             raise InvalidArgumentError(
-                f"actions: expected one for each of {self.agents}, got {sorted(actions)}"
+                f"actions: expected one for each of {self.agents}, got {actions}"
             )
         if not actions:
             return {}, {}, {}, {}, {}
-        chosen = np.array([actions[agent] for agent in self.agents])
+        try:
+            chosen = np.array([actions[agent] for agent in self.agents])
+        except ValueError as error:
+            raise InvalidArgumentError(f"actions: expected all of one shape: {error}") from None
         seen, rewards, terminated, truncated, infos = self._worlds.step(chosen)
         if (terminated | truncated).any():
             self.agents = []
