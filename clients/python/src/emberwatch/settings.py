@@ -95,9 +95,10 @@ class Settings:
             if name not in known:
                 alike = get_close_matches(name, known, 1)
                 hint = f" (did you mean {alike[0]!r}?)" if alike else ""
+                # In Python's words, by which TorchRL knows what to leave out.
                 raise TypeError(
-                    f"{environment.__name__}: unknown keyword {name!r}{hint}; known are "
-                    f"{', '.join(sorted(known))}"
+                    f"{environment.__name__}() got an unexpected keyword argument {name!r}{hint}; "
+                    f"known are {', '.join(sorted(known))}"
                 )
         return cls(**world)
 

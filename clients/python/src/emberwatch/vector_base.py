@@ -51,14 +51,14 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
             raise InvalidArgumentError(
                 f"max_episode_steps: expected at least 1 or None, got {max_episode_steps}"
             )
-        self._mode = AutoresetMode(autoreset_mode)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self._session, self._spec = session, session.spec
         spec, num_envs, mode = session.spec, session.n_rows, session.settings.render_mode
         self._observations = observations
         self._views = [View(mode, spec) for _ in range(num_envs)]
         self._max_steps = max_episode_steps
         self._reveals = reveals
-        self.metadata = {**WorldEnv.metadata, "autoreset_mode": self._mode}
+        self.metadata = {**WorldEnv.metadata, "autoreset_mode": self.autoreset_mode}
         self.num_envs = num_envs
         self.render_mode = mode
         self.single_observation_space = observations.space
@@ -116,7 +116,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         """
         chosen = self._check_actions(actions)
         over = self._over
-        if over.any() and self._mode is not AutoresetMode.NEXT_STEP:
+        if over.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
             raise gymnasium.error.ResetNeeded(
                 f"rows {np.flatnonzero(over).tolist()}: the episode is over; reset with "
                 "options={'reset_mask': ...}"
@@ -259,7 +259,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
             truncations |= flown & (self._elapsed >= self._max_steps)
         over = terminations | truncations
         infos: dict[str, Any] = {}
-        if self._mode is AutoresetMode.SAME_STEP and over.any():
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and over.any():
             infos = self._final(over)
             self._restart(np.flatnonzero(over).tolist(), [None] * self._session.n_worlds)
         else:
