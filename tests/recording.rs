@@ -194,7 +194,7 @@ fn a_killed_recorder_leaves_whole_records_and_readers_say_where_they_end() {
 }
 
 #[test]
-fn a_recorder_that_is_told_to_stop_records_what_was_published_before() {
+fn a_recorder_that_is_told_twice_at_once_to_stop_records_what_was_published_before() {
     let server = Server::start(&format!("{SMALL} --publish-truth"));
     let (_folder, file) = new_file();
     let recorder = start_recorder(&server.instance, &file, &["--truth"]);
@@ -206,6 +206,7 @@ fn a_recorder_that_is_told_to_stop_records_what_was_published_before() {
     }
     server.info(); // told after the last step was published
     recorder.signal(Signal::TERM);
+    recorder.signal(Signal::INT); // as when `timeout` signals a process and its group
     recorder.signal(Signal::CONT);
     assert_eq!(recorder.wait(PATIENCE).code, Some(0));
     let steps: Vec<u64> = frames(&read_whole(&file))

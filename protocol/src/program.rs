@@ -2,11 +2,14 @@
 //! when another process ends.
 
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::iterator::Signals;
+use signal_hook::low_level::exit;
 use std::fs::File;
 use std::io::{IsTerminal, Read};
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 use tracing_subscriber::EnvFilter;
 
 /// The name that `agent` uses.
@@ -14,6 +17,8 @@ pub use crate::wire::process::{NotRunning, WatchedProcess};
 
 /// Longest settings or model file, bytes: a model of 64 states with kernels of 15 x 15 cells has 5 MB.
 pub const MAX_TEXT_BYTES: u64 = 16 << 20;
+
+const SAME_SIGNAL: Duration = Duration::from_millis(500);
 
 /// Logs to standard error, at `info` unless `RUST_LOG` says otherwise.
 pub fn start_logging() {
@@ -40,15 +45,26 @@ pub fn read_text(path: &Path) -> std::io::Result<String> {
     Ok(text)
 }
 
-/// A flag that SIGINT, SIGTERM or SIGHUP sets; a second one ends the process at once.
+/// A flag that SIGINT, SIGTERM or SIGHUP sets; another one ends the process at once. `timeout` and shells send a
+/// signal to a process and to its group: what follows within half a second is taken as the same one.
 ///
 /// # Errors
-/// If the system refuses a handler.
+/// If the system refuses a handler or a thread.
 pub fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
-    for signal in [SIGINT, SIGTERM, SIGHUP] {
-        signal_hook::flag::register_conditional_shutdown(signal, 1, stop.clone())?;
-        signal_hook::flag::register(signal, stop.clone())?;
-    }
+    let flag = stop.clone();
+    let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP])?;
+    let wait = move || {
+        let mut first: Option<Instant> = None;
+        for _ in &mut signals {
+            flag.store(true, Ordering::SeqCst);
+            if first.get_or_insert_with(Instant::now).elapsed() > SAME_SIGNAL {
+                exit(1);
+            }
+        }
+    };
+    std::thread::Builder::new()
+        .name("signals".into())
+        .spawn(wait)?;
     Ok(stop)
 }
