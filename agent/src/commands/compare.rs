@@ -90,7 +90,8 @@ impl CompareCommand {
             [] => vec![None],
             robots => robots.iter().copied().map(Some).collect(),
         };
-        let (mut report, mut added) = (Report::default(), None);
+        let added = self.read_added()?;
+        let mut report = Report::default();
         for n_robots in numbers {
             let mut worlds = self.worlds.open(self.needs_scouts(), n_robots, |model| {
                 self.policies(model, &learned).map(|_| ())
@@ -112,9 +113,7 @@ impl CompareCommand {
                 config: config.clone(),
                 learned: learned.clone(),
             };
-            if added.is_none() {
-                added = Some(self.read_added(&comparison, arena.info().n_moves)?);
-            }
+            check_added(&added, &comparison, arena.info().n_moves)?;
             let results = run_comparison(arena, &comparison)?;
             if let Some(directory) = &self.figures {
                 draw_step(directory, arena, &results)?;
@@ -122,7 +121,7 @@ impl CompareCommand {
             report.is_recorded = arena.is_recorded();
             report.add(axis_label(arena.model()), results);
         }
-        self.tell(&report, added.unwrap_or_default(), &config)
+        self.tell(&report, added, &config)
     }
 
     /// Writes table and files.
@@ -145,19 +144,13 @@ impl CompareCommand {
         }
     }
 
-    fn read_added(&self, comparison: &Comparison, n_moves: usize) -> Result<Vec<PolicyRun>> {
+    fn read_added(&self) -> Result<Vec<PolicyRun>> {
         let read = |path: &PathBuf| {
             let expected = "expected a CSV file of `compare --csv` or emberwatch.benchmark";
             read_csv(path).with_context(|| format!("--add: {}: {expected}", path.display()))
         };
         let files = self.add.iter().map(read);
-        let added = files.collect::<Result<Vec<_>>>()?.concat();
-        let policies = comparison.policies.iter();
-        let policies: Vec<&str> = policies.map(|policy| &*policy.name).collect();
-        let (seeds, steps) = (&comparison.seeds, comparison.steps);
-        let steps = (steps, comparison.recent_steps);
-        check_settings(&added, &policies, seeds, steps, n_moves).context("--add")?;
-        Ok(added)
+        Ok(files.collect::<Result<Vec<_>>>()?.concat())
     }
 
     /// Makes the folders of the files to come: better to fail before a long comparison than after.
@@ -254,6 +247,13 @@ impl Report {
         self.fire_cells = results.fire_cells;
         self.axis_label = axis_label;
     }
+}
+
+fn check_added(added: &[PolicyRun], comparison: &Comparison, n_moves: usize) -> Result<()> {
+    let policies = comparison.policies.iter();
+    let policies: Vec<&str> = policies.map(|policy| &*policy.name).collect();
+    let steps = (comparison.steps, comparison.recent_steps);
+    check_settings(added, &policies, &comparison.seeds, steps, n_moves).context("--add")
 }
 
 fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConfig) -> Result<()> {
