@@ -132,7 +132,8 @@ pub fn first_worlds(checked: &Checked, spec: &WorldSpec) -> Result<Option<FirstW
         return Ok(None);
     }
     let path = Path::new(&checked.config.restore);
-    let files = if path.is_dir() {
+    let is_folder = path.is_dir();
+    let files = if is_folder {
         let folder = Folder::new(path, &checked.instance);
         let files = folder.files()?;
         if files.is_empty() {
@@ -153,7 +154,9 @@ pub fn first_worlds(checked: &Checked, spec: &WorldSpec) -> Result<Option<FirstW
                 return Err(refused(&path, error));
             }
             Err(error) if error.is_damaged => {
-                tracing::warn!("{error}");
+                if is_folder {
+                    tracing::warn!("{error}");
+                }
                 damaged.get_or_insert(error);
             }
             Err(error) => return Err(error),
