@@ -17,12 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from torch import nn
 from torch.distributions import Categorical
 
 from emberwatch.benchmark import evaluate, summary
+from emberwatch.planning import beam_search
 
 ENV = "emberwatch/WildfireMoves-v0"
 MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])
@@ -79,38 +81,6 @@ SYMMETRIES = symmetries()
 
 def turned(windows: torch.Tensor, turns: int, mirrored: bool) -> torch.Tensor:
     return torch.rot90(torch.flip(windows, (2,)) if mirrored else windows, turns, (1, 2))
-
-
-def first_moves(
-    values: np.ndarray,
-    robots: np.ndarray,
-    visited: np.ndarray,
-    n_moves: int,
-    rng: np.random.Generator,
-    width: int = 32,
-) -> np.ndarray:
-    """The first moves of paths that beam search finds to the highest sum of values, `(n, H, W)`."""
-    n, height, n_columns = values.shape
-    cells = np.stack(np.meshgrid(range(height), range(n_columns), indexing="ij"), -1)
-    after = (cells[:, :, None] + MOVES).clip(0, (height - 1, n_columns - 1))
-    after = (after[..., 0] * n_columns + after[..., 1]).reshape(-1, 4)
-    flat, worlds = values.reshape(n, -1), np.arange(n)[:, None]
-    at = (robots[:, 0] * n_columns + robots[:, 1])[:, None]
-    seen = visited.reshape(n, 1, -1) > 0
-    scores, firsts = np.zeros((n, 1)), np.zeros((n, 1), np.int64)
-    for move in range(n_moves):
-        reached = after[at].reshape(n, -1)
-        parents = np.repeat(np.arange(at.shape[1]), 4)[None]
-        new = scores[worlds, parents] + ~seen[worlds, parents, reached] * flat[worlds, reached]
-        new += 1e-6 * rng.random(new.shape)  # ties are broken at random
-        n_kept = min(width, new.shape[1])
-        kept = np.argpartition(-new, n_kept - 1, axis=1)[:, :n_kept]
-        parents = kept // 4
-        at, scores = reached[worlds, kept], new[worlds, kept]
-        firsts = kept % 4 if move == 0 else firsts[worlds, parents]
-        seen = seen[worlds, parents]
-        seen[worlds, np.arange(n_kept)[None], at] = True
-    return firsts[np.arange(n), scores.argmax(1)]
 
 
 class Training:
@@ -178,7 +148,13 @@ class Training:
             for _ in range(args.n_moves):
                 seen, left = self.seen, args.n_moves - int(self.seen["move"][0])
                 values = seen["belief"][..., target] / 255 + 0.02
-                best = first_moves(values, seen["robot"], seen["visited"], left, self.rng)
+                paths = beam_search(
+                    *(values, seen["robot"], left),
+                    rng=self.rng,
+                    visited=seen["visited"],
+                    width=32,
+                )
+                best = paths[:, 0].astype(np.int64)
                 at = (n_known + np.arange(len(best))) % len(wanted)
                 windows[at], wanted[at] = self.windows(), best
                 n_known += len(best)
@@ -299,11 +275,6 @@ def acting(network: Network, *, sampled: bool) -> Any:
 
 def draw(folder: Path) -> None:
     """The curve of a training, from its log."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     with (folder / "log.csv").open() as log:
         rows = list(csv.DictReader(log))
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")

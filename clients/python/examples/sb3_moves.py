@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import matplotlib.pyplot as plt
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -58,11 +59,6 @@ class Curve(BaseCallback):
 
 def draw(log: Path) -> None:
     """The curve of a training, from its log."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     rows = [tuple(map(float, line.split(","))) for line in log.read_text().splitlines()[1:]]
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
     axes.plot(*zip(*rows, strict=True))

@@ -25,6 +25,11 @@ EXAMPLES = [
         r"ppo: \d\S* \+- \S+ a step on 8 worlds",
     ),
     (
+        "learned_belief.py",
+        "--worlds 8 --cpu-seconds 6 --steps 5 --out OUT",
+        r"learned_belief: \d\S* \+- \S+ a step on 8 worlds",
+    ),
+    (
         "sb3_objective.py",
         "--total-steps 500 --evaluation-steps 50",
         r"always fire +[1-9]\S* fires found a step\n(.*\n)*PPO +\d",

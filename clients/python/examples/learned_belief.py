@@ -1,0 +1,288 @@
+"""Beam search on a belief that a network has corrected, learned from frames, in one file.
+
+python learned_belief.py --cpu-seconds 300 --evaluate 0..32 --out learned_belief
+
+The filter takes cells as independent: what is seen at one says nothing about those around it. The
+network learns what it says. It adds to the filter's log-probabilities, from what was last seen at
+each cell and around it, and its loss is how improbable the next observations were, under the
+model's observation matrix. Neither hidden states nor rewards are needed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from torch import nn
+
+from emberwatch.benchmark import evaluate, summary
+from emberwatch.model import Model
+from emberwatch.planning import beam_search
+
+ENV = "emberwatch/Wildfire-v0"
+PARTS = ("belief", "frame", "robot")
+UNOBSERVED = 255
+#: Columns of the log: what has been used, then means since the last row.
+COLUMNS = ("cpu_seconds", "moves", "reward_per_path", "loss", "filters_loss", "env_seconds")
+
+
+class Sightings:
+    """What each cell looked like when it was last seen, and the time before, with ages in steps."""
+
+    def __init__(self, frames: np.ndarray, n_observations: int) -> None:
+        self.never = n_observations
+        self.values = np.full((2, *frames.shape), self.never, np.uint8)
+        self.ages = np.full((2, *frames.shape), np.inf, np.float32)
+
+    def forget(self, worlds: np.ndarray) -> None:
+        self.values[:, worlds], self.ages[:, worlds] = self.never, np.inf
+
+    def see(self, frames: np.ndarray) -> None:
+        seen = frames != UNOBSERVED
+        self.ages += 1
+        self.values[1, seen], self.ages[1, seen] = self.values[0, seen], self.ages[0, seen]
+        self.values[0, seen], self.ages[0, seen] = frames[seen], 1
+
+    def images(self, beliefs: np.ndarray) -> torch.Tensor:
+        """What the network sees, `(n, channels, H, W)`; the first channels are the belief."""
+        one_hot = np.eye(self.never + 1, dtype=np.float32)[self.values]
+        parts = [
+            beliefs / np.float32(255),
+            *one_hot,
+            *(np.exp(-self.ages[0] / steps)[..., np.newaxis] for steps in (4, 32)),
+            np.exp(-self.ages[1] / 32)[..., np.newaxis],
+            np.ones((*beliefs.shape[:-1], 1), np.float32),  # unlike what is off the grid
+        ]
+        return torch.from_numpy(np.concatenate(parts, axis=-1)).permute(0, 3, 1, 2)
+
+
+class Belief(nn.Module):
+    """Log-probabilities of each cell's states: the filter's and what the network adds."""
+
+    def __init__(self, model: Model) -> None:
+        super().__init__()
+        self.n_states = model.n_states
+        n_channels = self.n_states + 2 * (model.n_observations + 1) + 4
+        self.layers = nn.Sequential(
+            *(nn.Conv2d(n_channels, 32, 3, padding=1), nn.ReLU()),
+            *(nn.Conv2d(32, 32, 3, padding=1), nn.ReLU()),
+            *(nn.Conv2d(32, 32, 3, padding=1), nn.ReLU()),
+            nn.Conv2d(32, self.n_states, 3, padding=1),
+        )
+        nn.init.zeros_(self.layers[-1].weight)
+        nn.init.zeros_(self.layers[-1].bias)
+
+    def filters(self, images: torch.Tensor) -> torch.Tensor:
+        # A belief comes in steps of 1 / 255.
+        return images[:, : self.n_states].clamp(min=1 / 510).log().log_softmax(1)
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return (self.filters(images) + self.layers(images)).log_softmax(1)
+
+
+class Policy:
+    """Paths over the cells that most probably pay; remembers what it saw in each world."""
+
+    def __init__(self, belief: Belief, model: Model, args: argparse.Namespace) -> None:
+        self.belief, self.model, self.args = belief, model, args
+        self.rng = np.random.default_rng(args.seed)
+        self.sightings: Sightings | None = None
+
+    def begin(self, n_worlds: int) -> None:
+        """Other worlds begin."""
+        self.sightings = None
+
+    def look(self, seen: dict[str, np.ndarray]) -> torch.Tensor:
+        """What is known now that these observations have come."""
+        frames = seen["frame"][..., 0]
+        if self.sightings is None:
+            self.sightings = Sightings(frames, self.model.n_observations)
+        self.sightings.see(frames)
+        return self.sightings.images(seen["belief"])
+
+    @torch.no_grad()
+    def plan(self, images: torch.Tensor, robots: np.ndarray) -> np.ndarray:
+        values = self.belief(images)[:, self.model.target_state].exp().numpy() + 0.02
+        args = self.args
+        return beam_search(values, robots, args.n_moves, rng=self.rng, width=args.beam)
+
+    def __call__(self, seen: dict[str, np.ndarray]) -> np.ndarray:
+        return self.plan(self.look(seen), seen["robot"])
+
+
+class Replay:
+    """Images, and what was then observed."""
+
+    def __init__(self, images: torch.Tensor, size: int) -> None:
+        self.images = torch.zeros((size, *images.shape[1:]), dtype=torch.float16)
+        self.frames = np.full((size, *images.shape[2:]), UNOBSERVED, np.uint8)
+        self.n_added = 0
+
+    def add(self, images: torch.Tensor, frames: np.ndarray) -> None:
+        at = (self.n_added + np.arange(len(images))) % len(self.images)
+        self.images[at], self.frames[at] = images.half(), frames
+        self.n_added += len(images)
+
+    def sample(self, n: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+        at = rng.integers(0, min(self.n_added, len(self.images)), n)
+        images, frames = self.images[at].float(), torch.from_numpy(self.frames[at])
+        if rng.random() < 0.5:  # the world looks the same mirrored
+            images, frames = images.flip(3), frames.flip(2)
+        return images, frames
+
+
+class Training:
+    """Worlds that the policy flies, and the network that learns from its frames."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        torch.set_num_threads(args.threads)
+        torch.manual_seed(args.seed)
+        self.args, self.rng = args, np.random.default_rng(args.seed)
+        self.envs = gymnasium.make_vec(
+            ENV,
+            num_envs=args.worlds,
+            autoreset_mode="SameStep",
+            max_episode_steps=args.episode,
+            observation=PARTS,
+            **world(args),
+        )
+        model = self.envs.unwrapped.model
+        self.observed_as = torch.from_numpy(model.observation_matrix).float()
+        self.belief = Belief(model)
+        if args.load is not None:
+            self.belief.load_state_dict(torch.load(args.load))
+        self.policy = Policy(self.belief, model, args)
+
+    def learn(self) -> None:
+        args, begin = self.args, time.process_time()
+        optimizer = torch.optim.Adam(self.belief.parameters())
+        seen, _ = self.envs.reset(seed=args.seed)
+        images = self.policy.look(seen)
+        replay, log, n_steps, env_seconds = Replay(images, 6_000), Log(args.out), 0, 0.0
+        while (used := time.process_time() - begin) < args.cpu_seconds:
+            for group in optimizer.param_groups:
+                group["lr"] = 2e-3 * (1.02 - used / args.cpu_seconds)
+            paths = self.policy.plan(images, seen["robot"])
+            explores = self.rng.random(len(paths)) < 0.1
+            paths[explores] = self.rng.integers(0, 4, (int(explores.sum()), args.n_moves))
+            step_begin = time.process_time()
+            seen, rewards, _, truncated, _ = self.envs.step(paths)
+            env_seconds += time.process_time() - step_begin
+            # The first frame of an episode is empty, so nothing is learned from it.
+            replay.add(images, seen["frame"][..., 0])
+            self.policy.sightings.forget(truncated)
+            images = self.policy.look(seen)
+            losses = [self.update(optimizer, replay) for _ in range(args.updates)]
+            log.add(rewards[~explores].mean(), *np.mean(losses, axis=0))
+            n_steps += 1
+            if n_steps % 100 == 0:
+                log.write(used, n_steps * args.worlds * args.n_moves, env_seconds)
+                torch.save(self.belief.state_dict(), args.out / "belief.pt")
+
+    def update(self, optimizer: Any, replay: Replay) -> tuple[float, float]:
+        """The network's loss and the filter's, in nats per visited cell."""
+        images, frames = replay.sample(64, self.rng)
+        visited = frames != UNOBSERVED
+        observed = frames[visited].long()[:, None]
+
+        def loss_of(log_probabilities: torch.Tensor) -> torch.Tensor:
+            states = log_probabilities.permute(0, 2, 3, 1)[visited].exp()
+            return -(states @ self.observed_as).gather(1, observed).log().mean()
+
+        loss = loss_of(self.belief(images))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        return loss.item(), loss_of(self.belief.filters(images)).item()
+
+
+class Log:
+    """Means of what was added, as rows of a file."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.rows = csv.writer((folder / "log.csv").open("w", buffering=1))
+        self.rows.writerow(COLUMNS)
+        self.added: list[tuple[float, ...]] = []
+
+    def add(self, *numbers: float) -> None:
+        self.added.append(numbers)
+
+    def write(self, used: float, moves: int, env_seconds: float) -> None:
+        reward, loss, filters = np.mean(self.added, axis=0)
+        self.added.clear()
+        self.rows.writerow((used, moves, reward, loss, filters, env_seconds))
+        print(f"{used:4.0f} s: reward {reward:.2f}, loss {loss:.4f}, the filter's {filters:.4f}")
+
+
+def draw(folder: Path) -> None:
+    """How much less the network's loss is than the filter's."""
+    with (folder / "log.csv").open() as log:
+        rows = list(csv.DictReader(log))
+    gains = [float(row["filters_loss"]) - float(row["loss"]) for row in rows]
+    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+    axes.plot([float(row["cpu_seconds"]) for row in rows], gains)
+    axes.set(xlabel="processor seconds", ylabel="nats per visited cell, better than the filter")
+    figure.savefig(folder / "curve.png", dpi=120)
+
+
+def world(args: argparse.Namespace) -> dict[str, Any]:
+    """The keywords of the worlds."""
+    names = ("model", "height", "width", "n_moves", "burn_in")
+    # A busy machine may take its time.
+    return {name: getattr(args, name) for name in names} | {"timeout": 60.0}
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument("--cpu-seconds", type=float, default=300, help="of the training")
+    parser.add_argument("--out", type=Path, default=Path("learned_belief"), help="a folder")
+    parser.add_argument(
+        "--evaluate", default="5000..5008", help="seeds, FIRST..END; below 1000: test"
+    )
+    parser.add_argument("--steps", type=int, default=100, help="paths of each world evaluated")
+    parser.add_argument("--load", type=Path, help="a network to begin with")
+    parser.add_argument("--name", default="learned_belief", help="in the benchmark's table")
+    parser.add_argument("--seed", type=int, default=1000, help="of the first training world, too")
+    parser.add_argument("--model", default="wildfire-small")
+    for name, default in (("height", 16), ("width", 16), ("n-moves", 16), ("burn-in", 3000)):
+        parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--beam", type=int, default=64, help="width of the beam")
+    parser.add_argument("--worlds", type=int, default=64)
+    parser.add_argument("--episode", type=int, default=400, help="paths of an episode")
+    parser.add_argument("--updates", type=int, default=2, help="for each step of the worlds")
+    parser.add_argument("--threads", type=int, default=1)
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Trains, then scores the policy for the benchmark's table."""
+    args = arguments()
+    training = Training(args)
+    training.learn()
+    training.envs.close()
+    draw(args.out)
+    first, end = map(int, args.evaluate.split(".."))
+    rows = evaluate(
+        training.policy,
+        name=args.name,
+        env=ENV,
+        estimator="network",
+        seeds=range(first, end),
+        steps=args.steps,
+        csv=args.out / "rows.csv",
+        observation=PARTS,
+        **world(args),
+    )
+    print(summary(rows))
+
+
+if __name__ == "__main__":
+    main()
