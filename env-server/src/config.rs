@@ -21,61 +21,34 @@ const MAX_WORLDS: u32 = 1024;
 /// The name of the default model.
 const WILDFIRE: &str = "wildfire";
 
-/// Every setting; `config/server.toml` lists them with their defaults.
+/// Every setting; `config/server.toml` says what each means, and `flags.rs`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ServerConfig {
-    /// Name under which clients find this server.
     pub instance: String,
-    /// Number of independent worlds, 1 to 1024; world i starts from `seed + i`.
     pub worlds: u32,
-    /// Robots of each world, 1 to 64; at most 4096 in all worlds together.
     pub robots: u32,
-    /// How long a world waits for the paths of its other held robots from the first path on, milliseconds; 0: no
-    /// deadline.
     pub deadline_millis: u64,
-    /// A built-in model (`wildfire`, `wildfire-sparse`, `wildfire-latent`, `wildfire-small`,
-    /// `wildfire-burnout`), or the path of a model file.
     pub model: String,
-    /// A states file: worlds show its sequences, and model, grid and burn-in are not used; empty: none.
     pub states: String,
-    /// Whether seeds also choose among the symmetries of the grid.
     pub states_symmetries: bool,
-    /// Largest recorded step with which an episode begins; each seed draws its own.
     pub states_offset: u64,
-    /// Grid height, cells.
     pub height: usize,
-    /// Grid width, cells.
     pub width: usize,
-    /// Moves in a path, 1 to 4096 (the paper's T).
     pub moves: usize,
-    /// Seed of world 0.
     pub seed: u64,
-    /// Steps simulated from the initial distribution before k = 0.
     pub burn_in: u64,
-    /// Episode length in steps; 0: never truncated.
     pub max_steps: u64,
-    /// What a step observes: `path`, `full`, or `client` (a step may ask for a full frame).
     pub coverage: CoverageRule,
-    /// The robots' first cells: `corner` (each in another), `centre`, `random`, or `{ row = R, col = C }`.
     pub start: Start,
-    /// Publish the hidden states, for evaluation and pictures.
     pub publish_truth: bool,
-    /// Tell clients the model, so that they can run the known-model filter.
     pub reveal_model: bool,
-    /// A lease ends this long after its last use, milliseconds, unless its client asks otherwise.
     pub lease_millis: u64,
-    /// Threads that simulate; 0: one per core.
     pub threads: usize,
-    /// Steps of each world whose frames are kept for later agents, 1 to 1,000,000.
     pub history: u32,
-    /// Start with the worlds of this snapshot file, or of the last in this folder; empty: with new ones.
     pub restore: String,
-    /// Steps of each world between two snapshots; 0: none are written.
     pub snapshot_every: u64,
-    /// The folder for these snapshots.
     pub snapshot_dir: String,
-    /// How many of them to keep, at least 1; the last that survives a loss of power is kept too.
     pub snapshot_keep: u32,
 }
 
@@ -162,9 +135,6 @@ impl Default for ServerConfig {
 
 impl ServerConfig {
     /// Checks every setting; a states file decides model, grid and burn-in.
-    ///
-    /// # Errors
-    /// If a setting is wrong; the error names the first, what it must be and what it is.
     pub fn check(mut self) -> Result<Checked, ConfigError> {
         let instance = Instance::new(&self.instance)?;
         self.check_ranges()?;
@@ -236,9 +206,6 @@ impl ServerConfig {
     }
 
     /// The settings of a TOML file.
-    ///
-    /// # Errors
-    /// If it cannot be read or is malformed.
     pub fn read(path: &Path) -> Result<Self, ConfigError> {
         let wrong = |error: &dyn Display| file_error("config file", path, error);
         let text = read_text(path).map_err(|error| wrong(&error))?;
@@ -303,7 +270,6 @@ fn in_range(setting: &'static str, got: u64, least: u64, most: u64) -> Result<()
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::Cell;
 
     #[test]
     fn the_documented_file_holds_the_defaults() {
@@ -320,37 +286,5 @@ mod tests {
             n_settings,
             "a setting is not listed"
         );
-    }
-
-    fn check(change: impl FnOnce(&mut ServerConfig), expected: &str) {
-        let mut config = ServerConfig::default();
-        change(&mut config);
-        let error = config.check().expect_err("must be refused").to_string();
-        assert!(
-            error.contains(expected),
-            "{error:?} does not say {expected:?}"
-        );
-    }
-
-    #[test]
-    fn wrong_settings_are_named() {
-        check(|c| c.worlds = 0, "worlds: expected 1 to 1024, got 0");
-        check(|c| c.robots = 65, "robots: expected 1 to 64, got 65");
-        check(
-            |c| (c.worlds, c.robots) = (1024, 5),
-            "worlds times robots: expected 1 to 4096, got 5120",
-        );
-        check(|c| c.moves = 4097, "moves: expected 1 to 4096, got 4097");
-        check(|c| c.height = 0, "height and width in 1..=4096, got 0 x 64");
-        check(|c| c.instance = "a b".into(), "instance name");
-        check(
-            |c| c.model = "no/such.toml".into(),
-            "model file no/such.toml: ",
-        );
-        check(
-            |c| c.start = Start::At(Cell { row: 64, col: 0 }),
-            "start: expected a cell on the 64 x 64 grid, got (64, 0)",
-        );
-        check(|c| c.lease_millis = 1, "lease_millis");
     }
 }

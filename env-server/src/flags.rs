@@ -105,9 +105,6 @@ pub enum CoverageFlag {
 
 impl ServerFlags {
     /// The effective settings.
-    ///
-    /// # Errors
-    /// If the file cannot be read or is malformed.
     pub fn effective(&self) -> Result<ServerConfig, ConfigError> {
         let mut config = match &self.config {
             None => ServerConfig::default(),

@@ -58,9 +58,6 @@ pub struct StatesError {
 
 impl StatesFile {
     /// Reads a `.npz` or `.npy` file or a folder of these, and the description beside or in it.
-    ///
-    /// # Errors
-    /// If the system refuses, or something is wrong; the error names the first problem.
     pub fn read(path: &Path) -> Result<Self, StatesError> {
         read(path).map_err(|problem| StatesError {
             path: path.display().to_string(),
@@ -84,9 +81,6 @@ impl Sequences {
     }
 
     /// Adds the arrays of a `.npz` archive in the order of their names.
-    ///
-    /// # Errors
-    /// If one is refused; the text names the first problem.
     pub fn add_archive(&mut self, mut archive: impl Read + Seek) -> Result<(), String> {
         let n_entries = n_entries(&mut archive).map_err(|error| error.to_string())?;
         let unfit = |error| format!("expected a .npz archive: {error}");
@@ -113,9 +107,6 @@ impl Sequences {
     }
 
     /// Adds one array in NumPy's format, of so many bytes.
-    ///
-    /// # Errors
-    /// If it is refused; the text says why.
     pub fn add_array(&mut self, name: &str, n_bytes: u64, from: impl Read) -> Result<(), String> {
         let about = |problem: String| format!("array {name:?}: {problem}");
         self.n_bytes = self.n_bytes.saturating_add(n_bytes);

@@ -7,7 +7,7 @@
 
 #![expect(clippy::print_stdout, reason = "the table is the output")]
 
-#[path = "../tests/statistics/mod.rs"]
+#[path = "../tests/model/statistics.rs"]
 mod statistics;
 
 use std::process::ExitCode;

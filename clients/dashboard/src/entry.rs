@@ -12,11 +12,8 @@ use std::time::Instant;
 /// One step of a world.
 #[derive(Debug)]
 pub struct Entry {
-    /// The grid.
     pub shape: Shape,
-    /// The step's result.
     pub result: WorldResult,
-    /// What each robot did.
     pub robots: Vec<Robot>,
     /// Cells that any robot saw, row by row, and what they showed.
     pub seen: Vec<(u32, u8)>,
@@ -31,7 +28,6 @@ pub struct Entry {
 /// A robot's part in a step.
 #[derive(Debug, PartialEq)]
 pub struct Robot {
-    /// Its result.
     pub result: RobotResult,
     /// The path that it flew; empty if it did not fly.
     pub moves: Vec<Move>,
@@ -44,13 +40,10 @@ pub struct Belief {
     pub levels: Box<[u8]>,
     /// Entropy as a share of `ln S`, `round(255 share)`.
     pub entropy: Box<[u8]>,
-    /// What the agent wants.
     pub intent: Intent,
-    /// Its process.
     pub pid: u32,
     /// Number of the first robot that the agent flies.
     pub first_robot: u32,
-    /// How many robots it flies.
     pub n_robots: u32,
     /// How good it is, where that is known.
     pub score: Option<Score>,
@@ -68,9 +61,7 @@ pub struct Score {
 /// The model's states, if the server reveals them: names, and which pays most.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct States {
-    /// The names.
     pub names: Vec<String>,
-    /// The state that pays most.
     pub target: usize,
 }
 

@@ -4,6 +4,8 @@
 //! which keeps the last few thousand steps of each world; a browser asks for one [`picture`] after the other
 //! over a WebSocket of the [`server`], at its own pace; [`page`] is what draws them.
 
+#![allow(missing_docs, reason = "a program, which tests use as a library")]
+
 pub mod album;
 pub mod entry;
 mod memory;

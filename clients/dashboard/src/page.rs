@@ -1,13 +1,9 @@
 //! The page, as it is in this program: no build step, nothing fetched from elsewhere.
 
-/// A file of the page.
 #[derive(Debug, Clone, Copy)]
 pub struct Asset {
-    /// Where browsers ask for it.
     pub path: &'static str,
-    /// What it is.
     pub content_type: &'static str,
-    /// What is in it.
     pub text: &'static str,
 }
 

@@ -32,7 +32,6 @@ const SILENCE: Duration = Duration::from_secs(2);
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ask {
-    /// The world.
     pub world: u32,
     /// Serial number of a step; `None`: the newest.
     pub at: Option<u64>,

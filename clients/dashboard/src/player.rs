@@ -1,45 +1,24 @@
 //! Plays a recording onto the stage, at a speed that browsers choose.
 
 use crate::scene::{Info, Lost, Player, Scene, Stage};
+use anyhow::{Context, Result};
 use protocol::recording::{Event, Reader, Record, RecordingError};
 use std::fs::File;
 use std::io::BufReader;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use thiserror::Error;
 
 /// How often a player that waits looks whether to go on.
 const TICK: Duration = Duration::from_millis(20);
 
-/// Why a recording cannot be played.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum PlayError {
-    /// The file.
-    #[error("recording {}: {problem}", path.display())]
-    File {
-        /// Its path.
-        path: PathBuf,
-        /// What is wrong.
-        problem: RecordingError,
-    },
-    /// A thread cannot be had.
-    #[error("start a thread: {0}")]
-    Thread(#[from] std::io::Error),
-}
-
 /// Plays a recording until `stop`, on the thread that is returned.
 ///
 /// # Errors
-/// [`PlayError::File`] if it cannot be opened or is no recording. What is wrong later on is shown.
-pub fn play(
-    path: &Path,
-    stage: &Arc<Stage>,
-    stop: &Arc<AtomicBool>,
-) -> Result<JoinHandle<()>, PlayError> {
+/// If it cannot be opened or is no recording. What is wrong later on is shown.
+pub fn play(path: &Path, stage: &Arc<Stage>, stop: &Arc<AtomicBool>) -> Result<JoinHandle<()>> {
     let mut reader = Some(open(path)?);
     let player = Player {
         file: path.display().to_string(),
@@ -60,12 +39,12 @@ pub fn play(
             let reader = reader.take().map_or_else(|| open(&path), Ok);
             let played = reader.and_then(|reader| {
                 let played = Playing::new(&stage, &stop).play(reader);
-                played.map_err(|problem| wrong(&path, problem))
+                played.with_context(|| in_file(&path))
             });
             change_player(&stage, |player| {
                 player.ended = true;
                 player.playing = false;
-                player.error = played.err().map(|error| error.to_string());
+                player.error = played.err().map(|error| format!("{error:#}"));
             });
             while !stop.load(Ordering::Relaxed) && !is_playing(&stage) {
                 std::thread::sleep(TICK);
@@ -73,18 +52,16 @@ pub fn play(
             stage.change(begin_again);
         }
     });
-    Ok(thread?)
+    thread.context("start a thread")
 }
 
-fn open(path: &Path) -> Result<Reader<BufReader<File>>, PlayError> {
-    let file = File::open(path).map_err(RecordingError::from);
-    let reader = file.and_then(|file| Reader::new(BufReader::new(file)));
-    reader.map_err(|problem| wrong(path, problem))
+fn open(path: &Path) -> Result<Reader<BufReader<File>>> {
+    let open = || Reader::new(BufReader::new(File::open(path)?));
+    open().with_context(|| in_file(path))
 }
 
-fn wrong(path: &Path, problem: RecordingError) -> PlayError {
-    let path = path.to_owned();
-    PlayError::File { path, problem }
+fn in_file(path: &Path) -> String {
+    format!("recording {}", path.display())
 }
 
 fn begin_again(scene: &mut Scene) {

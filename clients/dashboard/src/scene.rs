@@ -12,7 +12,6 @@ use tokio::sync::watch;
 /// What is watched, and how far it is.
 #[derive(Debug)]
 pub struct Scene {
-    /// The steps.
     pub album: Album,
     /// The instance's name; of a recording, its file's.
     pub instance: String,
@@ -35,24 +34,19 @@ pub struct Scene {
 /// Samples missed since watching began.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Lost {
-    /// Of `frames`.
     pub frames: u64,
-    /// Of `truth`.
     pub truth: u64,
-    /// Of `agent`.
     pub agent: u64,
 }
 
 /// A recording as it plays.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Player {
-    /// The file.
     pub file: String,
     /// Time since the recording began, seconds.
     pub seconds: f64,
     /// How many times as fast as it was recorded; 0: as fast as possible.
     pub speed: f64,
-    /// Whether it runs.
     pub playing: bool,
     /// Whether it has come to its end; to play it then begins again.
     pub ended: bool,

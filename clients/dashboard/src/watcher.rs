@@ -3,6 +3,7 @@
 //! One thread reads what is published, which needs no server; another asks the server now and then how it is.
 
 use crate::scene::{Info, Stage};
+use anyhow::{Context, Result, bail};
 use protocol::agent_belief::AgentBelief;
 use protocol::channels::{AGENT_BUFFER, ChannelError, FRAME_BUFFER, Instance};
 use protocol::connection::{Connection, ConnectionError, unexpected};
@@ -14,7 +15,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use thiserror::Error;
 
 /// Least time between two looks at the channels: a buffer of 64 frames lasts that long at 32,000 steps a second.
 const LEAST_INTERVAL: Duration = Duration::from_millis(2);
@@ -46,27 +46,15 @@ const ASK_TIMEOUT: Duration = Duration::from_secs(2);
 /// The name of this program in a server's log.
 const CLIENT_NAME: &str = "emberwatch-dashboard";
 
-/// Why an instance cannot be watched.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum WatchError {
-    /// The frames cannot be read.
-    #[error("{0}")]
-    Reader(String),
-    /// A thread cannot be had.
-    #[error("start a thread: {0}")]
-    Thread(#[from] std::io::Error),
-}
-
 /// Fills the stage until `stop`, on the threads that are returned.
 ///
 /// # Errors
-/// [`WatchError`], also when there are too many observers.
+/// If the frames cannot be read, as when there are too many observers, or a thread cannot be had.
 pub fn watch(
     instance: &Instance,
     stage: &Arc<Stage>,
     stop: &Arc<AtomicBool>,
-) -> Result<[JoinHandle<()>; 2], WatchError> {
+) -> Result<[JoinHandle<()>; 2]> {
     let (ready, is_ready) = std::sync::mpsc::channel();
     let spawn = |name: &str| std::thread::Builder::new().name(name.into());
     let (place, on, until) = (instance.clone(), stage.clone(), stop.clone());
@@ -77,11 +65,10 @@ pub fn watch(
         if let Ok(reader) = opened {
             read(reader, &place, &on, &until);
         }
-    })?;
-    match is_ready.recv() {
-        Ok(None) => {}
-        Ok(Some(problem)) => return Err(WatchError::Reader(problem)),
-        Err(_) => return Err(WatchError::Reader("it ended at once".into())),
+    });
+    let reader = reader.context("start a thread")?;
+    if let Some(problem) = is_ready.recv().context("the reader ended at once")? {
+        bail!(problem);
     }
     let (place, stage, stop) = (instance.clone(), stage.clone(), stop.clone());
     let asker = spawn("asker").spawn(move || {
@@ -94,8 +81,8 @@ pub fn watch(
             });
             std::thread::sleep(ASK_INTERVAL);
         }
-    })?;
-    Ok([reader, asker])
+    });
+    Ok([reader, asker.context("start a thread")?])
 }
 
 /// Reads until `stop`; opens what fails again.

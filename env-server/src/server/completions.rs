@@ -20,9 +20,6 @@ pub struct CompletionSender<T> {
 }
 
 /// Both ends.
-///
-/// # Errors
-/// If the system has no event descriptor left.
 pub fn completions<T>() -> Result<(CompletionSender<T>, Completions<T>), Errno> {
     let signal = Arc::new(eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?);
     let (sender, results) = channel();

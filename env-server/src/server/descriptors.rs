@@ -19,9 +19,6 @@ pub struct TooFewDescriptors {
 }
 
 /// Raises the soft limit if it is too low.
-///
-/// # Errors
-/// If the hard limit is too low.
 pub fn raise_limit() -> Result<(), TooFewDescriptors> {
     let Some(raised) = enough(getrlimit(Resource::Nofile))? else {
         return Ok(());

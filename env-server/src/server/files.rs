@@ -22,9 +22,6 @@ pub struct Files {
 
 impl Files {
     /// Starts the thread.
-    ///
-    /// # Errors
-    /// If the system has no event descriptor or thread left.
     pub fn start(spec: WorldSpec) -> std::io::Result<Self> {
         let (sender, finished) = completions()?;
         let (jobs, queue) = channel::<(u64, Job)>();

@@ -99,9 +99,6 @@ impl Ports {
     }
 
     /// Opens ports for messages of these sizes.
-    ///
-    /// # Errors
-    /// If another server has them, or the system has too little memory or descriptors.
     pub fn open_with(config: &PortConfig) -> Result<Self> {
         check_shared_memory(config)?;
         raise_limit()?;
@@ -172,9 +169,6 @@ impl Ports {
     }
 
     /// Checks that clients can still find the server.
-    ///
-    /// # Errors
-    /// If the server's files were removed.
     pub fn check_entries(&self) -> Result<(), ChannelError> {
         self.entries.check_at(Instant::now())
     }
@@ -203,33 +197,14 @@ impl Ports {
 
     /// Publishes a step of a world, if anybody observes.
     pub fn publish_frame(&self, header: FrameHeader, bytes: &[u8]) {
-        let sent = self
-            .frames
-            .loan_slice_uninit(bytes.len())
-            .map_err(|error| format!("{error:?}"))
-            .and_then(|mut sample| {
-                *sample.user_header_mut() = header;
-                sample
-                    .write_from_slice(bytes)
-                    .send()
-                    .map_err(|error| format!("{error:?}"))
-            });
+        let sent = publish(&self.frames, header, bytes);
         self.warn_of(sent, "a frame was not published");
     }
 
     /// Publishes hidden states, if the server does so at all.
     pub fn publish_truth(&self, header: TruthHeader, states: &[u8]) {
         let Some(truth) = &self.truth else { return };
-        let sent = truth
-            .loan_slice_uninit(states.len())
-            .map_err(|error| format!("{error:?}"))
-            .and_then(|mut sample| {
-                *sample.user_header_mut() = header;
-                sample
-                    .write_from_slice(states)
-                    .send()
-                    .map_err(|error| format!("{error:?}"))
-            });
+        let sent = publish(truth, header, states);
         self.warn_of(sent, "hidden states were not published");
     }
 
@@ -311,9 +286,6 @@ impl Ports {
     }
 
     /// Drops wake-ups; returns whether there were any.
-    ///
-    /// # Errors
-    /// If iceoryx2 cannot read them.
     pub fn drain(&self) -> Result<bool, ChannelError> {
         drain(&self.listener)
     }
@@ -322,6 +294,18 @@ impl Ports {
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         descriptor(&self.listener)
     }
+}
+
+fn publish<H: Header>(
+    publisher: &Publisher<Ipc, [u8], H>,
+    header: H,
+    bytes: &[u8],
+) -> Result<usize, String> {
+    let sample = publisher.loan_slice_uninit(bytes.len());
+    let mut sample = sample.map_err(|error| format!("{error:?}"))?;
+    *sample.user_header_mut() = header;
+    let sent = sample.write_from_slice(bytes).send();
+    sent.map_err(|error| format!("{error:?}"))
 }
 
 /// The longest payload of a sample on `frames`.

@@ -19,9 +19,6 @@ pub struct Resets {
 
 impl Resets {
     /// Threads without work yet.
-    ///
-    /// # Errors
-    /// If the system has no event descriptor left.
     pub fn new(threads: ThreadPool, rules: Rules) -> Result<Self, Errno> {
         let (sender, finished) = completions()?;
         Ok(Self {

@@ -31,9 +31,6 @@ const CONTROL_FIRST: u64 = 64;
 const NEW_OBSERVER_TICK: Duration = Duration::from_millis(5);
 
 /// Serves until `stop` is set, a client asks to shut down, or the process `exit_with` ends.
-///
-/// # Errors
-/// If the server cannot start, its channels fail, or the last snapshot cannot be written.
 pub fn serve(checked: Checked, stop: &Arc<AtomicBool>, exit_with: Option<i32>) -> Result<()> {
     let mut server = Server::start(checked, exit_with)?;
     let mut outcome = Ok(());

@@ -167,9 +167,6 @@ impl Server {
     }
 
     /// Writes a last snapshot and closes the channels; then others may take the instance.
-    ///
-    /// # Errors
-    /// If the last snapshot could not be written.
     pub(super) fn end(mut self) -> Result<()> {
         self.save(true);
         let (finished, is_late) = match self.files.finish(LAST_FILES) {

@@ -47,9 +47,6 @@ impl Beliefs {
     }
 
     /// Adds the next part of a belief for who flies a robot, at the step of its world; the first starts a new one.
-    ///
-    /// # Errors
-    /// If it is too long or does not follow the part before; the error says what was expected.
     pub fn add(
         &mut self,
         robot: usize,

@@ -64,9 +64,6 @@ pub struct ResetJob {
 
 impl Simulator {
     /// The worlds of a server and the jobs that start them; `next_token` makes the tokens of leases.
-    ///
-    /// # Errors
-    /// If the model does not fit the grid.
     pub fn new(
         checked: Checked,
         threads: ThreadPool,

@@ -16,9 +16,6 @@ use std::time::Instant;
 
 impl Simulator {
     /// Worlds as the bytes of a snapshot file.
-    ///
-    /// # Errors
-    /// If they are more than a file may hold.
     pub fn snapshot(&self, worlds: Range<usize>) -> Result<Vec<u8>, SnapshotError> {
         let places = self.places[worlds].iter();
         let worlds: Vec<_> = places

@@ -36,9 +36,6 @@ pub enum Durability {
 }
 
 /// Writes a file under another name first, so that there is never half of it; mode 0600.
-///
-/// # Errors
-/// If the system refuses, or something else than a snapshot has its name.
 pub fn write(path: &Path, bytes: &[u8], durability: Durability) -> Result<(), FileError> {
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(format!(".{}{PART}", std::process::id()));
@@ -64,9 +61,6 @@ pub fn write(path: &Path, bytes: &[u8], durability: Durability) -> Result<(), Fi
 }
 
 /// Reads a snapshot file.
-///
-/// # Errors
-/// If the system refuses, or it is no regular file with a whole snapshot.
 pub fn read(path: &Path) -> Result<Snapshot, FileError> {
     let bytes = read_bytes(path).map_err(|error| failed(path, error))?;
     let snapshot = bytes.and_then(|bytes| decode(&bytes));

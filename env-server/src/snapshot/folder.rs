@@ -28,9 +28,6 @@ impl Folder {
     }
 
     /// Makes the folder and checks that files can be made in it.
-    ///
-    /// # Errors
-    /// If the system refuses.
     pub fn prepare(&self) -> Result<(), FileError> {
         let probe = self.path.join(format!(".{}.probe", self.instance));
         let made = std::fs::create_dir_all(&self.path)
@@ -68,9 +65,6 @@ impl Folder {
     }
 
     /// The instance's files, the oldest first.
-    ///
-    /// # Errors
-    /// If the folder cannot be read.
     pub fn files(&self) -> Result<Vec<(u64, PathBuf)>, FileError> {
         let entries = std::fs::read_dir(&self.path).map_err(|error| failed(&self.path, error))?;
         let number = |path: &Path| {
@@ -108,9 +102,6 @@ impl Folder {
     }
 
     /// Writes the next file and removes all but the last few and `also_keep`.
-    ///
-    /// # Errors
-    /// If the system refuses.
     pub fn save(
         &self,
         bytes: &[u8],

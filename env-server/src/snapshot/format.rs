@@ -78,9 +78,6 @@ struct DecodedWorld {
 }
 
 /// Worlds as the bytes of a file.
-///
-/// # Errors
-/// If they are more than a file may hold.
 pub fn encode(
     settings: &Settings,
     worlds: &[SnapshotWorld<&Episode>],
@@ -102,9 +99,6 @@ pub fn encode(
 }
 
 /// The worlds in the bytes of a file, whole or not at all; [`Snapshot::restore`] checks their values.
-///
-/// # Errors
-/// If the bytes are damaged or malformed, or of another version.
 pub fn decode(bytes: &[u8]) -> Result<Snapshot, SnapshotError> {
     let malformed = |problem: String| SnapshotError::Unfit(format!("malformed: {problem}"));
     let body = checked_body(bytes)?;
@@ -252,9 +246,6 @@ impl<'a> EncodedWorld<'a> {
 
 impl Snapshot {
     /// The worlds, ready to continue on a server.
-    ///
-    /// # Errors
-    /// If they are of other settings, or one cannot be continued under the rules.
     pub fn restore(
         self,
         spec: &WorldSpec,

@@ -38,9 +38,6 @@ pub enum Done {
 
 impl Job {
     /// Reads or writes the file.
-    ///
-    /// # Errors
-    /// If the system refuses, or the file does not fit.
     pub fn run(self, spec: &WorldSpec) -> Result<Done, FileError> {
         match self {
             Self::Save { path, bytes } => {
@@ -65,9 +62,6 @@ impl Job {
 }
 
 /// Worlds of a file; `None`: all.
-///
-/// # Errors
-/// If the file cannot be read, has too few worlds, or does not fit.
 pub fn load(
     spec: &WorldSpec,
     path: &Path,

@@ -25,9 +25,6 @@ pub struct WorldSpec {
 
 impl WorldSpec {
     /// Those of a server.
-    ///
-    /// # Errors
-    /// If the model does not fit the grid.
     pub fn of(checked: &Checked) -> Result<Self, ModelError> {
         let Checked {
             config,
@@ -86,9 +83,6 @@ impl Settings {
     }
 
     /// Checks that these, of a file, are a server's own.
-    ///
-    /// # Errors
-    /// If one differs; the error names the first that does.
     pub fn check(&self, server: &Self) -> Result<(), SnapshotError> {
         let other = |setting: &str, expected: &str, got: &str| {
             let problem = format!("{setting}: expected {expected} as this server's, got {got}");

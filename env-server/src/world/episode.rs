@@ -130,9 +130,6 @@ impl Episode {
     }
 
     /// The episode that was saved: it continues bit for bit as the original.
-    ///
-    /// # Errors
-    /// If something cannot be part of an episode under these rules.
     pub fn restore(rules: &Rules, saved: SavedWorld) -> Result<Self, InvalidWorld> {
         saved.check(rules)?;
         let SavedWorld {

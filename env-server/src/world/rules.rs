@@ -54,9 +54,6 @@ pub struct Rules {
 
 impl Rules {
     /// The rules under a model, for one robot; `history` and `n_moves` are 0.
-    ///
-    /// # Errors
-    /// If the model does not fit the grid.
     pub fn new(
         model: &Model,
         shape: Shape,

@@ -41,9 +41,6 @@ pub struct InvalidWorld(pub String);
 
 impl SavedWorld {
     /// Checks everything that an episode relies on.
-    ///
-    /// # Errors
-    /// If something cannot be part of an episode under these rules; the error names the first such thing.
     pub fn check(&self, rules: &Rules) -> Result<(), InvalidWorld> {
         let n_cells = rules.shape.n_cells();
         for (what, states) in [

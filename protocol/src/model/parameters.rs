@@ -305,6 +305,7 @@ mod tests {
         );
         check(|f| f.kernel[0].scale = f64::NAN, "got NaN");
         check(|f| f.kernel[0].to = "ash".into(), "names state \"ash\"");
+        check(|f| f.kernel_size = [3, 5], "expected 3 rows of 5 weights");
         check(
             |f| f.kernel_size = [2, 3],
             "two odd numbers up to 15, got [2, 3]",

@@ -225,13 +225,11 @@ mod tests {
         for (code, status) in Status::ALL.into_iter().enumerate() {
             assert_eq!(status as usize, code);
             assert_eq!(Status::try_from(code as u32), Ok(status));
+            for detail in [0, 1, u64::MAX] {
+                assert!(!status.explain(detail).is_empty());
+            }
         }
-        assert_eq!(
-            Status::try_from(23),
-            Err(UnknownCode {
-                what: "status",
-                value: 23
-            })
-        );
+        let (what, value) = ("status", Status::ALL.len() as u32);
+        assert_eq!(Status::try_from(value), Err(UnknownCode { what, value }));
     }
 }

@@ -415,9 +415,16 @@ mod tests {
     }
 
     #[test]
-    fn full_frames_need_a_server_that_gives_them() {
-        assert_eq!(CoverageRule::Path.coverage(true), Err(Status::NotPermitted));
-        assert_eq!(CoverageRule::Client.coverage(true), Ok(Coverage::Full));
-        assert_eq!(CoverageRule::Full.coverage(false), Ok(Coverage::Full));
+    fn coverage_is_what_the_server_says() {
+        for (rule, asks, given) in [
+            (CoverageRule::Path, false, Ok(Coverage::Path)),
+            (CoverageRule::Path, true, Err(Status::NotPermitted)),
+            (CoverageRule::Full, false, Ok(Coverage::Full)),
+            (CoverageRule::Full, true, Ok(Coverage::Full)),
+            (CoverageRule::Client, false, Ok(Coverage::Path)),
+            (CoverageRule::Client, true, Ok(Coverage::Full)),
+        ] {
+            assert_eq!(rule.coverage(asks), given, "{rule:?} {asks}");
+        }
     }
 }

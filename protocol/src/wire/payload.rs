@@ -179,7 +179,9 @@ mod tests {
         let mut payload = bytemuck::bytes_of(&RobotResult::default()).to_vec();
         payload.extend_from_slice(bytemuck::bytes_of(&flew));
         payload.extend_from_slice(&[255, 255, 255, 0, 255, 2, 3, 3]);
-        let robots = split_frame_payload(&header, &payload).expect("well-formed");
+        // In shared memory a payload begins at any address.
+        let memory = [&[0], &payload[..]].concat();
+        let robots = split_frame_payload(&header, &memory[1..]).expect("well-formed");
         assert_eq!((robots[0].frame, robots[0].path), (&[255; 3][..], &[][..]));
         assert_eq!(
             (robots[1].frame, robots[1].path),

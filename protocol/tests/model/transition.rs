@@ -1,21 +1,9 @@
 //! `Phi` on beliefs against its formula (paper eqs. 2-4), for any model and grid.
 
-mod models;
-
-use models::{random_model, unit};
+use crate::models::{check_predictions, random_belief, random_model, shape};
 use ndarray::{Array3, Axis};
 use proptest::prelude::*;
-use protocol::{Model, Probabilities, Shape, Transition};
-
-/// Random beliefs, each cell's summing to one.
-fn random_beliefs(key: u64, n_states: usize, (height, width): (usize, usize)) -> Array3<f64> {
-    let mut beliefs = Array3::from_shape_fn((n_states, height, width), |(state, row, col)| {
-        unit(key, (state * height + row) * width + col)
-    });
-    let sums = beliefs.sum_axis(Axis(0));
-    beliefs /= &sums;
-    beliefs
-}
+use protocol::{Model, Transition};
 
 /// The formula of eqs. 2-4 as it stands.
 fn formula(model: &Model, belief: &Array3<f64>) -> Array3<f64> {
@@ -53,29 +41,15 @@ proptest! {
     ) {
         let kernel_size = [2 * half_kernel.0 + 1, 2 * half_kernel.1 + 1];
         let model = random_model(key, n_states, kernel_size);
-        let shape = Shape::new(side.0, side.1).expect("test shape");
-        let belief = random_beliefs(key, n_states, side);
-        let expected = formula(&model, &belief);
-
-        let mut double = Array3::zeros(belief.dim());
-        Transition::new(&model, shape).expect("biased").apply(&belief, &mut double);
-        prop_assert!((&double - &expected).iter().all(|difference| difference.abs() < 1e-12));
-
-        let mut single = Probabilities::zeros(belief.dim());
-        let belief = belief.mapv(|p| p as f32);
-        Transition::new(&model, shape).expect("biased").apply(&belief, &mut single);
-        prop_assert!(single.iter().all(|&p| (0.0..=1.0 + 1e-6).contains(&p)));
-        prop_assert!(single.sum_axis(Axis(0)).iter().all(|sum| (sum - 1.0).abs() < 1e-6));
-        let differences = single.mapv(f64::from) - expected;
-        prop_assert!(differences.iter().all(|difference| difference.abs() < 2e-6));
+        let belief = random_belief(key, n_states, side);
+        check_predictions(&model, &belief, &formula(&model, &belief));
     }
 }
 
 #[test]
 fn apply_leaves_nothing_of_the_belief_before() {
-    let shape = Shape::new(3, 17).expect("test shape");
-    let beliefs = [1, 2].map(|key| random_beliefs(key, 3, shape.dim()));
-    let mut used = Transition::new(&Model::wildfire(), shape).expect("wildfire");
+    let beliefs = [1, 2].map(|key| random_belief(key, 3, (3, 17)));
+    let mut used = Transition::new(&Model::wildfire(), shape(3, 17)).expect("wildfire");
     let mut fresh = used.clone();
     let [mut after_another, mut alone] = [Array3::zeros((3, 3, 17)), Array3::zeros((3, 3, 17))];
     used.apply(&beliefs[0], &mut after_another);

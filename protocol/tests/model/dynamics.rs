@@ -1,88 +1,15 @@
-//! The world's step draws what the operator `Phi` says, whatever the model, and looks like the authors'
-//! world. All seeds are fixed: a test passes always or never.
+//! The world's step draws what the operator `Phi` says, whatever the model, and looks like the authors' world.
 
-mod models;
-mod statistics;
+use crate::models::{
+    check_draws, hash_after, model, one_hot, predicted, random_model, random_states, shape,
+};
+use crate::statistics;
+use protocol::{Dynamics, Grid, Model};
 
-use models::{model, random_model, unit};
-use ndarray::Array3;
-use protocol::{Dynamics, Grid, Model, Shape, Transition};
-
-fn shape(height: usize, width: usize) -> Shape {
-    Shape::new(height, width).expect("test shape")
-}
-
-fn random_states(key: u64, n_states: usize, (height, width): (usize, usize)) -> Grid<u8> {
-    Grid::from_shape_fn((height, width), |(row, col)| {
-        (unit(key, row * width + col) * n_states as f64) as u8
-    })
-}
-
-/// `Phi` of realised states, in double precision.
-fn phi(model: &Model, states: &Grid<u8>) -> Array3<f64> {
-    let (height, width) = states.dim();
-    let mut transition = Transition::new(model, shape(height, width)).expect("test model");
-    let one_hot = Array3::from_shape_fn((model.n_states(), height, width), |(state, row, col)| {
-        f64::from(u8::from(usize::from(states[[row, col]]) == state))
-    });
-    let mut out = Array3::zeros(one_hot.dim());
-    transition.apply(&one_hot, &mut out);
-    out
-}
-
-/// Steps `states` often and compares each cell's outcomes with `Phi` by a chi-square test.
-///
-/// Cells are independent given the states, so the statistics and degrees of freedom of all cells add
-/// up; with d degrees of freedom the sum has mean d and variance 2d. The bound of 5 standard deviations
-/// is exceeded by chance with probability < 1e-3 for d = 2 and < 1e-5 for d = 100.
+/// Compares draws with `Phi` of the states, in double precision.
 fn check(model: &Model, states: &Grid<u8>, n_draws: u64) {
-    let (height, width) = states.dim();
-    let mut dynamics = Dynamics::new(model, shape(height, width)).expect("test model");
-    let mut counts = Array3::<u32>::zeros((model.n_states(), height, width));
-    let mut next = states.clone();
-    for n in 0..n_draws {
-        next.assign(states);
-        dynamics.step(11, n, &mut next);
-        for ((row, col), &state) in next.indexed_iter() {
-            counts[[usize::from(state), row, col]] += 1;
-        }
-    }
-    let expected = phi(model, states) * n_draws as f64;
-    let (mut sum, mut freedom) = (0.0, 0.0);
-    for (row, col) in (0..height).flat_map(|row| (0..width).map(move |col| (row, col))) {
-        let outcomes = (0..model.n_states()).map(|to| [to, row, col]);
-        let (statistic, bins) = chi_square(outcomes.map(|at| (counts[at].into(), expected[at])));
-        sum += statistic;
-        freedom += bins - 1.0;
-    }
-    let z = (sum - freedom) / (2.0 * f64::max(freedom, 1.0)).sqrt();
-    assert!(
-        z.abs() < 5.0,
-        "chi-square {sum} with {freedom} degrees of freedom"
-    );
-}
-
-/// Chi-square of observed against expected counts, and the number of bins. Outcomes expected fewer
-/// than 10 times share one bin; impossible ones must not occur.
-fn chi_square(outcomes: impl Iterator<Item = (f64, f64)>) -> (f64, f64) {
-    let (mut sum, mut bins) = (0.0, 0.0);
-    let mut rare = (0.0, 0.0);
-    let term = |(observed, expected): (f64, f64)| (observed - expected).powi(2) / expected;
-    for (observed, expected) in outcomes {
-        if expected == 0.0 {
-            assert_eq!(observed, 0.0, "an impossible outcome");
-        } else if expected < 10.0 {
-            rare = (rare.0 + observed, rare.1 + expected);
-        } else {
-            sum += term((observed, expected));
-            bins += 1.0;
-        }
-    }
-    if rare.1 > 0.0 {
-        sum += term(rare);
-        bins += 1.0;
-    }
-    (sum, bins)
+    let phi = predicted(model, &one_hot(model.n_states(), states));
+    check_draws(model, states, n_draws, &phi);
 }
 
 #[test]
@@ -185,15 +112,6 @@ fn a_step_depends_on_seed_and_step_alone() {
     assert_eq!(step(&mut fresh, 8, 4), step(&mut used, 8, 4));
     assert_ne!(step(&mut fresh, 8, 4), other);
     assert_ne!(step(&mut fresh, 9, 4), step(&mut used, 8, 4));
-}
-
-/// FNV-1a (http://www.isthe.com/chongo/tech/comp/fnv) of a world after some steps.
-fn hash_after(model: &Model, shape: Shape, n_steps: u64) -> u64 {
-    let mut dynamics = Dynamics::new(model, shape).expect("test model");
-    let mut states = dynamics.initial(7);
-    (0..n_steps).for_each(|n| dynamics.step(7, n, &mut states));
-    let hash = |hash: u64, &state: &u8| (hash ^ u64::from(state)).wrapping_mul(0x100_0000_01b3);
-    states.iter().fold(0xcbf2_9ce4_8422_2325, hash)
 }
 
 #[test]

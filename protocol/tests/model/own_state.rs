@@ -1,17 +1,15 @@
 //! Kernels that see the cell's own state, against their formula as it stands in docs/model-file.md, and the
-//! worlds of `wildfire-burnout` against a simulation by the formula. All seeds are fixed.
+//! worlds of `wildfire-burnout` against a simulation by the formula.
 
-mod models;
-
-use models::{random_own_model, unit};
-use ndarray::{Array3, Axis};
+use crate::models::{
+    assert_close, check_draws, check_predictions, chi_square, hash_after, one_hot, predicted,
+    random_belief, random_model, random_own_model, random_states, shape, unit,
+};
+use ndarray::Array3;
 use proptest::prelude::*;
-use protocol::{Dynamics, Grid, Model, Probabilities, Shape, Transition};
+use protocol::model::KernelEntry;
+use protocol::{Dynamics, Grid, Model};
 use std::collections::BTreeMap;
-
-fn shape(height: usize, width: usize) -> Shape {
-    Shape::new(height, width).expect("test shape")
-}
 
 /// `p`: each state's probability in each cell, from the entries of the model's file.
 fn formula(model: &Model, p: &Array3<f64>) -> Array3<f64> {
@@ -54,85 +52,10 @@ fn weights(model: &Model, p: &Array3<f64>, own: usize, (row, col): (usize, usize
     weights
 }
 
-fn one_hot(n_states: usize, states: &Grid<u8>) -> Array3<f64> {
-    let (height, width) = states.dim();
-    Array3::from_shape_fn((n_states, height, width), |(state, row, col)| {
-        f64::from(u8::from(usize::from(states[[row, col]]) == state))
-    })
-}
-
-fn random_states(key: u64, n_states: usize, (height, width): (usize, usize)) -> Grid<u8> {
-    Grid::from_shape_fn((height, width), |(row, col)| {
-        (unit(key, row * width + col) * n_states as f64) as u8
-    })
-}
-
-fn random_belief(key: u64, n_states: usize, (height, width): (usize, usize)) -> Array3<f64> {
-    let mut belief = Array3::from_shape_fn((n_states, height, width), |(state, row, col)| {
-        unit(key, (state * height + row) * width + col)
-    });
-    let sums = belief.sum_axis(Axis(0));
-    belief /= &sums;
-    belief
-}
-
-/// Chi-square of counts by cell class and outcome, in standard deviations. Outcomes expected fewer than
-/// 10 times share a bin; with d degrees of freedom the sum has mean d and variance 2d.
-fn z<'a>(classes: impl Iterator<Item = (&'a [f64], &'a [f64])>) -> f64 {
-    let (mut sum, mut freedom) = (0.0, 0.0);
-    let mut term = |observed: f64, expected: f64| {
-        sum += (observed - expected).powi(2) / expected;
-        freedom += 1.0;
-    };
-    let mut n_classes = 0.0;
-    for (observed, expected) in classes {
-        let mut rare = (0.0, 0.0);
-        for (&observed, &expected) in observed.iter().zip(expected) {
-            if expected == 0.0 {
-                assert_eq!(observed, 0.0, "an impossible outcome");
-            } else if expected < 10.0 {
-                rare = (rare.0 + observed, rare.1 + expected);
-            } else {
-                term(observed, expected);
-            }
-        }
-        if rare.1 > 0.0 {
-            term(rare.0, rare.1);
-        }
-        n_classes += 1.0;
-    }
-    let freedom: f64 = freedom - n_classes;
-    (sum - freedom) / (2.0 * freedom.max(1.0)).sqrt()
-}
-
-/// Steps `states` often and compares each cell's outcomes with the formula: 5 standard deviations are
-/// exceeded by chance with probability < 1e-3, and all seeds are fixed.
-fn check_draws(model: &Model, states: &Grid<u8>, n_draws: u64) {
-    let (height, width) = states.dim();
-    let mut dynamics = Dynamics::new(model, shape(height, width)).expect("test model");
-    let mut counts = Array3::<f64>::zeros((model.n_states(), height, width));
-    let mut next = states.clone();
-    for n in 0..n_draws {
-        next.assign(states);
-        dynamics.step(11, n, &mut next);
-        for ((row, col), &state) in next.indexed_iter() {
-            counts[[usize::from(state), row, col]] += 1.0;
-        }
-    }
-    let expected = formula(model, &one_hot(model.n_states(), states)) * n_draws as f64;
-    let by_cell = |counts: &Array3<f64>| -> Vec<Vec<f64>> {
-        counts
-            .lanes(Axis(0))
-            .into_iter()
-            .map(|cell| cell.to_vec())
-            .collect()
-    };
-    let (counts, expected) = (by_cell(&counts), by_cell(&expected));
-    let z = z(counts
-        .iter()
-        .map(Vec::as_slice)
-        .zip(expected.iter().map(Vec::as_slice)));
-    assert!(z.abs() < 5.0, "{z} standard deviations");
+/// Compares draws with the formula.
+fn check(model: &Model, states: &Grid<u8>, n_draws: u64) {
+    let expected = formula(model, &one_hot(model.n_states(), states));
+    check_draws(model, states, n_draws, &expected);
 }
 
 fn burnout() -> Model {
@@ -141,11 +64,11 @@ fn burnout() -> Model {
 
 #[test]
 fn burnout_steps_are_drawn_from_the_formula() {
-    check_draws(&burnout(), &random_states(1, 3, (5, 6)), 200_000);
-    check_draws(&burnout(), &random_states(2, 3, (3, 70)), 40_000);
-    check_draws(&burnout(), &random_states(3, 3, (92, 91)), 2_000);
+    check(&burnout(), &random_states(1, 3, (5, 6)), 200_000);
+    check(&burnout(), &random_states(2, 3, (3, 70)), 40_000);
+    check(&burnout(), &random_states(3, 3, (92, 91)), 2_000);
     for state in 0..3 {
-        check_draws(&burnout(), &Grid::from_elem((1, 1), state), 200_000);
+        check(&burnout(), &Grid::from_elem((1, 1), state), 200_000);
     }
 }
 
@@ -158,16 +81,9 @@ fn what_is_said_of_another_state_in_the_centre_means_nothing() {
             entry.weights[1][1] = 1e60;
         }
     }
-    let shape = shape(4, 5);
     let belief = random_belief(3, 3, (4, 5)).mapv(|p| p as f32);
-    let predicted = |model: &Model| {
-        let mut out = Array3::zeros(belief.dim());
-        let transition = Transition::<f32>::new(model, shape);
-        transition.expect("a model").apply(&belief, &mut out);
-        out
-    };
     let other = Model::new(file).expect("a model");
-    assert_eq!(predicted(&other), predicted(&model));
+    assert_eq!(predicted(&other, &belief), predicted(&model, &belief));
 }
 
 #[test]
@@ -180,7 +96,7 @@ fn random_models_are_drawn_from_the_formula() {
         (14, 24, [3, 3], (2, 2), 20_000),
     ] {
         let model = random_own_model(key, n_states, kernel_size);
-        check_draws(&model, &random_states(key + 1, n_states, side), n_draws);
+        check(&model, &random_states(key + 1, n_states, side), n_draws);
     }
 }
 
@@ -197,74 +113,41 @@ proptest! {
     ) {
         let kernel_size = [2 * half_kernel.0 + 1, 2 * half_kernel.1 + 1];
         let model = random_own_model(key, n_states, kernel_size);
-        let shape = shape(side.0, side.1);
         let belief = random_belief(key, n_states, side);
-        let expected = formula(&model, &belief);
-
-        let mut double = Array3::zeros(belief.dim());
-        Transition::new(&model, shape).expect("biased").apply(&belief, &mut double);
-        prop_assert!((&double - &expected).iter().all(|difference| difference.abs() < 1e-12));
-
-        let mut single = Probabilities::zeros(belief.dim());
-        let belief = belief.mapv(|p| p as f32);
-        Transition::new(&model, shape).expect("biased").apply(&belief, &mut single);
-        prop_assert!(single.sum_axis(Axis(0)).iter().all(|sum| (sum - 1.0).abs() < 1e-6));
-        let differences = single.mapv(f64::from) - expected;
-        prop_assert!(differences.iter().all(|difference| difference.abs() < 2e-6));
+        check_predictions(&model, &belief, &formula(&model, &belief));
     }
 }
 
 #[test]
 fn one_kernel_for_each_state_is_that_of_all_where_states_are_known() {
-    let plain = models::random_model(5, 3, [3, 3]);
+    let plain = random_model(5, 3, [3, 3]);
     let mut file = plain.file().clone();
     file.kernel = (0..3)
         .flat_map(|own| {
-            let of_own = |entry: &protocol::model::KernelEntry| {
-                let own = Some(format!("s{own}"));
-                protocol::model::KernelEntry {
-                    own,
-                    ..entry.clone()
-                }
+            let of_own = |entry: &KernelEntry| KernelEntry {
+                own: Some(format!("s{own}")),
+                ..entry.clone()
             };
             plain.file().kernel.iter().map(of_own).collect::<Vec<_>>()
         })
         .collect();
     let own = Model::new(file).expect("test models are valid");
     let states = one_hot(3, &random_states(9, 3, (6, 9)));
-    let predict = |model: &Model| {
-        let mut out = Array3::zeros(states.dim());
-        let mut transition = Transition::new(model, shape(6, 9)).expect("biased");
-        transition.apply(&states, &mut out);
-        out
-    };
-    let differences = predict(&own) - predict(&plain);
-    assert!(
-        differences
-            .iter()
-            .all(|difference| difference.abs() < 1e-12)
-    );
+    let (of_own, of_all) = (predicted(&own, &states), predicted(&plain, &states));
+    assert_close(&of_own, &of_all, 1e-12);
 }
 
 #[test]
 fn a_prediction_is_that_of_the_python_filter() {
     let json: serde_json::Value =
-        serde_json::from_str(include_str!("data/own_state.json")).expect("JSON");
+        serde_json::from_str(include_str!("../data/own_state.json")).expect("JSON");
     let array = |key: &str| {
         let numbers = serde_json::from_value::<Vec<Vec<Vec<f64>>>>(json[key].clone());
         let numbers = numbers.expect("numbers").concat().concat();
         Array3::from_shape_vec((3, 4, 5), numbers).expect("3 x 4 x 5 numbers")
     };
     let (belief, expected) = (array("belief"), array("prediction"));
-    let mut predicted = Array3::zeros(belief.dim());
-    let mut transition = Transition::new(&burnout(), shape(4, 5)).expect("a model");
-    transition.apply(&belief, &mut predicted);
-    let differences = predicted - expected;
-    assert!(
-        differences
-            .iter()
-            .all(|difference| difference.abs() < 1e-12)
-    );
+    assert_close(&predicted(&burnout(), &belief), &expected, 1e-12);
 }
 
 #[test]
@@ -273,9 +156,6 @@ fn a_prediction_is_the_average_over_simulated_next_steps() {
     // whatever they are: the mean field is exact for cells that are independent.
     let (model, side) = (burnout(), (4, 5));
     let belief = random_belief(3, 3, side);
-    let mut predicted = Array3::zeros(belief.dim());
-    let mut transition = Transition::new(&model, shape(4, 5)).expect("a model");
-    transition.apply(&belief, &mut predicted);
     let n_draws = 20_000;
     let mut average = Array3::<f64>::zeros(belief.dim());
     for draw in 0..n_draws {
@@ -288,10 +168,8 @@ fn a_prediction_is_the_average_over_simulated_next_steps() {
     }
     average /= n_draws as f64;
     // A probability's standard error is at most .5 / sqrt(n): 60 of them within 4.5.
-    let worst = (&average - &predicted)
-        .iter()
-        .fold(0.0, |worst, x| f64::max(worst, x.abs()));
-    assert!(worst < 4.5 * 0.5 / (n_draws as f64).sqrt(), "{worst}");
+    let bound = 4.5 * 0.5 / (n_draws as f64).sqrt();
+    assert_close(&average, &predicted(&model, &belief), bound);
 }
 
 /// Steps of the worlds whose statistics are taken.
@@ -388,10 +266,8 @@ fn worlds_that_burn_out_move_as_the_formula_says() {
         seen(0) > 50 && seen(1) > 1 && seen(2) > 1,
         "too few classes"
     );
-    let tables = classes
-        .values()
-        .map(|[observed, expected]| (&observed[..], &expected[..]));
-    let z = z(tables);
+    let tables = classes.into_values();
+    let z = chi_square(tables.map(|[observed, expected]| (observed.into(), expected.into())));
     assert!(z.abs() < 5.0, "{z} standard deviations");
 }
 
@@ -418,13 +294,6 @@ fn count(model: &Model, before: &Grid<u8>, after: &Grid<u8>, classes: &mut Class
 #[test]
 fn a_trajectory_is_the_same_on_every_platform() {
     // Pinned: if one changes, so does every published seed.
-    let hash_after = |model: &Model, shape: Shape, n_steps: u64| {
-        let mut dynamics = Dynamics::new(model, shape).expect("test model");
-        let mut states = dynamics.initial(7);
-        (0..n_steps).for_each(|n| dynamics.step(7, n, &mut states));
-        let hash = |hash: u64, &state: &u8| (hash ^ u64::from(state)).wrapping_mul(0x100_0000_01b3);
-        states.iter().fold(0xcbf2_9ce4_8422_2325, hash)
-    };
     assert_eq!(
         hash_after(&burnout(), shape(64, 64), 1000),
         15_190_413_380_503_145_369

@@ -1,0 +1,95 @@
+//! What comes from outside is hostile: every decoder gives an error or a valid value, never a panic. What bytes can be
+//! damaged to, and what must hold of what is decoded, is in `tests/src/fuzz/`.
+
+use proptest::collection::vec;
+use proptest::prelude::*;
+use protocol::Model;
+use protocol::control::{Reply, Request};
+use protocol::message::{FrameHeader, RobotResult, WorldResult};
+use protocol::model::parse_color;
+use protocol::payload::split_frame_payload;
+
+proptest! {
+    // No file of failures: tests leave the source tree alone.
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..Default::default() })]
+
+    #[test]
+    fn any_text_is_a_color_or_none(text in "#?.{0,8}") {
+        let is_color = text.len() == 7
+            && text.starts_with('#')
+            && text[1..].bytes().all(|byte| byte.is_ascii_hexdigit());
+        prop_assert_eq!(parse_color(&text).is_some(), is_color);
+    }
+
+    #[test]
+    fn a_sample_splits_only_at_its_exact_length(
+        side in (0u32..3, 0u32..3),
+        n_moves in vec(prop_oneof![9 => 0u32..4, 1 => any::<u32>()], 0..4),
+        n_robots in prop_oneof![9 => Just(None), 1 => any::<u32>().prop_map(Some)],
+        stayed in prop_oneof![9 => 0u64..2, 1 => any::<u64>()],
+        excess in 0usize..3,
+    ) {
+        let n_robots = n_robots.unwrap_or(n_moves.len() as u32);
+        let result = WorldResult { late: stayed, ..WorldResult::default() };
+        let (height, width) = side;
+        let header = FrameHeader { n_robots, height, width, result, ..FrameHeader::default() };
+        let results: Vec<RobotResult> = n_moves
+            .iter()
+            .map(|&n_moves| RobotResult { n_moves, ..RobotResult::default() })
+            .collect();
+        let n_cells = (height * width) as usize;
+        let n_flown: usize = n_moves.iter().map(|&n_moves| n_moves as usize % 300).sum();
+        let behind = vec![1; n_moves.len() * n_cells + n_flown + excess];
+        let payload = [bytemuck::cast_slice(&results), &behind].concat();
+        let is_whole = n_robots > 0 && n_robots as usize == n_moves.len() && n_cells > 0;
+        let is_short = n_moves.iter().all(|&n_moves| n_moves < 300);
+        let is_good = is_whole && is_short && excess == 0 && stayed < 1 << n_moves.len();
+        let robots = split_frame_payload(&header, &payload);
+        prop_assert_eq!(robots.is_ok(), is_good, "{:?}", robots);
+        for (robot, n_moves) in robots.into_iter().flatten().zip(n_moves) {
+            let lengths = (robot.frame.len(), robot.path.len());
+            prop_assert_eq!(lengths, (n_cells, n_moves as usize));
+        }
+    }
+}
+
+#[test]
+fn nesting_as_deep_as_a_message_can_be_is_refused() {
+    for (open, close) in [("[", "]"), (r#"{"a":"#, "}")] {
+        let deep = open.repeat(200_000) + &close.repeat(200_000);
+        let inside = format!(r#"{{"op":"reset","lease":1,"worlds":{deep}}}"#);
+        for text in [deep, inside] {
+            assert!(serde_json::from_str::<Request>(&text).is_err());
+            assert!(serde_json::from_str::<Reply>(&text).is_err());
+        }
+    }
+}
+
+#[test]
+fn nesting_as_deep_as_a_model_file_can_be_is_refused() {
+    for (open, close) in [("[", "]"), ("{a = ", "}"), ("[{a = ", "}]")] {
+        let deep = open.repeat(100_000) + "1" + &close.repeat(100_000);
+        assert!(Model::from_toml(&format!("name = {deep}\n")).is_err());
+        assert!(Model::from_toml(&format!("kernel_size = {deep}\n")).is_err());
+    }
+    let keys = "a.".repeat(100_000);
+    assert!(Model::from_toml(&format!("{keys}b = 1\n")).is_err());
+    assert!(Model::from_toml(&format!("[{keys}b]\n")).is_err());
+}
+
+#[test]
+fn a_model_file_of_any_size_is_refused_before_memory_is_asked_for() {
+    let wildfire = toml::to_string(Model::wildfire().file()).expect("models serialise");
+    for size in [
+        "[15, 99999999]",
+        "[9223372036854775807, 9223372036854775807]",
+        "[-1, 3]",
+    ] {
+        let text = wildfire.replacen("[3, 3]", size, 1);
+        assert!(Model::from_toml(&text).is_err(), "{size}");
+    }
+    let state = "[[states]]\nname = \"x\"\ncolor = \"#000000\"\ninitial = 0.0\nobserved_as = [1.0, 0.0, 0.0]\n";
+    assert!(Model::from_toml(&(wildfire.clone() + &state.repeat(10_000))).is_err());
+    let entry = "[[kernel]]\nfrom = \"fire\"\nto = \"fire\"\nweights = []\n";
+    assert!(Model::from_toml(&(wildfire + &entry.repeat(10_000))).is_err());
+}

@@ -1,0 +1,8 @@
+//! The model's mathematics against its formulas and the authors' worlds. All seeds are fixed: a test passes always or
+//! never.
+
+mod dynamics;
+mod models;
+mod own_state;
+mod statistics;
+mod transition;
