@@ -6,6 +6,7 @@ from contextlib import ExitStack
 from types import FrameType
 
 import pytest
+from environments import at_the_end
 from hypothesis import settings
 from processes import SMALL, Script, Server
 
@@ -35,6 +36,15 @@ def deadline() -> Iterator[None]:
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture(autouse=True)
+def environments(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Windows open in memory; environments are closed when a test ends."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setenv("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    yield
+    at_the_end.close()
 
 
 @pytest.fixture

@@ -48,16 +48,35 @@ def serving(**flags: object) -> Iterator[str]:
         server.stop()
 
 
-def make(name: str = WILDFIRE, **keywords: Any) -> gymnasium.Env[Any, Any]:
+#: Closes what `closed_later` was given.
+at_the_end = contextlib.ExitStack()
+
+
+def closed_later(env: Any) -> Any:
+    """An environment that the end of the test closes."""
+    at_the_end.callback(env.close)
+    return env
+
+
+def make(name: str = WILDFIRE, **keywords: Any) -> Any:
     """`gymnasium.make` of a small world, or with `instance` of a running server's."""
-    return gymnasium.make(name, **_small(keywords))
+    return closed_later(gymnasium.make(name, **_usual(name, keywords)))
 
 
-def make_vec(
-    n_worlds: int, name: str = WILDFIRE, **keywords: Any
-) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
+def make_vec(n_worlds: int, name: str = WILDFIRE, **keywords: Any) -> Any:
     """`gymnasium.make_vec` of small worlds, or with `instance` of a running server's."""
-    return gymnasium.make_vec(name, num_envs=n_worlds, **_small(keywords))
+    return closed_later(gymnasium.make_vec(name, num_envs=n_worlds, **_usual(name, keywords)))
+
+
+def private_pid(env: Any) -> int:
+    """The process of a private server."""
+    with emberwatch.connect(env.unwrapped.instance) as client:
+        return client.info.pid
+
+
+def agent_pid(env: Any) -> int:
+    """The process of an environment's own agent."""
+    return env.unwrapped._agent._own_agent.pid
 
 
 @contextlib.contextmanager
@@ -70,8 +89,9 @@ def impatient(env: Any, seconds: float = 0.2) -> Iterator[None]:
     session.settings = kept
 
 
-def _small(keywords: dict[str, Any]) -> dict[str, Any]:
-    return keywords if keywords.get("instance") is not None else {**SMALL, **keywords}
+def _usual(name: str, keywords: dict[str, Any]) -> dict[str, Any]:
+    usual = {} if keywords.get("instance") is not None else SMALL
+    return {**usual, **({"prior": "initial"} if name == OBJECTIVE else {}), **keywords}
 
 
 @contextlib.contextmanager

@@ -27,7 +27,6 @@ def test_an_image_shows_each_value_in_a_channel_of_its_own() -> None:
         assert np.array_equal(np.where(value == 3, 255, value), frame[:, :, 0])
         shown |= set(value.ravel().tolist())
     assert shown == {0, 1, 2, 3}
-    env.close()
 
 
 @pytest.mark.parametrize("name", [WILDFIRE, MOVES])
@@ -41,8 +40,6 @@ def test_a_belief_is_what_the_filter_predicts(name: str) -> None:
         predictor = transition.apply(filtered.filter.belief)
         assert np.array_equal(seen[number], np.rint(255 * predictor.transpose(1, 2, 0)))
     assert not np.array_equal(seen[0], seen[9])
-    env.close()
-    filtered.close()
 
 
 def test_a_window_shows_the_belief_around_the_robot() -> None:
@@ -67,7 +64,6 @@ def test_a_window_shows_the_belief_around_the_robot() -> None:
         )
         assert (local[..., 4] == np.rint(255 * (1 - number % 6 / 6))).all()
     assert len({tuple(seen["robot"]) for seen in steps}) > 3
-    env.close()
 
 
 def test_a_window_shows_what_was_last_seen_around_the_robot() -> None:
@@ -93,7 +89,6 @@ def test_a_window_shows_what_was_last_seen_around_the_robot() -> None:
                     expected *= 0.5 ** (1 / 16)
                     expected[seen["frame"][..., 0] != 255] = 0
                     expected[seen["frame"] == np.arange(3)] = 1
-        env.close()
 
 
 def test_a_belief_goes_on_where_a_world_is_resumed() -> None:
@@ -108,7 +103,6 @@ def test_a_belief_goes_on_where_a_world_is_resumed() -> None:
         assert np.array_equal(seen["frame"], last["frame"])
         unseen, _ = second.reset(seed=4)
         assert not np.array_equal(seen["belief"], unseen["belief"])
-        second.close()
 
 
 @pytest.mark.parametrize("window", [0, 4, -3, 2.5, "5"], ids=repr)

@@ -49,7 +49,6 @@ def test_pettingzoo_finds_no_fault(robots: int, observation: str) -> None:
         parallel_api_test(team(robots=robots, observation=observation), num_cycles=100)
         env = parallel_to_aec(team(robots=robots, observation=observation, max_episode_steps=9))
         api_test(env, num_cycles=50)
-        env.close()
 
 
 def test_pettingzoo_finds_no_fault_in_paths() -> None:
@@ -61,7 +60,6 @@ def test_pettingzoo_finds_no_fault_in_paths() -> None:
     # It knows neither dictionaries of observations nor actions that are arrays of choices.
     about = {str(warning.message).partition(" of ")[0] for warning in warned}
     assert all("bservation" in text or "ction" in text for text in about), about
-    env.close()
 
 
 def test_without_pettingzoo_an_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,8 +109,6 @@ def test_each_agent_sees_and_earns_what_its_row_does(reward: str) -> None:
             info = {name: int(others[-1][name][row]) for name in names}
             assert_same(outcome[-1][agent], info)
     assert ours.agents == [] and all(outcomes[-1][3].values())
-    ours.close()
-    rows.close()
 
 
 def test_rewards_of_a_team_are_what_its_definition_says() -> None:
@@ -147,7 +143,6 @@ def test_the_state_is_what_the_team_saw_and_where_it_is() -> None:
         places = np.zeros_like(frame)
         places[tuple(np.array([one["robot"] for one in seen.values()]).T)] = 255
         assert (state[..., -1] == places).all()
-    env.close()
 
 
 def test_a_team_is_drawn_as_a_whole() -> None:
@@ -160,8 +155,6 @@ def test_a_team_is_drawn_as_a_whole() -> None:
     before = env.render()
     env.step(dict(zip(AGENTS, range(4), strict=True)))
     assert (env.render() != before).any()
-    env.close()
-    alone.close()
 
 
 @pytest.mark.parametrize(
@@ -193,7 +186,6 @@ def test_actions_of_other_agents_are_refused() -> None:
         env.step({"robot_0": 1, "robot_1": [1, 2]})
     with pytest.raises(InvalidArgumentError, match="action: expected 0 to 3, got 4"):
         env.step({"robot_0": 1, "robot_1": 4})
-    env.close()
 
 
 # One robot of a team.
@@ -362,7 +354,6 @@ def test_an_episode_that_is_over_is_for_the_holder_of_all(alone: Callable[..., A
         one.close()
         env = team(instance=instance)
         assert env.reset(seed=1)[1]["robot_0"]["step"] == 0
-        env.close()
 
 
 @pytest.mark.parametrize(
@@ -415,4 +406,3 @@ def test_rows_of_a_world_are_reset_together() -> None:
         infos["step"].tolist() == [0, 0, 0, 0, 0, 0]
         and infos["_step"].tolist() == [True] * 3 + [False] * 3
     )
-    envs.close()

@@ -52,7 +52,6 @@ def test_a_recorded_world_passes_the_checker(states: Path) -> None:
     for name in (WILDFIRE, MOVES):
         env: Any = gymnasium.make(name, states=states, n_moves=3, states_symmetries=True)
         check_env(env.unwrapped, skip_render_check=True)
-        env.close()
 
 
 def test_episodes_show_what_was_recorded(states: Path, sequences: list[States]) -> None:
@@ -76,7 +75,6 @@ def test_episodes_show_what_was_recorded(states: Path, sequences: list[States]) 
         offsets.add(offset)
         assert env.render() is not None
     assert offsets == {0, 1, 2}
-    env.close()
 
 
 def test_vectors_begin_the_next_episode_at_the_end_of_a_sequence(states: Path) -> None:
@@ -90,7 +88,6 @@ def test_vectors_begin_the_next_episode_at_the_end_of_a_sequence(states: Path) -
     # The first episodes are those of seeds 0 and 1; a reset takes a step of its own.
     assert [int(np.argmax(of_world)) for of_world in np.transpose(ends)] == [3, 5]
     assert np.sum(ends, axis=0).min() >= 2
-    envs.close()
 
 
 def test_a_running_server_tells_of_its_recorded_world(states: Path) -> None:
@@ -147,8 +144,6 @@ def test_moves_are_paid_by_the_description(states: Path) -> None:
         paths.reset(seed=seed)
         expected = float(paths.step(np.array(path))[1])
         assert sum(float(env.step(move)[1]) for move in path) == expected
-    env.close()
-    paths.close()
 
 
 def test_what_does_not_fit_is_refused(tmp_path: Path, states: Path) -> None:
