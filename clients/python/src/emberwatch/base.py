@@ -47,13 +47,11 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
         "render_fps": RENDER_FPS,
     }
 
-    def __init__(self, session: Session, *, reveals: bool) -> None:
-        """`reveals` puts the hidden states into infos and pictures."""
+    def __init__(self, session: Session) -> None:
         self._session = session
         self._spec: Final = session.spec
         self.render_mode = session.settings.render_mode
         self._view = View(self.render_mode, self._spec)
-        self._reveals = reveals
         #: Which robot of a world that others fly in; None: it is alone in its world.
         self._robot: Final = session.settings.robot
         self._n_missed = 0
@@ -105,7 +103,8 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
 
     def _trace(self, result: RobotResult, path: NDArray[np.uint8]) -> None:
         """Keeps the cells of a path for pictures, if it was flown."""
-        self._path = fly(result.start, path[: result.n_moves], self._spec)
+        if self.render_mode is not None:
+            self._path = fly(result.start, path[: result.n_moves], self._spec)
 
     def _describe(self, answer: StepAnswer, result: StepResult) -> dict[str, Any]:
         info: dict[str, Any] = {
@@ -113,7 +112,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
         }
         if self._robot is not None:
             info["n_missed"] = self._n_missed
-        if self._reveals:
+        if self._session.settings.reveals:
             self._truth = truth = self._session.truth(answer)[0]
             info["truth"] = truth.copy()
         return info

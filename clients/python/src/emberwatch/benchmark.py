@@ -31,7 +31,7 @@ from emberwatch.observations import OF_BELIEF, OF_TEAM, cells_of, names_of
 from emberwatch.rows import Row, RowFile
 from emberwatch.rows import read as read
 from emberwatch.settings import WorldSpec
-from emberwatch.view import DIRECTIONS
+from emberwatch.view import fly
 
 #: Takes the stacked observations of some worlds; returns an action for each.
 Policy = Callable[[Any], Any]
@@ -41,8 +41,6 @@ FIRST_TRAINING_SEED: Final = 1000
 
 _MOVES: Final = "emberwatch/WildfireMoves-v0"
 _PATHS: Final = "emberwatch/Wildfire-v0"
-
-_DIRECTIONS: Final = np.array(DIRECTIONS, np.int64)
 
 #: Of `emberwatch-agent compare`.
 _BURN_IN: Final = 25_000
@@ -58,6 +56,7 @@ class _Tally:
     """Sums over the steps of some worlds."""
 
     def __init__(self, spec: WorldSpec, n_worlds: int, recent_steps: int) -> None:
+        self._spec: Final = spec
         self.n_moves: Final = spec.n_moves
         self.n_robots: Final = spec.n_robots
         self.recent_steps: Final = recent_steps
@@ -102,12 +101,9 @@ class _Tally:
     def _visited(self, robots: NDArray[np.void], paths: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Cells that some robot of each world visited, `(n_worlds, H, W)`."""
         visited = np.zeros(self._shape, np.bool_)
-        worlds = np.arange(len(robots)) // self.n_robots
-        last = np.array(self._shape[1:], np.int64) - 1
-        cells = np.stack((robots["start_row"], robots["start_col"]), 1).astype(np.int64)
-        for moves in paths.T:
-            cells = (cells + _DIRECTIONS[moves]).clip(0, last)
-            visited[worlds, cells[:, 0], cells[:, 1]] = True
+        worlds = np.arange(len(robots))[:, np.newaxis] // self.n_robots
+        cells = fly(np.stack((robots["start_row"], robots["start_col"]), 1), paths, self._spec)
+        visited[worlds, cells[..., 0], cells[..., 1]] = True
         return visited
 
 

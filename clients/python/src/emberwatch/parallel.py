@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from emberwatch.base import NOTHING_TO_DRAW
+from emberwatch.env import WildfireVectorEnv
 from emberwatch.errors import InvalidArgumentError
-from emberwatch.moves_env import MovesReward
-from emberwatch.moves_vector_env import WildfireMovesVectorEnv
+from emberwatch.moves_env import MovesReward, WildfireMovesVectorEnv
 from emberwatch.observations import MovesParts, of_row
 from emberwatch.settings import WorldArguments
 from emberwatch.vector_base import WorldVectorEnv, info_of
-from emberwatch.vector_env import WildfireVectorEnv
 from emberwatch.view import RENDER_FPS, RENDER_MODES
 from emberwatch.wire import UNOBSERVED
 

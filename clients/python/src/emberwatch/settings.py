@@ -64,6 +64,8 @@ class Settings:
     truth: bool = False
     timeout: float = STEP_TIMEOUT
     render_mode: str | None = None
+    #: Whether infos and pictures show the hidden states; `truth` may be for rewards alone.
+    reveals: bool = False
 
     def __post_init__(self) -> None:
         kinds = get_type_hints(Settings)
@@ -82,7 +84,7 @@ class Settings:
             raise InvalidArgumentError(f"timeout: expected seconds above 0, got {self.timeout}")
 
     @classmethod
-    def of(cls, environment: type, world: WorldArguments) -> Settings:
+    def of(cls, environment: type, world: WorldArguments, *, needs_truth: bool = False) -> Settings:
         """The settings from what is left of an environment's keywords.
 
         Raises:
@@ -100,7 +102,9 @@ class Settings:
                     f"{environment.__name__}() got an unexpected keyword argument {name!r}{hint}; "
                     f"known are {', '.join(sorted(known))}"
                 )
-        return cls(**world)
+        reveals = world.get("truth", False)
+        arguments: WorldArguments = {**world, "truth": reveals or needs_truth}
+        return cls(**arguments, reveals=reveals)
 
     def server_flags(self, n_worlds: int) -> list[str]:
         """The flags of a private server with these worlds."""

@@ -42,9 +42,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         *,
         max_episode_steps: int | None,
         autoreset_mode: AutoresetMode | str,
-        reveals: bool,
     ) -> None:
-        """`reveals` puts the hidden states into infos and pictures."""
         if max_episode_steps == -1:  # no limit in Gymnasium's own `make`
             max_episode_steps = None
         if max_episode_steps is not None and max_episode_steps < 1:
@@ -57,7 +55,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         self._observations = observations
         self._views = [View(mode, spec) for _ in range(num_envs)]
         self._max_steps = max_episode_steps
-        self._reveals = reveals
+        self._reveals = session.settings.reveals
         self.metadata = {**WorldEnv.metadata, "autoreset_mode": self.autoreset_mode}
         self.num_envs = num_envs
         self.render_mode = mode

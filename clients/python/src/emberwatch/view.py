@@ -20,7 +20,7 @@ RENDER_MODES: Final = ("human", "rgb_array", "ansi")
 RENDER_FPS: Final = 10
 
 #: Row and column that each move adds.
-DIRECTIONS: Final[tuple[tuple[int, int], ...]] = ((-1, 0), (1, 0), (0, -1), (0, 1))
+DIRECTIONS: Final = np.array(((-1, 0), (1, 0), (0, -1), (0, 1)), np.int64)
 
 
 class View:
@@ -60,13 +60,14 @@ class View:
             self._screen = None
 
 
-def fly(start: tuple[int, int], moves: ArrayLike, grid: WorldSpec | ServerInfo) -> NDArray[np.intp]:
-    """The cells of a path after each move, `(n_moves, 2)`: a move off the grid stays in place."""
-    row, col = start
-    cells: list[tuple[int, int]] = []
-    for move in np.asarray(moves).tolist():
-        down, right = DIRECTIONS[int(move)]
-        row = min(max(row + down, 0), grid.height - 1)
-        col = min(max(col + right, 0), grid.width - 1)
-        cells.append((row, col))
-    return np.array(cells, np.intp).reshape(-1, 2)
+def fly(start: ArrayLike, moves: ArrayLike, grid: WorldSpec | ServerInfo) -> NDArray[np.int64]:
+    """The cells of a path after each move, `(T, 2)`: a move off the grid stays in place.
+
+    Or those of n paths, `(n, T, 2)`, where `start` is `(n, 2)` and `moves` `(n, T)`.
+    """
+    given, cell = np.asarray(moves), np.asarray(start, np.int64)
+    cells = np.empty((*given.shape, 2), np.int64)
+    for move in range(given.shape[-1]):
+        cell = (cell + DIRECTIONS[given[..., move]]).clip(0, (grid.height - 1, grid.width - 1))
+        cells[..., move, :] = cell
+    return cells
