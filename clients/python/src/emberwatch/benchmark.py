@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from emberwatch import wire
 from emberwatch.arguments import as_seed
 from emberwatch.client import Client
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.merit import RECENT_STEPS, MeritTally
 from emberwatch.observations import OF_BELIEF, OF_TEAM, cells_of, names_of
 from emberwatch.rows import Row, RowFile
@@ -235,9 +235,7 @@ def _play(
                 flown.append(np.array(tally.timed(act, seen)))
                 seen, _, _, truncated, _ = worlds.step(flown[-1])
             if truncated.any() and step < steps:
-                raise InvalidArgumentError(
-                    f"steps: expected at most {step}, as episodes of these worlds have, got {steps}"
-                )
+                raise invalid("steps", f"at most {step}, as episodes of these worlds have", steps)
             paths = np.stack(flown, axis=1).reshape(len(truncated), -1)
             tally.add(worlds.unwrapped.results, paths, worlds.unwrapped.truths)
             report.add(len(seeds))
@@ -284,21 +282,21 @@ def _check(
 ) -> list[int]:
     """The seeds as a list; refuses what no worlds can be made of."""
     if not isinstance(name, str) or not name or not name.isprintable():  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise InvalidArgumentError(f"name: expected a name for the table, got {name!r}")
+        raise invalid("name", "a name for the table", repr(name))
     if env not in (_MOVES, _PATHS):
-        raise InvalidArgumentError(f"env: expected {_MOVES!r} or {_PATHS!r}, got {env!r}")
+        raise invalid("env", f"{_MOVES!r} or {_PATHS!r}", repr(env))
     numbers = {"steps": steps, "batch": batch, "recent_steps": recent_steps}
     for what, number in numbers.items():
         if not isinstance(number, int | np.integer) or number < 1:  # pyright: ignore[reportUnnecessaryIsInstance]
-            raise InvalidArgumentError(f"{what}: expected at least 1, got {number!r}")
+            raise invalid(what, "at least 1", repr(number))
     for what in _SET:
         if what in keywords:
             raise InvalidArgumentError(f"{what}: expected none, as evaluate sets it")
     if not isinstance(seeds, Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise InvalidArgumentError(f"seeds: expected some, such as range(8), got {seeds!r}")
+        raise invalid("seeds", "some, such as range(8)", repr(seeds))
     chosen = [as_seed(seed) for seed in seeds]
     if not chosen or len(set(chosen)) < len(chosen):
-        raise InvalidArgumentError(f"seeds: expected some, each once, got {chosen}")
+        raise invalid("seeds", "some, each once", chosen)
     return chosen
 
 
@@ -307,9 +305,8 @@ def _acting(policy: Any, deterministic: bool) -> Policy:
     if predict is not None:
         return lambda observations: predict(observations, deterministic=deterministic)[0]
     if not callable(policy):
-        raise InvalidArgumentError(
-            "policy: expected a function of observations, or a model of Stable-Baselines3, "
-            f"got {policy!r}"
+        raise invalid(
+            "policy", "a function of observations, or a model of Stable-Baselines3", repr(policy)
         )
     return cast("Policy", policy)
 

@@ -1,7 +1,5 @@
 """`emberwatch/Wildfire-v0`: one step flies one path, of one robot or of many."""
 
-from __future__ import annotations
-
 from typing import Any, Unpack
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Paths flown move by move by many robots: where they are, what they have visited."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -3,8 +3,6 @@
 They need no model: only which state is the target, and for two of them the hidden states.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

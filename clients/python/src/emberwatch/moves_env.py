@@ -3,8 +3,6 @@
 For one robot, or for many.
 """
 
-from __future__ import annotations
-
 from typing import Any, Final, Literal, TypeAlias, Unpack
 
 import numpy as np

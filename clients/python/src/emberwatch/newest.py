@@ -1,7 +1,5 @@
 """Published samples that belong to given steps: for infos, pictures and rewards by the move."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from typing import Final, Generic, TypeVar

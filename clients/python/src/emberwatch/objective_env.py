@@ -3,8 +3,6 @@
 For one world, or for many.
 """
 
-from __future__ import annotations
-
 from typing import Any, Literal, Unpack
 
 import numpy as np

@@ -3,8 +3,6 @@
 Such as `for frame in emberwatch.observe("lab", timeout=10): print(frame.result.reward)`.
 """
 
-from __future__ import annotations
-
 import ctypes
 import json
 import time
@@ -17,7 +15,7 @@ from numpy.typing import NDArray
 
 from emberwatch import wire
 from emberwatch.channels import Closable, Node, channel_errors, in_turn
-from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.errors import bad_answer, invalid
 from emberwatch.wire import RobotResult, WorldResult
 
 # Seconds to sleep while there is no sample, soon after many came and else: publishing notifies
@@ -189,7 +187,7 @@ class Reader(Closable, Generic[_Sample]):
         size = ctypes.sizeof(self._header)
         header: Any = self._header.from_buffer_copy(ctypes.string_at(sample.user_header_ptr, size))
         if header.version != wire.VERSION:
-            raise _bad_sample(f"version {wire.VERSION}, got {header.version}")
+            raise bad_answer("sample", f"version {wire.VERSION}", header.version)
         payload = bytearray(ctypes.string_at(sample.payload_ptr, sample.payload().len()))
         publisher = getattr(header, "pid", 0)
         # A smaller number than expected is a new server's.
@@ -267,7 +265,7 @@ def observe(
         timeout: Iteration ends when no frame comes for so many seconds; None: never.
     """
     if timeout is not None and not timeout >= 0:
-        raise InvalidArgumentError(f"timeout: expected seconds, at least 0, or None, got {timeout}")
+        raise invalid("timeout", "seconds, at least 0, or None", timeout)
     return Observer(instance, world=world, timeout=timeout)
 
 
@@ -275,7 +273,7 @@ def frame_from_sample(header: Any, payload: bytearray, n_lost: int) -> Frame:
     """A step out of a sample's header and payload, which it keeps."""
     n_robots, grid = header.n_robots, (header.height, header.width)
     if not 1 <= n_robots <= wire.MAX_ROBOTS:
-        raise _bad_sample(f"1 to {wire.MAX_ROBOTS} robots, got {n_robots}")
+        raise bad_answer("sample", f"1 to {wire.MAX_ROBOTS} robots", n_robots)
     world = WorldResult(*wire.WORLD.unpack(bytes(header.result)))
     wire.check_stayed(world.hovered | world.late, n_robots)
     n_cells = grid[0] * grid[1]
@@ -313,7 +311,7 @@ def outlook_from_sample(header: Any, payload: bytearray, n_lost: int) -> Outlook
     shape = (header.n_states, header.height, header.width)
     n_bytes = 4 * header.n_states * header.height * header.width
     if len(payload) < n_bytes:
-        raise _bad_sample(f"{n_bytes} bytes or more, got {len(payload)}")
+        raise bad_answer("sample", f"{n_bytes} bytes or more", len(payload))
     try:
         intent: dict[str, Any] = json.loads(payload[n_bytes:])
         return Outlook(
@@ -332,13 +330,9 @@ def outlook_from_sample(header: Any, payload: bytearray, n_lost: int) -> Outlook
             n_lost=n_lost,
         )
     except (ValueError, KeyError, TypeError) as error:
-        raise _bad_sample(f"an agent's intent, got {error!r}") from error
+        raise bad_answer("sample", "an agent's intent", repr(error)) from error
 
 
 def _check_length(got: int, expected: int) -> None:
     if got != expected:
-        raise _bad_sample(f"{expected} bytes, got {got}")
-
-
-def _bad_sample(problem: str) -> EmberwatchError:
-    return wire.bad_answer(f"sample: expected {problem}")
+        raise bad_answer("sample", f"{expected} bytes", got)

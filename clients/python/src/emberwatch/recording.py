@@ -4,8 +4,6 @@ Such as `for record in emberwatch.recording.read("lab.recording", world=0): ...`
 and opens no shared memory.
 """
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

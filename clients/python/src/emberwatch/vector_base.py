@@ -4,8 +4,6 @@ Rows are robots: all of the first world, then those of the next. The robots of a
 their episodes together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,7 +18,7 @@ from numpy.typing import NDArray
 from emberwatch.agent_session import Summaries
 from emberwatch.arguments import as_seed
 from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, wants_to_resume
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import invalid
 from emberwatch.observations import Observations, cells_of, of_row
 from emberwatch.session import Session, SessionOwner
 from emberwatch.settings import Settings, draw_seed
@@ -46,9 +44,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         if max_episode_steps == -1:  # no limit in Gymnasium's own `make`
             max_episode_steps = None
         if max_episode_steps is not None and max_episode_steps < 1:
-            raise InvalidArgumentError(
-                f"max_episode_steps: expected at least 1 or None, got {max_episode_steps}"
-            )
+            raise invalid("max_episode_steps", "at least 1 or None", max_episode_steps)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self._session, self._spec = session, session.spec
         spec, num_envs, mode = session.spec, session.n_rows, session.settings.render_mode
@@ -307,9 +303,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         if isinstance(seed, int | np.integer):
             return [as_seed(int(seed) + world) for world in range(n_worlds)]
         if not hasattr(seed, "__len__") or len(seed) != self.num_envs:
-            raise InvalidArgumentError(
-                f"seed: expected an integer, None or {self.num_envs} of them, got {seed!r}"
-            )
+            raise invalid("seed", f"an integer, None or {self.num_envs} of them", repr(seed))
         seeds = [None if one is None else as_seed(one) for one in seed]
         return seeds[:: self._spec.n_robots]
 
@@ -319,14 +313,10 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
             return np.ones(shape, np.bool_)
         got = f"{mask.dtype} {mask.shape}" if hasattr(mask, "dtype") else repr(mask.__class__)
         if got != f"bool {shape}" or not mask.any():
-            raise InvalidArgumentError(
-                f"reset_mask: expected an array {shape} of bool with at least one True, got {got}"
-            )
+            raise invalid("reset_mask", f"an array {shape} of bool with at least one True", got)
         worlds = mask.reshape(-1, self._spec.n_robots)
         if (worlds.any(axis=1) != worlds.all(axis=1)).any():
-            raise InvalidArgumentError(
-                "reset_mask: expected all robots of a world or none, got some"
-            )
+            raise invalid("reset_mask", "all robots of a world or none", "some")
         return mask
 
 
@@ -342,9 +332,7 @@ def info_of(infos: dict[str, Any], row: int) -> dict[str, Any]:
 def vector_session(settings: Settings, num_envs: int | None) -> Session:
     """A session of all robots of some worlds."""
     if settings.robot is not None:
-        raise InvalidArgumentError(
-            f"robot: expected None, as a vector environment flies all, got {settings.robot}"
-        )
+        raise invalid("robot", "None, as a vector environment flies all", settings.robot)
     return Session(settings, num_envs)
 
 

@@ -1,14 +1,12 @@
 """The picture of an environment in its render mode."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import invalid
 from emberwatch.render import Palette, Picture, Screen, ansi, rgb_array
 from emberwatch.replies import ServerInfo
 from emberwatch.settings import WorldSpec
@@ -28,9 +26,8 @@ class View:
 
     def __init__(self, render_mode: str | None, spec: WorldSpec) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
-            raise InvalidArgumentError(
-                f"render_mode: expected None or one of {', '.join(RENDER_MODES)}, "
-                f"got {render_mode!r}"
+            raise invalid(
+                "render_mode", f"None or one of {', '.join(RENDER_MODES)}", repr(render_mode)
             )
         self.mode: Final = render_mode
         self._palette = Palette.of(spec.described or spec.n_observations)

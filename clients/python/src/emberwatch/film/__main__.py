@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from emberwatch import recording
 from emberwatch.belief import Filter, initial_prior, uniform_prior
-from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.film.scenes import Scene, Selection, scenes
 from emberwatch.film.steps import steps
 from emberwatch.model import Model
@@ -131,9 +131,7 @@ def _survey(flags: argparse.Namespace, selection: Selection) -> tuple[ServerInfo
     if server is None and not worlds and caught:
         raise EmberwatchError(str(caught[-1].message), "recording")
     if server is None:
-        raise InvalidArgumentError(
-            f"--world: expected one of those recorded, {sorted(worlds)}, got {flags.world}"
-        )
+        raise invalid("--world", f"one of those recorded, {sorted(worlds)}", flags.world)
     if n_steps == 0:
         known = ", ".join(f"{first} to {last}" for first, last in runs[:_MOST_NAMED])
         more = ", ..." if len(runs) > _MOST_NAMED else ""
@@ -185,9 +183,7 @@ def _write(flags: argparse.Namespace, page: Page, n_scenes: int, scenes: Iterato
     (width, height), out = page.size, flags.out
     if n_scenes * width * height > _MOST_PIXELS:
         most = _MOST_PIXELS // (width * height)
-        raise InvalidArgumentError(
-            f"--every, --scale: expected at most {most} pictures of this size, got {n_scenes}"
-        )
+        raise invalid("--every, --scale", f"at most {most} pictures of this size", n_scenes)
     out.parent.mkdir(parents=True, exist_ok=True)
     beside = out.with_name(f".{out.name}.{os.getpid()}")
     try:

@@ -1,7 +1,5 @@
 """Steps in, scenes out: the known model's filter runs along, also where steps are missing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What a recording tells of one world, step by step: records in, steps out."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What times in files count, and from when: `hours since 2020-08-01 12:00`."""
 
-from __future__ import annotations
-
 import math
 import re
 from datetime import UTC, datetime, timedelta, timezone
@@ -10,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import InvalidArgumentError, invalid
 
 SECONDS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 """Of each unit."""
@@ -80,9 +78,7 @@ def length(text: str) -> float:
     except (KeyError, ValueError):
         seconds = 0.0
     if not 0.0 < seconds < math.inf:
-        raise InvalidArgumentError(
-            f"--step: expected a number and s, min, h or d, such as '10 min', got '{text}'"
-        )
+        raise invalid("--step", "a number and s, min, h or d, such as '10 min'", f"'{text}'")
     return seconds
 
 
@@ -102,7 +98,7 @@ def unit_of(clock: Clock, wanted: str | None, name: str) -> str | None:
     """What the times count, as the flag or the file says."""
     in_file = clock.unit()
     if None not in (wanted, in_file) and wanted != in_file:
-        raise InvalidArgumentError(f"--unit: expected {in_file}, as in {name}, got {wanted}")
+        raise invalid("--unit", f"{in_file}, as in {name}", wanted)
     return wanted or in_file
 
 

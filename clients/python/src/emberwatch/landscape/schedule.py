@@ -1,13 +1,11 @@
 """In which step each layer shows first: by the files' times, or in their order."""
 
-from __future__ import annotations
-
 from datetime import datetime
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.dates import EVEN, SECONDS, Clock, Time, steps_at, unit_of
 
 
@@ -61,9 +59,7 @@ class Schedule:
                 f"--step chooses among them, got {self._every}"
             )
         if self._clock is None and self._wanted is not None:
-            raise InvalidArgumentError(
-                f"--unit: expected none, as {self._first_name} has no times, got {self._wanted}"
-            )
+            raise invalid("--unit", f"none, as {self._first_name} has no times", self._wanted)
 
     def _check_clock(self, name: str, clock: Clock | None) -> None:
         """Refuses times that cannot be compared with those of the first layer."""
@@ -73,18 +69,14 @@ class Schedule:
                 "no time" if one is None else f"times in '{one.words}' ({one.calendar})"
                 for one in (self._clock, clock)
             )
-            raise InvalidArgumentError(
-                f"{name}: expected {first} as in {self._first_name}, got {got}"
-            )
+            raise invalid(name, f"{first} as in {self._first_name}", got)
 
     def _check_order(self, name: str, told: str) -> None:
         if len(self._times) < 2:
             return
         step, first = self._times[-1] - self._times[-2], self._times[1] - self._times[0]
         if step <= 0:
-            raise InvalidArgumentError(
-                f"{name}: expected a later time than {self._told}, got {told}"
-            )
+            raise invalid(name, f"a later time than {self._told}", told)
         if self._unit is None and abs(step - first) > EVEN * first:
             raise InvalidArgumentError(
                 f"{name}: expected steps of {first:.6g} in time, got {step:.6g}; --unit says what "
