@@ -9,10 +9,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from processes import Server, at_the_end
 
 import emberwatch
-from emberwatch.errors import EmberwatchError
-from emberwatch.programs import Program, unused_instance
 
 WILDFIRE = "emberwatch/Wildfire-v0"
 MOVES = "emberwatch/WildfireMoves-v0"
@@ -31,25 +30,9 @@ SMALL: dict[str, Any] = {"height": 7, "width": 5, "n_moves": 4, "burn_in": 50, "
 @contextlib.contextmanager
 def serving(**flags: object) -> Iterator[str]:
     """A running server of `SMALL` worlds, by its instance name; `flags` as on its command line."""
-    instance = str(flags.setdefault("instance", unused_instance()))
     small = {"height": 7, "width": 5, "moves": 4, "burn_in": 50, "model": LIVELY, "threads": 1}
-    arguments = [
-        f"--{name.replace('_', '-')}={str(value).lower() if isinstance(value, bool) else value}"
-        for name, value in {**small, **flags}.items()
-    ]
-    server = Program("emberwatch-server", arguments)
-    try:
-        server.wait_for(lambda: emberwatch.connect(instance)).close()
-        yield instance
-        # Sooner than a signal; a test may have ended it already.
-        with contextlib.suppress(EmberwatchError), emberwatch.connect(instance) as client:
-            client.shutdown()
-    finally:
-        server.stop()
-
-
-#: Closes what `closed_later` was given.
-at_the_end = contextlib.ExitStack()
+    with contextlib.closing(Server(**{**small, **flags}, ready=False)) as server:
+        yield server.instance
 
 
 def closed_later(env: Any) -> Any:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
 from typing import Any
 
 import environments
 import numpy as np
 import pytest
 from environments import OBJECTIVE, agent_pid, assert_same, impatient, private_pid, rollout
-from failures import fails
+from failures import fails, refuses
 from gymnasium.utils.env_checker import check_env
-from processes import Server, eventually, stopped
+from processes import eventually, server, stopped
 
 import emberwatch
 from emberwatch import errors
@@ -103,7 +102,7 @@ def test_a_stopped_agent_is_a_timeout_and_the_next_step_asks_for_a_reset(any_env
     assert np.all(decide(any_env) == info["step"] + 1)
 
 
-def test_a_lease_lost_between_steps_is_told_as_that(server: Callable[..., Server]) -> None:
+def test_a_lease_lost_between_steps_is_told_as_that() -> None:
     started = server(lease_millis=3000)
     env = make(instance=started.instance)
     env.reset(seed=1000)
@@ -114,8 +113,8 @@ def test_a_lease_lost_between_steps_is_told_as_that(server: Callable[..., Server
         env.step(0)
 
 
-def test_truth_is_not_waited_for_longer_than_the_timeout(server: Callable[..., Server]) -> None:
-    started = server(publish_truth="true")
+def test_truth_is_not_waited_for_longer_than_the_timeout() -> None:
+    started = server(publish_truth=True)
     env = make(instance=started.instance, truth=True)
     _, info = env.reset(seed=1000)
     assert info["truth"].shape == (5, 7)
@@ -123,21 +122,20 @@ def test_truth_is_not_waited_for_longer_than_the_timeout(server: Callable[..., S
         env._session._truth.at([(9, 9, 9)], 0.2)
 
 
-def test_a_hidden_model_must_be_given(server: Callable[..., Server]) -> None:
-    instance = server(reveal_model="false").instance
-    with pytest.raises(errors.InvalidArgumentError, match="model: expected one"):
+def test_a_hidden_model_must_be_given() -> None:
+    instance = server(reveal_model=False).instance
+    with refuses("model: expected one"):
         make(instance=instance)
     env = make(instance=instance, model="wildfire")
     env.reset(seed=1000)
     assert env.step(2)[4]["step"] == 1
 
 
-@pytest.mark.parametrize("action", [[[0], [1, 2]], 4, -1, 1.0, "fire", [0, 1], None])
-def test_a_wrong_action_is_refused_and_nothing_is_sent(env: Any, action: object) -> None:
-    env.reset(seed=1000)
-    with pytest.raises(errors.InvalidArgumentError, match="expected one integer, 0 to 3"):
-        env.step(action)
-    assert env.step(0)[4]["step"] == 1
+@pytest.mark.parametrize("action", [4, [0, 1, 4], "fire"])
+def test_a_wrong_action_is_refused_and_nothing_is_sent(any_env: Any, action: object) -> None:
+    with refuses("action: expected"):
+        any_env.step(action)
+    assert np.all(decide(any_env) == 1)
 
 
 @pytest.mark.parametrize(
@@ -152,27 +150,13 @@ def test_a_wrong_action_is_refused_and_nothing_is_sent(env: Any, action: object)
 )
 @pytest.mark.parametrize("maker", [make, make_vec])
 def test_a_wrong_keyword_is_refused(maker: Any, keywords: dict[str, Any], words: str) -> None:
-    with pytest.raises(errors.InvalidArgumentError, match=words):
+    with refuses(words):
         maker(**keywords)
 
 
-@pytest.mark.parametrize("action", [[0, 1], [0, 1, 4], [0, -1, 0], [0.0] * 3, [[0], [1, 2], 3]])
-def test_wrong_actions_are_refused_and_nothing_is_sent(action: object) -> None:
-    envs = make_vec()
-    envs.reset(seed=1000)
-    with pytest.raises(errors.InvalidArgumentError, match="action: expected"):
-        envs.step(action)
-    assert decide(envs).tolist() == [1, 1, 1]
-
-
 def test_more_worlds_than_frames_are_kept_of_are_not_drawn() -> None:
-    with pytest.raises(errors.InvalidArgumentError, match="expected at most 64 worlds, got 65"):
+    with refuses("expected at most 64 worlds, got 65"):
         make_vec(65, render_mode="rgb_array")
-
-
-def test_a_seed_that_does_not_fit_is_refused(env: Any) -> None:
-    with pytest.raises(errors.InvalidArgumentError, match="got 18446744073709551616"):
-        env.reset(seed=2**64)
 
 
 def test_a_reset_that_finds_agent_or_server_dead_starts_others(any_env: Any) -> None:
@@ -213,7 +197,7 @@ def test_it_attaches_to_a_running_server_and_to_a_running_agent(env: Any) -> Non
     assert env.step(3)[4]["step"] == 3
 
 
-def test_many_worlds_attach_to_a_running_agent_of_theirs(server: Callable[..., Server]) -> None:
+def test_many_worlds_attach_to_a_running_agent_of_theirs() -> None:
     started = server(worlds=4)
     flags = ["--instance", started.instance, "--world", "1", "--worlds", "3", "--prior", "initial"]
     agent = Program("emberwatch-agent", ["serve-decisions", *flags])
@@ -245,7 +229,7 @@ def test_many_worlds_attach_to_a_running_agent_of_theirs(server: Callable[..., S
     for n_worlds in (2, 1):
         other = make_vec(n_worlds, **arguments)
         words = f"expected one of worlds 1 to {n_worlds}, got one of 1 to 3"
-        with pytest.raises(errors.InvalidArgumentError, match=words):
+        with refuses(words):
             other.reset(seed=1000)
     agent.stop()
 

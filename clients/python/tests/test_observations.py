@@ -6,9 +6,9 @@ import gymnasium
 import numpy as np
 import pytest
 from environments import LIVELY, MOVES, WILDFIRE, actions, make, serving
+from failures import refuses
 
 from emberwatch.belief import Transition, entropy
-from emberwatch.errors import InvalidArgumentError
 from emberwatch.wrappers import BeliefObservation
 
 #: On the smallest grid that they are meant for.
@@ -107,23 +107,21 @@ def test_a_belief_goes_on_where_a_world_is_resumed() -> None:
 
 @pytest.mark.parametrize("window", [0, 4, -3, 2.5, "5"], ids=repr)
 def test_an_impossible_window_is_named(window: Any) -> None:
-    with pytest.raises(InvalidArgumentError, match="window: expected an odd number from 3 on"):
+    with refuses("window: expected an odd number from 3 on"):
         make(MOVES, window=window)
 
 
 @pytest.mark.parametrize("parts", [None, 3, [["frame"]], ["frame", None], []], ids=repr)
 def test_what_is_no_part_is_named(parts: Any) -> None:
     for name in (WILDFIRE, MOVES):
-        with pytest.raises(InvalidArgumentError, match="observation: expected one or several of"):
+        with refuses("observation: expected one or several of"):
             make(name, observation=parts)
 
 
 def test_a_belief_needs_a_model() -> None:
     with serving(reveal_model=False) as instance:
         for part in ("belief", "local"):
-            with pytest.raises(
-                InvalidArgumentError, match="observation: expected a server that reveals its mo"
-            ):
+            with refuses("observation: expected a server that reveals its mo"):
                 make(MOVES, instance=instance, observation=part)
 
 
