@@ -22,8 +22,7 @@ from emberwatch.errors import (
     bad_answer,
     invalid,
 )
-from emberwatch.newest import Newest
-from emberwatch.observer import Frame, Observer
+from emberwatch.observer import Frame, Newest, Observer
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program
 from emberwatch.replies import Decision, DecisionsInfo

@@ -50,6 +50,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
         self._spec: Final = session.spec
         self.render_mode = session.settings.render_mode
         self._view = View(self.render_mode, self._spec)
+        self._reveals = session.settings.reveals
         #: Which robot of a world that others fly in; None: it is alone in its world.
         self._robot: Final = session.settings.robot
         self._n_missed = 0
@@ -59,7 +60,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
 
     def render(self) -> Any:
         """Draws the last frame, path and robot, beside the truth when that is revealed."""
-        if self.render_mode is None or not self._is_open():
+        if self.render_mode is None or not self.is_open:
             gymnasium.logger.warn(NOTHING_TO_DRAW)
             return None
         return None if self.render_mode == "human" else self._draw()
@@ -101,8 +102,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
 
     def _trace(self, result: RobotResult, path: NDArray[np.uint8]) -> None:
         """Keeps the cells of a path for pictures, if it was flown."""
-        if self.render_mode is not None:
-            self._path = fly(result.start, path[: result.n_moves], self._spec)
+        self._path = fly(result.start, path[: result.n_moves], self._spec)
 
     def _describe(self, answer: StepAnswer, result: StepResult) -> dict[str, Any]:
         info: dict[str, Any] = {
@@ -110,7 +110,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
         }
         if self._robot is not None:
             info["n_missed"] = self._n_missed
-        if self._session.settings.reveals:
+        if self._reveals:
             self._truth = truth = self._session.truth(answer)[0]
             info["truth"] = truth.copy()
         return info

@@ -175,7 +175,8 @@ def evaluate(
     report = _Progress(progress, name, chosen, len(missing) * steps)
     for first in range(0, len(missing), batch):
         part = missing[first : first + batch]
-        getattr(policy, "begin", _nothing)(len(part))
+        if hasattr(policy, "begin"):
+            policy.begin(len(part))
         tally = _play(env, keywords, act, part, steps, recent_steps, report)
         rows = _rows(tally, part, steps, kind)
         done |= {row.world_seed: row for row in rows}
@@ -309,10 +310,6 @@ def _acting(policy: Any, deterministic: bool) -> Policy:
             "policy", "a function of observations, or a model of Stable-Baselines3", repr(policy)
         )
     return cast("Policy", policy)
-
-
-def _nothing(_n_worlds: int) -> None:
-    """What a policy without `begin` does."""
 
 
 class _Progress:

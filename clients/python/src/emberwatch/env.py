@@ -163,17 +163,16 @@ class WildfireEnv(WorldEnv):
         self._answer = answer = self._session.step(moves)
         self._update(self._observations, answer)
         result = answer.result()
-        self._trace(result.robot, moves.reshape(-1))
+        if self.render_mode is not None:
+            self._trace(result.robot, moves.reshape(-1))
         observation, info = self._seen(answer, result)
         reward, world = paid(result, self._pays), result.world
         return observation, reward, bool(world.terminated), bool(world.truncated), info
 
     def _seen(self, answer: StepAnswer, result: StepResult) -> tuple[Any, dict[str, Any]]:
         info = self._describe(answer, result)
-        frames = answer.frames
-        if self.render_mode is not None:
-            # The learner may write to its frame: pictures come from another.
-            frames = frames.copy()
+        # The learner may write to its frame: pictures come from another.
+        frames = answer.frames if self.render_mode is None else answer.frames.copy()
         if self.render_mode == "human":
             self._draw()
         cells = np.array([result.robot.cell], np.int64)

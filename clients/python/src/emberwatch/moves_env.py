@@ -129,7 +129,7 @@ class WildfireMovesEnv(WorldEnv):
             EmberwatchError: As `WildfireEnv.step`.
         """
         move = np.array([as_choice(action, wire.N_MOVES)], np.uint8)
-        if self._answer is None or not self._is_open():
+        if self._answer is None or not self.is_open:
             raise not_reset()
         flights = self._flights
         if not flights.completes()[0]:
@@ -141,7 +141,8 @@ class WildfireMovesEnv(WorldEnv):
         answer = self._session.step(path)
         result = answer.result()
         reward = paid(result, self._pays) - float(flights.paid[0])
-        self._trace(result.robot, path[0])
+        if self.render_mode is not None:
+            self._trace(result.robot, path[0])
         self._update(self._observations, answer)
         self._begin_path(answer)
         observation, info = self._seen(answer)
@@ -214,7 +215,7 @@ class WildfireMovesVectorEnv(WorldVectorEnv):
         return as_choices(actions, self.num_envs, wire.N_MOVES)
 
     def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
-        if not self._session.is_open:
+        if not self.is_open:
             raise not_reset()
         completed = flown & self._flights.completes()
         if not completed.any():

@@ -28,8 +28,7 @@ from emberwatch.errors import (
 )
 from emberwatch.lease import Lease
 from emberwatch.model import Model
-from emberwatch.newest import Newest
-from emberwatch.observer import Truth, TruthReader
+from emberwatch.observer import Newest, Truth, TruthReader
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program, unused_instance
 from emberwatch.settings import Settings, WorldSpec, private_spec, running_spec
@@ -331,13 +330,14 @@ class SessionOwner:
         """The server's instance name, once the environment has been reset."""
         return self._session.instance
 
-    def _is_open(self) -> bool:
+    @property
+    def is_open(self) -> bool:
         """Whether there has been a reset since it was made or closed."""
         return self._session.is_open
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies, which only a closed environment has: no two may act on the same worlds."""
-        if self._is_open():
+        if self.is_open:
             raise TypeError(
                 f"copy or pickle: expected a closed environment, got a {type(self).__name__} "
                 "that acts on a server's worlds: close it first, or make another with "

@@ -119,11 +119,10 @@ class Settings:
             "burn-in": self.burn_in,
             "start": self.start,
             "publish-truth": str(self.truth).lower(),
+            # Refused where there is no states file.
+            "states-symmetries": "true" if self.states_symmetries else None,
+            "states-offset": self.states_offset or None,
         }
-        if self.states_symmetries:
-            flags["states-symmetries"] = "true"
-        if self.states_offset:
-            flags["states-offset"] = self.states_offset
         return [f"--{flag}={value}" for flag, value in flags.items() if value is not None]
 
 

@@ -88,7 +88,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         mask = self._check_mask(rest.pop("reset_mask", None))
         seeds = self._check_seeds(seed)
         resumes = wants_to_resume(rest, seed)
-        if not mask.all() and not self._session.is_open:
+        if not mask.all() and not self.is_open:
             raise gymnasium.error.ResetNeeded("reset_mask: expected a reset of all worlds before")
         self.closed = False
         chosen = np.flatnonzero(mask).tolist()
@@ -125,7 +125,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
 
     def render(self) -> tuple[Any, ...] | None:
         """The picture of each robot, as `WildfireEnv.render` draws it."""
-        if self.render_mode is None or not self._session.is_open:
+        if self.render_mode is None or not self.is_open:
             gymnasium.logger.warn(NOTHING_TO_DRAW)
             return None
         if self.render_mode == "human":
@@ -160,11 +160,6 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         `(num_envs, H, W)`; not to be written to.
         """
         return self._truths
-
-    @property
-    def is_open(self) -> bool:
-        """Whether there has been a reset since it was made or closed."""
-        return self._session.is_open
 
     def close_extras(self, **kwargs: Any) -> None:
         self._session.close()

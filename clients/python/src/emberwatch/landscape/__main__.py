@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
-from emberwatch.landscape.dates import length
 from emberwatch.landscape.fire import BURNING, BURNT, Meaning, states, times
 from emberwatch.landscape.grid import Place, check_alike, of_world, target_shape
 from emberwatch.landscape.layers import Choice, read, stacks
+from emberwatch.landscape.schedule import length
 from emberwatch.landscape.world import Fill, arrays, check_outputs, description, write
 
 _NAME: Final = "python -m emberwatch.landscape"

@@ -14,18 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.landscape.dates import SECONDS, steps_at, unit_of
-from emberwatch.landscape.grid import (
-    Place,
-    Rule,
-    check_same,
-    check_square,
-    crop,
-    part,
-    resampled,
-)
+from emberwatch.landscape.grid import Place, Rule, check_same, check_square, crop, part, resampled
 from emberwatch.landscape.layers import Layer
-from emberwatch.landscape.schedule import Schedule
+from emberwatch.landscape.schedule import SECONDS, Schedule, steps_at, unit_of
 
 UNBURNT, BURNING, BURNT = 0, 1, 2
 

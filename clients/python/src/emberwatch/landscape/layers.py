@@ -17,17 +17,12 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
-from numpy.lib.format import (
-    read_array,
-    read_array_header_1_0,
-    read_array_header_2_0,
-    read_magic,
-)
+from numpy.lib.format import read_array, read_array_header_1_0, read_array_header_2_0, read_magic
 from numpy.typing import NDArray
 
 from emberwatch.errors import InvalidArgumentError, invalid
-from emberwatch.landscape.dates import Clock, Time
 from emberwatch.landscape.grid import Place
+from emberwatch.landscape.schedule import Clock, Time
 
 _DRIVERS: Final = {
     ".tif": ("GTiff", "a GeoTIFF"),
