@@ -1,15 +1,12 @@
-"""A deadline for each test; servers and scripts that end with it."""
+"""A deadline for each test, and the end of what it opened."""
 
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator
 from types import FrameType
 
 import pytest
 from hypothesis import settings
-from processes import SMALL, Script, Server
-
-from emberwatch.programs import unused_instance
+from processes import at_the_end
 
 # A busy machine is no bug: the deadline below is enough.
 settings.register_profile("emberwatch", deadline=None)
@@ -25,7 +22,7 @@ DEADLINE = 300
 
 @pytest.fixture(autouse=True)
 def deadline() -> Iterator[None]:
-    """A test that hangs fails."""
+    """A test that hangs fails; what it opened is closed."""
 
     def late(_number: int, _frame: FrameType | None) -> None:
         raise TimeoutError(f"still running after {DEADLINE} s")
@@ -33,31 +30,13 @@ def deadline() -> Iterator[None]:
     before = signal.signal(signal.SIGALRM, late)
     signal.alarm(DEADLINE)
     yield
+    at_the_end.close()
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
 
 
-@pytest.fixture
-def server() -> Iterator[Callable[..., Server]]:
-    """Starts a small server, `server(worlds=3, coverage="client")`, that ends with the test."""
-    with ExitStack() as stack:
-
-        def start(instance: str | None = None, *, ready: bool = True, **settings: object) -> Server:
-            started = Server(instance or unused_instance(), SMALL | settings, ready=ready)
-            stack.callback(started.close)
-            return started
-
-        yield start
-
-
-@pytest.fixture
-def script() -> Iterator[Callable[..., Script]]:
-    """Runs Python code in a process of its own, `script(code, argument)`."""
-    with ExitStack() as stack:
-
-        def start(code: str, *arguments: object) -> Script:
-            started = Script(code, *arguments)
-            stack.callback(started.close)
-            return started
-
-        yield start
+@pytest.fixture(autouse=True)
+def windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows open in memory."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setenv("PYGAME_HIDE_SUPPORT_PROMPT", "1")

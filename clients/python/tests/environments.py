@@ -9,10 +9,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from processes import Server, at_the_end
 
 import emberwatch
-from emberwatch.errors import EmberwatchError
-from emberwatch.programs import Program, unused_instance
 
 WILDFIRE = "emberwatch/Wildfire-v0"
 MOVES = "emberwatch/WildfireMoves-v0"
@@ -31,33 +30,36 @@ SMALL: dict[str, Any] = {"height": 7, "width": 5, "n_moves": 4, "burn_in": 50, "
 @contextlib.contextmanager
 def serving(**flags: object) -> Iterator[str]:
     """A running server of `SMALL` worlds, by its instance name; `flags` as on its command line."""
-    instance = str(flags.setdefault("instance", unused_instance()))
     small = {"height": 7, "width": 5, "moves": 4, "burn_in": 50, "model": LIVELY, "threads": 1}
-    arguments = [
-        f"--{name.replace('_', '-')}={str(value).lower() if isinstance(value, bool) else value}"
-        for name, value in {**small, **flags}.items()
-    ]
-    server = Program("emberwatch-server", arguments)
-    try:
-        server.wait_for(lambda: emberwatch.connect(instance)).close()
-        yield instance
-        # Sooner than a signal; a test may have ended it already.
-        with contextlib.suppress(EmberwatchError), emberwatch.connect(instance) as client:
-            client.shutdown()
-    finally:
-        server.stop()
+    with contextlib.closing(Server(**{**small, **flags}, ready=False)) as server:
+        yield server.instance
 
 
-def make(name: str = WILDFIRE, **keywords: Any) -> gymnasium.Env[Any, Any]:
+def closed_later(env: Any) -> Any:
+    """An environment that the end of the test closes."""
+    at_the_end.callback(env.close)
+    return env
+
+
+def make(name: str = WILDFIRE, **keywords: Any) -> Any:
     """`gymnasium.make` of a small world, or with `instance` of a running server's."""
-    return gymnasium.make(name, **_small(keywords))
+    return closed_later(gymnasium.make(name, **_usual(name, keywords)))
 
 
-def make_vec(
-    n_worlds: int, name: str = WILDFIRE, **keywords: Any
-) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
+def make_vec(n_worlds: int, name: str = WILDFIRE, **keywords: Any) -> Any:
     """`gymnasium.make_vec` of small worlds, or with `instance` of a running server's."""
-    return gymnasium.make_vec(name, num_envs=n_worlds, **_small(keywords))
+    return closed_later(gymnasium.make_vec(name, num_envs=n_worlds, **_usual(name, keywords)))
+
+
+def private_pid(env: Any) -> int:
+    """The process of a private server."""
+    with emberwatch.connect(env.unwrapped.instance) as client:
+        return client.info.pid
+
+
+def agent_pid(env: Any) -> int:
+    """The process of an environment's own agent."""
+    return env.unwrapped._agent._own_agent.pid
 
 
 @contextlib.contextmanager
@@ -70,8 +72,9 @@ def impatient(env: Any, seconds: float = 0.2) -> Iterator[None]:
     session.settings = kept
 
 
-def _small(keywords: dict[str, Any]) -> dict[str, Any]:
-    return keywords if keywords.get("instance") is not None else {**SMALL, **keywords}
+def _usual(name: str, keywords: dict[str, Any]) -> dict[str, Any]:
+    usual = {} if keywords.get("instance") is not None else SMALL
+    return {**usual, **({"prior": "initial"} if name == OBJECTIVE else {}), **keywords}
 
 
 @contextlib.contextmanager

@@ -1,5 +1,7 @@
 """Servers and scripts as child processes: on instances of their own, with deadlines."""
 
+from __future__ import annotations
+
 import os
 import select
 import signal
@@ -8,12 +10,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from typing import Any
 
 from emberwatch.client import Client
 from emberwatch.errors import EmberwatchError
-from emberwatch.programs import Program
+from emberwatch.programs import Program, unused_instance
 from emberwatch.replies import ServerStatus
 
 #: How long anything may take that should take milliseconds, seconds.
@@ -25,24 +27,39 @@ LONG = 5 * PATIENCE
 #: A small, quick server: 5 x 7 cells, 6 moves, 20 steps of burn-in.
 SMALL = {"height": 5, "width": 7, "moves": 6, "burn_in": 20}
 
+#: Closes what a test has opened, in the reverse order; `conftest.py` calls it.
+at_the_end = ExitStack()
+
+
+def server(instance: str | None = None, *, ready: bool = True, **flags: object) -> Server:
+    """Starts a small server, `server(worlds=3, coverage="client")`, that ends with the test."""
+    return at_the_end.enter_context(closing(Server(instance, ready=ready, **SMALL | flags)))
+
+
+def script(code: str, *arguments: object) -> Script:
+    """Runs Python code in a process of its own, which ends with the test."""
+    return at_the_end.enter_context(closing(Script(code, *arguments)))
+
 
 class Server:
     """A running server and the connections to it."""
 
-    def __init__(self, instance: str, settings: dict[str, object], *, ready: bool) -> None:
-        """Starts it and waits until it answers and, if asked, until its worlds are ready."""
-        self.instance = instance
-        arguments = {"instance": instance, **settings}
-        flags = [
-            f"--{name.replace('_', '-')}={value}"
-            for name, value in arguments.items()
-            if value is not None
-        ]
-        self.program = Program("emberwatch-server", flags)
+    def __init__(self, instance: str | None = None, *, ready: bool = True, **flags: object) -> None:
+        """Starts it and waits until it answers and, if asked, until its worlds are ready.
+
+        Flags that are None are left out.
+        """
+        self.instance = instance or unused_instance()
+        arguments: list[str] = []
+        for name, value in {"instance": self.instance, **flags}.items():
+            if value is not None:
+                word = str(value).lower() if isinstance(value, bool) else value
+                arguments.append(f"--{name.replace('_', '-')}={word}")
+        self.program = Program("emberwatch-server", arguments)
         self._held = ExitStack()
         self._held.callback(self.program.stop)
         try:
-            self._client = self.program.wait_for(lambda: Client(instance))
+            self._client = self.program.wait_for(lambda: Client(self.instance))
             self._held.enter_context(self._client)
             self._held.callback(self._shut_down)
             self._held.callback(self.wake_up)

@@ -6,20 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from failures import fails
+from failures import fails, refuses
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from emberwatch.belief import (
-    UNOBSERVED,
-    Filter,
-    Transition,
-    entropy,
-    initial_prior,
-    uniform_prior,
-)
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.belief import UNOBSERVED, Filter, Transition, entropy, initial_prior, uniform_prior
 from emberwatch.model import Model
 
 REPOSITORY = Path(__file__).parents[3]
@@ -302,5 +294,5 @@ def test_a_model_of_biases_only_forgets() -> None:
 def test_a_model_that_can_vanish_is_refused() -> None:
     model = model_of(kernel=np.zeros((2, 2, 1, 1)), bias=np.zeros(2), matrix=np.ones((2, 1)))
     filter = Filter(model, prior=uniform_prior(model, height=2, width=2))
-    with pytest.raises(InvalidArgumentError, match=r"cell \(0, 0\): expected a positive sum"):
+    with refuses(r"cell \(0, 0\): expected a positive sum"):
         filter.predict()

@@ -9,14 +9,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from failures import fails
+from failures import fails, refuses
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from emberwatch import programs
 from emberwatch.belief import Filter, initial_prior, uniform_prior
-from emberwatch.errors import InvalidArgumentError
 from emberwatch.model import Model
 from emberwatch.prior import simulated_prior
 from emberwatch.wrappers import BeliefObservation
@@ -212,7 +211,7 @@ def test_a_hidden_model_must_be_given(tmp_path: Path) -> None:
     for model in (WILDFIRE, file, str(file)):
         assert BeliefObservation(Stub(model=None), model=model).reset()[0].shape == (3, *SHAPE)
     file.write_text("")
-    with pytest.raises(InvalidArgumentError, match="model.toml"):
+    with refuses("model.toml"):
         BeliefObservation(Stub(), model=file)
 
 

@@ -3,23 +3,19 @@
 import os
 import signal
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from failures import fails
-from processes import LONG, PATIENCE, Script, Server, eventually
+from processes import LONG, PATIENCE, eventually, script, server
 
 from emberwatch import errors
 from emberwatch.client import connect
 
-Start = Callable[..., Server]
-Run = Callable[..., Script]
-
 US = os.getpid()
 
 
-def test_every_call_has_a_timeout(server: Start) -> None:
+def test_every_call_has_a_timeout() -> None:
     started = server()
     client = started.connect()
     lease = client.acquire()
@@ -42,7 +38,7 @@ def test_every_call_has_a_timeout(server: Start) -> None:
 
 
 @pytest.mark.parametrize("timeout", [0, -1, float("nan"), -float("inf")])
-def test_a_timeout_that_is_no_time_has_passed_already(server: Start, timeout: float) -> None:
+def test_a_timeout_that_is_no_time_has_passed_already(timeout: float) -> None:
     started = server()
     client = started.connect()
     started.stop()
@@ -52,7 +48,7 @@ def test_a_timeout_that_is_no_time_has_passed_already(server: Start, timeout: fl
     assert client.observe(timeout=float("inf")).result().world.step == 0
 
 
-def test_a_signal_that_is_handled_does_not_end_a_step(server: Start) -> None:
+def test_a_signal_that_is_handled_does_not_end_a_step() -> None:
     started = server()
     lease = started.connect().acquire()
     caught: list[int] = []
@@ -77,7 +73,7 @@ def test_a_signal_that_is_handled_does_not_end_a_step(server: Start) -> None:
     assert len(caught) == 5
 
 
-def test_closing_again_is_fine_and_a_closed_client_says_so(server: Start) -> None:
+def test_closing_again_is_fine_and_a_closed_client_says_so() -> None:
     client = server().connect()
     lease = client.acquire()
     for _ in range(3):
@@ -146,7 +142,7 @@ print("child", code)
     "how, code",
     [("sys.exit", 5), ("os._exit", 5), ("exception", 1), ("multiprocessing", 0)],
 )
-def test_a_forked_child_is_refused_and_its_parent_goes_on(script: Run, how: str, code: int) -> None:
+def test_a_forked_child_is_refused_and_its_parent_goes_on(how: str, code: int) -> None:
     ended, out, err = script(FORK, how).end()
     assert (ended, out) == (0, f"child {code}\n"), err
 
@@ -165,7 +161,7 @@ def asleep() -> None:
     assert eventually(is_asleep)
 
 
-def test_ctrl_c_ends_a_blocked_step_and_the_client_goes_on(server: Start) -> None:
+def test_ctrl_c_ends_a_blocked_step_and_the_client_goes_on() -> None:
     started = server()
     client = started.connect()
     lease = client.acquire()
@@ -187,7 +183,7 @@ def test_ctrl_c_ends_a_blocked_step_and_the_client_goes_on(server: Start) -> Non
     assert lease.step([3] * 6).result().world.step == before + 1
 
 
-def test_a_client_may_be_used_while_its_error_is_handled(server: Start) -> None:
+def test_a_client_may_be_used_while_its_error_is_handled() -> None:
     started = server()
     client = started.connect()
     lease = client.acquire()

@@ -11,14 +11,21 @@ from unittest import mock
 import iceoryx2 as iox2
 import pytest
 from failures import fails
-from processes import LONG, PATIENCE, Script, Server, connects, eventually, is_running
+from processes import (
+    LONG,
+    PATIENCE,
+    Script,
+    Server,
+    connects,
+    eventually,
+    is_running,
+    script,
+    server,
+)
 
 from emberwatch import channels, errors, ports, wire
 from emberwatch.client import connect
 from emberwatch.env import WildfireEnv
-
-Start = Callable[..., Server]
-Run = Callable[..., Script]
 
 SMALL = {"height": 5, "width": 7, "n_moves": 6, "burn_in": 20}
 
@@ -72,7 +79,7 @@ def check_kill(started: Server, call: Callable[[], object]) -> None:
 
 
 @pytest.mark.parametrize("what", ["step", "control"])
-def test_a_server_killed_during_a_request_is_gone(server: Start, what: str) -> None:
+def test_a_server_killed_during_a_request_is_gone(what: str) -> None:
     started = server()
     client = started.connect()
     lease = client.acquire()
@@ -83,12 +90,12 @@ def test_a_server_killed_during_a_request_is_gone(server: Start, what: str) -> N
         client.observe()
 
 
-def test_a_server_killed_during_the_handshake_is_gone(server: Start) -> None:
+def test_a_server_killed_during_the_handshake_is_gone() -> None:
     started = server()
     check_kill(started, lambda: connect(started.instance, timeout=LONG))
 
 
-def test_a_server_killed_between_steps_is_gone_at_the_next(server: Start) -> None:
+def test_a_server_killed_between_steps_is_gone_at_the_next() -> None:
     started = server()
     client = started.connect()
     lease = client.acquire()
@@ -101,7 +108,7 @@ def test_a_server_killed_between_steps_is_gone_at_the_next(server: Start) -> Non
         connect(started.instance)
 
 
-def test_a_stopped_server_is_a_timeout_and_observing_tells_what_happened(server: Start) -> None:
+def test_a_stopped_server_is_a_timeout_and_observing_tells_what_happened() -> None:
     started = server()
     lease = started.connect().acquire()
     for k in range(5):
@@ -118,7 +125,7 @@ def test_a_stopped_server_is_a_timeout_and_observing_tells_what_happened(server:
         assert lease.step([1] * 6).result().world.step == seen.result().world.step + 1
 
 
-def test_an_answer_that_comes_in_time_after_a_pause_is_the_steps(server: Start) -> None:
+def test_an_answer_that_comes_in_time_after_a_pause_is_the_steps() -> None:
     started = server()
     lease = started.connect().acquire()
     started.stop()
@@ -155,7 +162,7 @@ def services(instance: str) -> list[str]:
     return [name for name in names if f"/{instance}/" in name]
 
 
-def embedded(script: Run, end: str) -> tuple[Script, int, str]:
+def embedded(end: str) -> tuple[Script, int, str]:
     """A learner with a private server: its process, the server's pid and instance."""
     learner = script(EMBEDDED + end)
     pid, instance = learner.line().split()
@@ -163,8 +170,8 @@ def embedded(script: Run, end: str) -> tuple[Script, int, str]:
 
 
 @pytest.mark.parametrize("end", ENDS, ids=lambda end: end.partition(";")[0] or "normal")
-def test_a_private_server_ends_however_python_ends(script: Run, end: str) -> None:
-    learner, pid, instance = embedded(script, "input()\n" + end)
+def test_a_private_server_ends_however_python_ends(end: str) -> None:
+    learner, pid, instance = embedded("input()\n" + end)
     assert is_running(pid)
     remains = Remains(learner.pid, pid)
     learner.say()
@@ -178,8 +185,8 @@ def test_a_private_server_ends_however_python_ends(script: Run, end: str) -> Non
 
 
 @pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
-def test_a_private_server_ends_with_a_signalled_python(script: Run, number: int) -> None:
-    learner, pid, instance = embedded(script, "while True: env.step([1] * 6)")
+def test_a_private_server_ends_with_a_signalled_python(number: int) -> None:
+    learner, pid, instance = embedded("while True: env.step([1] * 6)")
     remains = Remains(learner.pid, pid)
     learner.signal(number)
     code, _, _ = learner.end()
@@ -189,8 +196,8 @@ def test_a_private_server_ends_with_a_signalled_python(script: Run, number: int)
     assert (remains.left(), services(instance)) == ([], [])
 
 
-def test_nothing_is_left_when_learner_and_private_server_are_killed(script: Run) -> None:
-    learner, pid, instance = embedded(script, "while True: env.step([1] * 6)")
+def test_nothing_is_left_when_learner_and_private_server_are_killed() -> None:
+    learner, pid, instance = embedded("while True: env.step([1] * 6)")
     remains = Remains(learner.pid, pid)
     for process in (pid, learner.pid):
         os.kill(process, signal.SIGKILL)
@@ -209,7 +216,7 @@ def next_start(instance: str) -> None:
     env.close()
 
 
-def test_a_killed_client_frees_its_worlds_at_once(server: Start, script: Run) -> None:
+def test_a_killed_client_frees_its_worlds_at_once() -> None:
     started = server()
     code = (
         "import sys; from emberwatch import connect\n"
@@ -226,7 +233,7 @@ def test_a_killed_client_frees_its_worlds_at_once(server: Start, script: Run) ->
     assert next_client.acquire().step([3] * 6).result().world.step > 1
 
 
-def test_killed_clients_use_up_no_limit(server: Start, script: Run) -> None:
+def test_killed_clients_use_up_no_limit() -> None:
     started = server()
     code = (
         "import sys; from emberwatch import connect\n"
@@ -250,7 +257,7 @@ def check_mismatch(raised: pytest.ExceptionInfo[errors.EmberwatchError]) -> None
 
 
 def test_a_client_of_another_version_is_told_both_and_what_to_do(
-    server: Start, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     started = server()
     monkeypatch.setattr(wire, "VERSION", 3)
@@ -261,9 +268,7 @@ def test_a_client_of_another_version_is_told_both_and_what_to_do(
     assert started.status().n_clients == 1
 
 
-def test_a_server_refuses_the_header_of_another_version(
-    server: Start, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_refuses_the_header_of_another_version(monkeypatch: pytest.MonkeyPatch) -> None:
     started = server()
     client = started.connect()
     name = channels.Node._name
@@ -286,7 +291,7 @@ def test_a_server_refuses_the_header_of_another_version(
 
 
 def test_a_server_of_another_version_elsewhere_is_not_meant(
-    server: Start, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     started = server()
     monkeypatch.setattr(wire, "VERSION", 3)

@@ -96,8 +96,31 @@ def large(folder: Path) -> Path:
 
 ONE, NONE = np.eye(3, 4), np.zeros((3, 4))
 
+Case = Callable[[Path], Flags]
+
+
+def arrivals(*flags: object, bands: object = (), **properties: object) -> Case:
+    """A file of arrival times, and flags."""
+    return lambda f: (geotiff(f / "a.tif", *bands, **properties), *ARRIVALS, *flags)  # type: ignore
+
+
+def layers(kind: Flags, *bands: object, flags: Flags = ()) -> Case:
+    """Layers of one file, and flags."""
+    return lambda f: (stack(f, *bands), *kind, *flags)
+
+
+def ascii_file(old: str, new: str) -> Case:
+    """An ASCII grid of arrival times with something else at a place."""
+    return lambda f: (edited(ascii_grid(f / "a.asc"), old, new), *ARRIVALS)
+
+
+def at(*times: float) -> Case:
+    """Four masks of these times."""
+    return lambda f: (netcdf(f / "a.nc", times=times, mask=masks()), *MASKS)
+
+
 #: What is wrong, the flags for a folder, and words of the error.
-CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
+CASES: dict[str, tuple[Case, str]] = {
     "no file": (lambda f: (f / "no.tif", *ARRIVALS), "expected a file or folder, got none"),
     "empty folder": (lambda f: (f, *MASKS), "expected rasters in this folder, got none"),
     "extension": (lambda f: (text(f / "fire.grd", ""), *MASKS), ".npz, got '.grd'"),
@@ -119,21 +142,15 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         "a.asc: expected 108 numbers for 27 x 4 cells, got 82",
     ),
     "ASCII grid without its last number": (
-        lambda f: (edited(ascii_grid(f / "a.asc"), "50.0", ""), *ARRIVALS),
+        ascii_file("50.0", ""),
         "a.asc: expected 12 numbers for 3 x 4 cells, got 11",
     ),
     "ASCII grid of another width": (
-        lambda f: (edited(ascii_grid(f / "a.asc"), "20.0", "20.0 20.0"), *ARRIVALS),
+        ascii_file("20.0", "20.0 20.0"),
         "a.asc: expected 12 numbers for 3 x 4 cells, got 14",
     ),
-    "word in an ASCII grid": (
-        lambda f: (edited(ascii_grid(f / "a.asc"), "35.0", "x"), *ARRIVALS),
-        "a.asc: expected numbers, got 'x'",
-    ),
-    "no NumPy file": (
-        lambda f: (text(f / "a.npz", "hello"), *MASKS),
-        "expected a NumPy file, got",
-    ),
+    "word in an ASCII grid": (ascii_file("35.0", "x"), "a.asc: expected numbers, got 'x'"),
+    "no NumPy file": (lambda f: (text(f / "a.npz", "hello"), *MASKS), "expected a NumPy file, got"),
     "objects": (
         lambda f: (array(f, np.array([{}], object)), *MASKS),
         "(layers, rows, columns), got object (1,)",
@@ -157,17 +174,14 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
     "words": (lambda f: (array(f, np.array([["a"]])), *MASKS), "(layers, rows, columns), got <U1"),
     "four dimensions": (lambda f: (array(f, np.zeros((2, 2, 2, 2))), *MASKS), "(2, 2, 2, 2)"),
     "complex numbers": (
-        lambda f: (geotiff(f / "a.tif", ARRIVAL, dtype="complex64", nodata=None), *ARRIVALS),
+        arrivals(bands=[ARRIVAL], dtype="complex64", nodata=None),
         "expected real numbers, got complex64",
     ),
     "three bands": (
-        lambda f: (geotiff(f / "a.tif", ARRIVAL, ARRIVAL, ARRIVAL), *ARRIVALS),
+        arrivals(bands=[ARRIVAL, ARRIVAL, ARRIVAL]),
         "expected one band of arrival times, got 3; choose with --band",
     ),
-    "band out of range": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--band", 2),
-        "--band: expected 1 to 1 for ",
-    ),
+    "band out of range": (arrivals("--band", 2), "--band: expected 1 to 1 for "),
     "several variables": (
         lambda f: (netcdf(f / "a.nc", at=ARRIVAL, wind=ARRIVAL), *ARRIVALS),
         "expected one variable, got 2 (at, wind); choose with --variable",
@@ -176,15 +190,9 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         lambda f: (netcdf(f / "a.nc", at=ARRIVAL), *ARRIVALS, "--variable", "lat"),
         "a.nc (at), got 'lat'",
     ),
-    "variable of a GeoTIFF": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--variable", "at"),
-        "which has no variables, got 'at'",
-    ),
+    "variable of a GeoTIFF": (arrivals("--variable", "at"), "which has no variables, got 'at'"),
     "fourth dimension": (
-        lambda f: (
-            netcdf(f / "a.nc", at=np.zeros((2, 2, 3, 4)), times=[0, 1], extra=True),
-            *MASKS,
-        ),
+        lambda f: (netcdf(f / "a.nc", at=np.zeros((2, 2, 3, 4)), times=[0, 1], extra=True), *MASKS),
         "expected a variable of time, rows and columns, in this order, got it over level",
     ),
     "other size": (
@@ -210,7 +218,7 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         "expected square cells, got 30 x 40",
     ),
     "degrees": (
-        lambda f: (geotiff(f / "a.tif", crs="EPSG:4326", corner=(0, 60), cell=(1, 1)), *ARRIVALS),
+        arrivals(crs="EPSG:4326", corner=(0, 60), cell=(1, 1)),
         "degrees of latitude; reproject it",
     ),
     "rotated grid": (
@@ -222,43 +230,31 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         "expected a value in each cell, got none in 9 cells, the first in row 0, column 1",
     ),
     "NaN": (
-        lambda f: (stack(f, ONE, np.where(ONE == 1, np.nan, 0)), *STATES),
+        layers(STATES, ONE, np.where(ONE == 1, np.nan, 0)),
         "band 2: expected a value in each cell, got none in 3 cells",
     ),
     "mask that shrinks": (
-        lambda f: (stack(f, ONE, NONE), *MASKS),
+        layers(MASKS, ONE, NONE),
         "band 2: expected burning cells to burn on, got 3 that are unburnt again, "
         "the first in row 0, column 0",
     ),
     "burns again": (
-        lambda f: (stack(f, ONE, NONE, ONE), *BURNING),
+        layers(BURNING, ONE, NONE, ONE),
         "band 3: expected burnt cells to stay burnt, got 3 that burn again",
     ),
     "burnt cell that burns": (
-        lambda f: (stack(f, ONE, 2 * ONE, ONE), *STATES),
+        layers(STATES, ONE, 2 * ONE, ONE),
         "band 3: expected burnt cells to stay burnt, got 3 that burn again",
     ),
     "unburnt again": (
-        lambda f: (stack(f, ONE, 2 * ONE, NONE), *STATES),
+        layers(STATES, ONE, 2 * ONE, NONE),
         "band 3: expected burning cells to burn on, got 3 that are unburnt again",
     ),
-    "time backwards": (
-        lambda f: (netcdf(f / "a.nc", times=[0, 600, 300, 900], mask=masks()), *MASKS),
-        "expected a later time than 600, got 300",
-    ),
-    "a time that is none": (
-        lambda f: (netcdf(f / "a.nc", times=[0, float("nan"), 1200, 1800], mask=masks()), *MASKS),
-        "band 2: expected a time, got nan",
-    ),
-    "uneven time": (
-        lambda f: (netcdf(f / "a.nc", times=[0, 600, 1200, 2400], mask=masks()), *MASKS),
-        "expected steps of 600 in time, got 1200",
-    ),
+    "time backwards": (at(0, 600, 300, 900), "expected a later time than 600, got 300"),
+    "a time that is none": (at(0, float("nan"), 1200, 1800), "band 2: expected a time, got nan"),
+    "uneven time": (at(0, 600, 1200, 2400), "expected steps of 600 in time, got 1200"),
     "dates backwards": (
-        lambda f: (
-            *days(f, "hours since 2020-08-02", "hours since 2020-08-01"),
-            *MASKS,
-        ),
+        lambda f: (*days(f, "hours since 2020-08-02", "hours since 2020-08-01"), *MASKS),
         "band 1: expected a later time than 2020-08-02 01:00:00+00:00, got 2020-08-01 00:00:00",
     ),
     "dates of another calendar": (
@@ -278,7 +274,7 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         "tells the times of its layers and --step chooses among them, got 2",
     ),
     "unit of layers without times": (
-        lambda f: (stack(f, NONE, ONE), *MASKS, "--unit", "s"),
+        layers(MASKS, NONE, ONE, flags=("--unit", "s")),
         "--unit: expected none, as ",
     ),
     "other unit of layers": (
@@ -286,42 +282,33 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         "--unit: expected h, as in ",
     ),
     "mask of three numbers": (
-        lambda f: (stack(f, ONE, 2 * ONE), *MASKS),
+        layers(MASKS, ONE, 2 * ONE),
         "band 2: expected 0 and one other number in all layers, 1, got 2 in row 0, column 0",
     ),
     "unknown code": (
-        lambda f: (stack(f, ONE, 3 * ONE), *STATES),
+        layers(STATES, ONE, 3 * ONE),
         "band 2: expected the codes 0, 1, 2, got 3 in row 0, column 0",
     ),
     "negative time": (
-        lambda f: (geotiff(f / "a.tif", nodata=None), *ARRIVALS),
+        arrivals(nodata=None),
         "expected times of at least 0, got -9999 in row 0, column 3; if that means never",
     ),
     "negative time before the begin": (
-        lambda f: (geotiff(f / "a.tif", nodata=None), *ARRIVALS, "--begin", 0),
+        arrivals("--begin", 0, nodata=None),
         "expected times of at least 0, got -9999 in row 0, column 3; if that means never",
     ),
     "begin of layers": (
-        lambda f: (stack(f, ONE), *STATES, "--begin", 2),
+        layers(STATES, ONE, flags=("--begin", 2)),
         "--begin: expected --kind arrival beside it, got states",
     ),
-    "begin that is none": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--begin", "nan"),
-        "--begin: expected a number, got nan",
-    ),
-    "begin after all": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--begin", 999),
-        "expected at least 2 steps, got 1",
-    ),
+    "begin that is none": (arrivals("--begin", "nan"), "--begin: expected a number, got nan"),
+    "begin after all": (arrivals("--begin", 999), "expected at least 2 steps, got 1"),
     "no fire in times": (
-        lambda f: (geotiff(f / "a.tif", np.full((3, 4), NEVER)), *ARRIVALS),
+        arrivals(bands=[np.full((3, 4), NEVER)]),
         "expected cells that burn, got none",
     ),
-    "no fire in masks": (lambda f: (stack(f, NONE, NONE), *MASKS), "cells that burn, got none"),
-    "no fire in the crop": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--crop", "2,0,1,1"),
-        "expected cells that burn, got none",
-    ),
+    "no fire in masks": (layers(MASKS, NONE, NONE), "cells that burn, got none"),
+    "no fire in the crop": (arrivals("--crop", "2,0,1,1"), "expected cells that burn, got none"),
     "members of an ensemble": (
         lambda f: (
             netcdf(f / "a.nc", at=np.zeros((2, 3, 4)), times=[0, 1], over=("member", "y", "x")),
@@ -337,7 +324,7 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         "expected a variable of time, rows and columns, in this order, got it over y",
     ),
     "a height that stretches": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--height", 2),
+        arrivals("--height", 2),
         "grid: expected the proportions of 3 x 4 cells, got 2 x 3; use --crop",
     ),
     "begin of layers at 0": (
@@ -345,7 +332,7 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         "--begin: expected --kind arrival beside it, got mask",
     ),
     "steps of nothing": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--step", "1e-310 s"),
+        arrivals("--step", "1e-310 s"),
         "--step: expected a share of 50, the last time, got ",
     ),
     "no fire in the middle": (
@@ -358,26 +345,23 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         ),
         "--resample: expected cells that burn on 1 x 1 cells, got none",
     ),
-    "one layer": (lambda f: (stack(f, ONE), *MASKS), "expected at least 2 steps, got 1"),
-    "one step": (
-        lambda f: (geotiff(f / "a.tif", ONE - 1, nodata=-1), *ARRIVALS),
-        "expected at least 2 steps, got 1",
-    ),
+    "one layer": (layers(MASKS, ONE), "expected at least 2 steps, got 1"),
+    "one step": (arrivals(bands=[ONE - 1], nodata=-1), "expected at least 2 steps, got 1"),
     "too many steps": (
-        lambda f: (geotiff(f / "a.tif", np.where(ARRIVAL < 0, NEVER, ARRIVAL * 1e9)), *ARRIVALS),
+        arrivals(bands=[np.where(ARRIVAL < 0, NEVER, ARRIVAL * 1e9)]),
         "bytes of states, got 4999999899 steps of 3 x 4",
     ),
     "too large": (lambda f: (large(f), *MASKS), "at most 4096 x 4096 cells, as the server takes"),
     "too large a wish": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--height", 4097),
+        arrivals("--height", 4097),
         "at most 4096 x 4096 cells, as the server takes, got 4097 x 5463",
     ),
     "other proportions": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--height", 3, "--width", 3),
+        arrivals("--height", 3, "--width", 3),
         "expected the proportions of 3 x 4 cells, got 3 x 3",
     ),
     "crop outside": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--crop", "1,0,3,4"),
+        arrivals("--crop", "1,0,3,4"),
         "--crop: expected TOP,LEFT,HEIGHT,WIDTH within 3 x 4 cells, got 1,0,3,4",
     ),
     "metres of no place": (
@@ -385,7 +369,7 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         "--cell: expected a grid in metres, got no place on the ground",
     ),
     "cell and height": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--cell", 60, "--height", 3),
+        arrivals("--cell", 60, "--height", 3),
         "--cell: expected neither --height nor --width beside it",
     ),
     "other grid": (
@@ -429,7 +413,7 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         "--burning: expected the steps that a cell burns, as --kind arrival does not",
     ),
     "flag of another kind": (
-        lambda f: (stack(f, ONE), *STATES, "--burning", 2),
+        layers(STATES, ONE, flags=("--burning", 2)),
         "--burning: expected --kind arrival or mask beside it, got states",
     ),
     "step without unit": (
@@ -441,25 +425,19 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         "such as '10 min', got 'nan min'",
     ),
     "picture that is none": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--picture", f / "a.gif"),
+        lambda f: arrivals("--picture", f / "a.gif")(f),
         "--picture: expected a .png, got ",
     ),
     "picture in the place of a folder": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--picture", folder(f / "a.png")),
+        lambda f: arrivals("--picture", folder(f / "a.png"))(f),
         "--picture: expected a file, got the folder ",
     ),
-    "name that is no text": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--name", "\udcff"),
-        r"--name: expected UTF-8, got '\udcff'",
-    ),
+    "name that is no text": (arrivals("--name", "\udcff"), r"--name: expected UTF-8, got '\udcff'"),
     "cells of nothing": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--cell", "1e-320"),
+        arrivals("--cell", "1e-320"),
         "--cell: expected at least 0.001 metres, got 1e-320",
     ),
-    "link to itself": (
-        lambda f: (linked(f), *ARRIVALS),
-        "a.tif: expected a GeoTIFF, got",
-    ),
+    "link to itself": (lambda f: (linked(f), *ARRIVALS), "a.tif: expected a GeoTIFF, got"),
     "unknown kind": (lambda f: (geotiff(f / "a.tif"), "--kind", "fire"), "invalid choice: 'fire'"),
     "codes": (
         lambda f: (geotiff(f / "a.tif"), *STATES, "--codes", "0,1,1"),
@@ -474,7 +452,7 @@ CASES: dict[str, tuple[Callable[[Path], Flags], str]] = {
         "argument --codes: expected three different numbers, got a,b,c",
     ),
     "crop of words": (
-        lambda f: (geotiff(f / "a.tif"), *ARRIVALS, "--crop", "1,0,x,4"),
+        arrivals("--crop", "1,0,x,4"),
         "argument --crop: expected TOP,LEFT,HEIGHT,WIDTH, four whole numbers, got 1,0,x,4",
     ),
     "no steps": (

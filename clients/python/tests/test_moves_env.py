@@ -1,34 +1,13 @@
 """`emberwatch/WildfireMoves-v0` against `Wildfire-v0` flown with the same moves."""
 
-import copy
-import os
-import signal
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
-from environments import (
-    MOVES,
-    SMALL,
-    actions,
-    assert_same,
-    impatient,
-    make,
-    no_warnings,
-    rollout,
-    serving,
-)
-from failures import fails
-from gymnasium.utils.env_checker import check_env
+from environments import MOVES, SMALL, actions, assert_same, make, rollout, serving
+from failures import fails, refuses
 from gymnasium.vector import AsyncVectorEnv
-from processes import stopped
-
-from emberwatch.errors import (
-    InvalidArgumentError,
-    RequestTimeoutError,
-    ServerGoneError,
-)
 
 PARTS = ("frame", "robot", "age", "visited", "move")
 
@@ -37,38 +16,6 @@ BURNING = {"height": 16, "width": 16, "n_moves": 8, "burn_in": 3000, "model": "w
 
 #: Seeds of `BURNING` worlds with fire.
 BURNING_SEEDS = [1000, 1004, 1016]
-
-
-@pytest.fixture(autouse=True)
-def headless(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Windows open in memory."""
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-
-
-@pytest.mark.parametrize(
-    "keywords",
-    [
-        {},
-        {"reward": "move"},
-        {"reward": "move", "truth": True},
-        *({"observation": part} for part in PARTS),
-        {"observation": ["move"]},
-        {"observation": PARTS},
-        {"truth": True},
-        {"start": "random"},
-        {"n_moves": 1, "height": 1, "width": 1},
-        *({"render_mode": mode} for mode in ("human", "rgb_array", "ansi")),
-    ],
-    ids=str,
-)
-def test_gymnasium_finds_no_fault(keywords: dict[str, Any]) -> None:
-    renders = "render_mode" in keywords
-    with no_warnings():
-        env = make(MOVES, **keywords)
-        for transition in rollout(env, 12, seed=2):
-            assert transition[0] in env.observation_space
-        check_env(env.unwrapped, skip_render_check=not renders)
-        env.close()
 
 
 def test_a_path_of_moves_is_a_step_of_the_other_environment() -> None:
@@ -83,8 +30,6 @@ def test_a_path_of_moves_is_a_step_of_the_other_environment() -> None:
         assert_same({part: got[-1][0][part] for part in parts}, expected[0])
         assert_same(got[-1][1:], expected[1:])
         assert [transition[1] for transition in got[:-1]] == [0.0, 0.0, 0.0]
-    moves.close()
-    paths.close()
 
 
 def test_the_world_moves_after_a_whole_path() -> None:
@@ -94,7 +39,6 @@ def test_the_world_moves_after_a_whole_path() -> None:
     moves = [transition[0]["move"] for transition in rollout(env, 9, seed=1)]
     assert moves == [0, 1, 2, 3, 0, 1, 2, 3, 0, 1]
     assert {type(move) for move in moves} == {np.int64}
-    env.close()
 
 
 def test_between_moves_the_frame_is_the_last_paths() -> None:
@@ -105,7 +49,6 @@ def test_between_moves_the_frame_is_the_last_paths() -> None:
         for transition in transitions[begin : begin + 4]:
             assert_same(transition[0]["frame"], first["frame"])
             assert_same(transition[0]["age"], first["age"])
-    env.close()
 
 
 def test_visited_shows_the_cells_of_this_path() -> None:
@@ -119,7 +62,6 @@ def test_visited_shows_the_cells_of_this_path() -> None:
     observation = env.step(1)[0]
     assert not observation["visited"].any()
     assert np.argwhere(observation["frame"][..., 0] != 255).tolist() == [[1, 3], [1, 4], [2, 4]]
-    env.close()
 
 
 @pytest.mark.parametrize(
@@ -134,7 +76,6 @@ def test_the_robot_stays_within_the_grid(start: str, move: int, cell: list[int])
         observation, _, _, _, info = env.step(move)
         assert observation["robot"].tolist() == cell
     assert info["n_visited"] == 1
-    env.close()
 
 
 @pytest.mark.parametrize("seed", BURNING_SEEDS)
@@ -155,8 +96,6 @@ def test_both_rewards_sum_to_the_same_over_each_path(seed: int) -> None:
         n_early += any(rewards[:-1])
         total += sum(paid)
     assert total > 0 and n_early > 0
-    late.close()
-    early.close()
 
 
 def test_a_cell_pays_once_a_path_what_it_was_before_the_world_moved() -> None:
@@ -177,7 +116,6 @@ def test_a_cell_pays_once_a_path_what_it_was_before_the_world_moved() -> None:
         n_late += abs(reward)
         truth = info["truth"]
     assert n_late > 0
-    env.close()
 
 
 def test_the_truth_is_revealed_only_when_asked_for() -> None:
@@ -186,8 +124,6 @@ def test_the_truth_is_revealed_only_when_asked_for() -> None:
     for one in (env, plain):
         assert "truth" not in one.reset(seed=3)[1]
     assert_same(env.render(), plain.render())
-    env.close()
-    plain.close()
 
 
 def test_episodes_are_truncated_after_max_episode_steps_moves() -> None:
@@ -201,28 +137,6 @@ def test_episodes_are_truncated_after_max_episode_steps_moves() -> None:
     assert gymnasium.spec(MOVES).max_episode_steps == 64_000
 
 
-def test_a_server_may_truncate_earlier() -> None:
-    with serving(max_steps=2) as instance:
-        env = make(MOVES, instance=instance)
-        ends = [transition[2:4] for transition in rollout(env, 8, seed=1)[1:]]
-        assert ends == [(False, False)] * 7 + [(False, True)]
-        for _ in range(3):
-            env.step(0)
-        with fails("episode_over"):
-            env.step(0)
-        assert env.reset()[1]["step"] == 0
-        env.close()
-
-
-def test_what_was_returned_is_never_changed() -> None:
-    env = make(MOVES, observation=PARTS, truth=True)
-    before = rollout(env, 9, seed=1)
-    kept = copy.deepcopy(before)
-    rollout(env, 9, seed=2, actions_seed=2)
-    assert_same(before, kept)
-    env.close()
-
-
 def test_what_was_returned_may_be_written_to() -> None:
     env, twin = make(MOVES, observation=PARTS), make(MOVES, observation=PARTS)
     assert_same(env.reset(seed=1), twin.reset(seed=1))
@@ -231,17 +145,6 @@ def test_what_was_returned_may_be_written_to() -> None:
         assert_same(observation, twin.step(move)[0])
         for part in ("frame", "age", "visited", "robot"):
             observation[part][:] = 1
-    env.close()
-    twin.close()
-
-
-def test_the_same_seed_and_moves_give_the_same_episode() -> None:
-    one, other = make(MOVES, truth=True), make(MOVES, truth=True)
-    for seed in (0, 5, None):
-        assert_same(rollout(one, 9, seed=seed), rollout(other, 9, seed=seed))
-    assert one.reset(seed=0)[1]["truth"].tobytes() != one.reset()[1]["truth"].tobytes()
-    one.close()
-    other.close()
 
 
 @pytest.mark.parametrize(
@@ -252,6 +155,7 @@ def test_the_same_seed_and_moves_give_the_same_episode() -> None:
         (1.0, "got 1.0"),
         (True, "got True"),
         ([0, 1], r"got \[0, 1\]"),
+        ([[0], [1, 2]], r"got \[\[0\], \[1, 2\]\]"),
         (None, "got None"),
         ("0", "got '0'"),
     ],
@@ -260,10 +164,9 @@ def test_the_same_seed_and_moves_give_the_same_episode() -> None:
 def test_a_wrong_move_is_named_and_not_flown(action: object, message: str) -> None:
     env = make(MOVES).unwrapped
     env.reset(seed=1)
-    with pytest.raises(InvalidArgumentError, match=message):
+    with refuses(message):
         env.step(action)
     assert env.step(1)[0]["move"] == 1
-    env.close()
 
 
 @pytest.mark.parametrize("kind", [int, np.int64, np.uint8, np.array, lambda n: np.array([n])])
@@ -271,36 +174,17 @@ def test_moves_come_as_any_integer(kind: Any) -> None:
     env = make(MOVES)
     env.reset(seed=1)
     assert env.step(kind(1))[0]["robot"].tolist() == [1, 0]
-    env.close()
-
-
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        (
-            {"reward": "cell"},
-            "reward: expected one of 'share', 'team', 'marginal', 'move', got 'cell'",
-        ),
-        ({"observation": "path"}, "expected one or several of frame, .*, visited, move, got"),
-        ({"observation": ["move", "move"]}, "observation"),
-        ({"n_moves": 0}, "moves: expected 1 to 4096, got 0"),
-    ],
-    ids=str,
-)
-def test_impossible_keywords_are_named(keywords: dict[str, Any], message: str) -> None:
-    with pytest.raises(InvalidArgumentError, match=message):
-        make(MOVES, **keywords)
 
 
 def test_paying_moves_needs_a_server_that_tells_enough() -> None:
     with (
         serving() as instance,
-        pytest.raises(InvalidArgumentError, match="expected a server started with --publish-truth"),
+        refuses("expected a server started with --publish-truth"),
     ):
         make(MOVES, instance=instance, reward="move")
     with (
         serving(publish_truth=True, reveal_model=False) as instance,
-        pytest.raises(InvalidArgumentError, match="expected a server that reveals its model"),
+        refuses("expected a server that reveals its model"),
     ):
         make(MOVES, instance=instance, reward="move")
     with serving(publish_truth=True) as instance:
@@ -308,8 +192,6 @@ def test_paying_moves_needs_a_server_that_tells_enough() -> None:
         assert_same(rollout(env, 20, seed=4), rollout(private, 20, seed=4))
         with fails("busy"):
             make(MOVES, instance=instance).reset()
-        env.close()
-        private.close()
 
 
 def test_resume_begins_a_new_path_where_the_world_stands() -> None:
@@ -326,47 +208,6 @@ def test_resume_begins_a_new_path_where_the_world_stands() -> None:
         assert observation["move"] == 0 and not observation["visited"].any()
         last = [env.step(1) for _ in range(4)][-1]
         assert last[4]["step"] == 2 and last[0]["robot"].tolist() == [6, 2]
-        env.close()
-
-
-def test_step_needs_a_reset_before_the_first_move() -> None:
-    env = make(MOVES).unwrapped
-    for _ in range(2):
-        with fails("closed", match="reset it first"):
-            env.step(0)
-        env.reset(seed=1)
-        env.step(0)
-        env.close()
-
-
-def test_a_killed_private_server_is_replaced_by_the_next_reset() -> None:
-    env = make(MOVES)
-    expected = rollout(env, 6, seed=3)
-    os.kill(_server(env), signal.SIGKILL)
-    with pytest.raises(ServerGoneError):
-        env.step(0)
-        env.step(0)
-    assert_same(rollout(env, 6, seed=3), expected)
-    env.close()
-
-
-def test_after_a_timeout_no_move_is_flown_before_a_reset() -> None:
-    env = make(MOVES)
-    env.reset(seed=1)
-    for _ in range(3):
-        env.step(1)
-    pid = _server(env)
-    with stopped(pid), impatient(env), pytest.raises(RequestTimeoutError):
-        env.step(1)
-    with fails("closed", match="timed out"):
-        env.step(1)
-    observation, info = env.reset(options={"resume": True})
-    assert observation["robot"].tolist() == [4 * info["step"], 0] and observation["move"] == 0
-    env.close()
-
-
-def _server(env: Any) -> int:
-    return env.unwrapped._session._client.info.pid
 
 
 def test_gymnasiums_wrappers_and_workers_take_it() -> None:
@@ -389,7 +230,6 @@ def test_gymnasiums_wrappers_and_workers_take_it() -> None:
         vector.close()
     plain = gymnasium.make_vec(MOVES, num_envs=2, **SMALL)
     assert plain.reset(seed=1)[0]["frame"].shape == (2, 7, 5, 1)
-    plain.close()
 
 
 def _make_small() -> gymnasium.Env[Any, Any]:

@@ -4,58 +4,46 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
 from typing import Any
 
-import gymnasium
+import environments
 import numpy as np
 import pytest
-from environments import impatient
-from failures import fails
+from environments import OBJECTIVE, agent_pid, assert_same, impatient, private_pid, rollout
+from failures import fails, refuses
 from gymnasium.utils.env_checker import check_env
-from processes import Server, eventually, stopped
+from processes import eventually, server, stopped
 
 import emberwatch
 from emberwatch import errors
 from emberwatch.programs import Program
 from emberwatch.wrappers import BeliefObservation
 
-SMALL = {"height": 9, "width": 7, "n_moves": 5, "burn_in": 50}
-
 
 def make(**keywords: Any) -> Any:
-    arguments = SMALL | {"prior": "initial"} | keywords
-    return gymnasium.make("emberwatch/WildfireObjective-v0", **arguments).unwrapped
+    return environments.make(OBJECTIVE, **keywords).unwrapped
 
 
-def make_vec(**keywords: Any) -> Any:
-    arguments = SMALL | {"prior": "initial", "num_envs": 3} | keywords
-    return gymnasium.make_vec("emberwatch/WildfireObjective-v0", **arguments)
+def make_vec(n_worlds: int = 3, **keywords: Any) -> Any:
+    return environments.make_vec(n_worlds, OBJECTIVE, **keywords)
 
 
 @pytest.fixture
-def env() -> Iterator[Any]:
-    made = make()
-    yield made
-    made.close()
+def env() -> Any:
+    return make()
 
 
 @pytest.fixture(params=[make, make_vec])
-def any_env(request: pytest.FixtureRequest) -> Iterator[Any]:
+def any_env(request: pytest.FixtureRequest) -> Any:
     """One of one world, and one of many."""
     made = request.param()
     made.reset(seed=1000)
-    yield made
-    made.close()
+    return made
 
 
 def decide(env: Any) -> Any:
     """Steps for the first state; returns k, of one world or many."""
     return env.step(np.zeros(env.action_space.shape, int))[4]["step"]
-
-
-def agent_pid(env: Any) -> int:
-    return env.unwrapped._agent._own_agent.pid
 
 
 @pytest.mark.parametrize(
@@ -66,7 +54,6 @@ def test_gymnasium_accepts_it(keywords: dict[str, Any]) -> None:
     check_env(env, skip_render_check=True)
     picture = env.render()
     assert picture.dtype == np.uint8 and picture.ndim == 3
-    env.close()
 
 
 def test_actions_and_numbers_have_names(env: Any) -> None:
@@ -78,41 +65,27 @@ def test_actions_and_numbers_have_names(env: Any) -> None:
     assert sum(named[f"mean_{state}"] for state in env.objectives[:3]) == pytest.approx(1.0)
 
 
-def rollout(env: Any, actions: list[int]) -> list[Any]:
-    seen = [env.reset(seed=1003)]
-    seen += [env.step(action) for action in actions]
-    return seen
-
-
 def test_the_same_seed_and_decisions_give_the_same_episode(env: Any) -> None:
-    actions = [2, 3, 0, 1, 2, 2]
-    twin = make()
-    first, again, other = rollout(env, actions), rollout(env, actions), rollout(twin, actions)
-    twin.close()
-    for one, two, three in zip(first, again, other, strict=True):
-        assert gymnasium.utils.env_checker.data_equivalence(one, two)
-        assert gymnasium.utils.env_checker.data_equivalence(one, three)
+    first, again, other = (rollout(one, 6, seed=1003) for one in (env, env, make()))
+    assert_same(first, again)
+    assert_same(first, other)
 
 
 def test_the_world_is_that_of_wildfire_with_the_same_seed(env: Any) -> None:
-    plain = gymnasium.make("emberwatch/Wildfire-v0", **SMALL)
-    counts = [plain.reset(seed=1003)[1]["n_target_cells"]]
-    counts += [plain.step(np.zeros(5, np.int64))[4]["n_target_cells"] for _ in range(4)]
-    plain.close()
-    assert [seen[-1]["n_target_cells"] for seen in rollout(env, [2, 2, 3, 0])] == counts
+    plain = environments.make()
+    counts = [
+        [seen[-1]["n_target_cells"] for seen in rollout(one, 4, seed=3)] for one in (env, plain)
+    ]
+    assert counts[0] == counts[1]
 
 
 def test_two_agents_of_their_own_do_not_share_a_world(env: Any) -> None:
     env.reset(seed=1000)
     env.step(2)
-    arguments = {"instance": env.instance, "prior": "initial", "planner": "shooting"}
     for takeover in (False, True):
-        other = gymnasium.make(
-            "emberwatch/WildfireObjective-v0", takeover=takeover, **arguments
-        ).unwrapped
+        other = make(instance=env.instance, planner="shooting", takeover=takeover)
         with fails("program", match="served already, by pid"):
             other.reset(seed=1001)
-        other.close()
     assert env.step(2)[4]["step"] == 2
 
 
@@ -129,48 +102,40 @@ def test_a_stopped_agent_is_a_timeout_and_the_next_step_asks_for_a_reset(any_env
     assert np.all(decide(any_env) == info["step"] + 1)
 
 
-def test_a_lease_lost_between_steps_is_told_as_that(server: Callable[..., Server]) -> None:
+def test_a_lease_lost_between_steps_is_told_as_that() -> None:
     started = server(lease_millis=3000)
-    env = gymnasium.make(
-        "emberwatch/WildfireObjective-v0", instance=started.instance, prior="initial"
-    ).unwrapped
+    env = make(instance=started.instance)
     env.reset(seed=1000)
     started.connect().acquire(takeover=True, ttl=3600)
     # The agent finds out when it renews its lease, and ends.
     assert eventually(lambda: env._agent._own_agent.exit_code() is not None)
     with pytest.raises(errors.LeaseLostError, match="lease lost"):
         env.step(0)
-    env.close()
 
 
-def test_truth_is_not_waited_for_longer_than_the_timeout(server: Callable[..., Server]) -> None:
-    started = server(publish_truth="true")
-    env = gymnasium.make(
-        "emberwatch/WildfireObjective-v0", instance=started.instance, prior="initial", truth=True
-    ).unwrapped
+def test_truth_is_not_waited_for_longer_than_the_timeout() -> None:
+    started = server(publish_truth=True)
+    env = make(instance=started.instance, truth=True)
     _, info = env.reset(seed=1000)
     assert info["truth"].shape == (5, 7)
     with pytest.raises(errors.RequestTimeoutError):
         env._session._truth.at([(9, 9, 9)], 0.2)
-    env.close()
 
 
-def test_a_hidden_model_must_be_given(server: Callable[..., Server]) -> None:
-    arguments = {"instance": server(reveal_model="false").instance, "prior": "initial"}
-    with pytest.raises(errors.InvalidArgumentError, match="model: expected one"):
-        gymnasium.make("emberwatch/WildfireObjective-v0", **arguments)
-    env = gymnasium.make("emberwatch/WildfireObjective-v0", model="wildfire", **arguments)
+def test_a_hidden_model_must_be_given() -> None:
+    instance = server(reveal_model=False).instance
+    with refuses("model: expected one"):
+        make(instance=instance)
+    env = make(instance=instance, model="wildfire")
     env.reset(seed=1000)
     assert env.step(2)[4]["step"] == 1
-    env.close()
 
 
-@pytest.mark.parametrize("action", [[[0], [1, 2]], 4, -1, 1.0, "fire", [0, 1], None])
-def test_a_wrong_action_is_refused_and_nothing_is_sent(env: Any, action: object) -> None:
-    env.reset(seed=1000)
-    with pytest.raises(errors.InvalidArgumentError, match="expected one integer, 0 to 3"):
-        env.step(action)
-    assert env.step(0)[4]["step"] == 1
+@pytest.mark.parametrize("action", [4, [0, 1, 4], "fire"])
+def test_a_wrong_action_is_refused_and_nothing_is_sent(any_env: Any, action: object) -> None:
+    with refuses("action: expected"):
+        any_env.step(action)
+    assert np.all(decide(any_env) == 1)
 
 
 @pytest.mark.parametrize(
@@ -185,37 +150,13 @@ def test_a_wrong_action_is_refused_and_nothing_is_sent(env: Any, action: object)
 )
 @pytest.mark.parametrize("maker", [make, make_vec])
 def test_a_wrong_keyword_is_refused(maker: Any, keywords: dict[str, Any], words: str) -> None:
-    with pytest.raises(errors.InvalidArgumentError, match=words):
+    with refuses(words):
         maker(**keywords)
 
 
-@pytest.mark.parametrize("action", [[0, 1], [0, 1, 4], [0, -1, 0], [0.0] * 3, [[0], [1, 2], 3]])
-def test_wrong_actions_are_refused_and_nothing_is_sent(action: object) -> None:
-    envs = make_vec()
-    envs.reset(seed=1000)
-    with pytest.raises(errors.InvalidArgumentError, match="action: expected"):
-        envs.step(action)
-    assert decide(envs).tolist() == [1, 1, 1]
-    envs.close()
-
-
 def test_more_worlds_than_frames_are_kept_of_are_not_drawn() -> None:
-    with pytest.raises(errors.InvalidArgumentError, match="expected at most 64 worlds, got 65"):
-        make_vec(num_envs=65, render_mode="rgb_array")
-
-
-def test_before_a_reset_and_after_closing_there_is_nothing(env: Any) -> None:
-    for _ in range(2):
-        with fails("closed", match="reset it first"):
-            env.step(0)
-        env.reset(seed=1000)
-        env.close()
-        env.close()
-
-
-def test_a_seed_that_does_not_fit_is_refused(env: Any) -> None:
-    with pytest.raises(errors.InvalidArgumentError, match="got 18446744073709551616"):
-        env.reset(seed=2**64)
+    with refuses("expected at most 64 worlds, got 65"):
+        make_vec(65, render_mode="rgb_array")
 
 
 def test_a_reset_that_finds_agent_or_server_dead_starts_others(any_env: Any) -> None:
@@ -223,7 +164,7 @@ def test_a_reset_that_finds_agent_or_server_dead_starts_others(any_env: Any) -> 
     for _ in range(2):
         os.kill(agent_pid(any_env), signal.SIGKILL)
         assert np.array_equal(any_env.reset(seed=1000)[0], expected[0])
-        os.kill(any_env.unwrapped._session._program.pid, signal.SIGKILL)
+        os.kill(private_pid(any_env), signal.SIGKILL)
         assert np.array_equal(any_env.reset(seed=1000)[0], expected[0])
     os.kill(agent_pid(any_env), signal.SIGKILL)
     with pytest.raises(errors.ServerGoneError):
@@ -239,7 +180,7 @@ def test_an_agent_that_is_killed_is_noticed_and_a_reset_starts_another(any_env: 
 
 
 def test_a_server_that_is_killed_ends_the_agent_with_a_word(any_env: Any) -> None:
-    os.kill(any_env.unwrapped._session._program.pid, signal.SIGKILL)
+    os.kill(private_pid(any_env), signal.SIGKILL)
     with pytest.raises(errors.ServerGoneError, match="the server on instance"):
         decide(any_env)
     any_env.reset(seed=1000)
@@ -248,9 +189,7 @@ def test_a_server_that_is_killed_ends_the_agent_with_a_word(any_env: Any) -> Non
 def test_it_attaches_to_a_running_server_and_to_a_running_agent(env: Any) -> None:
     env.reset(seed=1000)
     env.step(2)
-    guest = gymnasium.make(
-        "emberwatch/WildfireObjective-v0", instance=env.instance, agent="running"
-    ).unwrapped
+    guest = make(instance=env.instance, agent="running")
     _, info = guest.reset(options={"resume": True})
     assert info["step"] == 1
     guest.step(2)
@@ -258,12 +197,12 @@ def test_it_attaches_to_a_running_server_and_to_a_running_agent(env: Any) -> Non
     assert env.step(3)[4]["step"] == 3
 
 
-def test_many_worlds_attach_to_a_running_agent_of_theirs(server: Callable[..., Server]) -> None:
+def test_many_worlds_attach_to_a_running_agent_of_theirs() -> None:
     started = server(worlds=4)
     flags = ["--instance", started.instance, "--world", "1", "--worlds", "3", "--prior", "initial"]
     agent = Program("emberwatch-agent", ["serve-decisions", *flags])
     arguments = {"instance": started.instance, "world": 1, "agent": "running"}
-    envs = gymnasium.make_vec("emberwatch/WildfireObjective-v0", num_envs=3, **arguments)
+    envs = make_vec(**arguments)
     envs.reset(seed=1000)
     decide(envs)
     with emberwatch.Decisions(started.instance, 1) as decisions:
@@ -288,11 +227,9 @@ def test_many_worlds_attach_to_a_running_agent_of_theirs(server: Callable[..., S
     assert info["step"].tolist() == [2, 1, 0]
     envs.close()
     for n_worlds in (2, 1):
-        other = gymnasium.make_vec(
-            "emberwatch/WildfireObjective-v0", num_envs=n_worlds, **arguments
-        )
+        other = make_vec(n_worlds, **arguments)
         words = f"expected one of worlds 1 to {n_worlds}, got one of 1 to 3"
-        with pytest.raises(errors.InvalidArgumentError, match=words):
+        with refuses(words):
             other.reset(seed=1000)
     agent.stop()
 
@@ -312,20 +249,15 @@ def test_a_world_that_is_taken_over_ends_the_agent(env: Any) -> None:
 
 
 def test_a_busy_world_is_refused_with_the_agents_own_words() -> None:
-    env = gymnasium.make("emberwatch/Wildfire-v0", **SMALL).unwrapped
+    env = environments.make().unwrapped
     env.reset(seed=1000)
-    other = gymnasium.make(
-        "emberwatch/WildfireObjective-v0", instance=env.instance, prior="initial"
-    ).unwrapped
+    other = make(instance=env.instance)
     with fails("program", match="busy: held by pid"):
         other.reset()
-    other.close()
-    env.close()
 
 
 def test_beliefs_start_from_the_programs_prior() -> None:
-    env = BeliefObservation(gymnasium.make("emberwatch/Wildfire-v0", **SMALL), prior="simulated")
+    env = BeliefObservation(environments.make(), prior="simulated")
     belief, _ = env.reset(seed=1000)
-    assert belief.shape == (3, 9, 7)
+    assert belief.shape == (3, 7, 5)
     assert np.allclose(belief.sum(0), 1.0) and (belief > 0).all()
-    env.close()

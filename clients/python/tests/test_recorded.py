@@ -9,14 +9,17 @@ import gymnasium
 import numpy as np
 import pytest
 from environments import MOVES, RECORDED, WILDFIRE, serving
+from failures import refuses
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 import emberwatch
 from emberwatch.errors import EmberwatchError, InvalidArgumentError
-from emberwatch.programs import Program, unused_instance
 
 States = NDArray[np.uint8]
+
+#: What a states file decides.
+OF_STATES = dict.fromkeys(("height", "width", "burn_in", "model"))
 
 #: By number, as docs/recorded-worlds.md has them.
 SYMMETRIES: list[Callable[[States], States]] = [
@@ -52,7 +55,6 @@ def test_a_recorded_world_passes_the_checker(states: Path) -> None:
     for name in (WILDFIRE, MOVES):
         env: Any = gymnasium.make(name, states=states, n_moves=3, states_symmetries=True)
         check_env(env.unwrapped, skip_render_check=True)
-        env.close()
 
 
 def test_episodes_show_what_was_recorded(states: Path, sequences: list[States]) -> None:
@@ -76,7 +78,6 @@ def test_episodes_show_what_was_recorded(states: Path, sequences: list[States]) 
         offsets.add(offset)
         assert env.render() is not None
     assert offsets == {0, 1, 2}
-    env.close()
 
 
 def test_vectors_begin_the_next_episode_at_the_end_of_a_sequence(states: Path) -> None:
@@ -90,41 +91,31 @@ def test_vectors_begin_the_next_episode_at_the_end_of_a_sequence(states: Path) -
     # The first episodes are those of seeds 0 and 1; a reset takes a step of its own.
     assert [int(np.argmax(of_world)) for of_world in np.transpose(ends)] == [3, 5]
     assert np.sum(ends, axis=0).min() >= 2
-    envs.close()
 
 
 def test_a_running_server_tells_of_its_recorded_world(states: Path) -> None:
-    instance = unused_instance()
-    server = Program("emberwatch-server", [f"--instance={instance}", f"--states={states}"])
-    try:
-        with server.wait_for(lambda: emberwatch.connect(instance)) as client:
+    with serving(states=states, **OF_STATES) as instance:
+        with emberwatch.connect(instance) as client:
             recorded = client.info.recorded_world
             assert recorded is not None
             assert (recorded.n_sequences, recorded.n_steps) == (2, 4)
             assert recorded.description is not None
             assert "10 min" in recorded.description
         for setting in ({"states": states}, {"states_offset": 1}, {"states_symmetries": True}):
-            with pytest.raises(InvalidArgumentError, match="the running server has its own"):
+            with refuses("the running server has its own"):
                 gymnasium.make(WILDFIRE, instance=instance, **setting)
         env: Any = gymnasium.make(WILDFIRE, instance=instance)
         with warnings.catch_warnings(action="error"):
             observation, _ = env.reset(seed=0)  # There is nothing to find yet, as was recorded.
         assert env.unwrapped.model is None
         assert observation["frame"].shape[:2] == (4, 4)
-        env.close()
-    finally:
-        server.stop()
     with serving() as simulated, emberwatch.connect(simulated) as client:
         assert client.info.recorded_world is None
 
 
 def test_pictures_have_the_colours_of_the_description(states: Path) -> None:
-    instance = unused_instance()
-    flags = [f"--instance={instance}", f"--states={states}", "--publish-truth=true"]
-    server = Program("emberwatch-server", flags)
-    keywords: list[dict[str, Any]] = [{"states": states}, {"instance": instance}]
-    try:
-        server.wait_for(lambda: emberwatch.connect(instance)).close()
+    with serving(states=states, publish_truth=True, **OF_STATES) as instance:
+        keywords: list[dict[str, Any]] = [{"states": states}, {"instance": instance}]
         for world in keywords:
             env: Any = gymnasium.make(WILDFIRE, truth=True, render_mode="rgb_array", **world)
             _, info = env.reset(seed=1)
@@ -134,8 +125,6 @@ def test_pictures_have_the_colours_of_the_description(states: Path) -> None:
             corners = (slice(4, None, 128), slice(4, None, 128))  # the robot is in a middle
             np.testing.assert_array_equal(shown[corners], truth[corners], str(world))
             env.close()
-    finally:
-        server.stop()
 
 
 def test_moves_are_paid_by_the_description(states: Path) -> None:
@@ -147,8 +136,6 @@ def test_moves_are_paid_by_the_description(states: Path) -> None:
         paths.reset(seed=seed)
         expected = float(paths.step(np.array(path))[1])
         assert sum(float(env.step(move)[1]) for move in path) == expected
-    env.close()
-    paths.close()
 
 
 def test_what_does_not_fit_is_refused(tmp_path: Path, states: Path) -> None:
@@ -162,5 +149,5 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, states: Path) -> None:
     for keywords, words in wrong:
         with pytest.raises((InvalidArgumentError, EmberwatchError), match=words):
             gymnasium.make(WILDFIRE, **(usual | keywords))
-    with pytest.raises(InvalidArgumentError, match="expected none without a states file"):
+    with refuses("expected none without a states file"):
         gymnasium.make(WILDFIRE, states_offset=3)

@@ -5,7 +5,7 @@ import re
 import struct
 import subprocess
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,16 +15,12 @@ import pytest
 from failures import fails
 from hypothesis import given
 from hypothesis import strategies as st
-from processes import PATIENCE, Server, eventually
+from processes import PATIENCE, eventually, server
 
 import emberwatch
 from emberwatch import programs, recording, wire
 from emberwatch.observer import Frame, Truth
-from emberwatch.recording import (
-    Record,
-    RecordingCutWarning,
-    RecordingDamagedWarning,
-)
+from emberwatch.recording import Record, RecordingCutWarning, RecordingDamagedWarning
 
 INFO = document.examples()[1] | {"n_robots": 2, "deadline_millis": 0}
 TOTALS = {"n_servers": 1, "n_frames": 2, "n_truths": 1, "n_lost_frames": 3, "n_lost_truths": 0}
@@ -200,10 +196,8 @@ def program(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
         process.wait(PATIENCE)
 
 
-def test_what_a_recorder_wrote_is_what_the_server_answered(
-    path: Path, server: Callable[..., Server]
-) -> None:
-    started = server(worlds=2, robots=2, publish_truth="true")
+def test_what_a_recorder_wrote_is_what_the_server_answered(path: Path) -> None:
+    started = server(worlds=2, robots=2, publish_truth=True)
     flags = ("--instance", started.instance, "--out", path, "--truth", "--steps", 20)
     with program("record", *flags) as recorder:
         assert eventually(lambda: started.status().n_observers == 1)

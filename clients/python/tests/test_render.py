@@ -21,6 +21,7 @@ DARK, WHITE = (0x14, 0x14, 0x14), (255, 255, 255)
 FRAME = np.array([[0, 255, 255], [2, 1, 255]], np.uint8)
 TRUTH = np.array([[0, 1, 2], [2, 1, 0]], np.uint8)
 PATH = [(0, 0), (1, 0), (1, 1)]
+PARTS: dict[str, Any] = {"frame": FRAME, "robots": [(1, 1)], "palette": WILDFIRE, "paths": [PATH]}
 
 
 def pixel(image: NDArray[np.uint8], row: int, col: int) -> tuple[int, ...]:
@@ -28,15 +29,13 @@ def pixel(image: NDArray[np.uint8], row: int, col: int) -> tuple[int, ...]:
 
 
 def draw(**changes: Any) -> NDArray[np.uint8]:
-    usual = {"frame": FRAME, "robots": [(1, 1)], "palette": WILDFIRE, "paths": [PATH]}
     scale = changes.pop("scale", 40)
-    return rgb_array(Picture(**{**usual, **changes}), scale=scale)
+    return rgb_array(Picture(**PARTS | changes), scale=scale)
 
 
 def text(**changes: Any) -> str:
-    usual = {"frame": FRAME, "robots": [(1, 1)], "palette": WILDFIRE, "paths": [PATH]}
     color = changes.pop("color", False)
-    return ansi(Picture(**{**usual, **changes}), color=color)
+    return ansi(Picture(**PARTS | changes), color=color)
 
 
 def test_cells_are_squares_of_their_colour() -> None:
@@ -216,16 +215,13 @@ def test_tall_grids_take_half_the_lines() -> None:
     assert f"\x1b[38;2;{tint};{tint};{tint};48;2;200;55;27m▀" in flown
 
 
-PARTS: dict[str, Any] = {"frame": FRAME, "robots": [(1, 1)], "palette": WILDFIRE, "paths": [PATH]}
-
-
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def headless(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
 
 
-def test_a_window_shows_the_picture(headless: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_shows_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     pygame = pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     screen = Screen(title="test")
@@ -242,9 +238,7 @@ def test_a_window_shows_the_picture(headless: None, monkeypatch: pytest.MonkeyPa
     screen.close()
 
 
-def test_two_screens_take_turns_in_the_one_window(
-    headless: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_screens_take_turns_in_the_one_window(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     one, other = Screen(), Screen()
@@ -256,7 +250,7 @@ def test_two_screens_take_turns_in_the_one_window(
 
 
 def test_a_terminal_shows_the_text_in_place(
-    headless: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     screen = Screen()
@@ -271,7 +265,7 @@ def test_a_terminal_shows_the_text_in_place(
 
 
 def test_nowhere_to_show_is_said_once(
-    headless: None, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with caplog.at_level(logging.WARNING):
         screen = Screen(fps=0.001)
@@ -285,7 +279,7 @@ def test_nowhere_to_show_is_said_once(
     ]
 
 
-def test_pictures_keep_their_pace(headless: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_keep_their_pace(monkeypatch: pytest.MonkeyPatch) -> None:
     waits: list[float] = []
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setattr("time.sleep", waits.append)

@@ -1,7 +1,6 @@
 """Several robots of one world through the plain client: leases, paths, frames of the team."""
 
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,21 +8,19 @@ import numpy as np
 import pytest
 from environments import SMALL, WILDFIRE
 from failures import fails
-from processes import PATIENCE, Server, at_once, eventually
+from processes import PATIENCE, at_once, eventually, server
 
 import emberwatch.benchmark
 from emberwatch import errors
 from emberwatch.benchmark import evaluate
 from emberwatch.wire import StepAnswer
 
-Start = Callable[..., Server]
-
 
 def paths(n_robots: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 4, (n_robots, 6))
 
 
-def test_robots_are_numbered_through_all_worlds(server: Start) -> None:
+def test_robots_are_numbered_through_all_worlds() -> None:
     started = server(worlds=3, robots=2)
     client = started.connect()
     assert (client.info.n_worlds, client.info.n_robots) == (3, 2)
@@ -41,7 +38,7 @@ def test_robots_are_numbered_through_all_worlds(server: Start) -> None:
     assert us is not None and holders == [(None, None), (us, us), (us, None)]
 
 
-def test_frames_of_a_team_are_what_its_robots_saw(server: Start) -> None:
+def test_frames_of_a_team_are_what_its_robots_saw() -> None:
     lease = server(worlds=2, robots=3).connect().acquire(0, 6)
     answer = lease.step(paths(6))
     expected = answer.frames.reshape(2, 3, 5, 7).min(axis=1)
@@ -58,7 +55,7 @@ def test_frames_of_a_team_are_what_its_robots_saw(server: Start) -> None:
     assert (flown.frames == lease.observe().frames.reshape(2, 3, 5, 7).min(axis=1)).all()
 
 
-def test_a_step_waits_for_all_robots_that_are_held(server: Start) -> None:
+def test_a_step_waits_for_all_robots_that_are_held() -> None:
     started = server(robots=3)
     one, other = started.connect().acquire(0), started.connect().acquire(2)
     waits = threading.Event()
@@ -80,7 +77,7 @@ def test_a_step_waits_for_all_robots_that_are_held(server: Start) -> None:
     assert (first.result().world.step, first.result().world.hovered) == (1, 0b010)
 
 
-def test_a_request_names_all_robots_of_its_client(server: Start) -> None:
+def test_a_request_names_all_robots_of_its_client() -> None:
     started = server(worlds=2, robots=2)
     lease = started.connect().acquire(0, 4)
     for robots, missing in ((range(0, 1), 1), (range(1, 3), 0), (range(0, 3), 3)):
@@ -93,7 +90,7 @@ def test_a_request_names_all_robots_of_its_client(server: Start) -> None:
     assert lease.step(paths(4)).worlds["step"].tolist() == [1, 2]
 
 
-def test_a_late_path_is_refused_and_observing_goes_on(server: Start) -> None:
+def test_a_late_path_is_refused_and_observing_goes_on() -> None:
     started = server(robots=2, deadline_ms=30)
     quick, slow = started.connect().acquire(0), started.connect().acquire(1)
     for _ in range(3):
@@ -110,7 +107,7 @@ def test_a_late_path_is_refused_and_observing_goes_on(server: Start) -> None:
     assert answers[0].result().robot.n_moves == 6
 
 
-def test_a_robot_is_taken_over_and_its_world_goes_on(server: Start) -> None:
+def test_a_robot_is_taken_over_and_its_world_goes_on() -> None:
     started = server(robots=2)
     lease = started.connect().acquire(0, 2)
     lease.step(paths(2))
@@ -128,7 +125,7 @@ def test_a_robot_is_taken_over_and_its_world_goes_on(server: Start) -> None:
     assert first.result().world.step == 2
 
 
-def test_beliefs_are_left_for_each_robot(server: Start) -> None:
+def test_beliefs_are_left_for_each_robot() -> None:
     client = server(robots=2).connect()
     lease = client.acquire(0, 2)
     results = lease.step(paths(2))
@@ -138,7 +135,7 @@ def test_beliefs_are_left_for_each_robot(server: Start) -> None:
     assert [one and one.data for one in left] == [bytes(9), b"\1" * 9]
 
 
-def test_a_snapshot_has_all_robots(server: Start, tmp_path: Path) -> None:
+def test_a_snapshot_has_all_robots(tmp_path: Path) -> None:
     client = server(robots=3).connect()
     lease = client.acquire(0, 3)
     lease.step(paths(3))
@@ -149,7 +146,7 @@ def test_a_snapshot_has_all_robots(server: Start, tmp_path: Path) -> None:
     assert (again.frames == ahead.frames).all() and (again.results == ahead.results).all()
 
 
-def test_observers_see_who_flew(server: Start) -> None:
+def test_observers_see_who_flew() -> None:
     started = server(robots=3, deadline_ms=30)
     lease = started.connect().acquire(0)
     late = started.connect().acquire(2)

@@ -28,7 +28,6 @@ def test_its_environment_of_a_name_finds_no_fault(name: str, keywords: dict[str,
     env = GymEnv(name, **SMALL, **keywords)
     check_env_specs(env, seed=1)
     assert env.rollout(5)["next", "reward"].shape == (5, 1)
-    env.close()
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
@@ -52,5 +51,3 @@ def test_its_wrapper_of_a_vector_returns_the_vectors_steps(mode: str) -> None:
         np.testing.assert_allclose(seen["reward"][:, 0].numpy(), rewards)
         assert truncated.all() == (step == 5)
         np.testing.assert_array_equal(seen["truncated"][:, 0].numpy(), truncated)
-    wrapped.close()
-    plain.close()

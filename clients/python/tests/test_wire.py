@@ -5,7 +5,7 @@ import dataclasses
 import json
 import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +17,7 @@ import pytest
 from failures import fails
 from hypothesis import given
 from hypothesis import strategies as st
-from processes import Server
+from processes import server
 
 import emberwatch.connection
 from emberwatch import errors, observer, wire
@@ -535,7 +535,7 @@ def test_a_sample_with_robots_that_cannot_be_is_refused() -> None:
         observer.frame_from_sample(header, bytearray(98), 0)
 
 
-def test_the_worked_example_is_what_a_server_answers(server: Callable[..., Server]) -> None:
+def test_the_worked_example_is_what_a_server_answers() -> None:
     flags = re.search(r"^`emberwatch-server (.*?)`, then hello", document.PROTOCOL, re.MULTILINE)
     assert flags
     pairs = re.findall(r"--(\S+) (\S+)", flags[1])

@@ -17,17 +17,14 @@ import gymnasium
 from emberwatch import recording
 from emberwatch.client import Client, connect
 from emberwatch.decisions import Decisions
-from emberwatch.env import WildfireEnv
+from emberwatch.env import WildfireEnv, WildfireVectorEnv
 from emberwatch.errors import EmberwatchError
 from emberwatch.lease import Lease
-from emberwatch.moves_env import WildfireMovesEnv
-from emberwatch.moves_vector_env import WildfireMovesVectorEnv
-from emberwatch.objective_env import WildfireObjectiveEnv
-from emberwatch.objective_vector_env import WildfireObjectiveVectorEnv
+from emberwatch.moves_env import WildfireMovesEnv, WildfireMovesVectorEnv
+from emberwatch.objective_env import WildfireObjectiveEnv, WildfireObjectiveVectorEnv
 from emberwatch.observer import Frame, Observer, Outlook, OutlookReader, Truth, TruthReader, observe
 from emberwatch.release import VERSION
 from emberwatch.replies import Decision, DecisionsInfo, ServerInfo, ServerStatus, WorldInfo
-from emberwatch.vector_env import WildfireVectorEnv
 from emberwatch.wire import RobotResult, StepAnswer, StepResult, WorldResult
 
 if TYPE_CHECKING:
@@ -70,24 +67,17 @@ __version__ = VERSION
 #: Steps after which an episode is truncated, unless `gymnasium.make` is told otherwise.
 MAX_EPISODE_STEPS = 1000
 
-gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
-    "emberwatch/Wildfire-v0",
-    entry_point="emberwatch.env:WildfireEnv",
-    vector_entry_point="emberwatch.vector_env:WildfireVectorEnv",
-    max_episode_steps=MAX_EPISODE_STEPS,
-)
-gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
-    "emberwatch/WildfireMoves-v0",
-    entry_point="emberwatch.moves_env:WildfireMovesEnv",
-    vector_entry_point="emberwatch.moves_vector_env:WildfireMovesVectorEnv",
-    max_episode_steps=64 * MAX_EPISODE_STEPS,
-)
-gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
-    "emberwatch/WildfireObjective-v0",
-    entry_point="emberwatch.objective_env:WildfireObjectiveEnv",
-    vector_entry_point="emberwatch.objective_vector_env:WildfireObjectiveVectorEnv",
-    max_episode_steps=MAX_EPISODE_STEPS,
-)
+for _module, _kind, _steps in (
+    ("env", "Wildfire", MAX_EPISODE_STEPS),
+    ("moves_env", "WildfireMoves", 64 * MAX_EPISODE_STEPS),
+    ("objective_env", "WildfireObjective", MAX_EPISODE_STEPS),
+):
+    gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
+        f"emberwatch/{_kind}-v0",
+        entry_point=f"emberwatch.{_module}:{_kind}Env",
+        vector_entry_point=f"emberwatch.{_module}:{_kind}VectorEnv",
+        max_episode_steps=_steps,
+    )
 
 
 def parallel_env(**keywords: Any) -> WildfireParallelEnv:

@@ -1,7 +1,5 @@
 """`python -m emberwatch --version`."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Final
 

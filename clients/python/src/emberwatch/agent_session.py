@@ -1,7 +1,5 @@
 """Worlds that an agent estimates, plans and steps in: its client chooses what each path is for."""
 
-from __future__ import annotations
-
 import weakref
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -21,9 +19,10 @@ from emberwatch.errors import (
     NoServerError,
     RequestTimeoutError,
     ServerGoneError,
+    bad_answer,
+    invalid,
 )
-from emberwatch.newest import Newest
-from emberwatch.observer import Frame, Observer
+from emberwatch.observer import Frame, Newest, Observer
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program
 from emberwatch.replies import Decision, DecisionsInfo
@@ -54,13 +53,11 @@ class AgentSession(Session):
         for name, choices in _CHOICES.items():
             if arguments[name] not in choices:
                 expected = f"one of {', '.join(choices)}"
-                raise InvalidArgumentError(f"{name}: expected {expected}, got {arguments[name]!r}")
+                raise invalid(name, expected, repr(arguments[name]))
         if arguments["agent"] == "running" and settings.instance is None:
             raise InvalidArgumentError("agent='running': expected instance=..., where it runs")
         if settings.render_mode is not None and n_worlds > wire.FRAME_BUFFER:
-            raise InvalidArgumentError(
-                f"render_mode: expected at most {wire.FRAME_BUFFER} worlds, got {n_worlds}"
-            )
+            raise invalid("render_mode", f"at most {wire.FRAME_BUFFER} worlds", n_worlds)
         if settings.robot is not None or (settings.robots or 1) > 1:
             raise _no_team()
         super().__init__(settings, n_worlds)
@@ -187,8 +184,7 @@ class AgentSession(Session):
         spec, expected = self.spec, self.summaries.shape
         self.summaries = np.array([made.summary for made in decisions], np.float32)
         if self.summaries.shape != expected:
-            got = self.summaries.shape
-            raise wire.bad_answer(f"decisions: expected summaries of shape {expected}, got {got}")
+            raise bad_answer("decisions", f"summaries of shape {expected}", self.summaries.shape)
         header = wire.StepReply(
             first_robot=self.settings.world,
             n_robots=len(decisions),

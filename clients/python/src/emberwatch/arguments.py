@@ -1,7 +1,5 @@
 """What callers hand in: seeds, choices, moves, each checked before anything is sent."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import cast
 
@@ -9,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import wire
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import invalid
 
 
 def as_seed(seed: object) -> int:
@@ -18,7 +16,7 @@ def as_seed(seed: object) -> int:
         number = int(cast("int", seed))
         if 0 <= number < 2**64:
             return number
-    raise InvalidArgumentError(f"seed: expected an integer within 0 to 2**64 - 1, got {seed!r}")
+    raise invalid("seed", "an integer within 0 to 2**64 - 1", f"{seed!r}")
 
 
 def as_seeds(
@@ -28,7 +26,7 @@ def as_seeds(
     chosen = list(worlds)
     given = [None] * len(chosen) if seeds is None else list(seeds)
     if len(given) != len(chosen):
-        raise InvalidArgumentError(f"seeds: expected {len(chosen)}, got {len(given)}")
+        raise invalid("seeds", len(chosen), len(given))
     return [
         {"world": world, "seed": None if seed is None else as_seed(seed)}
         for world, seed in zip(chosen, given, strict=True)
@@ -43,9 +41,7 @@ def as_choice(action: object, n_choices: int) -> int:
         given = np.empty(0)
     if given.size == 1 and given.dtype.kind in "iu" and 0 <= int(given.item()) < n_choices:
         return int(given.item())
-    raise InvalidArgumentError(
-        f"action: expected one integer, 0 to {n_choices - 1}, got {action!r}"
-    )
+    raise invalid("action", f"one integer, 0 to {n_choices - 1}", repr(action))
 
 
 def as_choices(actions: object, n_worlds: int, n_choices: int) -> NDArray[np.uint8]:
@@ -53,15 +49,13 @@ def as_choices(actions: object, n_worlds: int, n_choices: int) -> NDArray[np.uin
     try:
         given = np.asarray(actions)
     except (ValueError, OverflowError) as error:
-        raise InvalidArgumentError(f"action: expected an array, got {error}") from None
+        raise invalid("action", "an array", error) from None
     if given.shape != (n_worlds,) or given.dtype.kind not in "iu":
         got = f"{given.dtype} {given.shape}"
-        raise InvalidArgumentError(f"action: expected integers of shape ({n_worlds},), got {got}")
+        raise invalid("action", f"integers of shape ({n_worlds},)", got)
     if (given < 0).any() or (given >= n_choices).any():
         wrong = int(np.argmax((given < 0) | (given >= n_choices)))
-        raise InvalidArgumentError(
-            f"action: expected 0 to {n_choices - 1}, got {given[wrong]} for world {wrong}"
-        )
+        raise invalid("action", f"0 to {n_choices - 1}", f"{given[wrong]} for world {wrong}")
     return given.astype(np.uint8)
 
 
@@ -70,18 +64,14 @@ def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]
     try:
         given = np.asarray(paths)
     except (ValueError, OverflowError) as error:
-        raise InvalidArgumentError(f"action: expected an array of moves, got {error}") from None
+        raise invalid("action", "an array of moves", error) from None
     if given.shape != (n_worlds, n_moves) and (n_worlds != 1 or given.shape != (n_moves,)):
         one = f" or ({n_moves},)" if n_worlds == 1 else ""
-        raise InvalidArgumentError(
-            f"action: expected shape ({n_worlds}, {n_moves}){one}, got {given.shape}"
-        )
+        raise invalid("action", f"shape ({n_worlds}, {n_moves}){one}", given.shape)
     if given.dtype.kind not in "iu":
-        raise InvalidArgumentError(f"action: expected integers, got {given.dtype}")
+        raise invalid("action", "integers", given.dtype)
     # One shift leaves something of each value below 0 or above 3.
     if (given >> 2).any():
         where = tuple(int(i) for i in np.argwhere((given < 0) | (given >= wire.N_MOVES))[0])
-        raise InvalidArgumentError(
-            f"action: expected moves 0 to {wire.N_MOVES - 1}, got {given[where]} at {where}"
-        )
+        raise invalid("action", f"moves 0 to {wire.N_MOVES - 1}", f"{given[where]} at {where}")
     return given.astype(np.uint8)

@@ -1,14 +1,12 @@
 """What the environments of one robot share: its session, its pictures, its beginning."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar, Final, Literal, TypeAlias
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.observations import Observations
 from emberwatch.session import Session, SessionOwner
 from emberwatch.settings import draw_seed
@@ -47,13 +45,12 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
         "render_fps": RENDER_FPS,
     }
 
-    def __init__(self, session: Session, *, reveals: bool) -> None:
-        """`reveals` puts the hidden states into infos and pictures."""
+    def __init__(self, session: Session) -> None:
         self._session = session
         self._spec: Final = session.spec
         self.render_mode = session.settings.render_mode
         self._view = View(self.render_mode, self._spec)
-        self._reveals = reveals
+        self._reveals = session.settings.reveals
         #: Which robot of a world that others fly in; None: it is alone in its world.
         self._robot: Final = session.settings.robot
         self._n_missed = 0
@@ -63,7 +60,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
 
     def render(self) -> Any:
         """Draws the last frame, path and robot, beside the truth when that is revealed."""
-        if self.render_mode is None or not self._is_open():
+        if self.render_mode is None or not self.is_open:
             gymnasium.logger.warn(NOTHING_TO_DRAW)
             return None
         return None if self.render_mode == "human" else self._draw()
@@ -134,7 +131,7 @@ def check_reward(reward: str, *more: str) -> tuple[str, str]:
     """The field of a result that says what a step pays; `more` rewards are the share as well."""
     if reward not in (*REWARDS, *more):
         expected = ", ".join(map(repr, (*REWARDS, *more)))
-        raise InvalidArgumentError(f"reward: expected one of {expected}, got {reward!r}")
+        raise invalid("reward", f"one of {expected}", repr(reward))
     return REWARDS.get(reward, REWARDS["share"])
 
 
@@ -148,10 +145,10 @@ def wants_to_resume(options: dict[str, Any] | None, seed: object) -> bool:
     """Reads the options of a reset."""
     for key in options or {}:
         if key != "resume":
-            raise InvalidArgumentError(f"options: expected 'resume', got {key!r}")
+            raise invalid("options", "'resume'", repr(key))
     resume = (options or {}).get("resume", False)
     if not isinstance(resume, bool):
-        raise InvalidArgumentError(f"options: expected resume True or False, got {resume!r}")
+        raise invalid("options", "resume True or False", repr(resume))
     if resume and seed is not None:
         raise InvalidArgumentError(
             "options: expected no seed with resume=True, which begins no episode"

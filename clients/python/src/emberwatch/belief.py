@@ -8,14 +8,12 @@ beside an environment.
 Beliefs have shape (S, H, W): one probability per state and cell, a distribution in each cell.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.model import Model
 from emberwatch.wire import UNOBSERVED
 
@@ -48,9 +46,7 @@ class Filter:
         """
         if frame.shape != self._belief.shape[1:] or frame.dtype != np.uint8:
             expected = f"shape {self._belief.shape[1:]} and type uint8"
-            raise InvalidArgumentError(
-                f"frame: expected {expected}, got {frame.shape} and {frame.dtype}"
-            )
+            raise invalid("frame", expected, f"{frame.shape} and {frame.dtype}")
         _correct(self._belief, self._likelihood, frame)
 
     def predict(self) -> None:
@@ -112,9 +108,7 @@ def _correct(
     if (observed >= n_observations).any():
         first = np.argmax(observed >= n_observations)
         expected = f"a value below {n_observations}, or {UNOBSERVED}"
-        raise InvalidArgumentError(
-            f"frame: cell {cell(first)}: expected {expected}, got {observed[first]}"
-        )
+        raise invalid(f"frame: cell {cell(first)}", expected, observed[first])
     flat = belief.reshape(len(belief), -1)
     prior = flat[:, cells]
     joint = prior * likelihood[:, observed]
@@ -171,7 +165,7 @@ class Transition:
     def apply(self, belief: NDArray[np.float64]) -> NDArray[np.float64]:
         """``Phi(belief)``, a new array of the same shape; each cell's sum is one."""
         if belief.shape != self._shape:
-            raise InvalidArgumentError(f"belief: expected shape {self._shape}, got {belief.shape}")
+            raise invalid("belief", f"shape {self._shape}", belief.shape)
         _, *_, height, width = self._shape
         self._inside[:] = belief.reshape(self._inside.shape)
         n_rows = self._rows[0] * self._rows[1]
@@ -255,14 +249,12 @@ def _distribution(prior: NDArray[np.floating], *, n_states: int) -> NDArray[np.f
     """A copy of the prior, each cell's sum exactly one."""
     belief = np.array(prior, dtype=np.float64, order="C")
     if belief.ndim != 3 or belief.shape[0] != n_states or not belief.size:
-        raise InvalidArgumentError(f"prior: expected shape ({n_states}, H, W), got {belief.shape}")
+        raise invalid("prior", f"shape ({n_states}, H, W)", belief.shape)
     total = belief.sum(axis=0)
     fine = (np.abs(total - 1.0) <= _SUM_TOLERANCE) & (belief >= 0.0).all(axis=0)
     if not fine.all():
         row, col = (int(i) for i in np.argwhere(~fine)[0])
         got = belief[:, row, col].tolist()
-        raise InvalidArgumentError(
-            f"prior: cell ({row}, {col}): expected probabilities >= 0 with sum 1, got {got}"
-        )
+        raise invalid(f"prior: cell ({row}, {col})", "probabilities >= 0 with sum 1", got)
     belief /= total
     return belief

@@ -25,13 +25,13 @@ from numpy.typing import NDArray
 from emberwatch import wire
 from emberwatch.arguments import as_seed
 from emberwatch.client import Client
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.merit import RECENT_STEPS, MeritTally
 from emberwatch.observations import OF_BELIEF, OF_TEAM, cells_of, names_of
 from emberwatch.rows import Row, RowFile
 from emberwatch.rows import read as read
 from emberwatch.settings import WorldSpec
-from emberwatch.view import DIRECTIONS
+from emberwatch.view import fly
 
 #: Takes the stacked observations of some worlds; returns an action for each.
 Policy = Callable[[Any], Any]
@@ -41,8 +41,6 @@ FIRST_TRAINING_SEED: Final = 1000
 
 _MOVES: Final = "emberwatch/WildfireMoves-v0"
 _PATHS: Final = "emberwatch/Wildfire-v0"
-
-_DIRECTIONS: Final = np.array(DIRECTIONS, np.int64)
 
 #: Of `emberwatch-agent compare`.
 _BURN_IN: Final = 25_000
@@ -58,6 +56,7 @@ class _Tally:
     """Sums over the steps of some worlds."""
 
     def __init__(self, spec: WorldSpec, n_worlds: int, recent_steps: int) -> None:
+        self._spec: Final = spec
         self.n_moves: Final = spec.n_moves
         self.n_robots: Final = spec.n_robots
         self.recent_steps: Final = recent_steps
@@ -102,12 +101,9 @@ class _Tally:
     def _visited(self, robots: NDArray[np.void], paths: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Cells that some robot of each world visited, `(n_worlds, H, W)`."""
         visited = np.zeros(self._shape, np.bool_)
-        worlds = np.arange(len(robots)) // self.n_robots
-        last = np.array(self._shape[1:], np.int64) - 1
-        cells = np.stack((robots["start_row"], robots["start_col"]), 1).astype(np.int64)
-        for moves in paths.T:
-            cells = (cells + _DIRECTIONS[moves]).clip(0, last)
-            visited[worlds, cells[:, 0], cells[:, 1]] = True
+        worlds = np.arange(len(robots))[:, np.newaxis] // self.n_robots
+        cells = fly(np.stack((robots["start_row"], robots["start_col"]), 1), paths, self._spec)
+        visited[worlds, cells[..., 0], cells[..., 1]] = True
         return visited
 
 
@@ -179,7 +175,8 @@ def evaluate(
     report = _Progress(progress, name, chosen, len(missing) * steps)
     for first in range(0, len(missing), batch):
         part = missing[first : first + batch]
-        getattr(policy, "begin", _nothing)(len(part))
+        if hasattr(policy, "begin"):
+            policy.begin(len(part))
         tally = _play(env, keywords, act, part, steps, recent_steps, report)
         rows = _rows(tally, part, steps, kind)
         done |= {row.world_seed: row for row in rows}
@@ -239,9 +236,7 @@ def _play(
                 flown.append(np.array(tally.timed(act, seen)))
                 seen, _, _, truncated, _ = worlds.step(flown[-1])
             if truncated.any() and step < steps:
-                raise InvalidArgumentError(
-                    f"steps: expected at most {step}, as episodes of these worlds have, got {steps}"
-                )
+                raise invalid("steps", f"at most {step}, as episodes of these worlds have", steps)
             paths = np.stack(flown, axis=1).reshape(len(truncated), -1)
             tally.add(worlds.unwrapped.results, paths, worlds.unwrapped.truths)
             report.add(len(seeds))
@@ -288,21 +283,21 @@ def _check(
 ) -> list[int]:
     """The seeds as a list; refuses what no worlds can be made of."""
     if not isinstance(name, str) or not name or not name.isprintable():  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise InvalidArgumentError(f"name: expected a name for the table, got {name!r}")
+        raise invalid("name", "a name for the table", repr(name))
     if env not in (_MOVES, _PATHS):
-        raise InvalidArgumentError(f"env: expected {_MOVES!r} or {_PATHS!r}, got {env!r}")
+        raise invalid("env", f"{_MOVES!r} or {_PATHS!r}", repr(env))
     numbers = {"steps": steps, "batch": batch, "recent_steps": recent_steps}
     for what, number in numbers.items():
         if not isinstance(number, int | np.integer) or number < 1:  # pyright: ignore[reportUnnecessaryIsInstance]
-            raise InvalidArgumentError(f"{what}: expected at least 1, got {number!r}")
+            raise invalid(what, "at least 1", repr(number))
     for what in _SET:
         if what in keywords:
             raise InvalidArgumentError(f"{what}: expected none, as evaluate sets it")
     if not isinstance(seeds, Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise InvalidArgumentError(f"seeds: expected some, such as range(8), got {seeds!r}")
+        raise invalid("seeds", "some, such as range(8)", repr(seeds))
     chosen = [as_seed(seed) for seed in seeds]
     if not chosen or len(set(chosen)) < len(chosen):
-        raise InvalidArgumentError(f"seeds: expected some, each once, got {chosen}")
+        raise invalid("seeds", "some, each once", chosen)
     return chosen
 
 
@@ -311,15 +306,10 @@ def _acting(policy: Any, deterministic: bool) -> Policy:
     if predict is not None:
         return lambda observations: predict(observations, deterministic=deterministic)[0]
     if not callable(policy):
-        raise InvalidArgumentError(
-            "policy: expected a function of observations, or a model of Stable-Baselines3, "
-            f"got {policy!r}"
+        raise invalid(
+            "policy", "a function of observations, or a model of Stable-Baselines3", repr(policy)
         )
     return cast("Policy", policy)
-
-
-def _nothing(_n_worlds: int) -> None:
-    """What a policy without `begin` does."""
 
 
 class _Progress:

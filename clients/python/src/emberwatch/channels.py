@@ -3,8 +3,6 @@
 The only module, with `cleanup`, `ports` and `observer`, that knows iceoryx2.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import importlib
@@ -19,7 +17,7 @@ from typing import Any, Final, Self
 
 from emberwatch import wire
 from emberwatch.cleanup import ChannelFiles
-from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.errors import EmberwatchError, invalid
 from emberwatch.turn import LONGEST_WAIT, SHORT_WAIT, cannot_create, turn
 
 _INSTANCE: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -50,9 +48,7 @@ class Node:
 
     def __init__(self, instance: str) -> None:
         if not _INSTANCE.fullmatch(instance):
-            raise InvalidArgumentError(
-                f"instance: expected 1 to 64 characters out of A-Z a-z 0-9 - _, got {instance!r}"
-            )
+            raise invalid("instance", "1 to 64 characters out of A-Z a-z 0-9 - _", repr(instance))
         self.instance: Final = instance
         self._held: list[Any] = []
         self._usable = True

@@ -4,8 +4,6 @@ During a turn every file is one of three: part of a node whose process lives, of
 a node uses, or left over.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 import shutil

@@ -4,8 +4,6 @@
 Every call waits `timeout` seconds for its answer; everything returned is a copy.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import sys
@@ -16,7 +14,7 @@ from typing import Final, TypeVar
 
 from emberwatch import wire
 from emberwatch.connection import ServerConnection
-from emberwatch.errors import EmberwatchError, InvalidArgumentError, NoServerError
+from emberwatch.errors import EmberwatchError, NoServerError, bad_answer, invalid
 from emberwatch.lease import Lease
 from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
 from emberwatch.replies import (
@@ -91,9 +89,7 @@ class Client(ServerConnection):
         nearest step that it keeps.
         """
         if not 0 <= step < 2**64:
-            raise InvalidArgumentError(
-                f"step: expected an integer within 0 to 2**64 - 1, got {step!r}"
-            )
+            raise invalid("step", "an integer within 0 to 2**64 - 1", repr(step))
         flags = wire.TEAM_FRAMES if team else 0
         body = step.to_bytes(8, sys.byteorder) * self.shape.n_worlds(first_robot, n_robots)
         return self.exchange(wire.RECALL, 0, first_robot, n_robots, flags, body, timeout=timeout)
@@ -135,8 +131,7 @@ class Client(ServerConnection):
             try:
                 part = b64decode(info.data, validate=True)
             except ValueError as error:
-                problem = f"answer to 'belief': expected base64, got {error}"
-                raise wire.bad_answer(problem) from None
+                raise bad_answer("answer to 'belief'", "base64", error) from None
             whole = (info.kind, info.episode, info.step, info.length)
             first = first or whole
             if whole != first:
@@ -146,8 +141,7 @@ class Client(ServerConnection):
             if len(data) == info.length:
                 return LeftBelief(info.kind, info.episode, info.step, data)
             if not part or len(data) > info.length:
-                problem = f"answer to 'belief': expected {info.length} bytes, got {len(data)}"
-                raise wire.bad_answer(problem)
+                raise bad_answer("answer to 'belief'", f"{info.length} bytes", len(data))
 
     def status(self, *, timeout: float = STEP_TIMEOUT) -> ServerStatus:
         reply = self.control({"op": "status"}, timeout=timeout)

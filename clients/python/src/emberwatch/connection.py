@@ -1,7 +1,5 @@
 """A connection to a process that answers: handshake, JSON requests, steps."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time
@@ -11,7 +9,7 @@ from typing import Any, Final, TypeVar, cast
 
 from emberwatch import wire
 from emberwatch.channels import Closable, Node, in_turn
-from emberwatch.errors import RequestTimeoutError, refusal
+from emberwatch.errors import RequestTimeoutError, bad_answer, refusal
 from emberwatch.ports import STEP_TIMEOUT, Peer, RequestPort
 from emberwatch.release import VERSION
 from emberwatch.replies import ServerInfo, record
@@ -179,8 +177,7 @@ def _decoded(what: str, answer: bytearray) -> dict[str, Any]:
     try:
         reply = json.loads(answer)
     except (ValueError, RecursionError) as error:
-        problem = f"answer to {what}: expected JSON, got {error}"
-        raise wire.bad_answer(problem) from None
+        raise bad_answer(f"answer to {what}", "JSON", error) from None
     if not isinstance(reply, dict):
-        raise wire.bad_answer(f"answer to {what}: expected an object, got {reply!r}")
+        raise bad_answer(f"answer to {what}", "an object", repr(reply))
     return cast("dict[str, Any]", reply)

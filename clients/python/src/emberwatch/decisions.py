@@ -3,8 +3,6 @@
 PROTOCOL.md section 13. `WildfireObjectiveEnv` makes an environment of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 

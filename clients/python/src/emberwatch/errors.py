@@ -3,8 +3,6 @@
 Subclasses exist only where a caller acts differently.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 
@@ -32,6 +30,16 @@ class InvalidArgumentError(EmberwatchError, ValueError):
     """An action or a keyword is impossible, or contradicts the server. Nothing was sent."""
 
     code = "invalid_argument"
+
+
+def invalid(subject: object, expected: object, got: object) -> InvalidArgumentError:
+    """The error of a value that is not what was expected."""
+    return InvalidArgumentError(f"{subject}: expected {expected}, got {got}")
+
+
+def bad_answer(subject: object, expected: object, got: object) -> EmberwatchError:
+    """The error of an answer, or of something published, that makes no sense."""
+    return EmberwatchError(f"{subject}: expected {expected}, got {got}", "bad_answer")
 
 
 class LeaseLostError(EmberwatchError):

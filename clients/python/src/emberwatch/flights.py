@@ -1,16 +1,13 @@
 """Paths flown move by move by many robots: where they are, what they have visited."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emberwatch.errors import InvalidArgumentError
 from emberwatch.settings import WorldSpec
 from emberwatch.view import DIRECTIONS
-
-_DIRECTIONS: Final = np.array(DIRECTIONS, np.int64)
 
 
 class Flights:
@@ -19,8 +16,9 @@ class Flights:
     def __init__(self, spec: WorldSpec, n_rows: int, *, pays: bool) -> None:
         """`pays`: each cell pays when it is first visited, what its hidden state pays."""
         self.spec: Final = spec
-        described = spec.described
-        self._reward = None if described is None or not pays else described.reward
+        if pays and spec.described is None:
+            raise InvalidArgumentError("reward='move': expected a server that reveals its model")
+        self._reward = spec.described.reward if pays and spec.described else None
         self._last_cell = np.array((spec.height - 1, spec.width - 1), np.int64)
         #: Row and column of each robot.
         self.robots = np.zeros((n_rows, 2), np.int64)
@@ -64,7 +62,7 @@ class Flights:
         chosen = actions[indices]
         self._moves[indices, self.n_made[indices]] = chosen
         self.n_made[indices] += 1
-        cells = (self.robots[indices] + _DIRECTIONS[chosen]).clip(0, self._last_cell)
+        cells = (self.robots[indices] + DIRECTIONS[chosen]).clip(0, self._last_cell)
         self.robots[indices] = cells
         at = (indices, cells[:, 0], cells[:, 1])
         rewards = np.zeros(len(indices))

@@ -1,7 +1,5 @@
 """What frames alone tell: which value was last observed in each cell, and how long ago."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

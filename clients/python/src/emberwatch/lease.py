@@ -1,7 +1,5 @@
 """A lease: the right to fly some robots, and what may be done with it."""
 
-from __future__ import annotations
-
 import os
 import threading
 from base64 import b64encode
@@ -14,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from emberwatch import wire
 from emberwatch.arguments import as_moves, as_seeds
 from emberwatch.connection import ServerConnection
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import invalid
 from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
 from emberwatch.replies import Grant, WorldInfo, records
 from emberwatch.wire import StepAnswer, StepResult
@@ -243,7 +241,5 @@ class Lease:
 def _part(what: str, part: range, whole: range) -> range:
     is_part = isinstance(part, range) and part.step == 1 and len(part) > 0  # pyright: ignore[reportUnnecessaryIsInstance]
     if not is_part or part.start < whole.start or part.stop > whole.stop:
-        raise InvalidArgumentError(
-            f"{what}: expected a range of consecutive {what} within {whole}, got {part}"
-        )
+        raise invalid(what, f"a range of consecutive {what} within {whole}", part)
     return part

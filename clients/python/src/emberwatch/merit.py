@@ -3,8 +3,6 @@
 They need no model: only which state is the target, and for two of them the hidden states.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 
@@ -46,7 +44,8 @@ class MeritTally:
         self._last_visits = np.zeros((n_worlds, *shape), np.int64)
         #: Step, 0: none yet, and burning cells.
         self._detections = np.zeros((n_worlds, 2), np.int64)
-        self._burning_seen, self._distances = _Means(n_worlds), _Means(n_worlds)
+        #: Sums and counts of the worlds that had a value.
+        self._burning_seen, self._distances = np.zeros((2, 2, n_worlds))
 
     def update(
         self,
@@ -81,8 +80,8 @@ class MeritTally:
         return Merit(
             steps_to_detection=step or None,
             burning_cells_at_detection=n_burning if step else None,
-            burning_seen_share=self._burning_seen.of(world),
-            front_distance=self._distances.of(world),
+            burning_seen_share=_mean(self._burning_seen[:, world]),
+            front_distance=_mean(self._distances[:, world]),
             grid_seen_share=np.count_nonzero(visits) / visits.size,
         )
 
@@ -90,7 +89,8 @@ class MeritTally:
         seen = self._last_visits > max(self._step - self._recent_steps, 0)
         n_burning = burning.sum(axis=(1, 2))
         n_seen = (burning & seen).sum(axis=(1, 2))
-        self._burning_seen.add(n_seen / np.maximum(n_burning, 1), n_burning > 0)
+        burns = n_burning > 0
+        self._burning_seen += np.where(burns, n_seen / np.maximum(n_burning, 1), 0.0), burns
         front: NDArray[np.bool_] = burning & ~seen
         far = sum(front.shape)
         nearest = np.full(len(front), far)
@@ -98,20 +98,10 @@ class MeritTally:
             row_moves = np.abs(self._rows - robot[:, :1])[:, :, np.newaxis]
             moves = row_moves + np.abs(self._cols - robot[:, 1:])[:, np.newaxis, :]
             nearest = np.minimum(nearest, np.where(front, moves, far).min(axis=(1, 2)))
-        self._distances.add(nearest, nearest < far)
+        self._distances += np.where(nearest < far, nearest, 0), nearest < far
 
 
-class _Means:
-    """A mean of what is there, for each world."""
-
-    def __init__(self, n_worlds: int) -> None:
-        self._sums, self._counts = np.zeros(n_worlds), np.zeros(n_worlds, np.int64)
-
-    def add(self, values: NDArray[np.number], has: NDArray[np.bool_]) -> None:
-        """A value of each world that has one."""
-        self._sums[has] += values[has]
-        self._counts += has
-
-    def of(self, world: int) -> float | None:
-        count = int(self._counts[world])
-        return float(self._sums[world]) / count if count else None
+def _mean(of: NDArray[np.float64]) -> float | None:
+    """Of a sum and a count."""
+    total, count = of.tolist()
+    return total / count if count else None

@@ -5,8 +5,6 @@ observation matrix ``O`` of eq. 1. Whether a file makes sense is for the server 
 reads what the server has accepted. `emberwatch.belief` applies the parameters to a belief.
 """
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import dataclass, fields
 from importlib import resources
@@ -18,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import invalid
 from emberwatch.programs import check_settings
 
 Color = tuple[int, int, int]
@@ -60,8 +58,8 @@ class Description:
             return cls(**cls._fields(tomllib.loads(text)), toml=text)
         except (AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
             kind = cls.__name__.lower()
-            raise InvalidArgumentError(
-                f"{kind}: expected a file that `emberwatch-server --check` accepts, got {error!r}"
+            raise invalid(
+                kind, "a file that `emberwatch-server --check` accepts", repr(error)
             ) from None
 
     @property

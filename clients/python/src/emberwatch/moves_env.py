@@ -1,20 +1,23 @@
-"""`emberwatch/WildfireMoves-v0`: one step flies one move; the world moves after T of them."""
+"""`emberwatch/WildfireMoves-v0`: one step flies one move; the world moves after T of them.
 
-from __future__ import annotations
+For one robot, or for many.
+"""
 
 from typing import Any, Final, Literal, TypeAlias, Unpack
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
 
 from emberwatch import wire
-from emberwatch.arguments import as_choice
+from emberwatch.arguments import as_choice, as_choices
 from emberwatch.base import ONE_ROW, Reward, WorldEnv, check_reward, paid
-from emberwatch.errors import InvalidArgumentError
 from emberwatch.flights import Flights
 from emberwatch.observations import WINDOW, MovesParts, Observations, of_row
 from emberwatch.session import Session, not_reset
-from emberwatch.settings import Settings, WorldArguments, WorldSpec
+from emberwatch.settings import Settings, WorldArguments
+from emberwatch.vector_base import WorldVectorEnv, vector_session
 from emberwatch.view import fly
 from emberwatch.wire import StepAnswer
 
@@ -99,11 +102,10 @@ class WildfireMovesEnv(WorldEnv):
         **world: Unpack[WorldArguments],
     ) -> None:
         """See the class. No server of its own runs before the first reset."""
-        reveals = world.get("truth", False)
         self._pays = check_reward(reward, "move")
-        settings = moves_settings(WildfireMovesEnv, reward, world)
-        super().__init__(Session(settings), reveals=reveals)
-        self._flights = flights = moves_flights(self._spec, 1, reward)
+        settings = Settings.of(WildfireMovesEnv, world, needs_truth=reward == "move")
+        super().__init__(Session(settings))
+        self._flights = flights = Flights(self._spec, 1, pays=reward == "move")
         self._observations = Observations(
             observation, self._spec, 1, flights, window, first=self._robot or 0
         )
@@ -127,7 +129,7 @@ class WildfireMovesEnv(WorldEnv):
             EmberwatchError: As `WildfireEnv.step`.
         """
         move = np.array([as_choice(action, wire.N_MOVES)], np.uint8)
-        if self._answer is None or not self._is_open():
+        if self._answer is None or not self.is_open:
             raise not_reset()
         flights = self._flights
         if not flights.completes()[0]:
@@ -139,7 +141,8 @@ class WildfireMovesEnv(WorldEnv):
         answer = self._session.step(path)
         result = answer.result()
         reward = paid(result, self._pays) - float(flights.paid[0])
-        self._trace(result.robot, path[0])
+        if self.render_mode is not None:
+            self._trace(result.robot, path[0])
         self._update(self._observations, answer)
         self._begin_path(answer)
         observation, info = self._seen(answer)
@@ -175,14 +178,76 @@ class WildfireMovesEnv(WorldEnv):
         return row, col
 
 
-def moves_settings(environment: type, reward: str, world: WorldArguments) -> Settings:
-    """The settings of an environment, which a reward for each move adds the truth to."""
-    reveals = world.get("truth", False)
-    return Settings.of(environment, {**world, "truth": reveals or reward == "move"})
+class WildfireMovesVectorEnv(WorldVectorEnv):
+    """Many robots of `WildfireMovesEnv`: one message steps all whose paths are complete.
 
+    As `WildfireVectorEnv`; arguments are those of `WildfireMovesEnv`, and `num_envs`,
+    `max_episode_steps` (moves), `autoreset_mode`.
+    """
 
-def moves_flights(spec: WorldSpec, n_rows: int, reward: str) -> Flights:
-    """The flights of robots that are paid for each move, or for the path."""
-    if reward == "move" and spec.described is None:
-        raise InvalidArgumentError("reward='move': expected a server that reveals its model")
-    return Flights(spec, n_rows, pays=reward == "move")
+    def __init__(
+        self,
+        *,
+        num_envs: int | None = 1,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        observation: MovesParts = ("frame", "visited", "robot", "move"),
+        reward: MovesReward = "share",
+        window: int = WINDOW,
+        **world: Unpack[WorldArguments],
+    ) -> None:
+        """See the class. No server of its own runs before the first reset."""
+        self._pays = check_reward(reward, "move")
+        settings = Settings.of(WildfireMovesVectorEnv, world, needs_truth=reward == "move")
+        session = vector_session(settings, num_envs)
+        n_rows = session.n_rows
+        self._flights = flights = Flights(session.spec, n_rows, pays=reward == "move")
+        self._parts = Observations(observation, session.spec, n_rows, flights, window)
+        super().__init__(
+            session,
+            self._parts,
+            spaces.Discrete(wire.N_MOVES),
+            max_episode_steps=max_episode_steps,
+            autoreset_mode=autoreset_mode,
+        )
+
+    def _check_actions(self, actions: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
+        return as_choices(actions, self.num_envs, wire.N_MOVES)
+
+    def _fly(self, actions: NDArray[np.uint8], flown: NDArray[np.bool_]) -> NDArray[np.float64]:
+        if not self.is_open:
+            raise not_reset()
+        completed = flown & self._flights.completes()
+        if not completed.any():
+            return self._move(actions, flown)
+        self._exchange(self._flights.paths(actions), completed)
+        part, name = self._pays
+        rewards = self._results[part][name] - self._flights.paid
+        others = flown & ~completed
+        if others.any():
+            rewards = np.where(others, self._move(actions, others), rewards)
+        self._begin(completed)
+        return rewards
+
+    def _move(self, actions: NDArray[np.uint8], moved: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """One move that completes no path."""
+        indices = np.flatnonzero(moved)
+        rewards = np.zeros(self.num_envs)
+        rewards[indices] = self._flights.move(indices, actions)
+        self._parts.visit(indices)
+        return rewards
+
+    def _begin(self, begun: NDArray[np.bool_]) -> None:
+        self._flights.begin(begun, super()._robots(), self._truths)
+
+    def _robots(self) -> NDArray[np.int64]:
+        return self._flights.robots.copy()
+
+    def _shown(self) -> NDArray[np.uint8]:
+        return self._frames.copy()  # each move of a path returns the frames again
+
+    def _path(self, row: int) -> NDArray[np.intp] | None:
+        if not self._flights.n_made[row]:
+            return super()._path(row)
+        start_row, start_col = super()._robots()[row].tolist()
+        return fly((start_row, start_col), self._flights.made(row), self._spec)

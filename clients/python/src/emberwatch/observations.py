@@ -1,7 +1,5 @@
 """What a learner sees: which parts, as which spaces."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any, Final, Literal, TypeAlias, cast
 
@@ -11,7 +9,7 @@ from numpy.typing import NDArray
 
 from emberwatch import wire
 from emberwatch.belief import Filters
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.flights import Flights
 from emberwatch.last_seen import LastSeen
 from emberwatch.prior import prior_of
@@ -54,9 +52,7 @@ class Observations:
         known = _spaces(spec, None if flights is None else window)
         names = names_of(parts)
         if not names or len(set(names)) < len(names) or not known.keys() >= set(names):
-            raise InvalidArgumentError(
-                f"observation: expected one or several of {', '.join(known)}, got {parts!r}"
-            )
+            raise invalid("observation", f"one or several of {', '.join(known)}", repr(parts))
         self._names, self._is_plain = names, isinstance(parts, str)
         self._spec, self._n_rows, self._flights = spec, n_rows, flights
         self._first = first
@@ -230,7 +226,7 @@ def _spaces(spec: WorldSpec, window: int | None) -> dict[str, spaces.Space[Any]]
     if window is None:
         return known
     if not isinstance(window, int | np.integer) or window < 3 or window % 2 == 0:  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise InvalidArgumentError(f"window: expected an odd number from 3 on, got {window!r}")
+        raise invalid("window", "an odd number from 3 on", repr(window))
 
     def around(n_of_world: int) -> spaces.Box:
         return spaces.Box(0, 255, (window, window, n_of_world + N_OF_PATH), np.uint8)

@@ -3,12 +3,10 @@
 Such as `for frame in emberwatch.observe("lab", timeout=10): print(frame.result.reward)`.
 """
 
-from __future__ import annotations
-
 import ctypes
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
@@ -17,7 +15,7 @@ from numpy.typing import NDArray
 
 from emberwatch import wire
 from emberwatch.channels import Closable, Node, channel_errors, in_turn
-from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.errors import RequestTimeoutError, bad_answer, invalid
 from emberwatch.wire import RobotResult, WorldResult
 
 # Seconds to sleep while there is no sample, soon after many came and else: publishing notifies
@@ -25,10 +23,14 @@ from emberwatch.wire import RobotResult, WorldResult
 _BUSY_SLEEP: Final = 500e-6
 _CALM_SLEEP: Final = 4e-3
 
+#: How long to wait for samples of given steps before they are first asked for again, seconds.
+_RETRY: Final = 0.02
+
 #: How long many samples are expected after many came, seconds.
 _BUSY: Final = 1.0
 
 _Sample = TypeVar("_Sample")
+_Step = TypeVar("_Step", bound="Frame | Truth")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -125,6 +127,8 @@ class Reader(Closable, Generic[_Sample]):
         publishers: int = 1,
     ) -> None:
         self._header, self._decode = header, decode
+        #: Samples of others are left out; None: of all worlds.
+        self._world: int | None = None
         #: The next sequence number of each publisher: each agent counts its own.
         self._next: dict[int, int] = {}
         self._many = buffer // 4
@@ -155,9 +159,6 @@ class Reader(Closable, Generic[_Sample]):
 
     def receive(self, timeout: float) -> _Sample | None:
         """The next sample; `None` if none comes within `timeout` seconds."""
-        return self._receive(timeout, None)
-
-    def _receive(self, timeout: float, world: int | None) -> _Sample | None:
         deadline = time.perf_counter() + timeout
         n_lost = 0
         while True:
@@ -166,7 +167,7 @@ class Reader(Closable, Generic[_Sample]):
                 return None
             header, payload, lost = copied
             n_lost += lost
-            if world is None or header.world == world:
+            if self._world in (None, header.world):
                 return self._decode(header, payload, n_lost)
 
     def _wait(self, timeout: float) -> tuple[Any, bytearray, int] | None:
@@ -189,7 +190,7 @@ class Reader(Closable, Generic[_Sample]):
         size = ctypes.sizeof(self._header)
         header: Any = self._header.from_buffer_copy(ctypes.string_at(sample.user_header_ptr, size))
         if header.version != wire.VERSION:
-            raise _bad_sample(f"version {wire.VERSION}, got {header.version}")
+            raise bad_answer("sample", f"version {wire.VERSION}", header.version)
         payload = bytearray(ctypes.string_at(sample.payload_ptr, sample.payload().len()))
         publisher = getattr(header, "pid", 0)
         # A smaller number than expected is a new server's.
@@ -221,10 +222,6 @@ class Observer(Reader[Frame]):
         self._world = world
         self._timeout = timeout
 
-    def receive(self, timeout: float) -> Frame | None:
-        """The next frame; `None` if none comes within `timeout` seconds."""
-        return self._receive(timeout, self._world)
-
     def __iter__(self) -> Iterator[Frame]:
         """Yields frames as they come, until none comes for `timeout`; without one, for ever."""
         while True:
@@ -253,6 +250,52 @@ class OutlookReader(Reader[Outlook]):
         super().__init__(instance, "agent", wire.AgentHeader, outlook_from_sample, **limits)
 
 
+class Newest(Generic[_Step]):
+    """The newest samples of consecutive worlds: for infos, pictures and rewards by the move."""
+
+    def __init__(self, subscribe: Callable[[], Reader[_Step]], worlds: range) -> None:
+        self._subscribe = subscribe
+        self._reader = subscribe()
+        self._worlds = worlds
+        self._samples: dict[int, _Step] = {}
+
+    def at(
+        self, moments: Sequence[tuple[int, int, int]], timeout: float, first: int = 0
+    ) -> list[_Step]:
+        """The samples of the worlds from `first` on at these moments.
+
+        Args:
+            moments: Seed, episode and step of each world.
+            first: The first of these worlds, counted from 0.
+        """
+        wanted = dict(zip(self._worlds[first:], moments, strict=False))
+        begin = asked = time.perf_counter()
+        n_asked = n_lost = 0
+        while any(self._moment(world) != moment for world, moment in wanted.items()):
+            now = time.perf_counter()
+            if now - begin > timeout:
+                raise RequestTimeoutError(f"nothing was published within {timeout} s")
+            # The samples of other worlds may have displaced these: a new reader gets all again.
+            # Where it missed nothing, they may just take longer.
+            if now - asked > (_RETRY if n_lost else _RETRY * 2**n_asked):
+                self._reader.close()
+                self._reader = self._subscribe()
+                asked, n_asked, n_lost = now, n_asked + 1, 0
+            sample = self._reader.receive(min(timeout, _RETRY))
+            if sample is not None:
+                n_lost += sample.n_lost
+                if sample.world in self._worlds:
+                    self._samples[sample.world] = sample
+        return [self._samples[world] for world in wanted]
+
+    def close(self) -> None:
+        self._reader.close()
+
+    def _moment(self, world: int) -> tuple[int, int, int] | None:
+        sample = self._samples.get(world)
+        return None if sample is None else sample.moment
+
+
 def observe(
     instance: str = "default", *, world: int | None = None, timeout: float | None = None
 ) -> Observer:
@@ -267,7 +310,7 @@ def observe(
         timeout: Iteration ends when no frame comes for so many seconds; None: never.
     """
     if timeout is not None and not timeout >= 0:
-        raise InvalidArgumentError(f"timeout: expected seconds, at least 0, or None, got {timeout}")
+        raise invalid("timeout", "seconds, at least 0, or None", timeout)
     return Observer(instance, world=world, timeout=timeout)
 
 
@@ -275,7 +318,7 @@ def frame_from_sample(header: Any, payload: bytearray, n_lost: int) -> Frame:
     """A step out of a sample's header and payload, which it keeps."""
     n_robots, grid = header.n_robots, (header.height, header.width)
     if not 1 <= n_robots <= wire.MAX_ROBOTS:
-        raise _bad_sample(f"1 to {wire.MAX_ROBOTS} robots, got {n_robots}")
+        raise bad_answer("sample", f"1 to {wire.MAX_ROBOTS} robots", n_robots)
     world = WorldResult(*wire.WORLD.unpack(bytes(header.result)))
     wire.check_stayed(world.hovered | world.late, n_robots)
     n_cells = grid[0] * grid[1]
@@ -313,7 +356,7 @@ def outlook_from_sample(header: Any, payload: bytearray, n_lost: int) -> Outlook
     shape = (header.n_states, header.height, header.width)
     n_bytes = 4 * header.n_states * header.height * header.width
     if len(payload) < n_bytes:
-        raise _bad_sample(f"{n_bytes} bytes or more, got {len(payload)}")
+        raise bad_answer("sample", f"{n_bytes} bytes or more", len(payload))
     try:
         intent: dict[str, Any] = json.loads(payload[n_bytes:])
         return Outlook(
@@ -332,13 +375,9 @@ def outlook_from_sample(header: Any, payload: bytearray, n_lost: int) -> Outlook
             n_lost=n_lost,
         )
     except (ValueError, KeyError, TypeError) as error:
-        raise _bad_sample(f"an agent's intent, got {error!r}") from error
+        raise bad_answer("sample", "an agent's intent", repr(error)) from error
 
 
 def _check_length(got: int, expected: int) -> None:
     if got != expected:
-        raise _bad_sample(f"{expected} bytes, got {got}")
-
-
-def _bad_sample(problem: str) -> EmberwatchError:
-    return wire.bad_answer(f"sample: expected {problem}")
+        raise bad_answer("sample", f"{expected} bytes", got)

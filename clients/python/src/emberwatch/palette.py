@@ -3,15 +3,13 @@
 Lightness distinguishes marks from cells, also in grey and under every colour blindness.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import invalid
 from emberwatch.model import MAX_VALUES, Color, Description, color_from_hex
 from emberwatch.wire import UNOBSERVED
 
@@ -96,7 +94,7 @@ def _paint(values: NDArray[np.uint8], colors: dict[int, Color]) -> NDArray[np.ui
     unknown = np.isin(values, list(colors), invert=True)
     if unknown.any():
         got = int(values[unknown][0])
-        raise InvalidArgumentError(f"picture: expected values out of {sorted(colors)}, got {got}")
+        raise invalid("picture", f"values out of {sorted(colors)}", got)
     return table[values]
 
 

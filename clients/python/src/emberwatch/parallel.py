@@ -3,8 +3,6 @@
 # pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
 # pyright: reportUnknownArgumentType=false
 
-from __future__ import annotations
-
 from copy import deepcopy
 from typing import Any, Final, Literal, Unpack
 
@@ -16,13 +14,12 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from emberwatch.base import NOTHING_TO_DRAW
-from emberwatch.errors import InvalidArgumentError
-from emberwatch.moves_env import MovesReward
-from emberwatch.moves_vector_env import WildfireMovesVectorEnv
+from emberwatch.env import WildfireVectorEnv
+from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.moves_env import MovesReward, WildfireMovesVectorEnv
 from emberwatch.observations import MovesParts, of_row
 from emberwatch.settings import WorldArguments
 from emberwatch.vector_base import WorldVectorEnv, info_of
-from emberwatch.vector_env import WildfireVectorEnv
 from emberwatch.view import RENDER_FPS, RENDER_MODES
 from emberwatch.wire import UNOBSERVED
 
@@ -58,7 +55,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     ) -> None:
         """See the class. No server of its own runs before the first reset."""
         if action not in _ENVIRONMENTS:
-            raise InvalidArgumentError(f"action: expected 'move' or 'path', got {action!r}")
+            raise invalid("action", "'move' or 'path'", repr(action))
         if world.get("instance") is None:
             world.setdefault("robots", 2)
         keywords: dict[str, Any] = {"reward": reward, **world}
@@ -120,9 +117,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         """A move or a path of each robot; raises as `WildfireEnv.step` does."""
         given: Any = actions
         if not isinstance(given, dict) or actions.keys() != set(self.agents):
-            raise InvalidArgumentError(
-                f"actions: expected one for each of {self.agents}, got {actions}"
-            )
+            raise invalid("actions", f"one for each of {self.agents}", actions)
         if not actions:
             return {}, {}, {}, {}, {}
         try:

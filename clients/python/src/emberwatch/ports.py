@@ -4,8 +4,6 @@ The wait is PROTOCOL.md section 8's: spin for 100 us where that pays, then sleep
 that the server notifies.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import select

@@ -1,7 +1,5 @@
 """What can be known about a world before its first frame: a filter's first belief."""
 
-from __future__ import annotations
-
 import functools
 import tempfile
 from pathlib import Path
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 
 from emberwatch import programs
 from emberwatch.belief import initial_prior, uniform_prior
-from emberwatch.errors import EmberwatchError, InvalidArgumentError
+from emberwatch.errors import EmberwatchError, invalid
 from emberwatch.model import Model
 
 PriorKind = Literal["simulated", "initial", "uniform"]
@@ -64,12 +62,12 @@ def prior_of(
     if not isinstance(prior, str):
         expected = (model.n_states, height, width)
         if prior.shape != expected:
-            raise InvalidArgumentError(f"prior: expected shape {expected}, got {prior.shape}")
+            raise invalid("prior", f"shape {expected}", prior.shape)
         return prior
     if prior == "simulated":
         return simulated_prior(model, height=height, width=width, burn_in=burn_in)
     simple = {"initial": initial_prior, "uniform": uniform_prior}
     if prior not in simple:
         expected = "'simulated', 'initial', 'uniform' or an array"
-        raise InvalidArgumentError(f"prior: expected {expected}, got {prior!r}")
+        raise invalid("prior", expected, repr(prior))
     return simple[prior](model, height=height, width=width)

@@ -1,7 +1,5 @@
 """The programs that come with the package: found, run, and started as private ones."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import itertools

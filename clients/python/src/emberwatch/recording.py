@@ -4,8 +4,6 @@ Such as `for record in emberwatch.recording.read("lab.recording", world=0): ...`
 and opens no shared memory.
 """
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os
@@ -40,6 +38,11 @@ SERVER: Final = 1
 FRAME: Final = 2
 TRUTH: Final = 3
 END: Final = 4
+
+_SAMPLES: Final = {
+    FRAME: (wire.FrameHeader, frame_from_sample, "frames"),
+    TRUTH: (wire.TruthHeader, truth_from_sample, "truths"),
+}
 
 
 class RecordingCutWarning(UserWarning):
@@ -160,16 +163,12 @@ class _Reader:
                 self._last.clear()
                 self._server = record_from_reply(ServerInfo, json.loads(body))
                 return None
-            if kind == FRAME:
-                header = wire.FrameHeader.from_buffer_copy(body)
-                sample = frame_from_sample(header, body[ctypes.sizeof(header) :], n_lost)
-            else:
-                header = wire.TruthHeader.from_buffer_copy(body)
-                sample = truth_from_sample(header, body[ctypes.sizeof(header) :], n_lost)
+            header_kind, decode, name = _SAMPLES[kind]
+            header = header_kind.from_buffer_copy(body)
+            sample = decode(header, body[ctypes.sizeof(header) :], n_lost)
         except (ValueError, RecursionError, EmberwatchError) as error:
             self._damaged(str(error))
         self._check_sample(header, sample)
-        name = "frames" if kind == FRAME else "truths"
         self._totals[f"n_{name}"] += 1
         self._totals[f"n_lost_{name}"] += n_lost
         if isinstance(sample, Frame):  # which may be published again

@@ -1,7 +1,5 @@
 """The package's version."""
 
-from __future__ import annotations
-
 import tomllib
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version

@@ -5,8 +5,6 @@ people, for ``render_mode="human"``. The path of one robot is dark or light, whi
 from the colours below it, and the robot a circle of both; each robot of a team has a colour.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import io
@@ -21,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import invalid
 from emberwatch.model import Color
 from emberwatch.palette import DARK, LIGHT, ROBOTS, mark_on
 from emberwatch.palette import Palette as Palette
@@ -64,26 +62,22 @@ class Picture:
             truth: Hidden states, shape (H, W).
         """
         if frame.ndim != 2 or not frame.size:
-            raise InvalidArgumentError(f"frame: expected shape (H, W), got {frame.shape}")
+            raise invalid("frame", "shape (H, W)", frame.shape)
         if truth is not None and truth.shape != frame.shape:
-            raise InvalidArgumentError(f"truth: expected shape {frame.shape}, got {truth.shape}")
+            raise invalid("truth", f"shape {frame.shape}", truth.shape)
         self.frame, self.robots, self.palette, self.truth = frame, robots, palette, truth
         self.paths = [np.asarray(path, dtype=np.intp).reshape(-1, 2) for path in paths]
         for what, places in (("robot", _cells(robots)), *(("path", path) for path in self.paths)):
             off = ((places < 0) | (places >= frame.shape)).any(axis=1)
             if off.any():
                 got = tuple(places[np.argmax(off)].tolist())
-                raise InvalidArgumentError(
-                    f"{what}: expected cells of a {frame.shape} grid, got {got}"
-                )
+                raise invalid(what, f"cells of a {frame.shape} grid", got)
         for path in self.paths:
             jumps = np.abs(np.diff(path, axis=0)).sum(axis=1) > 1
             if jumps.any():
                 at = int(np.argmax(jumps))
                 got = [tuple(cell) for cell in path[at : at + 2].tolist()]
-                raise InvalidArgumentError(
-                    f"path: expected neighbours one after the other, got {got}"
-                )
+                raise invalid("path", "neighbours one after the other", got)
 
     def color_of(self, robot: int) -> Color | None:
         """The colour of a robot of a team; None if it is alone."""
@@ -107,7 +101,7 @@ def rgb_array(picture: Picture, *, scale: int | None = None) -> NDArray[np.uint8
     if scale is None:  # even, where cells can be
         scale = max(1, 2 * round(_LONG_SIDE / max(height, width) / 2))
     if scale < 1:
-        raise InvalidArgumentError(f"scale: expected at least 1 pixel, got {scale}")
+        raise invalid("scale", "at least 1 pixel", scale)
     colors = palette.paint_frame(picture.frame)
     if scale < LEAST_LINE_SCALE:
         panels = [_enlarge(_tinted(colors, _visited(picture)), scale)]

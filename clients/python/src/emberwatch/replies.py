@@ -1,13 +1,11 @@
 """What comes back on JSON requests (PROTOCOL.md sections 6 and 13)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple, TypeVar, cast, get_origin, get_type_hints
 
-from emberwatch.errors import EmberwatchError
+from emberwatch.errors import bad_answer
 from emberwatch.model import Description
 from emberwatch.wire import Shape
 
@@ -188,14 +186,14 @@ def records(kind: type[_Record], reply: Mapping[str, Any]) -> tuple[_Record, ...
     """The records of a reply's worlds."""
     worlds = reply.get("worlds")
     if not isinstance(worlds, list):
-        raise _wrong(f"a list 'worlds', got {worlds!r}")
+        raise bad_answer("reply", "a list 'worlds'", repr(worlds))
     return tuple(record(kind, world) for world in cast("list[Any]", worlds))
 
 
 def record(kind: type[_Record], keys: Any) -> _Record:
     """A record from a reply; keys that this release does not know are ignored."""
     if not isinstance(keys, Mapping):
-        raise _wrong(f"an object, got {keys!r}")
+        raise bad_answer("reply", "an object", repr(keys))
     given = cast("Mapping[str, Any]", keys)
     values: dict[str, Any] = {}
     for name, types in _types(kind).items():
@@ -204,10 +202,10 @@ def record(kind: type[_Record], keys: Any) -> _Record:
             values[name] = None if nested is None else record(RecordedWorld, nested)
             continue
         if name not in given:
-            raise _wrong(f"a key {name!r}, got {sorted(given)}")
+            raise bad_answer("reply", f"a key {name!r}", sorted(given))
         value = _as_tuples(given[name])
         if not isinstance(value, types):
-            raise _wrong(f"another {name!r}, got {value!r}")
+            raise bad_answer("reply", f"another {name!r}", repr(value))
         values[name] = value
     return kind(**values)
 
@@ -215,10 +213,6 @@ def record(kind: type[_Record], keys: Any) -> _Record:
 def _as_tuples(value: Any) -> Any:
     """Lists, and those in them, as tuples."""
     return tuple(map(_as_tuples, cast("list[Any]", value))) if isinstance(value, list) else value
-
-
-def _wrong(problem: str) -> EmberwatchError:
-    return EmberwatchError(f"reply: expected {problem}", "bad_answer")
 
 
 @cache

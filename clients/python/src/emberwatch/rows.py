@@ -10,7 +10,7 @@ from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import InvalidArgumentError, invalid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +66,7 @@ class RowFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         if path.is_dir():
-            raise InvalidArgumentError(f"csv: expected a file, got the folder {path}")
+            raise invalid("csv", "a file", f"the folder {path}")
         path.parent.mkdir(parents=True, exist_ok=True)
         self._rows = read(path) if path.exists() else []
 
@@ -121,9 +121,7 @@ def read(path: str | os.PathLike[str]) -> list[Row]:
                 raise ValueError(lines.fieldnames)
             return [_row(line) for line in lines]
     except (ValueError, TypeError) as error:
-        raise InvalidArgumentError(
-            f"csv: expected {path} to have the columns {','.join(_HEADER)}, got {error}"
-        ) from None
+        raise invalid("csv", f"{path} to have the columns {','.join(_HEADER)}", error) from None
 
 
 def _row(line: dict[str, Any]) -> Row:

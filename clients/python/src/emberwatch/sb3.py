@@ -20,7 +20,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.vector_base import WorldVectorEnv, info_of
 
 
@@ -62,7 +62,7 @@ class WildfireVecEnv(VecEnv):
 
     def set_options(self, options: Any = None) -> None:
         if any([options] if options is None or isinstance(options, dict) else options):
-            raise InvalidArgumentError(f"set_options: expected none, got {options!r}")
+            raise invalid("set_options", "none", repr(options))
 
     def step_async(self, actions: NDArray[Any]) -> None:
         self._actions = actions
@@ -87,17 +87,14 @@ class WildfireVecEnv(VecEnv):
         return [getattr(self._worlds, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        raise InvalidArgumentError(
-            f"set_attr: expected none, as the worlds share one environment, got {attr_name!r}"
-        )
+        raise invalid("set_attr", "none, as the worlds share one environment", repr(attr_name))
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
         if method_name == "render":
             pictures = self.get_images()
             return [pictures[index] for index in self._get_indices(indices)]
-        raise InvalidArgumentError(
-            "env_method: expected 'render' alone, as the worlds share one environment, "
-            f"got {method_name!r}"
+        raise invalid(
+            "env_method", "'render' alone, as the worlds share one environment", repr(method_name)
         )
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:

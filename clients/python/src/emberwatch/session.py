@@ -4,8 +4,6 @@ Nothing of iceoryx2 is open before the first reset, so that environments may be 
 process and used in a forked child, as Gymnasium's `AsyncVectorEnv` does.
 """
 
-from __future__ import annotations
-
 import inspect
 import logging
 import warnings
@@ -23,15 +21,14 @@ from emberwatch.arguments import as_seed
 from emberwatch.client import Client, connect
 from emberwatch.errors import (
     EmberwatchError,
-    InvalidArgumentError,
     LeaseLostError,
     RequestTimeoutError,
     ServerGoneError,
+    invalid,
 )
 from emberwatch.lease import Lease
 from emberwatch.model import Model
-from emberwatch.newest import Newest
-from emberwatch.observer import Truth, TruthReader
+from emberwatch.observer import Newest, Truth, TruthReader
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program, unused_instance
 from emberwatch.settings import Settings, WorldSpec, private_spec, running_spec
@@ -80,9 +77,7 @@ class Session:
         self.n_worlds: Final = n_worlds
         self._worlds: Final = range(settings.world, settings.world + n_worlds)
         if settings.truth and n_worlds > wire.TRUTH_BUFFER:
-            raise InvalidArgumentError(
-                f"truth: expected at most {wire.TRUTH_BUFFER} worlds, got {n_worlds}"
-            )
+            raise invalid("truth", f"at most {wire.TRUTH_BUFFER} worlds", n_worlds)
         described = self.spec.described
         if described is not None and not described.reward.any():
             kind = "model" if self.spec.description is None else "description"
@@ -103,9 +98,7 @@ class Session:
     def resume(self) -> StepAnswer:
         """Goes on from where the worlds stand, such as after another agent."""
         if self.settings.instance is None and not self.is_open:
-            raise InvalidArgumentError(
-                "options: expected a reset before resume=True, got the first one"
-            )
+            raise invalid("options", "a reset before resume=True", "the first one")
         self._open(0)
         try:
             return self._observe()
@@ -296,10 +289,10 @@ class Session:
         """Another server may serve the instance by now."""
         spec, _ = running_spec(self.settings, self._asked_rows, client.info)
         if spec != self.spec:
-            raise InvalidArgumentError(
-                f"instance {client.instance!r}: expected the server as it was when the environment "
-                f"was made, {_told(self.spec)}, got {_told(spec)} or another model: make the "
-                "environment again"
+            raise invalid(
+                f"instance {client.instance!r}",
+                f"the server as it was when the environment was made, {_told(self.spec)}",
+                f"{_told(spec)} or another model: make the environment again",
             )
 
 
@@ -337,13 +330,14 @@ class SessionOwner:
         """The server's instance name, once the environment has been reset."""
         return self._session.instance
 
-    def _is_open(self) -> bool:
+    @property
+    def is_open(self) -> bool:
         """Whether there has been a reset since it was made or closed."""
         return self._session.is_open
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies, which only a closed environment has: no two may act on the same worlds."""
-        if self._is_open():
+        if self.is_open:
             raise TypeError(
                 f"copy or pickle: expected a closed environment, got a {type(self).__name__} "
                 "that acts on a server's worlds: close it first, or make another with "

@@ -10,7 +10,7 @@ from typing import Any, Final, TypedDict, cast, get_type_hints
 
 import numpy as np
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.model import Description, Model
 from emberwatch.ports import STEP_TIMEOUT
 from emberwatch.programs import check_settings
@@ -64,6 +64,8 @@ class Settings:
     truth: bool = False
     timeout: float = STEP_TIMEOUT
     render_mode: str | None = None
+    #: Whether infos and pictures show the hidden states; `truth` may be for rewards alone.
+    reveals: bool = False
 
     def __post_init__(self) -> None:
         kinds = get_type_hints(Settings)
@@ -75,14 +77,14 @@ class Settings:
                 object.__setattr__(self, field.name, value)
             is_kind = isinstance(value, int | float if kind is float else kind)
             if not is_kind or (isinstance(value, bool) and kind is not bool):
-                raise InvalidArgumentError(f"{field.name}: expected {field.type}, got {value!r}")
+                raise invalid(field.name, field.type, repr(value))
         if self.robots is not None and self.robots < 1:
-            raise InvalidArgumentError(f"robots: expected at least 1, got {self.robots}")
+            raise invalid("robots", "at least 1", self.robots)
         if not self.timeout > 0:
-            raise InvalidArgumentError(f"timeout: expected seconds above 0, got {self.timeout}")
+            raise invalid("timeout", "seconds above 0", self.timeout)
 
     @classmethod
-    def of(cls, environment: type, world: WorldArguments) -> Settings:
+    def of(cls, environment: type, world: WorldArguments, *, needs_truth: bool = False) -> Settings:
         """The settings from what is left of an environment's keywords.
 
         Raises:
@@ -100,7 +102,9 @@ class Settings:
                     f"{environment.__name__}() got an unexpected keyword argument {name!r}{hint}; "
                     f"known are {', '.join(sorted(known))}"
                 )
-        return cls(**world)
+        reveals = world.get("truth", False)
+        arguments: WorldArguments = {**world, "truth": reveals or needs_truth}
+        return cls(**arguments, reveals=reveals)
 
     def server_flags(self, n_worlds: int) -> list[str]:
         """The flags of a private server with these worlds."""
@@ -115,11 +119,10 @@ class Settings:
             "burn-in": self.burn_in,
             "start": self.start,
             "publish-truth": str(self.truth).lower(),
+            # Refused where there is no states file.
+            "states-symmetries": "true" if self.states_symmetries else None,
+            "states-offset": self.states_offset or None,
         }
-        if self.states_symmetries:
-            flags["states-symmetries"] = "true"
-        if self.states_offset:
-            flags["states-offset"] = self.states_offset
         return [f"--{flag}={value}" for flag, value in flags.items() if value is not None]
 
 
@@ -201,19 +204,13 @@ def running_spec(
         asked = getattr(settings, name)
         has = getattr(info, "n_robots" if name == "robots" else name)
         if asked not in (None, has):
-            raise InvalidArgumentError(
-                f"{name}: expected {has}, as the server has, or None, got {asked}"
-            )
+            raise invalid(name, f"{has}, as the server has, or None", asked)
     robots = _robots(settings, n_rows, info.n_robots)
     first, last = settings.world, (robots.stop - 1) // info.n_robots
     if not 0 <= first <= last < info.n_worlds:
-        raise InvalidArgumentError(
-            f"world: expected worlds within 0 to {info.n_worlds - 1}, got {first} to {last}"
-        )
+        raise invalid("world", f"worlds within 0 to {info.n_worlds - 1}", f"{first} to {last}")
     if settings.truth and not info.publish_truth:
-        raise InvalidArgumentError(
-            "truth: expected a server started with --publish-truth, got one without"
-        )
+        raise invalid("truth", "a server started with --publish-truth", "one without")
     model = None if info.model is None else Model.from_toml(info.model)
     spec = WorldSpec(
         model=model if settings.model is None else Model.named(settings.model),
@@ -242,7 +239,7 @@ def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:
         if n_rows != 1:
             raise InvalidArgumentError("robot: expected None, as all robots of a world are flown")
         if not 0 <= settings.robot < n_robots:
-            raise InvalidArgumentError(f"robot: expected 0 to {n_robots - 1}, got {settings.robot}")
+            raise invalid("robot", f"0 to {n_robots - 1}", settings.robot)
         return range(first + settings.robot, first + settings.robot + 1)
     n_rows = n_robots if n_rows is None else n_rows
     if n_rows % n_robots:

@@ -1,7 +1,5 @@
 """Decides when a wait spins, from how earlier waits ended (PROTOCOL.md section 8). Pure."""
 
-from __future__ import annotations
-
 from typing import Final
 
 #: How long to poll before sleeping, seconds: longer than the wake-up of a process that answers at

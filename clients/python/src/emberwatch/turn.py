@@ -4,8 +4,6 @@ During its turn no other process is in the middle of making something: what is h
 a dead one. The turn is a `flock`, which ends with its process.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

@@ -4,8 +4,6 @@ Rows are robots: all of the first world, then those of the next. The robots of a
 their episodes together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,7 +18,7 @@ from numpy.typing import NDArray
 from emberwatch.agent_session import Summaries
 from emberwatch.arguments import as_seed
 from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, wants_to_resume
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import invalid
 from emberwatch.observations import Observations, cells_of, of_row
 from emberwatch.session import Session, SessionOwner
 from emberwatch.settings import Settings, draw_seed
@@ -42,22 +40,18 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         *,
         max_episode_steps: int | None,
         autoreset_mode: AutoresetMode | str,
-        reveals: bool,
     ) -> None:
-        """`reveals` puts the hidden states into infos and pictures."""
         if max_episode_steps == -1:  # no limit in Gymnasium's own `make`
             max_episode_steps = None
         if max_episode_steps is not None and max_episode_steps < 1:
-            raise InvalidArgumentError(
-                f"max_episode_steps: expected at least 1 or None, got {max_episode_steps}"
-            )
+            raise invalid("max_episode_steps", "at least 1 or None", max_episode_steps)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self._session, self._spec = session, session.spec
         spec, num_envs, mode = session.spec, session.n_rows, session.settings.render_mode
         self._observations = observations
         self._views = [View(mode, spec) for _ in range(num_envs)]
         self._max_steps = max_episode_steps
-        self._reveals = reveals
+        self._reveals = session.settings.reveals
         self.metadata = {**WorldEnv.metadata, "autoreset_mode": self.autoreset_mode}
         self.num_envs = num_envs
         self.render_mode = mode
@@ -94,7 +88,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         mask = self._check_mask(rest.pop("reset_mask", None))
         seeds = self._check_seeds(seed)
         resumes = wants_to_resume(rest, seed)
-        if not mask.all() and not self._session.is_open:
+        if not mask.all() and not self.is_open:
             raise gymnasium.error.ResetNeeded("reset_mask: expected a reset of all worlds before")
         self.closed = False
         chosen = np.flatnonzero(mask).tolist()
@@ -131,7 +125,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
 
     def render(self) -> tuple[Any, ...] | None:
         """The picture of each robot, as `WildfireEnv.render` draws it."""
-        if self.render_mode is None or not self._session.is_open:
+        if self.render_mode is None or not self.is_open:
             gymnasium.logger.warn(NOTHING_TO_DRAW)
             return None
         if self.render_mode == "human":
@@ -166,11 +160,6 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         `(num_envs, H, W)`; not to be written to.
         """
         return self._truths
-
-    @property
-    def is_open(self) -> bool:
-        """Whether there has been a reset since it was made or closed."""
-        return self._session.is_open
 
     def close_extras(self, **kwargs: Any) -> None:
         self._session.close()
@@ -309,9 +298,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         if isinstance(seed, int | np.integer):
             return [as_seed(int(seed) + world) for world in range(n_worlds)]
         if not hasattr(seed, "__len__") or len(seed) != self.num_envs:
-            raise InvalidArgumentError(
-                f"seed: expected an integer, None or {self.num_envs} of them, got {seed!r}"
-            )
+            raise invalid("seed", f"an integer, None or {self.num_envs} of them", repr(seed))
         seeds = [None if one is None else as_seed(one) for one in seed]
         return seeds[:: self._spec.n_robots]
 
@@ -321,14 +308,10 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
             return np.ones(shape, np.bool_)
         got = f"{mask.dtype} {mask.shape}" if hasattr(mask, "dtype") else repr(mask.__class__)
         if got != f"bool {shape}" or not mask.any():
-            raise InvalidArgumentError(
-                f"reset_mask: expected an array {shape} of bool with at least one True, got {got}"
-            )
+            raise invalid("reset_mask", f"an array {shape} of bool with at least one True", got)
         worlds = mask.reshape(-1, self._spec.n_robots)
         if (worlds.any(axis=1) != worlds.all(axis=1)).any():
-            raise InvalidArgumentError(
-                "reset_mask: expected all robots of a world or none, got some"
-            )
+            raise invalid("reset_mask", "all robots of a world or none", "some")
         return mask
 
 
@@ -344,9 +327,7 @@ def info_of(infos: dict[str, Any], row: int) -> dict[str, Any]:
 def vector_session(settings: Settings, num_envs: int | None) -> Session:
     """A session of all robots of some worlds."""
     if settings.robot is not None:
-        raise InvalidArgumentError(
-            f"robot: expected None, as a vector environment flies all, got {settings.robot}"
-        )
+        raise invalid("robot", "None, as a vector environment flies all", settings.robot)
     return Session(settings, num_envs)
 
 

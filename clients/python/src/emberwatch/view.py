@@ -1,14 +1,12 @@
 """The picture of an environment in its render mode."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import invalid
 from emberwatch.render import Palette, Picture, Screen, ansi, rgb_array
 from emberwatch.replies import ServerInfo
 from emberwatch.settings import WorldSpec
@@ -20,7 +18,7 @@ RENDER_MODES: Final = ("human", "rgb_array", "ansi")
 RENDER_FPS: Final = 10
 
 #: Row and column that each move adds.
-DIRECTIONS: Final[tuple[tuple[int, int], ...]] = ((-1, 0), (1, 0), (0, -1), (0, 1))
+DIRECTIONS: Final = np.array(((-1, 0), (1, 0), (0, -1), (0, 1)), np.int64)
 
 
 class View:
@@ -28,9 +26,8 @@ class View:
 
     def __init__(self, render_mode: str | None, spec: WorldSpec) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
-            raise InvalidArgumentError(
-                f"render_mode: expected None or one of {', '.join(RENDER_MODES)}, "
-                f"got {render_mode!r}"
+            raise invalid(
+                "render_mode", f"None or one of {', '.join(RENDER_MODES)}", repr(render_mode)
             )
         self.mode: Final = render_mode
         self._palette = Palette.of(spec.described or spec.n_observations)
@@ -60,13 +57,14 @@ class View:
             self._screen = None
 
 
-def fly(start: tuple[int, int], moves: ArrayLike, grid: WorldSpec | ServerInfo) -> NDArray[np.intp]:
-    """The cells of a path after each move, `(n_moves, 2)`: a move off the grid stays in place."""
-    row, col = start
-    cells: list[tuple[int, int]] = []
-    for move in np.asarray(moves).tolist():
-        down, right = DIRECTIONS[int(move)]
-        row = min(max(row + down, 0), grid.height - 1)
-        col = min(max(col + right, 0), grid.width - 1)
-        cells.append((row, col))
-    return np.array(cells, np.intp).reshape(-1, 2)
+def fly(start: ArrayLike, moves: ArrayLike, grid: WorldSpec | ServerInfo) -> NDArray[np.int64]:
+    """The cells of a path after each move, `(T, 2)`: a move off the grid stays in place.
+
+    Or those of n paths, `(n, T, 2)`, where `start` is `(n, 2)` and `moves` `(n, T)`.
+    """
+    given, cell = np.asarray(moves), np.asarray(start, np.int64)
+    cells = np.empty((*given.shape, 2), np.int64)
+    for move in range(given.shape[-1]):
+        cell = (cell + DIRECTIONS[given[..., move]]).clip(0, (grid.height - 1, grid.width - 1))
+        cells[..., move, :] = cell
+    return cells

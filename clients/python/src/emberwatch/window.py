@@ -1,7 +1,5 @@
 """The observation parts `local` and `recent`: what belief or memory says around the robot."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

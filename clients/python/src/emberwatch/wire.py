@@ -4,8 +4,6 @@ Each header is a `ctypes.Structure`, as iceoryx2 wants it, whose fields follow t
 PROTOCOL.md section 3; a test compares the two.
 """
 
-from __future__ import annotations
-
 import ctypes
 import struct
 from typing import Any, Final, NamedTuple
@@ -13,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import EmberwatchError
+from emberwatch.errors import bad_answer
 
 #: The protocol version that this package speaks.
 VERSION: Final = 2
@@ -244,15 +242,13 @@ class StepAnswer:
     def __init__(self, reply: StepReply, payload: bytearray, shape: Shape) -> None:
         n_worlds, n_robots, n_cells = reply.n_worlds, reply.n_robots, reply.height * reply.width
         if not n_robots * n_cells or n_worlds != shape.n_worlds(reply.first_robot, n_robots):
-            raise bad_answer(
-                f"answer to step: expected robots and their worlds, got {n_robots} in {n_worlds} "
-                f"of {reply.height} x {reply.width} cells"
-            )
+            got = f"{n_robots} in {n_worlds} of {reply.height} x {reply.width} cells"
+            raise bad_answer("answer to step", "robots and their worlds", got)
         n_frames = n_worlds if reply.flags & TEAM_FRAMES else n_robots
         head = n_worlds * WORLD.size + n_robots * ROBOT.size
         expected = head + n_frames * n_cells
         if len(payload) != expected:
-            raise bad_answer(f"answer to step: expected {expected} bytes, got {len(payload)}")
+            raise bad_answer("answer to step", f"{expected} bytes", len(payload))
         self._payload, self._shape = payload, shape
         self.first_robot: int = reply.first_robot
         self.simulation_nanos: int = reply.simulation_nanos
@@ -264,7 +260,7 @@ class StepAnswer:
         check_stayed(stayed, shape.n_robots)
         n_moves = set(self.robots["n_moves"].tolist())
         if not n_moves <= {0, shape.n_moves}:
-            raise bad_answer(f"n_moves: expected 0 or {shape.n_moves}, got {n_moves}")
+            raise bad_answer("n_moves", f"0 or {shape.n_moves}", n_moves)
         frames = np.frombuffer(payload, np.uint8, offset=head)
         check_frame(frames, shape.n_observations)
         self.frames = frames.reshape(n_frames, reply.height, reply.width)
@@ -300,40 +296,31 @@ class StepAnswer:
         )
 
 
-def bad_answer(message: str) -> EmberwatchError:
-    """The error of an answer that makes no sense."""
-    return EmberwatchError(message, "bad_answer")
-
-
 def check_frame(values: NDArray[np.uint8], n_observations: int) -> None:
     """Refuses frames whole that hold anything but observations and 255."""
     # 255 wraps to 0, observation o becomes o + 1: one addition and one maximum check all.
     highest = int((values + np.uint8(1)).max(initial=0))
     if highest > n_observations:
-        raise bad_answer(
-            f"frame: expected observations below {n_observations} or 255, got {highest - 1}"
-        )
+        raise bad_answer("frame", f"observations below {n_observations} or 255", highest - 1)
 
 
 def check_stayed(stayed: int, n_robots: int) -> None:
     """Refuses bits of robots that a world does not have."""
     if stayed >> n_robots:
-        raise bad_answer(f"robots that stayed: expected bits below {n_robots}, got {stayed:#x}")
+        raise bad_answer("robots that stayed", f"bits below {n_robots}", f"{stayed:#x}")
 
 
 def check_asked(reply: StepReply, expected: tuple[int, int, int, int, int]) -> None:
     """Refuses an answer to another question: first robot, number, flags, height, width."""
     got = (reply.first_robot, reply.n_robots, reply.flags, reply.height, reply.width)
     if got != expected:
-        raise bad_answer(
-            "answer to step: expected first robot, robots, flags, height, width "
-            f"{expected}, got {got}"
-        )
+        what = f"first robot, robots, flags, height, width {expected}"
+        raise bad_answer("answer to step", what, got)
 
 
 def check_answer(what: str, reply: Any, sequence: int) -> None:
     """Refuses an answer of another version or to another request."""
     if reply.version != VERSION:
-        raise bad_answer(f"{what}: expected version {VERSION}, got {reply.version}")
+        raise bad_answer(what, f"version {VERSION}", reply.version)
     if reply.sequence != sequence:
-        raise bad_answer(f"{what}: expected sequence number {sequence}, got {reply.sequence}")
+        raise bad_answer(what, f"sequence number {sequence}", reply.sequence)

@@ -4,8 +4,6 @@ A frame shows a path; the belief is what all frames so far say about every cell.
 without memory, the belief is the better observation.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Literal, SupportsFloat
 
@@ -17,7 +15,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from emberwatch.belief import Filter
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.model import Model
 from emberwatch.prior import PriorKind, prior_of
 
@@ -70,7 +68,7 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
         RecordConstructorArgs.__init__(self, keep=keep, dtype=dtype, prior=prior, model=model)
         gymnasium.Wrapper.__init__(self, env)  # pyright: ignore[reportUnknownMemberType]
         if dtype not in ("float32", "uint8"):
-            raise InvalidArgumentError(f"dtype: expected 'float32' or 'uint8', got {dtype!r}")
+            raise invalid("dtype", "'float32' or 'uint8'", repr(dtype))
         self._keep, self._dtype = keep, dtype
         self._model = _model_of(env, model)
         original = _parts_of(env.observation_space, spaces.Dict)
@@ -155,9 +153,7 @@ def _grid_of(parts: dict[str, spaces.Space[Any]]) -> tuple[int, int]:
             return height, width
         case _:
             expected = "a frame of shape (H, W, 1) and type uint8, alone or as 'frame' of a Dict"
-            raise InvalidArgumentError(
-                f"BeliefObservation: expected observations of {expected}, got {parts}"
-            )
+            raise invalid("BeliefObservation", f"observations of {expected}", parts)
 
 
 def _frame_of(observation: Any) -> NDArray[np.uint8]:

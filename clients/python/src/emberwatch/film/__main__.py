@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from emberwatch import recording
-from emberwatch.belief import Filter, initial_prior, uniform_prior
-from emberwatch.errors import EmberwatchError, InvalidArgumentError
-from emberwatch.film.scenes import Scene, Selection, scenes
-from emberwatch.film.steps import steps
+from emberwatch.belief import Filter
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
+from emberwatch.film.scenes import Scene, Selection, scenes, steps
 from emberwatch.model import Model
 from emberwatch.observer import Frame
-from emberwatch.prior import simulated_prior
+from emberwatch.prior import PriorKind, prior_of
 from emberwatch.replies import ServerInfo
 
 if TYPE_CHECKING:
@@ -131,9 +130,7 @@ def _survey(flags: argparse.Namespace, selection: Selection) -> tuple[ServerInfo
     if server is None and not worlds and caught:
         raise EmberwatchError(str(caught[-1].message), "recording")
     if server is None:
-        raise InvalidArgumentError(
-            f"--world: expected one of those recorded, {sorted(worlds)}, got {flags.world}"
-        )
+        raise invalid("--world", f"one of those recorded, {sorted(worlds)}", flags.world)
     if n_steps == 0:
         known = ", ".join(f"{first} to {last}" for first, last in runs[:_MOST_NAMED])
         more = ", ..." if len(runs) > _MOST_NAMED else ""
@@ -169,15 +166,11 @@ def _model(path: str | None, server: ServerInfo) -> Model | None:
     return model
 
 
-def _begin(prior: str, model: Model, server: ServerInfo, k: int) -> Filter:
+def _begin(prior: PriorKind, model: Model, server: ServerInfo, k: int) -> Filter:
     """The filter before the frame of step k, the first that is known."""
-    grid = {"height": server.height, "width": server.width}
-    if prior == "simulated":
-        burn_in = min(server.burn_in + k, _MOST_SIMULATED)
-        return Filter(model, prior=simulated_prior(model, burn_in=burn_in, **grid))
-    return Filter(
-        model, prior=(initial_prior if prior == "initial" else uniform_prior)(model, **grid)
-    )
+    burn_in = min(server.burn_in + k, _MOST_SIMULATED)
+    grid = {"height": server.height, "width": server.width, "burn_in": burn_in}
+    return Filter(model, prior=prior_of(prior, model, **grid))
 
 
 def _write(flags: argparse.Namespace, page: Page, n_scenes: int, scenes: Iterator[Scene]) -> None:
@@ -185,9 +178,7 @@ def _write(flags: argparse.Namespace, page: Page, n_scenes: int, scenes: Iterato
     (width, height), out = page.size, flags.out
     if n_scenes * width * height > _MOST_PIXELS:
         most = _MOST_PIXELS // (width * height)
-        raise InvalidArgumentError(
-            f"--every, --scale: expected at most {most} pictures of this size, got {n_scenes}"
-        )
+        raise invalid("--every, --scale", f"at most {most} pictures of this size", n_scenes)
     out.parent.mkdir(parents=True, exist_ok=True)
     beside = out.with_name(f".{out.name}.{os.getpid()}")
     try:

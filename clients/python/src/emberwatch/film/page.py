@@ -1,7 +1,5 @@
 """A scene as a picture: truth, path, belief and entropy, and what their colours mean."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from emberwatch.belief import entropy
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import invalid
 from emberwatch.film.scenes import Scene
 from emberwatch.model import Color, Model
 from emberwatch.palette import DARK, LIGHT, ROBOTS, Palette
@@ -77,9 +75,7 @@ class Page:
         size = 2 * _MARGIN + n_panels * (self._room + _GAP) - _GAP, self._foot + _LINE
         if max(size) > _MOST_SIDE or size[0] * size[1] > _MOST_AREA:
             most = f"at most {_MOST_SIDE} pixels a side and {_MOST_AREA} in all"
-            raise InvalidArgumentError(
-                f"--scale: expected pictures of {most}, got {size[0]} x {size[1]}"
-            )
+            raise invalid("--scale", f"pictures of {most}", f"{size[0]} x {size[1]}")
         self._base = Image.new("RGB", size, LIGHT)
         for left, panel, legend in zip(self._lefts(), self._panels, legends, strict=True):
             _write(self._base, (left, _TOP - 13), _fit(panel.title, self._room))

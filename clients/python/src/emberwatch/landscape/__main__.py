@@ -1,7 +1,5 @@
 """`python -m emberwatch.landscape`: rasters of fires in, a recorded world out."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Sequence
@@ -14,11 +12,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import EmberwatchError, InvalidArgumentError
-from emberwatch.landscape.dates import length
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.landscape.fire import BURNING, BURNT, Meaning, states, times
 from emberwatch.landscape.grid import Place, check_alike, of_world, target_shape
 from emberwatch.landscape.layers import Choice, read, stacks
+from emberwatch.landscape.schedule import length
 from emberwatch.landscape.world import Fill, arrays, check_outputs, description, write
 
 _NAME: Final = "python -m emberwatch.landscape"
@@ -149,9 +147,7 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
         given = getattr(flags, name)
         if flags.kind not in kinds and given is not None and given is not False:
             flag = name.replace("_", "-")
-            raise InvalidArgumentError(
-                f"--{flag}: expected --kind {' or '.join(kinds)} beside it, got {flags.kind}"
-            )
+            raise invalid(f"--{flag}", f"--kind {' or '.join(kinds)} beside it", flags.kind)
     if flags.kind in _ONLY_FOR["burning"] and flags.burning is None:
         raise InvalidArgumentError(
             f"--burning: expected the steps that a cell burns, as --kind {flags.kind} does not "
@@ -160,9 +156,9 @@ def _meaning(flags: argparse.Namespace) -> Meaning:
     if flags.cell is not None and (flags.height, flags.width) != (None, None):
         raise InvalidArgumentError("--cell: expected neither --height nor --width beside it")
     if flags.begin is not None and not math.isfinite(flags.begin):
-        raise InvalidArgumentError(f"--begin: expected a number, got {flags.begin}")
+        raise invalid("--begin", "a number", flags.begin)
     if flags.cell is not None and not 1e-3 <= flags.cell < math.inf:
-        raise InvalidArgumentError(f"--cell: expected at least 0.001 metres, got {flags.cell}")
+        raise invalid("--cell", "at least 0.001 metres", flags.cell)
     return Meaning(
         kind=flags.kind,
         step=length(flags.step),
@@ -182,7 +178,7 @@ def _name(flags: argparse.Namespace) -> str:
     try:
         name.encode()
     except UnicodeEncodeError:
-        raise InvalidArgumentError(f"--name: expected UTF-8, got {ascii(name)}") from None
+        raise invalid("--name", "UTF-8", ascii(name)) from None
     return name
 
 

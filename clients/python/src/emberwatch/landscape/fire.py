@@ -4,8 +4,6 @@ Whatever the files hold is first two times of each cell, counted in layers or st
 to burn and when it is burnt. These are resampled, and then counted out step by step.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -15,19 +13,10 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError
-from emberwatch.landscape.dates import SECONDS, steps_at, unit_of
-from emberwatch.landscape.grid import (
-    Place,
-    Rule,
-    check_same,
-    check_square,
-    crop,
-    part,
-    resampled,
-)
+from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.landscape.grid import Place, Rule, check_same, check_square, crop, part, resampled
 from emberwatch.landscape.layers import Layer
-from emberwatch.landscape.schedule import Schedule
+from emberwatch.landscape.schedule import SECONDS, Schedule, steps_at, unit_of
 
 UNBURNT, BURNING, BURNT = 0, 1, 2
 
@@ -83,7 +72,7 @@ def states(fire: Times, shape: tuple[int, int], rule: Rule) -> NDArray[np.uint8]
     arrival, burnt = fire.arrival, fire.burnt
     burns = np.isfinite(arrival)
     if not burns.any():
-        raise InvalidArgumentError(f"{fire.name}: expected cells that burn, got none")
+        raise invalid(fire.name, "cells that burn", "none")
     # A cell is burnt when the last part of it that burns at all is.
     last = resampled(np.where(burns, burnt, -np.inf), shape, rule, latest=True)
     arrival = resampled(arrival, shape, rule)
@@ -108,10 +97,7 @@ def states(fire: Times, shape: tuple[int, int], rule: Rule) -> NDArray[np.uint8]
 def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
     layer = layers[0]
     if len(layers) != 1:
-        raise InvalidArgumentError(
-            f"{layer.name}: expected one band of arrival times, got {len(layers)}; "
-            "choose with --band"
-        )
+        raise invalid(layer.name, "one band of arrival times", f"{len(layers)}; choose with --band")
     _check_square(layer, meaning)
     layer = _cropped(layer, meaning)
     arrival = np.where(np.isfinite(layer.values), layer.values, np.inf)
@@ -124,12 +110,11 @@ def _of_arrival(layers: list[Layer], meaning: Meaning) -> Times:
         )
     finite = arrival[np.isfinite(arrival)]
     if not finite.size:
-        raise InvalidArgumentError(f"{layer.name}: expected cells that burn, got none")
+        raise invalid(layer.name, "cells that burn", "none")
     unit = unit_of(layer.clock, meaning.unit, layer.name)
     if unit is None:
-        raise InvalidArgumentError(
-            f"--unit: expected s, min, h or d, as {layer.name} does not say what its times count, "
-            "got none"
+        raise invalid(
+            "--unit", f"s, min, h or d, as {layer.name} does not say what its times count", "none"
         )
     step = meaning.step / SECONDS[unit]
     begin = float(finite.min()) if meaning.begin is None else meaning.begin
@@ -157,7 +142,7 @@ def _of_stack(layers: Iterable[Layer], meaning: Meaning) -> Times:
         schedule.add(layer.name, layer.time)
         mark = _add(layer, k, meaning, arrival, burnt, mark)
     if first is None:
-        raise InvalidArgumentError("layers: expected at least 2, got none")
+        raise invalid("layers", "at least 2", "none")
     steps, n_steps = schedule.steps()
     arrival, burnt = _at(arrival, steps), _at(burnt, steps)
     if meaning.kind == "mask":
@@ -187,10 +172,7 @@ def _add(
         unburnt, burning, done = (values == code for code in meaning.codes)
         known = unburnt | burning | done
         if not known.all():
-            raise InvalidArgumentError(
-                f"{layer.name}: expected the codes {_numbers(meaning.codes)}, "
-                f"got {_first(layer, ~known)}"
-            )
+            raise invalid(layer.name, f"the codes {_numbers(meaning.codes)}", _first(layer, ~known))
     else:
         unburnt, done = values == 0, np.zeros(values.shape, bool)
         if math.isnan(mark) and not unburnt.all():
@@ -245,7 +227,7 @@ def _checked(
     begin: datetime | None,
 ) -> Times:
     if n_steps < 2:
-        raise InvalidArgumentError(f"{layer.name}: expected at least 2 steps, got {n_steps}")
+        raise invalid(layer.name, "at least 2 steps", n_steps)
     return Times(
         arrival=arrival,
         burnt=burnt,

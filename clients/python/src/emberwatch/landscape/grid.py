@@ -1,7 +1,5 @@
 """Where cells are: what layers must have in common, and how they become the wanted grid."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Final, Literal
@@ -9,7 +7,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import InvalidArgumentError, invalid
 
 MAX_SIDE: Final = 4096
 """Most rows, and most columns, that the server takes."""
@@ -48,19 +46,14 @@ class Place:
 def check_same(place: Place, name: str, first: Place, first_name: str) -> None:
     """Refuses a layer whose cells are not those of the first."""
     if place.projection != first.projection:
-        raise InvalidArgumentError(
-            f"{name}: expected the projection of {first_name}, {_projection(first)}, "
-            f"got {_projection(place)}"
+        raise invalid(
+            name, f"the projection of {first_name}, {_projection(first)}", _projection(place)
         )
     if place.shape != first.shape:
-        raise InvalidArgumentError(
-            f"{name}: expected {_size(first)} cells as in {first_name}, got {_size(place)}"
-        )
+        raise invalid(name, f"{_size(first)} cells as in {first_name}", _size(place))
     apart = np.subtract(_extent(place), _extent(first))
     if (np.abs(apart) > _LIKE * first.cell[0]).any():
-        raise InvalidArgumentError(
-            f"{name}: expected the extent of {first_name}, {_extent(first)}, got {_extent(place)}"
-        )
+        raise invalid(name, f"the extent of {first_name}, {_extent(first)}", _extent(place))
 
 
 def check_square(place: Place, name: str) -> None:
@@ -145,9 +138,7 @@ def target_shape(
     rows, columns = place.shape
     if cell is not None:
         if place.corner is None or place.is_in_degrees:
-            raise InvalidArgumentError(
-                f"--cell: expected a grid in metres, got {_projection(place)}; use --height"
-            )
+            raise invalid("--cell", "a grid in metres", f"{_projection(place)}; use --height")
         share = place.sides()[1] * place.metres / cell
         height, width = max(1, round(rows * share)), max(1, round(columns * share))
     elif height is None and width is None:

@@ -4,8 +4,6 @@ GeoTIFF, ESRI ASCII grid and NetCDF are read by GDAL through rasterio, NumPy fil
 layer is in memory at a time, of NumPy files the whole array.
 """
 
-from __future__ import annotations
-
 import importlib
 import math
 import os
@@ -19,17 +17,12 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
-from numpy.lib.format import (
-    read_array,
-    read_array_header_1_0,
-    read_array_header_2_0,
-    read_magic,
-)
+from numpy.lib.format import read_array, read_array_header_1_0, read_array_header_2_0, read_magic
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError
-from emberwatch.landscape.dates import Clock, Time
+from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.landscape.grid import Place
+from emberwatch.landscape.schedule import Clock, Time
 
 _DRIVERS: Final = {
     ".tif": ("GTiff", "a GeoTIFF"),
@@ -83,11 +76,11 @@ def stacks(inputs: Sequence[Path], *, one_file_each: bool) -> list[list[Path]]:
     found, loose = list[list[Path]](), list[Path]()
     for path in inputs:
         if not path.exists():
-            raise InvalidArgumentError(f"{path}: expected a file or folder, got none")
+            raise invalid(path, "a file or folder", "none")
         if path.is_dir():
             files = sorted((file for file in path.iterdir() if _is_layer(file)), key=_by_number)
             if not files:
-                raise InvalidArgumentError(f"{path}: expected rasters in this folder, got none")
+                raise invalid(path, "rasters in this folder", "none")
             found.append(files)
         else:
             loose.append(path)
@@ -96,9 +89,9 @@ def stacks(inputs: Sequence[Path], *, one_file_each: bool) -> list[list[Path]]:
     known = set[str]()
     for file in files:
         if file.suffix.lower() not in (*_DRIVERS, *_NUMPY):
-            raise InvalidArgumentError(f"{file}: expected one of {_KNOWN}, got '{file.suffix}'")
+            raise invalid(file, f"one of {_KNOWN}", f"'{file.suffix}'")
         if os.path.realpath(file) in known:
-            raise InvalidArgumentError(f"{file}: expected each file once, got it twice")
+            raise invalid(file, "each file once", "it twice")
         known.add(os.path.realpath(file))
     return [[file] for file in files] if one_file_each else found
 
@@ -154,9 +147,8 @@ def _array(file: Path, choice: Choice) -> NDArray[Any]:
                     with archive.open(members[name]) as member:
                         return _checked_array(file, member)
             if choice.variable is not None:
-                raise InvalidArgumentError(
-                    f"--variable: expected none for {file}, which has one array, "
-                    f"got '{choice.variable}'"
+                raise invalid(
+                    "--variable", f"none for {file}, which has one array", f"'{choice.variable}'"
                 )
             return _checked_array(file, opened)
     except InvalidArgumentError:
@@ -174,16 +166,14 @@ def _checked_array(file: Path, opened: IO[bytes]) -> NDArray[Any]:
         raise ValueError(f"version {version} of the format")
     shape, _, dtype = header(opened)
     if dtype.kind not in "biuf" or len(shape) not in (2, 3) or 0 in shape:
-        raise InvalidArgumentError(
-            f"{file}: expected numbers of shape (rows, columns) or (layers, rows, columns), "
-            f"got {dtype} {shape}"
+        raise invalid(
+            file, "numbers of shape (rows, columns) or (layers, rows, columns)", f"{dtype} {shape}"
         )
     _check_cells(file, *shape[-2:])
     n_bytes = math.prod(shape) * dtype.itemsize
     if n_bytes > _MOST_BYTES:
-        raise InvalidArgumentError(
-            f"{file}: expected at most {_MOST_BYTES} bytes of numbers, got {n_bytes}: {dtype} "
-            f"{shape}"
+        raise invalid(
+            file, f"at most {_MOST_BYTES} bytes of numbers", f"{n_bytes}: {dtype} {shape}"
         )
     opened.seek(0)
     return read_array(opened, allow_pickle=False)
@@ -191,9 +181,7 @@ def _checked_array(file: Path, opened: IO[bytes]) -> NDArray[Any]:
 
 def _check_cells(file: Path, height: int, width: int) -> None:
     if height * width > _MOST_CELLS:
-        raise InvalidArgumentError(
-            f"{file}: expected at most {_MOST_CELLS} cells, got {height} x {width}"
-        )
+        raise invalid(file, f"at most {_MOST_CELLS} cells", f"{height} x {width}")
 
 
 def _read_raster(file: Path, choice: Choice) -> Generator[Layer]:
@@ -229,9 +217,8 @@ def _address(rasterio: Any, file: Path, driver: str, choice: Choice) -> str:
     """What GDAL opens: the file, or one variable of it."""
     if driver != "netCDF":
         if choice.variable is not None:
-            raise InvalidArgumentError(
-                f"--variable: expected none for {file}, which has no variables, "
-                f"got '{choice.variable}'"
+            raise invalid(
+                "--variable", f"none for {file}, which has no variables", f"'{choice.variable}'"
             )
         return str(file)
     with rasterio.open(file, driver=driver) as source:
@@ -246,11 +233,9 @@ def _variable(file: Path, names: list[str], wanted: str | None) -> str:
         return wanted
     known = ", ".join(sorted(names)) or "none"
     if wanted is not None:
-        raise InvalidArgumentError(f"--variable: expected one of {file} ({known}), got '{wanted}'")
+        raise invalid("--variable", f"one of {file} ({known})", f"'{wanted}'")
     if len(names) != 1:
-        raise InvalidArgumentError(
-            f"{file}: expected one variable, got {len(names)} ({known}); choose with --variable"
-        )
+        raise invalid(file, "one variable", f"{len(names)} ({known}); choose with --variable")
     return names[0]
 
 
@@ -258,7 +243,7 @@ def _bands(file: Path, count: int, choice: Choice) -> Sequence[int]:
     if choice.band is None:
         return range(1, count + 1)
     if not 1 <= choice.band <= count:
-        raise InvalidArgumentError(f"--band: expected 1 to {count} for {file}, got {choice.band}")
+        raise invalid("--band", f"1 to {count} for {file}", choice.band)
     return [choice.band]
 
 
@@ -269,7 +254,7 @@ def _place(file: Path, source: Any) -> Place:
     if transform.is_identity:
         return Place(shape=shape)
     if transform.b or transform.d:
-        raise InvalidArgumentError(f"{file}: expected rows from west to east, got a rotated grid")
+        raise invalid(file, "rows from west to east", "a rotated grid")
     far = transform * (source.width, source.height)
     return Place(
         shape=shape,
@@ -293,21 +278,16 @@ def _check_ascii(file: Path, height: int, width: int) -> None:
                 try:
                     float(word.replace(",", "."))
                 except ValueError:
-                    raise InvalidArgumentError(
-                        f"{file}: expected numbers, got '{word[:40]}'"
-                    ) from None
+                    raise invalid(file, "numbers", f"'{word[:40]}'") from None
             n_numbers += len(words)
     if n_numbers != height * width:
-        raise InvalidArgumentError(
-            f"{file}: expected {height * width} numbers for {height} x {width} cells, "
-            f"got {n_numbers}"
-        )
+        raise invalid(file, f"{height * width} numbers for {height} x {width} cells", n_numbers)
 
 
 def _layer(file: Path, source: Any, place: Place, band: int, nodata: Sequence[float]) -> Layer:
     dtype = source.dtypes[band - 1]
     if dtype.startswith("complex"):
-        raise InvalidArgumentError(f"{file}: expected real numbers, got {dtype}")
+        raise invalid(file, "real numbers", dtype)
     stored: Any = source.read(band, masked=True)
     values = stored.data.astype(np.float64) * source.scales[band - 1] + source.offsets[band - 1]
     values[stored.mask | _is_missing(stored.data, nodata)] = np.nan
@@ -320,7 +300,7 @@ def _layer(file: Path, source: Any, place: Place, band: int, nodata: Sequence[fl
     if f"NETCDF_DIM_{dimension}_VALUES" in tags:  # else the dimension only counts the layers
         value = float(of_band[f"NETCDF_DIM_{dimension}"])
         if not math.isfinite(value):
-            raise InvalidArgumentError(f"{file}, band {band}: expected a time, got {value}")
+            raise invalid(f"{file}, band {band}", "a time", value)
         time = Time(value, _clock(dimension, tags, None))
     return Layer(
         name=f"{file}, band {band}" if source.count > 1 else str(file),

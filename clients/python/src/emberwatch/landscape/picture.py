@@ -1,7 +1,5 @@
 """A picture of a sequence: steps from the first to the last, and how many cells burn."""
 
-from __future__ import annotations
-
 from typing import Any, Final, cast
 
 import numpy as np

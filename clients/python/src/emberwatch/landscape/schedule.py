@@ -1,14 +1,73 @@
-"""In which step each layer shows first: by the files' times, or in their order."""
+"""What times in files count (`hours since 2020-08-01`), and in which step each layer shows."""
 
-from __future__ import annotations
-
-from datetime import datetime
+import math
+import re
+from datetime import UTC, datetime, timedelta, timezone
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError
-from emberwatch.landscape.dates import EVEN, SECONDS, Clock, Time, steps_at, unit_of
+from emberwatch.errors import InvalidArgumentError, invalid
+
+SECONDS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+"""Of each unit."""
+EVEN: Final = 1e-3
+"""Share of a step by which times may differ, as 32-bit numbers do."""
+
+_SPELLINGS: Final = {
+    "sec": "s", "second": "s", "minute": "min", "hr": "h", "hour": "h", "day": "d"
+}  # fmt: skip
+#: Calendars whose dates are ours.
+_CALENDARS: Final = ("standard", "gregorian", "proleptic_gregorian")
+_GREGORIAN: Final = 1583  # the first year in which they mean the same days
+_DATE: Final = re.compile(
+    r"(\d{4})-(\d{1,2})-(\d{1,2})(?:[T ]+(\d{1,2})(?::(\d{1,2}))?(?::(\d{1,2})(?:\.\d*)?)?)?"
+    r"\s*(?:Z|UTC|GMT|([+-])(\d{1,2})(?::?(\d{2}))?)?"
+)
+
+
+class Clock(NamedTuple):
+    """What the times in a file count, in its words."""
+
+    words: str = ""
+    calendar: str = "standard"
+
+    def unit(self) -> str | None:
+        """One of `SECONDS`; None if the file does not say."""
+        unit = _unit(self.words.partition(" since ")[0])
+        return unit if unit in SECONDS else None
+
+    def date(self, seconds: float) -> datetime | None:
+        """So long after the count was 0."""
+        epoch = self.epoch()
+        try:
+            return None if epoch is None else epoch + timedelta(seconds=seconds)
+        except OverflowError:  # beyond the year 9999
+            return None
+
+    def epoch(self) -> datetime | None:
+        """When the count is 0; None if the file does not say, or in another calendar."""
+        parts = _DATE.fullmatch(self.words.partition(" since ")[2].strip())
+        if parts is None or self.calendar.lower() not in _CALENDARS:
+            return None
+        *digits, sign, hours, minutes = parts.groups(default="0")
+        numbers = [int(part) for part in digits]
+        if numbers[0] < _GREGORIAN:
+            return None
+        try:
+            ahead = timedelta(hours=int(hours), minutes=int(minutes))
+            zone = timezone(-ahead if sign == "-" else ahead)
+            return datetime(*numbers, tzinfo=zone).astimezone(UTC)
+        except (OverflowError, ValueError):  # no such day, or one beyond the years 1 to 9999
+            return None
+
+
+class Time(NamedTuple):
+    """When a layer is."""
+
+    value: float
+    clock: Clock
 
 
 class Schedule:
@@ -61,9 +120,7 @@ class Schedule:
                 f"--step chooses among them, got {self._every}"
             )
         if self._clock is None and self._wanted is not None:
-            raise InvalidArgumentError(
-                f"--unit: expected none, as {self._first_name} has no times, got {self._wanted}"
-            )
+            raise invalid("--unit", f"none, as {self._first_name} has no times", self._wanted)
 
     def _check_clock(self, name: str, clock: Clock | None) -> None:
         """Refuses times that cannot be compared with those of the first layer."""
@@ -73,20 +130,54 @@ class Schedule:
                 "no time" if one is None else f"times in '{one.words}' ({one.calendar})"
                 for one in (self._clock, clock)
             )
-            raise InvalidArgumentError(
-                f"{name}: expected {first} as in {self._first_name}, got {got}"
-            )
+            raise invalid(name, f"{first} as in {self._first_name}", got)
 
     def _check_order(self, name: str, told: str) -> None:
         if len(self._times) < 2:
             return
         step, first = self._times[-1] - self._times[-2], self._times[1] - self._times[0]
         if step <= 0:
-            raise InvalidArgumentError(
-                f"{name}: expected a later time than {self._told}, got {told}"
-            )
+            raise invalid(name, f"a later time than {self._told}", told)
         if self._unit is None and abs(step - first) > EVEN * first:
             raise InvalidArgumentError(
                 f"{name}: expected steps of {first:.6g} in time, got {step:.6g}; --unit says what "
                 "the times count"
             )
+
+
+def length(text: str) -> float:
+    """Seconds of a length of time such as `10 min`."""
+    number, _, unit = text.strip().partition(" ")
+    try:
+        seconds = float(number) * SECONDS[_unit(unit)]
+    except (KeyError, ValueError):
+        seconds = 0.0
+    if not 0.0 < seconds < math.inf:
+        raise invalid("--step", "a number and s, min, h or d, such as '10 min'", f"'{text}'")
+    return seconds
+
+
+def steps_at(times: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+    """The first step that is not before each time, counted from 0; infinite ones stay."""
+    with np.errstate(over="ignore"):
+        steps = np.ceil(times / step - EVEN)
+    if (np.isinf(steps) & np.isfinite(times)).any():
+        raise InvalidArgumentError(
+            f"--step: expected a share of {times[np.isfinite(times)].max():.6g}, the last time, "
+            f"got {step:.6g}"
+        )
+    return steps
+
+
+def unit_of(clock: Clock, wanted: str | None, name: str) -> str | None:
+    """What the times count, as the flag or the file says."""
+    in_file = clock.unit()
+    if None not in (wanted, in_file) and wanted != in_file:
+        raise invalid("--unit", f"{in_file}, as in {name}", wanted)
+    return wanted or in_file
+
+
+def _unit(text: str) -> str:
+    word = text.strip().lower()
+    word = word if word in SECONDS else word.removesuffix("s")
+    return _SPELLINGS.get(word, word)

@@ -1,7 +1,5 @@
 """What `emberwatch-server --states` reads: sequences in one `.npz`, described by a `.toml`."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +11,7 @@ from typing import IO, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import invalid
 from emberwatch.model import Color, color_from_hex
 
 Fill = Callable[[IO[bytes]], object]
@@ -67,16 +65,14 @@ def _quoted(text: str) -> str:
 def check_outputs(out: Path, picture: Path | None, *, force: bool) -> None:
     """Refuses names of other files, and without `force` files that are there already."""
     if out.suffix != ".npz":
-        raise InvalidArgumentError(f"--out: expected a .npz, got {out}")
+        raise invalid("--out", "a .npz", out)
     if picture is not None and picture.suffix != ".png":
-        raise InvalidArgumentError(f"--picture: expected a .png, got {picture}")
+        raise invalid("--picture", "a .png", picture)
     for flag, file in (("out", out), ("out", out.with_suffix(".toml")), ("picture", picture)):
         if file is not None and file.is_dir():
-            raise InvalidArgumentError(f"--{flag}: expected a file, got the folder {file}")
+            raise invalid(f"--{flag}", "a file", f"the folder {file}")
         if file is not None and file.exists() and not force:
-            raise InvalidArgumentError(
-                f"--{flag}: expected no {file}, got one; --force replaces it"
-            )
+            raise invalid(f"--{flag}", f"no {file}", "one; --force replaces it")
 
 
 def arrays(sequences: Sequence[NDArray[np.uint8]]) -> Fill:
