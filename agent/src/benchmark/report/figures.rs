@@ -103,7 +103,7 @@ pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<
 }
 
 fn estimated<'a>(group: &'a Group<'a>) -> Option<(&'a Group<'a>, Estimate)> {
-    let estimate = Estimate::of(&group.values(|run| run.mean_reward));
+    let estimate = group.estimate(|run| Some(run.mean_reward));
     estimate.map(|estimate| (group, estimate))
 }
 
