@@ -76,7 +76,7 @@ impl Decider {
         };
         let mut client = Client::acquire(connect(&task.instance)?, &claim)?;
         let observations = client.observe(client.robots())?;
-        let choices = Policy::choices(task.estimator, task.planner, &model);
+        let choices = Policy::choices(task.estimator, task.planner, &model.state_names());
         let mut decider = Self {
             last_use: Instant::now(),
             info: agent_info(task, &model, &choices, client.info()),

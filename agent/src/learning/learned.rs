@@ -8,6 +8,7 @@ use crate::learning::student::{decisions, network};
 use crate::planning::policy::{EstimatorKind, Policy};
 use ::network::Device;
 use anyhow::{Context, Result, ensure};
+use protocol::Model;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -77,6 +78,14 @@ impl Learned {
             }
             _ => None,
         }
+    }
+
+    /// The policies that act on it: those of filters, of the autoencoder, and of decisions.
+    pub fn policies(&self, model: &Model) -> Vec<Policy> {
+        let mut policies = Policy::all(model);
+        policies.retain(|policy| policy.needs_checkpoint() && self.suits(policy));
+        policies.sort_by_key(|policy| policy.estimator.knows_model());
+        policies
     }
 
     /// Whether what a policy acts on was learned, if anything has to be.

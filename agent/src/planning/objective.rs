@@ -13,6 +13,16 @@ use serde::{Deserialize, Serialize};
 /// difference (36.4 and 36.6; 8 training worlds, burn-in 25,000, 1,500 steps).
 pub const BEAM_BONUS: f32 = 0.02;
 
+/// A belief that paths may be planned on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum BasisKind {
+    /// The predictor `u_{k+1}` of where the world stands when the path is observed, as in the authors' code.
+    Predictor,
+    /// The estimate `p_k` of where it stands (the paper as printed, eqs. 13 to 15).
+    Estimate,
+}
+
 /// What makes a cell worth a visit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -84,7 +94,7 @@ impl Objective {
         }
     }
 
-    /// What the cells are worth under a belief, which [`super::PlanBasis`] chooses.
+    /// What the cells are worth under a belief.
     pub fn values(&self, belief: &Belief) -> CellValues {
         let value = match self.target {
             Target::State(state) => belief.probability(state).to_owned(),

@@ -7,7 +7,6 @@ use crate::learning::checkpoint::Contents;
 use anyhow::Result;
 
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::planning::PlanBasis;
 use crate::planning::policy::Policy;
 use crate::rollout::agent::{Agent, Setup};
 use crate::rollout::{Robot, Seen};
@@ -39,10 +38,12 @@ impl Worlds {
         observation: Observation,
     ) -> Robot {
         let setup = Setup {
-            basis: PlanBasis::new(config.objective.belief),
+            basis: config.objective.belief,
             state_names,
             n_moves: self.n_moves,
             seed: config.planner_seed(observation.world.seed),
+            target: None,
+            decider: None,
         };
         let agent = Agent::new(estimator, policy, config, setup);
         Robot::new(agent, Seen::new([observation]))

@@ -14,9 +14,8 @@ use crate::learning::checkpoint::Contents;
 use crate::learning::learner::{LearnedModel, Learner};
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
-use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
+use crate::planning::policy::{EstimatorKind, PlannerKind, Policy, numbered_states};
 use crate::planning::{Objective, Plan, Target};
-use crate::rollout::agent::numbered_states;
 use crate::rollout::{self, Robot};
 use anyhow::Result;
 use protocol::client::Observation;
@@ -119,7 +118,8 @@ impl FilterStudent {
             false => EstimatorKind::Learned,
             true => EstimatorKind::LearnedOwn,
         };
-        Policy::learned(estimator, PlannerKind::Beam)
+        let target = Target::State(self.learned.target);
+        Policy::new("learned_beam", estimator, PlannerKind::Beam, target)
     }
 
     /// Worlds whose robots walk at random: all at first, some for good; none of a frozen student.
@@ -188,10 +188,7 @@ impl Student for FilterStudent {
             let world = first_world + index as u32;
             self.learner.expect(world, run.robot.agent.belief());
         }
-        let objective = Objective {
-            target: Target::State(self.learned.target),
-            ..self.config.objective(&self.policy())
-        };
+        let objective = self.config.objective(&self.policy());
         let mut tick = Tick::default();
         rollout::step(
             &mut self.runs,

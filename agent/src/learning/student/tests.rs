@@ -79,6 +79,12 @@ fn path(
     config.planner(policy).plan(&problem).moves
 }
 
+/// Beam search for a state.
+fn beam(target: usize) -> Policy {
+    let (estimator, planner) = (EstimatorKind::Learned, PlannerKind::Beam);
+    Policy::new("learned_beam", estimator, planner, Target::State(target))
+}
+
 /// One step: the path, and the posterior after its frame.
 fn fly(student: &mut impl Student, step: u64) -> (Vec<Move>, Belief) {
     let (mut path, mut posterior) = (Vec::new(), None);
@@ -131,12 +137,14 @@ fn students_plan_on_the_belief_that_settings_say() {
         };
         let student = FilterStudent::new(dimensions, worlds(), config);
         check(student, basis, |belief, target, step| {
-            let policy = Policy::learned(EstimatorKind::Learned, PlannerKind::Beam);
-            let objective = Objective {
-                target: Target::State(target),
-                ..config.objective(&policy)
-            };
-            vec![path(config, &policy, objective, belief, step)]
+            let policy = beam(target);
+            vec![path(
+                config,
+                &policy,
+                config.objective(&policy),
+                belief,
+                step,
+            )]
         });
         let progress = Progress::first(&worlds(), config, &::network::Device::Cpu);
         let student = NetworkStudent::new(progress.expect("a network"), worlds(), config);
@@ -150,11 +158,10 @@ fn students_plan_on_the_belief_that_settings_say() {
         let decisions = Decisions::first(&model, &config.decisions, 0);
         let student = DecisionsStudent::new(decisions, filter, &model, worlds(), config);
         let actions = ActionSet::beam(&model);
-        let beam = Policy::learned(EstimatorKind::Learned, PlannerKind::Beam);
         check(student, basis, |belief, _, step| {
             let path = |action: &crate::planning::action::Action| {
                 let random = (config.planner_seed(0), step);
-                let mut planner = config.planner(&beam);
+                let mut planner = config.planner(&beam(0));
                 let plans = action.plan(&mut *planner, belief, &[ROBOT], worlds().n_moves, random);
                 plans[0].moves.clone()
             };
