@@ -2,8 +2,8 @@
 
 use agent::Belief;
 use agent::config::{AgentConfig, LearningConfig};
-use agent::estimation::BayesFilter;
 use agent::estimation::parameters::{Dimensions, Parameters, Tables};
+use agent::estimation::{BayesFilter, Estimator};
 use agent::learning::filter::{Trainer, Update, Window};
 use agent::learning::replay::{Replay, Sighting};
 use protocol::randomness::split_mix;
@@ -30,7 +30,7 @@ fn frame(shape: Shape, n_observations: usize, number: u64) -> Frame {
     frame
 }
 
-fn belief(n_states: usize, shape: Shape, seed: u64) -> Vec<f32> {
+fn belief(n_states: usize, shape: Shape, seed: u64) -> Belief {
     let number = |index: usize| 0.1 + (split_mix(seed, index as u64) >> 40) as f32 / 2e7;
     let n_cells = shape.n_cells();
     let mut belief: Vec<f32> = (0..n_states * n_cells).map(number).collect();
@@ -40,7 +40,9 @@ fn belief(n_states: usize, shape: Shape, seed: u64) -> Vec<f32> {
             .sum();
         (0..n_states).for_each(|state| belief[state * n_cells + cell] /= sum);
     }
-    belief
+    let dim = (n_states, shape.height(), shape.width());
+    let belief = Probabilities::from_shape_vec(dim, belief).expect("as many");
+    Belief::from_probabilities(belief).expect("sums of one")
 }
 
 fn burnout() -> Model {
@@ -63,8 +65,8 @@ fn with_the_true_parameters_it_is_the_known_model_filter() {
             let mut learned = BayesFilter::learned(&Tables::of_model(&model), prior);
             for number in 0..30 {
                 let frame = frame(shape, model.n_observations(), number);
-                known.correct(&frame).expect("possible");
-                learned.correct(&frame).expect("possible");
+                known.correct(&frame, None).expect("possible");
+                learned.correct(&frame, None).expect("possible");
                 known.predict();
                 learned.predict();
             }
@@ -163,8 +165,8 @@ fn check_gradients(dimensions: Dimensions, size: (usize, usize), from_belief: bo
         .map(|number| sightings(shape, dimensions.n_observations, number))
         .collect();
     let belief = belief(dimensions.n_states, shape, 4);
-    let start = from_belief.then_some(&*belief);
-    let mut end = vec![0.0; belief.len()];
+    let start = from_belief.then_some(belief.as_slice());
+    let mut end = vec![0.0; belief.as_slice().len()];
     let outcome = Window::new(tables.clone(), shape, 5).run(start, &frames, &mut end);
     let numbers = [tables.kernel, tables.likelihood, tables.initial];
     let numbers = numbers.map(|table| table.into_iter().map(f64::from).collect::<Vec<f64>>());
@@ -221,7 +223,9 @@ fn check_window(tables: Tables) {
     let mut end = vec![0.0; 3 * shape.n_cells()];
     window.run(None, &frames, &mut end);
     for number in 0..8 {
-        filter.correct(&frame(shape, 3, number)).expect("possible");
+        filter
+            .correct(&frame(shape, 3, number), None)
+            .expect("possible");
         filter.predict();
     }
     let most = filter.belief().as_slice().iter().zip(&end);
@@ -240,8 +244,7 @@ fn a_window_ends_with_the_filters_prediction() {
 #[test]
 fn learning_begins_alike_for_every_own_state() {
     let shape = Shape::new(12, 40).expect("test shape");
-    let prior = Probabilities::from_shape_vec((3, 12, 40), belief(3, shape, 0));
-    let prior = Belief::from_probabilities(prior.expect("as many")).expect("sums of one");
+    let prior = belief(3, shape, 0);
     let [one, own] = [false, true].map(|sees_own_state| {
         let tables = Parameters::first(dimensions(sees_own_state), 0).tables();
         let mut filter = BayesFilter::learned(&tables, prior.clone());
@@ -269,10 +272,8 @@ fn replay(shape: Shape, n_frames: u64) -> Replay {
     for world in 0..2 {
         replay.begin(world);
         for number in 0..n_frames {
-            if replay.wants_belief(world) {
-                replay.give_belief(world, &belief(3, shape, number));
-            }
-            replay.push(world, &frame(shape, 3, number * 2 + u64::from(world)));
+            let frame = frame(shape, 3, number * 2 + u64::from(world));
+            replay.push(world, &frame, Some(&belief(3, shape, number)));
         }
     }
     replay

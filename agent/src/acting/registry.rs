@@ -2,7 +2,7 @@
 
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
-use crate::estimation::truth::{Clairvoyant, Oracle, Unchanged};
+use crate::estimation::truth::{Clairvoyant, Oracle};
 use crate::estimation::{
     AutoencoderEstimator, BayesFilter, Correlations, Estimator, SpatialFilter,
 };
@@ -19,14 +19,12 @@ use protocol::{Model, Shape};
 /// What a misfit is told of.
 const CHECKPOINT: &str = "checkpoint";
 
-/// What an agent is built for.
 #[derive(Debug, Clone, Copy)]
 pub struct Task<'a> {
     /// The model, for filters and predictions.
     pub model: &'a Model,
     pub shape: Shape,
     pub n_moves: usize,
-    /// The belief before the first frame.
     pub prior: &'a Belief,
     /// Seed of the planner's random numbers: the agent's and the world's.
     pub seed: u64,
@@ -58,7 +56,6 @@ pub fn agent(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Ag
 fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>> {
     let prior = task.prior.clone();
     Ok(match policy.estimator {
-        EstimatorKind::None => Box::new(Unchanged(prior)),
         EstimatorKind::KnownModel => Box::new(BayesFilter::known(task.model, prior)?),
         EstimatorKind::Spatial => {
             let filter = BayesFilter::known(task.model, prior)?;
@@ -76,7 +73,7 @@ fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>> {
         }
         EstimatorKind::Autoencoder => Box::new(autoencoder(policy, task)?),
         EstimatorKind::Truth => Box::new(Oracle::new(task.model, prior)?),
-        EstimatorKind::NextTruth => Box::new(Clairvoyant(prior)),
+        EstimatorKind::None | EstimatorKind::NextTruth => Box::new(Clairvoyant(prior)),
     })
 }
 

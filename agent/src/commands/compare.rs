@@ -122,7 +122,6 @@ impl CompareCommand {
         self.tell(&report, added, &config)
     }
 
-    /// Writes table and files.
     fn tell(&self, report: &Report, added: Vec<PolicyRun>, config: &AgentConfig) -> Result<()> {
         let fits = check_worlds(&added, &report.runs);
         // What was measured is kept in any case.

@@ -54,7 +54,6 @@ pub struct EvaluateCommand {
 }
 
 impl EvaluateCommand {
-    /// Scores predictions, then policies.
     pub fn run(&self) -> Result<()> {
         let config = self.settings.effective()?;
         if let Some(path) = &self.csv {

@@ -5,7 +5,7 @@
 //! by zero.
 
 use crate::estimation::belief::Belief;
-use anyhow::{Result, bail};
+use anyhow::{Result, ensure};
 use ndarray::Array2;
 use protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
 use protocol::randomness::split_mix;
@@ -63,24 +63,21 @@ pub struct Tables {
 impl Dimensions {
     /// Checks them against the limits of a model.
     pub fn check(self) -> Result<Self> {
-        let values = 2..=MAX_VALUES;
         let side = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
+        let (n_states, n_observations) = (self.n_states, self.n_observations);
+        ensure!(
+            (2..=MAX_VALUES).contains(&n_states),
+            "learned filter: states: expected 2 to {MAX_VALUES}, got {n_states}"
+        );
+        ensure!(
+            (1..=MAX_VALUES).contains(&n_observations),
+            "learned filter: observations: expected 1 to {MAX_VALUES}, got {n_observations}"
+        );
         let (height, width) = self.kernel;
-        let wrong = |what, expected: String, got: String| {
-            bail!("learned filter: {what}: expected {expected}, got {got}")
-        };
-        let range = format!("2 to {MAX_VALUES}");
-        if !values.contains(&self.n_states) {
-            return wrong("states", range, self.n_states.to_string());
-        }
-        if !(1..=MAX_VALUES).contains(&self.n_observations) {
-            let range = format!("1 to {MAX_VALUES}");
-            return wrong("observations", range, self.n_observations.to_string());
-        }
-        if !side(height) || !side(width) {
-            let expected = format!("odd sides up to {MAX_KERNEL_SIDE}");
-            return wrong("kernel", expected, format!("{height} x {width}"));
-        }
+        ensure!(
+            side(height) && side(width),
+            "learned filter: kernel: expected odd sides up to {MAX_KERNEL_SIDE}, got {height} x {width}"
+        );
         Ok(self)
     }
 
@@ -196,7 +193,6 @@ impl Parameters {
         tensors.into_iter().find(wrong).map(|(name, _)| name)
     }
 
-    /// Moves every number into ±[`BOUND`].
     pub fn bound(&mut self) {
         for number in self.tensors.iter_mut().flatten() {
             *number = number.clamp(-BOUND, BOUND);
@@ -330,31 +326,14 @@ mod tests {
 
     #[test]
     fn dimensions_out_of_range_are_named() {
-        let check = |dimensions: Dimensions, words: &str| {
+        let check = |change: fn(&mut Dimensions), words: &str| {
+            let mut dimensions = dimensions();
+            change(&mut dimensions);
             let error = dimensions.check().expect_err(words).to_string();
             assert!(error.contains(words), "{error}");
         };
-        let fine = dimensions();
-        check(
-            Dimensions {
-                n_states: 1,
-                ..fine
-            },
-            "states: expected 2 to 64, got 1",
-        );
-        check(
-            Dimensions {
-                n_observations: 65,
-                ..fine
-            },
-            "got 65",
-        );
-        check(
-            Dimensions {
-                kernel: (3, 2),
-                ..fine
-            },
-            "odd sides up to 15, got 3 x 2",
-        );
+        check(|it| it.n_states = 1, "states: expected 2 to 64, got 1");
+        check(|it| it.n_observations = 65, "got 65");
+        check(|it| it.kernel = (3, 2), "odd sides up to 15, got 3 x 2");
     }
 }

@@ -20,7 +20,6 @@ const KINDS: [&str; 4] = [
     decisions::KIND,
 ];
 
-/// Everything that was learned.
 #[derive(Debug, Clone, Default)]
 pub struct Learned {
     /// A filter, for policies `learned_*`.
@@ -69,7 +68,6 @@ impl Learned {
 }
 
 impl Learned {
-    /// The filter of an estimator.
     pub fn filter(&self, estimator: EstimatorKind) -> Option<&LearnedModel> {
         match estimator {
             EstimatorKind::Learned | EstimatorKind::LearnedSpatial => self.filter.as_ref(),

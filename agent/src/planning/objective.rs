@@ -23,9 +23,7 @@ pub enum BasisKind {
     Estimate,
 }
 
-/// What makes a cell worth a visit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Target {
     /// The probability of one state: the paper's actions `a_k < S`.
     State(usize),
@@ -50,13 +48,10 @@ impl Target {
 }
 
 /// What a planner maximises: the sum over a path's cells of the target, plus a bonus per cell.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Objective {
     pub target: Target,
-    /// Added once for each distinct cell.
     pub coverage_bonus: f32,
-    /// Which entropy [`Target::Entropy`] means.
     pub entropy: EntropyKind,
     /// Whether a cell's value counts at every visit (eq. 15 as printed), not only at the first (the
     /// authors' code, and the reward).
@@ -137,7 +132,6 @@ impl CellValues {
         left
     }
 
-    /// Added once for each distinct cell.
     pub fn coverage_bonus(&self) -> f32 {
         self.coverage_bonus
     }

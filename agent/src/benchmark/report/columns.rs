@@ -5,7 +5,6 @@ use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};
 use crate::benchmark::report::statistics::Estimate;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 
-/// What a cell says of a group.
 type Cell<'a> = Box<dyn Fn(&Group<'_>) -> String + 'a>;
 
 /// The columns of a table, with their headings.

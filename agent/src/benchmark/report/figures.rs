@@ -128,7 +128,6 @@ fn bar(group: &Group<'_>, groups: &[Group<'_>], reward: Estimate, decimals: usiz
     }
 }
 
-/// The number of a policy's family.
 fn family(group: &Group<'_>) -> usize {
     let policy = group.policy.to_lowercase();
     match group.estimator {

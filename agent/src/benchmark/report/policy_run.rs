@@ -13,7 +13,6 @@ pub const ALONE: &str = "alone";
 /// One policy on one world: what `emberwatch-agent compare` measured, and a row of its CSV.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PolicyRun {
-    /// Name of the policy, such as `beam`.
     pub policy: String,
     /// Where the belief came from: `none`, `known_model`, `truth`, `next_truth` or a learned one.
     pub estimator: String,
@@ -30,12 +29,10 @@ pub struct PolicyRun {
     pub mean_plan_millis: f64,
     /// Mean Brier score of the belief, where there is a belief.
     pub brier: Option<f64>,
-    /// Moves of a path.
     pub moves: usize,
     /// Robots of the world. Rewards, cells and plans are those of all together.
     #[serde(default = "one")]
     pub robots: u32,
-    /// How they act together, such as `joint`.
     #[serde(default = "alone")]
     pub team: String,
     /// Share of the visits to distinct cells that a teammate made in the same step, in `0..1`.

@@ -5,7 +5,6 @@
 
 use std::collections::BTreeMap;
 
-/// A mean over worlds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
     pub mean: f64,

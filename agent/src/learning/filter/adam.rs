@@ -6,12 +6,9 @@ use serde::{Deserialize, Serialize};
 /// Added to the root of the second moment: the paper's.
 const EPSILON: f64 = 1e-8;
 
-/// The optimiser's state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Adam {
-    /// Decaying mean of gradients.
     pub first: Parameters,
-    /// Decaying mean of their squares.
     pub second: Parameters,
     pub n_steps: u64,
 }

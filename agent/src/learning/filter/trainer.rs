@@ -38,10 +38,8 @@ pub struct Trainer {
     windows: Vec<Window>,
 }
 
-/// What one update did.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Update {
-    /// Number of this update, from 1.
     pub number: u64,
     /// Minus the mean log-likelihood of a visited cell, before the update.
     pub loss: f64,

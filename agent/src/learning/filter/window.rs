@@ -14,7 +14,6 @@ use crate::learning::replay::Sighting;
 use protocol::Shape;
 use pulp::{Arch, Simd, WithSimd};
 
-/// What a window gives.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outcome {
     /// Derivatives of `-log_likelihood` by the kernel, the likelihood and the first belief.
@@ -41,7 +40,6 @@ pub struct Window {
     by_weights: Vec<f32>,
 }
 
-/// A visited cell of a window.
 #[derive(Debug, Clone, Copy)]
 struct Seen {
     frame: usize,

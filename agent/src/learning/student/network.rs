@@ -26,7 +26,6 @@ use protocol::client::Observation;
 use protocol::path;
 use std::time::{Duration, Instant};
 
-/// How checkpoints of this learner call it.
 pub const KIND: &str = "autoencoder";
 
 const COLUMNS: [&str; 5] = ["dqn_loss", "dqn_rate", "action", "action_value", "epsilon"];
@@ -97,7 +96,6 @@ impl NetworkStudent {
         }
     }
 
-    /// Adds the transition to the DQN's replay.
     fn remember(&mut self, robot: &Robot, decision: &Decision) {
         let step = Transition {
             input: decision.input.clone(),

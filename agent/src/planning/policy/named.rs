@@ -5,7 +5,6 @@ use crate::planning::objective::{BEAM_BONUS, Objective, Target};
 use anyhow::{Context, Result, ensure};
 use protocol::Model;
 
-/// Where a policy's belief comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum EstimatorKind {
     None,
@@ -29,7 +28,6 @@ pub enum EstimatorKind {
     NextTruth,
 }
 
-/// How a policy plans.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum PlannerKind {
     /// Uniform moves: the paper's baseline.
@@ -39,7 +37,6 @@ pub enum PlannerKind {
     Beam,
 }
 
-/// A way to act.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Policy {
     /// Its name in commands, tables and files.
@@ -54,7 +51,6 @@ pub struct Policy {
 }
 
 impl EstimatorKind {
-    /// Whether it filters with the true parameters.
     pub fn knows_model(self) -> bool {
         matches!(self, Self::KnownModel | Self::Spatial)
     }
@@ -71,7 +67,6 @@ impl EstimatorKind {
         )
     }
 
-    /// Its name in tables and files.
     pub fn label(self) -> &'static str {
         match self {
             Self::None => "none",
@@ -89,7 +84,6 @@ impl EstimatorKind {
 }
 
 impl PlannerKind {
-    /// Its name in commands and messages.
     pub fn label(self) -> &'static str {
         match self {
             Self::RandomWalk => "random_walk",
