@@ -1,8 +1,9 @@
 //! Time of learning at the paper's size: 64 x 64 cells, 64 moves, 3 states, 16 streams x 16 frames.
 
+use agent::Belief;
 use agent::config::AgentConfig;
-use agent::estimation::BayesFilter;
 use agent::estimation::parameters::{Dimensions, Parameters, Tables};
+use agent::estimation::{BayesFilter, Estimator};
 use agent::learning::filter::Trainer;
 use agent::learning::replay::Replay;
 use criterion::{Criterion, criterion_group, criterion_main};
@@ -38,10 +39,8 @@ fn replay(is_straight: bool) -> Replay {
             .collect();
         let flight = fly(shape(), robot, &moves);
         robot = flight.end;
-        if replay.wants_belief(0) {
-            replay.give_belief(0, &vec![1.0 / 3.0; 3 * shape().n_cells()]);
-        }
-        replay.push(0, &frame(&flight.visited));
+        let before = Belief::uniform(3, shape());
+        replay.push(0, &frame(&flight.visited), Some(&before));
     }
     replay
 }
@@ -100,7 +99,7 @@ fn filter(c: &mut Criterion) {
             &format!("learned filter: correct + predict{kernels}"),
             |b| {
                 b.iter(|| {
-                    filter.correct(&frame).expect("possible");
+                    filter.correct(&frame, None).expect("possible");
                     filter.predict();
                 });
             },

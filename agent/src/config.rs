@@ -74,7 +74,6 @@ pub enum PriorKind {
     Uniform,
 }
 
-/// Where settings start from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Preset {
     /// Whatever measures best
@@ -184,7 +183,6 @@ impl AgentConfig {
         world_seed ^ self.seed.rotate_left(32)
     }
 
-    /// The planner of a policy.
     pub fn planner(&self, policy: &Policy) -> Box<dyn Planner + Send> {
         match policy.planner {
             PlannerKind::RandomWalk => Box::new(RandomWalk),
@@ -198,7 +196,6 @@ impl AgentConfig {
 }
 
 impl AgentFlags {
-    /// The effective settings.
     pub fn effective(&self) -> Result<AgentConfig> {
         let mut config = match (&self.config, self.preset) {
             (Some(path), Preset::Default) => read(path)?,

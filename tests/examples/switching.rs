@@ -4,7 +4,7 @@
 //! `cargo run --release -p tests --example switching -- MODEL MOVES BURN_IN FIRST_SEED WORLDS STEPS`
 
 use agent::estimation::belief::Belief;
-use agent::estimation::{BayesFilter, Prior};
+use agent::estimation::{BayesFilter, Estimator, Prior};
 use agent::planning::BeamSearch;
 use agent::planning::action::{ActionSet, Region};
 use env_server::world::{Episode, Flown, Rules, Start};
@@ -66,7 +66,7 @@ impl Robot {
             };
             self.episode.step(&setup.rules, &flown);
             self.filter
-                .correct(self.episode.robots()[0].frame())
+                .correct(self.episode.robots()[0].frame(), None)
                 .expect("a possible frame");
             self.filter.predict();
             sum += self.episode.result().reward;

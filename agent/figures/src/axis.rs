@@ -9,7 +9,6 @@ pub fn is_drawable(value: f64) -> bool {
     value.abs() <= MOST
 }
 
-/// Range and ticks of an axis.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Axis {
     pub ticks: Vec<f64>,

@@ -16,7 +16,6 @@ const BOTTOM: f64 = 72.0;
 const LABEL_ROOM: f64 = 360.0;
 const VALUE_ROOM: f64 = 200.0;
 
-/// A page of bars.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ladder {
     pub title: String,
@@ -54,7 +53,7 @@ struct Plot {
 impl Ladder {
     pub fn svg(&self) -> String {
         let plot = Plot::of(&self.bars);
-        let mut page = Svg::titled(plot.bottom + BOTTOM, &self.title, &self.note);
+        let mut page = Svg::titled(&self.title, &self.note);
         self.draw_legend(&mut page);
         self.draw_axis(&mut page, &plot);
         for (rank, bar) in self.bars.iter().enumerate() {
@@ -62,7 +61,7 @@ impl Ladder {
         }
         let zero = plot.x(0.0);
         page.rule((zero, TOP), (zero, plot.bottom), 1.0, INK);
-        page.finish()
+        page.finish(WIDTH, plot.bottom + BOTTOM)
     }
 
     fn draw_legend(&self, page: &mut Svg) {

@@ -11,11 +11,9 @@ pub struct Named {
     pub color: Color,
 }
 
-/// Height of a line of the legend.
 const LINE: f64 = 26.0;
 const SWATCH: f64 = 14.0;
 
-/// A mark of the legend.
 #[derive(Debug, Clone, Copy)]
 enum Mark {
     /// No mark: the heading of a group.
@@ -26,88 +24,52 @@ enum Mark {
     Robot,
 }
 
-/// A mark with its name, and where it stands.
-struct Entry {
-    mark: Mark,
-    name: String,
-    at: Point,
-}
-
-/// Marks with their names, broken into lines.
-pub struct Legend {
-    entries: Vec<Entry>,
-    height: f64,
-}
-
-impl Legend {
-    /// The legend from `corner` on; what states and observations share is said once.
-    pub fn new(states: &[Named], observations: &[Named], unobserved: Color, corner: Point) -> Self {
-        let group = |heading: &str, named: &[Named]| {
-            let marks = named
-                .iter()
-                .map(|it| (Mark::Color(it.color), it.name.clone()));
-            std::iter::once((Mark::Heading, heading.into()))
-                .chain(marks)
-                .collect::<Vec<_>>()
-        };
-        let mut groups = match states == observations {
-            true => vec![group("state, observed value:", states)],
-            false => vec![
-                group("state:", states),
-                group("observed value:", observations),
-            ],
-        };
-        if let Some(last) = groups.last_mut() {
-            last.push((Mark::Color(unobserved), "not observed".into()));
-            last.extend([(Mark::Path, "path".into()), (Mark::Start, "start".into())]);
-            last.push((Mark::Robot, "robot".into()));
-        }
-        Self::placed(groups, corner)
+/// Draws the legend from `corner` on, each group of marks on lines of its own; what states and observations share is
+/// said once. Returns the height of its lines.
+pub fn draw_legend(
+    page: &mut Svg,
+    states: &[Named],
+    observations: &[Named],
+    unobserved: Color,
+    corner: Point,
+) -> f64 {
+    let group = |heading: &str, named: &[Named]| {
+        let heading = (Mark::Heading, heading.to_owned());
+        let marks = named
+            .iter()
+            .map(|it| (Mark::Color(it.color), it.name.clone()));
+        std::iter::once(heading).chain(marks).collect::<Vec<_>>()
+    };
+    let mut groups = match states == observations {
+        true => vec![group("state, observed value:", states)],
+        false => vec![
+            group("state:", states),
+            group("observed value:", observations),
+        ],
+    };
+    if let Some(last) = groups.last_mut() {
+        last.push((Mark::Color(unobserved), "not observed".into()));
+        last.extend([(Mark::Path, "path".into()), (Mark::Start, "start".into())]);
+        last.push((Mark::Robot, "robot".into()));
     }
-
-    /// Places each group of marks on lines of its own.
-    fn placed(groups: Vec<Vec<(Mark, String)>>, (left, top): Point) -> Self {
-        let mut entries = Vec::new();
-        let mut middle = top;
-        for group in groups {
-            let mut x = left;
-            for (mark, name) in group {
-                let name = TextStyle::LABEL.fit(&name, WIDTH - left - MARGIN - 30.0);
-                let width = mark.width() + TextStyle::LABEL.width(&name);
-                if x > left && x + width > WIDTH - MARGIN {
-                    (x, middle) = (left, middle + LINE);
-                }
-                entries.push(Entry {
-                    mark,
-                    name,
-                    at: (x, middle),
-                });
-                x += width + if mark.width() > 0.0 { 24.0 } else { 12.0 };
+    let (left, top) = corner;
+    let mut middle = top;
+    for group in groups {
+        let mut x = left;
+        for (mark, name) in group {
+            let name = TextStyle::LABEL.fit(&name, WIDTH - left - MARGIN - 30.0);
+            let width = mark.width() + TextStyle::LABEL.width(&name);
+            if x > left && x + width > WIDTH - MARGIN {
+                (x, middle) = (left, middle + LINE);
             }
-            middle += LINE;
+            mark.draw(page, (x, middle));
+            let at = (x + mark.width(), middle);
+            page.text(at, Align::Left, mark.style(), &name);
+            x += width + if mark.width() > 0.0 { 24.0 } else { 12.0 };
         }
-        Self {
-            entries,
-            height: middle - top,
-        }
+        middle += LINE;
     }
-
-    /// Height of its lines in points.
-    pub fn height(&self) -> f64 {
-        self.height
-    }
-
-    /// Draws all marks with their names.
-    pub fn draw(&self, page: &mut Svg) {
-        for Entry { mark, name, at } in &self.entries {
-            mark.draw(page, *at);
-            let style = match mark {
-                Mark::Heading => TextStyle::LABEL.colored(MUTED),
-                _ => TextStyle::LABEL,
-            };
-            page.text((at.0 + mark.width(), at.1), Align::Left, style, name);
-        }
-    }
+    middle - top
 }
 
 impl Mark {
@@ -117,6 +79,13 @@ impl Mark {
             Self::Heading => 0.0,
             Self::Path => SWATCH + 16.0,
             Self::Color(_) | Self::Start | Self::Robot => SWATCH + 7.0,
+        }
+    }
+
+    fn style(self) -> TextStyle {
+        match self {
+            Self::Heading => TextStyle::LABEL.colored(MUTED),
+            _ => TextStyle::LABEL,
         }
     }
 
@@ -155,7 +124,6 @@ pub fn draw_start(page: &mut Svg, (x, y): Point, half: f64) {
     page.rectangle((x - inner, y - inner), (x + inner, y + inner), PAPER);
 }
 
-/// Draws the mark of the robot's cell.
 pub fn draw_robot(page: &mut Svg, center: Point, radius: f64) {
     page.disc(center, radius, PAPER);
     page.disc(center, radius - 1.0, INK);

@@ -28,7 +28,6 @@ const BAND: f64 = 0.18;
 /// Part of the height that a shaded background may fill.
 const SHADE_HEIGHT: f64 = 0.4;
 
-/// A page of panels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Lines {
     pub title: String,
@@ -59,7 +58,6 @@ pub enum Scale {
     Logarithmic,
 }
 
-/// A named line.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Curve {
     pub name: String,
@@ -114,12 +112,12 @@ impl Lines {
             height,
         };
         let bottom = HEAD + height * panels.len() as f64;
-        let mut page = Svg::titled(bottom + FOOT, &self.title, &self.note);
+        let mut page = Svg::titled(&self.title, &self.note);
         for (index, panel) in panels.iter().enumerate() {
             panel.draw(&mut page, &frame, HEAD + height * index as f64);
         }
         frame.draw(&mut page, bottom - GAP, &self.axis);
-        Some(page.finish())
+        Some(page.finish(WIDTH, bottom + FOOT))
     }
 }
 

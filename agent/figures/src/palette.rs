@@ -2,7 +2,6 @@
 
 use std::fmt::{self, Display, Formatter};
 
-/// Red, green and blue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Color(pub u8, pub u8, pub u8);
 
@@ -15,13 +14,10 @@ impl Display for Color {
 /// Text, error bars and the zero line.
 pub const INK: Color = Color(0x33, 0x33, 0x33);
 
-/// Secondary text.
 pub const MUTED: Color = Color(0x66, 0x66, 0x66);
 
-/// Grid lines.
 pub const GRID: Color = Color(0xe4, 0xe4, 0xe4);
 
-/// The figure's background.
 pub const PAPER: Color = Color(0xff, 0xff, 0xff);
 
 /// Light area behind a line plot.

@@ -7,14 +7,12 @@ use resvg::tiny_skia::{Pixmap, PremultipliedColorU8, Transform};
 use resvg::usvg::Tree;
 use thiserror::Error;
 
-/// Pixels per point.
 const SCALE: f32 = 2.0;
 
 /// Shorter side that a small grid's picture has at least, pixels, where cells of up to sixteen give it.
 const LEAST_SIDE: usize = 256;
 const MOST_PIXELS_PER_CELL: usize = 16;
 
-/// Why there is no picture.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("PNG: {0}")]
 pub struct PngError(String);
@@ -35,12 +33,9 @@ pub fn png(svg: &str) -> Result<Vec<u8>, PngError> {
         .map_err(|error| PngError(error.to_string()))
 }
 
-/// A picture of probabilities.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Heat {
-    /// Height in pixels.
     pub height: usize,
-    /// Width in pixels.
     pub width: usize,
     pub png: Vec<u8>,
 }
@@ -71,10 +66,10 @@ mod tests {
 
     #[test]
     fn a_page_has_two_pixels_a_point() {
-        let mut page = Svg::new(10.0, 5.0);
+        let mut page = Svg::new();
         let ink = crate::palette::INK;
         page.rectangle((1.5, 1.0), (3.5, 1.5), ink);
-        let file = png(&page.finish()).expect("a PNG");
+        let file = png(&page.finish(10.0, 5.0)).expect("a PNG");
         let pixels = Pixmap::decode_png(&file).expect("a PNG");
         assert_eq!((pixels.width(), pixels.height()), (20, 10));
         let dark = pixels.pixels().iter().enumerate();

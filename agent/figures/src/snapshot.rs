@@ -1,7 +1,7 @@
 //! One step as the paper draws it: the hidden truth, what could be seen, what was seen along the
 //! path, and the belief in each state, if there is one.
 
-use crate::legend::{Legend, Named, draw_path, draw_robot, draw_start};
+use crate::legend::{Named, draw_legend, draw_path, draw_robot, draw_start};
 use crate::palette::{Color, MUTED, sequential, unlike};
 use crate::panels::{Layout, TITLE_ROOM};
 use crate::svg::{Align, MARGIN, Point, Svg, WIDTH};
@@ -46,12 +46,11 @@ impl Snapshot<'_> {
         let layout = Layout::new(self.truth.dim(), n_panels, (MARGIN, WIDTH - 2.0 * MARGIN));
         let unobserved = self.unobserved();
         let corner = (layout.left(), LEGEND_TOP);
-        let legend = Legend::new(&self.states, &self.observations, unobserved, corner);
-        let top = LEGEND_TOP + legend.height() + 4.0;
-        let mut page = Svg::new(WIDTH, (top + layout.height() + FOOT).ceil());
+        let (mut page, states) = (Svg::new(), &self.states);
         self.draw_title(&mut page, layout.left());
-        legend.draw(&mut page);
-        self.draw_worlds(&mut page, &layout, top);
+        let legend = draw_legend(&mut page, states, &self.observations, unobserved, corner);
+        let top = LEGEND_TOP + legend + 4.0;
+        self.draw_worlds(&mut page, &layout, top, unobserved);
         for (index, (state, belief)) in self.beliefs.iter().enumerate() {
             let title = format!("belief: {state}");
             draw_panel(&mut page, &layout, (3 + index, top), &title, |row, col| {
@@ -61,7 +60,7 @@ impl Snapshot<'_> {
         if !self.beliefs.is_empty() {
             draw_color_bar(&mut page, (layout.left(), top + layout.height() + 34.0));
         }
-        page.finish()
+        page.finish(WIDTH, (top + layout.height() + FOOT).ceil())
     }
 
     /// A grey for what was not observed.
@@ -78,8 +77,7 @@ impl Snapshot<'_> {
         page.text((x, 36.0), Align::Left, TextStyle::NOTE, &note);
     }
 
-    fn draw_worlds(&self, page: &mut Svg, layout: &Layout, top: f64) {
-        let unobserved = self.unobserved();
+    fn draw_worlds(&self, page: &mut Svg, layout: &Layout, top: f64, unobserved: Color) {
         for (index, title, grid, named) in [
             (0, "truth (hidden)", &self.truth, &self.states),
             (

@@ -25,29 +25,19 @@ pub enum Align {
 }
 
 /// The page. What is drawn later lies over what was drawn before.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Svg {
     body: String,
 }
 
 impl Svg {
-    /// An empty page of this size in points.
-    pub fn new(width: f64, height: f64) -> Self {
-        let size =
-            format!("width=\"{width}\" height=\"{height}\" viewBox=\"0 0 {width} {height}\"");
-        // Round joints, as mitred ones grow spikes at sharp angles. A space at the beginning of a text counts
-        // in its width.
-        let body = format!(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" {size} font-family=\"{FAMILY}\" \
-             stroke-linejoin=\"round\" xml:space=\"preserve\">\n\
-             <rect width=\"{width}\" height=\"{height}\" fill=\"{PAPER}\"/>\n"
-        );
-        Self { body }
+    pub fn new() -> Self {
+        Self::default()
     }
 
-    /// A page of the usual width with a title and a line of small print.
-    pub fn titled(height: f64, title: &str, note: &str) -> Self {
-        let mut page = Self::new(WIDTH, height);
+    /// A page with a title and a line of small print.
+    pub fn titled(title: &str, note: &str) -> Self {
+        let mut page = Self::new();
         for (y, style, text) in [
             (36.0, TextStyle::TITLE, title),
             (64.0, TextStyle::NOTE, note),
@@ -58,8 +48,17 @@ impl Svg {
         page
     }
 
-    pub fn finish(self) -> String {
-        self.body + "</svg>\n"
+    /// The text of a page of this size in points.
+    pub fn finish(self, width: f64, height: f64) -> String {
+        // Round joints, as mitred ones grow spikes at sharp angles. A space at the beginning of a text counts
+        // in its width.
+        format!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" \
+             viewBox=\"0 0 {width} {height}\" font-family=\"{FAMILY}\" \
+             stroke-linejoin=\"round\" xml:space=\"preserve\">\n\
+             <rect width=\"{width}\" height=\"{height}\" fill=\"{PAPER}\"/>\n{}</svg>\n",
+            self.body
+        )
     }
 
     /// Fills a rectangle, its edges on whole pixels of a PNG.
@@ -142,13 +141,9 @@ impl Svg {
             " textLength=\"{}\" lengthAdjust=\"spacingAndGlyphs\"",
             short(width)
         );
-        self.letters((start, at.1), style, &length, text);
-    }
-
-    fn letters(&mut self, (x, middle): Point, style: TextStyle, more: &str, text: &str) {
-        let baseline = short(middle + style.size * CAP_HEIGHT / 2.0);
-        let at = format!("x=\"{}\" y=\"{baseline}\"", short(x));
-        let element = style.element(&at, more, text);
+        let baseline = short(at.1 + style.size * CAP_HEIGHT / 2.0);
+        let at = format!("x=\"{}\" y=\"{baseline}\"", short(start));
+        let element = style.element(&at, &length, text);
         self.add(format_args!("{element}"));
     }
 
@@ -187,10 +182,10 @@ mod tests {
 
     #[test]
     fn texts_are_escaped_and_read_back() {
-        let mut page = Svg::new(10.0, 20.0);
+        let mut page = Svg::new();
         let text = "a < b & \"c\" > d\u{0}\u{1b}\n\u{ffff} 'ü 火'";
         page.text((0.0, 10.0), Align::Left, TextStyle::LABEL, text);
-        let svg = page.finish();
+        let svg = page.finish(10.0, 20.0);
         let document = Document::parse(&svg).expect("XML");
         let found = document
             .descendants()
@@ -201,12 +196,12 @@ mod tests {
 
     #[test]
     fn numbers_that_are_none_reach_no_file() {
-        let mut page = Svg::new(10.0, 20.0);
+        let mut page = Svg::new();
         let none = (f64::NAN, f64::INFINITY);
         page.line(&[none, none], 1.0, INK);
         page.rectangle(none, (1e300, 1e300), INK);
         page.disc(none, 1.0, INK);
-        let svg = page.finish();
+        let svg = page.finish(10.0, 20.0);
         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
     }
 }

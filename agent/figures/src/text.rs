@@ -27,7 +27,6 @@ pub static OPTIONS: LazyLock<Options<'static>> = LazyLock::new(|| {
     }
 });
 
-/// How a text looks.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TextStyle {
     pub size: f64,
@@ -36,13 +35,9 @@ pub struct TextStyle {
 }
 
 impl TextStyle {
-    /// A title.
     pub const TITLE: Self = Self::new(20.0, true, INK);
-    /// A label.
     pub const LABEL: Self = Self::new(14.0, false, INK);
-    /// A label that stands out.
     pub const STRONG: Self = Self::new(14.0, true, INK);
-    /// A note.
     pub const NOTE: Self = Self::new(13.0, false, MUTED);
 
     const fn new(size: f64, is_bold: bool, color: Color) -> Self {
@@ -68,7 +63,6 @@ impl TextStyle {
         format!("<text {at} font-size=\"{size}\"{weight}{more} fill=\"{color}\">{text}</text>")
     }
 
-    /// Width of a text in points.
     pub fn width(self, text: &str) -> f64 {
         // A space at the beginning of a text counts in its width.
         let page = format!(

@@ -9,8 +9,8 @@ use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
 use crate::estimation::summary::{summarise, summary_names};
 use crate::learning::learned::Learned;
+use crate::planning::Objective;
 use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
-use crate::planning::{Objective, Plan};
 use crate::rollout::{self, Robot, Seen, in_parallel};
 use crate::server::errors::refused;
 use crate::server::feed::Feed;
@@ -35,7 +35,6 @@ const RENEW_AFTER: u32 = 3;
 pub struct Assignment {
     pub instance: Instance,
     pub worlds: Range<u32>,
-    /// Take the worlds from their holders.
     pub takeover: bool,
     /// What keeps the beliefs: the known model's filter, or the spatial one.
     pub estimator: EstimatorKind,
@@ -51,20 +50,17 @@ pub struct Decider {
     prior: Belief,
     config: AgentConfig,
     choices: Vec<Policy>,
-    robots: Vec<Robot>,
-    last: Vec<Decision>,
+    worlds: Vec<World>,
     last_use: Instant,
     info: AgentInfo,
     feed: Feed,
 }
 
-/// A world that moves.
-struct Moving<'a> {
-    world: u32,
-    robot: &'a mut Robot,
-    last: &'a mut Decision,
-    /// What was asked, and what that is.
-    objective: (u64, Objective),
+/// A world with its robot, and where the belief about it stands.
+struct World {
+    number: u32,
+    robot: Robot,
+    last: Decision,
 }
 
 impl Decider {
@@ -76,7 +72,7 @@ impl Decider {
         };
         let mut client = Client::acquire(connect(&task.instance)?, &claim)?;
         let observations = client.observe(client.robots())?;
-        let choices = Policy::choices(task.estimator, task.planner, &model);
+        let choices = Policy::choices(task.estimator, task.planner, &model.state_names());
         let mut decider = Self {
             last_use: Instant::now(),
             info: agent_info(task, &model, &choices, client.info()),
@@ -86,16 +82,19 @@ impl Decider {
             prior,
             config: task.config.clone(),
             choices,
-            robots: Vec::new(),
-            last: Vec::new(),
+            worlds: Vec::new(),
         };
-        for (world, observation) in task.worlds.clone().zip(observations) {
+        for (number, observation) in task.worlds.clone().zip(observations) {
             let mut robot = decider.robot(observation)?;
-            if !resume(&mut decider.client, world, &mut robot)? {
+            if !resume(&mut decider.client, number, &mut robot)? {
                 robot.begin(None, |_| ())?;
             }
-            decider.last.push(decision(&robot, decider.n_moves(), None));
-            decider.robots.push(robot);
+            let last = decision(&robot, decider.n_moves(), None);
+            decider.worlds.push(World {
+                number,
+                robot,
+                last,
+            });
         }
         Ok(decider)
     }
@@ -105,15 +104,15 @@ impl Decider {
     }
 
     /// Where each world and the belief about it stand.
-    pub fn last(&self) -> &[Decision] {
-        &self.last
+    pub fn last(&self) -> Vec<Decision> {
+        self.worlds.iter().map(|world| world.last.clone()).collect()
     }
 
     /// Starts new episodes with new beliefs in some worlds; the others stay as they are.
     ///
     /// # Errors
     /// After a refusal everything is as it was.
-    pub fn reset(&mut self, seeds: &[WorldSeed]) -> Result<&[Decision]> {
+    pub fn reset(&mut self, seeds: &[WorldSeed]) -> Result<Vec<Decision>> {
         let worlds = self.client.robots();
         if let Some(other) = seeds.iter().find(|seed| !worlds.contains(&seed.world)) {
             return Err(no_such_world(&worlds, other.world).into());
@@ -130,48 +129,53 @@ impl Decider {
                     self.feed.show(&robot.view(world, world..world + 1));
                 }
             })?;
-            self.last[index] = decision(&robot, self.n_moves(), None);
-            self.robots[index] = robot;
+            let last = decision(&robot, self.n_moves(), None);
+            (self.worlds[index].robot, self.worlds[index].last) = (robot, last);
         }
-        Ok(&self.last)
+        Ok(self.last())
     }
 
     /// One step of the rollout in each world that has an objective; the others stay as they are.
     ///
     /// # Errors
     /// After a refusal everything is as it was.
-    pub fn decide(&mut self, objectives: &[Option<u64>]) -> Result<&[Decision]> {
+    pub fn decide(&mut self, objectives: &[Option<u64>]) -> Result<Vec<Decision>> {
         let targets = self.targets(objectives)?;
-        if targets.iter().all(Option::is_none) {
-            return Ok(&self.last);
-        }
         let n_moves = self.n_moves();
-        let worlds = self.client.robots();
-        let mut runs = moving(worlds, &mut self.robots, &mut self.last, targets);
-        let worlds: Vec<u32> = runs.iter().map(|run| run.world).collect();
+        let runs = self.worlds.iter_mut().zip(&targets);
+        let runs = runs.filter_map(|(world, target)| Some((world, (*target)?)));
+        let mut runs: Vec<(&mut World, (u64, Objective))> = runs.collect();
+        if runs.is_empty() {
+            return Ok(self.last());
+        }
+        let worlds: Vec<u32> = runs.iter().map(|run| run.0.number).collect();
         let shown = self.feed.turn(runs.len());
         rollout::step(
             &mut runs,
-            |run| &mut *run.robot,
-            Moving::plan,
+            |(world, _)| &mut world.robot,
+            |(world, (_, objective))| {
+                let robot = &mut world.robot;
+                robot.plan_with(|agent, robots, step| agent.plan_for(*objective, robots, step))
+            },
             |paths| {
                 let observations = step(&mut self.client, &worlds, paths)?;
                 self.last_use = Instant::now();
                 let seen = observations.into_iter();
                 Ok(seen.map(|observation| Seen::new([observation])).collect())
             },
-            |turn, run, _| {
+            |turn, (world, _), _| {
                 if shown.contains(&turn) {
+                    let number = world.number;
                     self.feed
-                        .show(&run.robot.view(run.world, run.world..run.world + 1));
+                        .show(&world.robot.view(number, number..number + 1));
                 }
                 Ok(())
             },
         )?;
-        in_parallel(runs.into_iter(), |run| {
-            *run.last = decision(run.robot, n_moves, Some(run.objective.0));
+        in_parallel(runs.into_iter(), |(world, (asked, _))| {
+            world.last = decision(&world.robot, n_moves, Some(asked));
         });
-        Ok(&self.last)
+        Ok(self.last())
     }
 
     /// How long until the lease wants to be renewed.
@@ -196,8 +200,8 @@ impl Decider {
     }
 
     pub fn release(mut self) -> Result<()> {
-        for (world, robot) in self.client.robots().zip(&self.robots) {
-            leave(&mut self.client, world, robot)?;
+        for world in &self.worlds {
+            leave(&mut self.client, world.number, &world.robot)?;
         }
         Ok(self.client.release()?)
     }
@@ -223,60 +227,33 @@ impl Decider {
 
     /// What each world is to move for, if at all; all are checked before any moves.
     fn targets(&self, asked: &[Option<u64>]) -> Result<Vec<Option<(u64, Objective)>>> {
-        let (expected, got) = (self.robots.len(), asked.len());
+        let (expected, got) = (self.worlds.len(), asked.len());
         if got != expected {
             let problem = format!("objectives: expected {expected}, one a world, got {got}");
             let message = format!("{}: {problem}", Status::Malformed.explain(0));
             return Err(refused(Status::Malformed, 0, message).into());
         }
-        let places = self.client.robots().zip(&self.robots).zip(asked);
-        let targets = places.map(|((world, robot), objective)| {
-            let target = |index| Ok((index, self.target(world, robot, index)?));
+        let targets = self.worlds.iter().zip(asked).map(|(world, objective)| {
+            let target = |index| Ok((index, self.target(world, index)?));
             objective.map(target).transpose()
         });
         targets.collect()
     }
 
-    fn target(&self, world: u32, robot: &Robot, index: u64) -> Result<Objective, ConnectionError> {
+    fn target(&self, world: &World, index: u64) -> Result<Objective, ConnectionError> {
         let choice = usize::try_from(index).ok();
         let Some(choice) = choice.and_then(|index| self.choices.get(index)) else {
             let (status, detail) = (Status::BadObjective, self.choices.len() as u64);
             let expected = status.explain(detail);
-            let message = format!("{expected}, got {index} for world {world}");
+            let message = format!("{expected}, got {index} for world {}", world.number);
             return Err(refused(status, detail, message));
         };
-        if robot.observation().world.truncated != 0 {
-            let (status, detail) = (Status::EpisodeOver, world.into());
+        if world.robot.observation().world.truncated != 0 {
+            let (status, detail) = (Status::EpisodeOver, world.number.into());
             return Err(refused(status, detail, status.explain(detail)));
         }
         Ok(self.config.objective(choice))
     }
-}
-
-impl Moving<'_> {
-    fn plan(&mut self) -> Vec<Plan> {
-        let (_, objective) = self.objective;
-        self.robot
-            .plan_with(|agent, robots, step| agent.plan_for(objective, robots, step))
-    }
-}
-
-fn moving<'a>(
-    worlds: Range<u32>,
-    robots: &'a mut [Robot],
-    last: &'a mut [Decision],
-    targets: Vec<Option<(u64, Objective)>>,
-) -> Vec<Moving<'a>> {
-    let places = worlds.zip(robots).zip(last).zip(targets);
-    let run = |(((world, robot), last), objective)| {
-        Some(Moving {
-            world,
-            robot,
-            last,
-            objective: objective?,
-        })
-    };
-    places.filter_map(run).collect()
 }
 
 /// Flies a path in each of these worlds, which ascend: one message for all that are consecutive.

@@ -168,17 +168,17 @@ impl Service {
                 Reply::Hello(Box::new(self.decider.info().clone()))
             }
             Ok(Request::Reset { worlds }) => {
-                let decisions = self.decider.reset(&worlds)?.to_vec();
+                let decisions = self.decider.reset(&worlds)?;
                 tracing::info!(n_worlds = worlds.len(), "reset");
                 Reply::Decisions { worlds: decisions }
             }
             Ok(Request::Decide { objectives }) => {
-                let worlds = self.decider.decide(&objectives)?.to_vec();
+                let worlds = self.decider.decide(&objectives)?;
                 tracing::debug!(?objectives, "decided");
                 Reply::Decisions { worlds }
             }
             Ok(Request::Last {}) => Reply::Decisions {
-                worlds: self.decider.last().to_vec(),
+                worlds: self.decider.last(),
             },
             Ok(Request::Shutdown {}) => return Ok(None),
         };

@@ -14,7 +14,6 @@ use protocol::model::{Description, ModelError};
 use std::ops::Range;
 use std::time::Duration;
 
-/// What to do on one world.
 #[derive(Debug, Clone)]
 pub struct Mission {
     pub instance: Instance,
@@ -28,7 +27,6 @@ pub struct Mission {
     pub steps: u64,
     /// A step begins this long after the one before, or later; a stop waits for that.
     pub shortest_step: Duration,
-    /// Take the robots from their holders.
     pub takeover: bool,
     /// The model, where the server does not reveal its own.
     pub model: Option<Model>,
@@ -106,7 +104,6 @@ pub fn recorded_states(info: &ServerInfo) -> Result<Option<Model>, ModelError> {
     description.map(Description::model_of).transpose()
 }
 
-/// A server's model, or the one given.
 pub(super) fn model_of(
     instance: &Instance,
     info: &ServerInfo,

@@ -174,7 +174,6 @@ impl Pilot {
         self.robot.begin(truth.as_ref(), look)
     }
 
-    /// Begins the world's next episode.
     fn begin_next(&mut self, mission: &Mission) -> Result<()> {
         let prior = match self.prior.take() {
             Some(prior) => prior,
@@ -295,7 +294,6 @@ impl Pilot {
     }
 }
 
-/// The belief before the first frame.
 fn prior(mission: &Mission, info: &ServerInfo, model: &Model, policy: &Policy) -> Result<Belief> {
     let prior = match policy.estimator.knows_model() {
         true => mission.config.prior(info.burn_in),

@@ -2,32 +2,29 @@
 
 use crate::config::AgentConfig;
 use crate::estimation::belief::Belief;
-use crate::estimation::truth::{Clairvoyant, Oracle, Unchanged};
+use crate::estimation::truth::{Clairvoyant, Oracle};
 use crate::estimation::{
     AutoencoderEstimator, BayesFilter, Correlations, Estimator, SpatialFilter,
 };
 use crate::learning::learned::Learned;
 use crate::learning::learner::LearnedModel;
 use crate::learning::student::decisions::Decisions;
-use crate::learning::student::network::Progress;
-use crate::planning::policy::{EstimatorKind, Policy};
-use crate::planning::{BasisKind, Objective, PlanBasis};
-use crate::rollout::agent::{Agent, Choice, Decider, Setup, numbered_states};
+use crate::planning::BasisKind;
+use crate::planning::action::Action;
+use crate::planning::policy::{EstimatorKind, Policy, numbered_states};
+use crate::rollout::agent::{Agent, Decider, Setup};
 use anyhow::{Context, Result, ensure};
-use protocol::{Cell, Model, Shape};
-use std::sync::Arc;
+use protocol::{Model, Shape};
 
 /// What a misfit is told of.
 const CHECKPOINT: &str = "checkpoint";
 
-/// What an agent is built for.
 #[derive(Debug, Clone, Copy)]
 pub struct Task<'a> {
     /// The model, for filters and predictions.
     pub model: &'a Model,
     pub shape: Shape,
     pub n_moves: usize,
-    /// The belief before the first frame.
     pub prior: &'a Belief,
     /// Seed of the planner's random numbers: the agent's and the world's.
     pub seed: u64,
@@ -43,24 +40,22 @@ pub fn agent(policy: &Policy, config: &AgentConfig, task: Task<'_>) -> Result<Ag
         _ => task.model.state_names(),
     };
     let setup = Setup {
-        basis: PlanBasis::new(basis(policy, &task, config)?),
+        basis: basis(policy, &task, config)?,
         state_names,
         n_moves: task.n_moves,
         seed: task.seed,
+        target: task.learned.target(policy.estimator),
+        decider: match policy.is_decided {
+            true => Some(decider(policy, &task, config)?),
+            false => None,
+        },
     };
-    let decider = policy
-        .is_decided
-        .then(|| decider(policy, &task, config))
-        .transpose()?;
-    let target = task.learned.target(policy.estimator);
-    let agent = Agent::new(estimator, policy, config, setup);
-    Ok(agent.with_target(target).with_decider(decider))
+    Ok(Agent::new(estimator, policy, config, setup))
 }
 
 fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>> {
     let prior = task.prior.clone();
     Ok(match policy.estimator {
-        EstimatorKind::None => Box::new(Unchanged(prior)),
         EstimatorKind::KnownModel => Box::new(BayesFilter::known(task.model, prior)?),
         EstimatorKind::Spatial => {
             let filter = BayesFilter::known(task.model, prior)?;
@@ -73,15 +68,12 @@ fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>> {
         EstimatorKind::LearnedSpatial | EstimatorKind::LearnedOwnSpatial => {
             let learned = learned_model(policy, task)?;
             let filter = learned_filter(learned, task);
-            Box::new(SpatialFilter::new(
-                filter,
-                learned.target,
-                learned.correlations.clone(),
-            ))
+            let correlations = learned.correlations.clone();
+            Box::new(SpatialFilter::new(filter, learned.target, correlations))
         }
         EstimatorKind::Autoencoder => Box::new(autoencoder(policy, task)?),
         EstimatorKind::Truth => Box::new(Oracle::new(task.model, prior)?),
-        EstimatorKind::NextTruth => Box::new(Clairvoyant(prior)),
+        EstimatorKind::None | EstimatorKind::NextTruth => Box::new(Clairvoyant(prior)),
     })
 }
 
@@ -103,42 +95,27 @@ fn basis(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<Basis
 }
 
 /// The DQN that chooses: the one learned beside the belief, or that of a known model's.
-fn decider(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<Box<dyn Decider>> {
+fn decider(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<Decider> {
     if policy.estimator != EstimatorKind::Autoencoder {
         let contents = present(policy, task.learned.decisions.as_ref())?;
         let mut decisions = Decisions::first(task.model, &config.decisions, config.seed);
         decisions.load(contents).context(CHECKPOINT)?;
-        return Ok(Box::new(decisions));
+        return Ok(Box::new(move |estimator, robot, n_moves| {
+            decisions
+                .best_action(estimator.belief(), robot, n_moves)
+                .clone()
+        }));
     }
     let network = present(policy, task.learned.network.as_ref())?.clone();
     let choices = Policy::network_choices(network.autoencoder.shape().n_states);
-    let objectives = choices.iter().map(|choice| config.objective(choice));
-    Ok(Box::new(NetworkDecider {
-        objectives: objectives.collect(),
-        network,
-    }))
-}
-
-/// The DQN of Algorithm 1.
-struct NetworkDecider {
-    network: Arc<Progress>,
-    objectives: Vec<Objective>,
-}
-
-impl Decider for NetworkDecider {
-    fn decide(&self, estimator: &dyn Estimator, robot: Cell, n_moves: usize) -> Choice {
+    let action = |choice: &Policy| Action::plain(&choice.name, config.objective(choice));
+    let actions: Vec<Action> = choices.iter().map(action).collect();
+    Ok(Box::new(move |estimator, robot, n_moves| {
         let follower = estimator.follower();
         let follower = follower.expect("invariant: it decides for an autoencoder");
-        let input = self.network.input.of(follower, robot, n_moves);
-        Choice::Objective(self.objectives[self.network.dqn.best(&input)])
-    }
-}
-
-impl Decider for Decisions {
-    fn decide(&self, estimator: &dyn Estimator, robot: Cell, n_moves: usize) -> Choice {
-        let action = self.best_action(estimator.belief(), robot, n_moves);
-        Choice::Action(action.clone())
-    }
+        let input = network.input.of(follower, robot, n_moves);
+        actions[network.dqn.best(&input)].clone()
+    }))
 }
 
 fn learned_model<'a>(policy: &Policy, task: &Task<'a>) -> Result<&'a LearnedModel> {

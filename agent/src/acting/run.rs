@@ -9,10 +9,8 @@ use protocol::message::Status;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// How often progress is told.
 const REPORT_INTERVAL: Duration = Duration::from_secs(2);
 
-/// What a mission did.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Summary {
     /// Steps in which its paths were flown.
@@ -66,7 +64,6 @@ pub fn run(mission: &Mission, stop: &AtomicBool) -> Result<Summary> {
     }
 }
 
-/// Tells of progress now and then.
 struct Report {
     since: Instant,
     last: Summary,

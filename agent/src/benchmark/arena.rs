@@ -108,12 +108,10 @@ impl Arena {
         self.client.shape()
     }
 
-    /// What the server said of itself.
     pub fn info(&self) -> &ServerInfo {
         self.client.info()
     }
 
-    /// Whether the hidden states are published.
     pub fn shows_truth(&self) -> bool {
         self.truth.is_some()
     }
@@ -123,7 +121,6 @@ impl Arena {
         self.main.len()
     }
 
-    /// Robots of each world.
     pub fn n_robots(&self) -> usize {
         self.info().n_robots as usize
     }
@@ -135,7 +132,6 @@ impl Arena {
         self.client.share_frames(team != Team::Alone);
     }
 
-    /// Agents of each world.
     pub fn n_agents(&self) -> usize {
         self.n_robots() / self.crew
     }

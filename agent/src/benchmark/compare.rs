@@ -24,7 +24,6 @@ use std::time::Duration;
 /// The policy of the team that is told the true states.
 const ORACLE: &str = "oracle_beam";
 
-/// What is compared.
 #[derive(Debug, Clone)]
 pub struct Comparison {
     /// The policies, in the order of the table.
@@ -32,7 +31,6 @@ pub struct Comparison {
     /// How the robots of a world act together, each with each policy.
     pub teams: Vec<Team>,
     pub seeds: Range<u64>,
-    /// Scored steps of each world.
     pub steps: u64,
     /// Steps for which a cell counts as seen after a visit, at least 1.
     pub recent_steps: u32,
@@ -41,7 +39,6 @@ pub struct Comparison {
     pub learned: Learned,
 }
 
-/// What came out.
 #[derive(Debug)]
 pub struct Results {
     /// One run per policy, team and world, in the order of the policies.
@@ -59,14 +56,12 @@ struct Contestant {
     team: Team,
 }
 
-/// One contestant's worlds.
 struct Runs {
     /// The agents of each world, world by world.
     robots: Vec<Robot>,
     worlds: Vec<World>,
 }
 
-/// One world's run of one contestant.
 struct World {
     seed: u64,
     tally: Tally,

@@ -16,7 +16,6 @@ use anyhow::Result;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// What is scored.
 #[derive(Debug, Clone)]
 pub struct Examination<'a> {
     pub guide: &'a str,
@@ -28,7 +27,6 @@ pub struct Examination<'a> {
     pub learned: &'a Learned,
 }
 
-/// Scores on one world.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Marks {
     pub seed: u64,

@@ -17,7 +17,6 @@ pub enum Team {
 }
 
 impl Team {
-    /// Its name in tables and files.
     pub fn label(self) -> &'static str {
         match self {
             Self::Alone => ALONE,

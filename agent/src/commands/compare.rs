@@ -14,9 +14,7 @@ use agent::benchmark::report::{
 use agent::benchmark::team::Team;
 use agent::config::{AgentConfig, AgentFlags};
 use agent::learning::learned::Learned;
-use agent::planning::policy::{
-    EstimatorKind, OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, OF_OWN_FILTER, Policy,
-};
+use agent::planning::policy::{EstimatorKind, Policy};
 use agent::server::launch::OwnDashboard;
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
@@ -124,7 +122,6 @@ impl CompareCommand {
         self.tell(&report, added, &config)
     }
 
-    /// Writes table and files.
     fn tell(&self, report: &Report, added: Vec<PolicyRun>, config: &AgentConfig) -> Result<()> {
         let fits = check_worlds(&added, &report.runs);
         // What was measured is kept in any case.
@@ -274,30 +271,21 @@ fn draw(directory: &Path, report: &Report, all: &[PolicyRun], config: &AgentConf
     std::fs::write(&path, settings).with_context(|| format!("write {}", path.display()))
 }
 
-/// The ladder, with the policies on learned beliefs beside those on the known model.
+/// The ladder, with the policies on what was learned beside those on the known model, the autoencoder's below them.
 fn ladder(model: &Model, learned: &Learned) -> Vec<Policy> {
+    let is_on = |kind| move |policy: &Policy| policy.estimator == kind;
+    let mut policies = learned.policies(model);
+    policies.sort_by_key(|policy| !policy.estimator.knows_model());
+    let (network, others) = policies
+        .into_iter()
+        .partition(is_on(EstimatorKind::Autoencoder));
     let mut ladder = Policy::ladder(model);
-    let named = |name: &&str| Policy::named(name, model).expect("invariant: these are known");
-    let mut insert = |after: fn(&Policy) -> bool, names: &[&str]| {
+    let mut insert = |after: &dyn Fn(&Policy) -> bool, policies: Vec<Policy>| {
         let at = ladder.iter().rposition(after).map_or(0, |last| last + 1);
-        ladder.splice(at..at, names.iter().map(named));
+        ladder.splice(at..at, policies);
     };
-    let is_known = |policy: &Policy| policy.estimator.knows_model();
-    if learned.decisions.is_some() {
-        insert(is_known, &OF_DECISIONS);
-    }
-    if learned.own_filter.is_some() {
-        insert(is_known, &OF_OWN_FILTER);
-    }
-    if learned.filter.is_some() {
-        insert(is_known, &OF_FILTER);
-    }
-    if learned.network.is_some() {
-        insert(
-            |policy| policy.estimator == EstimatorKind::None,
-            &OF_AUTOENCODER,
-        );
-    }
+    insert(&|policy| policy.estimator.knows_model(), others);
+    insert(&is_on(EstimatorKind::None), network);
     ladder
 }
 

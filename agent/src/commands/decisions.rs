@@ -54,7 +54,6 @@ enum EstimatorName {
     SpatialFilter,
 }
 
-/// The planners that have an objective.
 #[derive(Clone, Copy, ValueEnum)]
 enum PlannerName {
     /// Beam search
@@ -64,7 +63,6 @@ enum PlannerName {
 }
 
 impl ServeDecisionsCommand {
-    /// Serves to the end.
     pub fn run(&self) -> Result<()> {
         let model = self.model.as_deref().map(model_named).transpose()?;
         let task = Assignment {

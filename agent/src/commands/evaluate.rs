@@ -12,7 +12,7 @@ use agent::benchmark::team::Team;
 use agent::config::{AgentConfig, AgentFlags};
 use agent::estimation::scoring::Score;
 use agent::learning::learned::Learned;
-use agent::planning::policy::{OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, OF_OWN_FILTER, Policy};
+use agent::planning::policy::Policy;
 use anyhow::Result;
 use clap::Args;
 use network::DeviceKind;
@@ -54,7 +54,6 @@ pub struct EvaluateCommand {
 }
 
 impl EvaluateCommand {
-    /// Scores predictions, then policies.
     pub fn run(&self) -> Result<()> {
         let config = self.settings.effective()?;
         if let Some(path) = &self.csv {
@@ -67,7 +66,7 @@ impl EvaluateCommand {
         let steps = self.worlds.steps(arena.info())?;
         let policies = examined(&learned).into_iter();
         let policies = policies.map(|name| Policy::named(name, arena.model()));
-        let policies = policies.collect::<Result<Vec<_>, _>>()?;
+        let policies = policies.collect::<Result<Vec<_>>>()?;
         for guide in GUIDES {
             let examination = Examination {
                 guide,
@@ -87,22 +86,14 @@ impl EvaluateCommand {
     }
 
     fn policies(&self, arena: &mut Arena, config: AgentConfig, learned: Learned) -> Result<()> {
-        let mut names = POLICIES.to_vec();
-        if learned.filter.is_some() {
-            names.extend(OF_FILTER);
-        }
-        if learned.own_filter.is_some() {
-            names.extend(OF_OWN_FILTER);
-        }
-        if learned.network.is_some() {
-            names.extend(OF_AUTOENCODER);
-        }
-        if learned.decisions.is_some() {
-            names.extend(OF_DECISIONS);
-        }
         let named = |name| Policy::named(name, arena.model());
+        let mut policies = POLICIES
+            .into_iter()
+            .map(named)
+            .collect::<Result<Vec<_>>>()?;
+        policies.extend(learned.policies(arena.model()));
         let comparison = Comparison {
-            policies: names.into_iter().map(named).collect::<Result<_, _>>()?,
+            policies,
             teams: vec![Team::Alone],
             seeds: self.worlds.seeds.clone(),
             steps: self.worlds.steps(arena.info())?,

@@ -38,7 +38,6 @@ pub struct PriorCommand {
 }
 
 impl PriorCommand {
-    /// Simulates and writes.
     pub fn run(&self) -> Result<()> {
         let model = model_named(&self.model)?;
         let shape = Shape::new(self.height, self.width)?;

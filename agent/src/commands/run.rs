@@ -66,7 +66,6 @@ pub struct RunCommand {
 }
 
 impl RunCommand {
-    /// Runs the mission.
     pub fn run(&self) -> Result<()> {
         let model = self.model.as_deref().map(model_named).transpose()?;
         // What no server can fly needs none to be refused.

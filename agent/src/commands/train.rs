@@ -73,7 +73,6 @@ pub struct TrainCommand {
 }
 
 impl TrainCommand {
-    /// Trains until done or told to stop.
     pub fn run(&self) -> Result<()> {
         let mut config = self.settings.effective()?;
         config.learner = self.learner.unwrap_or(config.learner);

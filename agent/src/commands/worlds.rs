@@ -11,13 +11,10 @@ use protocol::{Model, Shape};
 use std::ops::Range;
 use std::path::PathBuf;
 
-/// Most worlds of a comparison.
 const MAX_SEEDS: u64 = 100_000;
 
-/// Burn-in of the benchmark, steps.
 const BENCHMARK_BURN_IN: u64 = 25_000;
 
-/// Scored steps of the benchmark.
 const BENCHMARK_STEPS: u64 = 1500;
 
 /// Flags that say which worlds.
@@ -73,7 +70,6 @@ pub struct GridFlags {
 
 /// Worlds, and the server that was started for them: dropped, it stops.
 pub struct Worlds {
-    /// The worlds.
     pub arena: Arena,
     _own: Option<OwnServer>,
 }
@@ -129,7 +125,6 @@ impl WorldFlags {
         Ok(steps)
     }
 
-    /// Number of worlds.
     pub fn n_seeds(&self) -> u32 {
         (self.seeds.end - self.seeds.start) as u32
     }

@@ -20,7 +20,6 @@ pub struct ObjectiveConfig {
     pub belief: BasisKind,
 }
 
-/// How the learned filter learns.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct LearningConfig {
     pub states: usize,

@@ -10,7 +10,6 @@ use ::network::{Autoencoder, NetworkError, Window};
 use ndarray::Array2;
 use protocol::{Frame, Grid};
 
-/// A network that follows one world.
 pub struct AutoencoderEstimator {
     network: Autoencoder,
     follower: Follower,

@@ -51,7 +51,6 @@ pub enum BeliefError {
 }
 
 impl Belief {
-    /// Every state equally likely in every cell.
     pub fn uniform(n_states: usize, shape: Shape) -> Self {
         Self::everywhere(&vec![1.0 / n_states as f32; n_states], shape)
     }

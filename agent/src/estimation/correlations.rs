@@ -16,13 +16,11 @@ pub const RADIUS: usize = 4;
 /// Rows and columns of a neighbourhood.
 pub const SIDE: usize = 2 * RADIUS + 1;
 
-/// Ranges of ages.
 pub(super) const N_AGES: usize = 8;
 
 /// The last age of each range but the last one, steps.
 const LAST_AGES: [u8; N_AGES - 1] = [1, 2, 4, 7, 12, 25, 60];
 
-/// The range of each age.
 pub const AGE_RANGES: [usize; 256] = {
     let mut ranges = [0; 256];
     let mut age = 1;
@@ -94,14 +92,12 @@ impl Ages {
         &self.0
     }
 
-    /// The next step.
     pub fn grow(&mut self) {
         for age in &mut self.0 {
             *age = age.saturating_add(1);
         }
     }
 
-    /// A cell is seen now.
     pub fn see(&mut self, index: usize) {
         self.0[index] = 0;
     }

@@ -4,7 +4,7 @@
 //! the next predictor `u_{k+1} = Phi(p_k)` (eq. 6). Cells are treated as independent given the
 //! frames, so this is an approximation even with the true model.
 
-use crate::estimation::bayes::{ZeroEvidence, correct};
+use crate::estimation::bayes::correct;
 use crate::estimation::belief::Belief;
 use crate::estimation::estimator::{Estimator, EstimatorError};
 use crate::estimation::parameters::Tables;
@@ -15,7 +15,7 @@ use protocol::grid::{Grid, Probabilities};
 use protocol::model::{Model, ModelError};
 use protocol::transition::Transition;
 
-/// Filter of one world: call [`BayesFilter::correct`] with each frame and [`BayesFilter::predict`] after it.
+/// Filter of one world.
 #[derive(Debug, Clone)]
 pub struct BayesFilter {
     transition: Transition,
@@ -66,45 +66,27 @@ impl BayesFilter {
         &self.likelihood
     }
 
-    /// The predictor `u_k`, or after [`BayesFilter::correct`] the posterior `p_k`.
-    pub fn belief(&self) -> &Belief {
-        &self.belief
-    }
-
     pub(super) fn belief_mut(&mut self) -> &mut Belief {
         &mut self.belief
-    }
-
-    /// Bayes' rule on the visited cells ([`correct`]).
-    ///
-    /// # Errors
-    /// [`ZeroEvidence`]; the belief is then as it was.
-    ///
-    /// # Panics
-    /// If the frame is of another grid or was decoded for more observations than the model has.
-    pub fn correct(&mut self, frame: &Frame) -> Result<(), ZeroEvidence> {
-        correct(&mut self.belief, &self.likelihood, frame)
-    }
-
-    /// The predictor of the next step, `u_{k+1} = Phi(p_k)` (eq. 6).
-    pub fn predict(&mut self) {
-        let belief = self.belief.probabilities_mut();
-        self.transition.apply(belief, &mut self.predictor);
-        std::mem::swap(belief, &mut self.predictor);
     }
 }
 
 impl Estimator for BayesFilter {
+    /// # Panics
+    /// If the frame is of another grid or was decoded for more observations than the model has.
     fn correct(&mut self, frame: &Frame, _: Option<&Grid<u8>>) -> Result<(), EstimatorError> {
-        Ok(BayesFilter::correct(self, frame)?)
+        Ok(correct(&mut self.belief, &self.likelihood, frame)?)
     }
 
     fn predict(&mut self) {
-        BayesFilter::predict(self);
+        let belief = self.belief.probabilities_mut();
+        self.transition.apply(belief, &mut self.predictor);
+        std::mem::swap(belief, &mut self.predictor);
     }
 
+    /// The predictor `u_k`, or after [`Estimator::correct`] the posterior `p_k`.
     fn belief(&self) -> &Belief {
-        BayesFilter::belief(self)
+        &self.belief
     }
 
     fn score(&self, frame: &Frame) -> Result<Option<Score>, EstimatorError> {
@@ -174,7 +156,7 @@ mod tests {
         let mut filter =
             BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape)).expect("valid");
         filter
-            .correct(&frame(shape, &[255, 2, 255]))
+            .correct(&frame(shape, &[255, 2, 255]), None)
             .expect("possible");
         let fire = filter.belief().probability(2);
         assert_eq!([fire[[0, 0]], fire[[0, 2]]], [1.0 / 3.0; 2]);
@@ -193,7 +175,7 @@ mod tests {
         file.states[2].observed_as = vec![0.999, 0.0005, 0.0005];
         let mut filter =
             BayesFilter::known(&Model::new(file).expect("valid"), prior).expect("valid");
-        filter.correct(&frame(shape, &[2])).expect("possible");
+        filter.correct(&frame(shape, &[2]), None).expect("possible");
         assert_eq!(filter.belief().probability(2)[[0, 0]], 1.0);
     }
 }

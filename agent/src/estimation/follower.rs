@@ -10,7 +10,6 @@ use serde::{Deserialize, Serialize};
 pub struct Follower {
     /// `h_k`.
     hidden: Vec<f32>,
-    /// The predictor `u_k` of the next frame.
     prediction: Belief,
 }
 
@@ -30,7 +29,6 @@ impl Follower {
         &self.hidden
     }
 
-    /// The predictor of the next frame.
     pub fn prediction(&self) -> &Belief {
         &self.prediction
     }

@@ -5,8 +5,8 @@
 //! by zero.
 
 use crate::estimation::belief::Belief;
-use anyhow::{Result, bail};
-use ndarray::{Array2, NdFloat};
+use anyhow::{Result, ensure};
+use ndarray::Array2;
 use protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
 use protocol::randomness::split_mix;
 use protocol::{Model, Shape};
@@ -50,37 +50,34 @@ pub struct Parameters {
 
 /// What the free numbers stand for.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Tables<T = f32> {
+pub struct Tables {
     pub dimensions: Dimensions,
     /// `w[to, from, row, col]`, or `w[own, to, from, row, col]`, whose centre only counts where `from` is `own`.
-    pub kernel: Vec<T>,
+    pub kernel: Vec<f32>,
     /// `P(y | x)`, shape `[S, O]`.
-    pub likelihood: Vec<T>,
+    pub likelihood: Vec<f32>,
     /// The belief about every cell before the first frame, shape `[S]`.
-    pub initial: Vec<T>,
+    pub initial: Vec<f32>,
 }
 
 impl Dimensions {
     /// Checks them against the limits of a model.
     pub fn check(self) -> Result<Self> {
-        let values = 2..=MAX_VALUES;
         let side = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
+        let (n_states, n_observations) = (self.n_states, self.n_observations);
+        ensure!(
+            (2..=MAX_VALUES).contains(&n_states),
+            "learned filter: states: expected 2 to {MAX_VALUES}, got {n_states}"
+        );
+        ensure!(
+            (1..=MAX_VALUES).contains(&n_observations),
+            "learned filter: observations: expected 1 to {MAX_VALUES}, got {n_observations}"
+        );
         let (height, width) = self.kernel;
-        let wrong = |what, expected: String, got: String| {
-            bail!("learned filter: {what}: expected {expected}, got {got}")
-        };
-        let range = format!("2 to {MAX_VALUES}");
-        if !values.contains(&self.n_states) {
-            return wrong("states", range, self.n_states.to_string());
-        }
-        if !(1..=MAX_VALUES).contains(&self.n_observations) {
-            let range = format!("1 to {MAX_VALUES}");
-            return wrong("observations", range, self.n_observations.to_string());
-        }
-        if !side(height) || !side(width) {
-            let expected = format!("odd sides up to {MAX_KERNEL_SIDE}");
-            return wrong("kernel", expected, format!("{height} x {width}"));
-        }
+        ensure!(
+            side(height) && side(width),
+            "learned filter: kernel: expected odd sides up to {MAX_KERNEL_SIDE}, got {height} x {width}"
+        );
         Ok(self)
     }
 
@@ -151,19 +148,22 @@ impl Parameters {
         }
     }
 
-    pub fn tables<T: NdFloat>(&self) -> Tables<T> {
-        let cast = |value: f64| T::from(value).expect("invariant: f64 casts to T");
-        let [kernel, likelihood, initial] = &self.tensors;
-        let rows = likelihood.chunks_exact(self.dimensions.n_observations);
+    pub fn tables(&self) -> Tables {
+        let [kernel, _, initial] = &self.tensors;
+        let cast = |numbers: Vec<f64>| numbers.into_iter().map(|number| number as f32).collect();
+        let weight = |&free: &f32| softplus(f64::from(free)) as f32;
         Tables {
             dimensions: self.dimensions,
-            kernel: kernel
-                .iter()
-                .map(|&free| cast(softplus(f64::from(free))))
-                .collect(),
-            likelihood: rows.flat_map(softmax).map(cast).collect(),
-            initial: softmax(initial).into_iter().map(cast).collect(),
+            kernel: kernel.iter().map(weight).collect(),
+            likelihood: cast(self.likelihood()),
+            initial: cast(softmax(initial)),
         }
+    }
+
+    /// `P(y | x)`, shape `[S, O]`.
+    pub fn likelihood(&self) -> Vec<f64> {
+        let rows = self.tensors[1].chunks_exact(self.dimensions.n_observations);
+        rows.flat_map(softmax).collect()
     }
 
     /// Gradients by the free numbers from gradients by the tables.
@@ -193,7 +193,6 @@ impl Parameters {
         tensors.into_iter().find(wrong).map(|(name, _)| name)
     }
 
-    /// Moves every number into ±[`BOUND`].
     pub fn bound(&mut self) {
         for number in self.tensors.iter_mut().flatten() {
             *number = number.clamp(-BOUND, BOUND);
@@ -201,7 +200,7 @@ impl Parameters {
     }
 }
 
-impl Tables<f32> {
+impl Tables {
     /// The learned belief before the first frame, in every cell.
     pub fn prior(&self, shape: Shape) -> Belief {
         Belief::everywhere(&self.initial, shape)
@@ -224,13 +223,10 @@ impl Tables<f32> {
             initial: model.initial().iter().map(cast).collect(),
         }
     }
-}
 
-impl<T: NdFloat> Tables<T> {
     /// `P(y | x)` as an array of shape `[S, O]`.
     pub fn likelihood_array(&self) -> Array2<f64> {
-        let numbers = self.likelihood.iter();
-        let numbers = numbers.map(|p| p.to_f64().expect("invariant: floats cast"));
+        let numbers = self.likelihood.iter().map(|&p| f64::from(p));
         let dim = (self.dimensions.n_states, self.dimensions.n_observations);
         Array2::from_shape_vec(dim, numbers.collect()).expect("invariant: S x O numbers")
     }
@@ -285,9 +281,9 @@ mod tests {
 
     #[test]
     fn tables_are_distributions_and_weights() {
-        let tables: Tables<f64> = Parameters::first(dimensions(), 7).tables();
+        let tables = Parameters::first(dimensions(), 7).tables();
         for row in tables.likelihood.chunks_exact(4).chain([&*tables.initial]) {
-            assert!((row.iter().sum::<f64>() - 1.0).abs() < 1e-12, "{row:?}");
+            assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-6, "{row:?}");
         }
         assert!(tables.kernel.iter().all(|&w| w > 0.0));
         assert!((tables.kernel[1] - 1.0).abs() < 0.11, "own weight");
@@ -302,10 +298,11 @@ mod tests {
             (0..length).map(factor).collect()
         });
         let value = |parameters: &Parameters| -> f64 {
-            let tables: Tables<f64> = parameters.tables();
+            let tables = parameters.tables();
             let all = [tables.kernel, tables.likelihood, tables.initial];
             let products = all.iter().flatten().zip(factors.iter().flatten());
-            products.map(|(table, factor)| table * factor).sum()
+            let product = |(&table, factor): (&f32, &f64)| f64::from(table) * factor;
+            products.map(product).sum()
         };
         let gradient = parameters.chain(&factors);
         for tensor in 0..3 {
@@ -329,31 +326,14 @@ mod tests {
 
     #[test]
     fn dimensions_out_of_range_are_named() {
-        let check = |dimensions: Dimensions, words: &str| {
+        let check = |change: fn(&mut Dimensions), words: &str| {
+            let mut dimensions = dimensions();
+            change(&mut dimensions);
             let error = dimensions.check().expect_err(words).to_string();
             assert!(error.contains(words), "{error}");
         };
-        let fine = dimensions();
-        check(
-            Dimensions {
-                n_states: 1,
-                ..fine
-            },
-            "states: expected 2 to 64, got 1",
-        );
-        check(
-            Dimensions {
-                n_observations: 65,
-                ..fine
-            },
-            "got 65",
-        );
-        check(
-            Dimensions {
-                kernel: (3, 2),
-                ..fine
-            },
-            "odd sides up to 15, got 3 x 2",
-        );
+        check(|it| it.n_states = 1, "states: expected 2 to 64, got 1");
+        check(|it| it.n_observations = 65, "got 65");
+        check(|it| it.kernel = (3, 2), "odd sides up to 15, got 3 x 2");
     }
 }

@@ -7,15 +7,12 @@ use protocol::model::{Model, ModelError};
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
 /// How much the average over the grid weighs in a cell's prior, in worlds: a choice that hardly
 /// matters, as the first frames soon outweigh it.
 const POOLED_WORLDS: f64 = 16.0;
 
-/// The first prior of a filter.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Prior {
     /// How often each cell of simulated worlds is in each state after burn-in: the best that can be
     /// known before the first frame.

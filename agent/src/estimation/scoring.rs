@@ -5,7 +5,6 @@ use ndarray::Array2;
 use protocol::Frame;
 use std::ops::AddAssign;
 
-/// Log-likelihood of seen cells.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Score {
     /// Sum of `ln P(y)`.

@@ -43,13 +43,11 @@ pub struct Spread {
     probability: Vec<f32>,
     /// Of the paying state, before the frame.
     deviation: Vec<f32>,
-    /// Steps since each cell was seen.
     ages: Vec<u8>,
     seen: Vec<Seen>,
     patches: Vec<Patch>,
 }
 
-/// A seen cell.
 #[derive(Debug, Clone)]
 struct Seen {
     cell: Cell,
@@ -134,7 +132,6 @@ impl Spread {
         patch
     }
 
-    /// How many cells are seen.
     pub fn n_seen(&self) -> usize {
         self.seen.len()
     }

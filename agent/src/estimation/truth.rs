@@ -5,16 +5,13 @@ use crate::estimation::estimator::{Estimator, EstimatorError};
 use protocol::model::ModelError;
 use protocol::{Frame, Grid, Model, Probabilities, Transition};
 
-/// Always the prior: no estimation at all.
-pub struct Unchanged(pub Belief);
-
 /// Told X_k: certain of it, and one prediction ahead of it for the next path.
 pub struct Oracle {
     belief: Belief,
     transition: Transition,
 }
 
-/// Told X_{k+1}, the state that the next path will meet.
+/// Told X_{k+1}, the state that the next path will meet; the prior until then, always if nobody tells.
 pub struct Clairvoyant(pub Belief);
 
 impl Oracle {
@@ -24,22 +21,6 @@ impl Oracle {
             transition: Transition::new(model, prior.shape())?,
             belief: prior,
         })
-    }
-}
-
-impl Estimator for Unchanged {
-    fn correct(&mut self, _: &Frame, _: Option<&Grid<u8>>) -> Result<(), EstimatorError> {
-        Ok(())
-    }
-
-    fn predict(&mut self) {}
-
-    fn belief(&self) -> &Belief {
-        &self.0
-    }
-
-    fn sees_frames(&self) -> bool {
-        false
     }
 }
 

@@ -49,13 +49,10 @@ const MAX_COUNT: u64 = 1 << 53;
 #[derive(Debug, Error)]
 #[error("expected contents with digest {expected}, got {got}: the file is damaged")]
 pub struct WrongDigest {
-    /// What the file says.
     pub expected: String,
-    /// What its contents give.
     pub got: String,
 }
 
-/// One tensor.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tensor {
     pub shape: Vec<usize>,
@@ -63,7 +60,6 @@ pub struct Tensor {
     pub numbers: Vec<f32>,
 }
 
-/// The contents of a checkpoint.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Contents {
     pub tensors: BTreeMap<String, Tensor>,
@@ -130,7 +126,6 @@ impl Contents {
         })
     }
 
-    /// The settings that it was trained with.
     pub fn settings(&self) -> Result<AgentConfig> {
         let is_there = !self.settings.is_empty();
         check(is_there, SETTINGS, "those of an agent", "none")?;

@@ -8,13 +8,13 @@
 //! look normal. Labels are anchored where learning starts (state i looks like observation i), and
 //! by a prior on the state that pays most: it is seen almost surely.
 
-pub mod adam;
+mod adam;
 mod correlation;
 mod layout;
 mod operator;
-pub mod trainer;
-pub mod vector;
-pub mod window;
+mod trainer;
+mod window;
 
 pub use adam::Adam;
 pub use trainer::{Trainer, Update};
+pub use window::Window;

@@ -8,6 +8,7 @@ use crate::learning::student::{decisions, network};
 use crate::planning::policy::{EstimatorKind, Policy};
 use ::network::Device;
 use anyhow::{Context, Result, ensure};
+use protocol::Model;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -19,7 +20,6 @@ const KINDS: [&str; 4] = [
     decisions::KIND,
 ];
 
-/// Everything that was learned.
 #[derive(Debug, Clone, Default)]
 pub struct Learned {
     /// A filter, for policies `learned_*`.
@@ -68,7 +68,6 @@ impl Learned {
 }
 
 impl Learned {
-    /// The filter of an estimator.
     pub fn filter(&self, estimator: EstimatorKind) -> Option<&LearnedModel> {
         match estimator {
             EstimatorKind::Learned | EstimatorKind::LearnedSpatial => self.filter.as_ref(),
@@ -77,6 +76,14 @@ impl Learned {
             }
             _ => None,
         }
+    }
+
+    /// The policies that act on it: those of filters, of the autoencoder, and of decisions.
+    pub fn policies(&self, model: &Model) -> Vec<Policy> {
+        let mut policies = Policy::all(model);
+        policies.retain(|policy| policy.needs_checkpoint() && self.suits(policy));
+        policies.sort_by_key(|policy| policy.estimator.knows_model());
+        policies
     }
 
     /// Whether what a policy acts on was learned, if anything has to be.

@@ -16,9 +16,7 @@ use ::network::NamedTensor;
 use anyhow::Result;
 use protocol::{Frame, Shape};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
 
-/// How checkpoints of this learner call it.
 pub const KIND: &str = "learned_filter";
 
 /// The same where kernels see the cell's own state.
@@ -34,7 +32,6 @@ const MAX_OWED: f64 = 2e6;
 #[derive(Debug, Clone, PartialEq)]
 pub struct LearnedModel {
     pub tables: Tables,
-    /// The state that pays most.
     pub target: usize,
     /// How much that state of one cell says of its neighbours'.
     pub correlations: Correlations,
@@ -44,7 +41,6 @@ pub struct LearnedModel {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Learner {
     pub trainer: Trainer,
-    /// Which state pays.
     pub reward: RewardEstimate,
     /// World steps seen, of all worlds together.
     pub world_steps: u64,
@@ -52,9 +48,6 @@ pub struct Learner {
     pub owed: f64,
     replay: Replay,
     neighbours: Neighbours,
-    /// Beliefs before the next frames, by world.
-    #[serde(skip)]
-    predictors: BTreeMap<u32, Belief>,
 }
 
 impl Learner {
@@ -68,36 +61,29 @@ impl Learner {
             owed: 0.0,
             replay: replay(&config.learning),
             neighbours: Neighbours::default(),
-            predictors: BTreeMap::new(),
         }
     }
 
     /// A world's track begins, for the first time or again.
     pub fn begin(&mut self, world: u32) {
         self.replay.begin(world);
-        self.predictors.remove(&world);
         self.neighbours.begin(world, self.trainer.cut().0.n_cells());
     }
 
-    /// Whether a world's track was begun.
     pub fn has_track(&self, world: u32) -> bool {
         self.replay.has_track(world)
     }
 
-    /// The belief before a world's next frame.
-    pub fn expect(&mut self, world: u32, predictor: &Belief) {
-        if self.replay.wants_belief(world) {
-            self.replay.give_belief(world, predictor.as_slice());
-        }
-        self.predictors.insert(world, predictor.clone());
-    }
-
-    /// A world's next frame, and what was known before it.
-    pub fn see(&mut self, world: u32, frame: &Frame, learned: &LearnedModel) {
-        self.replay.push(world, frame);
-        let predictor = self.predictors.remove(&world);
+    /// A world's next frame, the belief before it unless it is the first, and what was known then.
+    pub fn see(
+        &mut self,
+        world: u32,
+        frame: &Frame,
+        predictor: Option<&Belief>,
+        learned: &LearnedModel,
+    ) {
+        self.replay.push(world, frame, predictor);
         let (tables, target) = (&learned.tables, learned.target);
-        let predictor = predictor.as_ref();
         self.neighbours.see(world, frame, predictor, tables, target);
     }
 
@@ -128,7 +114,6 @@ impl Learner {
         self.replay = replay(self.trainer.config());
         self.trainer.leave_replay();
         self.owed = 0.0;
-        self.predictors.clear();
         self.neighbours.forget_worlds();
     }
 
@@ -143,7 +128,6 @@ impl Learner {
         }
     }
 
-    /// How checkpoints call it.
     pub fn kind(&self) -> &'static str {
         if self.trainer.dimensions().sees_own_state {
             OWN_KIND
@@ -262,9 +246,8 @@ mod tests {
         let belief = Belief::uniform(3, shape());
         for &value in values {
             let frame = Frame::from_bytes(shape(), 2, &[value, 255, 1]).expect("a frame");
-            learner.expect(4, &belief);
             let learned = learner.learned();
-            learner.see(4, &frame, &learned);
+            learner.see(4, &frame, Some(&belief), &learned);
             let visited: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
             learner.reward(&belief, &visited, 0.3);
             learner.learn().expect("finite");

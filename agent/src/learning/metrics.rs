@@ -21,7 +21,6 @@ const HEADER: [&str; 6] = [
     "rate",
 ];
 
-/// One step of all worlds.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Tick {
     /// World steps so far, of all worlds together.
@@ -33,7 +32,6 @@ pub struct Tick {
     pub score: Score,
 }
 
-/// What one update did.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelUpdate {
     /// Number of updates of the model so far.
@@ -58,11 +56,9 @@ impl ModelUpdate {
     }
 }
 
-/// The open file.
 pub struct Metrics {
     path: PathBuf,
     writer: csv::Writer<File>,
-    n_more: usize,
 }
 
 impl Metrics {
@@ -95,24 +91,17 @@ impl Metrics {
         writer.write_record(HEADER.iter().chain(more))?;
         rows.iter().try_for_each(|row| writer.write_record(row))?;
         writer.flush()?;
-        let (path, n_more) = (path.to_owned(), more.len());
-        Ok(Self {
-            path,
-            writer,
-            n_more,
-        })
+        let path = path.to_owned();
+        Ok(Self { path, writer })
     }
 
-    /// Adds a step's rows.
-    pub fn add(&mut self, tick: &Tick, updates: &[ModelUpdate], n_updates: u64) -> Result<()> {
-        let nothing = ModelUpdate::nothing(n_updates, self.n_more);
-        let nothing = updates.is_empty().then_some(&nothing);
-        let mut rows = updates.iter().chain(nothing);
-        rows.try_for_each(|update| self.writer.write_record(row(tick, update)))
+    /// Adds a row for each update of a step.
+    pub fn add(&mut self, tick: &Tick, updates: &[ModelUpdate]) -> Result<()> {
+        let mut rows = updates.iter().map(|update| row(tick, update));
+        rows.try_for_each(|row| self.writer.write_record(row))
             .with_context(|| of_file(&self.path))
     }
 
-    /// Writes what is still in memory.
     pub fn flush(&mut self) -> Result<()> {
         let flushed = self.writer.flush();
         flushed.with_context(|| of_file(&self.path))
@@ -163,31 +152,22 @@ fn numbers<'a>(tick: &Tick, update: &'a ModelUpdate) -> impl Iterator<Item = Opt
     numbers.into_iter().chain(update.more.iter().copied())
 }
 
-/// A step's numbers by column, means over its rows; without `world_steps`, and without columns that have
-/// no number. `more`: columns of the learner's own.
+/// A step's numbers by column, means over the rows of its updates; without `world_steps`, and without columns that
+/// have no number. `more`: columns of the learner's own.
 pub fn averages(
     tick: &Tick,
     updates: &[ModelUpdate],
-    n_updates: u64,
     more: &[&'static str],
 ) -> Vec<(&'static str, f64)> {
-    let nothing = [ModelUpdate::nothing(n_updates, more.len())];
-    let updates = if updates.is_empty() {
-        &nothing
-    } else {
-        updates
-    };
-    let rows: Vec<Vec<Option<f64>>> = updates
-        .iter()
-        .map(|update| numbers(tick, update).collect())
-        .collect();
+    let rows = updates.iter().map(|update| numbers(tick, update).collect());
+    let rows: Vec<Vec<Option<f64>>> = rows.collect();
     let mean = |(column, name): (usize, &&'static str)| {
         let there: Vec<f64> = rows.iter().filter_map(|row| row[column]).collect();
         let mean = there.iter().sum::<f64>() / there.len() as f64;
         (!there.is_empty()).then_some((*name, mean))
     };
     let names = HEADER[2..].iter().chain(more).enumerate();
-    let counted = [(HEADER[0], n_updates as f64)];
+    let counted = updates.last().map(|last| (HEADER[0], last.number as f64));
     counted.into_iter().chain(names.filter_map(mean)).collect()
 }
 
@@ -252,7 +232,7 @@ mod tests {
             score: Score::default(),
         };
         let updates = [update(1.0, None), update(2.0, Some(5.0))];
-        let got = averages(&tick, &updates, 7, &["dqn_loss"]);
+        let got = averages(&tick, &updates, &["dqn_loss"]);
         let expected = [
             ("update", 7.0),
             ("loss", 1.5),
@@ -261,7 +241,7 @@ mod tests {
             ("dqn_loss", 5.0),
         ];
         assert_eq!(got, expected);
-        let without = averages(&tick, &[], 7, &["dqn_loss"]);
+        let without = averages(&tick, &[ModelUpdate::nothing(7, 1)], &["dqn_loss"]);
         assert_eq!(without, [("update", 7.0), ("mean_reward", 3.0)]);
     }
 }

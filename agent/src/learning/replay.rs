@@ -12,12 +12,9 @@ use protocol::{Frame, Probabilities, Shape};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// One observed cell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Sighting {
-    /// Row-major index of the cell.
     pub cell: u32,
-    /// What was seen there.
     pub value: u8,
 }
 
@@ -31,7 +28,6 @@ pub struct Block {
     next: u64,
 }
 
-/// Blocks of all tracks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Replay {
     block_length: usize,
@@ -64,37 +60,24 @@ impl Replay {
         }
     }
 
-    /// Whether the world's track was begun.
     pub fn has_track(&self, world: u32) -> bool {
         self.open.contains_key(&world)
     }
 
-    /// Whether the world's next frame is the first of a block that needs a belief to start from.
-    pub fn wants_belief(&self, world: u32) -> bool {
-        let open = self.open.get(&world);
-        open.is_some_and(|(_, block)| {
-            block.frames.is_empty() && block.start.as_deref() == Some(&[])
-        })
-    }
-
-    /// Gives the belief that [`Self::wants_belief`] asks for.
-    pub fn give_belief(&mut self, world: u32, belief: &[f32]) {
-        if let Some((_, block)) = self.open.get_mut(&world) {
-            block.start = Some(belief.to_vec());
-        }
-    }
-
-    /// Adds the next frame of a world's track.
+    /// Adds the next frame of a world's track, and the belief before it where there is one.
     ///
     /// # Panics
     /// If the world's track was not begun.
-    pub fn push(&mut self, world: u32, frame: &Frame) {
+    pub fn push(&mut self, world: u32, frame: &Frame, before: Option<&Belief>) {
         let sighting = |(cell, value)| Sighting {
             cell: cell as u32,
             value,
         };
         let sightings = frame.observed().map(sighting).collect();
         let (_, block) = self.open.get_mut(&world).expect("a track that was begun");
+        if block.frames.is_empty() && block.start.is_some() {
+            block.start = before.map(|belief| belief.as_slice().to_vec());
+        }
         block.frames.push(sightings);
         if block.frames.len() == self.block_length {
             // An empty belief stands for one that is still to be given.
@@ -228,9 +211,9 @@ mod tests {
     }
 
     /// About two states of three cells, another for each number.
-    fn belief(number: u8) -> Vec<f32> {
+    fn belief(number: u8) -> Belief {
         let p = f32::from(number) / 16.0;
-        vec![p, p, p, 1.0 - p, 1.0 - p, 1.0 - p]
+        Belief::everywhere(&[p, 1.0 - p], Shape::new(1, 3).expect("test shape"))
     }
 
     /// A replay with blocks of 2 and room for 3, and two worlds' frames in turn.
@@ -244,10 +227,7 @@ mod tests {
 
     fn see(replay: &mut Replay, value: u8) {
         for world in [0, 5] {
-            if replay.wants_belief(world) {
-                replay.give_belief(world, &belief(value));
-            }
-            replay.push(world, &frame(value));
+            replay.push(world, &frame(value), Some(&belief(value)));
         }
     }
 
@@ -269,7 +249,7 @@ mod tests {
         let mut short = Replay::new(2, 7);
         for _ in 0..9 {
             short.begin(0);
-            short.push(0, &frame(1));
+            short.push(0, &frame(1), None);
         }
         assert_eq!(short.blocks().collect::<Vec<_>>(), [1, 2, 3, 4, 5, 6, 7]);
     }
@@ -278,9 +258,10 @@ mod tests {
     fn beliefs_are_handed_on_along_a_track() {
         let mut replay = replay(4);
         let start = |replay: &Replay, number| replay.block(number).and_then(|it| it.start.clone());
-        assert_eq!(start(&replay, 2), Some(belief(2)));
+        let given = Some(belief(2).as_slice().to_vec());
+        assert_eq!(start(&replay, 2), given);
         replay.hand_on(1, &[9.0]);
-        assert_eq!(start(&replay, 2), Some(belief(2)));
+        assert_eq!(start(&replay, 2), given);
         assert_eq!(start(&replay, 3), Some(vec![9.0]));
         replay.hand_on(2, &[8.0]); // the block after it is not full: nobody to hand on to
         replay.hand_on(77, &[8.0]);
@@ -290,9 +271,8 @@ mod tests {
     fn a_track_ends_with_a_shorter_block() {
         let mut replay = replay(3);
         replay.begin(0);
-        assert!(!replay.wants_belief(0));
-        replay.push(0, &frame(7));
-        replay.push(0, &frame(8));
+        replay.push(0, &frame(7), Some(&belief(7)));
+        replay.push(0, &frame(8), None);
         let kept = replay.blocks().map(|number| {
             let block = replay.block(number).expect("kept");
             (number, block.frames.len(), block.start.clone())
@@ -300,7 +280,7 @@ mod tests {
         let expected = [
             (0, 2, None),
             (1, 2, None),
-            (2, 1, Some(belief(2))),
+            (2, 1, Some(belief(2).as_slice().to_vec())),
             (4, 2, None),
         ];
         assert_eq!(kept.collect::<Vec<_>>(), expected);

@@ -12,10 +12,8 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
-/// The checksum of records.
 const CASTAGNOLI: Crc<u32> = Crc::<u32>::new(&CRC_32_ISCSI);
 
-/// What a file begins with.
 const FILE_VERSION: &str = "brain.Event:2";
 
 /// `SessionLog.START`: what was written for this step and later ones, in older files too, goes.
@@ -24,20 +22,16 @@ const SESSION_START: u64 = 1;
 /// Colour space of a PNG as `Summary.Image` numbers it: RGB.
 const RGB: u64 = 3;
 
-/// What is told of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Value<'a> {
     Scalar(f64),
     Image {
-        /// Height in pixels.
         height: usize,
-        /// Width in pixels.
         width: usize,
         png: &'a [u8],
     },
 }
 
-/// A file that grows.
 #[derive(Debug)]
 pub struct EventFile {
     path: PathBuf,
@@ -70,7 +64,6 @@ impl EventFile {
         self.write(&event(step).message(5, &summary))
     }
 
-    /// Writes what is still in memory.
     pub fn flush(&mut self) -> Result<()> {
         let flushed = self.file.flush();
         flushed.with_context(|| of_file(&self.path))

@@ -14,7 +14,7 @@ use self::events::Events;
 use self::students::student;
 use crate::estimation::scoring::Score;
 use crate::learning::checkpoint::{self, Contents};
-use crate::learning::metrics::{FROZEN, METRICS, Metrics, Tick};
+use crate::learning::metrics::{FROZEN, METRICS, Metrics, ModelUpdate, Tick};
 use crate::learning::student::Student;
 use crate::rollout::Robot;
 use crate::server::feed::Feed;
@@ -34,13 +34,11 @@ const FROZEN_EVENTS: &str = "frozen";
 /// How often a checkpoint is written while training goes on.
 const SAVE_INTERVAL: Duration = Duration::from_secs(30);
 
-/// How often progress is told.
 const REPORT_INTERVAL: Duration = Duration::from_secs(5);
 
 /// The lease outlives a pause of this length, such as a slow disk's or that in which a prior is simulated.
 const LEASE: Duration = Duration::from_secs(600);
 
-/// What a training did.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct TrainSummary {
     /// World steps acted, of all worlds together.
@@ -78,7 +76,6 @@ pub fn train(
     Ok(trainer.summary)
 }
 
-/// A learner and its robots.
 struct Trainer {
     client: Client,
     student: Box<dyn Student>,
@@ -164,10 +161,14 @@ impl Trainer {
                 true => Ok(Vec::new()),
                 false => self.student.learn(),
             };
-            let updates = updates.map_err(|problem| training.stopped(problem, &*self.student))?;
+            let mut updates =
+                updates.map_err(|problem| training.stopped(problem, &*self.student))?;
             self.summary.updates = self.student.n_updates();
-            let n_updates = self.student.n_updates();
-            self.metrics.add(&tick, &updates, n_updates)?;
+            if updates.is_empty() {
+                let n_more = self.student.columns().len();
+                updates.push(ModelUpdate::nothing(self.summary.updates, n_more));
+            }
+            self.metrics.add(&tick, &updates)?;
             self.events.add(&tick, &updates, &*self.student)?;
             self.report(&tick);
             if self.saved.elapsed() > SAVE_INTERVAL {

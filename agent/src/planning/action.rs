@@ -13,7 +13,6 @@ use protocol::{Cell, Grid, Model, Shape};
 /// A path of more moves than the block has cells leaves it again.
 pub const REGION_SLOPE: f32 = 0.3;
 
-/// One choice of a high-level decision.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Action {
     /// Its name in tables and files, unique in its set.
@@ -23,7 +22,6 @@ pub struct Action {
     pub exploration: f32,
     /// Paths that a plan looks ahead, at least 1; only the first is flown.
     pub horizon: usize,
-    /// Where the robot is drawn to.
     pub region: Option<Region>,
 }
 

@@ -4,7 +4,6 @@
 //! with the best score, which is eq. 15 with the sign turned and without its constant factor.
 
 pub mod action;
-pub mod basis;
 pub mod beam;
 pub mod objective;
 mod planner;
@@ -14,9 +13,8 @@ pub mod shooting;
 pub mod team;
 mod window;
 
-pub use basis::{BasisKind, PlanBasis};
 pub use beam::BeamSearch;
-pub use objective::{CellValues, Objective, Target};
+pub use objective::{BasisKind, CellValues, Objective, Target};
 pub use planner::{Plan, Planner, PlanningProblem};
 pub use random_walk::RandomWalk;
 pub use shooting::{Integration, Shooting};

@@ -13,9 +13,17 @@ use serde::{Deserialize, Serialize};
 /// difference (36.4 and 36.6; 8 training worlds, burn-in 25,000, 1,500 steps).
 pub const BEAM_BONUS: f32 = 0.02;
 
-/// What makes a cell worth a visit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+/// A belief that paths may be planned on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+pub enum BasisKind {
+    /// The predictor `u_{k+1}` of where the world stands when the path is observed, as in the authors' code.
+    Predictor,
+    /// The estimate `p_k` of where it stands (the paper as printed, eqs. 13 to 15).
+    Estimate,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Target {
     /// The probability of one state: the paper's actions `a_k < S`.
     State(usize),
@@ -40,13 +48,10 @@ impl Target {
 }
 
 /// What a planner maximises: the sum over a path's cells of the target, plus a bonus per cell.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Objective {
     pub target: Target,
-    /// Added once for each distinct cell.
     pub coverage_bonus: f32,
-    /// Which entropy [`Target::Entropy`] means.
     pub entropy: EntropyKind,
     /// Whether a cell's value counts at every visit (eq. 15 as printed), not only at the first (the
     /// authors' code, and the reward).
@@ -84,7 +89,7 @@ impl Objective {
         }
     }
 
-    /// What the cells are worth under a belief, which [`super::PlanBasis`] chooses.
+    /// What the cells are worth under a belief.
     pub fn values(&self, belief: &Belief) -> CellValues {
         let value = match self.target {
             Target::State(state) => belief.probability(state).to_owned(),
@@ -127,7 +132,6 @@ impl CellValues {
         left
     }
 
-    /// Added once for each distinct cell.
     pub fn coverage_bonus(&self) -> f32 {
         self.coverage_bonus
     }

@@ -4,12 +4,10 @@ use super::objective::CellValues;
 use protocol::grid::Cell;
 use protocol::path::Move;
 
-/// One path to be planned.
 #[derive(Debug, Clone, Copy)]
 pub struct PlanningProblem<'a> {
     /// Where the robot is; must lie on the grid.
     pub start: Cell,
-    /// Number of moves T of the path.
     pub n_moves: usize,
     pub values: &'a CellValues,
     /// Seed of the planner's random stream.
@@ -18,7 +16,6 @@ pub struct PlanningProblem<'a> {
     pub step: u64,
 }
 
-/// A path and what it is worth.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
     /// The moves, `n_moves` of them.

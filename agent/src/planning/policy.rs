@@ -2,8 +2,6 @@
 
 mod list;
 mod named;
-mod names;
 
 pub use list::list;
-pub use named::{EstimatorKind, PlannerKind, Policy, UnknownPolicy};
-pub use names::{OF_AUTOENCODER, OF_DECISIONS, OF_FILTER, OF_OWN_FILTER};
+pub use named::{EstimatorKind, PlannerKind, Policy, numbered_states};

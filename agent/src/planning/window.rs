@@ -48,7 +48,6 @@ impl Window {
         self.rows * self.cols
     }
 
-    /// Row-major index of a cell.
     #[inline]
     pub fn index(&self, row: u32, col: u32) -> usize {
         row as usize * self.cols + col as usize

@@ -7,62 +7,49 @@ use crate::estimation::scoring::Score;
 use crate::planning::action::Action;
 use crate::planning::policy::{PlannerKind, Policy};
 use crate::planning::team::{ROUNDS, plan_team};
-use crate::planning::{Objective, Plan, PlanBasis, Planner, RandomWalk, Target};
+use crate::planning::{BasisKind, Objective, Plan, Planner, RandomWalk, Target};
 use anyhow::Result;
 use protocol::agent_belief::Intent;
 use protocol::{Cell, Frame, Grid};
 use std::time::Duration;
 
 /// What a path that was not planned was for.
-pub const RANDOM_MOVES: &str = "random moves";
+const RANDOM_MOVES: &str = "random moves";
 
 /// A policy at work on one world.
 pub struct Agent {
     policy: Policy,
-    pub(crate) objective: Objective,
+    /// What each path is for, unless that is decided.
+    action: Action,
+    decider: Option<Decider>,
     estimator: Box<dyn Estimator>,
-    pub(crate) basis: PlanBasis,
+    pub(crate) basis: BasisKind,
+    /// The last estimate p_k, where paths are planned on it.
+    estimate: Option<Belief>,
     planner: Box<dyn Planner + Send>,
-    decider: Option<Box<dyn Decider>>,
     /// The state that pays most, where that is learned.
     target: Option<usize>,
-    /// What the last path was for.
-    pub(crate) aim: Aim,
+    /// What the last path was for, in a word or two.
+    aim: String,
     state_names: Vec<String>,
     n_moves: usize,
     seed: u64,
 }
 
-/// What a path was for.
-pub(crate) enum Aim {
-    Nothing,
-    Walk,
-    Objective(Target),
-    Action(String),
-}
-
-/// Chooses what each path is for (paper eq. 17), given the estimator after its prediction.
-pub trait Decider: Send {
-    /// The choice for a robot's cell.
-    fn decide(&self, estimator: &dyn Estimator, robot: Cell, n_moves: usize) -> Choice;
-}
-
-/// What a path may be for.
-pub enum Choice {
-    /// The cells that are worth most.
-    Objective(Objective),
-    /// One of [`crate::planning::action::ActionSet`].
-    Action(Action),
-}
+/// Chooses what the next path is for (paper eq. 17), given the estimator after its prediction, a robot's cell and the
+/// number of moves.
+pub type Decider = Box<dyn Fn(&dyn Estimator, Cell, usize) -> Action + Send>;
 
 /// What an agent has beside its estimator and its policy.
-#[derive(Debug, Clone)]
 pub struct Setup {
-    pub basis: PlanBasis,
+    pub basis: BasisKind,
     pub state_names: Vec<String>,
     pub n_moves: usize,
     /// Seed of the planner's random numbers: the agent's and the world's.
     pub seed: u64,
+    /// What the belief calls the state that pays most, where its states were learned.
+    pub target: Option<usize>,
+    pub decider: Option<Decider>,
 }
 
 impl Agent {
@@ -73,34 +60,31 @@ impl Agent {
         config: &AgentConfig,
         setup: Setup,
     ) -> Self {
+        let mut objective = config.objective(policy);
+        if let (Target::State(state), Some(target)) = (&mut objective.target, setup.target) {
+            *state = target;
+        }
+        let plain = || Action::plain(&objective.target.label(&setup.state_names), objective);
+        let is_random = policy.planner == PlannerKind::RandomWalk;
+        let aim = if is_random {
+            RANDOM_MOVES
+        } else {
+            "nothing yet"
+        };
         Self {
             policy: policy.clone(),
-            objective: config.objective(policy),
+            action: policy.action.clone().unwrap_or_else(plain),
+            decider: setup.decider,
             estimator,
             basis: setup.basis,
+            estimate: None,
             planner: config.planner(policy),
-            decider: None,
-            target: None,
-            aim: Aim::Nothing,
+            target: setup.target,
+            aim: aim.into(),
             state_names: setup.state_names,
             n_moves: setup.n_moves,
             seed: setup.seed,
         }
-    }
-
-    /// The same, for a belief that calls what pays most a state of its own.
-    pub fn with_target(mut self, target: Option<usize>) -> Self {
-        self.target = target;
-        if let (Target::State(state), Some(target)) = (&mut self.objective.target, target) {
-            *state = target;
-        }
-        self
-    }
-
-    /// The same, with what chooses its objectives.
-    pub fn with_decider(mut self, decider: Option<Box<dyn Decider>>) -> Self {
-        self.decider = decider;
-        self
     }
 
     /// The state that the belief calls what pays most; `otherwise` unless that is learned.
@@ -108,39 +92,39 @@ impl Agent {
         self.target.unwrap_or(otherwise)
     }
 
+    /// What the next path of a robot is for.
+    pub(crate) fn choose(&self, robot: Cell) -> Action {
+        match &self.decider {
+            Some(decide) => decide(&*self.estimator, robot, self.n_moves),
+            None => self.action.clone(),
+        }
+    }
+
     /// The paths for step k -> k + 1, from where the robots are (paper eq. 15). Decisions are made for the first robot.
     pub fn plan(&mut self, robots: &[Cell], step: u64) -> Vec<Plan> {
-        let estimator = &*self.estimator;
-        let decided = self.decider.as_ref();
-        let decided = decided.map(|decider| decider.decide(estimator, robots[0], self.n_moves));
-        let always = || self.policy.action.clone().map(Choice::Action);
-        match decided.or_else(always) {
-            Some(Choice::Action(action)) => self.plan_action(&action, robots, step),
-            Some(Choice::Objective(objective)) => self.plan_for(objective, robots, step),
-            None => self.plan_for(self.objective, robots, step),
-        }
+        self.plan_action(&self.choose(robots[0]), robots, step)
     }
 
     /// As [`Self::plan`], for an action other than the policy's.
     pub fn plan_action(&mut self, action: &Action, robots: &[Cell], step: u64) -> Vec<Plan> {
-        self.aim = Aim::Action(action.name.clone());
-        let belief = self.basis.belief(self.estimator.belief());
+        if self.policy.planner != PlannerKind::RandomWalk {
+            self.aim.clone_from(&action.name);
+        }
+        let belief = self.estimate.as_ref().unwrap_or(self.estimator.belief());
         let random = (self.seed, step);
         action.plan(&mut *self.planner, belief, robots, self.n_moves, random)
     }
 
     /// As [`Self::plan`], for an objective other than the policy's.
     pub fn plan_for(&mut self, objective: Objective, robots: &[Cell], step: u64) -> Vec<Plan> {
-        self.aim = Aim::Objective(objective.target);
-        let values = objective.values(self.basis.belief(self.estimator.belief()));
-        let (planner, random) = (&mut *self.planner, (self.seed, step));
-        plan_team(planner, &values, robots, self.n_moves, random, ROUNDS)
+        let name = objective.target.label(&self.state_names);
+        self.plan_action(&Action::plain(&name, objective), robots, step)
     }
 
     /// As [`Self::plan`], paths of random moves.
     pub fn walk(&mut self, robots: &[Cell], step: u64) -> Vec<Plan> {
-        self.aim = Aim::Walk;
-        let values = self.objective.values(self.estimator.belief());
+        self.aim = RANDOM_MOVES.into();
+        let values = self.action.values(self.estimator.belief());
         let (planner, random) = (&mut RandomWalk, (self.seed, step));
         plan_team(planner, &values, robots, self.n_moves, random, ROUNDS)
     }
@@ -160,8 +144,17 @@ impl Agent {
 
     /// Moves the belief from X_k to X_{k+1} (paper eq. 6).
     pub fn predict(&mut self) {
-        self.basis.see(self.estimator.belief());
+        if self.basis == BasisKind::Estimate {
+            self.estimate = Some(self.estimator.belief().clone());
+        }
         self.estimator.predict();
+    }
+
+    /// Goes on from an estimate p_k, if paths are planned on it.
+    pub fn remember_estimate(&mut self, estimate: Option<&Belief>) {
+        if self.basis == BasisKind::Estimate {
+            self.estimate = estimate.cloned();
+        }
     }
 
     /// Tells a clairvoyant agent the state X_{k+1} that its next path will meet; others ignore it.
@@ -182,24 +175,9 @@ impl Agent {
         &mut *self.estimator
     }
 
-    pub fn basis_mut(&mut self) -> &mut PlanBasis {
-        &mut self.basis
-    }
-
     /// The estimate p_k, where paths are planned on it.
     pub fn estimate(&self) -> Option<&Belief> {
-        self.basis.estimate()
-    }
-
-    /// What the last path was for, in a word or two.
-    fn aim(&self) -> String {
-        match &self.aim {
-            _ if self.policy.planner == PlannerKind::RandomWalk => RANDOM_MOVES.into(),
-            Aim::Walk => RANDOM_MOVES.into(),
-            Aim::Nothing => "nothing yet".into(),
-            Aim::Objective(target) => target.label(&self.state_names),
-            Aim::Action(name) => name.clone(),
-        }
+        self.estimate.as_ref()
     }
 
     /// What it tells observers; `planning`: time that its last plan took.
@@ -207,7 +185,7 @@ impl Agent {
         Intent {
             policy: self.policy.name.clone(),
             belief_from: self.policy.estimator.label().into(),
-            objective: self.aim(),
+            objective: self.aim.clone(),
             states: self.state_names.clone(),
             plan_millis: planning.as_secs_f64() * 1e3,
         }
@@ -216,11 +194,4 @@ impl Agent {
     pub fn policy(&self) -> &Policy {
         &self.policy
     }
-}
-
-/// Names of states that were learned.
-pub fn numbered_states(n_states: usize) -> Vec<String> {
-    (0..n_states)
-        .map(|state| format!("state {state}"))
-        .collect()
 }

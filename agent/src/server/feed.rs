@@ -20,10 +20,8 @@ pub struct Feed {
     turns: Turns,
 }
 
-/// Whose turn it is.
 #[derive(Default)]
 struct Turns {
-    /// When a world was shown last.
     shown: Option<Instant>,
     n_shown: usize,
 }
@@ -68,7 +66,6 @@ impl Feed {
         }
     }
 
-    /// Whether anybody looks.
     pub fn is_watched(&self) -> bool {
         self.publisher
             .as_ref()

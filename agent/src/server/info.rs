@@ -11,7 +11,6 @@ use std::time::{Duration, Instant};
 /// How long to wait between attempts to reach a server that is away.
 pub const RETRY_INTERVAL: Duration = Duration::from_millis(200);
 
-/// Connects to an instance's server.
 pub fn connect(instance: &Instance) -> Result<Connection, ConnectionError> {
     let name = concat!("emberwatch-agent ", env!("CARGO_PKG_VERSION"));
     Connection::open(instance, name, STEP_TIMEOUT)

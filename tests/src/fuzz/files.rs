@@ -211,9 +211,8 @@ fn filter(dimensions: Dimensions) -> Contents {
     learner.begin(0);
     for value in [0, 1, 1, 0, 1] {
         let frame = Frame::from_bytes(shape, 2, &[value, 255, 1]).expect("a frame");
-        learner.expect(0, &belief);
         let learned = learner.learned();
-        learner.see(0, &frame, &learned);
+        learner.see(0, &frame, Some(&belief), &learned);
         learner.reward(&belief, &[0, 2], 0.5);
         learner.learn().expect("finite");
     }

@@ -4,12 +4,12 @@ use super::*;
 use crate::estimation::dqn_input::DqnInput;
 use crate::learning::learner::Learner;
 use crate::learning::student::Worlds;
-use crate::planning::PlanningProblem;
-use crate::rollout::agent::Aim;
+use crate::learning::student::network::Progress;
 use ::network::{Device, Dqn, DqnSettings};
 use anyhow::Result;
 use protocol::randomness::split_mix;
-use protocol::{Frame, Grid};
+use protocol::{Cell, Frame, Grid};
+use std::sync::Arc;
 
 const N_MOVES: usize = 6;
 const ROBOT: Cell = Cell { row: 4, col: 4 };
@@ -83,28 +83,10 @@ fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
         agent.predict();
         agent.foresee(&world(step + 1).0).expect("valid states");
         let predictor = agent.belief().clone();
-        let got = agent.plan(&[ROBOT], step);
+        let (action, got) = (agent.choose(ROBOT), agent.plan(&[ROBOT], step));
         for (all, belief) in all.iter_mut().zip([estimate, predictor]) {
             let mut planner = config.planner(agent.policy());
-            let expected = match (&agent.policy().action, &agent.aim) {
-                (Some(action), _) => {
-                    action.plan(&mut *planner, &belief, &[ROBOT], N_MOVES, (7, step))
-                }
-                (None, Aim::Objective(target)) => {
-                    let objective = Objective {
-                        target: *target,
-                        ..agent.objective
-                    };
-                    vec![planner.plan(&PlanningProblem {
-                        start: ROBOT,
-                        n_moves: N_MOVES,
-                        values: &objective.values(&belief),
-                        seed: 7,
-                        step,
-                    })]
-                }
-                _ => panic!("{policy}: nothing was aimed at"),
-            };
+            let expected = action.plan(&mut *planner, &belief, &[ROBOT], N_MOVES, (7, step));
             *all &= got == expected;
         }
     }
@@ -176,7 +158,7 @@ fn decisions_are_planned_on_the_belief_that_they_were_learned_with() {
         contents.settings = toml::to_string(&config(basis)).expect("TOML");
         learned.decisions = Some(Arc::new(contents));
         let agent = agent("dqn_beam", &other, &learned).expect("an agent");
-        assert_eq!(agent.basis.kind(), basis);
+        assert_eq!(agent.basis, basis);
     }
 }
 
@@ -204,11 +186,7 @@ fn a_network_decides_on_what_it_was_learned_with() {
         let mut agent = agent("autoencoder_policy", &config, &learned).expect("an agent");
         agent.correct(&world(0).1, None).expect("possible");
         agent.predict();
-        agent.plan(&[ROBOT], 0);
-        assert!(
-            matches!(agent.aim, Aim::Objective(target) if target == expected),
-            "{}",
-            input.label()
-        );
+        let target = agent.choose(ROBOT).objective.target;
+        assert_eq!(target, expected, "{}", input.label());
     }
 }

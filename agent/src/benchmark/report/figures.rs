@@ -103,7 +103,7 @@ pub fn draw_ladder(path: &Path, runs: &[PolicyRun], axis_label: &str) -> Result<
 }
 
 fn estimated<'a>(group: &'a Group<'a>) -> Option<(&'a Group<'a>, Estimate)> {
-    let estimate = Estimate::of(&group.values(|run| run.mean_reward));
+    let estimate = group.estimate(|run| Some(run.mean_reward));
     estimate.map(|estimate| (group, estimate))
 }
 
@@ -128,7 +128,6 @@ fn bar(group: &Group<'_>, groups: &[Group<'_>], reward: Estimate, decimals: usiz
     }
 }
 
-/// The number of a policy's family.
 fn family(group: &Group<'_>) -> usize {
     let policy = group.policy.to_lowercase();
     match group.estimator {

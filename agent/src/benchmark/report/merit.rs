@@ -1,20 +1,8 @@
 //! The figures of merit as a table below that of the rewards.
 
-use crate::benchmark::report::number::{NOTHING, signed, with_error};
-use crate::benchmark::report::plain_table::plain_table;
-use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};
-use crate::benchmark::report::statistics::Estimate;
-
-const HEADER: [&str; 8] = [
-    "policy",
-    "detected",
-    "after steps",
-    "burning then",
-    "burning seen %",
-    "difference",
-    "front",
-    "grid seen %",
-];
+use crate::benchmark::report::columns::Columns;
+use crate::benchmark::report::number::NOTHING;
+use crate::benchmark::report::policy_run::{Group, PolicyRun};
 
 /// The table with its heading; `None` of runs that lack the figures, as those of old files do.
 ///
@@ -29,64 +17,34 @@ pub(super) fn merit_table(groups: &[Group<'_>], baseline: &str) -> Option<String
     );
     if groups
         .iter()
-        .all(|group| group.known(burning_seen).is_empty())
+        .all(|group| group.by_seed(burning_seen).is_empty())
     {
         heading += "No burning cells seen, and no front: no hidden states were published, or \
                     nothing burnt.\n";
     }
-    let mut table = plain_table(&HEADER);
-    for group in groups {
-        table.add_row(row(group, groups, baseline));
-    }
-    Some(format!("{heading}\n{table}"))
-}
-
-fn row(group: &Group<'_>, groups: &[Group<'_>], baseline: &str) -> Vec<String> {
-    let mean = |value: fn(&PolicyRun) -> Option<f64>| {
-        let values: Vec<f64> = group.known(value).into_values().collect();
-        with_error(Estimate::of(&values), 1)
-    };
-    vec![
-        name(group, groups),
-        detected(group),
-        mean(|run| run.steps_to_detection.map(|steps| steps as f64)),
-        mean(|run| run.burning_cells_at_detection.map(f64::from)),
-        mean(burning_seen),
-        difference(group, groups, baseline),
-        mean(|run| run.front_distance),
-        mean(|run| run.grid_seen_share.map(percent)),
-    ]
-}
-
-/// The policy, with its estimator and team where there are several of it.
-fn name(group: &Group<'_>, groups: &[Group<'_>]) -> String {
-    match group.marks(groups).as_slice() {
-        [] => group.policy.into(),
-        marks => format!("{} ({})", group.policy, marks.join(", ")),
-    }
+    let mut columns = Columns::default();
+    columns.add("policy", |group| group.name(groups));
+    columns.add("detected", detected);
+    columns.add_estimate("after steps", 1, |run| {
+        run.steps_to_detection.map(|steps| steps as f64)
+    });
+    columns.add_estimate("burning then", 1, |run| {
+        run.burning_cells_at_detection.map(f64::from)
+    });
+    columns.add_estimate("burning seen %", 1, burning_seen);
+    columns.add_difference(groups, baseline, 1, burning_seen);
+    columns.add_estimate("front", 1, |run| run.front_distance);
+    columns.add_estimate("grid seen %", 1, |run| run.grid_seen_share.map(percent));
+    Some(format!("{heading}\n{}", columns.table(groups)))
 }
 
 /// In how many worlds fire was detected.
 fn detected(group: &Group<'_>) -> String {
-    let n_worlds = group.known(|run| run.grid_seen_share).len();
-    let n_detected = group.known(|run| run.steps_to_detection.map(|_| 1.0)).len();
+    let n_worlds = group.by_seed(|run| run.grid_seen_share).len();
+    let detection = |run: &PolicyRun| run.steps_to_detection.map(|_| 1.0);
     match n_worlds {
         0 => NOTHING.into(),
-        _ => format!("{n_detected} of {n_worlds}"),
-    }
-}
-
-fn difference(group: &Group<'_>, groups: &[Group<'_>], baseline: &str) -> String {
-    let is_baseline = |other: &Group<'_>| {
-        (other.policy, other.robots, other.team) == (baseline, group.robots, ALONE)
-    };
-    match groups.iter().rfind(|other| is_baseline(other)) {
-        _ if is_baseline(group) => "baseline".into(),
-        None => NOTHING.into(),
-        Some(base) => {
-            let (seen, base) = (group.known(burning_seen), base.known(burning_seen));
-            signed(Estimate::of_difference(&seen, &base), 1)
-        }
+        _ => format!("{} of {n_worlds}", group.by_seed(detection).len()),
     }
 }
 

@@ -4,11 +4,11 @@
 //! Read [`statistics`] first, then [`table`] and [`figures`]. [`training`] turns metrics into curves.
 
 pub mod added;
+mod columns;
 pub mod events;
 pub mod figures;
 mod merit;
 mod number;
-mod plain_table;
 mod policy_run;
 mod rewards;
 pub mod statistics;

@@ -1,5 +1,6 @@
 //! What a comparison measured, and its groups.
 
+use crate::benchmark::report::statistics::Estimate;
 use crate::file::{Readers, replace_file};
 use anyhow::Result;
 use serde::{Deserialize, Serialize};
@@ -12,7 +13,6 @@ pub const ALONE: &str = "alone";
 /// One policy on one world: what `emberwatch-agent compare` measured, and a row of its CSV.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PolicyRun {
-    /// Name of the policy, such as `beam`.
     pub policy: String,
     /// Where the belief came from: `none`, `known_model`, `truth`, `next_truth` or a learned one.
     pub estimator: String,
@@ -29,12 +29,10 @@ pub struct PolicyRun {
     pub mean_plan_millis: f64,
     /// Mean Brier score of the belief, where there is a belief.
     pub brier: Option<f64>,
-    /// Moves of a path.
     pub moves: usize,
     /// Robots of the world. Rewards, cells and plans are those of all together.
     #[serde(default = "one")]
     pub robots: u32,
-    /// How they act together, such as `joint`.
     #[serde(default = "alone")]
     pub team: String,
     /// Share of the visits to distinct cells that a teammate made in the same step, in `0..1`.
@@ -93,17 +91,14 @@ pub(super) struct Group<'a> {
 }
 
 impl Group<'_> {
-    pub(super) fn values(&self, value: impl Fn(&PolicyRun) -> f64) -> Vec<f64> {
-        self.runs.iter().map(|run| value(run)).collect()
+    /// The mean over the runs that have a value.
+    pub(super) fn estimate(&self, value: impl Fn(&PolicyRun) -> Option<f64>) -> Option<Estimate> {
+        let values: Vec<f64> = self.runs.iter().filter_map(|run| value(run)).collect();
+        Estimate::of(&values)
     }
 
-    pub(super) fn by_seed(&self, value: impl Fn(&PolicyRun) -> f64) -> BTreeMap<u64, f64> {
-        let pair = |run: &&PolicyRun| (run.world_seed, value(run));
-        self.runs.iter().map(pair).collect()
-    }
-
-    /// By seed, of the runs that have the value.
-    pub(super) fn known(&self, value: impl Fn(&PolicyRun) -> Option<f64>) -> BTreeMap<u64, f64> {
+    /// The values of the runs that have one, by seed.
+    pub(super) fn by_seed(&self, value: impl Fn(&PolicyRun) -> Option<f64>) -> BTreeMap<u64, f64> {
         let pair = |run: &&PolicyRun| Some((run.world_seed, value(run)?));
         self.runs.iter().filter_map(pair).collect()
     }
@@ -111,6 +106,14 @@ impl Group<'_> {
     /// Whether there is more than a robot alone in its world.
     pub(super) fn is_team(&self) -> bool {
         (self.robots, self.team) != (1, ALONE)
+    }
+
+    /// The policy, with what tells it from others of that policy.
+    pub(super) fn name(&self, groups: &[Self]) -> String {
+        match self.marks(groups).as_slice() {
+            [] => self.policy.into(),
+            marks => format!("{} ({})", self.policy, marks.join(", ")),
+        }
     }
 
     /// What tells it from the other groups of its policy: estimator and team, where these differ.

@@ -78,17 +78,8 @@ fn curves(groups: &[Group<'_>], window: usize) -> Vec<Curve> {
     let mut ranked: Vec<&Group<'_>> = groups.iter().collect();
     ranked.sort_by(|a, b| mean(b).total_cmp(&mean(a)));
     let best = ranked.into_iter().take(MOST_CURVES);
-    best.map(|group| curve(group, short_name(group, groups), window))
+    best.map(|group| curve(group, readable(&group.name(groups)), window))
         .collect()
-}
-
-/// The policy, with its estimator and team where the policy stands more than once.
-fn short_name(group: &Group<'_>, groups: &[Group<'_>]) -> String {
-    let policy = readable(group.policy);
-    match group.marks(groups).as_slice() {
-        [] => policy,
-        marks => format!("{policy} ({})", readable(&marks.join(", "))),
-    }
 }
 
 /// Over the steps that all worlds made.

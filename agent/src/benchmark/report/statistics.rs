@@ -5,7 +5,6 @@
 
 use std::collections::BTreeMap;
 
-/// A mean over worlds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
     pub mean: f64,
@@ -52,19 +51,6 @@ pub fn ratio_of_means(values: &BTreeMap<u64, f64>, reference: &BTreeMap<u64, f64
             (above + value, below + base)
         });
     (below > 0.0).then(|| above / below)
-}
-
-/// Median; the mean of the middle two where their number is even, `None` where it is zero.
-pub fn median(values: &[f64]) -> Option<f64> {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let middle = sorted.len() / 2;
-    if sorted.len() % 2 == 1 {
-        Some(sorted[middle])
-    } else {
-        let below = sorted.get(middle.checked_sub(1)?)?;
-        Some((below + sorted[middle]) / 2.0)
-    }
 }
 
 fn shared<'a>(
@@ -125,12 +111,5 @@ mod tests {
         );
         assert_eq!(ratio_of_means(&a, &BTreeMap::from([(1, 0.0)])), None);
         assert_eq!(ratio_of_means(&a, &BTreeMap::new()), None);
-    }
-
-    #[test]
-    fn medians_of_odd_even_and_empty_lists() {
-        assert_eq!(median(&[3.0, 1.0, 2.0]), Some(2.0));
-        assert_eq!(median(&[4.0, 1.0, 2.0, 3.0]), Some(2.5));
-        assert_eq!(median(&[]), None);
     }
 }

@@ -46,7 +46,7 @@ fn curve((policy, team): (&str, &str), kinds: &[(&str, &str)], groups: &[Group<'
         .filter(|it| (it.policy, it.team) == (policy, team));
     let mut points: Vec<(f64, Estimate)> = own
         .filter_map(|group| {
-            let reward = Estimate::of(&group.values(|run| run.mean_reward))?;
+            let reward = group.estimate(|run| Some(run.mean_reward))?;
             Some((f64::from(group.robots), reward))
         })
         .collect();

@@ -13,7 +13,6 @@ pub const FIGURES: [&str; 2] = ["training.png", "training.svg"];
 /// Points of a curve: each is the mean over a part of the rows.
 const POINTS: usize = 200;
 
-/// Draws a training's metrics into its folder.
 pub fn draw_training(folder: &Path) -> Result<()> {
     let rows = Rows::read(folder)?;
     let curve = |column: &str, name: &str| averages(&rows, column, name);

@@ -6,24 +6,11 @@ use serde::{Deserialize, Serialize};
 /// Added to the root of the second moment: the paper's.
 const EPSILON: f64 = 1e-8;
 
-/// The optimiser's state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Adam {
-    /// Decaying mean of gradients.
     pub first: Parameters,
-    /// Decaying mean of their squares.
     pub second: Parameters,
     pub n_steps: u64,
-}
-
-/// How far and how steadily to step.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct StepSize {
-    pub rates: [f64; 3],
-    /// Decay of the mean of gradients.
-    pub beta1: f64,
-    /// Decay of the mean of squares.
-    pub beta2: f64,
 }
 
 impl Adam {
@@ -35,11 +22,18 @@ impl Adam {
         }
     }
 
-    pub fn step(&mut self, parameters: &mut Parameters, gradient: &Parameters, size: StepSize) {
+    /// One step, with a step size for each tensor and the decays of the two means.
+    pub fn step(
+        &mut self,
+        parameters: &mut Parameters,
+        gradient: &Parameters,
+        rates: [f64; 3],
+        [beta1, beta2]: [f64; 2],
+    ) {
         self.n_steps += 1;
         let steps = self.n_steps.min(1 << 30) as i32;
-        let corrections = [size.beta1, size.beta2].map(|beta| 1.0 - beta.powi(steps));
-        for (tensor, rate) in size.rates.into_iter().enumerate() {
+        let corrections = [beta1, beta2].map(|beta| 1.0 - beta.powi(steps));
+        for (tensor, rate) in rates.into_iter().enumerate() {
             let moments = self.first.tensors[tensor]
                 .iter_mut()
                 .zip(&mut self.second.tensors[tensor]);
@@ -47,8 +41,8 @@ impl Adam {
             let slopes = &gradient.tensors[tensor];
             for ((number, (first, second)), &slope) in numbers.zip(moments).zip(slopes) {
                 let slope = f64::from(slope);
-                let mean = size.beta1 * f64::from(*first) + (1.0 - size.beta1) * slope;
-                let square = size.beta2 * f64::from(*second) + (1.0 - size.beta2) * slope * slope;
+                let mean = beta1 * f64::from(*first) + (1.0 - beta1) * slope;
+                let square = beta2 * f64::from(*second) + (1.0 - beta2) * slope * slope;
                 (*first, *second) = (mean as f32, square as f32);
                 let root = (square / corrections[1]).sqrt();
                 *number -= (rate * mean / corrections[0] / (root + EPSILON)) as f32;
@@ -72,13 +66,9 @@ mod tests {
         let mut parameters = Parameters::zeros(dimensions);
         let mut gradient = Parameters::zeros(dimensions);
         gradient.tensors[0] = vec![3.0, -0.2, 0.0, 1.0];
-        let size = StepSize {
-            rates: [0.5, 0.1, 0.1],
-            beta1: 0.9,
-            beta2: 0.99,
-        };
+        let (rates, betas) = ([0.5, 0.1, 0.1], [0.9, 0.99]);
         let mut adam = Adam::new(dimensions);
-        adam.step(&mut parameters, &gradient, size);
+        adam.step(&mut parameters, &gradient, rates, betas);
         let close = |got: &[f32], expected: &[f32]| {
             let near = got.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6);
             assert!(near, "{got:?} {expected:?}");
@@ -89,7 +79,7 @@ mod tests {
         gradient.tensors[0]
             .iter_mut()
             .for_each(|slope| *slope = -*slope);
-        adam.step(&mut parameters, &gradient, size);
+        adam.step(&mut parameters, &gradient, rates, betas);
         let back = 0.5 * 0.01 / 0.19;
         close(&parameters.tensors[0][..2], &[-0.5 + back, 0.5 - back]);
     }

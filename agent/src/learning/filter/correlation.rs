@@ -3,8 +3,8 @@
 //! [`protocol::Transition`] computes the forward part too; it gains from weights that are zero or
 //! alike, of which a learned kernel has none, and does not know derivatives.
 
-use crate::learning::filter::layout::Layout;
-use crate::learning::filter::vector::{LANES, Lanes, Real};
+use crate::learning::filter::layout::{LANES, Layout};
+use pulp::{Simd, bytemuck};
 use std::ops::Range;
 
 /// Planes computed at once: with [`WIDE`] vectors of cells they fill the registers.
@@ -15,25 +15,25 @@ const WIDE: usize = 4;
 
 /// `to[m] = base[m] + sum_n sum_a w[m, n, a] from[n, . + a]`.
 #[derive(Debug, Clone)]
-pub(super) struct Correlation<T> {
+pub(super) struct Correlation {
     layout: Layout,
     n_from: usize,
     /// `w[to, from, row, col]`.
-    weights: Vec<T>,
+    weights: Vec<f32>,
 }
 
 /// What the products are added to.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Base<'a, T> {
+pub(super) enum Base<'a> {
     Zero,
     /// A number for each plane.
-    Biases(&'a [T]),
+    Biases(&'a [f32]),
     /// What the planes hold.
     Planes,
 }
 
-impl<T: Real> Correlation<T> {
-    pub(super) fn new(layout: Layout, n_from: usize, weights: Vec<T>) -> Self {
+impl Correlation {
+    pub(super) fn new(layout: Layout, n_from: usize, weights: Vec<f32>) -> Self {
         Self {
             layout,
             n_from,
@@ -60,62 +60,69 @@ impl<T: Real> Correlation<T> {
 
     /// One row of the grid.
     #[inline(always)]
-    pub(super) fn row<V: Lanes<T>>(&self, from: &[T], to: &mut [T], base: Base<'_, T>, row: usize) {
+    pub(super) fn row<S: Simd>(
+        &self,
+        simd: S,
+        from: &[f32],
+        to: &mut [f32],
+        base: Base<'_>,
+        row: usize,
+    ) {
         let n_to = self.n_to();
-        let mut first = 0;
-        while first < n_to {
+        for first in (0..n_to).step_by(GROUP) {
             match n_to - first {
-                1 => self.group::<V, 1>(from, to, base, row, first),
-                2 => self.group::<V, 2>(from, to, base, row, first),
-                _ => self.group::<V, GROUP>(from, to, base, row, first),
+                1 => self.group::<S, 1>(simd, from, to, base, row, first),
+                2 => self.group::<S, 2>(simd, from, to, base, row, first),
+                _ => self.group::<S, GROUP>(simd, from, to, base, row, first),
             }
-            first += GROUP;
         }
     }
 
     /// The same for the planes from `first` on.
     #[inline(always)]
-    fn group<V: Lanes<T>, const G: usize>(
+    fn group<S: Simd, const G: usize>(
         &self,
-        from: &[T],
-        to: &mut [T],
-        base: Base<'_, T>,
+        simd: S,
+        from: &[f32],
+        to: &mut [f32],
+        base: Base<'_>,
         row: usize,
         first: usize,
     ) {
         let columns = self.layout.columns();
         let mut col = 0;
-        while col + WIDE * LANES <= columns {
-            self.block::<V, G, WIDE>(from, to, base, (row, col), first);
-            col += WIDE * LANES;
+        while col + WIDE * S::F32_LANES <= columns {
+            self.block::<S, G, WIDE>(simd, from, to, base, (row, col), first);
+            col += WIDE * S::F32_LANES;
         }
         while col < columns {
-            self.block::<V, G, 1>(from, to, base, (row, col), first);
-            col += LANES;
+            self.block::<S, G, 1>(simd, from, to, base, (row, col), first);
+            col += S::F32_LANES;
         }
     }
 
     /// The same for `B` vectors of cells.
     #[inline(always)]
-    fn block<V: Lanes<T>, const G: usize, const B: usize>(
+    fn block<S: Simd, const G: usize, const B: usize>(
         &self,
-        from: &[T],
-        to: &mut [T],
-        base: Base<'_, T>,
+        simd: S,
+        from: &[f32],
+        to: &mut [f32],
+        base: Base<'_>,
         (row, col): (usize, usize),
         first: usize,
     ) {
         let layout = &self.layout;
         let n_taps = layout.n_taps();
-        let place =
-            |g: usize, b: usize| (first + g) * layout.plane + layout.row(row) + col + b * LANES;
-        let mut sums = [[V::splat(T::zero()); B]; G];
+        let corner = first * layout.plane + layout.row(row) + col;
+        let place = |g: usize, b: usize| corner + g * layout.plane + b * S::F32_LANES;
+        let mut sums = [[simd.splat_f32s(0.0); B]; G];
         for (g, sums) in sums.iter_mut().enumerate() {
             for (b, sum) in sums.iter_mut().enumerate() {
                 match base {
                     Base::Zero => {}
-                    Base::Biases(biases) => *sum = V::splat(biases[first + g]),
-                    Base::Planes => *sum = load(to, place(g, b)),
+                    Base::Biases(biases) => *sum = simd.splat_f32s(biases[first + g]),
+                    Base::Planes => *sum = load::<S>(to, place(g, b)),
                 }
             }
         }
@@ -124,14 +131,15 @@ impl<T: Real> Correlation<T> {
                 for c in 0..layout.kernel_width {
                     let at = plane * layout.plane + (row + a) * layout.stride + c + col;
                     let tap = plane * n_taps + a * layout.kernel_width + c;
-                    let mut cells = [V::splat(T::zero()); B];
+                    let mut cells = [simd.splat_f32s(0.0); B];
                     for (b, cells) in cells.iter_mut().enumerate() {
-                        *cells = load(from, at + b * LANES);
+                        *cells = load::<S>(from, at + b * S::F32_LANES);
                     }
                     for (g, sums) in sums.iter_mut().enumerate() {
                         let weight = self.weights[(first + g) * self.n_from * n_taps + tap];
+                        let weight = simd.splat_f32s(weight);
                         for (&cells, sum) in cells.iter().zip(sums) {
-                            *sum = V::splat(weight).multiply_add(cells, *sum);
+                            *sum = simd.mul_add_e_f32s(weight, cells, *sum);
                         }
                     }
                 }
@@ -139,32 +147,31 @@ impl<T: Real> Correlation<T> {
         }
         for (g, sums) in sums.iter().enumerate() {
             for (b, sum) in sums.iter().enumerate() {
-                store(*sum, to, place(g, b));
+                store::<S>(*sum, to, place(g, b));
             }
         }
     }
 
     /// Adds the derivatives by the weights, of derivatives `h` by some rows and columns of the result.
     #[inline(always)]
-    pub(super) fn add_weight_gradient<V: Lanes<T>>(
+    pub(super) fn add_weight_gradient<S: Simd>(
         &self,
-        from: &[T],
-        h: &[T],
+        simd: S,
+        from: &[f32],
+        h: &[f32],
         region: &Region,
         gradient: &mut [f64],
     ) {
         let n_to = self.n_to();
         for plane in 0..self.n_from {
             for kernel_row in 0..self.layout.kernel_height {
-                let mut to = 0;
-                while to < n_to {
-                    let corner = (to, plane, kernel_row);
+                for to in (0..n_to).step_by(GROUP) {
+                    let corner = [to, plane, kernel_row];
                     match n_to - to {
-                        1 => self.taps::<V, 1>(from, h, region, corner, gradient),
-                        2 => self.taps::<V, 2>(from, h, region, corner, gradient),
-                        _ => self.taps::<V, GROUP>(from, h, region, corner, gradient),
+                        1 => self.taps::<S, 1>(simd, from, h, region, corner, gradient),
+                        2 => self.taps::<S, 2>(simd, from, h, region, corner, gradient),
+                        _ => self.taps::<S, GROUP>(simd, from, h, region, corner, gradient),
                     }
-                    to += GROUP;
                 }
             }
         }
@@ -172,49 +179,56 @@ impl<T: Real> Correlation<T> {
 
     /// The gradients of one row of the kernel from a plane to `G` planes, three taps a time.
     #[inline(always)]
-    fn taps<V: Lanes<T>, const G: usize>(
+    fn taps<S: Simd, const G: usize>(
         &self,
-        p: &[T],
-        h: &[T],
+        simd: S,
+        p: &[f32],
+        h: &[f32],
         region: &Region,
-        corner: (usize, usize, usize),
+        [to, from, kernel_row]: [usize; 3],
         gradient: &mut [f64],
     ) {
         let mut first = 0;
-        while first + 3 <= self.layout.kernel_width {
-            self.some_taps::<V, G, 3>(p, h, region, corner, first, gradient);
-            first += 3;
-        }
         while first < self.layout.kernel_width {
-            self.some_taps::<V, G, 1>(p, h, region, corner, first, gradient);
-            first += 1;
+            let tap = [to, from, kernel_row, first];
+            match self.layout.kernel_width - first {
+                1 | 2 => {
+                    self.some_taps::<S, G, 1>(simd, p, h, region, tap, gradient);
+                    first += 1;
+                }
+                _ => {
+                    self.some_taps::<S, G, 3>(simd, p, h, region, tap, gradient);
+                    first += 3;
+                }
+            }
         }
     }
 
+    /// `C` of these gradients, from a tap on.
     #[inline(always)]
-    fn some_taps<V: Lanes<T>, const G: usize, const C: usize>(
+    fn some_taps<S: Simd, const G: usize, const C: usize>(
         &self,
-        p: &[T],
-        h: &[T],
+        simd: S,
+        p: &[f32],
+        h: &[f32],
         region: &Region,
-        (to, from, kernel_row): (usize, usize, usize),
-        first: usize,
+        [to, from, kernel_row, first]: [usize; 4],
         gradient: &mut [f64],
     ) {
         let layout = &self.layout;
         let tap = from * layout.plane + kernel_row * layout.stride + first;
         let origin = layout.row(0);
-        let mut sums = [[V::splat(T::zero()); C]; G];
+        let mut sums = [[simd.splat_f32s(0.0); C]; G];
         for row in region.rows.clone() {
-            for at in region.places(layout, row) {
-                let mut cells = [V::splat(T::zero()); C];
+            for at in region.places::<S>(layout, row) {
+                let mut cells = [simd.splat_f32s(0.0); C];
                 for (c, cells) in cells.iter_mut().enumerate() {
-                    *cells = load(p, tap + at - origin + c);
+                    *cells = load::<S>(p, tap + at - origin + c);
                 }
                 for (g, sums) in sums.iter_mut().enumerate() {
-                    let h: V = load(h, (to + g) * layout.plane + at);
+                    let h = load::<S>(h, (to + g) * layout.plane + at);
                     for (&cells, sum) in cells.iter().zip(sums) {
-                        *sum = cells.multiply_add(h, *sum);
+                        *sum = simd.mul_add_e_f32s(cells, h, *sum);
                     }
                 }
             }
@@ -223,7 +237,7 @@ impl<T: Real> Correlation<T> {
             let entry = ((to + g) * self.n_from + from) * layout.n_taps();
             let entry = entry + kernel_row * layout.kernel_width + first;
             for (gradient, &sum) in gradient[entry..].iter_mut().zip(sums) {
-                *gradient += total(sum);
+                *gradient += total::<S>(sum);
             }
         }
     }
@@ -261,13 +275,14 @@ impl Region {
 
     /// Places of the vectors in a row.
     #[inline(always)]
-    pub(super) fn places(
+    pub(super) fn places<S: Simd>(
         &self,
         layout: &Layout,
         row: usize,
-    ) -> impl Iterator<Item = usize> + use<> {
+    ) -> impl Iterator<Item = usize> + use<S> {
         let start = layout.row(row);
-        self.cols.clone().step_by(LANES).map(move |col| start + col)
+        let cols = self.cols.clone().step_by(S::F32_LANES);
+        cols.map(move |col| start + col)
     }
 }
 
@@ -279,23 +294,17 @@ fn widened(range: &Range<usize>, other: Range<usize>) -> Range<usize> {
 }
 
 #[inline(always)]
-pub(super) fn load<T, V: Lanes<T>>(planes: &[T], at: usize) -> V {
-    let lanes = planes[at..].first_chunk();
-    V::load(lanes.expect("invariant: the layout has room for whole vectors"))
+pub(super) fn load<S: Simd>(planes: &[f32], at: usize) -> S::f32s {
+    S::as_simd_f32s(&planes[at..][..S::F32_LANES]).0[0]
 }
 
 #[inline(always)]
-pub(super) fn store<T, V: Lanes<T>>(numbers: V, planes: &mut [T], at: usize) {
-    let lanes = planes[at..].first_chunk_mut();
-    numbers.store(lanes.expect("invariant: the layout has room for whole vectors"));
+pub(super) fn store<S: Simd>(numbers: S::f32s, planes: &mut [f32], at: usize) {
+    S::as_mut_simd_f32s(&mut planes[at..][..S::F32_LANES]).0[0] = numbers;
 }
 
 #[inline(always)]
-fn total<T: Real, V: Lanes<T>>(numbers: V) -> f64 {
-    let mut lanes = [T::zero(); LANES];
-    numbers.store(&mut lanes);
-    let lanes = lanes.iter();
-    lanes
-        .map(|lane| lane.to_f64().expect("invariant: floats cast"))
-        .sum()
+fn total<S: Simd>(numbers: S::f32s) -> f64 {
+    let lanes: &[f32] = bytemuck::cast_slice(std::slice::from_ref(&numbers));
+    lanes.iter().map(|&lane| f64::from(lane)).sum()
 }

@@ -1,8 +1,9 @@
 //! Where a cell of a state lies in planes with a margin of zeros, so that no cell is special.
 
-use crate::learning::filter::vector::LANES;
-use ndarray::NdFloat;
 use protocol::Shape;
+
+/// Cells that the widest vectors hold; those of each kind of processor divide it.
+pub(super) const LANES: usize = 16;
 
 /// Half a kernel of margin on each side, and on the right up to whole [`LANES`] and one more.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -44,8 +45,8 @@ impl Layout {
     }
 
     /// Planes of zeros, one per state.
-    pub(super) fn planes<T: NdFloat>(&self) -> Vec<T> {
-        vec![T::zero(); self.n_states * self.plane]
+    pub(super) fn planes(&self) -> Vec<f32> {
+        vec![0.0; self.n_states * self.plane]
     }
 
     /// Columns that are computed: whole vectors.
@@ -64,41 +65,27 @@ impl Layout {
     }
 
     /// 1 for each column of the grid, 0 for those up to whole vectors.
-    pub(super) fn mask<T: NdFloat>(&self) -> Vec<T> {
-        let on_grid = |col| {
-            if col < self.shape.width() {
-                T::one()
-            } else {
-                T::zero()
-            }
-        };
+    pub(super) fn mask(&self) -> Vec<f32> {
+        let on_grid = |col| f32::from(u8::from(col < self.shape.width()));
         (0..self.columns()).map(on_grid).collect()
     }
 
     /// Copies beliefs `[S, H, W]` inside the margins.
-    pub(super) fn load<T: Copy, U>(&self, from: &[T], to: &mut [U], cast: impl Fn(T) -> U) {
+    pub(super) fn load(&self, from: &[f32], to: &mut [f32]) {
         let states = from.chunks_exact(self.shape.n_cells());
         for (cells, plane) in states.zip(to.chunks_exact_mut(self.plane)) {
             for (row, cells) in cells.chunks_exact(self.shape.width()).enumerate() {
-                let places = &mut plane[self.row(row)..][..cells.len()];
-                places
-                    .iter_mut()
-                    .zip(cells)
-                    .for_each(|(to, &from)| *to = cast(from));
+                plane[self.row(row)..][..cells.len()].copy_from_slice(cells);
             }
         }
     }
 
     /// The reverse of [`Self::load`].
-    pub(super) fn unload<T: Copy, U>(&self, from: &[T], to: &mut [U], cast: impl Fn(T) -> U) {
+    pub(super) fn unload(&self, from: &[f32], to: &mut [f32]) {
         let states = to.chunks_exact_mut(self.shape.n_cells());
         for (cells, plane) in states.zip(from.chunks_exact(self.plane)) {
             for (row, cells) in cells.chunks_exact_mut(self.shape.width()).enumerate() {
-                let places = &plane[self.row(row)..][..cells.len()];
-                cells
-                    .iter_mut()
-                    .zip(places)
-                    .for_each(|(to, &from)| *to = cast(from));
+                cells.copy_from_slice(&plane[self.row(row)..][..cells.len()]);
             }
         }
     }

@@ -10,32 +10,30 @@
 
 use crate::learning::filter::correlation::{Base, Correlation, Region, load, store};
 use crate::learning::filter::layout::Layout;
-use crate::learning::filter::vector::{LANES, Lanes, Real};
+use pulp::Simd;
 use std::ops::Range;
 
 /// Weights `w[to, from, row, col]`, or `w[own, to, from, row, col]`, laid out for a grid.
 #[derive(Debug, Clone)]
-pub(super) struct Operator<T> {
+pub(super) struct Operator {
     pub(super) layout: Layout,
-    forward: Correlation<T>,
-    backward: Correlation<T>,
+    forward: Correlation,
+    backward: Correlation,
     /// Where kernels see the cell's own state: the weights of their centres, `[own, to]`.
-    centres: Option<Vec<T>>,
-    mask: Vec<T>,
+    centres: Option<Vec<f32>>,
+    mask: Vec<f32>,
 }
 
-impl<T: Real> Operator<T> {
-    pub(super) fn new(layout: Layout, n_kernels: usize, weights: &[T]) -> Self {
+impl Operator {
+    pub(super) fn new(layout: Layout, n_kernels: usize, weights: &[f32]) -> Self {
         let mut weights = weights.to_vec();
         let centres = (n_kernels > 1).then(|| {
-            let centres = centres(&layout);
-            centres
-                .map(|(own, all)| {
-                    let weight = weights[own];
-                    all.for_each(|at| weights[at] = T::zero());
-                    weight
-                })
-                .collect()
+            let take = |(own, all): (usize, Vec<usize>)| {
+                let weight = weights[own];
+                all.into_iter().for_each(|at| weights[at] = 0.0);
+                weight
+            };
+            centres(&layout).map(take).collect()
         });
         let forward = Correlation::new(layout, layout.n_states, weights);
         Self {
@@ -48,29 +46,30 @@ impl<T: Real> Operator<T> {
     }
 
     /// Planes of `v` and `h`.
-    pub(super) fn weighed_planes(&self) -> Vec<T> {
-        vec![T::zero(); self.forward.n_to() * self.layout.plane]
+    pub(super) fn weighed_planes(&self) -> Vec<f32> {
+        vec![0.0; self.forward.n_to() * self.layout.plane]
     }
 
     /// `u = Phi_w(p)` in planes. Of a kernel of all cells `factors` (one plane) gets `1 / sum_m v`, 0 beside the
     /// grid; of others `v` is room.
     #[inline(always)]
-    pub(super) fn forward<V: Lanes<T>>(
+    pub(super) fn forward<S: Simd>(
         &self,
-        p: &[T],
-        u: &mut [T],
-        factors: &mut [T],
-        v: &mut [T],
+        simd: S,
+        p: &[f32],
+        u: &mut [f32],
+        factors: &mut [f32],
+        v: &mut [f32],
     ) {
         for row in 0..self.layout.shape.height() {
             match &self.centres {
                 None => {
-                    self.forward.row::<V>(p, u, Base::Zero, row);
-                    self.normalise::<V>(u, factors, row);
+                    self.forward.row(simd, p, u, Base::Zero, row);
+                    self.normalise(simd, u, factors, row);
                 }
                 Some(centres) => {
-                    self.forward.row::<V>(p, v, Base::Biases(centres), row);
-                    self.mix::<V>(p, v, u, row);
+                    self.forward.row(simd, p, v, Base::Biases(centres), row);
+                    self.mix(simd, p, v, u, row);
                 }
             }
         }
@@ -78,24 +77,26 @@ impl<T: Real> Operator<T> {
 
     /// `h` from `g` in some rows and columns; `g` becomes `d`, and `u` is no more, where kernels see the cell's own state.
     #[inline(always)]
-    pub(super) fn backward_normalise<V: Lanes<T>>(
+    pub(super) fn backward_normalise<S: Simd>(
         &self,
-        p: &[T],
-        u: &mut [T],
-        factors: &[T],
-        (g, h): (&mut [T], &mut [T]),
+        simd: S,
+        p: &[f32],
+        u: &mut [f32],
+        factors: &[f32],
+        (g, h): (&mut [f32], &mut [f32]),
         region: &Region,
     ) {
         for row in region.rows.clone() {
             match &self.centres {
                 None => {
-                    let places = region.places(&self.layout, row);
-                    self.unnormalise::<V>(g, u, factors, h, places);
+                    for at in region.places::<S>(&self.layout, row) {
+                        self.unnormalise(simd, g, u, factors, h, at);
+                    }
                 }
                 Some(centres) => {
                     // Whole rows: h is 0 where g is.
-                    self.forward.row::<V>(p, h, Base::Biases(centres), row);
-                    self.unmix::<V>(p, u, g, h, row);
+                    self.forward.row(simd, p, h, Base::Biases(centres), row);
+                    self.unmix(simd, p, u, g, h, row);
                 }
             }
         }
@@ -103,15 +104,16 @@ impl<T: Real> Operator<T> {
 
     /// Adds `dL/dw` of some rows and columns of `h` to `gradient`; [`Self::end_gradient`] is still to come.
     #[inline(always)]
-    pub(super) fn add_weight_gradient<V: Lanes<T>>(
+    pub(super) fn add_weight_gradient<S: Simd>(
         &self,
-        p: &[T],
-        h: &[T],
+        simd: S,
+        p: &[f32],
+        h: &[f32],
         region: &Region,
         gradient: &mut [f64],
     ) {
         self.forward
-            .add_weight_gradient::<V>(p, h, region, gradient);
+            .add_weight_gradient(simd, p, h, region, gradient);
     }
 
     /// A centre that sees the cell's own state has the sum of `h` as its derivative. As beliefs sum to one, that is the sum
@@ -121,85 +123,87 @@ impl<T: Real> Operator<T> {
             return;
         }
         for (own, all) in centres(&self.layout) {
-            let sum: f64 = all.clone().map(|at| gradient[at]).sum();
-            all.for_each(|at| gradient[at] = 0.0);
+            let sum: f64 = all.iter().map(|&at| gradient[at]).sum();
+            all.into_iter().for_each(|at| gradient[at] = 0.0);
             gradient[own] = sum;
         }
     }
 
     /// `dL/dp` from `h`, and from `d` in `g`, in some rows.
     #[inline(always)]
-    pub(super) fn backward_correlate<V: Lanes<T>>(&self, h: &[T], g: &mut [T], rows: Range<usize>) {
+    pub(super) fn backward_correlate<S: Simd>(
+        &self,
+        simd: S,
+        h: &[f32],
+        g: &mut [f32],
+        rows: Range<usize>,
+    ) {
         let base = match self.centres {
             None => Base::Zero,
             Some(_) => Base::Planes,
         };
         for row in rows {
-            self.backward.row::<V>(h, g, base, row);
+            self.backward.row(simd, h, g, base, row);
         }
     }
 
     /// One row of eq. 3.
     #[inline(always)]
-    fn normalise<V: Lanes<T>>(&self, u: &mut [T], factors: &mut [T], row: usize) {
-        for col in (0..self.layout.columns()).step_by(LANES) {
+    fn normalise<S: Simd>(&self, simd: S, u: &mut [f32], factors: &mut [f32], row: usize) {
+        for col in (0..self.layout.columns()).step_by(S::F32_LANES) {
             let at = self.layout.row(row) + col;
-            let factor: V = self.factor(u, 0, at, col);
-            store(factor, factors, at);
+            let factor = self.factor(simd, u, 0, at, col);
+            store::<S>(factor, factors, at);
             for state in 0..self.layout.n_states {
                 let at = state * self.layout.plane + at;
-                let weights: V = load(u, at);
-                store(weights.times(factor), u, at);
+                store::<S>(simd.mul_f32s(load::<S>(u, at), factor), u, at);
             }
         }
     }
 
-    /// The reverse of [`Self::normalise`]: `h`.
+    /// The reverse of [`Self::normalise`], for the cells from a place on: `h`.
     #[inline(always)]
-    fn unnormalise<V: Lanes<T>>(
+    fn unnormalise<S: Simd>(
         &self,
-        g: &[T],
-        u: &[T],
-        factors: &[T],
-        h: &mut [T],
-        places: impl Iterator<Item = usize>,
+        simd: S,
+        g: &[f32],
+        u: &[f32],
+        factors: &[f32],
+        h: &mut [f32],
+        at: usize,
     ) {
-        let Layout {
-            n_states, plane, ..
-        } = self.layout;
+        let places = (0..self.layout.n_states).map(|state| state * self.layout.plane + at);
+        let mut mean = simd.splat_f32s(0.0);
+        for at in places.clone() {
+            mean = simd.mul_add_e_f32s(load::<S>(g, at), load::<S>(u, at), mean);
+        }
+        let factor = load::<S>(factors, at);
         for at in places {
-            let mut mean = V::splat(T::zero());
-            for state in 0..n_states {
-                let (g, u): (V, V) = (load(g, state * plane + at), load(u, state * plane + at));
-                mean = g.multiply_add(u, mean);
-            }
-            let factor: V = load(factors, at);
-            for state in 0..n_states {
-                let g: V = load(g, state * plane + at);
-                store(g.minus(mean).times(factor), h, state * plane + at);
-            }
+            let over_mean = simd.sub_f32s(load::<S>(g, at), mean);
+            store::<S>(simd.mul_f32s(over_mean, factor), h, at);
         }
     }
 
     /// One row of `u` from `v`, by the cell's own state.
     #[inline(always)]
-    fn mix<V: Lanes<T>>(&self, p: &[T], v: &[T], u: &mut [T], row: usize) {
+    fn mix<S: Simd>(&self, simd: S, p: &[f32], v: &[f32], u: &mut [f32], row: usize) {
         let Layout {
             n_states, plane, ..
         } = self.layout;
-        for col in (0..self.layout.columns()).step_by(LANES) {
+        for col in (0..self.layout.columns()).step_by(S::F32_LANES) {
             let at = self.layout.row(row) + col;
             for state in 0..n_states {
-                store(V::splat(T::zero()), u, state * plane + at);
+                store::<S>(simd.splat_f32s(0.0), u, state * plane + at);
             }
             for own in 0..n_states {
                 let first = own * n_states;
-                let p: V = load(p, own * plane + at);
-                let share = p.times(self.factor(v, first, at, col));
+                let p = load::<S>(p, own * plane + at);
+                let share = simd.mul_f32s(p, self.factor(simd, v, first, at, col));
                 for state in 0..n_states {
-                    let v: V = load(v, (first + state) * plane + at);
-                    let sum: V = load(u, state * plane + at);
-                    store(v.multiply_add(share, sum), u, state * plane + at);
+                    let v = load::<S>(v, (first + state) * plane + at);
+                    let sum = load::<S>(u, state * plane + at);
+                    let sum = simd.mul_add_e_f32s(v, share, sum);
+                    store::<S>(sum, u, state * plane + at);
                 }
             }
         }
@@ -207,56 +211,65 @@ impl<T: Real> Operator<T> {
 
     /// The reverse of [`Self::mix`]: `h` in the place of `v`, and `d` in that of `g`.
     #[inline(always)]
-    fn unmix<V: Lanes<T>>(&self, p: &[T], d: &mut [T], g: &mut [T], h: &mut [T], row: usize) {
+    fn unmix<S: Simd>(
+        &self,
+        simd: S,
+        p: &[f32],
+        d: &mut [f32],
+        g: &mut [f32],
+        h: &mut [f32],
+        row: usize,
+    ) {
         let Layout {
             n_states, plane, ..
         } = self.layout;
-        for col in (0..self.layout.columns()).step_by(LANES) {
+        for col in (0..self.layout.columns()).step_by(S::F32_LANES) {
             let at = self.layout.row(row) + col;
             for own in 0..n_states {
                 let first = own * n_states;
-                let factor: V = self.factor(h, first, at, col);
-                let mut mean = V::splat(T::zero());
+                let factor = self.factor(simd, h, first, at, col);
+                let mut mean = simd.splat_f32s(0.0);
                 for state in 0..n_states {
-                    let (g, v): (V, V) = (
-                        load(g, state * plane + at),
-                        load(h, (first + state) * plane + at),
-                    );
-                    mean = g.multiply_add(v.times(factor), mean);
+                    let g = load::<S>(g, state * plane + at);
+                    let v = load::<S>(h, (first + state) * plane + at);
+                    mean = simd.mul_add_e_f32s(g, simd.mul_f32s(v, factor), mean);
                 }
-                store(mean, d, own * plane + at);
-                let share = factor.times(load(p, own * plane + at));
+                store::<S>(mean, d, own * plane + at);
+                let share = simd.mul_f32s(factor, load::<S>(p, own * plane + at));
                 for state in 0..n_states {
-                    let g: V = load(g, state * plane + at);
-                    store(g.minus(mean).times(share), h, (first + state) * plane + at);
+                    let over_mean = simd.sub_f32s(load::<S>(g, state * plane + at), mean);
+                    let h_at = (first + state) * plane + at;
+                    store::<S>(simd.mul_f32s(over_mean, share), h, h_at);
                 }
             }
             for state in 0..n_states {
-                let d: V = load(d, state * plane + at);
-                store(d, g, state * plane + at);
+                store::<S>(load::<S>(d, state * plane + at), g, state * plane + at);
             }
         }
     }
 
     /// `1 / sum_m v` of the planes from `first` on, 0 beside the grid.
     #[inline(always)]
-    fn factor<V: Lanes<T>>(&self, v: &[T], first: usize, at: usize, col: usize) -> V {
-        let mask: V = load(&self.mask, col);
+    fn factor<S: Simd>(&self, simd: S, v: &[f32], first: usize, at: usize, col: usize) -> S::f32s {
+        let mask = load::<S>(&self.mask, col);
         // Beside the grid the sum may be 0, where no factor is wanted.
-        let mut total = V::splat(T::one()).minus(mask);
+        let mut total = simd.sub_f32s(simd.splat_f32s(1.0), mask);
         for state in first..first + self.layout.n_states {
-            total = total.plus(load(v, state * self.layout.plane + at));
+            total = simd.add_f32s(total, load::<S>(v, state * self.layout.plane + at));
         }
-        mask.over(total)
+        simd.div_f32s(mask, total)
     }
 }
 
 /// For each own state and each next one, the place of the weight of the centre that sees the own state, and of those of
 /// all states that it could see.
-fn centres(layout: &Layout) -> impl Iterator<Item = (usize, impl Iterator<Item = usize> + Clone)> {
+fn centres(layout: &Layout) -> impl Iterator<Item = (usize, Vec<usize>)> {
     let (n_states, n_taps) = (layout.n_states, layout.n_taps());
     (0..n_states * n_states).map(move |weighed| {
-        let place = move |from| (weighed * n_states + from) * n_taps + n_taps / 2;
-        (place(weighed / n_states), (0..n_states).map(place))
+        let place = |from| (weighed * n_states + from) * n_taps + n_taps / 2;
+        (
+            place(weighed / n_states),
+            (0..n_states).map(place).collect(),
+        )
     })
 }

@@ -6,10 +6,10 @@
 //! though gradients only run back through the window.
 
 use crate::config::LearningConfig;
-use crate::estimation::parameters::{Dimensions, Parameters, Tables};
+use crate::estimation::parameters::{Dimensions, Parameters};
 use crate::learning::checkpoint::{check, check_counts, check_numbers};
-use crate::learning::filter::adam::{Adam, StepSize};
-use crate::learning::filter::window::{Outcome, Start, Window};
+use crate::learning::filter::adam::Adam;
+use crate::learning::filter::window::{Outcome, Window};
 use crate::learning::replay::{Block, Replay};
 use anyhow::{Result, anyhow};
 use protocol::Shape;
@@ -35,13 +35,11 @@ pub struct Trainer {
     lap: Vec<u64>,
     n_laps: u64,
     #[serde(skip)]
-    windows: Vec<Window<f32>>,
+    windows: Vec<Window>,
 }
 
-/// What one update did.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Update {
-    /// Number of this update, from 1.
     pub number: u64,
     /// Minus the mean log-likelihood of a visited cell, before the update.
     pub loss: f64,
@@ -62,7 +60,7 @@ pub(crate) struct Stream {
 impl Trainer {
     /// Before the first update; the streams are not yet in any block.
     pub fn new(parameters: Parameters, shape: Shape, config: LearningConfig, seed: u64) -> Self {
-        let tables: Tables = parameters.tables();
+        let tables = parameters.tables();
         let numbers = vec![0.0; parameters.dimensions.n_states * shape.n_cells()];
         let stream = Stream {
             block: None,
@@ -228,10 +226,8 @@ impl Trainer {
             streams.iter_mut().filter_map(move |stream| {
                 let block = replay.block(stream.block?)?;
                 let first = stream.n_done * length;
-                let start = match block.start {
-                    None if first == 0 => Start::Initial,
-                    _ => Start::Belief(&stream.belief),
-                };
+                let is_first = block.start.is_none() && first == 0;
+                let start = (!is_first).then_some(&*stream.belief);
                 let end = block.frames.len().min(first + length);
                 Some(window.run(start, &block.frames[first..end], &mut stream.end))
             })
@@ -257,7 +253,7 @@ impl Trainer {
     /// state which is observable with negligible uncertainties" (paper section III.E, remark).
     fn add_anchor(&self, state: usize, by_likelihood: &mut [f64]) {
         let n_observations = self.dimensions().n_observations;
-        let likelihood = self.parameters.tables::<f64>().likelihood;
+        let likelihood = self.parameters.likelihood();
         let row = &likelihood[state * n_observations..][..n_observations];
         let shown = (0..n_observations).max_by(|&a, &b| row[a].total_cmp(&row[b]));
         if let Some(shown) = shown {
@@ -273,13 +269,10 @@ impl Trainer {
         }
         let rate = self.config.rate * self.config.rate_at(number - 1);
         let observation_rate = rate * self.config.observation_rate;
-        let size = StepSize {
-            rates: [rate, observation_rate, observation_rate],
-            beta1: self.config.beta1,
-            beta2: self.config.beta2,
-        };
+        let rates = [rate, observation_rate, observation_rate];
+        let betas = [self.config.beta1, self.config.beta2];
         let (mut parameters, mut adam) = (self.parameters.clone(), self.adam.clone());
-        adam.step(&mut parameters, &gradient, size);
+        adam.step(&mut parameters, &gradient, rates, betas);
         if let Some(tensor) = parameters.not_finite() {
             return Err(self.wrong(tensor, "a step to a number that is not"));
         }

@@ -10,20 +10,10 @@ use crate::estimation::parameters::Tables;
 use crate::learning::filter::correlation::Region;
 use crate::learning::filter::layout::Layout;
 use crate::learning::filter::operator::Operator;
-use crate::learning::filter::vector::{Lanes, Real, Vectorised, on_widest};
 use crate::learning::replay::Sighting;
 use protocol::Shape;
+use pulp::{Arch, Simd, WithSimd};
 
-/// Where a window's first predictor comes from.
-#[derive(Debug, Clone, Copy)]
-pub enum Start<'a> {
-    /// The first belief, which learns too.
-    Initial,
-    /// A belief of shape `[S, H, W]` that an earlier window ended with.
-    Belief(&'a [f32]),
-}
-
-/// What a window gives.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outcome {
     /// Derivatives of `-log_likelihood` by the kernel, the likelihood and the first belief.
@@ -35,22 +25,21 @@ pub struct Outcome {
 
 /// The recursion with its work space: give each thread its own.
 #[derive(Debug, Clone)]
-pub struct Window<T> {
-    operator: Operator<T>,
-    tables: Tables<T>,
+pub struct Window {
+    operator: Operator,
+    tables: Tables,
     /// Posteriors of each frame, and the predictor after the last.
-    planes: Vec<Vec<T>>,
+    planes: Vec<Vec<f32>>,
     /// One over the weights' sums behind each of them.
-    factors: Vec<Vec<T>>,
+    factors: Vec<Vec<f32>>,
     seen: Vec<Seen>,
     /// Predictors of the seen cells before their correction, S of each.
-    predictors: Vec<T>,
+    predictors: Vec<f32>,
     /// `dL/dp` or `dL/du`; `dL/dv`, and forward room for `v`.
-    by_belief: Vec<T>,
-    by_weights: Vec<T>,
+    by_belief: Vec<f32>,
+    by_weights: Vec<f32>,
 }
 
-/// A visited cell of a window.
 #[derive(Debug, Clone, Copy)]
 struct Seen {
     frame: usize,
@@ -59,9 +48,9 @@ struct Seen {
     value: usize,
 }
 
-impl<T: Real> Window<T> {
+impl Window {
     /// For windows of up to `n_frames` frames.
-    pub fn new(tables: Tables<T>, shape: Shape, n_frames: usize) -> Self {
+    pub fn new(tables: Tables, shape: Shape, n_frames: usize) -> Self {
         let dimensions = tables.dimensions;
         let layout = Layout::new(shape, dimensions.n_states, dimensions.kernel);
         let operator = Operator::new(layout, dimensions.n_kernels(), &tables.kernel);
@@ -70,7 +59,7 @@ impl<T: Real> Window<T> {
             operator,
             tables,
             planes: vec![layout.planes(); n_frames + 1],
-            factors: vec![vec![T::zero(); layout.plane]; n_frames + 1],
+            factors: vec![vec![0.0; layout.plane]; n_frames + 1],
             seen: Vec::new(),
             predictors: Vec::new(),
             by_belief: layout.planes(),
@@ -78,18 +67,24 @@ impl<T: Real> Window<T> {
     }
 
     /// Takes other parameters of the same dimensions.
-    pub fn set(&mut self, tables: &Tables<T>) {
+    pub fn set(&mut self, tables: &Tables) {
         let n_kernels = tables.dimensions.n_kernels();
         self.operator = Operator::new(self.layout(), n_kernels, &tables.kernel);
         self.tables.clone_from(tables);
     }
 
-    /// Runs over frames; `end` gets the predictor after the last, shape `[S, H, W]`.
+    /// Runs over frames from the belief `[S, H, W]` that an earlier window ended with, or from the first belief, which
+    /// learns too; `end` gets the predictor after the last.
     ///
     /// # Panics
     /// If there are more frames than there is room for, or cells off the grid.
-    pub fn run(&mut self, start: Start<'_>, frames: &[Vec<Sighting>], end: &mut [f32]) -> Outcome {
-        on_widest(Pass {
+    pub fn run(
+        &mut self,
+        start: Option<&[f32]>,
+        frames: &[Vec<Sighting>],
+        end: &mut [f32],
+    ) -> Outcome {
+        Arch::new().dispatch(Pass {
             window: self,
             start,
             frames,
@@ -101,20 +96,11 @@ impl<T: Real> Window<T> {
         self.operator.layout
     }
 
-    fn begin(&mut self, start: Start<'_>) {
+    fn begin(&mut self, start: Option<&[f32]>) {
         let layout = self.layout();
-        let cast = |p: f32| T::from(p).expect("invariant: f32 casts to T");
-        match start {
-            Start::Belief(belief) => layout.load(belief, &mut self.planes[0], cast),
-            Start::Initial => {
-                let n_cells = layout.shape.n_cells();
-                let states = self.tables.initial.iter();
-                let belief: Vec<T> = states
-                    .flat_map(|&p| std::iter::repeat_n(p, n_cells))
-                    .collect();
-                layout.load(&belief, &mut self.planes[0], |p| p);
-            }
-        }
+        let first = || self.tables.prior(layout.shape).as_slice().to_vec();
+        let belief = start.map_or_else(first, <[f32]>::to_vec);
+        layout.load(&belief, &mut self.planes[0]);
         self.seen.clear();
         self.predictors.clear();
     }
@@ -130,7 +116,7 @@ impl<T: Real> Window<T> {
             let (cell, value) = (sighting.cell as usize, usize::from(sighting.value));
             let place = layout.place(cell);
             let seen_as = |state: usize| self.tables.likelihood[state * n_observations + value];
-            let mut evidence = T::zero();
+            let mut evidence = 0.0;
             for state in 0..n_states {
                 let u = planes[state * layout.plane + place];
                 self.predictors.push(u);
@@ -140,7 +126,7 @@ impl<T: Real> Window<T> {
                 let p = &mut planes[state * layout.plane + place];
                 *p = *p * seen_as(state) / evidence;
             }
-            log_likelihood += evidence.to_f64().expect("invariant: floats cast").ln();
+            log_likelihood += f64::from(evidence).ln();
             self.seen.push(Seen {
                 frame,
                 cell,
@@ -153,23 +139,23 @@ impl<T: Real> Window<T> {
 
     /// Eq. 6.
     #[inline(always)]
-    fn predict<V: Lanes<T>>(&mut self, frame: usize) {
+    fn predict<S: Simd>(&mut self, simd: S, frame: usize) {
         let (before, after) = self.planes.split_at_mut(frame + 1);
         let factors = &mut self.factors[frame + 1];
         let weights = &mut self.by_weights;
         self.operator
-            .forward::<V>(&before[frame], &mut after[0], factors, weights);
+            .forward(simd, &before[frame], &mut after[0], factors, weights);
     }
 
     #[inline(always)]
-    fn backward<V: Lanes<T>>(&mut self, n_frames: usize, outcome: &mut Outcome) {
-        self.by_belief.fill(T::zero());
-        self.by_weights.fill(T::zero());
+    fn backward<S: Simd>(&mut self, simd: S, n_frames: usize, outcome: &mut Outcome) {
+        self.by_belief.fill(0.0);
+        self.by_weights.fill(0.0);
         let mut region = Region::default();
         for frame in (0..n_frames).rev() {
             self.uncorrect(frame, outcome, &mut region);
             if frame > 0 && !region.rows.is_empty() {
-                region = self.unpredict::<V>(frame, &region, outcome);
+                region = self.unpredict(simd, frame, &region, outcome);
             }
         }
     }
@@ -179,14 +165,13 @@ impl<T: Real> Window<T> {
         let layout = self.layout();
         let (n_states, width) = (layout.n_states, layout.shape.width());
         let n_observations = self.tables.dimensions.n_observations;
-        let float = |x: T| x.to_f64().expect("invariant: floats cast");
         let planes = &mut self.planes[frame];
         while let Some(seen) = self.seen.pop_if(|seen| seen.frame == frame) {
             region.add(seen.cell / width, seen.cell % width);
             let first = self.predictors.len() - n_states;
             let at = |state: usize| state * layout.plane + seen.place;
             let entry = |state: usize| state * n_observations + seen.value;
-            let (mut evidence, mut mean) = (T::zero(), T::zero());
+            let (mut evidence, mut mean) = (0.0, 0.0);
             for state in 0..n_states {
                 evidence += self.predictors[first + state] * self.tables.likelihood[entry(state)];
                 mean += self.by_belief[at(state)] * planes[at(state)];
@@ -194,8 +179,8 @@ impl<T: Real> Window<T> {
             for state in 0..n_states {
                 let u = self.predictors[first + state];
                 // The 1 is of -ln(evidence) itself.
-                let by_joint = (self.by_belief[at(state)] - mean - T::one()) / evidence;
-                outcome.gradient[1][entry(state)] += float(by_joint * u);
+                let by_joint = (self.by_belief[at(state)] - mean - 1.0) / evidence;
+                outcome.gradient[1][entry(state)] += f64::from(by_joint * u);
                 self.by_belief[at(state)] = by_joint * self.tables.likelihood[entry(state)];
                 planes[at(state)] = u;
             }
@@ -205,8 +190,9 @@ impl<T: Real> Window<T> {
 
     /// Eqs. 2 and 3 backward: from `dL/du` of a frame to `dL/dp` of the one before.
     #[inline(always)]
-    fn unpredict<V: Lanes<T>>(
+    fn unpredict<S: Simd>(
         &mut self,
+        simd: S,
         frame: usize,
         region: &Region,
         outcome: &mut Outcome,
@@ -215,10 +201,10 @@ impl<T: Real> Window<T> {
         let (p, u, factors) = (&before[frame - 1], &mut after[0], &self.factors[frame]);
         let operator = &self.operator;
         let (g, h) = (&mut self.by_belief, &mut self.by_weights);
-        operator.backward_normalise::<V>(p, u, factors, (g, h), region);
-        operator.add_weight_gradient::<V>(p, h, region, &mut outcome.gradient[0]);
+        operator.backward_normalise(simd, p, u, factors, (g, h), region);
+        operator.add_weight_gradient(simd, p, h, region, &mut outcome.gradient[0]);
         let reached = region.reached(&operator.layout);
-        operator.backward_correlate::<V>(h, g, reached.rows.clone());
+        operator.backward_correlate(simd, h, g, reached.rows.clone());
         reached
     }
 
@@ -229,29 +215,27 @@ impl<T: Real> Window<T> {
             for (state, sum) in outcome.gradient[2].iter_mut().enumerate() {
                 let at = state * layout.plane + layout.row(row);
                 let cells = &self.by_belief[at..][..layout.shape.width()];
-                let cells = cells
-                    .iter()
-                    .map(|x| x.to_f64().expect("invariant: floats cast"));
-                *sum += cells.sum::<f64>();
+                *sum += cells.iter().map(|&x| f64::from(x)).sum::<f64>();
             }
         }
     }
 }
 
 /// One call of [`Window::run`].
-struct Pass<'a, T> {
-    window: &'a mut Window<T>,
-    start: Start<'a>,
+struct Pass<'a> {
+    window: &'a mut Window,
+    start: Option<&'a [f32]>,
     frames: &'a [Vec<Sighting>],
     end: &'a mut [f32],
 }
 
-impl<T: Real> Vectorised for Pass<'_, T> {
-    type Number = T;
+/// All of it is inlined, down to the innermost loop, to be compiled for the vectors of each kind of processor. Results
+/// may differ in the last bits between these kinds, never between runs or numbers of threads on one.
+impl WithSimd for Pass<'_> {
     type Output = Outcome;
 
     #[inline(always)]
-    fn run<V: Lanes<T>>(self) -> Outcome {
+    fn with_simd<S: Simd>(self, simd: S) -> Outcome {
         let (window, n_frames) = (self.window, self.frames.len());
         let mut outcome = Outcome {
             gradient: window.tables.dimensions.lengths().map(|n| vec![0.0; n]),
@@ -262,15 +246,12 @@ impl<T: Real> Vectorised for Pass<'_, T> {
         for (frame, sightings) in self.frames.iter().enumerate() {
             outcome.log_likelihood += window.correct(frame, sightings);
             outcome.n_seen += sightings.len();
-            window.predict::<V>(frame);
+            window.predict(simd, frame);
         }
-        let cast = |p: T| p.to_f32().expect("invariant: floats cast");
-        window
-            .layout()
-            .unload(&window.planes[n_frames], self.end, cast);
-        window.backward::<V>(n_frames, &mut outcome);
+        window.layout().unload(&window.planes[n_frames], self.end);
+        window.backward(simd, n_frames, &mut outcome);
         window.operator.end_gradient(&mut outcome.gradient[0]);
-        if matches!(self.start, Start::Initial) {
+        if self.start.is_none() {
             window.add_initial_gradient(&mut outcome);
         }
         outcome

@@ -7,7 +7,6 @@ use crate::learning::checkpoint::Contents;
 use anyhow::Result;
 
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::planning::PlanBasis;
 use crate::planning::policy::Policy;
 use crate::rollout::agent::{Agent, Setup};
 use crate::rollout::{Robot, Seen};
@@ -24,7 +23,6 @@ pub struct Worlds {
     /// Number of values that an observed cell may show.
     pub n_observations: usize,
     pub n_moves: usize,
-    /// Numbers of the robots.
     pub numbers: Range<u32>,
 }
 
@@ -39,10 +37,12 @@ impl Worlds {
         observation: Observation,
     ) -> Robot {
         let setup = Setup {
-            basis: PlanBasis::new(config.objective.belief),
+            basis: config.objective.belief,
             state_names,
             n_moves: self.n_moves,
             seed: config.planner_seed(observation.world.seed),
+            target: None,
+            decider: None,
         };
         let agent = Agent::new(estimator, policy, config, setup);
         Robot::new(agent, Seen::new([observation]))
@@ -58,7 +58,6 @@ pub type Fly<'a> = &'a mut dyn FnMut(&[Vec<Move>]) -> Result<Vec<Observation>, C
 /// Is told of each robot, by its index, when its belief is the posterior.
 pub type Look<'a> = &'a mut dyn FnMut(usize, &Robot);
 
-/// What learns while it acts.
 pub trait Student {
     /// How its checkpoints call it.
     fn kind(&self) -> &'static str;
@@ -75,7 +74,6 @@ pub trait Student {
     /// its checkpoint left it.
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize>;
 
-    /// A robot's world begins again.
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()>;
 
     /// One step of the rollout of all robots: plans, flies, scores, corrects, remembers, predicts.
@@ -90,7 +88,6 @@ pub trait Student {
     /// World steps that were learned from, of all robots together.
     fn world_steps(&self) -> u64;
 
-    /// Updates of the model so far.
     fn n_updates(&self) -> u64;
 
     /// What it predicts of its first world, and the state of that which it thinks pays most.
@@ -103,7 +100,6 @@ pub trait Student {
     fn times(&self) -> Vec<(&'static str, Duration)>;
 }
 
-/// The place of an observation.
 pub(super) fn place(observation: &Observation) -> Place {
     let (world, robot) = (&observation.world, &observation.robot);
     let [row, col] = [robot.row, robot.col].map(u64::from);

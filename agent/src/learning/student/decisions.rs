@@ -19,7 +19,6 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
 
-/// How checkpoints of this learner call it.
 pub const KIND: &str = "decisions";
 
 /// A DQN over the actions of a model.
@@ -50,7 +49,6 @@ pub struct DecisionsStudent {
     policy: Policy,
     decisions: Decisions,
     filter: BayesFilter,
-    /// The state that pays most.
     target: usize,
     state_names: Vec<String>,
     runs: Vec<Run>,
@@ -59,7 +57,6 @@ pub struct DecisionsStudent {
     times: [(&'static str, Duration); 2],
 }
 
-/// One world's robot.
 struct Run {
     robot: Robot,
     /// What the last decision went by, and what it was.
@@ -96,7 +93,6 @@ impl Decisions {
         Contents::new(self.dqn.named_tensors(), &state)
     }
 
-    /// Takes over a checkpoint.
     pub fn load(&mut self, contents: &Contents) -> Result<()> {
         let saved: SavedDecisions = contents.state()?;
         let [expected, got] = [self.n_states, saved.n_states];

@@ -14,9 +14,8 @@ use crate::learning::checkpoint::Contents;
 use crate::learning::learner::{LearnedModel, Learner};
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
-use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
+use crate::planning::policy::{EstimatorKind, PlannerKind, Policy, numbered_states};
 use crate::planning::{Objective, Plan, Target};
-use crate::rollout::agent::numbered_states;
 use crate::rollout::{self, Robot};
 use anyhow::Result;
 use protocol::client::Observation;
@@ -24,13 +23,23 @@ use protocol::path;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-/// One world's robot.
 struct Run {
     robot: Robot,
     is_walking: bool,
+    /// The belief before the last frame, unless that was the first.
+    predictor: Option<Belief>,
 }
 
-/// A filter that is learned.
+impl From<Robot> for Run {
+    fn from(robot: Robot) -> Self {
+        Self {
+            robot,
+            is_walking: false,
+            predictor: None,
+        }
+    }
+}
+
 pub struct FilterStudent {
     worlds: Worlds,
     config: AgentConfig,
@@ -51,7 +60,6 @@ impl FilterStudent {
         Self::of(learner, BTreeMap::new(), worlds, config)
     }
 
-    /// Goes on from a checkpoint.
     pub fn resume(
         contents: &Contents,
         dimensions: Dimensions,
@@ -104,13 +112,11 @@ impl FilterStudent {
     /// A robot that has taken in what its world shows, with a track that begins there.
     fn begun(&mut self, world: u32, observation: Observation) -> Result<Run> {
         self.learner.begin(world);
-        self.learner.see(world, &observation.frame, &self.learned);
+        let frame = &observation.frame;
+        self.learner.see(world, frame, None, &self.learned);
         let mut robot = self.robot(observation);
         robot.begin(None, |_| ())?;
-        Ok(Run {
-            robot,
-            is_walking: false,
-        })
+        Ok(robot.into())
     }
 
     /// What robots that don't walk at random act by.
@@ -119,7 +125,8 @@ impl FilterStudent {
             false => EstimatorKind::Learned,
             true => EstimatorKind::LearnedOwn,
         };
-        Policy::learned(estimator, PlannerKind::Beam)
+        let target = Target::State(self.learned.target);
+        Policy::new("learned_beam", estimator, PlannerKind::Beam, target)
     }
 
     /// Worlds whose robots walk at random: all at first, some for good; none of a frozen student.
@@ -159,10 +166,7 @@ impl Student for FilterStudent {
                 let mut robot = self.robot(observation);
                 left.restore(&mut robot.agent);
                 n_gone_on += 1;
-                Run {
-                    robot,
-                    is_walking: false,
-                }
+                robot.into()
             } else {
                 self.begun(world, observation)?
             };
@@ -185,13 +189,9 @@ impl Student for FilterStudent {
         let (n_walking, first_world) = (self.n_walking(), self.worlds.numbers.start);
         for (index, run) in self.runs.iter_mut().enumerate() {
             run.is_walking = index < n_walking;
-            let world = first_world + index as u32;
-            self.learner.expect(world, run.robot.agent.belief());
+            run.predictor = Some(run.robot.agent.belief().clone());
         }
-        let objective = Objective {
-            target: Target::State(self.learned.target),
-            ..self.config.objective(&self.policy())
-        };
+        let objective = self.config.objective(&self.policy());
         let mut tick = Tick::default();
         rollout::step(
             &mut self.runs,
@@ -206,11 +206,9 @@ impl Student for FilterStudent {
                 let path = &turn.plans[0].moves;
                 let visited = path::fly(self.worlds.shape, turn.before.robot.cell(), path);
                 let reward = observation.robot.reward;
-                self.learner.see(
-                    first_world + index as u32,
-                    &observation.frame,
-                    &self.learned,
-                );
+                let (world, predictor) = (first_world + index as u32, run.predictor.as_ref());
+                self.learner
+                    .see(world, &observation.frame, predictor, &self.learned);
                 self.learner
                     .reward(agent.belief(), &visited.visited, reward);
                 tick.reward += reward;

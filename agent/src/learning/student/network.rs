@@ -19,15 +19,13 @@ use crate::learning::checkpoint::Contents;
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::reward::met;
 use crate::learning::student::base::{Fly, Look, Student, Worlds, place, without_truth};
-use crate::planning::policy::Policy;
-use crate::rollout::agent::numbered_states;
+use crate::planning::policy::{Policy, numbered_states};
 use crate::rollout::{self, Robot};
 use ::network::{Transition, Window};
 use protocol::client::Observation;
 use protocol::path;
 use std::time::{Duration, Instant};
 
-/// How checkpoints of this learner call it.
 pub const KIND: &str = "autoencoder";
 
 const COLUMNS: [&str; 5] = ["dqn_loss", "dqn_rate", "action", "action_value", "epsilon"];
@@ -98,7 +96,6 @@ impl NetworkStudent {
         }
     }
 
-    /// Adds the transition to the DQN's replay.
     fn remember(&mut self, robot: &Robot, decision: &Decision) {
         let step = Transition {
             input: decision.input.clone(),
@@ -197,9 +194,8 @@ impl Student for NetworkStudent {
             && shown == Some(&observation.frame);
         if goes_on {
             let mut robot = self.robot(self.progress.position.follower.clone(), observation);
-            if let Some(estimate) = &self.progress.position.estimate {
-                robot.agent.basis_mut().see(estimate);
-            }
+            let estimate = self.progress.position.estimate.as_ref();
+            robot.agent.remember_estimate(estimate);
             self.robot = Some(robot);
         } else {
             self.begin(self.worlds.numbers.start, observation)?;

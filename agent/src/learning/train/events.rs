@@ -11,7 +11,6 @@ use std::path::Path;
 /// Steps of all worlds from one picture to the next.
 const TICKS_PER_PICTURE: u64 = 100;
 
-/// The event file of a training.
 pub struct Events {
     file: EventFile,
     n_ticks: u64,
@@ -31,7 +30,7 @@ impl Events {
         updates: &[ModelUpdate],
         student: &dyn Student,
     ) -> Result<()> {
-        let averages = averages(tick, updates, student.n_updates(), student.columns());
+        let averages = averages(tick, updates, student.columns());
         let scalars = averages
             .iter()
             .map(|&(name, value)| (name, Value::Scalar(value)));
@@ -44,7 +43,6 @@ impl Events {
         }
     }
 
-    /// Writes what is still in memory.
     pub fn flush(&mut self) -> Result<()> {
         self.file.flush()
     }

@@ -15,21 +15,17 @@ use std::time::Duration;
 /// The checkpoint's name in the folder of a training.
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
 
-/// What to train on, for how long.
 #[derive(Debug, Clone)]
 pub struct Training {
     /// The worlds, with all their robots.
     pub worlds: Range<u32>,
-    /// Take the worlds from their holder.
     pub takeover: bool,
     /// World steps to act for, of all worlds together; 0: until stopped.
     pub steps: u64,
     /// Time to act for; `None`: until stopped.
     pub time_limit: Option<Duration>,
     pub out: PathBuf,
-    /// Go on from the folder's checkpoint.
     pub resume: bool,
-    /// Act on the parameters as they are.
     pub freeze: bool,
     pub device: Device,
     pub config: AgentConfig,

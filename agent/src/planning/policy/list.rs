@@ -1,16 +1,12 @@
 //! What each policy does, in a line.
 
 use super::named::{EstimatorKind, PlannerKind, Policy};
-use super::names::known_names;
 use crate::planning::objective::Target;
 use protocol::Model;
 
 /// All policies of a model, a line each: name, planner, objective, belief.
 pub fn list(model: &Model) -> String {
-    let policies: Vec<Policy> = known_names(model)
-        .iter()
-        .map(|name| Policy::named(name, model).expect("invariant: these are known"))
-        .collect();
+    let policies = Policy::all(model);
     let width = policies.iter().map(|policy| policy.name.len()).max();
     let width = width.unwrap_or(0);
     let lines = policies.iter().map(|policy| {
@@ -76,7 +72,8 @@ mod tests {
             .lines()
             .filter_map(|line| line.split_whitespace().next())
             .collect();
-        assert_eq!(named, known_names(&model));
+        let names = Policy::all(&model).into_iter().map(|policy| policy.name);
+        assert_eq!(named, names.collect::<Vec<_>>());
         let line = |name: &str| list.lines().find(|line| line.trim().starts_with(name));
         assert_eq!(
             line("clairvoyant_beam").map(str::trim),

@@ -1,12 +1,10 @@
 //! What a policy is, and policies by name.
 
-use super::names::{is_of_model, known_names, ladder_names, names_of_any_model};
 use crate::planning::action::{Action, ActionSet};
 use crate::planning::objective::{BEAM_BONUS, Objective, Target};
+use anyhow::{Context, Result, ensure};
 use protocol::Model;
-use thiserror::Error;
 
-/// Where a policy's belief comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum EstimatorKind {
     None,
@@ -30,7 +28,6 @@ pub enum EstimatorKind {
     NextTruth,
 }
 
-/// How a policy plans.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum PlannerKind {
     /// Uniform moves: the paper's baseline.
@@ -40,7 +37,6 @@ pub enum PlannerKind {
     Beam,
 }
 
-/// A way to act.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Policy {
     /// Its name in commands, tables and files.
@@ -54,16 +50,7 @@ pub struct Policy {
     pub action: Option<Action>,
 }
 
-/// A name that is no policy's.
-#[derive(Debug, Error, PartialEq, Eq)]
-#[error("policy: expected one of {expected}, got {name:?}")]
-pub struct UnknownPolicy {
-    name: String,
-    expected: String,
-}
-
 impl EstimatorKind {
-    /// Whether it filters with the true parameters.
     pub fn knows_model(self) -> bool {
         matches!(self, Self::KnownModel | Self::Spatial)
     }
@@ -80,7 +67,6 @@ impl EstimatorKind {
         )
     }
 
-    /// Its name in tables and files.
     pub fn label(self) -> &'static str {
         match self {
             Self::None => "none",
@@ -98,7 +84,6 @@ impl EstimatorKind {
 }
 
 impl PlannerKind {
-    /// Its name in commands and messages.
     pub fn label(self) -> &'static str {
         match self {
             Self::RandomWalk => "random_walk",
@@ -109,12 +94,18 @@ impl PlannerKind {
 }
 
 impl Policy {
-    fn new(
-        name: &str,
-        estimator: EstimatorKind,
-        planner: PlannerKind,
-        objective: Objective,
-    ) -> Self {
+    /// A policy with its planner's objective. Where states are learned, the agent puts the one that pays most in the
+    /// place of the target's.
+    pub fn new(name: &str, estimator: EstimatorKind, planner: PlannerKind, target: Target) -> Self {
+        let objective = match planner {
+            // The authors' for shooting; for beam search hardly any bonus.
+            PlannerKind::Shooting if target != Target::Coverage => Objective::paper(target),
+            PlannerKind::Beam => Objective {
+                coverage_bonus: BEAM_BONUS,
+                ..Objective::new(target)
+            },
+            PlannerKind::Shooting | PlannerKind::RandomWalk => Objective::new(target),
+        };
         Self {
             name: name.into(),
             estimator,
@@ -126,71 +117,12 @@ impl Policy {
     }
 
     /// The policy of a name under a model.
-    ///
-    /// Names are `random_walk`, `coverage`, `shooting_*` and `beam_*` with `exploit` (the state that
-    /// pays most), `exploit_only` (the same without the coverage bonus), `explore` (entropy) or the
-    /// name of a state, and `spatial_*`, `oracle_*`, `clairvoyant_*`, `learned_*`,
-    /// `learned_spatial_*`, `learned_own_*` and `learned_own_spatial_*` with `shooting` or `beam`. On
-    /// the autoencoder's belief there are `autoencoder_exploit` and `autoencoder_explore`, which
-    /// shoot, `autoencoder_policy`, for which the DQN chooses among the paper's objectives, and
-    /// `autoencoder_beam`. `dqn_beam` chooses among [`ActionSet::beam`] by a DQN; `act_*` always takes
-    /// the action of that name.
-    pub fn named(name: &str, model: &Model) -> Result<Self, UnknownPolicy> {
-        let unknown = || UnknownPolicy {
-            name: name.into(),
-            expected: known_names(model).join(", "),
-        };
-        let target = Target::State(model.target_state());
-        let policy = |estimator, planner, objective| Self::new(name, estimator, planner, objective);
-        Ok(match name {
-            "random_walk" => policy(
-                EstimatorKind::None,
-                PlannerKind::RandomWalk,
-                Objective::new(Target::Coverage),
-            ),
-            "coverage" => policy(
-                EstimatorKind::None,
-                PlannerKind::Shooting,
-                Objective::new(Target::Coverage),
-            ),
-            _ => {
-                let (family, rest) = name.split_once('_').ok_or_else(unknown)?;
-                match family {
-                    "dqn" if rest == "beam" => Self {
-                        is_decided: true,
-                        ..policy(
-                            EstimatorKind::KnownModel,
-                            PlannerKind::Beam,
-                            objective(PlannerKind::Beam, target),
-                        )
-                    },
-                    "act" => Self::always(name, rest, model).ok_or_else(unknown)?,
-                    "autoencoder" => Self::of_autoencoder(rest).ok_or_else(unknown)?,
-                    "spatial" | "oracle" | "clairvoyant" | "learned" => {
-                        let (estimator, planner) = match family {
-                            "learned" => learned_filter(rest),
-                            "spatial" => (EstimatorKind::Spatial, rest),
-                            "oracle" => (EstimatorKind::Truth, rest),
-                            _ => (EstimatorKind::NextTruth, rest),
-                        };
-                        let planner = planner_named(planner).ok_or_else(unknown)?;
-                        policy(estimator, planner, objective(planner, target))
-                    }
-                    _ => {
-                        let planner = planner_named(family).ok_or_else(unknown)?;
-                        let objective = match rest {
-                            "exploit" => objective(planner, target),
-                            "exploit_only" => Objective::new(target),
-                            "explore" => objective(planner, Target::Entropy),
-                            state => objective(
-                                planner,
-                                Target::State(model.state_named(state).ok_or_else(unknown)?),
-                            ),
-                        };
-                        policy(EstimatorKind::KnownModel, planner, objective)
-                    }
-                }
-            }
+    pub fn named(name: &str, model: &Model) -> Result<Self> {
+        let all = Self::all(model);
+        let found = all.iter().find(|policy| policy.name == name).cloned();
+        found.with_context(|| {
+            let names: Vec<&str> = all.iter().map(|policy| &*policy.name).collect();
+            unknown(name, &names)
         })
     }
 
@@ -198,120 +130,153 @@ impl Policy {
     ///
     /// # Errors
     /// If it is a policy's under no model.
-    pub fn check_name(name: &str) -> Result<(), UnknownPolicy> {
-        if is_of_model(name) || Self::named(name, &Model::wildfire()).is_ok() {
-            return Ok(());
+    pub fn check_name(name: &str) -> Result<()> {
+        let of_model = ["shooting_", "beam_", "act_"];
+        let mut rests = of_model
+            .iter()
+            .filter_map(|family| name.strip_prefix(family));
+        let all = Self::all(&Model::wildfire());
+        let is_known = all.iter().any(|policy| policy.name == name);
+        let is_general = |name: &&str| {
+            let (family, rest) = name.split_once('_').unwrap_or_default();
+            family != "act" && Model::wildfire().state_named(rest).is_none()
+        };
+        let names = all.iter().map(|policy| &*policy.name).filter(is_general);
+        let patterns = ["shooting_STATE", "beam_STATE", "act_ACTION"];
+        let names: Vec<&str> = names.chain(patterns).collect();
+        ensure!(
+            is_known || rests.any(|rest| !rest.is_empty()),
+            unknown(name, &names)
+        );
+        Ok(())
+    }
+
+    /// All policies of a model: the ladder, then the others.
+    pub fn all(model: &Model) -> Vec<Self> {
+        use EstimatorKind::*;
+        use PlannerKind::{Beam, Shooting};
+        let (target, states) = (Target::State(model.target_state()), model.state_names());
+        let mut all = Self::ladder(model);
+        all.extend([
+            Self::new("beam_explore", KnownModel, Beam, Target::Entropy),
+            Self::exploit_only("beam_exploit_only", Beam, target),
+            Self::new("clairvoyant_shooting", NextTruth, Shooting, target),
+        ]);
+        for (family, estimator) in [
+            ("learned", Learned),
+            ("learned_spatial", LearnedSpatial),
+            ("learned_own", LearnedOwn),
+            ("learned_own_spatial", LearnedOwnSpatial),
+        ] {
+            for planner in [Shooting, Beam] {
+                let name = format!("{family}_{}", planner.label());
+                all.push(Self::new(&name, estimator, planner, target));
+            }
         }
-        Err(UnknownPolicy {
-            name: name.into(),
-            expected: names_of_any_model().join(", "),
-        })
-    }
-
-    /// What a high-level decision chooses among (the paper's actions `a_k`): the probability of each
-    /// state in the model's order, then `entropy`; each named by its target, with the bonus of
-    /// `shooting_*` and `beam_*`.
-    pub fn choices(estimator: EstimatorKind, planner: PlannerKind, model: &Model) -> Vec<Self> {
-        let choice = |name: &str, target| {
-            let objective = objective(planner, target);
-            Self::new(name, estimator, planner, objective)
-        };
-        let states = model.file().states.iter().enumerate();
-        let states = states.map(|(state, entry)| choice(&entry.name, Target::State(state)));
-        states.chain([choice("entropy", Target::Entropy)]).collect()
-    }
-
-    /// A planner on the belief of a learned filter; what it maximises is learned too.
-    pub fn learned(estimator: EstimatorKind, planner: PlannerKind) -> Self {
-        // The agent puts the state that pays most, as learned, in the place of this one.
-        let target = match planner {
-            PlannerKind::RandomWalk => Target::Coverage,
-            PlannerKind::Shooting | PlannerKind::Beam => Target::State(0),
-        };
-        let filter = estimator.label().trim_end_matches("_filter");
-        let name = format!("{filter}_{}", planner.label());
-        Self::new(&name, estimator, planner, objective(planner, target))
-    }
-
-    /// Beam search on the known model's belief that always takes one action.
-    fn always(name: &str, action: &str, model: &Model) -> Option<Self> {
-        let actions = ActionSet::beam(model);
-        let action = actions.named(action)?;
-        let (estimator, planner) = (EstimatorKind::KnownModel, PlannerKind::Beam);
-        Some(Self {
+        all.push(Self::decided("dqn_beam", KnownModel, Beam, target));
+        all.extend(ActionSet::beam(model).actions().iter().map(|action| Self {
+            objective: action.objective,
             action: Some(action.clone()),
-            ..Self::new(name, estimator, planner, action.objective)
-        })
-    }
-
-    /// A policy on the autoencoder's belief; the agent puts the state that pays most, as learned, in the
-    /// place of this one.
-    fn of_autoencoder(name: &str) -> Option<Self> {
-        let (planner, target) = match name {
-            "exploit" | "policy" => (PlannerKind::Shooting, Target::State(0)),
-            "explore" => (PlannerKind::Shooting, Target::Entropy),
-            "beam" => (PlannerKind::Beam, Target::State(0)),
-            _ => return None,
+            ..Self::new(&format!("act_{}", action.name), KnownModel, Beam, target)
+        }));
+        all.extend([
+            Self::new(
+                "autoencoder_explore",
+                Autoencoder,
+                Shooting,
+                Target::Entropy,
+            ),
+            Self::new("autoencoder_exploit", Autoencoder, Shooting, target),
+            Self::decided("autoencoder_policy", Autoencoder, Shooting, target),
+            Self::new("autoencoder_beam", Autoencoder, Beam, target),
+        ]);
+        let of_state = |planner: PlannerKind, state: usize| {
+            let name = format!("{}_{}", planner.label(), states[state]);
+            Self::new(&name, KnownModel, planner, Target::State(state))
         };
-        let (full, objective) = (format!("autoencoder_{name}"), objective(planner, target));
-        Some(Self {
-            is_decided: name == "policy",
-            ..Self::new(&full, EstimatorKind::Autoencoder, planner, objective)
-        })
-    }
-
-    /// What the DQN of Algorithm 1 chooses among (paper section IV): the probability of each of the
-    /// autoencoder's states, then entropy.
-    pub fn network_choices(n_states: usize) -> Vec<Self> {
-        let choice = |name: &str, target| {
-            let (estimator, planner) = (EstimatorKind::Autoencoder, PlannerKind::Shooting);
-            Self::new(name, estimator, planner, objective(planner, target))
-        };
-        let states = 0..n_states;
-        let states = states.map(|state| choice(&format!("state_{state}"), Target::State(state)));
-        let entropy = choice("entropy", Target::Entropy);
-        states.chain([entropy]).collect()
+        all.push(of_state(Shooting, model.target_state()));
+        all.extend((0..states.len()).map(|state| of_state(Beam, state)));
+        all
     }
 
     /// The benchmark's ladder under a model, from the least to the most informed.
     pub fn ladder(model: &Model) -> Vec<Self> {
-        let named = |name: &String| {
-            Self::named(name, model).expect("invariant: the ladder's names are known")
-        };
-        ladder_names(model).iter().map(named).collect()
+        use EstimatorKind::{KnownModel, NextTruth, None, Spatial, Truth};
+        use PlannerKind::{Beam, RandomWalk, Shooting};
+        let target = Target::State(model.target_state());
+        let states = model.state_names().into_iter().enumerate();
+        let others = states.filter(|(state, _)| *state != model.target_state());
+        let others = others.map(|(state, name)| {
+            let target = Target::State(state);
+            Self::new(&format!("shooting_{name}"), KnownModel, Shooting, target)
+        });
+        let first = [
+            Self::new("random_walk", None, RandomWalk, Target::Coverage),
+            Self::new("coverage", None, Shooting, Target::Coverage),
+            Self::new("shooting_explore", KnownModel, Shooting, Target::Entropy),
+        ];
+        let rest = [
+            Self::new("shooting_exploit", KnownModel, Shooting, target),
+            Self::exploit_only("shooting_exploit_only", Shooting, target),
+            Self::new("beam_exploit", KnownModel, Beam, target),
+            Self::new("spatial_shooting", Spatial, Shooting, target),
+            Self::new("spatial_beam", Spatial, Beam, target),
+            Self::new("oracle_shooting", Truth, Shooting, target),
+            Self::new("oracle_beam", Truth, Beam, target),
+            Self::new("clairvoyant_beam", NextTruth, Beam, target),
+        ];
+        first.into_iter().chain(others).chain(rest).collect()
+    }
+
+    /// The known model's, without a bonus for each distinct cell.
+    fn exploit_only(name: &str, planner: PlannerKind, target: Target) -> Self {
+        Self {
+            objective: Objective::new(target),
+            ..Self::new(name, EstimatorKind::KnownModel, planner, target)
+        }
+    }
+
+    /// One for which a DQN chooses.
+    fn decided(name: &str, estimator: EstimatorKind, planner: PlannerKind, target: Target) -> Self {
+        Self {
+            is_decided: true,
+            ..Self::new(name, estimator, planner, target)
+        }
+    }
+
+    /// Whether it acts on what `train` learned.
+    pub fn needs_checkpoint(&self) -> bool {
+        self.is_decided || self.estimator.is_learned()
+    }
+
+    /// What a high-level decision chooses among (the paper's actions `a_k`): the probability of each
+    /// state, then `entropy`; each named by its target, with the bonus of `shooting_*` and `beam_*`.
+    pub fn choices(estimator: EstimatorKind, planner: PlannerKind, states: &[String]) -> Vec<Self> {
+        let choice = |name: &str, target| Self::new(name, estimator, planner, target);
+        let states = states.iter().enumerate();
+        let states = states.map(|(state, name)| choice(name, Target::State(state)));
+        states.chain([choice("entropy", Target::Entropy)]).collect()
+    }
+
+    /// What the DQN of Algorithm 1 chooses among (paper section IV).
+    pub fn network_choices(n_states: usize) -> Vec<Self> {
+        let states = numbered_states(n_states);
+        Self::choices(EstimatorKind::Autoencoder, PlannerKind::Shooting, &states)
     }
 }
 
-/// The authors' objective for shooting; for beam search hardly any bonus.
-fn objective(planner: PlannerKind, target: Target) -> Objective {
-    match planner {
-        PlannerKind::Shooting => Objective::paper(target),
-        PlannerKind::Beam | PlannerKind::RandomWalk => Objective {
-            coverage_bonus: BEAM_BONUS,
-            ..Objective::new(target)
-        },
-    }
+/// Names of states that were learned.
+pub fn numbered_states(n_states: usize) -> Vec<String> {
+    (0..n_states)
+        .map(|state| format!("state {state}"))
+        .collect()
 }
 
-/// The filter and the planner's name of a policy `learned_*`.
-fn learned_filter(name: &str) -> (EstimatorKind, &str) {
-    let kinds = [
-        ("own_spatial_", EstimatorKind::LearnedOwnSpatial),
-        ("own_", EstimatorKind::LearnedOwn),
-        ("spatial_", EstimatorKind::LearnedSpatial),
-        ("", EstimatorKind::Learned),
-    ];
-    let mut kinds = kinds.into_iter();
-    let found = kinds.find_map(|(prefix, kind)| Some((kind, name.strip_prefix(prefix)?)));
-    found.expect("invariant: every name begins with nothing")
-}
-
-fn planner_named(name: &str) -> Option<PlannerKind> {
-    match name {
-        "shooting" => Some(PlannerKind::Shooting),
-        "beam" => Some(PlannerKind::Beam),
-        _ => None,
-    }
+fn unknown(name: &str, expected: &[&str]) -> String {
+    format!(
+        "policy: expected one of {}, got {name:?}",
+        expected.join(", ")
+    )
 }
 
 #[cfg(test)]
@@ -321,11 +286,9 @@ mod tests {
     #[test]
     fn every_listed_name_is_a_policy_and_no_other() {
         let model = Model::wildfire();
-        for name in known_names(&model) {
-            assert_eq!(
-                Policy::named(&name, &model).map(|policy| policy.name),
-                Ok(name)
-            );
+        for policy in Policy::all(&model) {
+            let named = Policy::named(&policy.name, &model).expect("known");
+            assert_eq!(named, policy, "each name once");
         }
         for wrong in [
             "",
@@ -346,8 +309,8 @@ mod tests {
     #[test]
     fn a_name_is_checked_before_its_model_is_known() {
         for model in Model::built_in_names().filter_map(Model::built_in) {
-            for name in known_names(&model) {
-                assert_eq!(Policy::check_name(&name), Ok(()));
+            for policy in Policy::all(&model) {
+                Policy::check_name(&policy.name).expect("known");
             }
         }
         for wrong in ["", "bem_exploit", "beam_", "act_", "oracle_exploit", "fire"] {
@@ -367,7 +330,7 @@ mod tests {
             ("beam", PlannerKind::Beam),
             ("shooting", PlannerKind::Shooting),
         ] {
-            let choices = Policy::choices(EstimatorKind::KnownModel, planner, &model);
+            let choices = Policy::choices(EstimatorKind::KnownModel, planner, &model.state_names());
             let names = ["normal", "latent", "fire", "explore"];
             assert_eq!(choices.len(), names.len());
             for (choice, name) in choices.iter().zip(names) {

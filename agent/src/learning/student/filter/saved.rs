@@ -63,9 +63,7 @@ impl SavedWorld {
     pub fn restore(&self, agent: &mut Agent) {
         let is_taken = agent.estimator_mut().remember(&self.belief.to_bytes());
         debug_assert!(is_taken, "invariant: the belief was checked");
-        if let Some(estimate) = &self.estimate {
-            agent.basis_mut().see(estimate);
-        }
+        agent.remember_estimate(self.estimate.as_ref());
     }
 
     /// Refuses beliefs of another grid or about other states.

@@ -35,14 +35,12 @@ pub struct Progress {
 /// Where Algorithm 1 stands in its world.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Position {
-    /// What the network knows of the world.
     pub follower: Follower,
     /// The estimate where paths are planned on it, as a checkpoint left it.
     pub estimate: Option<Belief>,
     /// The world's latest steps, for the DQN's replay.
     pub track: Track,
     pub reward: RewardEstimate,
-    /// Iterations of Algorithm 1.
     pub iterations: u64,
     /// Where the world is that the hidden vector knows, if any.
     pub place: Option<Place>,
@@ -203,7 +201,6 @@ pub(super) fn follower(robot: &Robot) -> &Follower {
     follower.expect("invariant: its estimator is an autoencoder")
 }
 
-/// The network that settings ask for.
 fn network_shape(grid: Shape, n_observations: usize, config: &AgentConfig) -> NetworkShape {
     let settings = config.autoencoder.settings();
     NetworkShape {

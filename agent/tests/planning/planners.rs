@@ -1,86 +1,19 @@
-//! What holds for every planner, filter and summary, on random problems.
+//! Planners of one robot, filters and summaries.
 
-use agent::estimation::BayesFilter;
-use agent::estimation::belief::Belief;
+use crate::fields::{Field, fields, objectives, paths};
+use agent::Belief;
 use agent::estimation::summary::{N_BLOCKS, summarise, summary_length};
+use agent::estimation::{BayesFilter, Estimator};
 use agent::planning::{
     BeamSearch, CellValues, Integration, Objective, Plan, Planner, PlanningProblem, RandomWalk,
     Shooting, Target,
 };
 use proptest::prelude::*;
 use protocol::frame::{Frame, UNOBSERVED};
-use protocol::grid::{Cell, Probabilities, Shape};
-use protocol::model::Model;
-use protocol::path::{Move, fly};
+use protocol::path::fly;
 use protocol::randomness::{Purpose, split_mix, stream};
+use protocol::{Cell, Model, Move, Probabilities, Shape};
 use rand_chacha::rand_core::Rng;
-
-/// A grid of random values in `0..1`, and where the robot starts.
-#[derive(Debug, Clone)]
-struct Field {
-    belief: Belief,
-    start: Cell,
-    n_moves: usize,
-}
-
-impl Field {
-    fn new(shape: Shape, start: Cell, n_moves: usize, seed: u64) -> Self {
-        let uniform =
-            |index: usize| (split_mix(seed, index as u64) >> 40) as f32 / (1 << 24) as f32;
-        let (height, width) = shape.dim();
-        let numbers = Probabilities::from_shape_fn((2, height, width), |(state, row, col)| {
-            let p = uniform(shape.index(Cell { row, col }));
-            if state == 0 { p } else { 1.0 - p }
-        });
-        let belief = Belief::from_probabilities(numbers).expect("on the simplex");
-        Self {
-            belief,
-            start,
-            n_moves,
-        }
-    }
-
-    fn values(&self) -> CellValues {
-        Objective::new(Target::State(0)).values(&self.belief)
-    }
-
-    fn problem<'a>(&self, values: &'a CellValues, step: u64) -> PlanningProblem<'a> {
-        PlanningProblem {
-            start: self.start,
-            n_moves: self.n_moves,
-            values,
-            seed: 3,
-            step,
-        }
-    }
-}
-
-fn fields(max_side: usize, max_moves: usize) -> impl Strategy<Value = Field> {
-    let sides = (1..=max_side, 1..=max_side);
-    let sized = sides.prop_flat_map(move |(height, width)| {
-        let start = (0..height, 0..width);
-        (Just((height, width)), start, 0..=max_moves, any::<u64>())
-    });
-    sized.prop_map(|((height, width), (row, col), n_moves, seed)| {
-        let shape = Shape::new(height, width).expect("valid sides");
-        Field::new(shape, Cell { row, col }, n_moves, seed)
-    })
-}
-
-fn objectives() -> impl Strategy<Value = Objective> {
-    let targets = prop_oneof![
-        Just(Target::State(0)),
-        Just(Target::Entropy),
-        Just(Target::Coverage),
-    ];
-    (targets, any::<bool>(), 0.0..2.0_f32).prop_map(|(target, revisits, coverage_bonus)| {
-        Objective {
-            revisits,
-            coverage_bonus,
-            ..Objective::new(target)
-        }
-    })
-}
 
 /// The score from `protocol::path::fly`, whose flight says nothing of revisits.
 fn score_of_flight(values: &CellValues, start: Cell, moves: &[Move]) -> f32 {
@@ -97,17 +30,6 @@ fn score_of_flight(values: &CellValues, start: Cell, moves: &[Move]) -> f32 {
             .into_iter()
             .map(|index| worth(shape.cell(index)))
             .sum::<f32>()
-}
-
-/// The best score of all `4^T` paths.
-fn optimum(values: &CellValues, start: Cell, n_moves: usize) -> f32 {
-    let path = |code: u64| -> Vec<Move> {
-        (0..n_moves)
-            .map(|t| Move::from_low_bits(code >> (2 * t)))
-            .collect()
-    };
-    let scores = (0..1_u64 << (2 * n_moves)).map(|code| values.score(start, &path(code)));
-    scores.fold(f32::NEG_INFINITY, f32::max)
 }
 
 fn planners() -> [Box<dyn Planner>; 5] {
@@ -175,39 +97,39 @@ proptest! {
 
     #[test]
     fn a_plan_has_its_moves_and_the_score_it_reports(
-        field in fields(12, 40),
+        field in fields(12, 40, 1),
         objective in objectives(),
     ) {
         let values = objective.values(&field.belief);
         for mut planner in planners() {
-            let plan = planner.plan(&field.problem(&values, 0));
+            let plan = planner.plan(&field.problem(&values));
             prop_assert_eq!(plan.moves.len(), field.n_moves);
-            assert_close(plan.score, score_of_flight(&values, field.start, &plan.moves));
-            assert_close(values.score(field.start, &plan.moves), plan.score);
+            assert_close(plan.score, score_of_flight(&values, field.starts[0], &plan.moves));
+            assert_close(values.score(field.starts[0], &plan.moves), plan.score);
         }
     }
 
     #[test]
     fn a_plan_depends_on_nothing_but_the_problem(
-        field in fields(12, 40),
-        other in fields(20, 70),
+        field in fields(12, 40, 1),
+        other in fields(20, 70, 1),
     ) {
         let (values, other_values) = (field.values(), other.values());
         for (mut used, mut fresh) in planners().into_iter().zip(planners()) {
-            used.plan(&other.problem(&other_values, 8));
-            let problem = field.problem(&values, 5);
+            used.plan(&other.problem(&other_values));
+            let problem = field.problem(&values);
             prop_assert_eq!(used.plan(&problem), fresh.plan(&problem));
         }
     }
 
     #[test]
-    fn a_beam_of_one_is_a_greedy_walk(field in fields(12, 40), objective in objectives()) {
+    fn a_beam_of_one_is_a_greedy_walk(field in fields(12, 40, 1), objective in objectives()) {
         let values = objective.values(&field.belief);
-        let moves = BeamSearch::new(1).plan(&field.problem(&values, 0)).moves;
+        let moves = BeamSearch::new(1).plan(&field.problem(&values)).moves;
         for t in 0..moves.len() {
             let with = |step: Move| {
                 let path: Vec<Move> = moves[..t].iter().copied().chain([step]).collect();
-                values.score(field.start, &path)
+                values.score(field.starts[0], &path)
             };
             let most = Move::ALL.map(with).into_iter().fold(f32::NEG_INFINITY, f32::max);
             prop_assert_eq!(with(moves[t]), most);
@@ -215,9 +137,9 @@ proptest! {
     }
 
     #[test]
-    fn beam_search_is_never_worse_than_greedy(field in fields(12, 40)) {
+    fn beam_search_is_never_worse_than_greedy(field in fields(12, 40, 1)) {
         let values = field.values();
-        let problem = field.problem(&values, 0);
+        let problem = field.problem(&values);
         let greedy = BeamSearch::new(1).plan(&problem).score;
         for width in [2, 3, 10] {
             prop_assert!(BeamSearch::new(width).plan(&problem).score >= greedy);
@@ -225,18 +147,19 @@ proptest! {
     }
 
     #[test]
-    fn a_wide_beam_finds_the_best_path(field in fields(4, 6), objective in objectives()) {
+    fn a_wide_beam_finds_the_best_path(field in fields(4, 6, 1), objective in objectives()) {
         let values = objective.values(&field.belief);
         // 4^6 = 4096 paths: the beam holds them all.
-        let plan = BeamSearch::new(4096).plan(&field.problem(&values, 0));
-        assert_close(plan.score, optimum(&values, field.start, field.n_moves));
+        let plan = BeamSearch::new(4096).plan(&field.problem(&values));
+        let scores = paths(field.n_moves).into_iter().map(|path| values.score(field.starts[0], &path));
+        assert_close(plan.score, scores.fold(f32::NEG_INFINITY, f32::max));
     }
 
     #[test]
-    fn shooting_finds_the_first_of_its_best_samples(field in fields(8, 70)) {
+    fn shooting_finds_the_first_of_its_best_samples(field in fields(8, 70, 1)) {
         // Numbers of cells have no rounding and many ties.
         let values = Objective::new(Target::Coverage).values(&field.belief);
-        let (problem, shape) = (field.problem(&values, 2), values.shape());
+        let (problem, shape) = (field.problem(&values), values.shape());
         for integration in [Integration::ClampEachMove, Integration::ClampSum] {
             let mut rng = stream(problem.seed, Purpose::Planner, problem.step);
             let n_words = field.n_moves.div_ceil(32);
@@ -244,9 +167,9 @@ proptest! {
                 let words: Vec<u64> = (0..n_words).map(|_| rng.next_u64()).collect();
                 let bits = |t: usize| words[t / 32] >> (2 * (t % 32));
                 let sampled = (0..field.n_moves).map(|t| Move::from_low_bits(bits(t)));
-                integration.as_flown(shape, field.start, &sampled.collect::<Vec<_>>())
+                integration.as_flown(shape, field.starts[0], &sampled.collect::<Vec<_>>())
             });
-            let score = |moves: &Vec<Move>| values.score(field.start, moves);
+            let score = |moves: &Vec<Move>| values.score(field.starts[0], moves);
             let better = |a: Vec<Move>, b| if score(&b) > score(&a) { b } else { a };
             let first_best = samples.reduce(better).expect("30 samples");
             prop_assert_eq!(Shooting::new(30, integration).plan(&problem).moves, first_best);
@@ -255,7 +178,7 @@ proptest! {
 
     #[test]
     fn correct_stays_on_the_simplex(
-        field in fields(6, 0),
+        field in fields(6, 0, 1),
         steps in prop::collection::vec(prop::collection::vec(0..6_u8, 36), 1..20),
     ) {
         let shape = field.belief.shape();
@@ -265,7 +188,7 @@ proptest! {
             let values = values.iter().take(shape.n_cells());
             let bytes: Vec<u8> = values.map(|&v| if v < 3 { v } else { UNOBSERVED }).collect();
             let frame = Frame::from_bytes(shape, 3, &bytes).expect("valid frame");
-            filter.correct(&frame).expect("no probability is zero");
+            filter.correct(&frame, None).expect("no probability is zero");
             let posterior = filter.belief().view().to_owned();
             prop_assert!(Belief::from_probabilities(posterior).is_ok());
             filter.predict();
@@ -279,8 +202,8 @@ proptest! {
 fn scores(mut planner: impl Planner) -> Vec<f32> {
     let shape = Shape::new(64, 64).expect("valid sides");
     let score = |seed| {
-        let field = Field::new(shape, shape.cell(seed as usize * 67), 64, seed);
-        planner.plan(&field.problem(&field.values(), 0)).score
+        let field = Field::new(shape, vec![shape.cell(seed as usize * 67)], 64, seed);
+        planner.plan(&field.problem(&field.values())).score
     };
     (0..60).map(score).collect()
 }
@@ -306,9 +229,14 @@ fn a_wider_beam_is_better_on_average_and_shooting_worse() {
 #[test]
 fn each_step_has_its_own_random_numbers() {
     let shape = Shape::new(9, 9).expect("valid sides");
-    let field = Field::new(shape, shape.centre(), 30, 1);
+    let field = Field::new(shape, vec![shape.centre()], 30, 1);
     let values = field.values();
-    let plan = |step| -> Plan { RandomWalk.plan(&field.problem(&values, step)) };
+    let plan = |step| -> Plan {
+        RandomWalk.plan(&PlanningProblem {
+            step,
+            ..field.problem(&values)
+        })
+    };
     assert_ne!(plan(0), plan(1));
 }
 
@@ -323,10 +251,10 @@ fn the_cost_of_a_plan_does_not_grow_with_the_grid() {
         let values = Objective::paper(Target::Entropy).values(&belief);
         let field = Field {
             belief,
-            start,
+            starts: vec![start],
             n_moves: 10,
         };
-        BeamSearch::new(30).plan(&field.problem(&values, 0))
+        BeamSearch::new(30).plan(&field.problem(&values))
     };
     assert_eq!(plan(small), plan(large));
 }

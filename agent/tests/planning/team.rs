@@ -1,59 +1,32 @@
-//! What holds for the plans of several robots, on random problems.
+//! Plans of several robots.
 
-use agent::Belief;
+use crate::fields::{Field, RANDOM, fields, objectives, paths};
 use agent::planning::team::{ROUNDS, plan_team, robot_seed};
 use agent::planning::{
-    BeamSearch, CellValues, Integration, Objective, Plan, Planner, PlanningProblem, Shooting,
-    Target,
+    BeamSearch, CellValues, Integration, Objective, Plan, Planner, Shooting, Target,
 };
 use proptest::prelude::*;
 use protocol::path::fly;
-use protocol::randomness::split_mix;
-use protocol::{Cell, Move, Probabilities, Shape};
+use protocol::{Cell, Move, Shape};
 use std::collections::BTreeSet;
 
-/// The planner's random numbers.
-const RANDOM: (u64, u64) = (3, 5);
-
-/// Random values in `0..1`, and where the robots start.
-#[derive(Debug, Clone)]
-struct Field {
+/// Robots, and what cells are worth to them.
+struct Team<'a> {
+    field: &'a Field,
     values: CellValues,
-    starts: Vec<Cell>,
-    n_moves: usize,
 }
 
-impl Field {
-    fn new(
-        shape: Shape,
-        objective: Objective,
-        starts: Vec<Cell>,
-        n_moves: usize,
-        seed: u64,
-    ) -> Self {
-        let (height, width) = shape.dim();
-        let numbers = Probabilities::from_shape_fn((2, height, width), |(state, row, col)| {
-            let index = shape.index(Cell { row, col }) as u64;
-            let p = (split_mix(seed, index) >> 40) as f32 / (1 << 24) as f32;
-            if state == 0 { p } else { 1.0 - p }
-        });
-        let belief = Belief::from_probabilities(numbers).expect("on the simplex");
-        Self {
-            values: objective.values(&belief),
-            starts,
-            n_moves,
-        }
+impl<'a> Team<'a> {
+    fn new(field: &'a Field, objective: Objective) -> Self {
+        let values = objective.values(&field.belief);
+        Self { field, values }
     }
 
     fn plan(&self, planner: &mut dyn Planner, rounds: usize) -> Vec<Plan> {
-        plan_team(
-            planner,
-            &self.values,
-            &self.starts,
-            self.n_moves,
-            RANDOM,
-            rounds,
-        )
+        let Field {
+            starts, n_moves, ..
+        } = self.field;
+        plan_team(planner, &self.values, starts, *n_moves, RANDOM, rounds)
     }
 
     /// What the team gains: each cell once, however many robots visit it, unless each visit counts.
@@ -63,7 +36,7 @@ impl Field {
     }
 
     fn worth_of(&self, paths: &[&[Move]]) -> f64 {
-        let robots = self.starts.iter().zip(paths);
+        let robots = self.field.starts.iter().zip(paths);
         if self.values.revisits() {
             let own = robots.map(|(&start, path)| self.values.score(start, path));
             return own.map(f64::from).sum();
@@ -80,54 +53,11 @@ impl Field {
 
     /// The most that any two paths gain.
     fn optimum_of_two(&self) -> f64 {
-        let codes = 0..1_u64 << (2 * self.n_moves);
-        let path = |code: u64| -> Vec<Move> {
-            let moves = 0..self.n_moves;
-            moves
-                .map(|t| Move::from_low_bits(code >> (2 * t)))
-                .collect()
-        };
-        let paths: Vec<Vec<Move>> = codes.map(path).collect();
+        let paths = paths(self.field.n_moves);
         let pairs = paths.iter().flat_map(|a| paths.iter().map(move |b| (a, b)));
         let worth = pairs.map(|(a, b)| self.worth_of(&[a, b]));
         worth.fold(f64::NEG_INFINITY, f64::max)
     }
-}
-
-fn fields(max_side: usize, max_moves: usize, max_robots: usize) -> impl Strategy<Value = Field> {
-    let targets = prop_oneof![
-        Just(Target::State(0)),
-        Just(Target::Entropy),
-        Just(Target::Coverage)
-    ];
-    let objectives = (targets, any::<bool>(), 0.0..2.0_f32);
-    let sides = (1..=max_side, 1..=max_side);
-    let sized = (sides, objectives).prop_flat_map(move |(sides, objective)| {
-        let start = (0..sides.0, 0..sides.1);
-        let starts = prop::collection::vec(start, 1..=max_robots);
-        (
-            Just(sides),
-            Just(objective),
-            starts,
-            0..=max_moves,
-            any::<u64>(),
-        )
-    });
-    sized.prop_map(
-        |((height, width), (target, revisits, bonus), starts, n_moves, seed)| {
-            let shape = Shape::new(height, width).expect("valid sides");
-            let objective = Objective {
-                revisits,
-                coverage_bonus: bonus,
-                ..Objective::new(target)
-            };
-            let starts = starts
-                .into_iter()
-                .map(|(row, col)| Cell { row, col })
-                .collect();
-            Field::new(shape, objective, starts, n_moves, seed)
-        },
-    )
 }
 
 fn planners() -> [Box<dyn Planner>; 3] {
@@ -145,22 +75,30 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(200) })]
 
     #[test]
-    fn a_team_has_a_path_for_each_robot_and_the_scores_it_reports(field in fields(12, 30, 6)) {
+    fn a_team_has_a_path_for_each_robot_and_the_scores_it_reports(
+        field in fields(12, 30, 6),
+        objective in objectives(),
+    ) {
+        let team = Team::new(&field, objective);
         for mut planner in planners() {
-            let plans = field.plan(&mut *planner, ROUNDS);
+            let plans = team.plan(&mut *planner, ROUNDS);
             prop_assert_eq!(plans.len(), field.starts.len());
             prop_assert!(plans.iter().all(|plan| plan.moves.len() == field.n_moves));
             // In order of planning each score counts what was left: none counts a cell twice.
-            let greedy = field.plan(&mut *planner, 0);
+            let greedy = team.plan(&mut *planner, 0);
             let scores: f64 = greedy.iter().map(|plan| f64::from(plan.score)).sum();
-            prop_assert!((scores - field.worth(&greedy)).abs() < ROUNDING * scores.abs().max(1.0));
+            prop_assert!((scores - team.worth(&greedy)).abs() < ROUNDING * scores.abs().max(1.0));
         }
     }
 
     #[test]
-    fn a_teams_value_never_falls_from_round_to_round(field in fields(8, 20, 5)) {
+    fn a_teams_value_never_falls_from_round_to_round(
+        field in fields(8, 20, 5),
+        objective in objectives(),
+    ) {
+        let team = Team::new(&field, objective);
         for mut planner in planners() {
-            let worth = |rounds| field.worth(&field.plan(&mut *planner, rounds));
+            let worth = |rounds| team.worth(&team.plan(&mut *planner, rounds));
             let values: Vec<f64> = (0..5).map(worth).collect();
             let rises = |pair: &[f64]| pair[1] >= pair[0] - ROUNDING * pair[0].abs().max(1.0);
             prop_assert!(values.windows(2).all(rises), "{:?}", values);
@@ -171,33 +109,33 @@ proptest! {
     fn a_team_plan_depends_on_nothing_but_the_problem(
         field in fields(12, 30, 5),
         other in fields(16, 40, 5),
+        objective in objectives(),
     ) {
+        let (team, other) = (Team::new(&field, objective), Team::new(&other, objective));
         for (mut used, mut fresh) in planners().into_iter().zip(planners()) {
             other.plan(&mut *used, ROUNDS);
-            prop_assert_eq!(field.plan(&mut *used, ROUNDS), field.plan(&mut *fresh, ROUNDS));
+            prop_assert_eq!(team.plan(&mut *used, ROUNDS), team.plan(&mut *fresh, ROUNDS));
         }
     }
 
     #[test]
-    fn one_robot_is_planned_once_as_if_there_were_no_team(field in fields(20, 70, 1)) {
+    fn one_robot_is_planned_once_as_if_there_were_no_team(
+        field in fields(20, 70, 1),
+        objective in objectives(),
+    ) {
+        let team = Team::new(&field, objective);
         for (mut planner, mut of_team) in planners().into_iter().zip(planners()) {
-            let alone = planner.plan(&PlanningProblem {
-                start: field.starts[0],
-                n_moves: field.n_moves,
-                values: &field.values,
-                seed: RANDOM.0,
-                step: RANDOM.1,
-            });
-            prop_assert_eq!(field.plan(&mut *of_team, ROUNDS), [alone]);
+            let alone = planner.plan(&field.problem(&team.values));
+            prop_assert_eq!(team.plan(&mut *of_team, ROUNDS), [alone]);
         }
     }
 }
 
-/// Two robots on 2 x 3 cells with two moves, and a beam that holds all 16 paths.
+/// Two robots on 2 x 3 cells with two moves, for which a beam of 16 holds all paths.
 fn pair(starts: [(usize, usize); 2], seed: u64) -> Field {
     let shape = Shape::new(2, 3).expect("valid sides");
     let starts = starts.map(|(row, col)| Cell { row, col }).to_vec();
-    Field::new(shape, Objective::new(Target::State(0)), starts, 2, seed)
+    Field::new(shape, starts, 2, seed)
 }
 
 #[test]
@@ -206,8 +144,9 @@ fn two_robots_gain_nearly_what_the_best_pair_of_paths_gains() {
     for seed in 0..60 {
         for starts in [[(0, 0), (0, 0)], [(0, 1), (1, 1)], [(0, 0), (1, 2)]] {
             let field = pair(starts, seed);
-            let worth = field.worth(&field.plan(&mut BeamSearch::new(16), ROUNDS));
-            let optimum = field.optimum_of_two();
+            let team = Team::new(&field, Objective::new(Target::State(0)));
+            let worth = team.worth(&team.plan(&mut BeamSearch::new(16), ROUNDS));
+            let optimum = team.optimum_of_two();
             assert!(worth <= optimum + ROUNDING, "{worth} above {optimum}");
             // What a greedy team is worth at least (Fisher, Nemhauser and Wolsey, 1978).
             assert!(worth >= optimum / 2.0 - ROUNDING, "{worth} of {optimum}");
@@ -226,18 +165,13 @@ fn a_second_robot_leaves_the_best_cells_to_the_first() {
     // On a row of five both start in the middle: one goes left, one right.
     let shape = Shape::new(1, 5).expect("valid sides");
     let start = Cell { row: 0, col: 2 };
-    let field = Field::new(
-        shape,
-        Objective::new(Target::Coverage),
-        vec![start; 2],
-        2,
-        0,
-    );
-    let plans = field.plan(&mut BeamSearch::new(16), ROUNDS);
-    assert_eq!(field.worth(&plans), 4.0);
+    let field = Field::new(shape, vec![start; 2], 2, 0);
+    let team = Team::new(&field, Objective::new(Target::Coverage));
+    let plans = team.plan(&mut BeamSearch::new(16), ROUNDS);
+    assert_eq!(team.worth(&plans), 4.0);
     assert_ne!(plans[0].moves, plans[1].moves);
-    let alone = field.plan(&mut BeamSearch::new(16), 0)[0].clone();
-    assert_eq!(field.worth(&[alone.clone(), alone]), 2.0);
+    let alone = team.plan(&mut BeamSearch::new(16), 0)[0].clone();
+    assert_eq!(team.worth(&[alone.clone(), alone]), 2.0);
 }
 
 #[test]
@@ -246,7 +180,8 @@ fn planning_again_against_the_others_gains_more_than_planning_once() {
     let gains = |rounds| {
         let count = |seed| {
             let field = pair([(0, 1), (0, 0)], seed);
-            field.worth(&field.plan(&mut BeamSearch::new(16), rounds))
+            let team = Team::new(&field, Objective::new(Target::State(0)));
+            team.worth(&team.plan(&mut BeamSearch::new(16), rounds))
         };
         (0..200).map(count).sum::<f64>()
     };

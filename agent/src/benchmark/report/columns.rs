@@ -1,0 +1,94 @@
+//! Tables of a comparison: a row for each group, with a cell in each column.
+
+use crate::benchmark::report::number::{NOTHING, number, signed, with_error};
+use crate::benchmark::report::policy_run::{ALONE, Group, PolicyRun};
+use crate::benchmark::report::statistics::Estimate;
+use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+
+type Cell<'a> = Box<dyn Fn(&Group<'_>) -> String + 'a>;
+
+/// The columns of a table, with their headings.
+#[derive(Default)]
+pub(super) struct Columns<'a>(Vec<(String, Cell<'a>)>);
+
+impl<'a> Columns<'a> {
+    /// What groups are called, with their teams where there are any.
+    pub(super) fn of_names(groups: &[Group<'_>]) -> Self {
+        let mut columns = Self::default();
+        columns.add("policy", |group| group.policy.into());
+        columns.add("estimator", |group| group.estimator.into());
+        if groups.iter().any(Group::is_team) {
+            columns.add("team", |group| group.team.into());
+            columns.add("robots", |group| group.robots.to_string());
+        }
+        columns
+    }
+
+    pub(super) fn add(&mut self, heading: &str, cell: impl Fn(&Group<'_>) -> String + 'a) {
+        self.0.push((heading.into(), Box::new(cell)));
+    }
+
+    /// Means over worlds.
+    pub(super) fn add_mean(
+        &mut self,
+        heading: &str,
+        decimals: usize,
+        value: impl Fn(&PolicyRun) -> Option<f64> + 'a,
+    ) {
+        self.add(heading, move |group| match group.estimate(&value) {
+            Some(estimate) => number(estimate.mean, decimals),
+            None => NOTHING.into(),
+        });
+    }
+
+    /// The same with standard errors.
+    pub(super) fn add_estimate(
+        &mut self,
+        heading: &str,
+        decimals: usize,
+        value: impl Fn(&PolicyRun) -> Option<f64> + 'a,
+    ) {
+        let cell = move |group: &Group<'_>| with_error(group.estimate(&value), decimals);
+        self.add(heading, cell);
+    }
+
+    /// Differences, paired by world, to a policy alone with as many robots.
+    pub(super) fn add_difference(
+        &mut self,
+        groups: &'a [Group<'a>],
+        baseline: &'a str,
+        decimals: usize,
+        value: impl Fn(&PolicyRun) -> Option<f64> + 'a,
+    ) {
+        self.add("difference", move |group| {
+            let wanted = (baseline, group.robots, ALONE);
+            let is_baseline = |it: &Group<'_>| (it.policy, it.robots, it.team) == wanted;
+            match groups.iter().rfind(|other| is_baseline(other)) {
+                _ if is_baseline(group) => "baseline".into(),
+                None => NOTHING.into(),
+                Some(base) => {
+                    let (values, base) = (group.by_seed(&value), base.by_seed(&value));
+                    signed(Estimate::of_difference(&values, &base), decimals)
+                }
+            }
+        });
+    }
+
+    /// A Markdown table; all but the columns of names are right-aligned.
+    pub(super) fn table(&self, groups: &[Group<'_>]) -> Table {
+        let mut table = Table::new();
+        table
+            .load_preset(presets::ASCII_MARKDOWN)
+            .set_content_arrangement(ContentArrangement::Disabled)
+            .set_header(self.0.iter().map(|column| &column.0));
+        for (column, (heading, _)) in table.column_iter_mut().zip(&self.0) {
+            if !["policy", "estimator", "team"].contains(&&**heading) {
+                column.set_cell_alignment(CellAlignment::Right);
+            }
+        }
+        for group in groups {
+            table.add_row(self.0.iter().map(|(_, cell)| cell(group)));
+        }
+        table
+    }
+}

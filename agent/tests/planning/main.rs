@@ -1,0 +1,5 @@
+//! What holds for planners and teams on random problems, and for filters and summaries.
+
+mod fields;
+mod planners;
+mod team;
