@@ -1,0 +1,153 @@
+//! A world as its published steps must make it, stepped in this process: no server, no clients, no time. And a world of
+//! a server that goes as fast as it is checked so.
+
+use crate::harness::{PATIENCE, Paths, Server, frames_until, robots_of};
+use env_server::config::ServerConfig;
+use env_server::snapshot::WorldSpec;
+use env_server::world::{Episode, Flown, Robot, Rules};
+use protocol::client::Claim;
+use protocol::connection::ConnectionError;
+use protocol::control::ServerInfo;
+use protocol::message::{FrameHeader, RobotResult, Status, WorldResult};
+use protocol::observer::{Observer, Sample};
+use protocol::path::{path_from_bytes, path_to_bytes};
+use protocol::{Client, Coverage, Move};
+use std::time::{Duration, Instant};
+
+/// A lease that ends by nothing but what a test does.
+const LONG: Duration = Duration::from_secs(3600);
+
+/// World 0 of a server, undisturbed.
+pub struct Mirror {
+    rules: Rules,
+    episode: Episode,
+}
+
+impl Mirror {
+    /// At k = 0 of the first episode; but for what it says of itself, the server has the default settings.
+    pub fn of(info: &ServerInfo) -> Self {
+        let config = ServerConfig {
+            height: info.height,
+            width: info.width,
+            moves: info.n_moves,
+            robots: info.n_robots,
+            burn_in: info.burn_in,
+            ..ServerConfig::default()
+        };
+        let seed = config.seed;
+        let checked = config.check().expect("valid settings");
+        let rules = WorldSpec::of(&checked).expect("a valid model").rules;
+        let episode = Episode::new(&rules, seed);
+        Self { rules, episode }
+    }
+
+    /// Takes a published step, with the paths and masks that the sample tells; returns whether it is a new one, not the
+    /// last one again.
+    ///
+    /// # Panics
+    /// If a step is missing, or the sample shows anything else than these paths give.
+    pub fn follow(&mut self, sample: &Sample<FrameHeader>) -> bool {
+        let (world, k) = (sample.header.result, self.episode.result().step);
+        let robots = robots_of(sample);
+        let is_new = world.step != k;
+        if is_new {
+            assert_eq!(world.step, k + 1, "a step was lost, or made twice");
+            let path = |bytes| path_from_bytes(bytes).expect("a path");
+            let flown = robots.iter().map(|robot| (path(robot.path), robot.result));
+            step_again(&mut self.episode, &self.rules, &world, flown);
+        }
+        assert_eq!(*self.episode.result(), world);
+        for (index, (robot, shown)) in self.episode.robots().iter().zip(&robots).enumerate() {
+            assert_eq!(*robot.result(), shown.result, "robot {index}, step {k}");
+            let expected = (shown.frame, shown.path.to_vec());
+            assert_eq!(seen(robot), expected, "robot {index}, step {k}");
+        }
+        is_new
+    }
+}
+
+/// Takes the step that a result and the robots' paths tell of; these are empty for who hovered or was late.
+pub fn step_again(
+    episode: &mut Episode,
+    rules: &Rules,
+    told: &WorldResult,
+    robots: impl ExactSizeIterator<Item = (Vec<Move>, RobotResult)>,
+) {
+    let all = (1 << robots.len()) - 1;
+    let mut moves = vec![Move::Up; rules.n_robots * rules.n_moves];
+    let (mut ready, mut full) = (0, 0);
+    for (index, (path, result)) in robots.enumerate() {
+        moves[index * rules.n_moves..][..path.len()].copy_from_slice(&path);
+        ready |= u64::from(!path.is_empty()) << index;
+        full |= u64::from(result.coverage == Coverage::Full as u32) << index;
+    }
+    let (hovered, late) = (told.hovered, told.late);
+    // Each robot flew, hovered or was late, and only one of these.
+    assert_eq!(ready ^ hovered ^ late, all);
+    assert_eq!(hovered & late, 0);
+    let flown = Flown {
+        moves: &moves,
+        ready,
+        full,
+        hovered,
+        late,
+    };
+    episode.step(rules, &flown);
+}
+
+fn seen(robot: &Robot) -> (&[u8], Vec<u8>) {
+    (robot.frame().as_bytes(), path_to_bytes(robot.path()))
+}
+
+/// World 0 of a server, one of whose robots is flown by this process: it checks each step before it flies the next, so
+/// that no step is missed.
+pub struct PacedWorld {
+    pub client: Client,
+    pub last: WorldResult,
+    observer: Observer<FrameHeader>,
+    mirror: Mirror,
+    paths: Paths,
+}
+
+impl PacedWorld {
+    /// The world at k = 0, and a robot that nobody holds.
+    pub fn new(server: &Server, robot: u32) -> Self {
+        let observer = Observer::frames(&server.instance).expect("observe");
+        frames_until(&observer, 0, 0);
+        let claim = Claim {
+            time_to_live: Some(LONG),
+            ..Claim::new(robot..robot + 1)
+        };
+        Self {
+            client: Client::acquire(server.connect(), &claim).expect("acquire"),
+            last: WorldResult::default(),
+            observer,
+            mirror: Mirror::of(&server.info()),
+            paths: Paths::new(0),
+        }
+    }
+
+    /// Flies a path, checks all steps until then, and tells of each.
+    pub fn step(&mut self, mut tell: impl FnMut(&Sample<FrameHeader>)) {
+        let path = self.paths.next(self.client.info().n_moves);
+        let (start, robots) = (Instant::now(), self.client.robots());
+        let is_over = || start.elapsed() > PATIENCE;
+        let flown = self.client.step_until(robots.clone(), &[path], &is_over);
+        match flown {
+            Ok(Some(_)) => {}
+            // This process was not given the time: it goes on with the next step.
+            Err(ConnectionError::Refused {
+                status: Status::Late,
+                ..
+            }) => {}
+            other => panic!("the world does not move: {other:?}"),
+        }
+        let now = self.client.observe(robots).expect("observe")[0].world;
+        for sample in frames_until(&self.observer, 0, now.step) {
+            if self.mirror.follow(&sample) {
+                self.last = sample.header.result;
+                tell(&sample);
+            }
+        }
+    }
+}

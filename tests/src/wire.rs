@@ -1,0 +1,240 @@
+//! The protocol byte by byte: headers and payloads as a client of another language, or a hostile
+//! one, sends them. Nothing is filled in and nothing is checked.
+
+use crate::programs::PATIENCE;
+use iceoryx2::node::Node;
+use iceoryx2::pending_response::PendingResponse;
+use iceoryx2::port::client::{Client, RequestSendError};
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::prelude::AllocationStrategy;
+use protocol::channels::{
+    Channel, ChannelError, Instance, Ipc, RequestResponse, Services, create_node, ipc_error,
+};
+use protocol::control::{LeaseInfo, Reply, Request};
+use protocol::message::{
+    ControlReply, ControlRequest, Header, Operation, Status, StepReply, StepRequest, VERSION,
+};
+use protocol::payload::write_step_body;
+use protocol::wait::Waiter;
+use std::convert::Infallible;
+use std::fmt::Debug;
+use std::ops::Range;
+use std::time::Duration;
+
+pub type StepAnswer = (StepReply, Vec<u8>);
+
+pub type ControlAnswer = (ControlReply, Vec<u8>);
+
+pub type Requests<Q, R> = Client<Ipc, [u8], Q, [u8], R>;
+
+/// A request that waits for its answer.
+pub type Pending<Q, R> = PendingResponse<Ipc, [u8], Q, [u8], R>;
+
+/// Sends raw messages and waits for their answers: what the compliance suite asks of a client.
+pub trait RawClient {
+    /// Sends a step request and waits for its answer.
+    fn step(&self, header: StepRequest, payload: &[u8]) -> StepAnswer;
+
+    /// Sends bytes on `control` and waits for the answer.
+    fn control(&self, header: ControlRequest, payload: &[u8]) -> ControlAnswer;
+
+    /// The process that the server sees.
+    fn pid(&self) -> u32;
+
+    /// Sends a well-formed control request; the status in the header must be the reply's.
+    fn ask(&self, request: &Request) -> Reply {
+        let text = serde_json::to_vec(request).expect("requests serialise");
+        let (header, payload) = self.control(control_header(7), &text);
+        assert_eq!((header.version, header.sequence), (VERSION, 7));
+        let reply: Reply = serde_json::from_slice(&payload).expect("a reply");
+        assert_eq!(Status::try_from(header.status), Ok(reply.status()));
+        reply
+    }
+
+    /// Sends a step request: the status of its answer, and the detail.
+    fn status_of(&self, header: StepRequest, payload: &[u8]) -> (Status, u64) {
+        let (reply, _) = self.step(header, payload);
+        let status = Status::try_from(reply.status);
+        (status.expect("a known status"), reply.detail)
+    }
+
+    fn acquire(&self, robots: Range<u32>) -> LeaseInfo {
+        match self.ask(&acquire_request(robots)) {
+            Reply::Lease(lease) => lease,
+            other => panic!("expected a lease, got {other:?}"),
+        }
+    }
+}
+
+/// A client without manners.
+pub struct Wire {
+    step: Requests<StepRequest, StepReply>,
+    control: Requests<ControlRequest, ControlReply>,
+    server: Notifier<Ipc>,
+    _node: Node<Ipc>,
+}
+
+impl Wire {
+    /// Opens both channels of an instance, without a handshake.
+    pub fn open(instance: &Instance) -> Self {
+        Self::try_open(instance).expect("open the channels")
+    }
+
+    /// As [`Self::open`], where it may fail.
+    pub fn try_open(instance: &Instance) -> Result<Self, ChannelError> {
+        let node = create_node()?;
+        let services = Services {
+            node: &node,
+            instance,
+        };
+        let step = client(&services.open_step()?)?;
+        let control = client(&services.open_control()?)?;
+        let wake = services.wake(Channel::WakeServer)?;
+        let server = wake.notifier_builder().create();
+        Ok(Self {
+            step,
+            control,
+            server: server.map_err(ipc_error("create a notifier"))?,
+            _node: node,
+        })
+    }
+
+    pub fn send_step(
+        &self,
+        header: StepRequest,
+        payload: &[u8],
+    ) -> Result<Pending<StepRequest, StepReply>, RequestSendError> {
+        let pending = send(&self.step, header, payload)?;
+        self.server.notify().expect("wake the server");
+        Ok(pending)
+    }
+
+    pub fn send_control(
+        &self,
+        header: ControlRequest,
+        payload: &[u8],
+    ) -> Result<Pending<ControlRequest, ControlReply>, RequestSendError> {
+        let pending = send(&self.control, header, payload)?;
+        self.server.notify().expect("wake the server");
+        Ok(pending)
+    }
+}
+
+impl RawClient for Wire {
+    fn step(&self, header: StepRequest, payload: &[u8]) -> StepAnswer {
+        let pending = self.send_step(header, payload).expect("send a step");
+        answer(&pending, PATIENCE).expect("an answer to a step")
+    }
+
+    fn control(&self, header: ControlRequest, payload: &[u8]) -> ControlAnswer {
+        let pending = self.send_control(header, payload).expect("send a request");
+        answer(&pending, PATIENCE).expect("an answer on control")
+    }
+
+    fn pid(&self) -> u32 {
+        std::process::id()
+    }
+}
+
+/// The header of a correct step of robot 0.
+pub fn step_header(lease: u64, n_moves: u32) -> StepRequest {
+    StepRequest {
+        version: VERSION,
+        operation: Operation::Step as u32,
+        lease,
+        sequence: 1,
+        n_robots: 1,
+        n_moves,
+        ..StepRequest::default()
+    }
+}
+
+/// The header of a correct request for what robots show now.
+pub fn observe_header(robots: Range<u32>) -> StepRequest {
+    StepRequest {
+        operation: Operation::Observe as u32,
+        first_robot: robots.start,
+        n_robots: robots.len() as u32,
+        ..step_header(0, 0)
+    }
+}
+
+/// The header of a correct request for what robots showed at a step.
+pub fn recall_header(robots: Range<u32>) -> StepRequest {
+    StepRequest {
+        operation: Operation::Recall as u32,
+        ..observe_header(robots)
+    }
+}
+
+/// The payload of a step of worlds that are at these steps.
+pub fn step_body(steps: &[u64], paths: &[u8]) -> Vec<u8> {
+    let mut body = Vec::new();
+    write_step_body(steps, paths, &mut body);
+    body
+}
+
+/// A request for robots that nobody holds.
+pub fn acquire_request(robots: Range<u32>) -> Request {
+    Request::Acquire {
+        first_robot: robots.start,
+        n_robots: robots.len() as u32,
+        takeover: false,
+        ttl_millis: None,
+    }
+}
+
+/// The header of a correct control request.
+pub fn control_header(sequence: u64) -> ControlRequest {
+    ControlRequest {
+        version: VERSION,
+        sequence,
+        ..ControlRequest::default()
+    }
+}
+
+/// Waits for an answer; `None` if none comes in time.
+pub fn answer<Q: Header, R: Header>(
+    pending: &Pending<Q, R>,
+    limit: Duration,
+) -> Option<(R, Vec<u8>)> {
+    let block = |remaining: Duration| {
+        std::thread::sleep(remaining.min(Duration::from_micros(100)));
+        Ok::<_, Infallible>(())
+    };
+    answer_by(pending, limit, &Waiter::default(), block)
+}
+
+/// The same, where something else may tell of the answer.
+pub fn answer_by<Q: Header, R: Header, E: Debug>(
+    pending: &Pending<Q, R>,
+    limit: Duration,
+    waiter: &Waiter,
+    block: impl FnMut(Duration) -> Result<(), E>,
+) -> Option<(R, Vec<u8>)> {
+    let poll = || {
+        let response = pending.receive().expect("receive an answer");
+        Ok(response.map(|response| (*response.user_header(), response.payload().to_vec())))
+    };
+    waiter.wait(limit, poll, block).expect("wait")
+}
+
+/// A port of a service; nobody is greeted.
+pub fn client<Q: Header, R: Header>(
+    service: &RequestResponse<Q, R>,
+) -> Result<Requests<Q, R>, ChannelError> {
+    let builder = service.client_builder().initial_max_slice_len(4096);
+    let builder = builder.allocation_strategy(AllocationStrategy::PowerOfTwo);
+    builder.create().map_err(ipc_error("create a client"))
+}
+
+/// Sends a request and wakes nobody.
+pub fn send<Q: Header, R: Header>(
+    client: &Requests<Q, R>,
+    header: Q,
+    payload: &[u8],
+) -> Result<Pending<Q, R>, RequestSendError> {
+    let mut request = client.loan_slice_uninit(payload.len())?;
+    *request.user_header_mut() = header;
+    request.write_from_slice(payload).send()
+}
