@@ -1,17 +1,12 @@
 //! What agents show of their beliefs, to readers of their channel.
 
-use crate::harness::{PATIENCE, Program, Server, eventually};
-use crate::learner::start_at;
 use protocol::agent_belief::AgentBelief;
 use protocol::message::AgentHeader;
 use protocol::observer::Observer;
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
-
-fn run(server: &Server, flags: &[&str]) -> Program {
-    let common = ["run", "--instance", server.instance.name()];
-    Program::start("emberwatch-agent", &[&common[..], flags].concat())
-}
+use tests::harness::{AGENT, PATIENCE, Program, Server, eventually};
+use tests::learner::start_at;
 
 /// Reads until one is as wanted.
 fn until(
@@ -36,14 +31,14 @@ fn next(observer: &Observer<AgentHeader>, limit: Duration) -> Option<AgentBelief
 fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
     let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 2000");
     let observer = Observer::agents(&server.instance).expect("observe");
-    let mut agent = run(&server, &["--steps", "2000", "--policy", "beam_explore"]);
+    let mut agent = Program::agent(&server.instance, "--steps 2000 --policy beam_explore");
     let mut shown = Vec::new();
     let has_ended = eventually(4 * PATIENCE, || {
         shown.extend(next(&observer, Duration::ZERO));
         agent.has_ended()
     });
     assert!(has_ended, "{}", agent.stderr());
-    assert_eq!(agent.wait(PATIENCE).code, Some(0));
+    agent.ends(0);
     shown.extend(std::iter::from_fn(|| next(&observer, Duration::ZERO)));
     let last = shown
         .last()
@@ -73,9 +68,8 @@ fn an_agent_shows_what_it_believes_and_its_last_belief_in_any_case() {
 #[test]
 fn beliefs_that_nobody_looks_at_are_not_shown() {
     let server = Server::start("--height 16 --width 24 --moves 12 --burn-in 200");
-    let agent = run(&server, &[]);
-    let acts = || server.step_of(0) > 500;
-    assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
+    let agent = Program::agent(&server.instance, "");
+    agent.until(|| server.step_of(0) > 500);
     let observer = Observer::agents(&server.instance).expect("observe");
     let shown = until(&observer, |_| true);
     assert!(shown[0].header.step > 500, "a belief of before");
@@ -95,7 +89,7 @@ fn a_comparison_that_is_watched_shows_the_beliefs_of_all_its_worlds() {
              --watch 127.0.0.1:0 --instance {}",
             server.instance.name()
         );
-        Program::start("emberwatch-agent", &words.split(' ').collect::<Vec<_>>())
+        Program::start(AGENT, &words)
     };
     let comparison = compare(1_000_000);
     let mut missing: BTreeSet<u32> = (0..8).collect();
@@ -107,18 +101,13 @@ fn a_comparison_that_is_watched_shows_the_beliefs_of_all_its_worlds() {
         missing.remove(&sample.header.world);
         std::thread::sleep(Duration::from_millis(2)); // as a dashboard looks
     }
-    comparison.wait_for_words("watch at http://127.0.0.1:", PATIENCE);
+    comparison.wait_for_words("watch at http://127.0.0.1:");
     drop((comparison, observer));
-    let held = || {
-        server
-            .status()
-            .worlds
-            .iter()
-            .any(|world| world.holder_pids != [None])
-    };
-    assert!(eventually(PATIENCE, || !held()));
-    let ended = compare(5).wait(PATIENCE);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    server.program.until(|| {
+        let mut worlds = server.status().worlds.into_iter();
+        worlds.all(|world| world.holder_pids == [None])
+    });
+    compare(5).ends(0);
 }
 
 #[test]
@@ -129,18 +118,13 @@ fn a_training_shows_what_it_believes_of_all_its_worlds() {
     let out = folder.path().join("out");
     let config = folder.path().join("agent.toml");
     std::fs::write(&config, "[learning]\nexplore_steps = 1000000\n").expect("write");
-    let flags = [
-        "--config",
-        config.to_str().expect("a path"),
-        "--out",
-        out.to_str().expect("a path"),
-        "--world",
-        "1",
-        "--worlds",
-        "2",
-    ];
-    let common = ["train", "--instance", server.instance.name()];
-    let training = Program::start("emberwatch-agent", &[&common[..], &flags].concat());
+    let flags = format!(
+        "train --instance {} --config {} --out {} --world 1 --worlds 2",
+        server.instance.name(),
+        config.display(),
+        out.display()
+    );
+    let training = Program::start(AGENT, &flags);
     let mut worlds = BTreeSet::new();
     let shown = until(&observer, |shown| {
         worlds.insert(shown.header.world);
@@ -172,10 +156,8 @@ fn an_agent_shows_what_it_believes_of_the_worlds_that_are_decided_for() {
         let are_shown = eventually(PATIENCE, || {
             learner.decide_all(&objectives);
             while let Some(AgentBelief { header, intent, .. }) = next(&observer, Duration::ZERO) {
-                assert_eq!(
-                    (header.pid, &*intent.belief_from),
-                    (agent.pid(), "known_model")
-                );
+                assert_eq!(header.pid, agent.pid());
+                assert_eq!(intent.belief_from, "known_model");
                 shown.insert((header.world, intent.objective));
             }
             let is_shown = |&(world, aim): &(u32, &str)| shown.contains(&(world, aim.to_owned()));

@@ -1,16 +1,12 @@
 //! `emberwatch-agent train` with the autoencoder: the paper's Algorithm 1, small.
 
-use crate::commands::{AGENT, check};
-use crate::harness::{Ended, Server, fly, run};
+use crate::commands::{agent, check};
+use crate::trainings::Place;
 use agent::learning::checkpoint::{self, Contents};
 use agent::learning::student::network::{KIND, SavedNetwork};
 use protocol::Move;
-use std::path::{Path, PathBuf};
-use std::time::Duration;
-use tempfile::TempDir;
-
-/// How long a small training may take.
-const LIMIT: Duration = Duration::from_secs(60);
+use std::path::Path;
+use tests::harness::{AGENT, Server, fly};
 
 /// A server with one small world.
 const WORLD: &str = "--height 6 --width 9 --moves 5 --burn-in 60";
@@ -34,53 +30,13 @@ fn printed() -> String {
 }
 
 /// Columns of the metrics.
+const HEADER: &str = "update,world_steps,loss,held_out_log_likelihood,mean_reward,rate,\
+                      dqn_loss,dqn_rate,action,action_value,epsilon";
 const LOSS: usize = 2;
 const DQN_LOSS: usize = 6;
 
-struct Place {
-    folder: TempDir,
-}
-
-impl Place {
-    fn new(settings: &str) -> Self {
-        let folder = TempDir::new().expect("a folder");
-        std::fs::write(folder.path().join("agent.toml"), settings).expect("settings");
-        Self { folder }
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-
-    fn checkpoint(&self, out: &str) -> PathBuf {
-        self.path(out).join("checkpoint.safetensors")
-    }
-
-    /// The command's words for training into a folder.
-    fn words(&self, out: &str, flags: &str) -> String {
-        let (config, out) = (self.path("agent.toml"), self.path(out));
-        let (config, out) = (config.display(), out.display());
-        format!("train --config {config} --out {out} {flags}")
-    }
-
-    fn train(&self, out: &str, flags: &str) -> Vec<Vec<String>> {
-        agent(&self.words(out, flags));
-        let text = std::fs::read_to_string(self.path(out).join("metrics.csv"));
-        let text = text.expect("the metrics");
-        let mut lines = text.lines();
-        let header = "update,world_steps,loss,held_out_log_likelihood,mean_reward,rate,\
-                      dqn_loss,dqn_rate,action,action_value,epsilon";
-        assert_eq!(lines.next(), Some(header));
-        lines
-            .map(|line| line.split(',').map(String::from).collect())
-            .collect()
-    }
-}
-
-fn agent(words: &str) -> Ended {
-    let ended = run(AGENT, &words.split_whitespace().collect::<Vec<_>>(), LIMIT);
-    assert_eq!(ended.code, Some(0), "{words}: {}", ended.stderr);
-    ended
+fn place(settings: &str) -> Place {
+    Place::new(settings, HEADER)
 }
 
 /// What a checkpoint holds, but for its settings.
@@ -96,9 +52,9 @@ fn state(contents: &Contents) -> SavedNetwork {
 
 #[test]
 fn the_same_seed_gives_the_same_losses_bit_for_bit() {
-    let place = Place::new(SETTINGS);
+    let place = place(SETTINGS);
     let train =
-        |out: &str, seed: u64| place.train(out, &format!("{WORLD} --steps 30 --agent-seed {seed}"));
+        |out: &str, seed: u64| place.learn(out, &format!("{WORLD} --steps 30 --agent-seed {seed}"));
     let [a, b, c] = [("a", 5), ("b", 5), ("c", 6)].map(|(out, seed)| train(out, seed));
     assert_eq!(a, b);
     assert_ne!(a, c);
@@ -120,17 +76,17 @@ fn a_training_that_stopped_goes_on_as_if_it_had_not() {
 }
 
 fn goes_on_as_if_it_had_not_stopped(settings: &str) {
-    let place = Place::new(settings);
+    let place = place(settings);
     let flags = format!("{WORLD} --coverage client");
     let whole = Server::start(&flags);
     let name = whole.instance.name();
-    let whole = place.train("whole", &format!("--instance {name} --steps 24"));
+    let whole = place.learn("whole", &format!("--instance {name} --steps 24"));
     let parts = Server::start(&flags);
     let name = parts.instance.name();
-    place.train("parts", &format!("--instance {name} --steps 11"));
+    place.learn("parts", &format!("--instance {name} --steps 11"));
     let again = place.words("parts", &format!("--instance {name} --steps 11"));
-    check(AGENT, &again, &["--out", "expected --resume"]);
-    let parts = place.train("parts", &format!("--instance {name} --steps 13 --resume"));
+    check(AGENT, &again, "--out | expected --resume");
+    let parts = place.learn("parts", &format!("--instance {name} --steps 13 --resume"));
     assert_eq!(whole, parts);
     let checkpoint = |out| contents(&place.checkpoint(out));
     assert_eq!(checkpoint("whole"), checkpoint("parts"));
@@ -147,8 +103,8 @@ fn settings_of_sizes_and_of_plans_reach_the_training() {
         ),
     ];
     let runs = settings.map(|(from, to)| {
-        let place = Place::new(&SETTINGS.replacen(from, to, 1));
-        let rows = place.train("out", &format!("{WORLD} --steps 8"));
+        let place = place(&SETTINGS.replacen(from, to, 1));
+        let rows = place.learn("out", &format!("{WORLD} --steps 8"));
         let loss = rows.into_iter().find(|row| !row[LOSS].is_empty());
         (loss.expect("an update"), contents(&place.checkpoint("out")))
     });
@@ -166,8 +122,8 @@ fn settings_of_sizes_and_of_plans_reach_the_training() {
 #[test]
 fn actions_go_by_what_the_settings_say_and_a_checkpoint_by_its_own() {
     for (input, length) in [("after_frame", 4), ("summary", 74)] {
-        let place = Place::new(&SETTINGS.replace("[dqn]", &format!("[dqn]\ninput = \"{input}\"")));
-        place.train("out", &format!("{WORLD} --steps 15"));
+        let place = place(&SETTINGS.replace("[dqn]", &format!("[dqn]\ninput = \"{input}\"")));
+        place.learn("out", &format!("{WORLD} --steps 15"));
         let stored = state(&contents(&place.checkpoint("out")));
         let transitions = stored.dqn.transitions;
         assert_eq!(transitions.len(), 15, "{input}");
@@ -185,25 +141,25 @@ fn actions_go_by_what_the_settings_say_and_a_checkpoint_by_its_own() {
         let compared = agent(&format!(
             "compare {policies} --checkpoint {checkpoint} {worlds}"
         ));
-        assert!(compared.stdout.contains("autoencoder_policy"), "{input}");
+        compared.check_prints("autoencoder_policy");
         let other = if input == "summary" {
             "after_frame"
         } else {
             "summary"
         };
         let settings = SETTINGS.replace("[dqn]", &format!("[dqn]\ninput = \"{other}\""));
-        std::fs::write(place.path("agent.toml"), settings).expect("settings");
+        place.set(&settings);
         let resume = place.words("out", &format!("{WORLD} --steps 8 --resume"));
         let words = format!("dqn.input: expected {other}, got {input}");
-        check(AGENT, &resume, &[&words]);
+        check(AGENT, &resume, &words);
     }
 }
 
 #[test]
 fn another_world_is_begun_again() {
-    let place = Place::new(SETTINGS);
-    place.train("out", &format!("{WORLD} --steps 20"));
-    let rows = place.train("out", &format!("{WORLD} --steps 20 --resume --seed 7"));
+    let place = place(SETTINGS);
+    place.learn("out", &format!("{WORLD} --steps 20"));
+    let rows = place.learn("out", &format!("{WORLD} --steps 20 --resume --seed 7"));
     assert_eq!(rows.len(), 40);
     assert_eq!(rows[39][1], "40");
     assert!(!rows[39][LOSS].is_empty());
@@ -211,10 +167,10 @@ fn another_world_is_begun_again() {
 
 #[test]
 fn frozen_networks_stay_as_they_are() {
-    let place = Place::new(SETTINGS);
-    let learned = place.train("out", &format!("{WORLD} --steps 20"));
+    let place = place(SETTINGS);
+    let learned = place.learn("out", &format!("{WORLD} --steps 20"));
     let checkpoint = std::fs::read(place.checkpoint("out")).expect("a checkpoint");
-    let after = place.train("out", &format!("{WORLD} --steps 9 --resume --freeze"));
+    let after = place.learn("out", &format!("{WORLD} --steps 9 --resume --freeze"));
     assert_eq!(learned, after, "metrics of learning");
     let again = std::fs::read(place.checkpoint("out")).expect("a checkpoint");
     assert!(checkpoint == again, "the checkpoint changed");
@@ -224,35 +180,29 @@ fn frozen_networks_stay_as_they_are() {
 
 #[test]
 fn a_kill_costs_no_more_than_the_steps_since_the_checkpoint() {
-    let place = Place::new(SETTINGS);
-    let rows = place.train("out", &format!("{WORLD} --steps 20"));
+    let place = place(SETTINGS);
+    let rows = place.learn("out", &format!("{WORLD} --steps 20"));
     let metrics = place.path("out").join("metrics.csv");
     let text = std::fs::read_to_string(&metrics).expect("the metrics");
     let last = text.lines().last().expect("rows").replace(",20,", ",21,");
     // What a kill leaves: a row after the checkpoint, and half of another.
     std::fs::write(&metrics, format!("{text}{last}\n{}", &last[..9])).expect("written");
-    let after = place.train("out", &format!("{WORLD} --steps 5 --resume"));
+    let after = place.learn("out", &format!("{WORLD} --steps 5 --resume"));
     assert_eq!(after[..20], rows[..]);
     let steps: Vec<&str> = after[20..].iter().map(|row| &*row[1]).collect();
     assert_eq!(steps, ["21", "22", "23", "24", "25"]);
     std::fs::write(&metrics, "update,loss\n").expect("written");
     let resume = place.words("out", &format!("{WORLD} --steps 5 --resume"));
-    check(
-        AGENT,
-        &resume,
-        &[
-            "metrics.csv: expected the columns update,world_steps",
-            "got update,loss",
-        ],
-    );
+    let words = "metrics.csv: expected the columns update,world_steps | got update,loss";
+    check(AGENT, &resume, words);
 }
 
 #[test]
 fn episodes_that_end_are_begun_again() {
-    let place = Place::new(&SETTINGS.replace("[dqn]", "[dqn]\nn_step = 2"));
+    let place = place(&SETTINGS.replace("[dqn]", "[dqn]\nn_step = 2"));
     let server = Server::start(&format!("{WORLD} --coverage client --max-steps 7"));
     let instance = format!("--instance {}", server.instance.name());
-    let rows = place.train("out", &format!("{instance} --steps 30"));
+    let rows = place.learn("out", &format!("{instance} --steps 30"));
     assert!(!rows[29][LOSS].is_empty() && !rows[29][DQN_LOSS].is_empty());
     assert_eq!(server.status().worlds[0].info.step, 30 % 7);
     // An agent that stopped at an episode's end leaves a world that only a reset goes on from.
@@ -261,17 +211,17 @@ fn episodes_that_end_are_begun_again() {
         fly(&mut client, vec![Move::Up; 5]);
     }
     client.release().expect("released");
-    let rows = place.train("out", &format!("{instance} --steps 3 --resume"));
+    let rows = place.learn("out", &format!("{instance} --steps 3 --resume"));
     assert_eq!(rows.len(), 33);
     assert_eq!(server.status().worlds[0].info.step, 3);
 }
 
 #[test]
 fn full_observation_tells_which_state_pays() {
-    let place = Place::new(SETTINGS);
+    let place = place(SETTINGS);
     let server = Server::start(&format!("{WORLD} --coverage full"));
     let name = server.instance.name();
-    let rows = place.train("out", &format!("--instance {name} --steps 30"));
+    let rows = place.learn("out", &format!("--instance {name} --steps 30"));
     assert!(!rows[29][LOSS].is_empty());
     let rewards: f64 = rows
         .iter()
@@ -287,8 +237,8 @@ fn full_observation_tells_which_state_pays() {
 #[test]
 fn numbers_that_are_not_finite_stop_training_with_a_checkpoint() {
     for (section, tensor) in [("autoencoder", "decoder.0.weight"), ("dqn", "dqn.network")] {
-        let place = Place::new(SETTINGS);
-        place.train("out", &format!("{WORLD} --steps 10"));
+        let place = place(SETTINGS);
+        place.learn("out", &format!("{WORLD} --steps 10"));
         let path = place.checkpoint("out");
         let (_, mut broken) = checkpoint::read(&path, &[KIND]).expect("a checkpoint");
         let numbers = broken.tensors.iter_mut();
@@ -300,19 +250,19 @@ fn numbers_that_are_not_finite_stop_training_with_a_checkpoint() {
         }
         checkpoint::write(&path, KIND, &broken).expect("written");
         let resume = place.words("out", &format!("{WORLD} --steps 10 --resume"));
-        let words = ["world steps: update ", "expected finite numbers", "is in"];
-        check(AGENT, &resume, &words);
+        let words = "world steps: update  | expected finite numbers | is in";
+        check(AGENT, &resume, words);
         let saved = contents(&path);
         assert!(saved.tensors.contains_key("W_obs_param"), "{section}");
         // What was saved is read again, and stops again.
-        check(AGENT, &resume, &words);
+        check(AGENT, &resume, words);
     }
 }
 
 #[test]
 fn a_checkpoint_enters_the_ladder() {
-    let place = Place::new(SETTINGS);
-    place.train("out", &format!("{WORLD} --steps 12"));
+    let place = place(SETTINGS);
+    place.learn("out", &format!("{WORLD} --steps 12"));
     let checkpoint = place.checkpoint("out");
     let checkpoint = checkpoint.display();
     let worlds = format!("--seeds 3..5 --steps 5 {WORLD} --beam-width 4 --shooting-samples 16");
@@ -320,63 +270,51 @@ fn a_checkpoint_enters_the_ladder() {
     let evaluated = agent(&format!("evaluate --checkpoint {checkpoint} {worlds}"));
     for policy in ["exploit", "explore", "policy", "beam"] {
         let policy = format!("autoencoder_{policy} ");
-        assert!(compared.stdout.contains(&policy), "{}", compared.stdout);
-        assert!(evaluated.stdout.contains(&policy), "{}", evaluated.stdout);
+        compared.check_prints(&policy);
+        evaluated.check_prints(&policy);
     }
-    let row = "autoencoder - known_model";
-    assert!(evaluated.stdout.contains(row), "{}", evaluated.stdout);
+    evaluated.check_prints("autoencoder - known_model");
     let server = Server::start(WORLD);
-    let run = format!("run --instance {} --steps 5", server.instance.name());
-    let run = format!("{run} --policy autoencoder_policy");
+    let name = server.instance.name();
+    let run = format!("run --instance {name} --steps 5 --policy autoencoder_policy");
     agent(&format!("{run} --checkpoint {checkpoint}"));
-    check(
-        AGENT,
-        &run,
-        &["autoencoder_policy", "--checkpoint FILE of an autoencoder"],
-    );
+    let words = "autoencoder_policy | --checkpoint FILE of an autoencoder";
+    check(AGENT, &run, words);
     let twice = format!("compare --checkpoint {checkpoint} --checkpoint {checkpoint} {worlds}");
-    check(
-        AGENT,
-        &twice,
-        &["expected one checkpoint of autoencoder, got two"],
-    );
+    let words = "expected one checkpoint of autoencoder, got two";
+    check(AGENT, &twice, words);
     let other = worlds.replace("--height 6", "--height 7");
     let other = format!("compare --policies autoencoder_beam --checkpoint {checkpoint} {other}");
-    check(
-        AGENT,
-        &other,
-        &["expected a network for 7 x 9 cells", "got one for 6 x 9"],
-    );
+    let words = "expected a network for 7 x 9 cells | got one for 6 x 9";
+    check(AGENT, &other, words);
 }
 
 #[test]
 fn what_does_not_fit_is_named() {
-    let place = Place::new(SETTINGS);
+    let place = place(SETTINGS);
     let words = |flags: &str| place.words("out", flags);
+    let two = words(&format!("{WORLD} --worlds 2"));
     check(
         AGENT,
-        &words(&format!("{WORLD} --worlds 2")),
-        &["--worlds: expected 1 for the autoencoder", "got 2"],
+        &two,
+        "--worlds: expected 1 for the autoencoder | got 2",
     );
     let server = Server::start(WORLD);
     let instance = format!("--instance {}", server.instance.name());
-    check(
-        AGENT,
-        &words(&instance),
-        &["autoencoder.full_frames: 6 frames", "--coverage client"],
-    );
-    place.train("out", &format!("{WORLD} --steps 8"));
+    let full = "autoencoder.full_frames: 6 frames | --coverage client";
+    check(AGENT, &words(&instance), full);
+    place.learn("out", &format!("{WORLD} --steps 8"));
     let resume = words(&format!("{WORLD} --steps 8 --resume"));
-    let check_settings = |settings: &str, expected: &[&str]| {
-        std::fs::write(place.path("agent.toml"), settings).expect("settings");
+    let check_settings = |settings: &str, expected: &str| {
+        place.set(settings);
         check(AGENT, &resume, expected);
     };
     check_settings(
         &SETTINGS.replace("[dqn]", "hidden = 5\n[dqn]"),
-        &["decoder.0.weight: expected shape [5, 128, 1, 1], got [4, "],
+        "decoder.0.weight: expected shape [5, 128, 1, 1], got [4, ",
     );
     check_settings(
         &SETTINGS.replace("learner = \"autoencoder\"\n", ""),
-        &["expected a checkpoint of learned_filter, got one of autoencoder"],
+        "expected a checkpoint of learned_filter, got one of autoencoder",
     );
 }

@@ -1,18 +1,10 @@
 //! Wrong input to every command: an exit code, one line that says what was expected, no panic.
 
-use crate::harness::{Ended, PATIENCE, Program, SMALL, Server, new_instance, run};
 use agent::planning::policy;
 use protocol::Model;
 use rustix::process::Signal;
 use std::time::{Duration, Instant};
-
-/// How long a refusal may take.
-pub const LIMIT: Duration = Duration::from_secs(60);
-
-/// The server's program.
-pub const SERVER: &str = "emberwatch-server";
-/// The agent's program.
-pub const AGENT: &str = "emberwatch-agent";
+use tests::harness::{AGENT, Ended, Program, SERVER, SMALL, Server, new_instance, run};
 
 /// A comparison of a moment, on worlds of its own.
 pub const TINY: &str = "--seeds 0..1 --steps 1 --height 4 --width 4 --moves 2 --burn-in 1 \
@@ -135,23 +127,28 @@ compare TINY --csv / => --csv: expected a file, got the folder /
 compare TINY --figures /proc/no => create /proc/no
 "#;
 
-/// Runs a program and checks that it refuses in one line that holds all these words.
-pub fn check(program: &str, arguments: &str, words: &[&str]) {
-    let arguments: Vec<&str> = arguments.split_whitespace().collect();
-    let ended = run(program, &arguments, LIMIT);
-    assert_refusal(&format!("{program} {}", arguments.join(" ")), &ended, words);
+/// Runs a program and checks that it refuses in one line that holds all these words, which ` | ` separates.
+pub fn check(program: &str, arguments: &str, words: &str) {
+    let ended = run(program, arguments);
+    assert_refusal(&format!("{program} {arguments}"), &ended, words);
+}
+
+/// Runs a command of the agent that succeeds.
+pub fn agent(arguments: &str) -> Ended {
+    let ended = run(AGENT, arguments).check(0);
+    assert!(!ended.stderr.contains("ERROR"), "{}", ended.stderr);
+    ended
 }
 
 /// Checks every line `flags => words | words`; `TINY` stands for [`TINY`].
 pub fn check_table(program: &str, table: &str) {
     for line in table.trim().lines() {
         let (flags, words) = line.split_once(" => ").expect("flags and words");
-        let words: Vec<&str> = words.split(" | ").collect();
-        check(program, &flags.replace("TINY", TINY), &words);
+        check(program, &flags.replace("TINY", TINY), words);
     }
 }
 
-fn assert_refusal(what: &str, ended: &Ended, words: &[&str]) {
+fn assert_refusal(what: &str, ended: &Ended, words: &str) {
     let Ended {
         code,
         stdout,
@@ -170,7 +167,7 @@ fn assert_refusal(what: &str, ended: &Ended, words: &[&str]) {
         1,
         "{what}: expected one line of error: {stderr}"
     );
-    for word in words {
+    for word in words.split(" | ") {
         assert!(
             stderr.contains(word),
             "{what}: {stderr:?} does not say {word:?}"
@@ -228,11 +225,8 @@ compare SERVER --policies coverage,oracle_beam => oracle_beam | --publish-truth"
 fn a_second_server_on_an_instance_is_told_who_the_first_is() {
     let server = Server::start(SMALL);
     let words = format!("already running, as pid {}", server.program.pid());
-    check(
-        SERVER,
-        &format!("--instance {}", server.instance.name()),
-        &[&words],
-    );
+    let flags = format!("--instance {}", server.instance.name());
+    check(SERVER, &flags, &words);
     assert_eq!(server.status().n_steps, 0, "the first lives on");
 }
 
@@ -240,23 +234,20 @@ fn a_second_server_on_an_instance_is_told_who_the_first_is() {
 fn status_tells_people_and_programs_of_every_world() {
     let server = Server::start(&format!("{SMALL} --worlds 2 --seed 40"));
     let _client = server.acquire(1..2);
-    let name = server.instance.name();
-    let people = run(SERVER, &["status", "--instance", name], LIMIT);
-    assert_eq!(people.code, Some(0), "{}", people.stderr);
+    let people = server.command("status").check(0);
     let holder = format!("pid {}", std::process::id());
     assert!(
         people.stdout.contains("41") && people.stdout.contains(&holder),
         "{}",
         people.stdout
     );
-    let json = run(SERVER, &["status", "--json", "--instance", name], LIMIT);
+    let json = server.command("status --json");
     let status: serde_json::Value = serde_json::from_str(&json.stdout).expect("JSON");
     assert_eq!(status["pid"], server.program.pid());
     assert_eq!(status["worlds"][1]["holder_pids"][0], std::process::id());
     assert_eq!(status["worlds"][1]["seed"], 41);
-    let stop = run(SERVER, &["stop", "--instance", name], LIMIT);
-    assert_eq!(stop.code, Some(0), "{}", stop.stderr);
-    assert_eq!(server.program.wait(LIMIT).code, Some(0));
+    server.command("stop").check(0);
+    server.program.ends(0);
 }
 
 #[test]
@@ -274,9 +265,8 @@ fn the_documented_prior_is_written() {
     let command = command.replace("FILE", file.to_str().expect("a plain path"));
     // Fewer and younger worlds than documented: it is the flags that are checked.
     let command = command.replace("--burn-in 10000", "--burn-in 10 --worlds 1");
-    let words: Vec<&str> = command.split_whitespace().skip(1).collect();
-    let ended = run(AGENT, &words, LIMIT);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    let (_, flags) = command.split_once(' ').expect("program and flags");
+    agent(flags);
     assert!(file.is_file());
 }
 
@@ -296,16 +286,14 @@ fn agents_wait_for_the_server_that_is_started_with_them() {
     ] {
         let instance = new_instance();
         let flags = format!("{command} --wait 60 --instance {}", instance.name());
-        let flags: Vec<&str> = flags.split_whitespace().collect();
         let agent = Program::start(AGENT, &flags);
-        agent.wait_for_words("waiting for it", PATIENCE);
+        agent.wait_for_words("waiting for it");
         let _server = Server::start_on(&instance, &format!("{SMALL} --worlds 2 --publish-truth"));
-        agent.wait_for_words(done, PATIENCE);
+        agent.wait_for_words(done);
         if command == "serve-decisions" {
             agent.signal(Signal::TERM);
         }
-        let ended = agent.wait(PATIENCE);
-        assert_eq!(ended.code, Some(0), "{command}: {}", ended.stderr);
+        let ended = agent.ends(0);
         let told = ended.stderr.matches("waiting for it").count();
         assert_eq!(told, 1, "{command}: {}", ended.stderr);
     }
@@ -315,24 +303,18 @@ fn agents_wait_for_the_server_that_is_started_with_them() {
 fn an_agent_that_waits_can_be_stopped() {
     for command in ["run", "serve-decisions"] {
         let instance = new_instance();
-        let flags = [command, "--wait", "1e18", "--instance", instance.name()];
+        let flags = format!("{command} --wait 1e18 --instance {}", instance.name());
         let agent = Program::start(AGENT, &flags);
-        agent.wait_for_words("waiting for it", PATIENCE);
-        agent.signal(Signal::TERM);
-        let ended = agent.wait(PATIENCE);
-        assert_eq!(ended.code, Some(0), "{command}: {}", ended.stderr);
+        agent.wait_for_words("waiting for it");
+        agent.finish();
     }
 }
 
 #[test]
 fn an_agent_acts_as_slowly_as_it_is_told() {
     let server = Server::start(SMALL);
-    let name = server.instance.name();
-    let flags = format!("run --instance {name} --steps 4 --steps-per-second 1");
-    let flags: Vec<&str> = flags.split_whitespace().collect();
     let start = Instant::now();
-    let ended = run(AGENT, &flags, LIMIT);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    Program::agent(&server.instance, "--steps 4 --steps-per-second 1").ends(0);
     // Without pauses it takes a fraction of that.
     assert!(start.elapsed() >= Duration::from_secs(3), "three pauses");
 }
@@ -340,7 +322,7 @@ fn an_agent_acts_as_slowly_as_it_is_told() {
 #[test]
 fn help_lists_the_policies() {
     for command in ["run", "compare"] {
-        let help = run(AGENT, &[command, "--help"], LIMIT).stdout;
+        let help = run(AGENT, &format!("{command} --help")).stdout;
         let list = policy::list(&Model::wildfire());
         assert!(help.contains(list.trim_end()), "{command}: {help}");
     }

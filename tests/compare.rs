@@ -1,16 +1,11 @@
 //! `emberwatch-agent` from end to end: comparisons that repeat to the bit, and a second model.
 
-use crate::harness::{Ended, Server, repository, run};
+use crate::commands::agent;
 use env_server::world::{Source, World};
 use protocol::{Dynamics, Model, Shape};
 use std::path::Path;
-use std::time::Duration;
 use tempfile::TempDir;
-
-const AGENT: &str = "emberwatch-agent";
-
-/// How long a small comparison may take.
-const LIMIT: Duration = Duration::from_secs(60);
+use tests::harness::{Program, Server, repository};
 
 /// What is compared; the worlds come on top.
 const WHAT: &str = "compare --seeds 3..5 --steps 5 --shooting-samples 16 --beam-width 4";
@@ -22,14 +17,6 @@ const HEADER: &str = "policy,estimator,world_seed,steps,mean_reward,mean_distinc
                       mean_fire_cells,mean_plan_millis,brier,moves,robots,team,mean_repeated,\
                       steps_to_detection,burning_cells_at_detection,recent_steps,\
                       burning_seen_share,front_distance,grid_seen_share";
-
-fn agent(arguments: &[&str]) -> Ended {
-    let words = arguments.iter().flat_map(|flags| flags.split_whitespace());
-    let ended = run(AGENT, &words.collect::<Vec<_>>(), LIMIT);
-    assert_eq!(ended.code, Some(0), "{arguments:?}: {}", ended.stderr);
-    assert!(!ended.stderr.contains("ERROR"), "{}", ended.stderr);
-    ended
-}
 
 /// The rows of a CSV file without the time that plans took; its header is checked.
 fn rows(path: &Path) -> Vec<Vec<String>> {
@@ -46,9 +33,8 @@ fn rows(path: &Path) -> Vec<Vec<String>> {
     rows.collect()
 }
 
-fn compare_to(path: &Path, flags: &[&str]) -> Vec<Vec<String>> {
-    let csv = format!("--csv {}", path.display());
-    agent(&[&[WHAT, &csv], flags].concat());
+fn compare_to(path: &Path, flags: &str) -> Vec<Vec<String>> {
+    agent(&format!("{WHAT} --csv {} {flags}", path.display()));
     rows(path)
 }
 
@@ -58,19 +44,16 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
     let path = |name: &str| folder.path().join(name);
     let (csv, figures) = (path("new/out.csv"), path("figures"));
     let places = format!("--csv {} --figures {}", csv.display(), figures.display());
-    let ended = agent(&[WHAT, WORLDS, &places]);
+    let ended = agent(&format!("{WHAT} {WORLDS} {places}"));
     let rows = rows(&csv);
     // Thirteen policies of the wildfire's ladder, two seeds each.
     assert_eq!(rows.len(), 13 * 2, "{rows:?}");
     for [first, second] in rows.as_chunks::<2>().0 {
-        assert!(ended.stdout.contains(&first[0]), "{}", ended.stdout);
+        ended.check_prints(&first[0]);
         assert_eq!((&first[0], &*first[2], &*second[2]), (&second[0], "3", "4"));
         let fire_cells = [&first[7], &second[7]];
-        assert_eq!(
-            fire_cells,
-            [&rows[0][7], &rows[1][7]],
-            "all met the same worlds"
-        );
+        let theirs = [&rows[0][7], &rows[1][7]];
+        assert_eq!(fire_cells, theirs, "all met the same worlds");
     }
     for name in ["ladder.png", "rewards.png", "snapshot.png"] {
         let bytes = std::fs::read(figures.join(name)).expect(name);
@@ -91,21 +74,18 @@ fn a_comparison_writes_a_table_a_csv_file_and_figures() {
 fn a_comparison_repeats_to_the_bit_on_any_server() {
     let folder = TempDir::new().expect("a folder");
     let path = |name: &str| folder.path().join(name);
-    let first = compare_to(&path("first.csv"), &[WORLDS]);
-    assert_eq!(compare_to(&path("again.csv"), &[WORLDS]), first);
+    let first = compare_to(&path("first.csv"), WORLDS);
+    assert_eq!(compare_to(&path("again.csv"), WORLDS), first);
     let roomy = format!("{WORLDS} --publish-truth --coverage client --seed 77");
     for n_worlds in [5, 2] {
         let server = Server::start(&format!("{roomy} --worlds {n_worlds} --threads 2"));
         let instance = format!("--instance {}", server.instance.name());
         for round in ["one.csv", "two.csv"] {
-            assert_eq!(
-                compare_to(&path(round), &[&instance]),
-                first,
-                "{n_worlds} worlds"
-            );
+            let again = compare_to(&path(round), &instance);
+            assert_eq!(again, first, "{n_worlds} worlds");
         }
     }
-    let other_seed = compare_to(&path("seed.csv"), &[WORLDS, "--agent-seed 5"]);
+    let other_seed = compare_to(&path("seed.csv"), &format!("{WORLDS} --agent-seed 5"));
     assert_ne!(other_seed, first, "planners draw from the agent's seed");
 }
 
@@ -115,7 +95,7 @@ fn without_hidden_states_what_needs_them_is_empty() {
     let path = |name: &str| folder.path().join(name);
     let worlds = "--model wildfire-small --height 12 --width 14 --moves 8 --burn-in 300";
     let policies = "--policies beam_exploit,coverage";
-    let mut expected = compare_to(&path("truth.csv"), &[worlds, policies]);
+    let mut expected = compare_to(&path("truth.csv"), &format!("{worlds} {policies}"));
     // Brier score, burning cells seen and distance to the front.
     for row in &mut expected {
         assert!(
@@ -128,15 +108,11 @@ fn without_hidden_states_what_needs_them_is_empty() {
     }
     let server = Server::start(&format!("{worlds} --worlds 2"));
     let csv = path("blind.csv");
-    let places = format!(
-        "--csv {} --instance {}",
-        csv.display(),
-        server.instance.name()
-    );
-    let ended = agent(&[WHAT, policies, &places]);
+    let (path, name) = (csv.display(), server.instance.name());
+    let places = format!("--csv {path} --instance {name}");
+    let ended = agent(&format!("{WHAT} {policies} {places}"));
     assert_eq!(rows(&csv), expected);
-    let told = "no hidden states were published";
-    assert!(ended.stdout.contains(told), "{}", ended.stdout);
+    ended.check_prints("no hidden states were published");
 }
 
 #[test]
@@ -144,9 +120,12 @@ fn teams_meet_the_worlds_of_one_robot_and_one_robot_is_each_team() {
     let folder = TempDir::new().expect("a folder");
     let path = |name: &str| folder.path().join(name);
     let lively = "--model wildfire-small --height 12 --width 14 --moves 8 --burn-in 300";
-    let alone = compare_to(&path("one.csv"), &[lively, "--policies beam_exploit"]);
+    let alone = compare_to(
+        &path("one.csv"),
+        &format!("{lively} --policies beam_exploit"),
+    );
     let teams = "--robots 1,3 --team alone,shared,joint,oracle";
-    let rows = compare_to(&path("teams.csv"), &[lively, teams]);
+    let rows = compare_to(&path("teams.csv"), &format!("{lively} {teams}"));
     assert_eq!(rows.len(), 2 * 4 * 2, "{rows:?}");
     // Robots and team stand in columns 10 and 11.
     let of = |robots: &str, team: &str| -> Vec<Vec<String>> {
@@ -175,7 +154,7 @@ fn teams_meet_the_worlds_of_one_robot_and_one_robot_is_each_team() {
         "{lively} --robots 3 --publish-truth --coverage client"
     ));
     let flags = format!("--team joint --instance {}", server.instance.name());
-    let joint = compare_to(&path("joint.csv"), &[&flags]);
+    let joint = compare_to(&path("joint.csv"), &flags);
     assert!(
         joint.iter().all(|row| row[10..12] == ["3", "joint"]),
         "{joint:?}"
@@ -193,8 +172,8 @@ fn runs_with_one_seed_act_alike() {
     ] {
         let act = || {
             let server = Server::start(&format!("{WORLDS} --publish-truth"));
-            let name = server.instance.name();
-            agent(&["run --instance", name, "--policy", policy, flags]);
+            let flags = format!("--policy {policy} {flags}");
+            Program::agent(&server.instance, &flags).ends(0);
             (server.observe(0), server.status().worlds[0].holder_pids[0])
         };
         let (first, holder) = act();
@@ -212,32 +191,26 @@ fn a_second_model_runs_from_end_to_end() {
     let flags = format!("{worlds} {model}");
     let server = Server::start(&flags);
     let info = server.info();
-    assert_eq!(
-        (info.n_observations, info.observations),
-        (3, vec!["dark".into(), "shiny".into(), "white".into()])
-    );
-    let name = server.instance.name();
-    agent(&[
-        "run --steps 30 --beam-width 5 --policy beam_ice --instance",
-        name,
-    ]);
-    agent(&[
-        "run --steps 10 --shooting-samples 9 --policy shooting_gritted --instance",
-        name,
-    ]);
+    assert_eq!(info.n_observations, 3);
+    assert_eq!(info.observations, ["dark", "shiny", "white"]);
+    for flags in [
+        "--steps 30 --beam-width 5 --policy beam_ice",
+        "--steps 10 --shooting-samples 9 --policy shooting_gritted",
+    ] {
+        Program::agent(&server.instance, flags).ends(0);
+    }
     assert_eq!(server.observe(0).0.step, 40);
     let figures = format!("--figures {}", folder.path().join("figures").display());
-    let rows = compare_to(&folder.path().join("ice.csv"), &[&flags, &figures]);
+    let rows = compare_to(
+        &folder.path().join("ice.csv"),
+        &format!("{flags} {figures}"),
+    );
     // Fourteen policies: the ladder has one for each of three states beside the one that pays.
     assert_eq!(rows.len(), 14 * 2, "{rows:?}");
     assert!(folder.path().join("figures/snapshot.png").exists());
     let hidden = Server::start(&format!("{flags} --reveal-model false"));
-    agent(&[
-        "run --steps 3 --beam-width 5",
-        &model,
-        "--instance",
-        hidden.instance.name(),
-    ]);
+    let flags = format!("--steps 3 --beam-width 5 {model}");
+    Program::agent(&hidden.instance, &flags).ends(0);
 }
 
 #[test]

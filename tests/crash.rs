@@ -1,36 +1,30 @@
 //! Agents that are killed or stopped in the middle of a step: the world stays exactly where it was.
 
-use crate::harness::{
-    PATIENCE, Paths, Program, Server, eventually, fly, frames_until, path_of, seen_by, seen_in,
-    status, takeover,
-};
-use crate::wire::{RawClient, Wire, answer, control_header, step_body, step_header};
 use protocol::channels::{ChannelError, Instance};
 use protocol::client::Claim;
 use protocol::connection::ConnectionError;
 use protocol::control::{Reply, Request};
-use protocol::message::{FrameHeader, Status, StepRequest};
-use protocol::observer::{Observer, Sample};
+use protocol::message::{Status, StepRequest};
+use protocol::observer::Observer;
 use protocol::payload::split_step_payload;
 use protocol::{Client, Connection};
 use rustix::process::Signal;
 use std::time::Duration;
+use tests::harness::{
+    AGENT, PATIENCE, Paths, Program, Server, eventually, fly, frames_until, seen_in, status,
+};
+use tests::mirror::Mirror;
+use tests::wire::{
+    RawClient, Wire, acquire_request, answer, control_header, step_body, step_header,
+};
 
 /// A grid on which planning takes most of a step.
 const FLAGS: &str = "--height 12 --width 9 --moves 8 --burn-in 50";
 
 /// An agent that acts without end, some tens of milliseconds a step.
-fn start_agent(instance: &Instance, flags: &[&str]) -> Program {
-    let common = ["run", "--instance", instance.name(), "--policy", "coverage"];
-    let slow = ["--shooting-samples", "100000"];
-    Program::start(
-        "emberwatch-agent",
-        &[&common[..], &slow[..], flags].concat(),
-    )
-}
-
-fn holder(server: &Server) -> Option<u32> {
-    server.status().worlds[0].holder_pids[0]
+fn start_agent(instance: &Instance, flags: &str) -> Program {
+    let slow = "--policy coverage --shooting-samples 100000";
+    Program::agent(instance, &format!("{slow} {flags}"))
 }
 
 #[test]
@@ -41,12 +35,11 @@ fn a_killed_agents_world_is_free_at_once_and_goes_on_as_if_nothing_had_been() {
     for _ in 0..3 {
         let next = Wire::open(&server.instance);
         // No more steps than an observer is kept, however late it reads.
-        let agent = start_agent(&server.instance, &["--steps", "50"]);
+        let agent = start_agent(&server.instance, "--steps 50");
         let at = frames[frames.len() - 1].header.result.step;
         frames.extend(frames_until(&observer, 0, at + 4));
         server.program.stop();
-        agent.signal(Signal::KILL);
-        agent.wait(PATIENCE);
+        agent.kill();
         let lease = acquire_from_stopped(&server, &next);
         while let Some(frame) = observer.try_receive().expect("receive") {
             frames.push(frame);
@@ -55,28 +48,26 @@ fn a_killed_agents_world_is_free_at_once_and_goes_on_as_if_nothing_had_been() {
         assert_eq!(server.observe(0), seen_in(last));
         assert_eq!(next.ask(&Request::Release { lease }), Reply::Done);
     }
-    let is_next =
-        |pair: &[Sample<FrameHeader>]| pair[1].header.sequence == pair[0].header.sequence + 1;
-    assert!(frames.windows(2).all(is_next), "a frame was missed");
     let mut survivor = server.acquire(0..1);
-    let mut undisturbed = replay(&frames);
     for path in Paths::new(5).take(8, 10) {
-        assert_eq!(
-            fly(&mut survivor, path.clone()),
-            fly(&mut undisturbed.1, path)
-        );
+        fly(&mut survivor, path);
     }
+    let last = server.step_of(0);
+    frames.extend(frames_until(&observer, 0, last));
+    let mut sequences = frames.iter().map(|frame| frame.header.sequence);
+    let first = sequences.next().expect("a frame");
+    assert!(
+        sequences.eq(first + 1..first + frames.len() as u64),
+        "a frame was missed"
+    );
+    let mut mirror = Mirror::of(&server.info());
+    let n_steps = frames.iter().filter(|frame| mirror.follow(frame)).count();
+    assert_eq!(n_steps as u64, last, "each step once");
 }
 
 /// Acquires with the first request that a stopped server finds when it goes on.
 fn acquire_from_stopped(server: &Server, next: &Wire) -> u64 {
-    let request = Request::Acquire {
-        first_robot: 0,
-        n_robots: 1,
-        takeover: false,
-        ttl_millis: None,
-    };
-    let text = serde_json::to_vec(&request).expect("requests serialise");
+    let text = serde_json::to_vec(&acquire_request(0..1)).expect("requests serialise");
     let pending = next.send_control(control_header(1), &text).expect("send");
     server.program.signal(Signal::CONT);
     let (_, reply) = answer(&pending, PATIENCE).expect("an answer");
@@ -86,30 +77,15 @@ fn acquire_from_stopped(server: &Server, next: &Wire) -> u64 {
     }
 }
 
-/// Flies the published paths on a new server of the same seed, where nothing is killed.
-fn replay(frames: &[Sample<FrameHeader>]) -> (Server, Client) {
-    let server = Server::start(FLAGS);
-    let mut client = server.acquire(0..1);
-    let flown = frames.iter().filter(|frame| frame.header.result.step > 0);
-    for (index, sample) in flown.enumerate() {
-        assert_eq!(
-            sample.header.result.step,
-            index as u64 + 1,
-            "a step without a frame"
-        );
-        let seen = fly(&mut client, path_of(sample));
-        assert_eq!(seen_by(&seen), seen_in(sample));
-    }
-    (server, client)
-}
-
 #[test]
 fn a_stopped_agent_loses_its_lease_and_says_so_when_it_wakes() {
     let server = Server::start(&format!("{FLAGS} --lease-millis 1500"));
-    let agent = start_agent(&server.instance, &[]);
-    agent.wait_for_words("acting", PATIENCE);
+    let agent = start_agent(&server.instance, "");
+    agent.wait_for_words("acting");
+    let refused = start_agent(&server.instance, "").ends(1);
+    refused.check_says(&format!("busy: held by pid {}", agent.pid()));
     agent.signal(Signal::STOP);
-    assert!(eventually(PATIENCE, || holder(&server).is_none()));
+    agent.until(|| server.holder().is_none());
     let long = Claim {
         time_to_live: Some(Duration::from_secs(3600)),
         ..Claim::new(0..1)
@@ -117,43 +93,10 @@ fn a_stopped_agent_loses_its_lease_and_says_so_when_it_wakes() {
     let mut next = Client::acquire(server.connect(), &long).expect("acquire");
     let before = next.observe(0..1).expect("observe");
     agent.signal(Signal::CONT);
-    let ended = agent.wait(PATIENCE);
-    assert_eq!(ended.code, Some(3), "{}", ended.stderr);
     // To us, or to nobody, where it had been paused for so long before.
-    assert!(ended.stderr.contains("lease lost"), "{}", ended.stderr);
-    assert_eq!(
-        next.observe(0..1).expect("observe"),
-        before,
-        "it stepped nothing"
-    );
-}
-
-#[test]
-fn an_agent_whose_world_is_taken_over_ends_with_code_3() {
-    let server = Server::start(FLAGS);
-    let first = start_agent(&server.instance, &[]);
-    assert!(
-        eventually(PATIENCE, || holder(&server) == Some(first.pid())),
-        "{}",
-        first.stderr()
-    );
-    let refused = start_agent(&server.instance, &[]).wait(PATIENCE);
-    assert_eq!(refused.code, Some(1));
-    let words = format!("busy: held by pid {}", first.pid());
-    assert!(refused.stderr.contains(&words), "{}", refused.stderr);
-    let second = start_agent(&server.instance, &["--takeover"]);
-    let ended = first.wait(PATIENCE);
-    assert_eq!(ended.code, Some(3), "{}", ended.stderr);
-    let words = format!("lease lost to pid {}", second.pid());
-    assert!(ended.stderr.contains(&words), "{}", ended.stderr);
-    second.signal(Signal::TERM);
-    let ended = second.wait(PATIENCE);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-    assert_eq!(
-        holder(&server),
-        None,
-        "an agent that is told to stop releases its world"
-    );
+    agent.ends(3).check_says("lease lost");
+    let after = next.observe(0..1).expect("observe");
+    assert_eq!(after, before, "it stepped nothing");
 }
 
 #[test]
@@ -162,22 +105,13 @@ fn agents_killed_one_after_the_other_change_no_world_and_use_up_no_limit() {
     let (server, undisturbed) = (Server::start(&flags), Server::start(&flags));
     let mut before = 0;
     for _ in 0..20 {
-        let flags = [
-            "run",
-            "--instance",
-            server.instance.name(),
-            "--policy",
-            "random_walk",
-        ];
-        let agent = Program::start("emberwatch-agent", &[&flags[..], &["--takeover"]].concat());
-        let acts = || server.step_of(0) > before;
-        assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
-        agent.signal(Signal::KILL);
-        agent.wait(PATIENCE);
+        let agent = Program::agent(&server.instance, "--policy random_walk --takeover");
+        agent.until(|| server.step_of(0) > before);
+        agent.kill();
         before = server.step_of(0);
     }
     // From here on what the last one asked for is refused.
-    drop(Client::acquire(server.connect(), &takeover(0..1)).expect("take over"));
+    drop(server.take_over(0..1));
     let (world, _, frame) = server.observe(0);
     let last = world.step;
     let mut client = undisturbed.acquire(0..1);
@@ -202,7 +136,7 @@ fn agents_killed_one_after_the_other_change_no_world_and_use_up_no_limit() {
 fn a_step_whose_client_gave_up_waiting_is_made_once_or_not_and_its_answer_taken_for_no_other() {
     let server = Server::start(FLAGS);
     let wire = Wire::open(&server.instance);
-    let lease = wire.acquire(0, 1).lease;
+    let lease = wire.acquire(0..1).lease;
     server.program.stop();
     let header = |sequence| StepRequest {
         sequence,
@@ -240,11 +174,9 @@ fn the_private_server_of_a_comparison_ends_with_it() {
     let flags = "compare --seeds 0..1 --steps 1000000 --height 5 --width 5 --moves 4 --burn-in 5 \
                  --policies random_walk,coverage --baseline random_walk";
     for signal in [Signal::KILL, Signal::TERM] {
-        let flags: Vec<&str> = flags.split_whitespace().collect();
-        let agent = Program::start("emberwatch-agent", &flags);
+        let agent = Program::start(AGENT, flags);
         let instance = Instance::new(&format!("private-{}", agent.pid())).expect("a plain name");
-        let acts = || status(&instance).is_ok_and(|status| status.n_steps > 10);
-        assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
+        agent.until(|| status(&instance).is_ok_and(|status| status.n_steps > 10));
         agent.signal(signal);
         agent.wait(PATIENCE);
         let gone = || {

@@ -1,10 +1,5 @@
 //! How agents that serve decisions begin, keep their world and end; and learners that are killed.
 
-use crate::harness::{PATIENCE, Program, SMALL, Server, eventually, new_instance, takeover};
-use crate::learner::{
-    Learner, decide, refusal, reply_to, start_agent, start_at, start_with_learner,
-};
-use crate::wire::control_header;
 use agent::acting::decider::{Assignment, Decider};
 use agent::acting::mission::prepare;
 use agent::config::AgentConfig;
@@ -18,13 +13,14 @@ use protocol::message::Status;
 use rustix::process::Signal;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
+use tests::harness::{PATIENCE, Program, SMALL, Server, eventually, new_instance, takeover};
+use tests::learner::{
+    Learner, decide, refusal, reply_to, start_agent, start_at, start_with_learner,
+};
+use tests::wire::control_header;
 
 /// Names the instance to the child of a test.
 const CHILD: &str = "EMBERWATCH_TEST_CHILD";
-
-fn holder(server: &Server) -> Option<u32> {
-    server.status().worlds[0].holder_pids[0]
-}
 
 #[test]
 fn a_second_agent_is_refused_whatever_it_asks_for() {
@@ -32,19 +28,13 @@ fn a_second_agent_is_refused_whatever_it_asks_for() {
     let (agent, learner) = start_with_learner(&server.instance, "");
     let words = format!("served already, by pid {}", agent.pid());
     for flags in ["", "--takeover"] {
-        let second = start_agent(&server.instance, flags).wait(PATIENCE);
-        assert_eq!(second.code, Some(1), "{}", second.stderr);
-        assert!(second.stderr.contains(&words), "{}", second.stderr);
+        let second = start_agent(&server.instance, flags).ends(1);
+        second.check_says(&words);
     }
     learner.decide(2);
-    agent.signal(Signal::KILL);
-    agent.wait(PATIENCE);
+    agent.kill();
     let (_agent, next) = start_with_learner(&server.instance, "");
-    assert_eq!(
-        next.last().step,
-        1,
-        "the next goes on where the first was killed"
-    );
+    assert_eq!(next.last().step, 1, "where the first was killed");
     assert_eq!(next.decide(2).step, 2);
 }
 
@@ -58,7 +48,7 @@ fn an_agent_renews_its_lease_when_a_third_of_it_has_passed_without_use() {
     let almost = due - Duration::from_millis(1);
     assert!(!decider.until_renewal(almost).is_zero());
     assert!(decider.until_renewal(due).is_zero());
-    let _thief = Client::acquire(server.connect(), &takeover(0..1)).expect("take over");
+    let _thief = server.take_over(0..1);
     decider.keep_alive(almost).expect("nothing is asked");
     let lost = decider.keep_alive(due).expect_err("the lease is lost");
     let status = errors::refusal(&lost).map(|(status, ..)| status);
@@ -86,10 +76,10 @@ fn an_agent_that_waits_for_a_server_ends_with_the_process_it_watches() {
     let mut watched = Command::new("sleep").arg("600").spawn().expect("sleep");
     let flags = format!("--wait 600 --exit-with {}", watched.id());
     let agent = start_agent(&new_instance(), &flags);
-    agent.wait_for_words("waiting for it", PATIENCE);
+    agent.wait_for_words("waiting for it");
     watched.kill().expect("kill it");
     watched.wait().expect("its end");
-    assert_eq!(agent.wait(PATIENCE).code, Some(0));
+    agent.ends(0);
 }
 
 #[test]
@@ -97,15 +87,14 @@ fn an_agent_that_is_told_to_end_releases_its_world_first() {
     let server = Server::start(SMALL);
     let (agent, learner) = start_with_learner(&server.instance, "");
     assert_eq!(learner.ask(&Request::Shutdown {}), Reply::Done);
-    assert_eq!(holder(&server), None);
+    assert_eq!(server.holder(), None);
     drop(learner);
-    assert_eq!(agent.wait(PATIENCE).code, Some(0));
+    agent.ends(0);
     for signal in [Signal::TERM, Signal::INT] {
         let (agent, _learner) = start_with_learner(&server.instance, "");
         agent.signal(signal);
-        let ended = agent.wait(PATIENCE);
-        assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-        assert_eq!(holder(&server), None);
+        agent.ends(0);
+        assert_eq!(server.holder(), None);
     }
     let error = Learner::try_open(&server.instance).err();
     assert!(
@@ -122,10 +111,9 @@ fn an_agent_ends_with_the_process_that_it_was_started_for() {
     let (agent, _learner) =
         start_with_learner(&server.instance, &format!("--exit-with {}", keeper.id()));
     keeper.kill().expect("kill the keeper");
-    let ended = agent.wait(PATIENCE);
     keeper.wait().expect("wait for the keeper");
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-    assert_eq!(holder(&server), None);
+    agent.ends(0);
+    assert_eq!(server.holder(), None);
 }
 
 #[test]
@@ -149,9 +137,7 @@ fn an_agent_whose_server_is_killed_says_so_and_ends() {
             server.kill();
         }
         drop(learner);
-        let ended = agent.wait(PATIENCE);
-        assert_eq!(ended.code, Some(1), "{}", ended.stderr);
-        assert!(ended.stderr.contains("is gone"), "{}", ended.stderr);
+        agent.ends(1).check_says("is gone");
     }
 }
 
@@ -173,9 +159,7 @@ fn an_agent_whose_world_is_taken_says_so_and_ends_with_code_3() {
             assert_eq!(detail, u64::from(std::process::id()));
         }
         drop(learner);
-        let ended = agent.wait(PATIENCE);
-        assert_eq!(ended.code, Some(3), "{}", ended.stderr);
-        assert!(ended.stderr.contains("lease lost"), "{}", ended.stderr);
+        agent.ends(3).check_says("lease lost");
         assert_eq!(server.observe(0).0, before, "it stepped nothing");
     }
 }
@@ -183,16 +167,13 @@ fn an_agent_whose_world_is_taken_says_so_and_ends_with_code_3() {
 #[test]
 fn a_world_goes_from_agent_to_agent_in_the_middle_of_an_episode() {
     let server = Server::start(SMALL);
-    let name = server.instance.name();
-    let flags = ["run", "--instance", name, "--policy", "random_walk"];
-    let first = Program::start("emberwatch-agent", &flags);
-    let acts = || server.observe(0).0.step > 3;
-    assert!(eventually(PATIENCE, acts), "{}", first.stderr());
-    let refused = start_agent(&server.instance, "").wait(PATIENCE);
+    let first = Program::agent(&server.instance, "--policy random_walk");
+    first.until(|| server.step_of(0) > 3);
+    let refused = start_agent(&server.instance, "").ends(1);
     let words = format!("busy: held by pid {}", first.pid());
-    assert!(refused.stderr.contains(&words), "{}", refused.stderr);
+    refused.check_says(&words);
     let (_agent, learner) = start_with_learner(&server.instance, "--takeover");
-    assert_eq!(first.wait(PATIENCE).code, Some(3));
+    first.ends(3);
     let (result, ..) = server.observe(0);
     let last = learner.last();
     assert_eq!((last.step, last.reward), (result.step, result.reward));
@@ -208,10 +189,8 @@ fn each_world_goes_on_from_what_is_known_about_it() {
     let objectives = [Some(2), Some(3), Some(0)];
     for known in ["", "the belief that was left", "the frames that were kept"] {
         let (agent, learner) = start_at(&server.instance, 1, "--worlds 3");
-        assert_eq!(
-            learner.decide_all(&objectives),
-            expected.decide_all(&objectives)
-        );
+        let decisions = learner.decide_all(&objectives);
+        assert_eq!(decisions, expected.decide_all(&objectives));
         let words = agent.stderr();
         assert!(
             known.is_empty() || words.matches(known).count() == 3,
@@ -220,7 +199,7 @@ fn each_world_goes_on_from_what_is_known_about_it() {
         if known.is_empty() {
             assert_eq!(learner.ask(&Request::Shutdown {}), Reply::Done);
             drop(learner);
-            assert_eq!(agent.wait(PATIENCE).code, Some(0));
+            agent.ends(0);
         } else {
             agent.kill();
         }
@@ -239,8 +218,7 @@ fn killed_learners_disturb_nobody_and_use_up_no_limit() {
         child.wait().expect("wait for it");
         assert!(decides, "{}", agent.stderr());
     }
-    let connects = || Learner::try_open(&server.instance).is_ok();
-    assert!(eventually(PATIENCE, connects), "{}", agent.stderr());
+    agent.until(|| Learner::try_open(&server.instance).is_ok());
     let before = learner.last().step;
     assert_eq!(learner.decide(2).step, before + 1);
 }

@@ -1,12 +1,6 @@
 //! Agents that take decisions from a learner outside: same worlds, same plans, clear refusals.
 
-use crate::harness::{PATIENCE, SMALL, Server, frames_until, new_instance, run, seen_in};
-use crate::learner::{
-    Learner, decide, decisions, refusal, reset, start_agent, start_at, start_with_learner,
-};
-use crate::wire::control_header;
 use protocol::channels::ChannelError;
-use protocol::control::WorldSeed;
 use protocol::decisions::{Decision, Reply, Request};
 use protocol::message::{ControlRequest, Status, VERSION};
 use protocol::observer::Observer;
@@ -14,6 +8,11 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use rustix::process::Signal;
+use tests::harness::{Program, SMALL, Server, frames_until, new_instance, seed, seen_in};
+use tests::learner::{
+    Learner, decide, decisions, refusal, reset, start_agent, start_at, start_with_learner,
+};
+use tests::wire::control_header;
 
 /// A world in which something burns.
 const BURNING: &str = "--height 32 --width 24 --moves 24 --burn-in 10000";
@@ -43,10 +42,8 @@ fn hello_tells_what_can_be_decided() {
     assert_eq!((info.height, info.width, info.n_moves), (5, 7, 6));
     assert_eq!((info.protocol, info.max_steps), (VERSION, 9));
     assert_eq!((info.first_world, info.n_worlds), (0, 1));
-    assert_eq!(
-        (info.pid, &*info.instance),
-        (agent.pid(), server.instance.name())
-    );
+    assert_eq!(info.pid, agent.pid());
+    assert_eq!(info.instance, server.instance.name());
     assert_eq!(info.states, ["normal", "latent", "fire"]);
     assert_eq!(info.objectives, ["normal", "latent", "fire", "entropy"]);
     assert_eq!((&*info.estimator, &*info.planner), ("known_model", "beam"));
@@ -70,14 +67,8 @@ fn assert_the_same_steps(policy: &str, estimator: &str) {
     let (server, other) = (Server::start(&flags), Server::start(&flags));
     let observer = Observer::frames(&server.instance).expect("observe");
     frames_until(&observer, 0, 0);
-    let name = server.instance.name();
-    let policy = ["--policy", policy, "--steps", "30"];
-    let ran = run(
-        "emberwatch-agent",
-        &[&["run", "--instance", name], &policy[..]].concat(),
-        PATIENCE,
-    );
-    assert_eq!(ran.code, Some(0), "{}", ran.stderr);
+    let flags = format!("--policy {policy} --steps 30");
+    Program::agent(&server.instance, &flags).ends(0);
     let flown: Vec<_> = frames_until(&observer, 0, 30)
         .iter()
         .filter(|sample| sample.header.result.step > 0)
@@ -93,21 +84,12 @@ fn assert_the_same_steps(policy: &str, estimator: &str) {
         }
         for (world, robot, _) in &flown {
             let made = learner.decide(2);
-            assert_eq!(
-                (made.step, made.reward, made.n_hits, made.robot),
-                (
-                    world.step,
-                    world.reward,
-                    world.n_hits,
-                    [robot.row, robot.col]
-                )
-            );
+            assert_eq!((made.step, made.reward), (world.step, world.reward));
+            assert_eq!(made.n_hits, world.n_hits);
+            assert_eq!(made.robot, [robot.row, robot.col]);
             assert_eq!(made.objective, Some(2));
-            assert!(
-                made.summary
-                    .iter()
-                    .all(|number| (0.0..=1.0).contains(number))
-            );
+            let mut summary = made.summary.iter();
+            assert!(summary.all(|number| (0.0..=1.0).contains(number)));
         }
     }
 }
@@ -117,10 +99,8 @@ fn the_same_seed_and_objectives_give_the_same_decisions() {
     let server = Server::start(BURNING);
     let objectives = [2, 3, 0, 1, 2, 2, 3];
     for planner in ["beam", "shooting"] {
-        let (agent, learner) = start_with_learner(
-            &server.instance,
-            &format!("--planner {planner} --shooting-samples 64"),
-        );
+        let flags = format!("--planner {planner} --shooting-samples 64");
+        let (agent, learner) = start_with_learner(&server.instance, &flags);
         assert_eq!(learner.hello().planner, planner);
         let first = episode(&learner, 7, &objectives);
         assert_eq!(first[0].step, 0);
@@ -128,13 +108,11 @@ fn the_same_seed_and_objectives_give_the_same_decisions() {
         episode(&learner, 8, &[3, 3]);
         assert_eq!(episode(&learner, 7, &objectives), first);
         assert_ne!(episode(&learner, 7, &[3; 7]), first);
-        agent.signal(Signal::TERM);
-        assert_eq!(agent.wait(PATIENCE).code, Some(0));
+        agent.finish();
     }
     let (_agent, learner) = start_with_learner(&server.instance, "--agent-seed 1");
     learner.reset(1);
-    let (world, seed) = (0, None);
-    let worlds = vec![WorldSeed { world, seed }];
+    let worlds = vec![seed(0, None)];
     let unseeded = decisions(learner.ask(&Request::Reset { worlds }));
     assert_ne!(unseeded[0].seed, 1);
 }
@@ -186,61 +164,47 @@ fn what_some_worlds_cannot_do_is_refused_for_all() {
     use Status::{BadObjective, EpisodeOver, Malformed, NoSuchWorld};
     let server = Server::start(&format!("{SMALL} --worlds 4 --max-steps 2"));
     let (_agent, learner) = start_at(&server.instance, 1, "--worlds 3");
-    (0..2).for_each(|_| _ = learner.decide_all(&[None, None, Some(2)]));
+    let first = learner.decide_all(&[None, None, Some(2)]);
+    assert!(!first[2].truncated);
+    learner.decide_all(&[None, None, Some(2)]);
     let before = learner.last_of_all();
+    assert!(before[2].truncated && !before[2].terminated);
     let malformed = "malformed control message: ";
     let count = format!("{malformed}objectives: expected 3, one a world, got");
     let objective = "objective: expected 0 to 3, got";
     let no_world = "no such world: the agent has worlds 1 to 3, got";
     let twice = format!("{malformed}reset: expected each world once, got world 2 twice");
     let over = "world 3 was truncated: reset it first";
+    let high = decide(&[Some(2), Some(4), None]);
+    let highest = decide(&[Some(2), None, Some(u64::MAX)]);
+    let ended = decide(&[Some(2), None, Some(2)]);
+    let [below, above] = [0, 4].map(|world| reset(&[(1, 5), (world, 5)]));
     for (request, status, detail, words) in [
         (decide(&[]), Malformed, 0, format!("{count} 0")),
         (decide(&[Some(2); 4]), Malformed, 0, format!("{count} 4")),
+        (high, BadObjective, 4, format!("{objective} 4 for world 2")),
         (
-            decide(&[Some(2), Some(4), None]),
-            BadObjective,
-            4,
-            format!("{objective} 4 for world 2"),
-        ),
-        (
-            decide(&[Some(2), None, Some(u64::MAX)]),
+            highest,
             BadObjective,
             4,
             format!("{objective} {} for world 3", u64::MAX),
         ),
         (decide(&[Some(2); 3]), EpisodeOver, 3, over.into()),
-        (
-            decide(&[Some(2), None, Some(2)]),
-            EpisodeOver,
-            3,
-            over.into(),
-        ),
-        (
-            reset(&[(1, 5), (0, 5)]),
-            NoSuchWorld,
-            3,
-            format!("{no_world} 0"),
-        ),
-        (
-            reset(&[(1, 5), (4, 5)]),
-            NoSuchWorld,
-            3,
-            format!("{no_world} 4"),
-        ),
+        (ended, EpisodeOver, 3, over.into()),
+        (below, NoSuchWorld, 3, format!("{no_world} 0")),
+        (above, NoSuchWorld, 3, format!("{no_world} 4")),
         (reset(&[(1, 5), (2, 5), (2, 6)]), Malformed, 0, twice),
     ] {
         assert_eq!(learner.refused(&request), (status, detail, words));
         assert_eq!(learner.last_of_all(), before, "{request:?}");
     }
-    let steps = [1, 2, 3].map(|world| server.observe(world).0.step);
+    let steps = [1, 2, 3].map(|world| server.step_of(world));
     assert_eq!(steps, [0, 0, 2]);
     assert_eq!(learner.reset_some(&[]), before);
     let after = learner.decide_all(&[Some(2), Some(2), None]);
-    assert_eq!(
-        after.iter().map(|made| made.step).collect::<Vec<_>>(),
-        [1, 1, 2]
-    );
+    assert!(after.iter().map(|made| made.step).eq([1, 1, 2]));
+    assert_eq!(learner.reset_some(&[(3, 5)])[2].step, 0);
+    assert_eq!(learner.decide_all(&[None, None, Some(2)])[2].step, 1);
 }
 
 #[test]
@@ -273,13 +237,11 @@ fn what_is_no_decision_is_refused_and_changes_nothing() {
         r#"{"op":"hello","protocol":2}"#,
         r#"{"op":"hello","protocol":"1","client":"x"}"#,
     ] {
-        let (status, detail, message) =
-            refusal(learner.exchange(control_header(1), text.as_bytes()));
+        let reply = learner.exchange(control_header(1), text.as_bytes());
+        let (status, detail, message) = refusal(reply);
         assert_eq!((status, detail), (Status::Malformed, 0), "{text}");
-        assert!(
-            message.starts_with("malformed control message: "),
-            "{message}"
-        );
+        let is_named = message.starts_with("malformed control message: ");
+        assert!(is_named, "{message}");
     }
     let hello = br#"{"op":"hello","protocol":3,"client":"x"}"#;
     assert_mismatch(learner.exchange(control_header(1), hello));
@@ -289,16 +251,13 @@ fn what_is_no_decision_is_refused_and_changes_nothing() {
     };
     assert_mismatch(learner.exchange(header, br#"{"op":"last"}"#));
     assert_eq!(learner.last(), before);
-    assert_eq!(server.observe(0).0.step, 1);
+    assert_eq!(server.step_of(0), 1);
 }
 
 fn assert_mismatch(reply: Reply) {
     let (status, detail, message) = refusal(reply);
-    assert_eq!(
-        (status, detail),
-        (Status::VersionMismatch, VERSION.into()),
-        "{message}"
-    );
+    let expected = (Status::VersionMismatch, VERSION.into());
+    assert_eq!((status, detail), expected, "{message}");
 }
 
 #[test]
@@ -311,12 +270,13 @@ fn random_and_oversized_messages_are_refused_and_change_nothing() {
     for _ in 0..3000 {
         let mut bytes = vec![0; rng.random_range(0..200)];
         rng.fill_bytes(&mut bytes);
+        let version = if rng.random_ratio(1, 9) {
+            rng.random()
+        } else {
+            1
+        };
         let header = ControlRequest {
-            version: if rng.random_ratio(1, 9) {
-                rng.random()
-            } else {
-                1
-            },
+            version,
             reserved: rng.random(),
             sequence: rng.random(),
             listener_low: rng.random(),
@@ -357,27 +317,12 @@ fn after_a_timeout_last_tells_whether_the_decision_was_made() {
 }
 
 #[test]
-fn a_truncated_episode_is_over_until_the_next_reset() {
-    let server = Server::start(&format!("{SMALL} --max-steps 2"));
-    let (_agent, learner) = start_with_learner(&server.instance, "");
-    learner.reset(3);
-    assert!(!learner.decide(2).truncated);
-    let last = learner.decide(2);
-    assert!(last.truncated && !last.terminated);
-    let (status, detail, message) = learner.refused(&decide(&[Some(2)]));
-    assert_eq!((status, detail), (Status::EpisodeOver, 0), "{message}");
-    assert_eq!(learner.last(), last);
-    assert_eq!(learner.reset(3).step, 0);
-    assert_eq!(learner.decide(2).step, 1);
-}
-
-#[test]
 fn a_model_that_is_not_the_servers_is_refused() {
     let server = Server::start(&format!("{SMALL} --reveal-model false"));
     let check = |flags: &str, words: &str| {
-        let ended = start_agent(&server.instance, flags).wait(PATIENCE);
-        assert_eq!(ended.code, Some(1), "{}", ended.stderr);
-        assert!(ended.stderr.contains(words), "{}", ended.stderr);
+        start_agent(&server.instance, flags)
+            .ends(1)
+            .check_says(words);
     };
     check("", "does not reveal its model: expected --model FILE");
     for worlds in [

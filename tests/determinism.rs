@@ -1,9 +1,9 @@
 //! A world is a function of model, seed and k: nothing beside it, before it or around it counts.
 
-use crate::harness::{PATIENCE, Paths, Server, fly, reset, takeover};
 use protocol::client::{Claim, Observation};
 use protocol::observer::Observer;
 use protocol::{Client, Move};
+use tests::harness::{PATIENCE, Paths, Server, fly, reset};
 
 /// Seeds, one world each.
 const N_SEEDS: u32 = 8;
@@ -69,15 +69,10 @@ fn check_batches(size: &str, flags: &str, n_observers: usize, expected: &[Trajec
         .map(|_| Observer::frames(&server.instance).expect("observe"))
         .collect();
     let mut trajectories = vec![Vec::new(); N_SEEDS as usize];
-    batches(
-        &mut server.acquire(0..N_SEEDS),
-        0..N_STEPS,
-        &mut trajectories,
-    );
-    assert!(
-        trajectories == expected,
-        "{size} {flags}, {n_observers} observers"
-    );
+    let mut client = server.acquire(0..N_SEEDS);
+    batches(&mut client, 0..N_STEPS, &mut trajectories);
+    let is_same = trajectories == expected;
+    assert!(is_same, "{size} {flags}, {n_observers} observers");
     for observer in observers {
         assert!(observer.receive(PATIENCE).expect("receive").is_some());
     }
@@ -95,29 +90,6 @@ fn worlds_do_not_depend_on_worlds_beside_them_observers_or_threads() {
 }
 
 #[test]
-fn a_batch_equals_single_steps_in_any_order() {
-    let flags = format!("{SMALL} --worlds {N_SEEDS}");
-    let (together, apart) = (start(&flags), start(&flags));
-    let mut trajectories = vec![Vec::new(); N_SEEDS as usize];
-    batches(
-        &mut together.acquire(0..N_SEEDS),
-        0..N_STEPS,
-        &mut trajectories,
-    );
-    let mut client = apart.acquire(0..N_SEEDS);
-    for world in (0..N_SEEDS).rev() {
-        for (path, expected) in paths(world.into())
-            .iter()
-            .zip(&trajectories[world as usize])
-        {
-            let path = std::slice::from_ref(path);
-            let answer = client.step(world..world + 1, path).expect("step");
-            assert_eq!(answer, std::slice::from_ref(expected), "world {world}");
-        }
-    }
-}
-
-#[test]
 fn worlds_do_not_notice_who_acts_on_them() {
     let expected = reference(SMALL);
     let server = start(&format!("{SMALL} --worlds {N_SEEDS}"));
@@ -129,7 +101,7 @@ fn worlds_do_not_notice_who_acts_on_them() {
     let claimed = Client::acquire(server.connect(), &Claim::new(0..1));
     assert!(claimed.is_err(), "a refused claim in between");
     batches(&mut second, 4..8, &mut trajectories);
-    let mut third = Client::acquire(server.connect(), &takeover(0..N_SEEDS)).expect("take over");
+    let mut third = server.take_over(0..N_SEEDS);
     let stale = second.step(0..1, &paths(99)[..1]);
     assert!(stale.is_err(), "a lost lease steps nothing");
     batches(&mut third, 8..N_STEPS, &mut trajectories);

@@ -1,9 +1,8 @@
 //! Settings and model files: wrong ones are refused by path and entry, right ones run.
 
-use crate::commands::{AGENT, LIMIT, SERVER, TINY, check};
-use crate::harness::{SMALL, Server, repository, run};
-use std::path::PathBuf;
+use crate::commands::{TINY, check};
 use tempfile::TempDir;
+use tests::harness::{AGENT, SERVER, SMALL, Server, repository, run};
 
 /// Files of wrong content, by name.
 struct Files(TempDir);
@@ -21,64 +20,36 @@ impl Files {
 }
 
 /// Writes a file, names it with a flag, and checks that it is refused by its path.
-fn check_file(flag: &str, text: &str, words: &[&str]) {
+fn check_file(flag: &str, text: &str, words: &str) {
     let files = Files::new();
     let path = files.write("wrong.toml", text);
-    let words = [&[&*path], words].concat();
+    let words = format!("{path} | {words}");
     check(SERVER, &format!("{flag} {path} --check"), &words);
 }
 
 #[test]
 fn wrong_settings_files_are_refused_by_path_and_entry() {
-    check_file("--config", "wrolds = 3\n", &["unknown field `wrolds`"]);
-    check_file(
-        "--config",
-        "worlds = 'three'\n",
-        &["invalid type", "worlds"],
-    );
-    check_file("--config", "worlds = = 3\n", &["config file"]);
+    check_file("--config", "wrolds = 3\n", "unknown field `wrolds`");
+    check_file("--config", "worlds = 'three'\n", "invalid type | worlds");
+    check_file("--config", "worlds = = 3\n", "config file");
 }
 
 #[test]
 fn wrong_model_files_are_refused_by_path_and_entry() {
     let wildfire = repository().join("config/models/wildfire.toml");
     let wildfire = std::fs::read_to_string(wildfire).expect("the model file");
-    let check = |from: &str, to: &str, words: &[&str]| {
+    let check = |from: &str, to: &str, words: &str| {
         assert!(wildfire.contains(from), "{from}");
         check_file("--model", &wildfire.replacen(from, to, 1), words);
     };
-    check_file("--model", "", &["missing field"]);
-    check_file("--model", "name = ", &["model file"]);
-    check("name =", "colour = 1\nname =", &["unknown field `colour`"]);
+    check_file("--model", "", "missing field");
+    check_file("--model", "name = ", "model file");
+    check("name =", "colour = 1\nname =", "unknown field `colour`");
     check(
         "[[kernel]]",
         "[[kernel]]\nown = \"normal\"",
-        &["own in every entry, or in none, got 1 of 6"],
+        "own in every entry, or in none, got 1 of 6",
     );
-    check(
-        "[0.98, 0.01, 0.01]",
-        "[0.98, 0.01, 0.02]",
-        &["normal", "sum"],
-    );
-    check(
-        "[0.98, 0.01, 0.01]",
-        "[0.98, 0.02]",
-        &["normal", "expected"],
-    );
-    check(
-        "scale = 0.9999",
-        "scale = -0.9999",
-        &["weights >= 0", "-0.0999"],
-    );
-    check("scale = 0.9999", "scale = nan", &["expected", "NaN"]);
-    check("initial = 0.99", "initial = 0.9", &["initial", "0.9"]);
-    check(
-        "from = \"normal\"",
-        "from = \"ash\"",
-        &["\"ash\"", "expected one of"],
-    );
-    check("[3, 3]", "[3, 5]", &["expected", "got"]);
-    check("[3, 3]", "[2, 3]", &["kernel_size", "2"]);
 }
 
 #[test]
@@ -99,14 +70,9 @@ fn a_model_that_can_divide_by_zero_on_the_grid_is_refused() {
         ]
     "##;
     let path = files.write("above.toml", model);
-    let words = [
-        "from-above",
-        "cell (0, 0) can sum to zero",
-        "expected a positive sum",
-    ];
-    check(SERVER, &format!("--model {path}"), &words);
-    let compare = format!("compare {TINY} --model {path}");
-    check(AGENT, &compare, &words);
+    let words = "from-above | cell (0, 0) can sum to zero | expected a positive sum";
+    check(SERVER, &format!("--model {path}"), words);
+    check(AGENT, &format!("compare {TINY} --model {path}"), words);
 }
 
 #[test]
@@ -120,17 +86,10 @@ fn the_checked_settings_are_accepted_again_as_a_file() {
         "--start random --seed 9007199254740993 --max-steps 12 --burn-in 0",
         &format!("--model {model} --height 24 --width 40"),
     ] {
-        let flags: Vec<&str> = flags.split_whitespace().collect();
-        let first = run(SERVER, &[&["--check"], &flags[..]].concat(), LIMIT);
-        assert_eq!(first.code, Some(0), "{}", first.stderr);
+        let first = run(SERVER, &format!("--check {flags}")).check(0);
         let path = files.write("settings.toml", &first.stdout);
-        let second = run(SERVER, &["--check", "--config", &path], LIMIT);
-        assert_eq!(
-            (second.code, &second.stdout),
-            (Some(0), &first.stdout),
-            "{}",
-            second.stderr
-        );
+        let second = run(SERVER, &format!("--check --config {path}")).check(0);
+        assert_eq!(second.stdout, first.stdout);
     }
 }
 
@@ -173,14 +132,11 @@ fn the_documented_files_are_accepted() {
         "config/models/wildfire-small.toml",
         "config/models/wildfire-burnout.toml",
     ] {
-        let path: PathBuf = repository().join(file);
-        let path = path.to_str().expect("a plain path");
-        let flag = if file.contains("models") {
-            "--model"
-        } else {
-            "--config"
+        let path = repository().join(file);
+        let flag = match file.contains("models") {
+            true => "--model",
+            false => "--config",
         };
-        let ended = run(SERVER, &["--check", flag, path], LIMIT);
-        assert_eq!(ended.code, Some(0), "{file}: {}", ended.stderr);
+        run(SERVER, &format!("--check {flag} {}", path.display())).check(0);
     }
 }

@@ -1,17 +1,15 @@
 //! What the next agent believes: what the last one left, or what the kept frames tell.
 
-use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly, frames_until, path_of};
-use crate::wire::{RawClient, Wire, step_body, step_header};
 use agent::estimation::belief::Belief;
 use agent::estimation::{BayesFilter, Estimator};
 use agent::server::left_belief::{leave_belief, left_belief};
-use protocol::Model;
-use protocol::Move;
-use protocol::control::{LeftPart, Reply, Request, WorldSeed};
-use protocol::message::{FrameHeader, Operation, Status, StepRequest};
+use protocol::control::{LeftPart, Reply, Request};
+use protocol::message::{FrameHeader, Status};
 use protocol::observer::Observer;
 use protocol::payload::split_step_payload;
-use rustix::process::Signal;
+use protocol::{Client, Model, Move};
+use tests::harness::{PATIENCE, Paths, Program, SMALL, Server, fly, frames_until, path_of, seed};
+use tests::wire::{RawClient, Wire, recall_header, step_body};
 
 /// A world with fires to find, and room for all their frames.
 const FLAGS: &str = "--height 16 --width 16 --moves 12 --burn-in 3000 --seed 3";
@@ -22,9 +20,8 @@ const ALL: &str = "--history 100000";
 /// What an agent says before it simulates one.
 const FIRST_BELIEF: &str = "simulating the first belief";
 
-fn run(server: &Server, flags: &[&str]) -> Program {
-    let common = ["run", "--instance", server.instance.name()];
-    Program::start("emberwatch-agent", &[&common[..], flags].concat())
+fn run(server: &Server, flags: &str) -> Program {
+    Program::agent(&server.instance, flags)
 }
 
 /// The last paths flown until step `last`: as many as an observer is kept, more than 40.
@@ -35,46 +32,30 @@ fn paths(observer: &Observer<FrameHeader>, last: u64) -> Vec<Vec<Move>> {
 }
 
 /// What one agent flies that nobody disturbs.
-fn undisturbed(n_steps: u64, policy: &[&str]) -> Vec<Vec<Move>> {
+fn undisturbed(n_steps: u64, policy: &str) -> Vec<Vec<Move>> {
     let server = Server::start(FLAGS);
     let observer = Observer::frames(&server.instance).expect("observe");
-    let steps = n_steps.to_string();
-    let ended = run(&server, &[policy, &["--steps", &steps]].concat()).wait(4 * PATIENCE);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    let agent = run(&server, &format!("{policy} --steps {n_steps}"));
+    agent.wait(4 * PATIENCE).check(0);
     paths(&observer, n_steps)
 }
 
 #[test]
 fn an_agent_that_takes_over_flies_as_the_other_would_have() {
-    for policy in [
-        ["--policy", "beam_exploit"],
-        ["--policy", "shooting_explore"],
-        ["--policy", "spatial_beam"],
-    ] {
+    for policy in ["beam_exploit", "shooting_explore", "spatial_beam"] {
+        let policy = format!("--policy {policy}");
         let server = Server::start(&format!("{FLAGS} {ALL}"));
         let observer = Observer::frames(&server.instance).expect("observe");
-        let first = run(&server, &[&policy[..], &["--steps", "0"]].concat());
-        let acts = || server.step_of(0) > 20;
-        assert!(eventually(PATIENCE, acts), "{}", first.stderr());
-        let second = run(
-            &server,
-            &[&policy[..], &["--takeover", "--steps", "20"]].concat(),
-        );
-        let ended = first.wait(PATIENCE);
-        assert_eq!(ended.code, Some(3), "{}", ended.stderr);
-        let ended = second.wait(PATIENCE);
-        assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-        for words in [FIRST_BELIEF, "the frames that were kept"] {
-            assert!(ended.stderr.contains(words), "{}", ended.stderr);
-        }
+        let first = run(&server, &format!("{policy} --steps 0"));
+        first.until(|| server.step_of(0) > 20);
+        let second = run(&server, &format!("{policy} --takeover --steps 20"));
+        first.ends(3);
+        let second = second.ends(0);
+        second.check_says(FIRST_BELIEF);
+        second.check_says("the frames that were kept");
         // The third comes after a release, and finds the second's belief.
-        let third = run(&server, &[&policy[..], &["--steps", "20"]].concat()).wait(PATIENCE);
-        assert_eq!(third.code, Some(0), "{}", third.stderr);
-        assert!(
-            third.stderr.contains("the belief that was left"),
-            "{}",
-            third.stderr
-        );
+        let third = run(&server, &format!("{policy} --steps 20")).ends(0);
+        third.check_says("the belief that was left");
         assert!(!third.stderr.contains(FIRST_BELIEF), "{}", third.stderr);
         let last = server.step_of(0);
         assert_eq!(
@@ -87,7 +68,7 @@ fn an_agent_that_takes_over_flies_as_the_other_would_have() {
 
 #[test]
 fn an_agent_that_finds_a_damaged_belief_begins_with_its_own() {
-    let policy = ["--policy", "beam_exploit"];
+    let policy = "--policy beam_exploit";
     let server = Server::start(FLAGS);
     let observer = Observer::frames(&server.instance).expect("observe");
     let mut client = server.acquire(0..1);
@@ -98,35 +79,27 @@ fn an_agent_that_finds_a_damaged_belief_begins_with_its_own() {
     let kind = filter.expect("a filter").kind().expect("its kind");
     leave_belief(&mut client, 0, &at, &kind, b"not whole").expect("leave");
     client.release().expect("release");
-    let ended = run(&server, &[&policy[..], &["--steps", "10"]].concat()).wait(PATIENCE);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-    assert!(ended.stderr.contains(FIRST_BELIEF), "{}", ended.stderr);
-    assert_eq!(paths(&observer, 10), undisturbed(10, &policy));
+    let ended = run(&server, &format!("{policy} --steps 10")).ends(0);
+    ended.check_says(FIRST_BELIEF);
+    assert_eq!(paths(&observer, 10), undisturbed(10, policy));
 }
 
 #[test]
 fn an_agent_that_finds_only_some_frames_makes_do_with_them() {
     let server = Server::start(&format!("{FLAGS} --history 5"));
-    let steps = ["--policy", "random_walk", "--steps", "30"];
-    assert_eq!(run(&server, &steps).wait(PATIENCE).code, Some(0));
-    let ended = run(&server, &["--steps", "2"]).wait(PATIENCE);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-    assert!(
-        ended.stderr.contains("first=26 step=30"),
-        "{}",
-        ended.stderr
-    );
+    let walk = "--policy random_walk --steps 30";
+    run(&server, walk).ends(0);
+    let ended = run(&server, "--steps 2").ends(0);
+    ended.check_says("first=26 step=30");
     let forgetful = Server::start(&format!("{FLAGS} --history 1"));
-    assert_eq!(run(&forgetful, &steps).wait(PATIENCE).code, Some(0));
-    let ended = run(&forgetful, &["--steps", "2"]).wait(PATIENCE);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    run(&forgetful, walk).ends(0);
+    let ended = run(&forgetful, "--steps 2").ends(0);
     assert!(!ended.stderr.contains("going on from"), "{}", ended.stderr);
 }
 
 #[test]
 fn kept_frames_are_those_that_were_answered() {
-    let server =
-        Server::start("--height 5 --width 7 --moves 6 --burn-in 20 --worlds 2 --history 4");
+    let server = Server::start(&format!("{SMALL} --worlds 2 --history 4"));
     let mut client = server.acquire(0..2);
     let mut seen = vec![client.observe(0..2).expect("observe")];
     for k in 0..6 {
@@ -141,29 +114,18 @@ fn kept_frames_are_those_that_were_answered() {
     }
     let wire = Wire::open(&server.instance);
     let recall = |step, n_robots| {
-        let header = StepRequest {
-            operation: Operation::Recall as u32,
-            n_robots,
-            ..step_header(0, 0)
-        };
-        wire.step(header, &step_body(&vec![step; n_robots as usize], &[]))
+        let body = step_body(&vec![step; n_robots as usize], &[]);
+        wire.step(recall_header(0..n_robots), &body)
     };
     for (step, nearest) in [(0, 3), (2, 3), (7, 6), (u64::MAX, 6)] {
         let (reply, payload) = recall(step, 2);
-        assert_eq!(
-            (reply.status, reply.detail),
-            (Status::NotKept as u32, nearest),
-            "{step}"
-        );
+        let expected = (Status::NotKept as u32, nearest);
+        assert_eq!((reply.status, reply.detail), expected, "{step}");
         assert!(payload.is_empty());
     }
     let (reply, _) = recall(3, 3);
     assert_eq!(reply.status, Status::NoSuchRobot as u32);
-    let seeds = [WorldSeed {
-        world: 1,
-        seed: Some(8),
-    }];
-    client.reset(&seeds).expect("reset");
+    client.reset(&[seed(1, 8)]).expect("reset");
     let (reply, _) = recall(3, 2);
     assert_eq!((reply.status, reply.detail), (Status::NotKept as u32, 0));
     let (reply, payload) = recall(6, 1);
@@ -173,23 +135,18 @@ fn kept_frames_are_those_that_were_answered() {
 
 #[test]
 fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_robot_alone() {
-    let server = Server::start("--height 5 --width 7 --moves 6 --burn-in 20 --worlds 2");
+    let server = Server::start(&format!("{SMALL} --worlds 2"));
     let mut client = server.acquire(0..1);
     fly(&mut client, Paths::new(0).next(6));
-    assert_eq!(left_belief(&mut client, 0, "kind").expect("none yet"), None);
+    let left = |client: &mut Client, kind| left_belief(client, 0, kind).expect("asked");
+    assert_eq!(left(&mut client, "kind"), None);
     let bytes: Vec<u8> = (0..35 * 76 + 32_768).map(|n| n as u8).collect();
     let at = client.observe(0..1).expect("observe")[0].world;
     leave_belief(&mut client, 0, &at, "kind", &bytes).expect("leave");
-    assert_eq!(
-        left_belief(&mut client, 0, "kind").expect("belief"),
-        Some(bytes.clone())
-    );
-    assert_eq!(
-        left_belief(&mut client, 0, "another kind").expect("belief"),
-        None
-    );
+    assert_eq!(left(&mut client, "kind"), Some(bytes));
+    assert_eq!(left(&mut client, "another kind"), None);
     let wire = Wire::open(&server.instance);
-    let lease = wire.acquire(1, 1).lease;
+    let lease = wire.acquire(1..2).lease;
     let part = |lease, robot, step, offset, length, data: &str| {
         Request::LeaveBelief(LeftPart {
             lease,
@@ -233,20 +190,16 @@ fn a_belief_is_given_whole_for_its_step_alone_and_to_its_holder_s_robot_alone() 
     assert_eq!(wire.ask(&leave(lease, 1, 1, 2, "AQ==")), Reply::Done);
     assert!(matches!(wire.ask(&ask), Reply::Belief { data, .. } if data == "AAE="));
     fly(&mut client, Paths::new(1).next(6));
-    assert_eq!(
-        left_belief(&mut client, 0, "kind").expect("another step"),
-        None
-    );
+    assert_eq!(left(&mut client, "kind"), None, "another step");
 }
 
 #[test]
 fn an_agent_told_to_stop_leaves_its_belief() {
     let server = Server::start(FLAGS);
-    let agent = run(&server, &["--steps", "0"]);
-    let acts = || server.step_of(0) > 5;
-    assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
-    agent.signal(Signal::TERM);
-    assert_eq!(agent.wait(PATIENCE).code, Some(0));
+    let agent = run(&server, "--steps 0");
+    agent.until(|| server.step_of(0) > 5);
+    agent.finish();
+    assert_eq!(server.holder(), None, "it releases its world");
     let mut connection = server.connect();
     let ask = Request::Belief {
         robot: 0,

@@ -3,19 +3,19 @@
 //!
 //! `cargo test -p tests -- --ignored` sends a million messages, and thousands of observers.
 
-use crate::attacker::Attacker;
-use crate::harness::{PATIENCE, Paths, Program, Server, eventually, fly};
-use crate::siege::{FLAGS, besiege};
-use crate::wire::{RawClient, Wire, answer, client, control_header, step_body, step_header};
 use protocol::channels::{Channel, MAX_CLIENTS, MAX_OBSERVERS, Services, create_node};
 use protocol::client::Claim;
 use protocol::connection::ConnectionError;
-use protocol::control::{MAX_CONTROL_BYTES, Reply, Request, WorldSeed};
+use protocol::control::{MAX_CONTROL_BYTES, Reply, Request};
 use protocol::message::{Status, StepRequest};
 use protocol::observer::Observer;
 use protocol::{Client, Connection};
 use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, prlimit};
 use std::time::Duration;
+use tests::attacker::Attacker;
+use tests::harness::{PATIENCE, Paths, Program, Server, eventually, fly};
+use tests::siege::{FLAGS, besiege};
+use tests::wire::{RawClient, Wire, answer, client, control_header, step_body, step_header};
 
 fn attack(n_messages: u64) {
     besiege(|server, stolen| {
@@ -61,7 +61,7 @@ fn a_server_without_descriptors_says_so_and_hears_who_comes_when_there_are_some(
     let unheard = Connection::open(&server.instance, "tests", Duration::from_secs(1));
     assert!(matches!(unheard, Err(ConnectionError::Timeout { .. })));
     let words = "no file descriptors for a client or an observer";
-    server.program.wait_for_words(words, PATIENCE);
+    server.program.wait_for_words(words);
     limit(512);
     server.connect();
 }
@@ -71,43 +71,11 @@ fn refusals_are_counted_one_by_one() {
     let server = Server::start(FLAGS);
     let wire = Wire::open(&server.instance);
     for count in 1..=100 {
-        let (reply, _) = wire.step(step_header(1, 6), &step_body(&[0], &[0; 6]));
-        assert_eq!(reply.status, Status::NoLease as u32);
+        let status = wire.status_of(step_header(1, 6), &step_body(&[0], &[0; 6]));
+        assert_eq!(status.0, Status::NoLease);
         wire.control(control_header(1), b"nonsense");
         assert_eq!(server.status().n_refused, 2 * count);
     }
-}
-
-#[test]
-fn a_stolen_token_opens_nothing() {
-    let server = Server::start(FLAGS);
-    let (owner, thief) = (Wire::open(&server.instance), Wire::open(&server.instance));
-    let lease = owner.acquire(0, 3).lease;
-    let before = server.status().worlds;
-    for robot in 0..3 {
-        let header = StepRequest {
-            first_robot: robot,
-            ..step_header(lease, 6)
-        };
-        let (reply, _) = thief.step(header, &step_body(&[0], &[0; 6]));
-        assert_eq!(reply.status, Status::NoLease as u32);
-    }
-    let seed = |world| WorldSeed { world, seed: None };
-    for request in [
-        Request::Renew { lease },
-        Request::Release { lease },
-        Request::Reset {
-            lease,
-            worlds: vec![seed(0)],
-        },
-        Request::Reset {
-            lease,
-            worlds: vec![],
-        },
-    ] {
-        assert_eq!(thief.ask(&request).status(), Status::NoLease, "{request:?}");
-    }
-    assert_eq!(server.status().worlds, before);
 }
 
 /// The header of a correct step of robot 1.
@@ -125,15 +93,15 @@ fn body(k: u64) -> Vec<u8> {
 
 /// Steps robot 1 of a server from where it is.
 fn fly_second(server: &Server, wire: &Wire, lease: u64) -> Status {
-    let (reply, _) = wire.step(second_robot(lease), &body(server.step_of(1)));
-    Status::try_from(reply.status).expect("a known status")
+    wire.status_of(second_robot(lease), &body(server.step_of(1)))
+        .0
 }
 
 #[test]
 fn a_flood_of_requests_whose_answers_nobody_reads_disturbs_nobody() {
     besiege(|server, _| {
         let wire = Wire::open(&server.instance);
-        let lease = wire.acquire(1, 1).lease;
+        let lease = wire.acquire(1..2).lease;
         for round in 0..2_000 {
             // The first may be flown; what comes after it is late.
             let step = wire
@@ -154,7 +122,7 @@ fn a_flood_of_requests_whose_answers_nobody_reads_disturbs_nobody() {
 fn answers_and_requests_that_are_held_keep_only_their_holder_from_more() {
     besiege(|server, _| {
         let wire = Wire::open(&server.instance);
-        let lease = wire.acquire(1, 1).lease;
+        let lease = wire.acquire(1..2).lease;
         let mut held = Vec::new();
         for _ in 0..200 {
             // As soon as it holds too many, the client cannot send, or gets no answer.
@@ -181,42 +149,34 @@ fn old_leases_and_numbers_open_nothing_again() {
         let (wire, other) = (Wire::open(&server.instance), Wire::open(&server.instance));
         let mut old = Vec::new();
         for round in 0..20 {
-            let lease = wire.acquire(1, 2).lease;
+            let lease = wire.acquire(1..3).lease;
             for k in 5 * round..5 * (round + 1) {
-                let status = |from: &Wire| {
-                    let (reply, _) = from.step(second_robot(lease), &body(k));
-                    Status::try_from(reply.status)
-                };
+                let status = |from: &Wire| from.status_of(second_robot(lease), &body(k)).0;
                 // The very same request again comes too late.
-                assert_eq!(status(&wire), Ok(Status::Ok));
-                assert_eq!(status(&wire), Ok(Status::Late));
-                assert_eq!(status(&other), Ok(Status::NoLease));
+                assert_eq!(status(&wire), Status::Ok);
+                assert_eq!(status(&wire), Status::Late);
+                assert_eq!(status(&other), Status::NoLease);
             }
             assert_eq!(wire.ask(&Request::Release { lease }), Reply::Done);
             old.push(lease);
-            for (from, lease) in old
-                .iter()
-                .flat_map(|&lease| [(&wire, lease), (&other, lease)])
-            {
+            for (&lease, from) in old.iter().flat_map(|it| [(it, &wire), (it, &other)]) {
                 let now = body(5 * (round + 1));
-                let status = from.step(second_robot(lease), &now).0.status;
-                assert_eq!(status, Status::LeaseLost as u32);
-                assert_eq!(
-                    from.ask(&Request::Renew { lease }).status(),
-                    Status::LeaseLost
-                );
+                let status = from.status_of(second_robot(lease), &now).0;
+                assert_eq!(status, Status::LeaseLost);
+                let renewed = from.ask(&Request::Renew { lease });
+                assert_eq!(renewed.status(), Status::LeaseLost);
             }
         }
         // All three worlds with a lease on two of them, and the victim's with its own lease.
-        let lease = wire.acquire(1, 2).lease;
+        let lease = wire.acquire(1..3).lease;
         let all = StepRequest {
             n_robots: 3,
             ..step_header(lease, 6)
         };
-        let (reply, _) = wire.step(all, &step_body(&[0, 100, 0], &[3; 18]));
-        assert_eq!(reply.status, Status::NoLease as u32);
-        let (reply, _) = wire.step(step_header(stolen, 6), &body(server.step_of(0)));
-        assert_eq!(reply.status, Status::NoLease as u32);
+        let status = wire.status_of(all, &step_body(&[0, 100, 0], &[3; 18]));
+        assert_eq!(status.0, Status::NoLease);
+        let status = wire.status_of(step_header(stolen, 6), &body(server.step_of(0)));
+        assert_eq!(status.0, Status::NoLease);
         assert_eq!(server.step_of(1), 100);
     });
 }
@@ -272,15 +232,10 @@ fn thousands_of_observers_that_come_and_go_leave_nothing() {
 #[test]
 fn a_client_that_is_stopped_in_the_middle_disturbs_nobody() {
     besiege(|server, _| {
-        let name = server.instance.name();
-        let agent = Program::start(
-            "emberwatch-agent",
-            &["run", "--instance", name, "--world", "1"],
-        );
+        let agent = Program::agent(&server.instance, "--world 1");
         let mut step = 0;
         for round in 0..40 {
-            let acts = eventually(PATIENCE, || server.step_of(1) > step);
-            assert!(acts, "{}", agent.stderr());
+            agent.until(|| server.step_of(1) > step);
             std::thread::sleep(Duration::from_micros(37 * round));
             agent.stop();
             step = server.step_of(1);
@@ -303,41 +258,36 @@ fn the_longest_control_requests_are_answered_in_short() {
     };
     let texts = [
         (
-            longest(r#"{"op":"hello","protocol":2,"client":""#, "x", r#""}"#),
+            r#"{"op":"hello","protocol":2,"client":""#,
+            "x",
+            r#""}"#,
             Status::Ok,
         ),
-        (longest(r#"{"op":""#, "x", r#""}"#), Status::Malformed),
+        (r#"{"op":""#, "x", r#""}"#, Status::Malformed),
+        (r#"{"op":"status",""#, "é", r#"":1}"#, Status::Malformed),
         (
-            longest(r#"{"op":"status",""#, "é", r#"":1}"#),
+            r#"{"op":"renew","lease":""#,
+            "x",
+            r#""}"#,
             Status::Malformed,
         ),
         (
-            longest(r#"{"op":"renew","lease":""#, "x", r#""}"#),
-            Status::Malformed,
-        ),
-        (
-            longest(
-                r#"{"op":"reset","lease":1,"worlds":["#,
-                r#"{"world":1},"#,
-                r#"{"world":2}]}"#,
-            ),
+            r#"{"op":"reset","lease":1,"worlds":["#,
+            r#"{"world":1},"#,
+            r#"{"world":2}]}"#,
             Status::NoLease,
         ),
-        (longest("", "9", ""), Status::Malformed),
+        ("", "9", "", Status::Malformed),
     ];
+    let texts = texts.map(|(begin, unit, end, status)| (longest(begin, unit, end), status));
     besiege(|server, _| {
         let wire = Wire::open(&server.instance);
         for (text, expected) in &texts {
             for _ in 0..10 {
                 let (reply, answer) = wire.control(control_header(1), text.as_bytes());
-                assert_eq!(
-                    Status::try_from(reply.status),
-                    Ok(*expected),
-                    "{}",
-                    &text[..40]
-                );
-                let (short, got) = (16 << 10, answer.len());
-                assert!(got <= short, "{got} bytes in answer to {}", &text[..40]);
+                let (text, got) = (&text[..40], answer.len());
+                assert_eq!(reply.status, *expected as u32, "{text}");
+                assert!(got <= 16 << 10, "{got} bytes in answer to {text}");
             }
         }
     });
@@ -348,7 +298,7 @@ fn requests_that_wait_for_a_reset_and_are_given_up_do_not_wear_the_server_out() 
     let server = Server::start_with_endless_resets("");
     let mut bystander = server.acquire(0..1);
     let wire = Wire::open(&server.instance);
-    let lease = wire.acquire(1, 1).lease;
+    let lease = wire.acquire(1..2).lease;
     let reset = format!(r#"{{"op":"reset","lease":{lease},"worlds":[{{"world":1}}]}}"#);
     let renew = format!(r#"{{"op":"renew","lease":{lease}}}"#);
     let send = |text: &str| {
@@ -376,7 +326,7 @@ fn messages_of_any_length_are_refused_whole() {
     let server = Server::start(FLAGS);
     let mut bystander = server.acquire(0..1);
     let wire = Wire::open(&server.instance);
-    let lease = wire.acquire(1, 1).lease;
+    let lease = wire.acquire(1..2).lease;
     for length in [
         1,
         7,
@@ -386,18 +336,11 @@ fn messages_of_any_length_are_refused_whole() {
         MAX_CONTROL_BYTES + 1,
         3 * MAX_CONTROL_BYTES,
     ] {
-        let (reply, _) = wire.step(second_robot(lease), &vec![0; length]);
-        assert_eq!(
-            (reply.status, reply.detail),
-            (Status::WrongLength as u32, 8 + 6)
-        );
+        let refused = wire.status_of(second_robot(lease), &vec![0; length]);
+        assert_eq!(refused, (Status::WrongLength, 8 + 6));
         let (reply, text) = wire.control(control_header(1), &vec![b' '; length]);
-        assert_eq!(
-            reply.status,
-            Status::Malformed as u32,
-            "{}",
-            String::from_utf8_lossy(&text)
-        );
+        let text = String::from_utf8_lossy(&text);
+        assert_eq!(reply.status, Status::Malformed as u32, "{text}");
         fly(&mut bystander, Paths::new(0).next(6));
     }
 }

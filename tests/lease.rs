@@ -1,15 +1,13 @@
 //! Who may act: one holder a robot, ended by release, expiry or takeover; its world stays put.
 
-use crate::harness::{
-    ENDLESS, PATIENCE, Paths, SMALL, Server, eventually, fly, new_instance, takeover,
-};
-use crate::wire::{RawClient, Wire, control_header};
 use protocol::client::Claim;
 use protocol::connection::ConnectionError;
-use protocol::control::{Reply, Request, ServerStatus, WorldSeed};
+use protocol::control::{Reply, Request};
 use protocol::message::Status;
 use protocol::{Client, Connection, Move};
 use std::time::Duration;
+use tests::harness::{PATIENCE, Paths, SMALL, Server, fly, seed};
+use tests::wire::{RawClient, Wire};
 
 fn check<T>(result: Result<T, ConnectionError>, expected: Status, expected_detail: u64) {
     match result {
@@ -30,58 +28,18 @@ fn paths(n_robots: usize) -> Vec<Vec<Move>> {
 }
 
 #[test]
-fn a_robot_has_one_holder_until_it_is_released() {
-    let server = Server::start(&format!("{SMALL} --worlds 2"));
-    let holder = server.acquire(0..1);
-    check(
-        Client::acquire(server.connect(), &Claim::new(0..1)),
-        Status::Busy,
-        us(),
-    );
-    check(
-        Client::acquire(server.connect(), &Claim::new(0..2)),
-        Status::Busy,
-        us(),
-    );
-    let pids: Vec<_> = server
-        .status()
-        .worlds
-        .iter()
-        .flat_map(|world| world.holder_pids.clone())
-        .collect();
-    assert_eq!(
-        pids,
-        [Some(std::process::id()), None],
-        "a refused claim takes no robot"
-    );
-    holder.release().expect("release");
-    assert_eq!(server.status().worlds[0].holder_pids, [None]);
-    server.acquire(0..2);
-}
-
-#[test]
 fn a_takeover_ends_the_former_lease_and_leaves_the_world_where_it_was() {
     let server = Server::start(SMALL);
     let mut former = server.acquire(0..1);
     let last = fly(&mut former, Paths::new(1).next(6));
-    let mut next = Client::acquire(server.connect(), &takeover(0..1)).expect("take over");
+    let mut next = server.take_over(0..1);
     check(former.step(0..1, &paths(1)), Status::LeaseLost, us());
-    check(
-        former.reset(&[WorldSeed {
-            world: 0,
-            seed: None,
-        }]),
-        Status::LeaseLost,
-        us(),
-    );
-    assert_eq!(
-        next.observe(0..1).expect("observe"),
-        std::slice::from_ref(&last)
-    );
-    assert_eq!(
-        former.observe(0..1).expect("observing needs no lease"),
-        [last]
-    );
+    check(former.reset(&[seed(0, None)]), Status::LeaseLost, us());
+    // Observing needs no lease.
+    for client in [&mut next, &mut former] {
+        let seen = client.observe(0..1).expect("observe");
+        assert_eq!(seen, std::slice::from_ref(&last));
+    }
     assert_eq!(fly(&mut next, Paths::new(2).next(6)).world.step, 2);
     next.release().expect("release");
     check(former.step(0..1, &paths(1)), Status::LeaseLost, us());
@@ -92,17 +50,12 @@ fn a_takeover_ends_the_former_lease_and_leaves_the_world_where_it_was() {
 fn a_takeover_of_some_worlds_leaves_the_others_with_their_holder() {
     let server = Server::start(&format!("{SMALL} --worlds 3"));
     let mut former = server.acquire(0..3);
-    let mut next = Client::acquire(server.connect(), &takeover(1..2)).expect("take over");
+    let mut next = server.take_over(1..2);
     former.step(0..1, &paths(1)).expect("still held");
     former.step(2..3, &paths(1)).expect("still held");
     check(former.step(0..3, &paths(3)), Status::LeaseLost, us());
     next.step(1..2, &paths(1)).expect("taken");
-    let steps: Vec<u64> = server
-        .status()
-        .worlds
-        .iter()
-        .map(|world| world.info.step)
-        .collect();
+    let steps = [0, 1, 2].map(|robot| server.step_of(robot));
     assert_eq!(steps, [1, 1, 1], "the refused batch stepped nothing");
 }
 
@@ -110,16 +63,14 @@ fn a_takeover_of_some_worlds_leaves_the_others_with_their_holder() {
 fn a_renewal_tells_of_the_robots_that_are_still_held() {
     let server = Server::start(&format!("{SMALL} --worlds 3"));
     let wire = Wire::open(&server.instance);
-    let lease = wire.acquire(0, 3).lease;
-    let _next = Client::acquire(server.connect(), &takeover(1..2)).expect("take over");
+    let lease = wire.acquire(0..3).lease;
+    let _next = server.take_over(1..2);
     let Reply::Lease(renewed) = wire.ask(&Request::Renew { lease }) else {
         panic!("expected a lease");
     };
     let worlds: Vec<u32> = renewed.worlds.iter().map(|world| world.world).collect();
-    assert_eq!(
-        (renewed.lease, renewed.ttl_millis, renewed.robots),
-        (lease, 30_000, vec![0, 2])
-    );
+    assert_eq!((renewed.lease, renewed.ttl_millis), (lease, 30_000));
+    assert_eq!(renewed.robots, [0, 2]);
     assert_eq!(worlds, [0, 2]);
 }
 
@@ -131,8 +82,7 @@ fn a_client_may_ask_for_a_lease_of_its_own_length() {
         ..Claim::new(0..1)
     };
     let mut client = Client::acquire(server.connect(), &short).expect("acquire");
-    let is_free = || server.status().worlds[0].holder_pids == [None];
-    assert!(eventually(PATIENCE, is_free));
+    server.program.until(|| server.holder().is_none());
     check(client.step(0..1, &paths(1)), Status::LeaseLost, 0);
     for (asked, given) in [(Some(0), 100), (Some(u64::MAX), 86_400_000), (None, 30_000)] {
         let request = Request::Acquire {
@@ -146,25 +96,6 @@ fn a_client_may_ask_for_a_lease_of_its_own_length() {
         };
         assert_eq!(lease.ttl_millis, given, "{asked:?}");
     }
-}
-
-#[test]
-fn a_lease_outlives_a_burn_in_that_is_longer() {
-    let flags = format!("{SMALL} --lease-millis 100").replace("20", &ENDLESS.to_string());
-    let server = Server::start_in_burn_in(&new_instance(), &flags);
-    let wire = Wire::open(&server.instance);
-    let acquire = br#"{"op":"acquire","first_robot":0,"n_robots":1}"#;
-    let _pending = wire.send_control(control_header(1), acquire).expect("send");
-    let is_held =
-        |status: &ServerStatus| status.worlds[0].holder_pids == [Some(std::process::id())];
-    assert!(eventually(PATIENCE, || is_held(&server.status())));
-    let due = server.status().uptime_millis + 1_000;
-    let mut late = server.status();
-    assert!(eventually(PATIENCE, || {
-        late = server.status();
-        late.uptime_millis > due
-    }));
-    assert!(is_held(&late));
 }
 
 #[test]
@@ -185,15 +116,9 @@ fn paths_of_other_lengths_are_refused_though_their_sum_is_right() {
     let server = Server::start(&format!("{SMALL} --worlds 3"));
     let mut client = server.acquire(0..3);
     let paths_of = |lengths: [usize; 3]| lengths.map(|length| vec![Move::Up; length]).to_vec();
-    check(
-        client.step(0..3, &paths_of([6, 5, 7])),
-        Status::WrongPathLength,
-        6,
-    );
-    check(
-        client.step(0..3, &paths_of([6, 6, 6])[..2]),
-        Status::WrongLength,
-        42,
-    );
+    let unequal = client.step(0..3, &paths_of([6, 5, 7]));
+    check(unequal, Status::WrongPathLength, 6);
+    let two = client.step(0..3, &paths_of([6, 6, 6])[..2]);
+    check(two, Status::WrongLength, 42);
     assert_eq!(server.step_of(0), 0);
 }

@@ -1,13 +1,12 @@
 //! The real processes together: `emberwatch-server` and `emberwatch-agent` as a user runs them.
 //!
 //! `cargo build --workspace` first: cargo does not build another package's programs for a test.
-//! `harness` runs programs; `wire` speaks the protocol byte by byte, `python` lets the Python package speak it;
-//! `mirror` steps a published world again; `learner` decides and `attacker` annoys; `random_robot` is the example of a client; every other module is a group of
-//! facts. Each test has an instance, a folder and a deadline of its own. `cargo test -p tests -- --ignored` adds the
-//! long run of the hostile clients, and what needs Python (`scripts/test` installs it).
+//! What they share is in `src`; `python` lets the Python package speak the protocol, `random_robot` is the example of a
+//! client; every other module is a group of facts. Each test has an instance, a folder and a deadline of its own.
+//! `cargo test -p tests -- --ignored` adds the long run of the hostile clients, and what needs Python (`scripts/test`
+//! installs it).
 
 mod agent_beliefs;
-mod attacker;
 mod autoencoder;
 mod commands;
 mod compare;
@@ -20,12 +19,9 @@ mod episodes;
 mod files;
 mod frames;
 mod handover;
-mod harness;
 mod hostile;
 mod kills;
-mod learner;
 mod lease;
-mod mirror;
 mod places;
 mod python;
 #[expect(dead_code, reason = "the example's own main")]
@@ -36,9 +32,8 @@ mod recording;
 mod replays;
 mod restart;
 mod security;
-mod siege;
 mod snapshots;
 mod team_agents;
 mod teams;
 mod training;
-mod wire;
+mod trainings;

@@ -3,9 +3,9 @@
 //! In a mount namespace of its own, as that is everybody's; where none may be made, those tests say so and pass, but
 //! in CI they fail.
 
-use crate::harness::{SMALL, program_path};
 use std::io::Write;
 use std::process::{Command, Output};
+use tests::harness::{SMALL, program_path};
 
 /// Runs a shell script where `/dev/shm` is its own; `$S` is the server. `None` if there may be no such place.
 fn apart(script: &str) -> Option<Output> {

@@ -1,7 +1,5 @@
 //! The protocol byte by byte through the Python package: `wire_driver.py` sends what it is told.
 
-use crate::harness::{PATIENCE, eventually, python, repository};
-use crate::wire::{ControlAnswer, RawClient, StepAnswer};
 use bytemuck::{AnyBitPattern, NoUninit, bytes_of, pod_read_unaligned};
 use protocol::channels::Instance;
 use protocol::message::{ControlRequest, StepRequest};
@@ -9,6 +7,8 @@ use serde_json::{Value, json};
 use std::cell::RefCell;
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use tests::harness::{PATIENCE, eventually, python, repository};
+use tests::wire::{ControlAnswer, RawClient, StepAnswer};
 
 /// A Python process with both channels open.
 pub struct PythonWire {

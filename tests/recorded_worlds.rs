@@ -1,20 +1,24 @@
 //! Recorded worlds: what was recorded is what the truth channel shows, and agents act there without a model.
 
-use crate::commands::{AGENT, LIMIT, SERVER, check};
-use crate::harness::{PATIENCE, Paths, Server, eventually, fly, new_instance, reset, run};
-use crate::recording::{read, read_whole, start_recorder, start_replay, stop, text, truths};
-use crate::snapshots::server_command;
+use crate::commands::{agent, check, check_table};
+use crate::recording::{read, read_whole, start_recorder, start_replay, stop, truths};
 use agent::server::truth::TruthFeed;
 use ndarray::{Array3, ArrayView2, Axis};
 use ndarray_npy::WriteNpyExt;
 use protocol::channels::Instance;
 use protocol::connection::ConnectionError;
-use protocol::message::Status;
+use protocol::message::{Status, TruthHeader};
 use protocol::model::Description;
+use protocol::observer::Sample;
 use protocol::recording::Event;
 use protocol::{Client, Connection, Grid, Shape};
+use rustix::fs::{CWD, FileType, Mode, mknodat};
 use std::fs::File;
 use tempfile::TempDir;
+use tests::harness::{
+    AGENT, PATIENCE, Paths, SERVER, Server, fly, new_instance, repository, reset, run,
+};
+use tests::meter::memory;
 
 const N_MOVES: usize = 4;
 
@@ -82,23 +86,26 @@ impl Place {
 
 fn turned(states: ArrayView2<'_, u8>, symmetry: u64) -> Grid<u8> {
     let (height, width) = states.dim();
-    let dim = if symmetry < 4 {
-        (height, width)
-    } else {
+    let is_transposed = symmetry >= 4;
+    let dim = if is_transposed {
         (width, height)
+    } else {
+        (height, width)
+    };
+    let turn = |at, length, bit| {
+        if symmetry & bit == 0 {
+            at
+        } else {
+            length - 1 - at
+        }
     };
     Grid::from_shape_fn(dim, |(row, col)| {
-        let row = if symmetry & 1 == 0 {
-            row
+        let (row, col) = (turn(row, dim.0, 1), turn(col, dim.1, 2));
+        states[if is_transposed {
+            [col, row]
         } else {
-            dim.0 - 1 - row
-        };
-        let col = if symmetry & 2 == 0 {
-            col
-        } else {
-            dim.1 - 1 - col
-        };
-        states[if symmetry < 4 { [row, col] } else { [col, row] }]
+            [row, col]
+        }]
     })
 }
 
@@ -164,10 +171,8 @@ fn hello_tells_of_the_recorded_world_and_keeps_what_it_shall() {
     let recorded = info.recorded_world.expect("it is one");
     assert_eq!((recorded.n_sequences, recorded.n_steps), (2, 3));
     assert_eq!((info.height, info.width, info.burn_in), (3, 5, 0));
-    assert_eq!(
-        (info.model, info.observations),
-        (None, ["dark", "hot", "grey"].map(String::from).to_vec())
-    );
+    assert_eq!(info.model, None);
+    assert_eq!(info.observations, ["dark", "hot", "grey"]);
     let model = Description::model_of(&recorded.description.expect("revealed"));
     assert_eq!(model.expect("valid").name(), "lab");
     let server = Server::start(&place.flags("--reveal-model false"));
@@ -207,14 +212,13 @@ fn a_restored_world_goes_on_and_another_states_file_is_refused() {
     let (mut client, truth) = (server.acquire(0..2), feed(&server));
     reset(&mut client, 21);
     future(&mut client, &truth);
-    let written = server_command(&server, &["snapshot", text(&file)]);
-    assert_eq!(written.code, Some(0), "{}", written.stderr);
+    let file = file.display();
+    server.command(&format!("snapshot {file}")).check(0);
     let went_on = future(&mut client, &truth);
-    let restore = ["restore", text(&file), "--takeover"];
-    let restored = server_command(&server, &restore);
-    assert_eq!(restored.code, Some(0), "{}", restored.stderr);
+    let restore = format!("restore {file} --takeover");
+    server.command(&restore).check(0);
     assert_eq!(future(&mut server.acquire(0..2), &truth), went_on);
-    let again = Server::start(&place.flags(&format!("{settings} --restore {}", text(&file))));
+    let again = Server::start(&place.flags(&format!("{settings} --restore {file}")));
     assert_eq!(future(&mut again.acquire(0..2), &feed(&again)), went_on);
     for (place, settings, words) in [
         (&other, settings, "states: expected 2 sequences of CRC-32 "),
@@ -230,13 +234,7 @@ fn a_restored_world_goes_on_and_another_states_file_is_refused() {
         ),
     ] {
         let server = Server::start(&place.flags(settings));
-        let refused = server_command(&server, &restore);
-        assert_eq!(refused.code, Some(1), "{words}");
-        assert!(
-            refused.stderr.contains(words),
-            "{words}: {}",
-            refused.stderr
-        );
+        server.command(&restore).check(1).check_says(words);
     }
 }
 
@@ -246,18 +244,13 @@ fn a_recording_and_its_replay_show_what_was_recorded() {
     let folder = TempDir::new().expect("a folder");
     let file = folder.path().join("lab.recording");
     let server = Server::start(&place.flags("--states-symmetries"));
-    let recorder = start_recorder(&server.instance, &file, &["--truth"]);
+    let recorder = start_recorder(&server.instance, &file, "--truth");
     let mut client = server.acquire(0..1);
     reset(&mut client, 2);
     let mut paths = Paths::new(1);
     while fly(&mut client, paths.next(N_MOVES)).world.truncated == 0 {}
-    let is_last = |step| step == place.last(2) as u64;
-    let has_all = || {
-        truths(&read(&file).0)
-            .iter()
-            .any(|it| is_last(it.header.step))
-    };
-    assert!(eventually(PATIENCE, has_all));
+    let is_last = |it: &Sample<TruthHeader>| it.header.step == place.last(2) as u64;
+    recorder.until(|| truths(&read(&file).0).iter().any(is_last));
     stop(recorder);
     let records = read_whole(&file);
     let expected = |step: u64| place.states(2, 4, step as usize);
@@ -273,8 +266,8 @@ fn a_recording_and_its_replay_show_what_was_recorded() {
     };
     assert_eq!(info.recorded_world, server.info().recorded_world);
     let again: Instance = new_instance();
-    let replay = start_replay(&again, &file, &["--loop"]);
-    replay.wait_for_words("replaying", PATIENCE);
+    let replay = start_replay(&again, &file, "--loop");
+    replay.wait_for_words("replaying");
     let connection = Connection::open(&again, "tests", PATIENCE).expect("connect");
     assert_eq!(connection.info().recorded_world, info.recorded_world);
 }
@@ -283,14 +276,11 @@ fn a_recording_and_its_replay_show_what_was_recorded() {
 fn a_server_takes_less_memory_than_twice_its_recorded_states() {
     let place = Place::new(&[1000], (256, 256));
     let server = Server::start(&place.flags(""));
-    let status = format!("/proc/{}/status", server.program.pid());
-    let status = std::fs::read_to_string(status).expect("a process");
-    let most = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
-    let most = most
-        .and_then(|most| most.trim().strip_suffix(" kB"))
-        .expect("kilobytes");
-    let most: usize = most.parse().expect("a number");
-    assert!(most < 2 * 64_000, "{most} kB for 64,000 kB of states");
+    let most = memory("VmHWM:", server.program.pid());
+    assert!(
+        (64_000..2 * 64_000).contains(&most),
+        "{most} kB for 64,000 kB of states"
+    );
 }
 
 #[test]
@@ -298,29 +288,16 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     let place = Place::new(&[24, 30], (5, 6));
     let folder = TempDir::new().expect("a folder");
     let settings = folder.path().join("agent.toml");
-    std::fs::write(
-        &settings,
-        "[learning]\nwindow = 4\nblock_windows = 2\nstreams = 4\n",
-    )
-    .expect("write");
+    let small = "[learning]\nwindow = 4\nblock_windows = 2\nstreams = 4\n";
+    std::fs::write(&settings, small).expect("write");
     let out = folder.path().join("out");
     let server = Server::start(&place.flags("--worlds 5 --coverage client"));
     let instance = format!("--instance {}", server.instance.name());
-    let act = |words: &str| {
-        let words = format!("{words} {instance}");
-        let ended = run(AGENT, &words.split_whitespace().collect::<Vec<_>>(), LIMIT);
-        assert_eq!(ended.code, Some(0), "{words}: {}", ended.stderr);
-        ended
-    };
-    let settings = settings.display();
-    act(&format!(
-        "train --worlds 2 --steps 400 --out {} --config {settings}",
-        out.display()
-    ));
-    let checkpoint = format!(
-        "--checkpoint {}",
-        out.join("checkpoint.safetensors").display()
-    );
+    let act = |words: &str| agent(&format!("{words} {instance}"));
+    let (settings, out) = (settings.display(), out.display());
+    let learn = format!("train --worlds 2 --steps 400 --out {out} --config {settings}");
+    act(&learn);
+    let checkpoint = format!("--checkpoint {out}/checkpoint.safetensors");
     for policy in [
         "coverage",
         "oracle_beam",
@@ -329,16 +306,15 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
         "learned_spatial_beam",
     ] {
         let ended = act(&format!("run --policy {policy} --steps 70 {checkpoint}"));
-        assert!(ended.stderr.contains("steps=70"), "{}", ended.stderr);
+        ended.check_says("steps=70");
         let n_ends = ended.stderr.matches("the next begins").count();
         assert!(n_ends >= 2, "{policy}: {}", ended.stderr);
     }
     let figures = folder.path().join("figures");
     let draw = format!("--figures {}", figures.display());
     for policies in ["", "--policies random_walk,coverage"] {
-        act(&format!(
-            "compare --seeds 0..2 --steps 9 {checkpoint} {draw} {policies}"
-        ));
+        let compare = format!("compare --seeds 0..2 --steps 9 {checkpoint} {draw}");
+        act(&format!("{compare} {policies}"));
         let bytes = std::fs::read(figures.join("snapshot.png")).expect("a snapshot");
         assert!(bytes.starts_with(b"\x89PNG"));
         std::fs::remove_file(figures.join("snapshot.png")).expect("remove");
@@ -351,23 +327,17 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
         ladder.contains("2 worlds, 23 steps each") && !ladder.contains("| beam_"),
         "{ladder}"
     );
-    let refuse =
-        |words: &str, expected: &[&str]| check(AGENT, &format!("{words} {instance}"), expected);
-    let no_model = ["filters with a model, and recorded worlds have none"];
-    refuse("run", &[&["\"beam_exploit\""], &no_model[..]].concat());
-    refuse("run --policy spatial_beam", &no_model);
-    refuse(
-        "compare --policies coverage,shooting_explore --seeds 0..1",
-        &no_model,
-    );
-    refuse(
-        "compare --seeds 0..1 --steps 24",
-        &["--steps: expected at most 23, as the shortest episode has, got 24"],
-    );
-    refuse(
-        "serve-decisions",
-        &["has recorded worlds, without a model: expected --model FILE"],
-    );
+    let refuse = |words: &str, expected| check(AGENT, &format!("{words} {instance}"), expected);
+    let no_model = "filters with a model, and recorded worlds have none";
+    let beam = format!("\"beam_exploit\" | {no_model}");
+    refuse("run", &beam);
+    refuse("run --policy spatial_beam", no_model);
+    let ladder = "compare --policies coverage,shooting_explore --seeds 0..1";
+    refuse(ladder, no_model);
+    let words = "--steps: expected at most 23, as the shortest episode has, got 24";
+    refuse("compare --seeds 0..1 --steps 24", words);
+    let words = "has recorded worlds, without a model: expected --model FILE";
+    refuse("serve-decisions", words);
 }
 
 #[test]
@@ -381,40 +351,22 @@ fn settings_that_a_states_file_decides_are_refused_as_flags() {
         ("--model wildfire", "model"),
     ] {
         let words = format!("{setting}: expected no flag beside a states file");
-        check(SERVER, &format!("{states} {flag}"), &[&words]);
+        check(SERVER, &format!("{states} {flag}"), &words);
     }
-    check(
-        SERVER,
-        "--states-offset 3",
-        &["expected none without a states file"],
-    );
-    check(
-        SERVER,
-        &format!("{states} --states-offset 2"),
-        &["states_offset: expected 0 to 1"],
-    );
-    check(
-        SERVER,
-        "--states no/such.npz",
-        &["states file no/such.npz: description no/such.toml: No such file"],
-    );
+    let table = "--states-offset 3 => expected none without a states file
+STATES --states-offset 2 => states_offset: expected 0 to 1
+--states no/such.npz => states file no/such.npz: description no/such.toml: No such file";
+    check_table(SERVER, &table.replace("STATES", &states));
     for (command, flag) in [("compare", "--height"), ("train --out x", "--burn-in")] {
-        check(
-            AGENT,
-            &format!("{command} {states} {flag} 3"),
-            &["--states <FILE|FOLDER>", "cannot be used with", flag],
-        );
+        let words = format!("--states <FILE|FOLDER> | cannot be used with | {flag}");
+        check(AGENT, &format!("{command} {states} {flag} 3"), &words);
     }
 }
 
 #[test]
 fn the_landscape_that_ships_is_a_states_file() {
-    let states = concat!(
-        env!("CARGO_MANIFEST_DIR"),
-        "/../config/landscapes/jacksboro/jacksboro.npz"
-    );
-    let ended = run(SERVER, &["--check", "--states", states], LIMIT);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    let states = repository().join("config/landscapes/jacksboro/jacksboro.npz");
+    run(SERVER, &format!("--check --states {}", states.display())).check(0);
 }
 
 #[test]
@@ -422,14 +374,7 @@ fn a_pipe_is_no_states_file() {
     let folder = TempDir::new().expect("a folder");
     std::fs::write(folder.path().join("states.toml"), DESCRIPTION).expect("write");
     let pipe = folder.path().join("0.npy");
-    rustix::fs::mknodat(
-        rustix::fs::CWD,
-        &pipe,
-        rustix::fs::FileType::Fifo,
-        rustix::fs::Mode::RUSR,
-        0,
-    )
-    .expect("a pipe");
+    mknodat(CWD, &pipe, FileType::Fifo, Mode::RUSR, 0).expect("a pipe");
     let states = format!("--states {}", folder.path().display());
-    check(SERVER, &states, &["0.npy: expected a regular file"]);
+    check(SERVER, &states, "0.npy: expected a regular file");
 }

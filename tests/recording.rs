@@ -1,9 +1,6 @@
 //! Recorders: what they keep, and what they and their files say when something is missing.
 
-use crate::commands::{SERVER, check_table};
-use crate::harness::{
-    Ended, PATIENCE, Paths, Program, SMALL, Server, eventually, fly, new_instance,
-};
+use crate::commands::check_table;
 use protocol::channels::Instance;
 use protocol::control::{CoverageRule, ServerInfo};
 use protocol::message::{FrameHeader, Header, RobotResult, TruthHeader, VERSION};
@@ -15,6 +12,9 @@ use std::io::Read;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
+use tests::harness::{
+    Ended, PATIENCE, Paths, Program, SERVER, SMALL, Server, eventually, fly, new_instance,
+};
 
 /// A folder of a test's own, and a file in it that is not there yet.
 pub fn new_file() -> (TempDir, PathBuf) {
@@ -23,28 +23,25 @@ pub fn new_file() -> (TempDir, PathBuf) {
     (folder, file)
 }
 
-pub fn text(path: &Path) -> &str {
-    path.to_str().expect("a plain path")
-}
-
 /// Starts a recorder and waits until it observes.
-pub fn start_recorder(instance: &Instance, file: &Path, flags: &[&str]) -> Program {
-    let own = ["record", "--instance", instance.name(), "--out", text(file)];
-    let recorder = Program::start(SERVER, &[&own, flags].concat());
-    recorder.wait_for_words("recording", PATIENCE);
+pub fn start_recorder(instance: &Instance, file: &Path, flags: &str) -> Program {
+    let (name, file) = (instance.name(), file.display());
+    let recorder = Program::start(
+        SERVER,
+        &format!("record --instance {name} --out {file} {flags}"),
+    );
+    recorder.wait_for_words("recording");
     recorder
 }
 
-pub fn start_replay(instance: &Instance, file: &Path, flags: &[&str]) -> Program {
-    let own = ["replay", text(file), "--instance", instance.name()];
-    Program::start(SERVER, &[&own, flags].concat())
+pub fn start_replay(instance: &Instance, file: &Path, flags: &str) -> Program {
+    let (name, file) = (instance.name(), file.display());
+    Program::start(SERVER, &format!("replay {file} --instance {name} {flags}"))
 }
 
 pub fn stop(recorder: Program) -> Ended {
-    recorder.signal(Signal::TERM);
-    let ended = recorder.wait(PATIENCE);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-    assert!(ended.stderr.contains("recorded"), "{}", ended.stderr);
+    let ended = recorder.finish();
+    ended.check_says("recorded");
     ended
 }
 
@@ -152,10 +149,8 @@ pub fn write_recording(file: &Path, n_frames: u64, millis_apart: u64) -> Vec<Sam
         };
         let payload = [bytemuck::bytes_of(&robot), &[255, 0, 255, 255, 1, 255, 3]].concat();
         let sample = Sample { header, payload };
-        write(
-            sequence * millis_apart * 1_000_000,
-            Event::Frame(sample.clone()),
-        );
+        let nanos = sequence * millis_apart * 1_000_000;
+        write(nanos, Event::Frame(sample.clone()));
         samples.push(sample);
     }
     writer.finish().expect("finish");
@@ -166,7 +161,7 @@ pub fn write_recording(file: &Path, n_frames: u64, millis_apart: u64) -> Vec<Sam
 fn a_killed_recorder_leaves_whole_records_and_readers_say_where_they_end() {
     let server = Server::start(SMALL);
     let (_folder, file) = new_file();
-    let recorder = start_recorder(&server.instance, &file, &[]);
+    let recorder = start_recorder(&server.instance, &file, "");
     let mut client = server.acquire(0..1);
     let mut paths = Paths::new(0);
     for _ in 0..30 {
@@ -184,20 +179,18 @@ fn a_killed_recorder_leaves_whole_records_and_readers_say_where_they_end() {
     }
     let instance = new_instance();
     let observer = Observer::frames(&instance).expect("observe");
-    let replay = start_replay(&instance, &file, &["--speed", "max"]);
+    let replay = start_replay(&instance, &file, "--speed max");
     let recorded = frames(&records);
     assert_eq!(take(&observer, recorded.len()), recorded);
     drop(observer);
-    let ended = replay.wait(PATIENCE);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-    assert!(ended.stderr.contains("cut short"), "{}", ended.stderr);
+    replay.ends(0).check_says("cut short");
 }
 
 #[test]
 fn a_recorder_that_is_told_twice_at_once_to_stop_records_what_was_published_before() {
     let server = Server::start(&format!("{SMALL} --publish-truth"));
     let (_folder, file) = new_file();
-    let recorder = start_recorder(&server.instance, &file, &["--truth"]);
+    let recorder = start_recorder(&server.instance, &file, "--truth");
     let mut client = server.acquire(0..1);
     recorder.stop();
     let mut paths = Paths::new(0);
@@ -208,7 +201,7 @@ fn a_recorder_that_is_told_twice_at_once_to_stop_records_what_was_published_befo
     recorder.signal(Signal::TERM);
     recorder.signal(Signal::INT); // as when `timeout` signals a process and its group
     recorder.signal(Signal::CONT);
-    assert_eq!(recorder.wait(PATIENCE).code, Some(0));
+    recorder.ends(0);
     let steps: Vec<u64> = frames(&read_whole(&file))
         .iter()
         .map(|frame| frame.header.result.step)
@@ -220,8 +213,8 @@ fn a_recorder_that_is_told_twice_at_once_to_stop_records_what_was_published_befo
 fn a_recorder_comes_before_the_server_and_stays_for_the_next() {
     let instance = new_instance();
     let (_folder, file) = new_file();
-    let recorder = start_recorder(&instance, &file, &["--truth"]);
-    recorder.wait_for_words("no server yet", PATIENCE);
+    let recorder = start_recorder(&instance, &file, "--truth");
+    recorder.wait_for_words("no server yet");
     for (seed, flags) in [
         (11, SMALL),
         (12, "--height 3 --width 4 --moves 2 --burn-in 20"),
@@ -237,11 +230,10 @@ fn a_recorder_comes_before_the_server_and_stays_for_the_next() {
             let mut results = frames.iter().map(|frame| frame.header.result);
             results.any(|result| (result.seed, result.step) == (seed, 3))
         };
-        assert!(eventually(PATIENCE, is_there), "{}", recorder.stderr());
+        recorder.until(is_there);
         server.kill();
     }
-    let ended = stop(recorder);
-    assert!(ended.stderr.contains("servers=2"), "{}", ended.stderr);
+    stop(recorder).check_says("servers=2");
     let mut seed = 10;
     let mut heights = Vec::new();
     for record in read_whole(&file) {
@@ -261,7 +253,7 @@ fn a_recorder_comes_before_the_server_and_stays_for_the_next() {
 fn what_a_recorder_misses_is_said_by_it_and_by_the_file() {
     let server = Server::start(SMALL);
     let (_folder, file) = new_file();
-    let recorder = start_recorder(&server.instance, &file, &[]);
+    let recorder = start_recorder(&server.instance, &file, "");
     let mut client = server.acquire(0..1);
     let mut paths = Paths::new(0);
     fly(&mut client, paths.next(6));
@@ -273,12 +265,7 @@ fn what_a_recorder_misses_is_said_by_it_and_by_the_file() {
     }
     recorder.signal(Signal::CONT);
     wait_for_step(&file, last);
-    let ended = stop(recorder);
-    assert!(
-        ended.stderr.contains("samples were lost"),
-        "{}",
-        ended.stderr
-    );
+    stop(recorder).check_says("samples were lost");
     let records = read_whole(&file);
     let recorded = frames(&records);
     let gaps = recorded.windows(2).map(|pair| {
@@ -296,16 +283,14 @@ fn a_recorder_ends_after_its_steps_with_its_worlds_alone() {
     let server = Server::start(&format!("{SMALL} --worlds 3 --publish-truth"));
     let (_folder, file) = new_file();
     std::fs::write(&file, "something else").expect("write");
-    let flags = ["--steps", "4", "--worlds", "0,2", "--truth", "--force"];
-    let recorder = start_recorder(&server.instance, &file, &flags);
+    let flags = "--steps 4 --worlds 0,2 --truth --force";
+    let recorder = start_recorder(&server.instance, &file, flags);
     let mut client = server.acquire(0..3);
     for step in 0..2 {
         let paths = Paths::new(step).take(6, 3);
         client.step(0..3, &paths).expect("step");
     }
-    let ended = recorder.wait(PATIENCE);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-    assert!(ended.stderr.contains("steps=4"), "{}", ended.stderr);
+    recorder.ends(0).check_says("steps=4");
     let records = read_whole(&file);
     assert!(records.iter().all(|record| record.n_lost == 0));
     assert!(frames(&records).iter().all(|frame| frame.header.world != 1));
@@ -332,15 +317,12 @@ fn a_damaged_recording_is_replayed_up_to_the_damage_unless_that_is_checked() {
     let words = format!("good before it: {} steps", good.len() - 1);
     let instance = new_instance();
     let observer = Observer::frames(&instance).expect("observe");
-    let replay = start_replay(&instance, &file, &[]);
+    let replay = start_replay(&instance, &file, "");
     assert_eq!(take(&observer, good.len()), good);
     drop(observer);
-    let ended = replay.wait(PATIENCE);
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-    assert!(ended.stderr.contains(&words), "{}", ended.stderr);
-    let refused = start_replay(&instance, &file, &["--strict"]).wait(PATIENCE);
-    assert_eq!(refused.code, Some(1), "{}", refused.stderr);
-    assert!(refused.stderr.contains(&words), "{}", refused.stderr);
+    replay.ends(0).check_says(&words);
+    let refused = start_replay(&instance, &file, "--strict").ends(1);
+    refused.check_says(&words);
 }
 
 #[test]
@@ -353,11 +335,10 @@ fn nobody_else_reads_a_recording() {
     let old = File::open(&file).expect("somebody has it open");
     let everybody = std::fs::Permissions::from_mode(0o666);
     std::fs::set_permissions(&file, everybody).expect("a mode");
-    let flags = ["--truth", "--force"];
     let (target, dangling) = (folder.path().join("target"), folder.path().join("dangling"));
     std::os::unix::fs::symlink(&target, &dangling).expect("a link to nothing");
     for path in [&file, &link, &folder.path().join("new"), &dangling] {
-        stop(start_recorder(&server.instance, path, &flags));
+        stop(start_recorder(&server.instance, path, "--truth --force"));
         let mode = path.metadata().expect("the file").permissions().mode();
         assert_eq!(mode & 0o777, 0o600, "{}", path.display());
     }
@@ -416,7 +397,7 @@ replay GOOD --speed fast => --speed | above 0, or max
         ("START", &start),
     ];
     let table = files.iter().fold(table.to_owned(), |table, (name, path)| {
-        table.replace(name, text(path))
+        table.replace(name, &path.display().to_string())
     });
     check_table(SERVER, &table);
     assert_eq!(std::fs::read(&good).expect("read"), bytes, "left as it was");

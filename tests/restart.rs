@@ -1,8 +1,5 @@
 //! Servers that end: by signal, by kill, and what their agents and successors make of it.
 
-use crate::harness::{
-    PATIENCE, Paths, Program, SMALL, Server, eventually, fly, new_instance, reset,
-};
 use iceoryx2::prelude::{CallbackProgression, Service};
 use protocol::channels::{Instance, Ipc, node_config};
 use protocol::connection::ConnectionError;
@@ -11,20 +8,14 @@ use protocol::observer::Observer;
 use rustix::process::Signal;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
+use tests::harness::{ENDLESS, PATIENCE, Paths, Program, SMALL, Server, fly, new_instance, reset};
 
 fn start_agent(instance: &Instance) -> Program {
-    let flags = [
-        "run",
-        "--instance",
-        instance.name(),
-        "--policy",
-        "random_walk",
-    ];
-    Program::start("emberwatch-agent", &flags)
+    Program::agent(instance, "--policy random_walk")
 }
 
 fn is_held_by(server: &Server, agent: &Program) -> bool {
-    server.status().worlds[0].holder_pids == [Some(agent.pid())]
+    server.holder() == Some(agent.pid())
 }
 
 #[test]
@@ -33,39 +24,26 @@ fn an_agent_says_that_its_server_is_gone_and_goes_on_with_the_next() {
     let server = Server::start_on(&instance, SMALL);
     let agent = start_agent(&instance);
     let acts = |server: &Server| is_held_by(server, &agent) && server.status().n_steps > 0;
-    assert!(eventually(PATIENCE, || acts(&server)), "{}", agent.stderr());
+    agent.until(|| acts(&server));
     server.kill();
-    agent.wait_for_words("is gone; waiting for it to come back", PATIENCE);
+    agent.wait_for_words("is gone; waiting for it to come back");
     let server = Server::start_on(&instance, SMALL);
-    assert!(eventually(PATIENCE, || acts(&server)), "{}", agent.stderr());
-    let stopped = crate::harness::run(
-        "emberwatch-server",
-        &["stop", "--instance", instance.name()],
-        PATIENCE,
-    );
-    assert_eq!(stopped.code, Some(0), "{}", stopped.stderr);
-    agent.signal(Signal::TERM);
-    let ended = agent.wait(PATIENCE);
-    assert_eq!(
-        ended.code,
-        Some(0),
-        "an agent without a server stops when told: {}",
-        ended.stderr
-    );
+    agent.until(|| acts(&server));
+    server.command("stop").check(0);
+    // An agent without a server stops when told.
+    agent.finish();
 }
 
 #[test]
 fn an_agent_outlives_a_pause_of_its_server() {
     let server = Server::start(&format!("{SMALL} --lease-millis 86400000"));
     let agent = start_agent(&server.instance);
-    let acts = || is_held_by(&server, &agent) && server.status().n_steps > 0;
-    assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
+    agent.until(|| is_held_by(&server, &agent) && server.status().n_steps > 0);
     server.program.stop();
-    agent.wait_for_words("no answer to step", PATIENCE);
+    agent.wait_for_words("no answer to step");
     server.program.signal(Signal::CONT);
     let before = server.status().n_steps;
-    let acts = || server.status().n_steps > before + 10;
-    assert!(eventually(PATIENCE, acts), "{}", agent.stderr());
+    agent.until(|| server.status().n_steps > before + 10);
     assert!(is_held_by(&server, &agent));
 }
 
@@ -78,26 +56,17 @@ fn a_server_takes_the_place_of_a_killed_one_whose_client_stays() {
     first.kill();
     let second = Server::start_on(&instance, SMALL);
     let refused = client.step(0..1, &[Paths::new(0).next(6)]);
-    assert!(
-        matches!(
-            refused,
-            Err(ConnectionError::ServerGone { .. } | ConnectionError::Refused { .. })
-        ),
-        "{refused:?}"
-    );
+    use ConnectionError::{Refused, ServerGone};
+    let is_told = matches!(refused, Err(ServerGone { .. } | Refused { .. }));
+    assert!(is_told, "{refused:?}");
     let mut next = second.acquire(0..1);
-    assert_eq!(
-        fly(&mut next, Paths::new(0).next(6)),
-        step,
-        "a new server starts from its seed"
-    );
+    // A new server starts from its seed.
+    assert_eq!(fly(&mut next, Paths::new(0).next(6)), step);
 }
 
 #[test]
 fn a_client_that_waits_learns_that_its_server_was_killed() {
-    let flags = ["--height", "64", "--width", "64", "--burn-in", "0"];
-    let instance = new_instance();
-    let server = Server::start_with(&instance, &flags);
+    let server = Server::start("--height 64 --width 64 --burn-in 0");
     let mut connection = server.connect();
     server.program.stop();
     let refused = std::thread::scope(|scope| {
@@ -112,21 +81,14 @@ fn a_client_that_waits_learns_that_its_server_was_killed() {
 
 #[test]
 fn a_signal_ends_a_server_with_code_0() {
-    for (signal, burn_in) in [
-        (Signal::TERM, 0),
-        (Signal::INT, 0),
-        (Signal::TERM, 1u64 << 40),
-    ] {
-        let burn_in = burn_in.to_string();
-        let flags = ["--height", "40", "--width", "40", "--burn-in", &burn_in];
+    for (signal, burn_in) in [(Signal::TERM, 0), (Signal::INT, 0), (Signal::TERM, ENDLESS)] {
+        let flags = format!("--height 40 --width 40 --burn-in {burn_in}");
         let server = Server::start_without_waiting(&new_instance(), &flags);
-        server.program.wait_for_words("serving", PATIENCE);
+        server.program.wait_for_words("serving");
         let agent = start_agent(&server.instance);
-        let attached = || server.status().n_clients > 1;
-        assert!(eventually(PATIENCE, attached), "{}", agent.stderr());
+        agent.until(|| server.status().n_clients > 1);
         server.program.signal(signal);
-        let ended = server.program.wait(PATIENCE);
-        assert_eq!(ended.code, Some(0), "{signal:?}: {}", ended.stderr);
+        server.program.ends(0);
     }
 }
 
@@ -136,22 +98,16 @@ fn a_clean_stop_leaves_nothing_behind() {
     let instance = server.instance.clone();
     let observer = Observer::frames(&instance).expect("observe");
     let agent = start_agent(&instance);
-    assert!(
-        eventually(PATIENCE, || is_held_by(&server, &agent)),
-        "{}",
-        agent.stderr()
-    );
+    agent.until(|| is_held_by(&server, &agent));
     let mut client = server.acquire(1..2);
     reset(&mut client, 3);
     fly(&mut client, Paths::new(0).next(6));
     let files = shared_files(&[server.program.pid(), agent.pid()]);
     assert!(files.len() > 5, "{files:?}");
     client.release().expect("release");
-    agent.signal(Signal::TERM);
-    assert_eq!(agent.wait(PATIENCE).code, Some(0));
+    agent.finish();
     drop(observer);
-    server.program.signal(Signal::TERM);
-    assert_eq!(server.program.wait(PATIENCE).code, Some(0));
+    server.program.finish();
     let left: Vec<_> = files
         .iter()
         .filter_map(|path| Some((path, path.metadata().ok()?.len())))

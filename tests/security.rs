@@ -2,11 +2,10 @@
 //!
 //! A thread plays the other user, which only root may let it do; elsewhere those tests say so and pass.
 
-use crate::harness::{PATIENCE, SMALL, Server, eventually, frames_until};
 use iceoryx2::node::NodeBuilder;
 use iceoryx2::prelude::{Config, FileName, Path as IpcPath, SemanticString};
 use protocol::channels::{
-    Channel, ChannelError, Instance, SHARED_MEMORY, Services, channel_directory, create_node,
+    Channel, ChannelError, Instance, Ipc, SHARED_MEMORY, Services, channel_directory, create_node,
 };
 use protocol::observer::Observer;
 use rustix::process::{Gid, Uid, getuid};
@@ -16,6 +15,8 @@ use std::io::{ErrorKind, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::channel;
+use tests::harness::{PATIENCE, SMALL, Server, eventually, frames_until};
+use tests::meter::all_under;
 
 /// Users whom nobody is.
 const USERS: [u32; 3] = [64_001, 64_002, 64_003];
@@ -42,19 +43,17 @@ fn as_user<T: Send>(user: u32, act: impl FnOnce() -> T + Send) -> Option<T> {
 
 /// Everything of this user's channels: files in its directory and in shared memory.
 fn places() -> (Vec<PathBuf>, Vec<PathBuf>) {
-    let mut files = vec![channel_directory()];
-    let mut next = 0;
-    while let Some(path) = files.get(next).cloned() {
-        let below = std::fs::read_dir(path).into_iter().flatten().flatten();
-        files.extend(below.map(|entry| entry.path()));
-        next += 1;
-    }
-    let prefix = format!("emberwatch-{}_", getuid().as_raw());
-    let segments = std::fs::read_dir(SHARED_MEMORY)
-        .expect("shared memory")
-        .flatten();
-    let own = segments.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix));
-    (files, own.map(|entry| entry.path()).collect())
+    let segments = segments_of(getuid().as_raw());
+    (all_under(&channel_directory()), segments.collect())
+}
+
+/// A user's files in shared memory.
+fn segments_of(user: u32) -> impl Iterator<Item = PathBuf> {
+    let prefix = format!("emberwatch-{user}_");
+    let entries = std::fs::read_dir(SHARED_MEMORY).expect("shared memory");
+    let segments = entries.flatten();
+    let own = segments.filter(move |it| it.file_name().to_string_lossy().starts_with(&prefix));
+    own.map(|entry| entry.path())
 }
 
 /// A path's mode, if it has not gone meanwhile: other tests come and go.
@@ -87,31 +86,20 @@ fn another_user_cannot_connect_observe_read_or_remove() {
     let server = Server::start(SMALL);
     let _client = server.acquire(0..1);
     let (files, segments) = places();
-    let ours = (
-        channel_directory(),
-        format!("emberwatch-{}_", getuid().as_raw()),
-    );
+    let ours = channel_directory();
+    let prefix = format!("emberwatch-{}_", getuid().as_raw());
     clean_up(USERS[0]);
     as_user(USERS[0], || {
         let denied = |path: &Path, result: std::io::Result<()>| match result {
             Err(error) if error.kind() == ErrorKind::NotFound => {}
-            Err(error) => assert_eq!(
-                error.kind(),
-                ErrorKind::PermissionDenied,
-                "{}",
-                path.display()
-            ),
+            Err(error) => assert_eq!(error.kind(), ErrorKind::PermissionDenied, "{path:?}"),
             Ok(()) => panic!("another user got at {}", path.display()),
         };
-        for path in files
-            .iter()
-            .chain(&segments)
-            .filter(|path| **path != ours.0)
-        {
+        for path in files.iter().chain(&segments).filter(|path| **path != ours) {
             denied(path, File::open(path).map(drop));
             denied(path, OpenOptions::new().write(true).open(path).map(drop));
         }
-        denied(&ours.0, std::fs::read_dir(&ours.0).map(drop));
+        denied(&ours, std::fs::read_dir(&ours).map(drop));
         // Removing is up to the folder: ours, and one whose sticky bit is set.
         let removed = remove_file(&segments[0]).expect_err("a segment that is ours");
         assert!(matches!(
@@ -119,25 +107,19 @@ fn another_user_cannot_connect_observe_read_or_remove() {
             ErrorKind::PermissionDenied | ErrorKind::NotFound
         ));
         let mut config = Config::default();
-        let root = ours.0.as_os_str().as_encoded_bytes();
-        config
-            .global
-            .set_root_path(&IpcPath::new(root).expect("a path"));
-        config.global.prefix = FileName::new(ours.1.as_bytes()).expect("a prefix");
-        let node = NodeBuilder::new()
-            .config(&config)
-            .create::<protocol::channels::Ipc>();
+        let root = ours.as_os_str().as_encoded_bytes();
+        let root = IpcPath::new(root).expect("a path");
+        config.global.set_root_path(&root);
+        config.global.prefix = FileName::new(prefix.as_bytes()).expect("a prefix");
+        let node = NodeBuilder::new().config(&config).create::<Ipc>();
         assert!(node.is_err(), "another user's node among ours");
         let node = create_node().expect("its own place is free");
         let services = Services {
             node: &node,
             instance: &server.instance,
         };
-        let step = services.open_step();
-        assert!(
-            matches!(step, Err(ChannelError::NoServer { .. })),
-            "our server from its own place"
-        );
+        let is_none = matches!(services.open_step(), Err(ChannelError::NoServer { .. }));
+        assert!(is_none, "our server from its own place");
     });
     clean_up(USERS[0]);
 }
@@ -217,13 +199,5 @@ fn threads_that_listen_leave_the_umask_as_it_was() {
 /// Removes what a user who is nobody left.
 fn clean_up(user: u32) {
     let _ = std::fs::remove_dir_all(format!("{SHARED_MEMORY}/emberwatch-{user}"));
-    let prefix = format!("emberwatch-{user}_");
-    for entry in std::fs::read_dir(SHARED_MEMORY)
-        .expect("shared memory")
-        .flatten()
-    {
-        if entry.file_name().to_string_lossy().starts_with(&prefix) {
-            let _ = remove_file(entry.path());
-        }
-    }
+    segments_of(user).for_each(|path| _ = remove_file(path));
 }

@@ -1,15 +1,15 @@
 //! Agents that fly robots of one world: by one plan without a word between them, in a world that goes on without them.
 
-use crate::harness::{PATIENCE, Program, Server, eventually, robots_of, run as run_program};
+use crate::commands::check;
 use agent::acting::mission::{Company, Mission};
 use agent::acting::run::{Summary, run};
 use agent::config::AgentConfig;
 use agent::learning::learned::Learned;
 use protocol::observer::Observer;
-use rustix::process::Signal;
 use std::ops::Range;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
+use tests::harness::{AGENT, PATIENCE, Server, robots_of};
 
 /// A lively world of four robots, whose server keeps all frames of these steps.
 const FLAGS: &str =
@@ -74,65 +74,18 @@ fn agents_of_a_team_fly_one_plan_whoever_flies_what() {
 }
 
 #[test]
-fn an_agent_whose_path_comes_late_catches_up() {
-    let server = Server::start(&format!("{FLAGS} --deadline-ms 50"));
-    let name = server.instance.name().to_owned();
-    let agent = |robot: &str| {
-        let flags = ["run", "--instance", &name, "--robot", robot, "--team"];
-        Program::start("emberwatch-agent", &flags)
-    };
-    let (prompt, slow) = (agent("0"), agent("1"));
-    slow.wait_for_words("acting", PATIENCE);
-    slow.stop();
-    let before = server.step_of(0);
-    assert!(eventually(PATIENCE, || server.step_of(0) > before + 3));
-    slow.signal(Signal::CONT);
-    slow.wait_for_words("late: the world went on", PATIENCE);
-    let late = |step: u64| {
-        let (world, robot, _) = server.observe(1);
-        world.step > step && robot.n_moves > 0
-    };
-    let after = server.step_of(0);
-    assert!(
-        eventually(PATIENCE, || late(after + 3)),
-        "{}",
-        slow.stderr()
-    );
-    for agent in [prompt, slow] {
-        agent.signal(Signal::TERM);
-        let ended = agent.wait(PATIENCE);
-        assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-    }
-}
-
-#[test]
 fn what_a_server_of_several_robots_cannot_give_is_refused_by_name() {
     let server = Server::start(&format!("{FLAGS} --publish-truth"));
     let check = |flags: &str, words: &str| {
         let flags = format!("{flags} --instance {}", server.instance.name());
-        let ended = run_program(
-            "emberwatch-agent",
-            &flags.split(' ').collect::<Vec<_>>(),
-            PATIENCE,
-        );
-        assert_ne!(ended.code, Some(0), "{flags}");
-        assert!(ended.stderr.contains(words), "{flags}: {}", ended.stderr);
+        check(AGENT, &flags, words);
     };
-    check(
-        "run --robot 4",
-        "expected some of the world's 0..4, got 4..5",
-    );
-    check(
-        "run --robots 2..6 --team",
-        "expected some of the world's 0..4, got 2..6",
-    );
+    let robots = "expected some of the world's 0..4, got";
+    check("run --robot 4", &format!("{robots} 4..5"));
+    check("run --robots 2..6 --team", &format!("{robots} 2..6"));
     check("run --world 1", "no such world");
-    check(
-        "serve-decisions",
-        "expected a server with --robots 1, got 4",
-    );
-    check(
-        "compare --robots 2",
-        "expected the running server's 4, got 2",
-    );
+    let robots = "expected a server with --robots 1, got 4";
+    check("serve-decisions", robots);
+    let robots = "expected the running server's 4, got 2";
+    check("compare --robots 2", robots);
 }

@@ -1,24 +1,23 @@
 //! Several robots in one world, flown by several clients: the same paths give the same bytes, and no client that dies,
 //! hangs, is replaced or is not allowed changes what the others fly and see.
 
-use crate::harness::{
-    Ended, PATIENCE, Paths, Program, Server, eventually, frames_until, new_instance, robots_of,
-    takeover,
-};
-use crate::mirror::{Mirror, PacedWorld};
 use crate::recording::{frames, new_file, read_whole, start_recorder, stop};
-use crate::wire::{Pending, RawClient, Wire, answer, step_body, step_header};
-use protocol::Client;
-use protocol::control::{Reply, Request, WorldSeed};
-use protocol::message::{
-    FLAG_TEAM_FRAMES, Operation, RobotResult, Status, StepReply, StepRequest, WorldResult,
-};
+use protocol::control::{Reply, Request};
+use protocol::message::{FLAG_TEAM_FRAMES, Status, StepReply, StepRequest, WorldResult};
 use protocol::observer::Observer;
 use protocol::path::path_to_bytes;
 use protocol::payload::split_step_payload;
 use rustix::process::Signal;
 use std::ops::Range;
 use std::time::Instant;
+use tests::harness::{
+    PATIENCE, Paths, Program, Seen, Server, eventually, frames_until, robots_of, seed,
+};
+use tests::mirror::{Mirror, PacedWorld};
+use tests::wire::{
+    Pending, RawClient, Wire, acquire_request, answer, observe_header, recall_header, step_body,
+    step_header,
+};
 
 /// Robots of the world.
 const TEAM: u32 = 4;
@@ -29,9 +28,6 @@ const FLAGS: &str = "--height 9 --width 14 --moves 10 --burn-in 2000 --robots 4"
 
 /// Steps: one for each order in which four clients can come.
 const N_STEPS: u64 = 24;
-
-/// What a robot shows, with the result of its world.
-type Shown = (WorldResult, RobotResult, Vec<u8>);
 
 /// A client of some robots.
 struct Flyer {
@@ -45,7 +41,7 @@ type Sent = Pending<StepRequest, StepReply>;
 impl Flyer {
     fn new(server: &Server, robots: Range<u32>) -> Self {
         let wire = Wire::open(&server.instance);
-        let lease = wire.acquire(robots.start, robots.len() as u32).lease;
+        let lease = wire.acquire(robots.clone()).lease;
         Self {
             wire,
             lease,
@@ -63,19 +59,16 @@ impl Flyer {
 
     /// Sends its robots' paths for a step.
     fn send(&self, k: u64) -> Sent {
-        let paths: Vec<u8> = self
-            .robots
-            .clone()
-            .flat_map(|robot| path(k, robot))
-            .collect();
+        let robots = self.robots.clone();
+        let paths: Vec<u8> = robots.flat_map(|robot| path(k, robot)).collect();
         let sent = self.wire.send_step(self.header(), &step_body(&[k], &paths));
         sent.expect("send a step")
     }
 
     /// Waits for the answer to a step.
-    fn shown(&self, sent: &Sent) -> Vec<Shown> {
+    fn shown(&self, sent: &Sent) -> Vec<Seen> {
         let (reply, payload) = answer(sent, PATIENCE).expect("an answer to a step");
-        assert_eq!(Status::try_from(reply.status), Ok(Status::Ok), "{reply:?}");
+        assert_eq!(reply.status, Status::Ok as u32, "{reply:?}");
         let parts = split_step_payload(&reply, &payload).expect("a whole payload");
         let frames = parts.frames.chunks_exact(9 * 14);
         let robots = parts.robots.iter().zip(frames);
@@ -106,9 +99,9 @@ fn path(k: u64, robot: u32) -> Vec<u8> {
 }
 
 /// The steps of four robots, flown by clients that each hold some; in step k the clients send in the k-th order.
-fn fly(server: &Server, shares: &[Range<u32>]) -> Vec<Vec<Shown>> {
-    let flyers: Vec<Flyer> = shares
-        .iter()
+fn fly(server: &Server, shares: &[Range<u32>]) -> Vec<Vec<Seen>> {
+    let flyers = shares.iter();
+    let flyers: Vec<_> = flyers
         .map(|robots| Flyer::new(server, robots.clone()))
         .collect();
     let step = |k: u64| {
@@ -144,14 +137,14 @@ fn the_same_paths_give_the_same_bytes_whoever_sends_them_in_whatever_order() {
     let together = Server::start(&format!("{FLAGS} --threads 1"));
     let all = 0..4;
     let expected = fly(&together, std::slice::from_ref(&all));
-    let has_shared = |step: &Vec<Shown>| {
+    let has_shared = |step: &Vec<Seen>| {
         let own: u32 = step.iter().map(|(_, robot, _)| robot.n_visited).sum();
         own > step[0].0.n_visited
     };
     assert!(expected.iter().any(has_shared), "no cell was visited twice");
     let apart = Server::start(&format!("{FLAGS} --threads 2"));
     let (_folder, file) = new_file();
-    let recorder = start_recorder(&apart.instance, &file, &[]);
+    let recorder = start_recorder(&apart.instance, &file, "");
     assert!(fly(&apart, &[0..1, 1..2, 2..3, 3..4]) == expected);
     apart.info(); // told after the last step was published
     stop(recorder);
@@ -163,12 +156,11 @@ fn the_same_paths_give_the_same_bytes_whoever_sends_them_in_whatever_order() {
     let new: Vec<_> = steps.iter().filter(|step| mirror.follow(step)).collect();
     assert_eq!(new.len(), expected.len());
     for (k, (step, expected)) in new.into_iter().zip(&expected).enumerate() {
-        for (robot, (sample, (world, result, frame))) in
-            robots_of(step).iter().zip(expected).enumerate()
-        {
+        let robots = robots_of(step).into_iter().zip(expected);
+        for (robot, (sample, (world, result, frame))) in (0..).zip(robots) {
             assert_eq!((step.header.result, sample.result), (*world, *result));
             assert_eq!(sample.frame, frame);
-            assert_eq!(sample.path, path(k as u64, robot as u32));
+            assert_eq!(sample.path, path(k as u64, robot));
         }
     }
 }
@@ -197,32 +189,22 @@ fn a_team_frame_holds_what_all_saw_and_is_open_to_all() {
     let server = Server::start(FLAGS);
     let flyers = [0..1, 1..4].map(|robots| Flyer::new(&server, robots));
     let sent = flyers.each_ref().map(|flyer| flyer.send(0));
-    let own: Vec<Shown> = flyers
-        .iter()
-        .zip(&sent)
-        .flat_map(|(flyer, sent)| flyer.shown(sent))
-        .collect();
+    let own = flyers.iter().zip(&sent);
+    let own: Vec<Seen> = own.flat_map(|(flyer, sent)| flyer.shown(sent)).collect();
     drop(sent);
     let union = |cell: usize| own.iter().map(|(.., frame)| frame[cell]).min();
     let union: Vec<u8> = (0..9 * 14).filter_map(union).collect();
     let stranger = Wire::open(&server.instance);
-    for (operation, body) in [
-        (Operation::Observe, Vec::new()),
-        (Operation::Recall, step_body(&[1], &[])),
+    for (mut header, body) in [
+        (observe_header(2..3), Vec::new()),
+        (recall_header(2..3), step_body(&[1], &[])),
     ] {
-        let header = StepRequest {
-            operation: operation as u32,
-            flags: FLAG_TEAM_FRAMES,
-            first_robot: 2,
-            ..step_header(0, 0)
-        };
+        header.flags = FLAG_TEAM_FRAMES;
         let (reply, payload) = stranger.step(header, &body);
         let parts = split_step_payload(&reply, &payload).expect("a whole payload");
-        assert_eq!(
-            (&parts.worlds[..], &parts.robots[..]),
-            (&[own[2].0][..], &[own[2].1][..])
-        );
-        assert_eq!(parts.frames, union, "{operation:?}");
+        assert_eq!(parts.worlds[..], [own[2].0]);
+        assert_eq!(parts.robots[..], [own[2].1]);
+        assert_eq!(parts.frames, union, "{header:?}");
     }
 }
 
@@ -243,17 +225,14 @@ fn a_path_that_is_withdrawn_is_never_flown() {
     assert_eq!(first.refusal(&waiting), (Status::LeaseLost, 0));
     drop(waiting);
     let sent = second.send(0);
-    let shown = second.shown(&sent);
-    assert_eq!(
-        (shown[0].0.step, shown[0].0.hovered, shown[0].0.late),
-        (1, 3, 0)
-    );
+    let world = second.shown(&sent)[0].0;
+    assert_eq!((world.step, world.hovered, world.late), (1, 3, 0));
     drop(sent);
     // One of its robots is taken over: the path of the other is withdrawn with it.
     let first = Flyer::new(&server, 0..2);
     let waiting = first.send(1);
     second.wait_for_paths(2);
-    let thief = Client::acquire(server.connect(), &takeover(1..2)).expect("take over");
+    let thief = server.take_over(1..2);
     let us = u64::from(std::process::id());
     assert_eq!(first.refusal(&waiting), (Status::LeaseLost, us));
     second.wait_for_paths(0);
@@ -273,21 +252,14 @@ fn a_late_path_is_refused_and_not_flown_in_a_later_step() {
     let mut mirror = Mirror::of(&server.info());
     let flyers = [0..1, 1..4].map(|robots| Flyer::new(&server, robots));
     let [quick, slow] = &flyers;
-    let shown = quick.shown(&quick.send(0));
-    assert_eq!(
-        (shown[0].0.step, shown[0].0.late, shown[0].1.n_moves),
-        (1, 0b1110, 10)
-    );
+    let (world, robot, _) = quick.shown(&quick.send(0)).remove(0);
+    assert_eq!((world.step, world.late, robot.n_moves), (1, 0b1110, 10));
     assert_eq!(slow.refusal(&slow.send(0)), (Status::Late, 1));
     assert_eq!(slow.refusal(&slow.send(2)), (Status::Early, 1));
     // The next step has the paths that were meant for it, whichever come in time.
     let sent = flyers.each_ref().map(|flyer| flyer.send(1));
-    assert!(
-        flyers
-            .iter()
-            .zip(&sent)
-            .any(|(flyer, sent)| flyer.refusal(sent).0 == Status::Ok)
-    );
+    let mut answers = flyers.iter().zip(&sent);
+    assert!(answers.any(|(flyer, sent)| flyer.refusal(sent).0 == Status::Ok));
     for step in frames_until(&observer, 0, 2) {
         mirror.follow(&step);
         for (robot, sample) in (0..).zip(robots_of(&step)) {
@@ -303,21 +275,7 @@ fn who_holds_no_robot_can_neither_fly_nor_read_ahead_nor_block() {
     let flyers = [0..1, 1..4].map(|robots| Flyer::new(&server, robots));
     let frames = Observer::frames(&server.instance).expect("the channel");
     let stranger = Wire::open(&server.instance);
-    let status = |header: StepRequest, body: &[u8]| {
-        let (reply, _) = stranger.step(header, body);
-        (
-            Status::try_from(reply.status).expect("a known status"),
-            reply.detail,
-        )
-    };
-    let observe = || {
-        let header = StepRequest {
-            operation: Operation::Observe as u32,
-            n_robots: TEAM,
-            ..step_header(0, 0)
-        };
-        stranger.step(header, &[]).1
-    };
+    let observe = || stranger.step(observe_header(0..TEAM), &[]).1;
     for k in 0..5 {
         let before = observe();
         let first = flyers[0].send(k);
@@ -329,47 +287,28 @@ fn who_holds_no_robot_can_neither_fly_nor_read_ahead_nor_block() {
                 ..step_header(lease, N_MOVES as u32)
             };
             let body = step_body(&[k], &[3; N_MOVES]);
-            assert_eq!(status(header, &body), (Status::NoLease, robot.into()));
+            let refused = stranger.status_of(header, &body);
+            assert_eq!(refused, (Status::NoLease, robot.into()));
         }
-        let recall = StepRequest {
-            operation: Operation::Recall as u32,
-            n_robots: TEAM,
-            ..step_header(0, 0)
-        };
-        let ahead = step_body(&[k + 1], &[]);
-        assert_eq!(status(recall, &ahead), (Status::NotKept, k));
-        let acquire = Request::Acquire {
-            first_robot: 3,
-            n_robots: 1,
-            takeover: false,
-            ttl_millis: None,
-        };
+        let ahead = stranger.status_of(recall_header(0..TEAM), &step_body(&[k + 1], &[]));
+        assert_eq!(ahead, (Status::NotKept, k));
         let reset = |lease| Request::Reset {
             lease,
-            worlds: vec![WorldSeed {
-                world: 0,
-                seed: None,
-            }],
+            worlds: vec![seed(0, None)],
         };
-        assert_eq!(stranger.ask(&acquire).status(), Status::Busy);
-        assert_eq!(
-            stranger.ask(&reset(flyers[0].lease)).status(),
-            Status::NoLease
-        );
+        let acquired = stranger.ask(&acquire_request(3..4));
+        assert_eq!(acquired.status(), Status::Busy);
+        let stolen = stranger.ask(&reset(flyers[0].lease));
+        assert_eq!(stolen.status(), Status::NoLease);
         // Not even who holds some of its robots may reset the world.
-        assert_eq!(
-            flyers[1].wire.ask(&reset(flyers[1].lease)).status(),
-            Status::Busy
-        );
+        let own = flyers[1].wire.ask(&reset(flyers[1].lease));
+        assert_eq!(own.status(), Status::Busy);
         assert!(observe() == before);
         flyers[1].wait_for_paths(1);
         let second = flyers[1].send(k);
         let shown = [flyers[0].shown(&first), flyers[1].shown(&second)].concat();
-        assert!(
-            shown
-                .iter()
-                .all(|(world, ..)| (world.step, world.hovered) == (k + 1, 0))
-        );
+        let mut worlds = shown.iter().map(|(world, ..)| world);
+        assert!(worlds.all(|world| (world.step, world.hovered) == (k + 1, 0)));
     }
     // What was refused is not published either: each step once, after the present state for a new observer.
     let mut steps = Vec::new();
@@ -396,29 +335,24 @@ impl Lab {
         Self { server, world }
     }
 
-    fn start_agent(&self, robot: u32, flags: &[&str]) -> Program {
-        let robot = robot.to_string();
-        let common = ["run", "--instance", self.server.instance.name()];
-        let which = ["--robot", &robot, "--policy", "random_walk"];
-        Program::start("emberwatch-agent", &[&common[..], &which, flags].concat())
+    fn start_agent(&self, robot: u32, flags: &str) -> Program {
+        let flags = format!("--robot {robot} --policy random_walk {flags}");
+        Program::agent(&self.server.instance, &flags)
+    }
+
+    /// Three agents, once all robots fly.
+    fn start_agents(&mut self) -> [Program; 3] {
+        let agents = [1, 2, 3].map(|robot| self.start_agent(robot, ""));
+        self.until(&agents.each_ref(), all_fly);
+        agents
     }
 
     /// Steps until a result is as wanted; every step on the way must be as its own paths make it.
     fn until(&mut self, agents: &[&Program], wanted: impl Fn(&WorldResult) -> bool) {
         let start = Instant::now();
         while !wanted(&self.step()) {
-            let said = || {
-                agents
-                    .iter()
-                    .map(|agent| agent.stderr())
-                    .collect::<String>()
-            };
-            assert!(
-                start.elapsed() < PATIENCE,
-                "{:?}: {}",
-                self.world.last,
-                said()
-            );
+            let said: String = agents.iter().map(|agent| agent.stderr()).collect();
+            assert!(start.elapsed() < PATIENCE, "{:?}: {said}", self.world.last);
         }
     }
 
@@ -433,38 +367,26 @@ fn all_fly(world: &WorldResult) -> bool {
     world.hovered | world.late == 0
 }
 
-fn check_end(ended: &Ended, words: &str) {
-    assert_eq!(ended.code, Some(3), "{}", ended.stderr);
-    assert!(ended.stderr.contains(words), "{words:?}: {}", ended.stderr);
-}
-
 #[test]
 fn the_robot_of_a_killed_agent_hovers_until_the_next_one_flies_it() {
     let mut lab = Lab::new("--lease-millis 86400000");
-    let agents = [1, 2, 3].map(|robot| lab.start_agent(robot, &[]));
-    lab.until(&agents.each_ref(), all_fly);
-    let [one, two, three] = agents;
+    let [one, two, three] = lab.start_agents();
     two.kill();
     lab.until(&[&one, &three], |world| world.hovered == 0b0100);
     for _ in 0..20 {
         let world = lab.step();
-        assert_eq!(
-            (world.hovered, world.late),
-            (0b0100, 0),
-            "the others fly on"
-        );
+        let stayed = (world.hovered, world.late);
+        assert_eq!(stayed, (0b0100, 0), "the others fly on");
     }
-    let two = lab.start_agent(2, &[]);
+    let two = lab.start_agent(2, "");
     lab.until(&[&one, &two, &three], all_fly);
 }
 
 #[test]
 fn a_takeover_changes_who_flies_a_robot_and_nothing_else() {
     let mut lab = Lab::new("--lease-millis 86400000");
-    let agents = [1, 2, 3].map(|robot| lab.start_agent(robot, &[]));
-    lab.until(&agents.each_ref(), all_fly);
-    let [one, two, three] = agents;
-    let next = lab.start_agent(2, &["--takeover"]);
+    let [one, two, three] = lab.start_agents();
+    let next = lab.start_agent(2, "--takeover");
     let start = Instant::now();
     while lab.server.status().worlds[0].holder_pids[2] != Some(next.pid()) {
         assert!(start.elapsed() < PATIENCE, "{}", next.stderr());
@@ -475,34 +397,28 @@ fn a_takeover_changes_who_flies_a_robot_and_nothing_else() {
         let world = lab.step();
         assert!(all_fly(&world), "{world:?}");
     }
-    check_end(
-        &two.wait(PATIENCE),
-        &format!("lease lost to pid {}", next.pid()),
-    );
+    let words = format!("lease lost to pid {}", next.pid());
+    two.ends(3).check_says(&words);
     drop((one, three));
 }
 
 #[test]
 fn a_stopped_agent_delays_its_world_until_its_lease_ends() {
     let mut lab = Lab::new("--lease-millis 1500");
-    let agents = [1, 2, 3].map(|robot| lab.start_agent(robot, &[]));
-    lab.until(&agents.each_ref(), all_fly);
-    let [_one, _two, three] = agents;
+    let [_one, _two, three] = lab.start_agents();
     three.stop();
     lab.until(&[&three], |world| world.hovered & 0b1000 != 0);
     let holder = lab.server.status().worlds[0].holder_pids[3];
     assert_eq!(holder, None);
     three.signal(Signal::CONT);
     // It has no world to wait for it: it asks by itself, and hears.
-    check_end(&three.wait(PATIENCE), "lease lost");
+    three.ends(3).check_says("lease lost");
 }
 
 #[test]
 fn a_stopped_agent_is_late_in_each_step_and_flies_again_when_it_wakes() {
     let mut lab = Lab::new("--lease-millis 86400000 --deadline-ms 200");
-    let agents = [1, 2, 3].map(|robot| lab.start_agent(robot, &[]));
-    lab.until(&agents.each_ref(), all_fly);
-    let [one, two, mut three] = agents;
+    let [one, two, mut three] = lab.start_agents();
     three.stop();
     for _ in 0..3 {
         lab.until(&[&three], |world| world.late & 0b1000 != 0);
@@ -510,25 +426,20 @@ fn a_stopped_agent_is_late_in_each_step_and_flies_again_when_it_wakes() {
     }
     three.signal(Signal::CONT);
     lab.until(&[&one, &two, &three], all_fly);
+    three.wait_for_words("late: the world went on");
     assert!(!three.has_ended(), "{}", three.stderr());
 }
 
 #[test]
 fn one_agent_flies_a_team_and_others_share_its_frames() {
-    let instance = new_instance();
-    let server = Server::start_on(&instance, FLAGS);
-    let observer = Observer::frames(&instance).expect("observe");
+    let server = Server::start(FLAGS);
+    let observer = Observer::frames(&server.instance).expect("observe");
     let mut mirror = Mirror::of(&server.info());
-    let run = |flags: &[&str]| {
-        let common = ["run", "--instance", instance.name(), "--steps", "10"];
-        Program::start("emberwatch-agent", &[&common[..], flags].concat())
-    };
-    let team = run(&["--robots", "0..4", "--team"]).wait(PATIENCE);
-    assert_eq!(team.code, Some(0), "{}", team.stderr);
-    let mates = ["0", "1", "2", "3"].map(|robot| run(&["--robot", robot, "--share"]));
+    let run = |flags: &str| Program::agent(&server.instance, &format!("--steps 10 {flags}"));
+    run("--robots 0..4 --team").ends(0);
+    let mates = [0, 1, 2, 3].map(|robot| run(&format!("--robot {robot} --share")));
     for mate in mates {
-        let ended = mate.wait(PATIENCE);
-        assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+        mate.ends(0);
     }
     let steps = server.step_of(0);
     let n_new = frames_until(&observer, 0, steps)

@@ -1,7 +1,7 @@
 //! `emberwatch-agent train` and what becomes of its checkpoints.
 
-use crate::commands::{AGENT, check, check_table};
-use crate::harness::{Ended, Program, SMALL, Server, eventually, fly, run};
+use crate::commands::{agent, check, check_table};
+use crate::trainings::Place;
 use agent::learning::checkpoint::{self, Contents};
 use agent::learning::learner::KIND;
 use agent::learning::learner::Learner;
@@ -9,12 +9,9 @@ use agent::learning::student::filter::SavedFilter;
 use protocol::Move;
 use rustix::process::Signal;
 use std::ffi::OsString;
-use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::path::Path;
 use tempfile::TempDir;
-
-/// How long a small training may take.
-const LIMIT: Duration = Duration::from_secs(60);
+use tests::harness::{AGENT, LIMIT, Program, SMALL, Server, fly, repository, run};
 
 /// A private server with small worlds.
 const WORLDS: &str = "--worlds 2 --height 6 --width 9 --moves 5 --burn-in 60";
@@ -28,60 +25,15 @@ explore_steps = 40
 updates_per_step = 1.0
 ";
 
-struct Place {
-    folder: TempDir,
+const HEADER: &str = "update,world_steps,loss,held_out_log_likelihood,mean_reward,rate";
+
+fn place() -> Place {
+    Place::new(SETTINGS, HEADER)
 }
 
-impl Place {
-    fn new() -> Self {
-        let folder = TempDir::new().expect("a folder");
-        std::fs::write(folder.path().join("agent.toml"), SETTINGS).expect("settings");
-        Self { folder }
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-
-    fn checkpoint(&self, out: &str) -> PathBuf {
-        self.path(out).join("checkpoint.safetensors")
-    }
-
-    fn contents(&self, out: &str) -> Contents {
-        let read = checkpoint::read(&self.checkpoint(out), &[KIND]);
-        read.expect("a checkpoint").1
-    }
-
-    /// The command's words for training into a folder.
-    fn words(&self, out: &str, flags: &str) -> String {
-        let (config, out) = (self.path("agent.toml"), self.path(out));
-        format!(
-            "train --config {} --out {} {flags}",
-            config.display(),
-            out.display()
-        )
-    }
-
-    fn train(&self, out: &str, flags: &str) -> Ended {
-        agent(&self.words(out, flags))
-    }
-
-    fn rows(&self, out: &str) -> Vec<Vec<String>> {
-        let text = std::fs::read_to_string(self.path(out).join("metrics.csv"));
-        let text = text.expect("the metrics");
-        let mut lines = text.lines();
-        let header = "update,world_steps,loss,held_out_log_likelihood,mean_reward,rate";
-        assert_eq!(lines.next(), Some(header));
-        lines
-            .map(|line| line.split(',').map(String::from).collect())
-            .collect()
-    }
-}
-
-fn agent(words: &str) -> Ended {
-    let ended = run(AGENT, &words.split_whitespace().collect::<Vec<_>>(), LIMIT);
-    assert_eq!(ended.code, Some(0), "{words}: {}", ended.stderr);
-    ended
+fn read(checkpoint: &Path) -> Contents {
+    let (_, contents) = checkpoint::read(checkpoint, &[KIND]).expect("a checkpoint");
+    contents
 }
 
 fn learner(contents: &Contents) -> Learner {
@@ -94,7 +46,7 @@ fn bytes(path: &Path) -> Vec<u8> {
 
 #[test]
 fn the_same_seed_gives_the_same_losses_bit_for_bit() {
-    let place = Place::new();
+    let place = place();
     for (out, seed) in [("a", 5), ("b", 5), ("c", 6)] {
         place.train(out, &format!("{WORLDS} --steps 120 --agent-seed {seed}"));
     }
@@ -117,9 +69,9 @@ fn training_goes_on_bit_for_bit_where_it_stopped() {
         (&[120], "estimate"),
         (&[22, 61, 100], "estimate"),
     ] {
-        let place = Place::new();
+        let place = place();
         let settings = format!("{SETTINGS}[objective]\nbelief = \"{belief}\"\n");
-        std::fs::write(place.path("agent.toml"), settings).expect("settings");
+        place.set(&settings);
         let [whole, parts] = ["whole", "parts"].map(|out| {
             let server = Server::start(&format!("{SMALL} --worlds 2 --seed 4"));
             let train = |flags: String| {
@@ -136,7 +88,7 @@ fn training_goes_on_bit_for_bit_where_it_stopped() {
             let resume = if done > 0 { "--resume" } else { "" };
             let ended = train(format!("--steps {} {resume}", 200 - done));
             assert!(!ended.stderr.contains("a new track"), "{}", ended.stderr);
-            (place.rows(out), place.contents(out))
+            (place.rows(out), read(&place.checkpoint(out)))
         });
         assert_eq!(whole.0, parts.0, "{stops:?}");
         assert_eq!(whole.0.last().map(|row| &*row[1]), Some("200"));
@@ -147,14 +99,13 @@ fn training_goes_on_bit_for_bit_where_it_stopped() {
 
 #[test]
 fn other_worlds_begin_new_tracks_and_an_empty_replay() {
-    let place = Place::new();
+    let place = place();
     place.train("out", &format!("{WORLDS} --steps 60"));
     let n_rows = place.rows("out").len();
     let refused = place.words("out", &format!("{WORLDS} --steps 60"));
-    check(AGENT, &refused, &["--out", "expected --resume"]);
+    check(AGENT, &refused, "--out | expected --resume");
     let ended = place.train("out", &format!("{WORLDS} --steps 60 --resume"));
-    let told = "beliefs begin again robots=2";
-    assert!(ended.stderr.contains(told), "{}", ended.stderr);
+    ended.check_says("beliefs begin again robots=2");
     let files = std::fs::read_dir(place.path("out")).expect("the folder");
     let names = files.map(|file| file.expect("a file").file_name());
     let is_of_tensorboard = |name: &OsString| name.to_string_lossy().contains(".tfevents.");
@@ -173,15 +124,14 @@ fn other_worlds_begin_new_tracks_and_an_empty_replay() {
 
 #[test]
 fn a_world_that_stands_elsewhere_begins_a_new_track_and_the_replay_stays() {
-    let place = Place::new();
+    let place = place();
     let server = Server::start(&format!("{SMALL} --worlds 2"));
     let flags = format!("--instance {} --worlds 2", server.instance.name());
     place.train("out", &format!("{flags} --steps 60"));
     let n_rows = place.rows("out").len();
     fly(&mut server.acquire(0..1), vec![Move::from_low_bits(0); 6]);
     let ended = place.train("out", &format!("{flags} --steps 60 --resume"));
-    let told = "beliefs begin again robots=1";
-    assert!(ended.stderr.contains(told), "{}", ended.stderr);
+    ended.check_says("beliefs begin again robots=1");
     let rows = place.rows("out");
     let updates = |row: &Vec<String>| row[0].parse::<u64>().expect("a number");
     assert!(updates(&rows[n_rows]) > updates(&rows[n_rows - 1]));
@@ -189,13 +139,13 @@ fn a_world_that_stands_elsewhere_begins_a_new_track_and_the_replay_stays() {
 
 #[test]
 fn a_number_that_is_not_finite_ends_training_by_name_with_a_checkpoint() {
-    let place = Place::new();
+    let place = place();
     place.train("out", &format!("{WORLDS} --steps 80"));
     let checkpoint = place.checkpoint("out");
     // Finite, but a large step along it is not.
     let settings = format!("{SETTINGS}rate = 1.0\nobservation_rate = 100.0\n");
-    std::fs::write(place.path("agent.toml"), settings).expect("settings");
-    let mut contents = place.contents("out");
+    place.set(&settings);
+    let mut contents = read(&place.checkpoint("out"));
     for (name, number) in [("first_moment", f32::MAX), ("second_moment", 0.0)] {
         let tensor = contents.tensors.get_mut(&format!("likelihood.{name}"));
         tensor.expect("a moment").numbers[4] = number;
@@ -204,16 +154,15 @@ fn a_number_that_is_not_finite_ends_training_by_name_with_a_checkpoint() {
     let n_rows = place.rows("out").len();
     let next = learner(&contents).n_updates() + 1;
     let words = place.words("out", &format!("{WORLDS} --steps 80 --resume"));
-    let ended = run(AGENT, &words.split_whitespace().collect::<Vec<_>>(), LIMIT);
-    assert_eq!(ended.code, Some(1), "{}", ended.stderr);
+    let ended = run(AGENT, &words).check(1);
     let expected = format!(
         "update {next}: likelihood: expected finite numbers, got a step to a number that is not; \
          what was learned before is in {}",
         checkpoint.display()
     );
-    assert!(ended.stderr.contains(&expected), "{}", ended.stderr);
+    ended.check_says(&expected);
     assert!(!ended.stderr.contains("panicked"), "{}", ended.stderr);
-    let saved = place.contents("out");
+    let saved = read(&place.checkpoint("out"));
     for name in ["kernel", "likelihood", "initial"] {
         let tensors = [&contents, &saved].map(|contents| contents.tensors.get(name));
         assert_eq!(tensors[0], tensors[1], "{name}: as before the update");
@@ -221,12 +170,12 @@ fn a_number_that_is_not_finite_ends_training_by_name_with_a_checkpoint() {
     assert_eq!(learner(&saved).n_updates(), next - 1);
     assert!(place.rows("out").len() >= n_rows);
     // It reads back whole: a later run gets as far, and no further.
-    check(AGENT, &words, &["likelihood: expected finite numbers"]);
+    check(AGENT, &words, "likelihood: expected finite numbers");
 }
 
 #[test]
 fn frozen_parameters_stay_as_they_are() {
-    let place = Place::new();
+    let place = place();
     place.train("out", &format!("{WORLDS} --steps 80"));
     let (rows, checkpoint) = (place.rows("out"), bytes(&place.checkpoint("out")));
     place.train("out", &format!("{WORLDS} --steps 80 --resume --freeze"));
@@ -239,16 +188,14 @@ fn frozen_parameters_stay_as_they_are() {
 #[test]
 fn a_signal_ends_training_with_a_checkpoint_and_a_free_world() {
     for signal in [Signal::INT, Signal::TERM] {
-        let place = Place::new();
+        let place = place();
         let server = Server::start(&format!("{SMALL} --worlds 2 --reveal-model false"));
         let name = server.instance.name();
         let words = place.words("out", &format!("--instance {name} --worlds 2"));
-        let program = Program::start(AGENT, &words.split_whitespace().collect::<Vec<_>>());
-        let acts = eventually(LIMIT, || server.status().n_steps > 40);
-        assert!(acts, "{}", program.stderr());
+        let program = Program::start(AGENT, &words);
+        program.until(|| server.status().n_steps > 40);
         program.signal(signal);
-        let ended = program.wait(LIMIT);
-        assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+        program.wait(LIMIT).check(0);
         assert!(place.checkpoint("out").is_file());
         server.acquire(0..2);
     }
@@ -256,43 +203,32 @@ fn a_signal_ends_training_with_a_checkpoint_and_a_free_world() {
 
 #[test]
 fn a_server_that_dies_leaves_what_was_learned() {
-    let place = Place::new();
+    let place = place();
     let server = Server::start(&format!("{SMALL} --worlds 2"));
     let name = server.instance.name();
     let words = place.words("out", &format!("--instance {name} --worlds 2"));
-    let program = Program::start(AGENT, &words.split_whitespace().collect::<Vec<_>>());
-    assert!(eventually(LIMIT, || server.status().n_steps > 40));
+    let program = Program::start(AGENT, &words);
+    program.until(|| server.status().n_steps > 40);
     server.kill();
-    let ended = program.wait(LIMIT);
-    assert_eq!(ended.code, Some(1), "{}", ended.stderr);
+    let ended = program.wait(LIMIT).check(1);
     assert!(!ended.stderr.contains("panicked"), "{}", ended.stderr);
     assert!(place.checkpoint("out").is_file());
 }
 
 #[test]
 fn episodes_that_end_are_begun_again() {
-    let place = Place::new();
+    let place = place();
     let server = Server::start(&format!("{SMALL} --worlds 2 --max-steps 9"));
     let name = server.instance.name();
     place.train("out", &format!("--instance {name} --worlds 2 --steps 80"));
-    assert!(
-        server
-            .status()
-            .worlds
-            .iter()
-            .all(|world| world.info.step == 40 % 9)
-    );
-    assert!(
-        place
-            .rows("out")
-            .last()
-            .is_some_and(|row| !row[2].is_empty())
-    );
+    assert_eq!([0, 1].map(|world| server.step_of(world)), [40 % 9; 2]);
+    let rows = place.rows("out");
+    assert!(rows.last().is_some_and(|row| !row[2].is_empty()));
 }
 
 #[test]
 fn a_checkpoint_is_compared_and_evaluated() {
-    let place = Place::new();
+    let place = place();
     place.train("out", &format!("{WORLDS} --steps 80"));
     place.train("own", &format!("{WORLDS} --steps 80 --learner own_filter"));
     let [checkpoint, own] = ["out", "own"].map(|out| place.checkpoint(out));
@@ -309,8 +245,8 @@ fn a_checkpoint_is_compared_and_evaluated() {
         "learned_own_beam",
         "learned_own_spatial_beam",
     ] {
-        assert!(compared.stdout.contains(policy), "{}", compared.stdout);
-        assert!(evaluated.stdout.contains(policy), "{}", evaluated.stdout);
+        compared.check_prints(policy);
+        evaluated.check_prints(policy);
     }
     for row in [
         "class frequencies",
@@ -318,76 +254,51 @@ fn a_checkpoint_is_compared_and_evaluated() {
         "learned_filter - known_model",
         "learned_own_filter - known_model",
     ] {
-        assert!(evaluated.stdout.contains(row), "{}", evaluated.stdout);
+        evaluated.check_prints(row);
     }
     let server = Server::start(SMALL);
     let name = server.instance.name();
     let flags = format!("--instance {name} --steps 5 --policy learned_beam");
     agent(&format!("run {flags} --checkpoint {checkpoint}"));
-    check(
-        AGENT,
-        &format!("run {flags}"),
-        &["learned_beam", "--checkpoint FILE"],
-    );
+    let words = "learned_beam | --checkpoint FILE";
+    check(AGENT, &format!("run {flags}"), words);
     let flags = format!("--instance {name} --steps 5 --policy learned_own_spatial_beam");
     agent(&format!("run {flags} --checkpoint {own}"));
-    check(
-        AGENT,
-        &format!("run {flags} --checkpoint {checkpoint}"),
-        &[
-            "learned_own_spatial_beam",
-            "--checkpoint FILE of a filter by own state",
-        ],
-    );
-    check(
-        AGENT,
-        &place.words("own", &format!("{WORLDS} --steps 8 --resume")),
-        &["expected a checkpoint of learned_filter, got one of learned_own_filter"],
-    );
-    let resume = format!("{WORLDS} --steps 8 --resume --learner own_filter");
-    place.train("own", &resume);
+    let other = format!("run {flags} --checkpoint {checkpoint}");
+    let words = "learned_own_spatial_beam | --checkpoint FILE of a filter by own state";
+    check(AGENT, &other, words);
+    let resume = format!("{WORLDS} --steps 8 --resume");
+    let words = "expected a checkpoint of learned_filter, got one of learned_own_filter";
+    check(AGENT, &place.words("own", &resume), words);
+    place.train("own", &format!("{resume} --learner own_filter"));
 }
 
 #[test]
 fn a_checkpoint_that_does_not_fit_is_refused_by_name() {
-    let place = Place::new();
+    let place = place();
     place.train("out", &format!("{WORLDS} --steps 40"));
     let checkpoint = place.checkpoint("out");
     let whole = bytes(&checkpoint);
     let resume = place.words("out", &format!("{WORLDS} --steps 8 --resume"));
     let settings = SETTINGS.replace("[learning]", "[learning]\nkernel = [5, 5]");
-    std::fs::write(place.path("agent.toml"), settings).expect("settings");
-    let shape = ["checkpoint.safetensors: kernel: expected shape [3, 3, 5, 5], got [3, 3, 3, 3]"];
-    check(AGENT, &resume, &shape);
+    place.set(&settings);
+    let shape = "checkpoint.safetensors: kernel: expected shape [3, 3, 5, 5], got [3, 3, 3, 3]";
+    check(AGENT, &resume, shape);
     let evaluate = format!(
         "evaluate --checkpoint {} --seeds 0..1 --steps 1 --height 4 --width 4 --moves 2 --burn-in 1",
         checkpoint.display()
     );
     std::fs::write(&checkpoint, &whole[..whole.len() / 2]).expect("cut");
-    check(
-        AGENT,
-        &resume,
-        &["checkpoint.safetensors", "damaged or cut off"],
-    );
-    check(
-        AGENT,
-        &evaluate,
-        &["checkpoint.safetensors", "damaged or cut off"],
-    );
+    let damaged = "checkpoint.safetensors | damaged or cut off";
+    check(AGENT, &resume, damaged);
+    check(AGENT, &evaluate, damaged);
     let mut flipped = whole.clone();
     *flipped.last_mut().expect("not empty") ^= 1;
     std::fs::write(&checkpoint, flipped).expect("flipped");
-    check(
-        AGENT,
-        &resume,
-        &["checkpoint.safetensors", "expected contents with digest"],
-    );
+    let words = "checkpoint.safetensors | expected contents with digest";
+    check(AGENT, &resume, words);
     std::fs::write(&checkpoint, "not a checkpoint").expect("written");
-    check(
-        AGENT,
-        &evaluate,
-        &["checkpoint.safetensors", "damaged or cut off"],
-    );
+    check(AGENT, &evaluate, damaged);
 }
 
 /// Flags of `train`, `evaluate` and `compare`, and the words of their refusal.
@@ -424,33 +335,29 @@ fn wrong_flags_of_learners_are_named() {
 
 #[test]
 fn worlds_and_settings_that_do_not_fit_are_named() {
-    let place = Place::new();
+    let place = place();
     let server = Server::start(SMALL);
     let words = |flags: &str| {
         let name = server.instance.name();
         place.words("out", &format!("--instance {name} {flags}"))
     };
-    check(AGENT, &words("--worlds 2"), &["no such robot"]);
+    check(AGENT, &words("--worlds 2"), "no such robot");
     let _held = server.acquire(0..1);
-    check(AGENT, &words("--worlds 1"), &["pid"]);
-    let settings = "[learning]\nkernel = [2, 3]\n";
-    std::fs::write(place.path("agent.toml"), settings).expect("settings");
+    check(AGENT, &words("--worlds 1"), "pid");
+    place.set("[learning]\nkernel = [2, 3]\n");
     let words = words("--worlds 1 --takeover --steps 1");
-    check(
-        AGENT,
-        &words,
-        &["kernel: expected odd sides up to 15, got 2 x 3"],
-    );
-    std::fs::write(place.path("agent.toml"), "[learning]\nrate = 2.0\n").expect("settings");
-    check(AGENT, &words, &["learning.rate: expected 0 to 1, got 2"]);
+    let kernel = "kernel: expected odd sides up to 15, got 2 x 3";
+    check(AGENT, &words, kernel);
+    place.set("[learning]\nrate = 2.0\n");
+    check(AGENT, &words, "learning.rate: expected 0 to 1, got 2");
 }
 
 #[test]
 fn decisions_are_learned_and_enter_the_ladder() {
-    let place = Place::new();
+    let place = place();
     let settings = "learner = \"decisions\"\nbeam_width = 4\nprior_worlds = 2\n\
                     [decisions]\nbatch = 8\nreplay = 100\nupdates_per_step = 1.0\n";
-    std::fs::write(place.path("agent.toml"), settings).expect("settings");
+    place.set(settings);
     place.train("out", &format!("{WORLDS} --steps 60"));
     place.train("out", &format!("{WORLDS} --steps 40 --resume"));
     let metrics = std::fs::read_to_string(place.path("out").join("metrics.csv"));
@@ -464,18 +371,14 @@ fn decisions_are_learned_and_enter_the_ladder() {
     let policies = "--policies dqn_beam,act_exploit --baseline act_exploit";
     let compare = format!("compare {policies} {worlds}");
     let compared = agent(&format!("{compare} --checkpoint {}", checkpoint.display()));
-    assert!(compared.stdout.contains("dqn_beam"), "{}", compared.stdout);
-    check(AGENT, &compare, &["dqn_beam", "--checkpoint FILE"]);
+    compared.check_prints("dqn_beam");
+    check(AGENT, &compare, "dqn_beam | --checkpoint FILE");
     let other = format!("{compare} --model config/models/road-ice.toml");
     let other = format!("{other} --checkpoint {}", checkpoint.display());
-    let root = crate::harness::repository().display().to_string();
+    let root = repository().display().to_string();
     let other = other.replace("config/models", &format!("{root}/config/models"));
-    check(AGENT, &other, &["states: expected"]);
+    check(AGENT, &other, "states: expected");
     let server = Server::start(&format!("{SMALL} --worlds 2 --reveal-model false"));
     let flags = format!("--instance {} --worlds 2 --steps 4", server.instance.name());
-    check(
-        AGENT,
-        &place.words("hidden", &flags),
-        &["--reveal-model true"],
-    );
+    check(AGENT, &place.words("hidden", &flags), "--reveal-model true");
 }

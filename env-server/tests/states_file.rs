@@ -2,7 +2,7 @@
 
 use env_server::config::ServerConfig;
 use env_server::states_file::{Sequences, StatesFile};
-use ndarray::{Array, Array3, Array4, Dimension};
+use ndarray::{Array, Array3, Dimension};
 use ndarray_npy::{WritableElement, WriteNpyExt};
 use std::fs::{create_dir, write};
 use std::io::{Cursor, Read, Write};
@@ -24,6 +24,21 @@ observations = [{ name = "cold", color = "#000000" }, { name = "hot", color = "#
 
 /// What the header of an array says.
 const HEADER: &str = "{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 4), }\n";
+
+/// What replaces a part of this header, and the problem of the array then.
+const WRONG_HEADERS: &str = "
+|u1 => <f4 => expected dtype '|u1' (uint8), got '<f4'
+|u1 => |i1 => expected dtype '|u1' (uint8), got '|i1'
+|u1 => |b1 => expected dtype '|u1' (uint8), got '|b1'
+(2, 3, 4) => (2, 3, 4, 1) => expected three axes [K, H, W], got 4
+(2, 3, 4) => (24,) => expected three axes [K, H, W], got 1
+(2, 3, 4) => (0, 3, 4) => expected the array alone, got 24 bytes
+(2, 3, 4) => (2, 3, 5) => cut short: expected 6 bytes more
+2, 3 => 999999, 999999999 => cut short: expected
+2, 3 => 99999999999, 99999999999 => expected a NumPy array:
+'shape' => 'form' => expected a NumPy array:
+False => [[[[[[[[ => expected a NumPy array:
+";
 
 fn sequence(first: usize, dim: (usize, usize, usize)) -> Array3<u8> {
     let mut states = (first..).map(|n| (n % 3) as u8);
@@ -146,65 +161,24 @@ fn broken_files_are_refused_each_by_its_problem() {
         check("lab.npz", &archive, &format!("array \"one\": {words}"));
     };
     let header = |from: &str, to: &str| npy_with(&HEADER.replace(from, to));
-    assert!(
-        read("lab.npy", &npy_with(HEADER)).is_ok(),
-        "but for what is replaced"
-    );
-    array(
-        &npy(&Array3::<f32>::zeros((2, 3, 4))),
-        "expected dtype '|u1' (uint8), got '<f4'",
-    );
-    array(
-        &npy(&Array3::<i8>::zeros((2, 3, 4))),
-        "expected dtype '|u1' (uint8), got '|i1'",
-    );
-    array(
-        &npy(&Array3::from_elem((2, 3, 4), true)),
-        "expected dtype '|u1' (uint8), got '|b1'",
-    );
-    array(
-        &npy(&Array4::<u8>::zeros((2, 3, 4, 1))),
-        "expected three axes [K, H, W], got 4",
-    );
-    array(
-        &header("(2, 3, 4)", "(24,)"),
-        "expected three axes [K, H, W], got 1",
-    );
-    array(
-        &npy(&sequence(0, (1, 3, 4))),
-        "expected at least 2 recorded steps, got 1",
-    );
-    array(
-        &header("(2, 3, 4)", "(0, 3, 4)"),
-        "expected the array alone, got 24 bytes",
-    );
-    array(
-        &npy(&sequence(0, (2, 0, 4))),
-        "grid shape: expected height and width in 1..=4096, got 0 x 4",
-    );
-    array(
-        &npy(&sequence(0, (2, 1, 4097))),
-        "grid shape: expected height and width in 1..=4096, got 1 x 4097",
-    );
-    array(
-        &header("(2, 3, 4)", "(2, 3, 5)"),
-        "cut short: expected 6 bytes more",
-    );
-    array(&header("2, 3", "999999, 999999999"), "cut short: expected ");
-    array(
-        &header("2, 3", "99999999999, 99999999999"),
-        "expected a NumPy array: ",
-    );
-    array(&header("'shape'", "'form'"), "expected a NumPy array: ");
-    array(&header("False", "[[[[[[[["), "expected a NumPy array: ");
-    array(
-        &header("False", &"[".repeat(60_000)),
-        "expected a NumPy array with a header of at most 512 bytes, got 60058",
-    );
-    array(
-        &whole[..whole.len() - 1],
-        "cut short: expected 1 bytes more",
-    );
+    let right = read("lab.npy", &npy_with(HEADER));
+    assert!(right.is_ok(), "but for what is replaced");
+    for line in WRONG_HEADERS.trim_start().lines() {
+        let mut parts = line.split(" => ");
+        let [from, to, words] = [(); 3].map(|()| parts.next().expect(line));
+        array(&header(from, to), words);
+    }
+    let short = "expected at least 2 recorded steps, got 1";
+    array(&npy(&sequence(0, (1, 3, 4))), short);
+    for (height, width) in [(0, 4), (1, 4097)] {
+        let got = format!("expected height and width in 1..=4096, got {height} x {width}");
+        let empty = npy(&sequence(0, (2, height, width)));
+        array(&empty, &format!("grid shape: {got}"));
+    }
+    let long = "expected a NumPy array with a header of at most 512 bytes, got 60058";
+    array(&header("False", &"[".repeat(60_000)), long);
+    let cut = &whole[..whole.len() - 1];
+    array(cut, "cut short: expected 1 bytes more");
     array(b"", "expected a NumPy array: ");
     array(b"PNG and so on", "expected a NumPy array: ");
     let mut fourth = sequence(0, (2, 3, 4));
@@ -214,29 +188,17 @@ fn broken_files_are_refused_each_by_its_problem() {
     array(&npy(&fourth), words);
     check("lab.npz", &whole, "expected a .npz archive: ");
     check("lab.npz", b"", "expected a .npz archive: ");
-    check(
-        "lab.npz",
-        &stored(&[]),
-        "expected at least one array, got none",
-    );
-    check(
-        "lab.npz",
-        &stored(&[("a.txt", whole.clone())]),
-        "expected arrays alone, got the member \"a.txt\"",
-    );
+    let none = "expected at least one array, got none";
+    check("lab.npz", &stored(&[]), none);
+    let text = "expected arrays alone, got the member \"a.txt\"";
+    check("lab.npz", &stored(&[("a.txt", whole.clone())]), text);
     let turned = npy(&sequence(0, (2, 4, 3)));
     let two = stored(&[("a.npy", whole.clone()), ("b.npy", turned)]);
-    check(
-        "lab.npz",
-        &two,
-        "array \"b\": expected 3 x 4 cells as the first array has, got 4 x 3",
-    );
+    let words = "array \"b\": expected 3 x 4 cells as the first array has, got 4 x 3";
+    check("lab.npz", &two, words);
     let deflated = npz(&[("a.npy", whole.clone())], CompressionMethod::Deflated);
-    check(
-        "lab.npz",
-        &deflated[..deflated.len() / 2],
-        "expected a .npz archive: ",
-    );
+    let half = &deflated[..deflated.len() / 2];
+    check("lab.npz", half, "expected a .npz archive: ");
     let place = deflated.len() / 4;
     let mut damaged = deflated;
     damaged[place] ^= 0xff;
@@ -245,17 +207,24 @@ fn broken_files_are_refused_each_by_its_problem() {
     while let Some(at) = twice.windows(7).position(|name| name == b"two.npy") {
         twice[at..at + 7].copy_from_slice(b"one.npy");
     }
-    check(
-        "lab.npz",
-        &twice,
-        "expected 1 arrays, one of each name, got 2",
-    );
-    check(
-        "lab.tif",
-        &whole,
-        "expected a .npz or .npy file, or a folder of these, got \"lab.tif\"",
-    );
+    let words = "expected 1 arrays, one of each name, got 2";
+    check("lab.npz", &twice, words);
+    let words = "expected a .npz or .npy file, or a folder of these, got \"lab.tif\"";
+    check("lab.tif", &whole, words);
 }
+
+/// What replaces a part of the description, and the problem then.
+const WRONG_DESCRIPTIONS: &str = r#"
+step = => pace = => unknown field `pace`
+step = "10 min" =>  => missing field `step`
+step = => kernel_size = => unknown field `kernel_size`
+reward = 1.0 => initial = 1.0 => unknown field `initial`
+[0.2, 0.8] => [0.2, 0.7] => state "burning": observed_as: expected a sum of 1
+[0.2, 0.8] => [1.0] => expected 2 probabilities, one per observation, got 1
+"burnt" => "burning" => state name "burning" stands twice
+#777777 => grey => expected #rrggbb, got grey
+step = => step => expected
+"#;
 
 #[test]
 fn descriptions_are_checked_as_model_files_are() {
@@ -265,38 +234,12 @@ fn descriptions_are_checked_as_model_files_are() {
     let check = |words: &str| {
         let error = StatesFile::read(&path).expect_err(words).to_string();
         let about = format!("description {}: ", place.display());
-        assert!(
-            error.contains(&about) && error.contains(words),
-            "{error:?}: {words:?}"
-        );
+        let is_named = error.contains(&about) && error.contains(words);
+        assert!(is_named, "{error:?}: {words:?}");
     };
-    for (from, to, words) in [
-        ("step =", "pace =", "unknown field `pace`"),
-        ("step = \"10 min\"", "", "missing field `step`"),
-        (
-            "name = \"lab\"",
-            "name = \"lab\"\nkernel_size = [1, 1]",
-            "unknown field `kernel_size`",
-        ),
-        ("reward = 1.0", "initial = 1.0", "unknown field `initial`"),
-        (
-            "[0.2, 0.8]",
-            "[0.2, 0.7]",
-            "state \"burning\": observed_as: expected a sum of 1",
-        ),
-        (
-            "[0.2, 0.8]",
-            "[1.0]",
-            "expected 2 probabilities, one per observation, got 1",
-        ),
-        (
-            "\"burnt\"",
-            "\"burning\"",
-            "state name \"burning\" stands twice",
-        ),
-        ("#777777", "grey", "expected #rrggbb, got grey"),
-        ("step =", "step", "expected"),
-    ] {
+    for line in WRONG_DESCRIPTIONS.trim().lines() {
+        let mut parts = line.split(" => ");
+        let [from, to, words] = [(); 3].map(|()| parts.next().expect(line));
         assert!(DESCRIPTION.contains(from));
         write(&place, DESCRIPTION.replace(from, to)).expect("write");
         check(words);
@@ -317,22 +260,18 @@ fn what_is_no_file_is_refused() {
     check(&gone, "gone.npz: No such file");
     let empty = folder.path().join("empty");
     create_dir(&empty).expect("make");
-    check(
-        &empty,
-        "expected .npz or .npy files in the folder, got none",
-    );
+    let words = "expected .npz or .npy files in the folder, got none";
+    check(&empty, words);
     write(empty.join("a.npy"), npy(&sequence(0, (2, 3, 4)))).expect("write");
     check(&empty, "empty/states.toml: No such file");
     write(empty.join("states.toml"), DESCRIPTION).expect("write");
     assert!(StatesFile::read(&empty).is_ok());
     create_dir(empty.join("b.npy")).expect("make");
-    check(&empty, "b.npy: expected a regular file, got something else");
+    let other = "expected a regular file, got something else";
+    check(&empty, &format!("b.npy: {other}"));
     std::fs::remove_file(empty.join("states.toml")).expect("remove");
     create_dir(empty.join("states.toml")).expect("make");
-    check(
-        &empty,
-        "states.toml: expected a regular file, got something else",
-    );
+    check(&empty, &format!("states.toml: {other}"));
 }
 
 #[test]

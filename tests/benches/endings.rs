@@ -3,11 +3,6 @@
 //! Peer: this process's own notice of the same death, by a pidfd. Then, how much of a replay at full speed
 //! reaches an observer that reads.
 
-#[expect(dead_code, reason = "the tests use all of it")]
-#[path = "../harness.rs"]
-mod harness;
-
-use harness::{PATIENCE, Program, Server, eventually, new_instance};
 use protocol::control::Request;
 use protocol::observer::Observer;
 use protocol::recording::Reader;
@@ -17,11 +12,13 @@ use std::fs::File;
 use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
+use tests::harness::{
+    AGENT, PATIENCE, Program, SERVER, SMALL, Server, eventually, new_instance, run,
+};
+use tests::report::{quantiles, say};
+use tests::wire::acquire_request;
 
 const N_ROUNDS: usize = 30;
-
-/// A grid on which a step is short.
-const FLAGS: &str = "--height 5 --width 7 --moves 6 --burn-in 20";
 
 fn main() {
     report("a killed agent's world is acquired", killed_agent);
@@ -32,15 +29,11 @@ fn main() {
 /// Prints the median and the longest time, and their ratio to the peer's median.
 fn report(what: &str, mut measure: impl FnMut() -> (Duration, Duration)) {
     let times: Vec<_> = (0..N_ROUNDS).map(|_| measure()).collect();
-    let sorted = |time: fn(&(Duration, Duration)) -> Duration| {
-        let mut millis: Vec<f64> = times
-            .iter()
-            .map(|both| time(both).as_secs_f64() * 1e3)
-            .collect();
-        millis.sort_unstable_by(f64::total_cmp);
-        (millis[N_ROUNDS / 2], millis[N_ROUNDS - 1])
+    let millis = |time: fn(&(Duration, Duration)) -> Duration| {
+        let millis = times.iter().map(|both| time(both).as_secs_f64() * 1e3);
+        quantiles(millis.collect(), [0.5, 1.0])
     };
-    let ((median, longest), (peer, _)) = (sorted(|both| both.0), sorted(|both| both.1));
+    let ([median, longest], [peer, _]) = (millis(|both| both.0), millis(|both| both.1));
     say(&format!(
         "{what:<35} p50 {median:7.2} max {longest:7.2} ms, {:.1} times a pidfd's {peer:.2} ms",
         median / peer
@@ -67,23 +60,16 @@ fn kill(program: &Program, notice: impl FnOnce()) -> (Duration, Duration) {
 }
 
 fn killed_agent() -> (Duration, Duration) {
-    let server = Server::start(FLAGS);
+    let server = Server::start(SMALL);
     let mut next = server.connect();
-    let flags = ["run", "--instance", server.instance.name()];
-    let agent = Program::start("emberwatch-agent", &flags);
-    assert!(eventually(PATIENCE, || server.step_of(0) > 0));
-    let request = Request::Acquire {
-        first_robot: 0,
-        n_robots: 1,
-        takeover: false,
-        ttl_millis: None,
-    };
-    let mut acquires = || next.control(&request, PATIENCE).is_ok();
+    let agent = Program::agent(&server.instance, "");
+    agent.until(|| server.step_of(0) > 0);
+    let mut acquires = || next.control(&acquire_request(0..1), PATIENCE).is_ok();
     kill(&agent, || assert!(eventually(PATIENCE, &mut acquires)))
 }
 
 fn killed_server() -> (Duration, Duration) {
-    let server = Server::start(FLAGS);
+    let server = Server::start(SMALL);
     let mut connection = server.connect();
     server.program.stop();
     kill(&server.program, || {
@@ -104,15 +90,8 @@ fn report_replay() {
     let n_frames = reader.totals().n_frames;
     let instance = new_instance();
     let observer = Observer::frames(&instance).expect("observe");
-    let flags = [
-        "replay",
-        file,
-        "--instance",
-        instance.name(),
-        "--speed",
-        "max",
-    ];
-    let mut replay = Program::start("emberwatch-server", &flags);
+    let flags = format!("replay {file} --instance {} --speed max", instance.name());
+    let mut replay = Program::start(SERVER, &flags);
     let (began, mut n_read) = (Instant::now(), 0);
     let mut last = began;
     // It stays a few seconds for those who read.
@@ -130,27 +109,12 @@ fn report_replay() {
 }
 
 fn record(file: &str) {
-    let server = Server::start(FLAGS);
+    let server = Server::start(SMALL);
     let name = server.instance.name();
-    let flags = ["record", "--instance", name, "--out", file];
-    let recorder = Program::start("emberwatch-server", &flags);
-    recorder.wait_for_words("recording", PATIENCE);
-    let flags = [
-        "run",
-        "--instance",
-        name,
-        "--policy",
-        "random_walk",
-        "--steps",
-        "20000",
-    ];
-    let agent = Program::start("emberwatch-agent", &flags);
-    assert_eq!(agent.wait(4 * PATIENCE).code, Some(0));
+    let recorder = Program::start(SERVER, &format!("record --instance {name} --out {file}"));
+    recorder.wait_for_words("recording");
+    let flags = format!("run --instance {name} --policy random_walk --steps 20000");
+    run(AGENT, &flags).check(0);
     recorder.signal(Signal::INT);
-    assert_eq!(recorder.wait(PATIENCE).code, Some(0));
-}
-
-#[expect(clippy::print_stdout, reason = "a benchmark's output")]
-fn say(line: &str) {
-    println!("{line}");
+    recorder.ends(0);
 }

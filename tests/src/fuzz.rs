@@ -3,6 +3,7 @@
 //! A [`Target`] is a line of [`TARGETS`]. [`campaign`] runs it on stable Rust over mutations
 //! ([`mutation`]) of its corpus, `fuzz/corpus/<name>/`; `fuzz/` runs the same functions under libFuzzer.
 
+mod besieged;
 pub mod campaign;
 mod files;
 mod messages;

@@ -68,17 +68,22 @@ fn reset(seed: u64) -> Request {
 
 /// The status of a step of world 0 from step k on.
 fn step(simulator: &mut Simulator, now: Instant, k: u64) -> Status {
+    let mut body = Vec::new();
+    write_step_body(&[k], &[1, 3], &mut body);
+    status_of(simulator, now, Operation::Step, &body)
+}
+
+/// The status of a request for world 0.
+fn status_of(simulator: &mut Simulator, now: Instant, what: Operation, body: &[u8]) -> Status {
     let request = StepRequest {
         version: VERSION,
-        operation: Operation::Step as u32,
+        operation: what as u32,
         lease: 1,
         n_robots: 1,
         n_moves: 2,
         ..StepRequest::default()
     };
-    let mut body = Vec::new();
-    write_step_body(&[k], &[1, 3], &mut body);
-    match simulator.step(now, US, &request, &body, &mut Vec::new()) {
+    match simulator.step(now, US, &request, body, &mut Vec::new()) {
         Stepped::Reply(reply) => Status::try_from(reply.status).expect("a known status"),
         Stepped::Waits(_) => panic!("the only robot waits for nobody"),
     }
@@ -98,6 +103,8 @@ fn a_world_in_burn_in_takes_no_step_and_requests_for_it_wait() {
     let (jobs, pending) = ask_pending(&mut simulator, now, &reset(77));
     assert_eq!(simulator.pending_reply(now, &pending), None);
     assert_eq!(step(&mut simulator, now, 0), Status::Resetting);
+    let observed = status_of(&mut simulator, now, Operation::Observe, &[]);
+    assert_eq!(observed, Status::Resetting);
     let twice = ask(&mut simulator, now, &reset(78));
     let is_refused =
         matches!(&twice, Outcome::Answer(reply) if reply.status() == Status::Resetting);

@@ -1,38 +1,23 @@
 //! What observers cost: a step's time with 0, 1, 4 and 16 of them, one of them stopped.
 
-use crate::harness::{Paths, Server};
-use crate::{range, say};
+use protocol::Probabilities;
 use protocol::agent_belief::{BeliefPublisher, Intent};
 use protocol::channels::Instance;
-use protocol::connection::StepAnswer;
-use protocol::control::{Reply, Request};
-use protocol::message::{AgentHeader, Operation, StepRequest};
+use protocol::message::AgentHeader;
 use protocol::observer::Observer;
 use protocol::path::path_to_bytes;
-use protocol::payload::write_step_body;
-use protocol::{Connection, Probabilities};
-use rustix::process::{Pid, Signal, kill_process};
-use std::process::{Child, Command, Stdio};
+use rustix::process::Signal;
 use std::time::{Duration, Instant};
+use tests::harness::{Paths, Program, Server};
+use tests::report::{quantiles, range, say};
+use tests::stepper::Stepper;
 
 const N_STEPS: usize = 20_000;
-
-pub const TIMEOUT: Duration = Duration::from_secs(20);
-
-/// A process; killed on drop.
-pub struct Process(pub Child);
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
 
 /// Prints the server's own time and the round trip for each number of observers, some rounds over.
 pub fn compare(n_rounds: usize) {
     let audiences = [0, 1, 4, 16].map(|n_observers| {
-        let attend = move |server: &Server| -> Vec<Process> {
+        let attend = move |server: &Server| -> Vec<Program> {
             (0..n_observers).map(|n| start(server, n == 1)).collect()
         };
         (format!("{n_observers} observers"), attend)
@@ -68,7 +53,7 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
     let server = Server::start(flags);
     let _audience = attend(&server);
     std::thread::sleep(Duration::from_millis(500));
-    let mut stepper = Stepper::new(&server);
+    let mut stepper = Stepper::new(server.connect(), 0..1);
     let info = stepper.connection.info().clone();
     let belief = Probabilities::from_elem((3, info.height, info.width), 1.0 / 3.0);
     let mut showcase = BeliefPublisher::open(&server.instance, 4 * belief.len() + 1024)
@@ -102,74 +87,19 @@ fn measure<T>(flags: &str, attend: impl Fn(&Server) -> T) -> [f64; 4] {
             shown.expect("a belief is shown");
         }
     }
-    let at = |times: &mut Vec<f64>, q: f64| {
-        times.sort_by(f64::total_cmp);
-        times[(times.len() as f64 * q) as usize]
-    };
-    [
-        at(&mut work, 0.5),
-        at(&mut work, 0.99),
-        at(&mut trips, 0.5),
-        at(&mut trips, 0.99),
-    ]
+    let [work, slow_work] = quantiles(work, [0.5, 0.99]);
+    let [trip, slow_trip] = quantiles(trips, [0.5, 0.99]);
+    [work, slow_work, trip, slow_trip]
 }
 
-/// A connection that holds the first robot, and the request of its step.
-pub struct Stepper {
-    pub connection: Connection,
-    request: StepRequest,
-    k: u64,
-}
-
-impl Stepper {
-    pub fn new(server: &Server) -> Self {
-        let mut connection = server.connect();
-        let acquire = Request::Acquire {
-            first_robot: 0,
-            n_robots: 1,
-            takeover: false,
-            ttl_millis: None,
-        };
-        let Ok(Reply::Lease(lease)) = connection.control(&acquire, TIMEOUT) else {
-            panic!("expected a lease");
-        };
-        let request = StepRequest {
-            operation: Operation::Step as u32,
-            lease: lease.lease,
-            n_robots: 1,
-            n_moves: connection.info().n_moves as u32,
-            ..StepRequest::default()
-        };
-        let k = lease.worlds[0].step;
-        Self {
-            connection,
-            request,
-            k,
-        }
-    }
-
-    pub fn step(&mut self, path: &[u8]) -> StepAnswer {
-        let mut body = Vec::new();
-        write_step_body(&[self.k], path, &mut body);
-        self.k += 1;
-        let answer = self.connection.step(self.request, &body, TIMEOUT);
-        answer.expect("a step")
-    }
-}
-
-fn start(server: &Server, is_stopped: bool) -> Process {
+fn start(server: &Server, is_stopped: bool) -> Program {
     let program = std::env::current_exe().expect("this program");
-    let mut command = Command::new(program);
-    command
-        .args(["observe", server.instance.name()])
-        .stdout(Stdio::null());
-    let process = Process(command.spawn().expect("an observer"));
+    let observer = Program::start_at(&program, &["observe", server.instance.name()]);
     std::thread::sleep(Duration::from_millis(50));
     if is_stopped {
-        let pid = Pid::from_raw(process.0.id() as i32).expect("a process id");
-        kill_process(pid, Signal::STOP).expect("stop it");
+        observer.signal(Signal::STOP);
     }
-    process
+    observer
 }
 
 /// Reads frames without end.

@@ -1,7 +1,5 @@
 //! Servers that are killed at random moments and come back from their last snapshot.
 
-use crate::harness::{Paths, Server, new_instance, takeover};
-use crate::{say, spread};
 use protocol::Client;
 use protocol::client::Observation;
 use rand::RngExt;
@@ -10,6 +8,8 @@ use rand_chacha::rand_core::SeedableRng;
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
+use tests::harness::{Paths, Server, new_instance};
+use tests::report::{say, spread};
 
 const FLAGS: &str = "--height 64 --width 64 --moves 64 --burn-in 1000 --worlds 2";
 
@@ -32,7 +32,7 @@ pub fn kill(n_kills: usize) {
     for n in 0..=n_kills {
         let started = Instant::now();
         let server = Server::start_on(&instance, &flags);
-        let mut client = Client::acquire(server.connect(), &takeover(0..2)).expect("acquire");
+        let mut client = server.take_over(0..2);
         let mut seen = client.observe(0..2).expect("observe");
         waits.push(started.elapsed().as_secs_f64());
         let stands = seen[0].world.step;

@@ -1,11 +1,11 @@
 //! What `--snapshot-every 1000` costs a client that steps as fast as it can, with a folder where temporary files are.
 
-use crate::harness::{Paths, Server};
-use crate::observers::Stepper;
-use crate::{range, say};
 use protocol::path::path_to_bytes;
 use std::time::Instant;
 use tempfile::TempDir;
+use tests::harness::{Paths, Server};
+use tests::report::{range, say};
+use tests::stepper::Stepper;
 
 const N_STEPS: usize = 100_000;
 
@@ -41,7 +41,7 @@ pub fn compare(n_rounds: usize) {
 /// Microseconds of a step.
 fn measure(flags: &str) -> f64 {
     let server = Server::start(&format!("--burn-in 1000 {flags}"));
-    let mut stepper = Stepper::new(&server);
+    let mut stepper = Stepper::new(server.connect(), 0..1);
     let n_moves = stepper.connection.info().n_moves;
     let path = path_to_bytes(&Paths::new(0).next(n_moves));
     let mut step = || _ = stepper.step(&path);

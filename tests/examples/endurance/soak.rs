@@ -1,9 +1,6 @@
 //! Hours of agents and observers that come, go, are killed, stopped and taken over, snapshots among them;
 //! what the server uses, second by second, as CSV and as a figure.
 
-use crate::harness::{Program, Server, run};
-use crate::meter::Use;
-use crate::say;
 use figures::{Curve, Lines, Panel, Scale};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -12,11 +9,12 @@ use rustix::process::Signal;
 use std::fmt::Write;
 use std::path::Path;
 use std::time::{Duration, Instant};
+use tests::harness::{PATIENCE, Program, Server};
+use tests::meter::Use;
+use tests::report::say;
 
 const FLAGS: &str =
     "--height 64 --width 64 --worlds 4 --burn-in 1000 --lease-millis 1000 --publish-truth";
-
-const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Does all that for some seconds; writes `soak.csv` and `soak.png`.
 pub fn soak(seconds: u64, folder: &Path) {
@@ -87,13 +85,8 @@ impl Guests<'_> {
             }
             6 => {
                 let file = folder.join("now.snapshot");
-                let flags = ["snapshot", "--instance", self.server.instance.name()];
-                let ended = run(
-                    "emberwatch-server",
-                    &[&flags[..], &[&file.to_string_lossy()]].concat(),
-                    PATIENCE,
-                );
-                assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+                let command = format!("snapshot {}", file.display());
+                self.server.command(&command).check(0);
             }
             _ => return,
         }
@@ -102,21 +95,11 @@ impl Guests<'_> {
     }
 
     fn start(&mut self, is_takeover: bool) {
-        let world = self.rng.random_range(0..4).to_string();
-        let mut flags = vec![
-            "run",
-            "--instance",
-            self.server.instance.name(),
-            "--world",
-            &world,
-            "--policy",
-            "coverage",
-        ];
-        if is_takeover {
-            flags.push("--takeover");
-        }
-        self.programs
-            .push((Program::start("emberwatch-agent", &flags), false));
+        let world = self.rng.random_range(0..4);
+        let takeover = if is_takeover { "--takeover" } else { "" };
+        let flags = format!("--world {world} --policy coverage {takeover}");
+        let agent = Program::agent(&self.server.instance, &flags);
+        self.programs.push((agent, false));
     }
 
     fn signal(&mut self, chosen: usize, signal: Signal, stops: bool) {

@@ -1,11 +1,10 @@
 //! Programs that are killed while they start, end or connect, in five loops at once; then every name must start.
 
-use crate::harness::{PATIENCE, Server, status};
-use crate::kills::{FLAGS, Kills, files_of, kill_in_loops, look_up_nobody};
-use crate::meter::Use;
-use crate::{say, spread};
-use rustix::process::Signal;
 use std::time::{Duration, Instant};
+use tests::harness::{Server, status};
+use tests::kills::{FLAGS, Kills, files_of, kill_in_loops, look_up_nobody};
+use tests::meter::Use;
+use tests::report::{say, spread};
 
 const N_LOOPS: usize = 5;
 
@@ -42,10 +41,9 @@ pub fn kill(n_starts: usize) {
     let mut starts = Vec::new();
     for instance in &left.instances {
         let start = Instant::now();
-        let server = Server::start_with(instance, &FLAGS);
+        let server = Server::start_on(instance, FLAGS);
         starts.push(start.elapsed().as_secs_f64());
-        server.program.signal(Signal::TERM);
-        assert_eq!(server.program.wait(PATIENCE).code, Some(0));
+        server.program.finish();
     }
     assert!(starts.iter().all(|&seconds| seconds < LONGEST));
     say(&format!("{} names start: {}", starts.len(), spread(starts)));

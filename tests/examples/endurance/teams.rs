@@ -1,18 +1,14 @@
 //! A world whose robots are flown by a process each: these are killed, stopped, told to end and taken over at random
 //! moments, while this process flies one more robot, which paces the world, and checks each step.
 
-use crate::harness::{PATIENCE, Program, Server, eventually, robots_of};
-use crate::mirror::PacedWorld;
-use crate::{say, spread};
 use agent::config::AgentConfig;
 use agent::estimation::belief::Belief;
 use agent::planning::team::robot_seed;
 use agent::planning::{CellValues, Objective, Planner, PlanningProblem, RandomWalk, Target};
-use protocol::control::{Reply, Request};
 use protocol::message::FrameHeader;
 use protocol::observer::Sample;
 use protocol::path::path_to_bytes;
-use protocol::{Cell, Connection, Shape};
+use protocol::{Cell, Shape};
 use rand::RngExt;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
@@ -20,6 +16,9 @@ use rand_chacha::rand_core::SeedableRng;
 use rustix::process::Signal;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
+use tests::harness::{PATIENCE, Program, Server, eventually, robots_of};
+use tests::mirror::PacedWorld;
+use tests::report::{say, spread};
 
 const FLAGS: &str = "--height 64 --width 64 --moves 64 --burn-in 1000 --robots 5 --deadline-ms 100 \
                      --lease-millis 86400000";
@@ -171,7 +170,6 @@ impl PlannedPaths {
 struct Crowd<'a> {
     server: &'a Server,
     last: &'a Last,
-    connection: Connection,
     agents: Vec<Program>,
     rng: ChaCha8Rng,
     events: Vec<(Event, usize, Instant)>,
@@ -179,11 +177,10 @@ struct Crowd<'a> {
 
 impl<'a> Crowd<'a> {
     fn new(server: &'a Server, last: &'a Last) -> Self {
-        let agents = (0..N_AGENTS).map(|robot| start(server, robot, &[]));
-        let mut crowd = Self {
+        let agents = (0..N_AGENTS).map(|robot| start(server, robot, ""));
+        let crowd = Self {
             server,
             last,
-            connection: server.connect(),
             agents: agents.collect(),
             rng: ChaCha8Rng::seed_from_u64(0),
             events: Vec::new(),
@@ -213,7 +210,7 @@ impl<'a> Crowd<'a> {
     fn kill(&mut self, robot: usize) {
         self.agents[robot].signal(Signal::KILL);
         self.wait(robot, "hover", |last| last.hovered.load(Ordering::Relaxed));
-        self.agents[robot] = start(self.server, robot, &[]);
+        self.agents[robot] = start(self.server, robot, "");
     }
 
     fn stop(&mut self, robot: usize) {
@@ -224,15 +221,13 @@ impl<'a> Crowd<'a> {
     }
 
     fn restart(&mut self, robot: usize) {
-        let former = self.agents.remove(robot);
-        former.signal(Signal::TERM);
-        check_end(former, 0);
-        self.agents.insert(robot, start(self.server, robot, &[]));
+        self.agents.remove(robot).finish();
+        self.agents.insert(robot, start(self.server, robot, ""));
     }
 
     fn take_over(&mut self, robot: usize) {
-        let next = start(self.server, robot, &["--takeover"]);
-        check_end(std::mem::replace(&mut self.agents[robot], next), 3);
+        let next = start(self.server, robot, "--takeover");
+        std::mem::replace(&mut self.agents[robot], next).ends(3);
     }
 
     fn wait(&self, robot: usize, what: &str, mask: impl Fn(&Last) -> u64) {
@@ -244,18 +239,9 @@ impl<'a> Crowd<'a> {
         );
     }
 
-    fn wait_until_it_flies(&mut self, robot: usize) {
+    fn wait_until_it_flies(&self, robot: usize) {
         let pid = Some(self.agents[robot].pid());
-        let holds = eventually(PATIENCE, || {
-            match self.connection.control(&Request::Status {}, PATIENCE) {
-                Ok(Reply::Status(status)) => status.worlds[0].holder_pids[robot] == pid,
-                other => panic!(
-                    "expected a status, got {other:?}: {}",
-                    self.server.program.stderr()
-                ),
-            }
-        });
-        assert!(holds, "{}", self.agents[robot].stderr());
+        self.agents[robot].until(|| self.server.status().worlds[0].holder_pids[robot] == pid);
         let at = self.last.step.load(Ordering::Acquire);
         let flies = |last: &Last| {
             let step = last.step.load(Ordering::Acquire);
@@ -266,14 +252,7 @@ impl<'a> Crowd<'a> {
     }
 }
 
-fn check_end(agent: Program, code: i32) {
-    let ended = agent.wait(PATIENCE);
-    assert_eq!(ended.code, Some(code), "{}", ended.stderr);
-}
-
-fn start(server: &Server, robot: usize, flags: &[&str]) -> Program {
-    let robot = robot.to_string();
-    let common = ["run", "--instance", server.instance.name()];
-    let which = ["--robot", &robot, "--policy", "random_walk"];
-    Program::start("emberwatch-agent", &[&common[..], &which, flags].concat())
+fn start(server: &Server, robot: usize, flags: &str) -> Program {
+    let flags = format!("--robot {robot} --policy random_walk {flags}");
+    Program::agent(&server.instance, &flags)
 }

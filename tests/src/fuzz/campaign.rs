@@ -4,6 +4,8 @@
 
 use super::mutation::mutated;
 use super::target::Target;
+use crate::meter::memory;
+use anyhow::{Result, bail, ensure};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rustix::time::{ClockId, clock_gettime};
@@ -12,7 +14,6 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::{Builder, park_timeout};
 use std::time::{Duration, Instant};
-use thiserror::Error;
 
 /// Processor time that one input may take. An input that sleeps instead takes no such time.
 const MOST_WORK: Duration = Duration::from_secs(1);
@@ -38,11 +39,8 @@ pub struct Campaign {
 /// What a campaign met.
 #[derive(Debug, Clone, Copy)]
 pub struct Report {
-    /// Inputs decoded.
     pub n_inputs: u64,
-    /// How many of them were accepted.
     pub n_accepted: u64,
-    /// Time it took.
     pub elapsed: Duration,
     /// Memory resident after the first tenth, KiB.
     pub resident_before: u64,
@@ -50,43 +48,8 @@ pub struct Report {
     pub resident_after: u64,
 }
 
-/// What is wrong with a decoder.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum Failure {
-    /// The corpus or a failing input could not be read or written.
-    #[error("{0}")]
-    Io(#[from] std::io::Error),
-    /// An input on which it panicked.
-    #[error("{name}: input {index} panics; it is in {}", path.display())]
-    Panic {
-        /// The target.
-        name: &'static str,
-        /// Which input.
-        index: u64,
-        /// Where it was saved.
-        path: PathBuf,
-    },
-    /// Inputs made it keep memory.
-    #[error("{name}: expected memory to grow by at most {most} KiB, got {got} {when}")]
-    Growth {
-        /// The target.
-        name: &'static str,
-        /// The bound.
-        most: u64,
-        /// What it grew by.
-        got: u64,
-        /// In the end, or for a while.
-        when: &'static str,
-    },
-}
-
 impl Campaign {
-    /// A campaign over a target's corpus.
-    ///
-    /// # Errors
-    /// [`Failure::Io`].
-    pub fn new(target: Target, seed: u64) -> Result<Self, Failure> {
+    pub fn new(target: Target, seed: u64) -> Result<Self> {
         let entries = target.corpus()?;
         Ok(Self {
             target,
@@ -108,8 +71,8 @@ impl Campaign {
     /// Decodes so many inputs, the corpus first. An input that takes too long ends the process.
     ///
     /// # Errors
-    /// [`Failure`].
-    pub fn run(&self, n_inputs: u64) -> Result<Report, Failure> {
+    /// If one makes the decoder panic or keep memory, or a file cannot be read or written.
+    pub fn run(&self, n_inputs: u64) -> Result<Report> {
         let (index, is_over) = (AtomicU64::new(0), AtomicBool::new(false));
         std::thread::scope(|scope| {
             let watch = || self.watch(&index, &is_over);
@@ -123,7 +86,7 @@ impl Campaign {
         })
     }
 
-    fn decode_all(&self, n_inputs: u64, index: &AtomicU64) -> Result<Report, Failure> {
+    fn decode_all(&self, n_inputs: u64, index: &AtomicU64) -> Result<Report> {
         let (started, warm) = (Instant::now(), n_inputs / 10);
         let (mut n_accepted, mut resident_before) = (0, 0);
         let resident_first = resident();
@@ -135,11 +98,8 @@ impl Campaign {
                 Ok(accepted) => n_accepted += u64::from(accepted),
                 Err(_) => {
                     let (name, path) = (self.target.name, self.save(number)?);
-                    return Err(Failure::Panic {
-                        name,
-                        index: number,
-                        path,
-                    });
+                    let path = path.display();
+                    bail!("{name}: input {number} panics; it is in {path}");
                 }
             }
             if number == warm {
@@ -154,14 +114,10 @@ impl Campaign {
             (MOST_AT_ONCE, at_once, "for a while"),
         ] {
             let name = self.target.name;
-            if got > most {
-                return Err(Failure::Growth {
-                    name,
-                    most,
-                    got,
-                    when,
-                });
-            }
+            ensure!(
+                got <= most,
+                "{name}: expected memory to grow by at most {most} KiB, got {got} {when}"
+            );
         }
         let elapsed = started.elapsed();
         Ok(Report {
@@ -218,34 +174,21 @@ fn forget_peak() {
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }
 
-/// A line of a process's `/proc/<pid>/status` that is in KiB; 0 if there is none.
-pub fn memory(line: &str, pid: u32) -> u64 {
-    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
-    let found = status.lines().find_map(|text| text.strip_prefix(line));
-    found
-        .and_then(|text| text.split_whitespace().next()?.parse().ok())
-        .unwrap_or(0)
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::{Kind, TARGETS};
+    use super::super::Kind;
     use super::*;
     use std::cell::RefCell;
 
     /// A target that is no decoder; its corpus is another's.
     fn target(body: fn(&[u8]) -> bool) -> Campaign {
-        let (name, kind, seeds) = ("control_request", Kind::Message, TARGETS[0].seeds);
-        Campaign::new(
-            Target {
-                name,
-                kind,
-                body,
-                seeds,
-            },
-            1,
-        )
-        .expect("its corpus")
+        let target = Target {
+            name: "control_request",
+            kind: Kind::Message,
+            body,
+            seeds: Vec::new,
+        };
+        Campaign::new(target, 1).expect("its corpus")
     }
 
     #[test]
@@ -254,10 +197,11 @@ mod tests {
             assert!(!bytes.contains(&b'\xff'), "no such byte");
             true
         });
-        let Err(Failure::Panic { index, path, .. }) = campaign.run(100_000) else {
-            panic!("expected a panic");
-        };
-        let saved = std::fs::read(&path).expect("the input");
+        let failure = campaign.run(100_000).expect_err("a panic").to_string();
+        let (told, path) = failure.split_once(" panics; it is in ").expect(&failure);
+        let (_, index) = told.rsplit_once(' ').expect("its number");
+        let index = index.parse().expect("a number");
+        let saved = std::fs::read(path).expect("the input");
         assert!(saved == campaign.input(index) && saved.contains(&b'\xff'));
         std::fs::remove_file(path).expect("clean up");
     }

@@ -153,35 +153,6 @@ fn decisions() -> Decisions {
     Decisions::first(&Model::wildfire(), &AgentConfig::default().decisions, 0)
 }
 
-pub fn model_seeds() -> Vec<Seed> {
-    let written = |file: &ModelFile| {
-        toml::to_string(file)
-            .expect("models serialise")
-            .into_bytes()
-    };
-    let wildfire = Model::wildfire();
-    let built_in = |name| written(Model::built_in(name).expect("a built-in model").file());
-    vec![
-        ("wildfire.toml", written(wildfire.file())),
-        ("sparse.toml", built_in("wildfire-sparse")),
-        ("line.toml", LINE.into()),
-    ]
-}
-
-/// A small model with everything in it: a bias, rewards, a kernel of one row.
-const LINE: &str = r##"name = "line"
-kernel_size = [1, 3]
-states = [
-    { name = "a", color = "#000000", initial = 0.5, reward = 1.0, bias = 0.25, observed_as = [0.75, 0.25] },
-    { name = "b", color = "#ffffff", initial = 0.5, observed_as = [0.0, 1.0] },
-]
-observations = [{ name = "x", color = "#000000" }, { name = "y", color = "#123abc" }]
-kernel = [
-    { from = "a", to = "b", scale = 0.5, weights = [[0.0, 1.0, 0.5]] },
-    { from = "b", to = "b", weights = [[1.0, 2.0, 1.0]] },
-]
-"##;
-
 pub fn checkpoint_seeds() -> Vec<Seed> {
     let encoded = |kind, contents| encode(kind, &contents).expect("checkpoints serialise");
     let (small, large) = (autoencoder(8, 4), autoencoder(4096, 256));

@@ -3,7 +3,7 @@
 use super::target::Seed;
 use bytemuck::{Pod, bytes_of};
 use protocol::agent_belief::{AgentBelief, Intent};
-use protocol::control::{LeaseInfo, Reply, ServerStatus, WorldInfo, WorldSeed, WorldStatus, parse};
+use protocol::control::{Reply, parse};
 use protocol::decisions;
 use protocol::message::{
     AgentHeader, FLAG_TEAM_FRAMES, FrameHeader, RobotResult, Status, StepReply, VERSION,
@@ -231,84 +231,6 @@ pub fn outlook_seeds() -> Vec<Seed> {
     };
     let belief = [0.25f32, 0.75].map(|p| [p; 6]).concat();
     let belief: Vec<u8> = belief.iter().flat_map(|p| p.to_ne_bytes()).collect();
-    vec![(
-        "belief",
-        [bytes_of(&header), &belief, &json(&intent)].concat(),
-    )]
-}
-
-pub fn control_reply_seeds() -> Vec<Seed> {
-    let world = WorldInfo {
-        world: 0,
-        step: 2,
-        seed: 42,
-        episode: 1,
-        robots: vec![[2, 4], [0, 0]],
-    };
-    let lease = LeaseInfo {
-        lease: 5_179_721,
-        ttl_millis: 60_000,
-        robots: vec![0, 1],
-        worlds: vec![world.clone()],
-    };
-    let status = ServerStatus {
-        pid: 14_661,
-        uptime_millis: 925,
-        n_steps: 2,
-        steps_per_second: 0.5,
-        n_refused: 0,
-        n_clients: 1,
-        n_observers: 0,
-        worlds: vec![WorldStatus {
-            info: world,
-            holder_pids: vec![Some(14_683), None],
-            n_paths: 1,
-            resetting: false,
-        }],
-    };
-    let hello = r#"{"reply":"hello","protocol":2,"build":"0.1.0","pid":1,"height":3,"width":5,"n_moves":4,"n_worlds":1,"n_robots":2,"n_observations":1,"observations":["fire"],"model":null,"burn_in":500,"max_steps":0,"max_clients":16,"coverage":"path","publish_truth":false,"lease_millis":30000,"deadline_millis":0}"#;
-    vec![
-        ("hello", hello.into()),
-        ("lease", json(&Reply::Lease(lease))),
-        ("status", json(&Reply::Status(status))),
-        ("error", json(&Reply::refusal(Status::Busy, 14_683))),
-    ]
-}
-
-pub fn decision_seeds() -> Vec<Seed> {
-    let decision = decisions::Decision {
-        step: 3,
-        reward: 1.5,
-        n_target_cells: 9,
-        n_visited: 4,
-        n_hits: 1,
-        robot: [0, 2],
-        terminated: false,
-        truncated: false,
-        seed: 7,
-        episode: 1,
-        objective: Some(2),
-        summary: vec![0.25, 0.5],
-    };
-    let unmoved = decisions::Decision {
-        objective: None,
-        ..decision.clone()
-    };
-    let worlds = vec![decision, unmoved];
-    let objectives = vec![Some(1), None];
-    let seeds = [(0, Some(1)), (1, None)].map(|(world, seed)| WorldSeed { world, seed });
-    let seeds = seeds.to_vec();
-    vec![
-        ("decisions", json(&decisions::Reply::Decisions { worlds })),
-        (
-            "error",
-            json(&decisions::Reply::refusal(Status::BadObjective, 4)),
-        ),
-        ("decide", json(&decisions::Request::Decide { objectives })),
-        ("reset", json(&decisions::Request::Reset { worlds: seeds })),
-    ]
-}
-
-pub fn json(value: &impl Serialize) -> Vec<u8> {
-    serde_json::to_vec(value).expect("messages serialise")
+    let intent = serde_json::to_vec(&intent).expect("messages serialise");
+    vec![("belief", [bytes_of(&header), &belief, &intent].concat())]
 }

@@ -34,7 +34,7 @@ const INTEGERS: [u64; 16] = [
 ];
 
 /// Words that readers of TOML, JSON and numbers trip over.
-const WORDS: [&str; 32] = [
+const WORDS: [&str; 35] = [
     "0",
     "1",
     "-1",
@@ -48,6 +48,9 @@ const WORDS: [&str; 32] = [
     "1e400",
     "1e-400",
     "1e308",
+    "1e100",
+    "1e30",
+    "1e-30",
     "1e-320",
     "nan",
     "-inf",

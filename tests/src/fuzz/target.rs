@@ -16,16 +16,14 @@ pub enum Kind {
 pub struct Target {
     /// Also its folder in the corpus, and its program in `fuzz/`.
     pub name: &'static str,
-    /// Message or file.
     pub kind: Kind,
     /// Decodes bytes and panics if something is wrong with the decoder; returns whether they were
     /// accepted.
     pub body: fn(&[u8]) -> bool,
-    /// What the corpus begins with: names and bytes.
+    /// What the code makes of the corpus: names and bytes. Texts lie there as they were written.
     pub seeds: fn() -> Vec<Seed>,
 }
 
-/// A file of the corpus.
 pub type Seed = (&'static str, Vec<u8>);
 
 impl Target {
@@ -36,9 +34,6 @@ impl Target {
     }
 
     /// The files of its corpus, in the order of their names.
-    ///
-    /// # Errors
-    /// The system's.
     pub fn corpus(&self) -> std::io::Result<Vec<Vec<u8>>> {
         let entries = std::fs::read_dir(self.folder())?;
         let paths = entries.map(|entry| Ok(entry?.path()));
@@ -48,9 +43,6 @@ impl Target {
     }
 
     /// Writes its seeds into its corpus.
-    ///
-    /// # Errors
-    /// The system's.
     pub fn write_seeds(&self) -> std::io::Result<()> {
         std::fs::create_dir_all(self.folder())?;
         for (name, bytes) in (self.seeds)() {

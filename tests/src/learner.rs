@@ -1,27 +1,30 @@
 //! A learner outside: asks an agent for decisions as PROTOCOL.md says, byte by byte if need be.
 
-use crate::harness::{PATIENCE, Program, eventually};
-use crate::wire::{Pending, Requests, answer, client, control_header, send};
+use crate::harness::{AGENT, PATIENCE, Program, eventually, seed};
+use crate::wire::{
+    ControlAnswer, Pending, Requests, answer, answer_by, client, control_header, send,
+};
 use iceoryx2::node::Node;
+use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use protocol::channels::{Channel, ChannelError, Instance, Ipc, Services, create_node, ipc_error};
-use protocol::control::WorldSeed;
 use protocol::decisions::{AgentInfo, Decision, Reply, Request};
 use protocol::message::{ControlReply, ControlRequest, Status, VERSION};
+use protocol::wait::{Waiter, descriptor, drain, sleep_until_readable};
 use std::time::Duration;
 
-/// A learner that is connected to an agent.
 pub struct Learner {
     port: Requests<ControlRequest, ControlReply>,
     agent: Notifier<Ipc>,
+    listener: Listener<Ipc>,
+    waiter: Waiter,
     _node: Node<Ipc>,
 }
 
 /// Starts an agent that serves decisions, of world 0 unless told otherwise; `flags` are separated by spaces.
 pub fn start_agent(instance: &Instance, flags: &str) -> Program {
-    let name = ["serve-decisions", "--instance", instance.name()];
-    let flags: Vec<&str> = name.into_iter().chain(flags.split_whitespace()).collect();
-    Program::start("emberwatch-agent", &flags)
+    let name = instance.name();
+    Program::start(AGENT, &format!("serve-decisions --instance {name} {flags}"))
 }
 
 /// Starts an agent and waits until it answers.
@@ -77,11 +80,12 @@ impl Learner {
         Ok(Self {
             port,
             agent: agent.map_err(ipc_error("create a notifier"))?,
+            listener: services.listener(Channel::WakeClient)?,
+            waiter: Waiter::default(),
             _node: node,
         })
     }
 
-    /// Sends bytes.
     pub fn send(
         &self,
         header: ControlRequest,
@@ -97,13 +101,26 @@ impl Learner {
         reply_to(&self.send(header, payload), header)
     }
 
-    /// Sends a request and waits for the reply.
+    /// Sends a request and waits for the reply as PROTOCOL.md says: until it is woken.
     pub fn ask(&self, request: &Request) -> Reply {
         let text = serde_json::to_vec(request).expect("requests serialise");
-        self.exchange(control_header(7), &text)
+        let id = self.listener.id().value();
+        let header = ControlRequest {
+            listener_low: id as u64,
+            listener_high: (id >> 64) as u64,
+            ..control_header(7)
+        };
+        let pending = self.send(header, &text);
+        let block = |limit| {
+            if !drain(&self.listener)? {
+                sleep_until_readable(&[descriptor(&self.listener)], limit).expect("sleep");
+            }
+            Ok::<_, ChannelError>(())
+        };
+        let answered = answer_by(&pending, PATIENCE, &self.waiter, block);
+        checked(answered.expect("an answer"), header)
     }
 
-    /// What the agent says of itself.
     pub fn hello(&self) -> AgentInfo {
         match self.ask(&hello()) {
             Reply::Hello(info) => *info,
@@ -111,7 +128,6 @@ impl Learner {
         }
     }
 
-    /// Starts an episode in the one world.
     pub fn reset(&self, seed: u64) -> Decision {
         one(self.reset_some(&[(0, seed)]))
     }
@@ -121,7 +137,6 @@ impl Learner {
         decisions(self.ask(&reset(seeds)))
     }
 
-    /// Decides for an objective in the one world.
     pub fn decide(&self, objective: u64) -> Decision {
         one(self.decide_all(&[Some(objective)]))
     }
@@ -147,18 +162,13 @@ impl Learner {
     }
 }
 
-/// A request to start episodes.
 pub fn reset(seeds: &[(u32, u64)]) -> Request {
-    let seeds = seeds.iter().map(|&(world, seed)| WorldSeed {
-        world,
-        seed: Some(seed),
-    });
+    let seeds = seeds.iter().map(|&(world, to)| seed(world, to));
     Request::Reset {
         worlds: seeds.collect(),
     }
 }
 
-/// A request to decide.
 pub fn decide(objectives: &[Option<u64>]) -> Request {
     Request::Decide {
         objectives: objectives.to_vec(),
@@ -174,7 +184,10 @@ fn hello() -> Request {
 
 /// The reply to a request under way.
 pub fn reply_to(pending: &Pending<ControlRequest, ControlReply>, header: ControlRequest) -> Reply {
-    let (answered, payload) = answer(pending, PATIENCE).expect("an answer");
+    checked(answer(pending, PATIENCE).expect("an answer"), header)
+}
+
+fn checked((answered, payload): ControlAnswer, header: ControlRequest) -> Reply {
     assert_eq!(
         (answered.version, answered.sequence),
         (VERSION, header.sequence)
@@ -184,7 +197,6 @@ pub fn reply_to(pending: &Pending<ControlRequest, ControlReply>, header: Control
     reply
 }
 
-/// The decisions of a reply.
 pub fn decisions(reply: Reply) -> Vec<Decision> {
     match reply {
         Reply::Decisions { worlds } => worlds,
@@ -197,7 +209,6 @@ fn one(mut decisions: Vec<Decision>) -> Decision {
     decisions.remove(0)
 }
 
-/// Status, detail and message of a refusal.
 pub fn refusal(reply: Reply) -> (Status, u64, String) {
     match reply {
         Reply::Error {

@@ -1,7 +1,7 @@
 //! The protocol byte by byte: headers and payloads as a client of another language, or a hostile
 //! one, sends them. Nothing is filled in and nothing is checked.
 
-use crate::harness::PATIENCE;
+use crate::programs::PATIENCE;
 use iceoryx2::node::Node;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::{Client, RequestSendError};
@@ -16,15 +16,15 @@ use protocol::message::{
 };
 use protocol::payload::write_step_body;
 use protocol::wait::Waiter;
+use std::convert::Infallible;
+use std::fmt::Debug;
+use std::ops::Range;
 use std::time::Duration;
 
-/// An answer to a step: header and payload.
 pub type StepAnswer = (StepReply, Vec<u8>);
 
-/// An answer to a control request: header and payload.
 pub type ControlAnswer = (ControlReply, Vec<u8>);
 
-/// A port that sends requests.
 pub type Requests<Q, R> = Client<Ipc, [u8], Q, [u8], R>;
 
 /// A request that waits for its answer.
@@ -51,15 +51,15 @@ pub trait RawClient {
         reply
     }
 
-    /// Acquires robots.
-    fn acquire(&self, first_robot: u32, n_robots: u32) -> LeaseInfo {
-        let request = Request::Acquire {
-            first_robot,
-            n_robots,
-            takeover: false,
-            ttl_millis: None,
-        };
-        match self.ask(&request) {
+    /// Sends a step request: the status of its answer, and the detail.
+    fn status_of(&self, header: StepRequest, payload: &[u8]) -> (Status, u64) {
+        let (reply, _) = self.step(header, payload);
+        let status = Status::try_from(reply.status);
+        (status.expect("a known status"), reply.detail)
+    }
+
+    fn acquire(&self, robots: Range<u32>) -> LeaseInfo {
+        match self.ask(&acquire_request(robots)) {
             Reply::Lease(lease) => lease,
             other => panic!("expected a lease, got {other:?}"),
         }
@@ -99,7 +99,6 @@ impl Wire {
         })
     }
 
-    /// Sends a step request.
     pub fn send_step(
         &self,
         header: StepRequest,
@@ -110,7 +109,6 @@ impl Wire {
         Ok(pending)
     }
 
-    /// Sends a control request.
     pub fn send_control(
         &self,
         header: ControlRequest,
@@ -151,11 +149,39 @@ pub fn step_header(lease: u64, n_moves: u32) -> StepRequest {
     }
 }
 
+/// The header of a correct request for what robots show now.
+pub fn observe_header(robots: Range<u32>) -> StepRequest {
+    StepRequest {
+        operation: Operation::Observe as u32,
+        first_robot: robots.start,
+        n_robots: robots.len() as u32,
+        ..step_header(0, 0)
+    }
+}
+
+/// The header of a correct request for what robots showed at a step.
+pub fn recall_header(robots: Range<u32>) -> StepRequest {
+    StepRequest {
+        operation: Operation::Recall as u32,
+        ..observe_header(robots)
+    }
+}
+
 /// The payload of a step of worlds that are at these steps.
 pub fn step_body(steps: &[u64], paths: &[u8]) -> Vec<u8> {
     let mut body = Vec::new();
     write_step_body(steps, paths, &mut body);
     body
+}
+
+/// A request for robots that nobody holds.
+pub fn acquire_request(robots: Range<u32>) -> Request {
+    Request::Acquire {
+        first_robot: robots.start,
+        n_robots: robots.len() as u32,
+        takeover: false,
+        ttl_millis: None,
+    }
 }
 
 /// The header of a correct control request.
@@ -172,17 +198,25 @@ pub fn answer<Q: Header, R: Header>(
     pending: &Pending<Q, R>,
     limit: Duration,
 ) -> Option<(R, Vec<u8>)> {
-    let poll = || {
-        let response = pending.receive()?;
-        Ok(response.map(|response| (*response.user_header(), response.payload().to_vec())))
-    };
     let block = |remaining: Duration| {
         std::thread::sleep(remaining.min(Duration::from_micros(100)));
-        Ok::<_, iceoryx2::port::ReceiveError>(())
+        Ok::<_, Infallible>(())
     };
-    Waiter::default()
-        .wait(limit, poll, block)
-        .expect("receive an answer")
+    answer_by(pending, limit, &Waiter::default(), block)
+}
+
+/// The same, where something else may tell of the answer.
+pub fn answer_by<Q: Header, R: Header, E: Debug>(
+    pending: &Pending<Q, R>,
+    limit: Duration,
+    waiter: &Waiter,
+    block: impl FnMut(Duration) -> Result<(), E>,
+) -> Option<(R, Vec<u8>)> {
+    let poll = || {
+        let response = pending.receive().expect("receive an answer");
+        Ok(response.map(|response| (*response.user_header(), response.payload().to_vec())))
+    };
+    waiter.wait(limit, poll, block).expect("wait")
 }
 
 /// A port of a service; nobody is greeted.

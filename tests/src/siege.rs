@@ -2,6 +2,7 @@
 //! were there, and afterwards the server must hold no more than before.
 
 use crate::harness::{PATIENCE, Paths, Server, eventually};
+use crate::meter::{memory, n_descriptors};
 use crate::wire::{RawClient, Wire, step_body, step_header};
 use protocol::channels::{Instance, SHARED_MEMORY};
 use protocol::message::Status;
@@ -9,7 +10,6 @@ use protocol::path::path_to_bytes;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Sender, channel};
 use std::time::Duration;
-use tests::fuzz::campaign::memory;
 
 /// Three worlds: the first is the victim's, the second the attacker's, the third anybody's.
 pub const FLAGS: &str =
@@ -25,7 +25,6 @@ const PACE: Duration = Duration::from_micros(500);
 /// What a server holds.
 #[derive(Debug)]
 struct Holdings {
-    /// Descriptors.
     n_descriptors: usize,
     /// Shared memory that it has mapped, bytes.
     shared: u64,
@@ -66,12 +65,12 @@ impl Drop for Stop<'_> {
 /// The victim: steps world 0 until told to stop; returns every answer's payload.
 fn live(instance: &Instance, tell_lease: &Sender<u64>, stop: &AtomicBool) -> Vec<Vec<u8>> {
     let wire = Wire::open(instance);
-    let lease = wire.acquire(0, 1).lease;
+    let lease = wire.acquire(0..1).lease;
     let (mut paths, mut seen) = (Paths::new(0), Vec::new());
     while !stop.load(Ordering::Relaxed) || seen.len() <= 50 {
         let body = step_body(&[seen.len() as u64], &path_to_bytes(&paths.next(6)));
         let (reply, payload) = wire.step(step_header(lease, 6), &body);
-        assert_eq!(Status::try_from(reply.status), Ok(Status::Ok));
+        assert_eq!(reply.status, Status::Ok as u32);
         seen.push(payload);
         if seen.len() == 1 {
             // From here on nothing of the victim's is new to the server.
@@ -86,7 +85,7 @@ fn live(instance: &Instance, tell_lease: &Sender<u64>, stop: &AtomicBool) -> Vec
 fn assert_undisturbed(seen: &[Vec<u8>]) {
     let server = Server::start(FLAGS);
     let wire = Wire::open(&server.instance);
-    let (lease, mut paths) = (wire.acquire(0, 1).lease, Paths::new(0));
+    let (lease, mut paths) = (wire.acquire(0..1).lease, Paths::new(0));
     for (step, payload) in seen.iter().enumerate() {
         let body = step_body(&[step as u64], &path_to_bytes(&paths.next(6)));
         assert_eq!(
@@ -99,7 +98,6 @@ fn assert_undisturbed(seen: &[Vec<u8>]) {
 
 impl Holdings {
     fn of(pid: u32) -> Self {
-        let descriptors = std::fs::read_dir(format!("/proc/{pid}/fd")).expect("its descriptors");
         let maps = std::fs::read_to_string(format!("/proc/{pid}/maps")).expect("its memory");
         let length = |line: &str| {
             let (from, to) = line.split_whitespace().next()?.split_once('-')?;
@@ -108,7 +106,7 @@ impl Holdings {
         };
         let shared = maps.lines().filter(|line| line.contains(SHARED_MEMORY));
         Self {
-            n_descriptors: descriptors.count(),
+            n_descriptors: n_descriptors(pid),
             shared: shared.filter_map(length).sum(),
             own: memory("RssAnon:", pid),
         }

@@ -33,9 +33,7 @@ pub struct Attacker {
     leases: Vec<u64>,
     /// The step that it last saw in an answer.
     k: u64,
-    /// Answers that refused.
     pub n_refused: u64,
-    /// Answers that did not.
     pub n_accepted: u64,
 }
 
@@ -43,7 +41,7 @@ impl Attacker {
     /// An attacker that holds robot 1 and knows somebody else's lease.
     pub fn new(instance: &Instance, stolen: u64, seed: u64) -> Self {
         let wire = Wire::open(instance);
-        let own = wire.acquire(1, 1).lease;
+        let own = wire.acquire(1..2).lease;
         Self {
             wire,
             rng: ChaCha8Rng::seed_from_u64(seed),

@@ -1,17 +1,16 @@
 //! A world as its published steps must make it, stepped in this process: no server, no clients, no time. And a world of
 //! a server that goes as fast as it is checked so.
 
-use crate::harness::{PATIENCE, Paths, Server, frames_until};
+use crate::harness::{PATIENCE, Paths, Server, frames_until, robots_of};
 use env_server::config::ServerConfig;
 use env_server::snapshot::WorldSpec;
 use env_server::world::{Episode, Flown, Robot, Rules};
 use protocol::client::Claim;
 use protocol::connection::ConnectionError;
 use protocol::control::ServerInfo;
-use protocol::message::{FrameHeader, Status, WorldResult};
+use protocol::message::{FrameHeader, RobotResult, Status, WorldResult};
 use protocol::observer::{Observer, Sample};
 use protocol::path::{path_from_bytes, path_to_bytes};
-use protocol::payload::{RobotSample, split_frame_payload};
 use protocol::{Client, Coverage, Move};
 use std::time::{Duration, Instant};
 
@@ -49,46 +48,51 @@ impl Mirror {
     /// If a step is missing, or the sample shows anything else than these paths give.
     pub fn follow(&mut self, sample: &Sample<FrameHeader>) -> bool {
         let (world, k) = (sample.header.result, self.episode.result().step);
-        let robots = split_frame_payload(&sample.header, &sample.payload).expect("a whole sample");
+        let robots = robots_of(sample);
         let is_new = world.step != k;
         if is_new {
             assert_eq!(world.step, k + 1, "a step was lost, or made twice");
-            self.fly(sample, &robots);
+            let path = |bytes| path_from_bytes(bytes).expect("a path");
+            let flown = robots.iter().map(|robot| (path(robot.path), robot.result));
+            step_again(&mut self.episode, &self.rules, &world, flown);
         }
         assert_eq!(*self.episode.result(), world);
         for (index, (robot, shown)) in self.episode.robots().iter().zip(&robots).enumerate() {
             assert_eq!(*robot.result(), shown.result, "robot {index}, step {k}");
-            assert_eq!(
-                seen(robot),
-                (shown.frame, shown.path.to_vec()),
-                "robot {index}, step {k}"
-            );
+            let expected = (shown.frame, shown.path.to_vec());
+            assert_eq!(seen(robot), expected, "robot {index}, step {k}");
         }
         is_new
     }
+}
 
-    fn fly(&mut self, sample: &Sample<FrameHeader>, robots: &[RobotSample<'_>]) {
-        let mut moves = vec![Move::Up; self.rules.n_robots * self.rules.n_moves];
-        let (mut ready, mut full) = (0, 0);
-        for (index, robot) in robots.iter().enumerate() {
-            let path = path_from_bytes(robot.path).expect("a path");
-            moves[index * self.rules.n_moves..][..path.len()].copy_from_slice(&path);
-            ready |= u64::from(!path.is_empty()) << index;
-            full |= u64::from(robot.result.coverage == Coverage::Full as u32) << index;
-        }
-        let (hovered, late) = (sample.header.result.hovered, sample.header.result.late);
-        // Each robot flew, hovered or was late, and only one of these.
-        assert_eq!(ready ^ hovered ^ late, (1 << robots.len()) - 1);
-        assert_eq!(hovered & late, 0);
-        let flown = Flown {
-            moves: &moves,
-            ready,
-            full,
-            hovered,
-            late,
-        };
-        self.episode.step(&self.rules, &flown);
+/// Takes the step that a result and the robots' paths tell of; these are empty for who hovered or was late.
+pub fn step_again(
+    episode: &mut Episode,
+    rules: &Rules,
+    told: &WorldResult,
+    robots: impl ExactSizeIterator<Item = (Vec<Move>, RobotResult)>,
+) {
+    let all = (1 << robots.len()) - 1;
+    let mut moves = vec![Move::Up; rules.n_robots * rules.n_moves];
+    let (mut ready, mut full) = (0, 0);
+    for (index, (path, result)) in robots.enumerate() {
+        moves[index * rules.n_moves..][..path.len()].copy_from_slice(&path);
+        ready |= u64::from(!path.is_empty()) << index;
+        full |= u64::from(result.coverage == Coverage::Full as u32) << index;
     }
+    let (hovered, late) = (told.hovered, told.late);
+    // Each robot flew, hovered or was late, and only one of these.
+    assert_eq!(ready ^ hovered ^ late, all);
+    assert_eq!(hovered & late, 0);
+    let flown = Flown {
+        moves: &moves,
+        ready,
+        full,
+        hovered,
+        late,
+    };
+    episode.step(rules, &flown);
 }
 
 fn seen(robot: &Robot) -> (&[u8], Vec<u8>) {
@@ -98,9 +102,7 @@ fn seen(robot: &Robot) -> (&[u8], Vec<u8>) {
 /// World 0 of a server, one of whose robots is flown by this process: it checks each step before it flies the next, so
 /// that no step is missed.
 pub struct PacedWorld {
-    /// What flies the robot.
     pub client: Client,
-    /// The last step.
     pub last: WorldResult,
     observer: Observer<FrameHeader>,
     mirror: Mirror,

@@ -1,0 +1,317 @@
+//! A simulator under attack: the victim in it, who acts on a world of its own, and shares another with an attacker.
+//!
+//! It is kept from one input to the next, so that leases, resets and episodes come to every
+//! state, and begins again after some inputs, so that few of them cause a failure.
+
+use crate::mirror::step_again;
+use crate::wire::{step_body, step_header};
+use env_server::config::ServerConfig;
+use env_server::simulator::{
+    ClientId, Outcome, PendingReply, ResetJob, ServerStats, Simulator, Stepped, Ticket,
+};
+use env_server::world::Episode;
+use protocol::control::{CoverageRule, Reply, WorldStatus};
+use protocol::message::{RobotResult, Status, StepReply, StepRequest, VERSION, WorldResult};
+use protocol::path::path_to_bytes;
+use protocol::payload::split_step_payload;
+use rayon::ThreadPoolBuilder;
+use std::cell::RefCell;
+use std::ops::Range;
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+/// Moves of a path.
+pub const N_MOVES: usize = 4;
+
+/// Robots of a world.
+pub const N_ROBOTS: usize = 2;
+
+/// Worlds: the attackers' two, the shared one, the victim's.
+pub const N_WORLDS: u32 = 4;
+
+/// The shared world: its first robot is the attacker's, its second the victim's.
+pub const SHARED: usize = 2;
+
+/// The victim's world.
+const HOME: usize = 3;
+
+/// Robots that are the attackers', from 0 on.
+pub const N_THEIRS: u32 = (SHARED * N_ROBOTS + 1) as u32;
+
+/// How long the shared world waits for a path.
+const DEADLINE: Duration = Duration::from_millis(50);
+
+/// Inputs that one simulator gets.
+const N_INPUTS: usize = 256;
+
+/// Of so many inputs, the victim steps after one.
+const VICTIM_STEPS: usize = 8;
+
+/// Who must not notice anything: the victim in its own world, and as a second client in the shared one.
+const VICTIM: ClientId = ClientId { node: 1, pid: 1 };
+const SHARER: ClientId = ClientId { node: 4, pid: 4 };
+
+/// The others. The first holds the attackers' robots.
+pub const ATTACKERS: [ClientId; 2] = [ClientId { node: 2, pid: 2 }, ClientId { node: 3, pid: 3 }];
+
+/// A simulator, its clock, and what waits.
+pub struct Siege {
+    pub simulator: Simulator,
+    pub now: Instant,
+    pub jobs: Vec<ResetJob>,
+    pub pending: Vec<(ClientId, PendingReply)>,
+    /// The victim's lease, then the attackers' last, then the victim's in the shared world.
+    pub leases: [u64; 4],
+    /// The attacker's step that waits, and since when.
+    pub attackers_step: Option<(Ticket, Instant)>,
+    /// The victim's step that waits in the shared world, and its path.
+    shared_step: Option<(Ticket, Vec<u8>)>,
+    /// The shared world as it must be.
+    mirror: Episode,
+    n_inputs: usize,
+}
+
+/// A world, and each of its robots with its frame.
+pub type WorldSeen = (WorldResult, Vec<(RobotResult, Vec<u8>)>);
+
+pub fn on_siege(input: impl FnOnce(&mut Siege) -> bool) -> bool {
+    thread_local! { static SIEGE: RefCell<Option<Siege>> = const { RefCell::new(None) } }
+    SIEGE.with_borrow_mut(|kept| {
+        kept.take_if(|siege| siege.n_inputs == N_INPUTS);
+        let siege = kept.get_or_insert_with(Siege::begin);
+        let is_accepted = input(siege);
+        siege.check_shared();
+        siege.n_inputs += 1;
+        if siege.n_inputs % VICTIM_STEPS == 0 {
+            siege.victim_steps();
+        }
+        is_accepted
+    })
+}
+
+impl Siege {
+    /// The victim and the first attacker hold their worlds.
+    fn begin() -> Self {
+        let config = ServerConfig {
+            worlds: N_WORLDS,
+            robots: N_ROBOTS as u32,
+            deadline_millis: DEADLINE.as_millis() as u64,
+            height: 2,
+            width: 3,
+            moves: N_MOVES,
+            burn_in: 0,
+            max_steps: 40,
+            coverage: CoverageRule::Client,
+            ..ServerConfig::default()
+        };
+        let threads = ThreadPoolBuilder::new()
+            .num_threads(1)
+            .build()
+            .expect("a thread");
+        let mut token = 10;
+        let next_token = Box::new(move || {
+            token += 1;
+            token
+        });
+        let checked = config.check().expect("valid settings");
+        let (simulator, jobs) =
+            Simulator::new(checked, threads, next_token).expect("valid settings");
+        let (now, pending) = (Instant::now(), Vec::new());
+        let mirror = Episode::new(&simulator.spec().rules, SHARED as u64);
+        let mut siege = Self {
+            simulator,
+            now,
+            jobs,
+            pending,
+            leases: [0; 4],
+            attackers_step: None,
+            shared_step: None,
+            mirror,
+            n_inputs: 0,
+        };
+        siege.finish_resets();
+        for (who, client, first_robot, n_robots) in [
+            (0, VICTIM, HOME * N_ROBOTS, N_ROBOTS),
+            (3, SHARER, N_THEIRS as usize, 1),
+            (1, ATTACKERS[0], 0, N_THEIRS as usize),
+        ] {
+            let text = format!(
+                r#"{{"op":"acquire","first_robot":{first_robot},"n_robots":{n_robots},"ttl_millis":86400000}}"#
+            );
+            let Outcome::Pending(_, pending) = siege.ask(client, VERSION, text.as_bytes()) else {
+                panic!("the robots are free");
+            };
+            siege.answer(who, &pending);
+        }
+        siege
+    }
+
+    pub fn ask(&mut self, client: ClientId, version: u32, text: &[u8]) -> Outcome {
+        self.simulator
+            .control(self.now, client, version, text, &ServerStats::default())
+    }
+
+    /// Runs the resets, and answers the clients that waited for them.
+    pub fn finish_resets(&mut self) {
+        for job in std::mem::take(&mut self.jobs) {
+            let (world, episode) = job.run(&self.simulator.spec().rules);
+            self.simulator.put(world, episode);
+        }
+        for (client, pending) in std::mem::take(&mut self.pending) {
+            self.answer(usize::from(client == ATTACKERS[1]) + 1, &pending);
+        }
+    }
+
+    fn answer(&mut self, who: usize, pending: &PendingReply) {
+        let reply = self.simulator.pending_reply(self.now, pending);
+        if let Reply::Lease(lease) = reply.expect("all worlds are ready") {
+            self.leases[who] = lease.lease;
+        }
+    }
+
+    /// Results and frames of the worlds, but of those in their burn-in.
+    pub fn worlds(&self) -> Vec<Option<WorldSeen>> {
+        let worlds = self.simulator.worlds();
+        let episodes = worlds.map(|world| self.simulator.episode(world));
+        episodes.map(|episode| episode.map(seen)).collect()
+    }
+
+    /// What everybody may know of the worlds.
+    pub fn status(&mut self) -> Vec<WorldStatus> {
+        match self.ask(VICTIM, VERSION, br#"{"op":"status"}"#) {
+            Outcome::Answer(Reply::Status(status)) => status.worlds,
+            _ => panic!("everybody may ask for the status"),
+        }
+    }
+
+    /// Steps the victim's world, which must go as if nobody else were there; and its robot in the shared one.
+    fn victim_steps(&mut self) {
+        static QUIET: OnceLock<Vec<(StepReply, Vec<u8>)>> = OnceLock::new();
+        let steps = QUIET.get_or_init(|| {
+            let mut quiet = Siege::begin();
+            (0..N_INPUTS / VICTIM_STEPS)
+                .map(|number| quiet.victim_step(number))
+                .collect()
+        });
+        let number = self.n_inputs / VICTIM_STEPS - 1;
+        assert!(
+            self.victim_step(number) == steps[number],
+            "the victim's step {number} differs"
+        );
+        match self.shared_step.take_if(|_| number % 2 == 1) {
+            // What is given up is never flown.
+            Some((ticket, _)) => self.simulator.cancel_step(self.now, ticket),
+            None => self.fly_shared(),
+        }
+    }
+
+    fn victim_step(&mut self, number: usize) -> (StepReply, Vec<u8>) {
+        let robots = (HOME * N_ROBOTS) as u32..N_WORLDS * N_ROBOTS as u32;
+        let request = step_request(self.leases[0], robots);
+        let paths = [0, 1, 2, 3, 4, 5, 6, 7].map(|turn| ((number * 7 + turn * 5) % 4) as u8);
+        let (body, mut payload) = (step_body(&[number as u64], &paths), Vec::new());
+        let stepped = self
+            .simulator
+            .step(self.now, VICTIM, &request, &body, &mut payload);
+        let Stepped::Reply(reply) = stepped else {
+            panic!("the victim holds all robots of its world");
+        };
+        assert_eq!(reply.status, Status::Ok as u32);
+        (reply, payload)
+    }
+
+    /// Sends a path for the victim's robot of the shared world, unless one waits.
+    pub fn fly_shared(&mut self) {
+        if self.shared_step.is_some() || self.mirror.is_over() {
+            return;
+        }
+        let k = self.mirror.result().step;
+        let path: Vec<u8> = (0..N_MOVES as u64)
+            .map(|turn| ((k + turn) % 4) as u8)
+            .collect();
+        let request = step_request(self.leases[3], N_THEIRS..N_THEIRS + 1);
+        let body = step_body(&[k], &path);
+        let mut payload = Vec::new();
+        let stepped = self
+            .simulator
+            .step(self.now, SHARER, &request, &body, &mut payload);
+        match stepped {
+            Stepped::Waits(ticket) => self.shared_step = Some((ticket, path)),
+            Stepped::Reply(reply) => {
+                assert_eq!(check_answer(&reply, &payload), Status::Ok);
+                self.check_shared_step(Some(&path));
+            }
+        }
+        self.check_shared();
+    }
+
+    /// Takes the answers to steps that waited, and checks that the shared world is as its own paths make it.
+    pub fn check_shared(&mut self) {
+        let (mut payload, mut waited) = (Vec::new(), Duration::ZERO);
+        let before = self.mirror.result().step;
+        while let Some((ticket, reply)) = self.simulator.next_answer(&mut payload) {
+            let status = check_answer(&reply, &payload);
+            if let Some((_, since)) = self.attackers_step.take_if(|(own, _)| *own == ticket) {
+                waited = self.now - since;
+                continue;
+            }
+            let (waiting, path) = self.shared_step.take().expect("somebody waits for it");
+            assert_eq!((waiting, status), (ticket, Status::Ok));
+            self.check_shared_step(Some(&path));
+        }
+        for world in self.simulator.take_moved() {
+            assert_ne!(world, HOME, "the victim's world moved on its own");
+        }
+        self.check_shared_step(None);
+        let now = self.mirror.result();
+        let is_late = now.step > before && now.late & 2 != 0;
+        let is_due = !is_late || waited >= DEADLINE;
+        assert!(is_due, "the victim was not waited for");
+    }
+
+    /// Takes the step in the mirror that the shared world has taken, if any: with this path of the victim's, or none.
+    fn check_shared_step(&mut self, path: Option<&[u8]>) {
+        let episode = self.simulator.episode(SHARED);
+        let episode = episode.expect("nobody but who holds both robots resets it");
+        let result = episode.result();
+        if result.step == self.mirror.result().step {
+            assert_eq!(path, None, "the victim's path was answered, but not flown");
+        } else {
+            let stayed = result.hovered | result.late;
+            assert_eq!(result.hovered & 2, 0, "the victim holds its robot");
+            let flown = (stayed & 2 == 0).then(|| path_to_bytes(episode.robots()[1].path()));
+            assert_eq!(flown.as_deref(), path, "not the victim's path");
+            let robots = episode.robots().iter();
+            let robots = robots.map(|robot| (robot.path().to_vec(), *robot.result()));
+            let rules = &self.simulator.spec().rules;
+            step_again(&mut self.mirror, rules, result, robots);
+        }
+        assert!(
+            seen(episode) == seen(&self.mirror),
+            "the shared world differs"
+        );
+    }
+}
+
+fn seen(episode: &Episode) -> WorldSeen {
+    let robots = episode.robots().iter();
+    let robots = robots.map(|robot| (*robot.result(), robot.frame().as_bytes().to_vec()));
+    (*episode.result(), robots.collect())
+}
+
+/// Checks that an answer is whole, and a refusal empty.
+pub fn check_answer(reply: &StepReply, payload: &[u8]) -> Status {
+    assert_eq!(reply.version, VERSION);
+    let parts = split_step_payload(reply, payload).expect("as long as its header says");
+    let status = Status::try_from(reply.status).expect("a known status");
+    assert_eq!(parts.worlds.is_empty(), status != Status::Ok, "{status:?}");
+    status
+}
+
+pub fn step_request(lease: u64, robots: Range<u32>) -> StepRequest {
+    StepRequest {
+        sequence: 7,
+        first_robot: robots.start,
+        n_robots: robots.len() as u32,
+        ..step_header(lease, N_MOVES as u32)
+    }
+}

@@ -1,0 +1,280 @@
+//! Servers as children, on names of their own, and what tests do with them.
+
+use crate::wire::observe_header;
+use env_server::config::ServerConfig;
+use env_server::snapshot::{SnapshotWorld, WorldSpec, encode};
+use env_server::world::Episode;
+use protocol::channels::Instance;
+use protocol::client::{Claim, Observation};
+use protocol::connection::ConnectionError;
+use protocol::control::{Reply, Request, ServerInfo, ServerStatus, WorldSeed};
+use protocol::message::{FrameHeader, RobotResult, WorldResult};
+use protocol::observer::{Observer, Sample};
+use protocol::path::path_from_bytes;
+use protocol::payload::{RobotSample, split_frame_payload};
+use protocol::{Client, Connection, Move};
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+use tempfile::TempDir;
+
+pub use crate::programs::{
+    AGENT, Ended, LIMIT, PATIENCE, Program, SERVER, eventually, program_path, python, repository,
+    run,
+};
+
+/// How long a server that has just begun may take to answer, before it is asked again.
+const START: Duration = Duration::from_secs(3);
+
+/// A small, quick server: 5 x 7 cells, 6 moves, 20 steps of burn-in.
+pub const SMALL: &str = "--height 5 --width 7 --moves 6 --burn-in 20";
+
+/// A burn-in that never ends, steps.
+pub const ENDLESS: u64 = 1 << 40;
+
+/// A world's last result, that of one of its robots, and what this robot saw.
+pub type Seen = (WorldResult, RobotResult, Vec<u8>);
+
+pub struct Server {
+    pub program: Program,
+    pub instance: Instance,
+}
+
+impl Server {
+    /// Starts a server on an instance of its own; `flags` are separated by spaces.
+    pub fn start(flags: &str) -> Self {
+        Self::start_on(&new_instance(), flags)
+    }
+
+    /// Starts a server on an instance and waits until its worlds are ready.
+    pub fn start_on(instance: &Instance, flags: &str) -> Self {
+        let server = Self::start_without_waiting(instance, flags);
+        let mut problem = String::new();
+        let answers = eventually(2 * PATIENCE, || match status_within(instance, START) {
+            Ok(status) => !status.worlds.iter().any(|world| world.resetting),
+            Err(error) => {
+                problem = error.to_string();
+                false
+            }
+        });
+        assert!(answers, "{problem}: {}", server.program.stderr());
+        server
+    }
+
+    /// Starts a server on an instance; it may not answer yet.
+    pub fn start_without_waiting(instance: &Instance, flags: &str) -> Self {
+        let arguments = format!("--instance {} {flags}", instance.name());
+        Self {
+            program: Program::start(SERVER, &arguments),
+            instance: instance.clone(),
+        }
+    }
+
+    /// Starts a server and waits until it answers; its worlds are in burn-in then.
+    pub fn start_in_burn_in(flags: &str) -> Self {
+        let server = Self::start_without_waiting(&new_instance(), flags);
+        let answers = || status_within(&server.instance, START).is_ok();
+        server.program.until(answers);
+        server
+    }
+
+    /// Starts a server of two worlds as [`SMALL`] ones at k = 0, whose every reset goes on for ever.
+    pub fn start_with_endless_resets(flags: &str) -> Self {
+        let WorldSpec {
+            settings,
+            mut rules,
+        } = small_spec(ENDLESS);
+        rules.burn_in = 0;
+        let episodes = [0, 1].map(|seed| Episode::new(&rules, seed));
+        let worlds = episodes.each_ref().map(SnapshotWorld::Ready);
+        let folder = TempDir::new().expect("a folder for the worlds");
+        let file = folder.path().join("worlds.snapshot");
+        std::fs::write(&file, encode(&settings, &worlds).expect("small")).expect("write");
+        let shape = "--height 5 --width 7 --moves 6 --worlds 2";
+        let file = file.display();
+        Self::start(&format!(
+            "{shape} --burn-in {ENDLESS} --restore {file} {flags}"
+        ))
+    }
+
+    pub fn connect(&self) -> Connection {
+        Connection::open(&self.instance, "tests", PATIENCE).expect("connect")
+    }
+
+    /// A client that holds robots of it.
+    pub fn acquire(&self, robots: Range<u32>) -> Client {
+        Client::acquire(self.connect(), &Claim::new(robots)).expect("acquire")
+    }
+
+    /// A client that takes robots of it from their holders.
+    pub fn take_over(&self, robots: Range<u32>) -> Client {
+        Client::acquire(self.connect(), &takeover(robots)).expect("take over")
+    }
+
+    pub fn info(&self) -> ServerInfo {
+        self.connect().info().clone()
+    }
+
+    pub fn status(&self) -> ServerStatus {
+        status(&self.instance).expect("status")
+    }
+
+    /// What a robot shows, and its world's last result, over a connection that holds nothing.
+    pub fn observe(&self, robot: u32) -> Seen {
+        let request = observe_header(robot..robot + 1);
+        let answer = self
+            .connect()
+            .step(request, &[], PATIENCE)
+            .expect("observe");
+        (answer.worlds[0], answer.robots[0], answer.frames)
+    }
+
+    /// The step k that the world of a robot is at.
+    pub fn step_of(&self, robot: u32) -> u64 {
+        self.observe(robot).0.step
+    }
+
+    pub fn holder(&self) -> Option<u32> {
+        self.status().worlds[0].holder_pids[0]
+    }
+
+    /// Runs one of the program's commands for it.
+    pub fn command(&self, words: &str) -> Ended {
+        run(
+            SERVER,
+            &format!("{words} --instance {}", self.instance.name()),
+        )
+    }
+
+    /// Kills it as no handler can prevent; returns when it is gone.
+    pub fn kill(self) {
+        self.program.kill();
+    }
+}
+
+/// A claim on robots that are taken from their holders.
+pub fn takeover(robots: Range<u32>) -> Claim {
+    Claim {
+        takeover: true,
+        ..Claim::new(robots)
+    }
+}
+
+/// What a world shall be reset to; `None`: what the server chooses.
+pub fn seed(world: u32, seed: impl Into<Option<u64>>) -> WorldSeed {
+    WorldSeed {
+        world,
+        seed: seed.into(),
+    }
+}
+
+/// A name that no other test has.
+pub fn new_instance() -> Instance {
+    static COUNTER: AtomicU64 = AtomicU64::new(0);
+    let count = COUNTER.fetch_add(1, Ordering::Relaxed);
+    let name = format!("test-{}-{count}", std::process::id());
+    Instance::new(&name).expect("a plain name")
+}
+
+/// What snapshots of a server as a [`SMALL`] one say of it, and the rules of its worlds.
+pub fn small_spec(burn_in: u64) -> WorldSpec {
+    let config = ServerConfig {
+        height: 5,
+        width: 7,
+        moves: 6,
+        burn_in,
+        ..ServerConfig::default()
+    };
+    let checked = config.check().expect("valid settings");
+    WorldSpec::of(&checked).expect("a valid model")
+}
+
+/// The server's status, over a connection of its own.
+pub fn status(instance: &Instance) -> Result<ServerStatus, ConnectionError> {
+    status_within(instance, PATIENCE)
+}
+
+fn status_within(instance: &Instance, limit: Duration) -> Result<ServerStatus, ConnectionError> {
+    let mut connection = Connection::open(instance, "tests", limit)?;
+    match connection.control(&Request::Status {}, limit)? {
+        Reply::Status(status) => Ok(status),
+        other => panic!("expected a status, got {other:?}"),
+    }
+}
+
+/// Reproducible paths.
+pub struct Paths(ChaCha8Rng);
+
+impl Paths {
+    pub fn new(seed: u64) -> Self {
+        Self(ChaCha8Rng::seed_from_u64(seed))
+    }
+
+    pub fn next(&mut self, n_moves: usize) -> Vec<Move> {
+        let moves = (0..n_moves).map(|_| Move::from_low_bits(self.0.random()));
+        moves.collect()
+    }
+
+    pub fn take(&mut self, n_moves: usize, n_paths: usize) -> Vec<Vec<Move>> {
+        (0..n_paths).map(|_| self.next(n_moves)).collect()
+    }
+}
+
+/// Starts a client's worlds again with consecutive seeds.
+pub fn reset(client: &mut Client, first_seed: u64) {
+    let worlds = client.worlds_of(&client.robots());
+    let seeds = worlds.zip(first_seed..);
+    let seeds: Vec<WorldSeed> = seeds.map(|(world, to)| seed(world, to)).collect();
+    client.reset(&seeds).expect("reset");
+}
+
+/// Flies one path with a client's only robot.
+pub fn fly(client: &mut Client, path: Vec<Move>) -> Observation {
+    let robots = client.robots();
+    client.step(robots, &[path]).expect("step").remove(0)
+}
+
+/// The robots of a published step.
+pub fn robots_of(sample: &Sample<FrameHeader>) -> Vec<RobotSample<'_>> {
+    split_frame_payload(&sample.header, &sample.payload).expect("a whole sample")
+}
+
+/// The path of the only robot of a published step; empty after a reset.
+pub fn path_of(sample: &Sample<FrameHeader>) -> Vec<Move> {
+    path_from_bytes(robots_of(sample)[0].path).expect("a path")
+}
+
+/// What the only robot of a published step shows, as [`Server::observe`] does.
+pub fn seen_in(sample: &Sample<FrameHeader>) -> Seen {
+    let robot = &robots_of(sample)[0];
+    (sample.header.result, robot.result, robot.frame.to_vec())
+}
+
+/// What an answer of a client shows, as [`Server::observe`] does.
+pub fn seen_by(observation: &Observation) -> Seen {
+    let frame = observation.frame.as_bytes().to_vec();
+    (observation.world, observation.robot, frame)
+}
+
+/// Reads frames until one of a world and step has come; returns all, that one last.
+pub fn frames_until(
+    observer: &Observer<FrameHeader>,
+    world: u32,
+    step: u64,
+) -> Vec<Sample<FrameHeader>> {
+    let mut samples = Vec::new();
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let left = deadline.saturating_duration_since(Instant::now());
+        let sample = observer.receive(left).expect("receive");
+        let sample = sample.unwrap_or_else(|| panic!("no frame of world {world} at step {step}"));
+        let is_last = sample.header.world == world && sample.header.result.step == step;
+        samples.push(sample);
+        if is_last {
+            return samples;
+        }
+    }
+}

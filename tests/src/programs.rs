@@ -1,0 +1,244 @@
+//! Programs as children: started, waited for with deadlines, killed on drop.
+
+use protocol::channels::Instance;
+use rustix::process::{Pid, Signal, kill_process};
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant, SystemTime};
+use tempfile::TempDir;
+
+/// How long anything may take that should take milliseconds: less than a lease lasts, 30 s.
+pub const PATIENCE: Duration = Duration::from_secs(25);
+
+pub const LIMIT: Duration = Duration::from_secs(60);
+
+pub const SERVER: &str = "emberwatch-server";
+
+pub const AGENT: &str = "emberwatch-agent";
+
+/// A child process and what it wrote to its standard error so far.
+pub struct Program {
+    child: Child,
+    folder: TempDir,
+}
+
+#[derive(Debug)]
+pub struct Ended {
+    /// Its exit code; `None` if a signal ended it.
+    pub code: Option<i32>,
+    pub stdout: String,
+    pub stderr: String,
+}
+
+impl Program {
+    /// Starts a program of this workspace; its arguments are separated by spaces.
+    pub fn start(name: &str, arguments: &str) -> Self {
+        let arguments: Vec<&str> = arguments.split_whitespace().collect();
+        Self::start_at(&program_path(name), &arguments)
+    }
+
+    /// Starts an agent that acts on an instance.
+    pub fn agent(instance: &Instance, flags: &str) -> Self {
+        Self::start(
+            AGENT,
+            &format!("run --instance {} {flags}", instance.name()),
+        )
+    }
+
+    /// Starts Python with the package, for the lines of a script.
+    pub fn start_python(script: &str) -> Self {
+        Self::start_at(&python(), &["-c", script])
+    }
+
+    pub fn start_at(program: &Path, arguments: &[&str]) -> Self {
+        let folder = TempDir::new().expect("a folder for the program's output");
+        let file = |name: &str| File::create(folder.path().join(name)).expect("an output file");
+        let child = Command::new(program)
+            .args(arguments)
+            .stdin(Stdio::null())
+            .stdout(file("stdout"))
+            .stderr(file("stderr"))
+            .env("RUST_LOG", "info")
+            .spawn();
+        Self {
+            child: child.expect("start the program"),
+            folder,
+        }
+    }
+
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// What it has written to its standard output so far.
+    pub fn stdout(&self) -> String {
+        self.read("stdout")
+    }
+
+    /// What it has written to its standard error so far.
+    pub fn stderr(&self) -> String {
+        self.read("stderr")
+    }
+
+    pub fn signal(&self, signal: Signal) {
+        let pid = Pid::from_raw(self.child.id() as i32).expect("a process id");
+        kill_process(pid, signal).expect("signal the program");
+    }
+
+    /// Pauses it; returns when it no longer runs.
+    pub fn stop(&self) {
+        self.signal(Signal::STOP);
+        let stat = format!("/proc/{}/stat", self.pid());
+        let is_stopped = || {
+            let stat = std::fs::read_to_string(&stat).expect("its state");
+            stat.rsplit(") ")
+                .next()
+                .is_some_and(|rest| rest.starts_with('T'))
+        };
+        self.until(is_stopped);
+    }
+
+    pub fn until(&self, holds: impl FnMut() -> bool) {
+        assert!(eventually(PATIENCE, holds), "{}", self.stderr());
+    }
+
+    pub fn has_ended(&mut self) -> bool {
+        let status = self.child.try_wait();
+        status.expect("look at the program").is_some()
+    }
+
+    pub fn wait(mut self, limit: Duration) -> Ended {
+        let mut status: Option<ExitStatus> = None;
+        let ended = eventually(limit, || {
+            status = self.child.try_wait().expect("wait for the program");
+            status.is_some()
+        });
+        assert!(ended, "still running after {limit:?}: {}", self.stderr());
+        Ended {
+            code: status.and_then(|status| status.code()),
+            stdout: self.stdout(),
+            stderr: self.stderr(),
+        }
+    }
+
+    pub fn ends(self, code: i32) -> Ended {
+        self.wait(PATIENCE).check(code)
+    }
+
+    /// Tells it to stop, which it does gently.
+    pub fn finish(self) -> Ended {
+        self.signal(Signal::TERM);
+        self.ends(0)
+    }
+
+    /// Kills it as no handler can prevent, unless it has ended; returns when it is gone.
+    pub fn kill(mut self) {
+        self.child.kill().expect("kill the program");
+        self.child.wait().expect("wait for the program");
+    }
+
+    pub fn wait_for_words(&self, words: &str) {
+        let said = eventually(PATIENCE, || self.stderr().contains(words));
+        assert!(said, "{words:?} not said: {}", self.stderr());
+    }
+
+    fn read(&self, file: &str) -> String {
+        std::fs::read_to_string(self.folder.path().join(file)).expect("read the output")
+    }
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+impl Ended {
+    pub fn check(self, code: i32) -> Self {
+        assert_eq!(self.code, Some(code), "{}", self.stderr);
+        self
+    }
+
+    pub fn check_prints(&self, words: &str) -> &Self {
+        let printed = &self.stdout;
+        assert!(printed.contains(words), "{words:?} not printed: {printed}");
+        self
+    }
+
+    pub fn check_says(&self, words: &str) -> &Self {
+        let said = &self.stderr;
+        assert!(said.contains(words), "{words:?} not said: {said}");
+        self
+    }
+}
+
+/// Runs a program to its end; its arguments are separated by spaces.
+pub fn run(name: &str, arguments: &str) -> Ended {
+    Program::start(name, arguments).wait(LIMIT)
+}
+
+/// Looks every millisecond until something holds; returns whether it did before the deadline.
+pub fn eventually(limit: Duration, mut holds: impl FnMut() -> bool) -> bool {
+    let deadline = Instant::now() + limit;
+    while !holds() {
+        if Instant::now() > deadline {
+            return false;
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    true
+}
+
+pub fn repository() -> PathBuf {
+    let tests = Path::new(env!("CARGO_MANIFEST_DIR"));
+    tests.parent().expect("tests lies in the repository").into()
+}
+
+/// The Python of the tests, which `scripts/test` makes.
+pub fn python() -> PathBuf {
+    let python = repository().join("target/venv/bin/python");
+    assert!(python.exists(), "no {}; run scripts/test", python.display());
+    python
+}
+
+/// The program of a name, as built from the present sources.
+pub fn program_path(name: &str) -> PathBuf {
+    let test = std::env::current_exe().expect("this program's path");
+    let target = test.ancestors().nth(2).expect("target/<profile>/deps/test");
+    let path = target.join(name);
+    let package = match name {
+        "emberwatch-server" => "env-server",
+        "emberwatch-dashboard" => "clients/dashboard",
+        _ => "agent",
+    };
+    let sources = [package, "protocol"].map(|package| repository().join(package).join("src"));
+    let newest = sources
+        .iter()
+        .filter_map(|folder| newest_change(folder))
+        .max();
+    let built = path
+        .metadata()
+        .and_then(|metadata| metadata.modified())
+        .ok();
+    assert!(
+        built.is_some() && built >= newest,
+        "{name} is missing or older than its source: run `cargo build --workspace`, with the \
+         profile of the tests, before them"
+    );
+    path
+}
+
+fn newest_change(path: &Path) -> Option<SystemTime> {
+    if path.is_file() {
+        return path
+            .metadata()
+            .and_then(|metadata| metadata.modified())
+            .ok();
+    }
+    let entries = std::fs::read_dir(path).ok()?.flatten();
+    entries
+        .filter_map(|entry| newest_change(&entry.path()))
+        .max()
+}
