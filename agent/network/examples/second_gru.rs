@@ -74,10 +74,10 @@ fn main() -> Result<()> {
     for update in 0..100 {
         let dropout = Dropout::draw(window.len(), 1, update);
         let loss = model.loss(&Pass::training(&window, &dropout), &[0.0; 8])?;
-        let step = adam.step(&settings, &loss.backward()?)?;
-        adam.take(step)?;
+        let loss = adam.update(&settings, &loss);
+        let loss = loss.map_err(candle_core::Error::wrap)?;
         if update % 20 == 0 {
-            println!("update {update}: loss {:.4}", loss.to_scalar::<f32>()?);
+            println!("update {update}: loss {loss:.4}");
         }
     }
     Ok(())
