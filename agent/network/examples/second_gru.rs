@@ -28,7 +28,7 @@ impl TwoGrus {
             first: Gru::new(&vb.pp("rnn_layer"), shape.encoding, n, false)?,
             second: Gru::new(&vb.pp("second_rnn_layer"), n, n, false)?,
             decoder: Decoder::new(&vb.pp("decoder"), shape, false)?,
-            observation: Observation::new(vb, shape.n_observations, shape.n_states, false)?,
+            observation: Observation::new(vb, shape.n_observations, shape.n_states)?,
         })
     }
 
@@ -40,8 +40,7 @@ impl TwoGrus {
 
     fn loss(&self, pass: &Pass<'_>, hidden: &[f32]) -> Result<Tensor> {
         let hidden = self.forward(pass, hidden)?;
-        let logits = self.decoder.forward(&hidden, pass)?;
-        self.observation.loss(&logits, pass.window)
+        self.decoder.loss(&hidden, &self.observation, pass)
     }
 }
 
