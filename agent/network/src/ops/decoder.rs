@@ -30,7 +30,6 @@ pub(crate) struct Layers<'a> {
 /// The hidden vectors and the matrix between them and the first planes.
 struct Seed<'a> {
     hidden: &'a [f32],
-    n_hidden: usize,
     weights: &'a [f32],
     mask: &'a Mask,
     area: usize,
@@ -53,7 +52,7 @@ struct Last<'a> {
     cell: Vec<f32>,
 }
 
-impl Layers<'_> {
+impl<'a> Layers<'a> {
     /// Logits of all cells, `[frames, states, rows, cols]`, through which no gradient goes. `moments` gives those
     /// of a level from those of the window.
     pub(crate) fn logits(
@@ -97,15 +96,14 @@ impl Layers<'_> {
         then: impl FnOnce(Forward<'_>) -> Result<R>,
     ) -> Result<R> {
         let (hidden, weights) = (numbers(self.hidden)?, numbers(self.seed)?);
-        let (n_hidden, _, mut rows, mut cols) = self.seed.dims4()?;
-        let weights_of_levels = self
-            .levels
-            .iter()
-            .map(|[gamma, beta, kernels]| Ok([numbers(gamma)?, numbers(beta)?, numbers(kernels)?]));
+        let (_, _, mut rows, mut cols) = self.seed.dims4()?;
+        let weights_of = |[gamma, beta, kernels]: &[&'a Tensor; 3]| {
+            Ok([numbers(gamma)?, numbers(beta)?, numbers(kernels)?])
+        };
+        let weights_of_levels = self.levels.iter().map(weights_of);
         let weights_of_levels = weights_of_levels.collect::<Result<Vec<_>>>()?;
         let seed = Seed {
             hidden: &hidden,
-            n_hidden,
             weights: &weights,
             mask: self.masks[0],
             area: rows * cols,
@@ -114,9 +112,9 @@ impl Layers<'_> {
         let (mut levels, mut z) = (Vec::<Doubling<'_>>::new(), Vec::new());
         for (level, [gamma, beta, kernels]) in weights_of_levels.iter().enumerate() {
             if let Some(before) = levels.last() {
-                let (next, next_sums) = before.all_frames(&planes);
+                let next;
+                (next, sums) = before.all_frames(&planes);
                 z.push(std::mem::replace(&mut planes, next));
-                sums = next_sums;
             }
             let masks = [self.masks[level], self.masks[level + 1]];
             let scale = masks[0].scale();
@@ -144,8 +142,12 @@ impl Seed<'_> {
         first..first + self.area
     }
 
+    fn n_hidden(&self) -> usize {
+        self.hidden.len() / self.mask.n_frames()
+    }
+
     fn hidden(&self, frame: usize) -> &[f32] {
-        &self.hidden[frame * self.n_hidden..][..self.n_hidden]
+        &self.hidden[frame * self.n_hidden()..][..self.n_hidden()]
     }
 
     fn forward(&self) -> (Frames, Sums) {
@@ -178,7 +180,7 @@ impl Seed<'_> {
         };
         let (d_hidden, d_weights) = frames(
             self.mask.n_frames(),
-            |_| self.n_hidden,
+            |_| self.n_hidden(),
             new,
             #[inline(always)]
             |(d_weights, dz), frame, d_hidden| {
@@ -351,21 +353,11 @@ impl Last<'_> {
         for visit in targets {
             let (row, col) = (usize::from(visit.row), usize::from(visit.col));
             let out = row * 2 * sizes.cols + col;
-            for (state, logit) in self.cell.iter_mut().enumerate() {
-                *logit = last.constants[state * sizes.out_area() + out];
-            }
-            for (tap, cell) in sizes.meets(row, col) {
-                for (index, channel) in kept.iter().enumerate() {
-                    let x = to.room.shifted[index * sizes.shifted() + sizes.unshifted() + cell];
-                    let kernels = last.kernels[channel * n_states * TAPS..].chunks_exact(TAPS);
-                    let logits = self.cell.iter_mut().zip(kernels);
-                    logits.for_each(|(logit, kernel)| *logit += kernel[tap] * x);
-                }
-            }
+            last.logits_at([row, col], frame, &to.room, &mut self.cell);
             self.loss.add(&mut self.cell, visit.value);
             for (tap, cell) in sizes.meets(row, col) {
                 for (index, channel) in kept.iter().enumerate() {
-                    let x = to.room.shifted[index * sizes.shifted() + sizes.unshifted() + cell];
+                    let x = to.room.x_at(sizes, index, cell);
                     let dx = &mut to.room.dx[index * area + cell];
                     for (state, d) in self.cell.iter().enumerate() {
                         let at = (channel * n_states + state) * TAPS + tap;

@@ -25,7 +25,7 @@ pub(super) struct Doubling<'a> {
     /// The constants of lost channels; zero if there are none.
     floors: Vec<f32>,
     /// What becomes of them.
-    pub(super) constants: Vec<f32>,
+    constants: Vec<f32>,
 }
 
 /// Room for one frame.
@@ -33,7 +33,7 @@ pub(super) struct Room {
     /// One channel after normalisation and ReLU, less the constant.
     x: Vec<f32>,
     /// All of them, as [`Sizes::shift`] writes them.
-    pub(super) shifted: Vec<f32>,
+    shifted: Vec<f32>,
     phases: Vec<f32>,
     views: Vec<f32>,
     padded: Vec<f32>,
@@ -49,6 +49,14 @@ pub(super) struct Gradients {
     /// Of the output, over frames.
     pub(super) d_out: Vec<f32>,
     pub(super) sums: Sums,
+}
+
+impl Room {
+    /// What [`Doubling::read`] has left of a kept channel at a cell.
+    #[inline(always)]
+    pub(super) fn x_at(&self, sizes: &Sizes, index: usize, cell: usize) -> f32 {
+        self.shifted[index * sizes.shifted() + sizes.unshifted() + cell]
+    }
 }
 
 impl<'a> Doubling<'a> {
@@ -168,6 +176,29 @@ impl<'a> Doubling<'a> {
         }
     }
 
+    /// What becomes of the frame in `room` at one cell.
+    #[inline(always)]
+    pub(super) fn logits_at(
+        &self,
+        [row, col]: [usize; 2],
+        frame: usize,
+        room: &Room,
+        logits: &mut [f32],
+    ) {
+        let (sizes, out_area) = (&self.sizes, self.sizes.out_area());
+        for (state, logit) in logits.iter_mut().enumerate() {
+            *logit = self.constants[state * out_area + row * 2 * sizes.cols + col];
+        }
+        for (tap, cell) in sizes.meets(row, col) {
+            for (index, channel) in self.input.kept(frame).iter().enumerate() {
+                let x = room.x_at(sizes, index, cell);
+                let kernels = &self.kernels[channel * sizes.channels_out * TAPS..];
+                let logits = logits.iter_mut().zip(kernels.chunks_exact(TAPS));
+                logits.for_each(|(logit, kernel)| *logit += kernel[tap] * x);
+            }
+        }
+    }
+
     /// The results of all frames, and the sums of their numbers and squares.
     pub(super) fn all_frames(&self, z: &Frames) -> (Frames, Sums) {
         let (input, output, area) = (self.input, self.output, self.sizes.out_area());
@@ -219,9 +250,22 @@ impl<'a> Doubling<'a> {
             cols: area,
         };
         product(&mut room.dx, &steps(inputs.len(), area), left, right);
+        self.add_kernel_gradient(room, [&kernels, outputs], d_out, d_kernels);
+    }
+
+    /// Adds the gradient of the kernels that begin at `kernels`, those of the inputs in `room`.
+    #[inline(always)]
+    fn add_kernel_gradient<'b>(
+        &self,
+        room: &mut Room,
+        [kernels, outputs]: [&[usize]; 2],
+        d_out: impl Iterator<Item = &'b [f32]>,
+        d_kernels: &mut [f32],
+    ) {
+        let (sizes, area) = (&self.sizes, self.sizes.area());
         let x = Left {
             numbers: &room.shifted[sizes.unshifted()..],
-            rows: &steps(inputs.len(), sizes.shifted()),
+            rows: &steps(kernels.len(), sizes.shifted()),
             terms: &steps(area, 1),
         };
         let cells = steps(area, TAPS);
@@ -232,7 +276,7 @@ impl<'a> Doubling<'a> {
                 terms: &cells,
                 cols: TAPS,
             };
-            add_product(&mut d_kernels[output * TAPS..], &kernels, x, right);
+            add_product(&mut d_kernels[output * TAPS..], kernels, x, right);
         }
     }
 

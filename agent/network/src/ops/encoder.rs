@@ -187,10 +187,8 @@ impl Encoder {
         let (stage, before) = (&stage[0], stages.last());
         let channels = stage.shape.channels_out;
         let length = before.map_or(0, Stage::length);
-        let (first, conv) = (
-            VisitedConv(stage.shape),
-            Conv::new(&stage.shape, &stage.kernels),
-        );
+        let first = VisitedConv(stage.shape);
+        let conv = Conv::new(&stage.shape, &stage.kernels);
         let turned = conv.turned();
         frames(
             self.window.len(),

@@ -156,10 +156,9 @@ impl Call<'_> {
             for (index, sum) in sums.iter().enumerate() {
                 // SAFETY: as above.
                 let to = unsafe { self.out.as_mut_ptr().add(row + col + index * S::F32_LANES) };
-                match self.adds {
-                    true => vector.store(simd, to, simd.add_f32s(vector.load(simd, to), *sum)),
-                    false => vector.store(simd, to, *sum),
-                }
+                let before = self.adds.then(|| vector.load(simd, to));
+                let sum = before.map_or(*sum, |before| simd.add_f32s(before, *sum));
+                vector.store(simd, to, sum);
             }
         }
     }
