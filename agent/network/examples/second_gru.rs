@@ -28,7 +28,7 @@ impl TwoGrus {
             first: Gru::new(&vb.pp("rnn_layer"), shape.encoding, n, false)?,
             second: Gru::new(&vb.pp("second_rnn_layer"), n, n, false)?,
             decoder: Decoder::new(&vb.pp("decoder"), shape, false)?,
-            observation: Observation::new(vb, shape.n_observations, shape.n_states, false)?,
+            observation: Observation::new(vb, shape.n_observations, shape.n_states)?,
         })
     }
 
@@ -40,8 +40,7 @@ impl TwoGrus {
 
     fn loss(&self, pass: &Pass<'_>, hidden: &[f32]) -> Result<Tensor> {
         let hidden = self.forward(pass, hidden)?;
-        let logits = self.decoder.forward(&hidden, pass)?;
-        self.observation.loss(&logits, pass.window)
+        self.decoder.loss(&hidden, &self.observation, pass)
     }
 }
 
@@ -74,10 +73,10 @@ fn main() -> Result<()> {
     for update in 0..100 {
         let dropout = Dropout::draw(window.len(), 1, update);
         let loss = model.loss(&Pass::training(&window, &dropout), &[0.0; 8])?;
-        let step = adam.step(&settings, &loss.backward()?)?;
-        adam.take(step)?;
+        let loss = adam.update(&settings, &loss);
+        let loss = loss.map_err(candle_core::Error::wrap)?;
         if update % 20 == 0 {
-            println!("update {update}: loss {:.4}", loss.to_scalar::<f32>()?);
+            println!("update {update}: loss {loss:.4}");
         }
     }
     Ok(())

@@ -1,6 +1,7 @@
 //! Adam over candle variables, as PyTorch has it, with moments that can be saved.
 
-use crate::tensors::{Change, set};
+use crate::error::{NetworkError, NotFinite};
+use crate::tensors::{Change, first_not_finite, named, set};
 use crate::variables::{Variables, is_statistic};
 use candle_core::backprop::GradStore;
 use candle_core::{Result, Tensor, Var};
@@ -42,15 +43,8 @@ pub struct Adam {
     steps: u64,
 }
 
-/// A step that can still be refused: nothing has moved yet.
-#[derive(Debug)]
-pub struct Step(Vec<Change>);
-
 impl Adam {
     /// Before the first step.
-    ///
-    /// # Errors
-    /// As candle's.
     pub fn new(variables: Variables) -> Result<Self> {
         let parameters = variables.iter().filter(|(name, _)| !is_statistic(name));
         let moments = parameters.flat_map(|(name, var)| {
@@ -63,11 +57,66 @@ impl Adam {
         })
     }
 
-    /// The step against some gradients.
+    /// One step against the gradients of a loss, which it returns.
     ///
     /// # Errors
-    /// As candle's.
-    pub fn step(&self, settings: &AdamSettings, gradients: &GradStore) -> Result<Step> {
+    /// [`NetworkError`] for a number that is not finite, with the first such tensor: a cause before what
+    /// follows from it. Nothing has changed then.
+    pub fn update(
+        &mut self,
+        settings: &AdamSettings,
+        loss: &Tensor,
+    ) -> std::result::Result<f32, NetworkError> {
+        self.update_with(settings, loss, Vec::new(), "")
+    }
+
+    /// [`Self::update`] with changes that go with it. `prefix` precedes the names of variables in errors.
+    pub(crate) fn update_with(
+        &mut self,
+        settings: &AdamSettings,
+        loss: &Tensor,
+        statistics: Vec<Change>,
+        prefix: &'static str,
+    ) -> std::result::Result<f32, NetworkError> {
+        let gradients = loss.backward()?;
+        let loss = loss.to_scalar::<f32>()?;
+        let groups = [(prefix, &self.variables)];
+        let of_variables = named(&groups).zip(self.variables.values());
+        let of_variables = of_variables.filter_map(|((name, _), var)| {
+            let gradient = gradients.get(var)?;
+            Some((format!("gradient of {name}"), gradient))
+        });
+        self.check(named(&groups).chain(of_variables))?;
+        if !loss.is_finite() {
+            return Err(self.not_finite("loss".into()));
+        }
+        let mut changes = statistics;
+        changes.extend(self.changes(settings, &gradients)?);
+        let after = changes.iter();
+        self.check(after.map(|(name, _, tensor)| (format!("{prefix}{name}"), tensor)))?;
+        set(&changes)?;
+        self.steps += 1;
+        Ok(loss)
+    }
+
+    /// An error for the first tensor with a number that is not finite.
+    pub(crate) fn check<'a>(
+        &self,
+        tensors: impl Iterator<Item = (String, &'a Tensor)>,
+    ) -> std::result::Result<(), NetworkError> {
+        match first_not_finite(tensors)? {
+            None => Ok(()),
+            Some(tensor) => Err(self.not_finite(tensor)),
+        }
+    }
+
+    pub(crate) fn not_finite(&self, tensor: String) -> NetworkError {
+        let update = self.steps;
+        NotFinite { update, tensor }.into()
+    }
+
+    /// What a step moves.
+    fn changes(&self, settings: &AdamSettings, gradients: &GradStore) -> Result<Vec<Change>> {
         let betas = settings.betas.map(f64::from);
         let bias = betas.map(|beta| 1.0 - beta.powf((self.steps + 1) as f64));
         let rate = f64::from(settings.learning_rate) / bias[0];
@@ -88,17 +137,7 @@ impl Adam {
             changes.push((of_mean, first.clone(), mean));
             changes.push((of_square, second.clone(), square));
         }
-        Ok(Step(changes))
-    }
-
-    /// Makes a step.
-    ///
-    /// # Errors
-    /// As candle's.
-    pub fn take(&mut self, step: Step) -> Result<()> {
-        set(&step.0)?;
-        self.steps += 1;
-        Ok(())
+        Ok(changes)
     }
 
     /// What is learned.
@@ -122,15 +161,6 @@ impl Adam {
     }
 }
 
-impl Step {
-    /// Everything that is about to change: its name, and its values after the step.
-    pub fn tensors(&self) -> impl Iterator<Item = (String, &Tensor)> {
-        self.0
-            .iter()
-            .map(|(name, _, tensor)| (name.clone(), tensor))
-    }
-}
-
 fn names(variable: &str) -> [String; 2] {
     ["first", "second"].map(|which| format!("{which}.{variable}"))
 }
@@ -146,21 +176,17 @@ mod tests {
     use super::*;
     use candle_core::Device;
 
-    /// The variables `p` of two numbers, and the gradients of `sum(p * g)`.
-    fn gradients(variables: &Variables, g: [f32; 2]) -> GradStore {
-        let g = Tensor::new(&g, &Device::Cpu).expect("tensor");
-        let sum = (variables["p"].as_tensor() * g).and_then(|product| product.sum_all());
-        sum.and_then(|sum| sum.backward()).expect("gradients")
-    }
-
     fn variables() -> Variables {
         let var = Var::new(&[1.0_f32, -2.0], &Device::Cpu).expect("variable");
         [("p".to_owned(), var)].into()
     }
 
+    /// A step of the variable `p` against the gradients `g` of `sum(p * g)`.
     fn step(adam: &mut Adam, settings: &AdamSettings, g: [f32; 2]) {
-        let step = adam.step(settings, &gradients(&adam.variables, g));
-        adam.take(step.expect("a step")).expect("numbers");
+        let g = Tensor::new(&g, &Device::Cpu).expect("tensor");
+        let sum = (adam.variables["p"].as_tensor() * g).and_then(|product| product.sum_all());
+        let loss = adam.update(settings, &sum.expect("sum"));
+        loss.expect("finite");
     }
 
     /// `torch.optim.Adam([p], lr=.1, betas=(.5, .9))` on `p = 1, -2`, gradients `(.5, -3)`, `(.25, 4)`:

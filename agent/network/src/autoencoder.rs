@@ -3,15 +3,14 @@
 use crate::adam::{Adam, AdamSettings};
 use crate::batch_norm::moved_statistics;
 use crate::dropout::Dropout;
-use crate::error::{NetworkError, NotFinite};
+use crate::error::NetworkError;
 use crate::model::{Network, Stock};
 use crate::pass::Pass;
 use crate::shape::NetworkShape;
-use crate::tensors::{NamedTensor, first_not_finite, found, named, named_numbers, numbers_of, set};
+use crate::tensors::{NamedTensor, found, named_numbers, numbers_of, set};
 use crate::variables::{Variables, build, normal};
 use crate::window::Window;
-use candle_core::backprop::GradStore;
-use candle_core::{DType, Device, Result as CandleResult, Tensor};
+use candle_core::{DType, Device, Tensor};
 use protocol::grid::Probabilities;
 use protocol::randomness::{Purpose, stream};
 use serde::{Deserialize, Serialize};
@@ -57,7 +56,9 @@ impl AutoencoderSettings {
     }
 }
 
-/// The network, its variables and its optimiser.
+/// The network, its variables and its optimiser. Clones share the variables: each sees the updates that another
+/// makes.
+#[derive(Clone)]
 pub struct Autoencoder {
     settings: AutoencoderSettings,
     shape: NetworkShape,
@@ -70,9 +71,6 @@ pub struct Autoencoder {
 
 impl Autoencoder {
     /// A new network of a seed, which is also that of its masks and hidden vectors.
-    ///
-    /// # Errors
-    /// [`NetworkError`] where the device fails.
     pub fn new(
         settings: AutoencoderSettings,
         shape: NetworkShape,
@@ -90,19 +88,6 @@ impl Autoencoder {
             network: Arc::new(network),
             n_updates: 0,
         })
-    }
-
-    /// The same network for another owner, who reads it: both see the updates that one makes.
-    pub fn shared(&self) -> Self {
-        Self {
-            settings: self.settings,
-            shape: self.shape,
-            seed: self.seed,
-            device: self.device.clone(),
-            network: self.network.clone(),
-            adam: self.adam.clone(),
-            n_updates: self.n_updates,
-        }
     }
 
     /// Sizes and step size.
@@ -136,9 +121,6 @@ impl Autoencoder {
     }
 
     /// The learned observation matrix `O`, row-major `[observation][state]`; columns sum to one.
-    ///
-    /// # Errors
-    /// [`NetworkError`] where the device fails.
     pub fn observation_matrix(&self) -> Result<Vec<f32>, NetworkError> {
         Ok(numbers_of(&self.network.observation_matrix()?)?)
     }
@@ -167,14 +149,11 @@ impl Autoencoder {
         match hidden.iter().all(|number| number.is_finite()) {
             true => Ok(hidden),
             // Softmax and ReLU would make numbers again of what is none.
-            false => Err(self.not_finite("the hidden vector".into())),
+            false => Err(self.adam.not_finite("the hidden vector".into())),
         }
     }
 
     /// The predictor `u` that a hidden vector stands for, `[S, H, W]`.
-    ///
-    /// # Errors
-    /// [`NetworkError`] where the device fails.
     pub fn predict(&self, hidden: &[f32]) -> Result<Probabilities, NetworkError> {
         let (height, width) = self.shape.grid.dim();
         let hidden = Tensor::from_slice(hidden, (1, hidden.len()), &self.device)?;
@@ -187,9 +166,7 @@ impl Autoencoder {
     }
 
     /// One step of Adam on a window, with dropout and `h_0` from this update's streams; the loss before it.
-    ///
-    /// # Errors
-    /// [`NetworkError`]; nothing has changed then.
+    /// Nothing has changed after an error.
     ///
     /// # Panics
     /// If the window has no targets or does not fit the network.
@@ -199,12 +176,6 @@ impl Autoencoder {
     }
 
     /// [`Self::update`] with given masks and `h_0`.
-    ///
-    /// # Errors
-    /// [`NetworkError`]; nothing has changed then.
-    ///
-    /// # Panics
-    /// If the window has no targets or does not fit the network.
     pub fn update_with(
         &mut self,
         window: &Window,
@@ -215,46 +186,16 @@ impl Autoencoder {
         assert!(window.fits(&self.shape), "window: grid or observations");
         let pass = Pass::training(window, dropout);
         let loss = self.network.loss(&pass, first)?;
-        let gradients = loss.backward()?;
-        let loss = f64::from(loss.to_scalar::<f32>()?);
-        if let Some(tensor) = self.cause(loss, &gradients)? {
-            return Err(self.not_finite(tensor));
-        }
         let statistics = moved_statistics(self.variables(), &pass.into_moments())?;
-        let step = self.adam.step(&self.settings.adam, &gradients)?;
-        let after = statistics
-            .iter()
-            .map(|(name, _, tensor)| (name.clone(), tensor));
-        if let Some(tensor) = first_not_finite(after.chain(step.tensors()))? {
-            return Err(self.not_finite(tensor));
-        }
-        set(&statistics)?;
-        self.adam.take(step)?;
+        let loss = self
+            .adam
+            .update_with(&self.settings.adam, &loss, statistics, "")?;
         self.n_updates += 1;
-        Ok(loss)
-    }
-
-    /// The first thing that is not finite: a cause before what follows from it.
-    fn cause(&self, loss: f64, gradients: &GradStore) -> CandleResult<Option<String>> {
-        let gradients = self.variables().iter().filter_map(|(name, var)| {
-            let gradient = gradients.get(var)?;
-            Some((format!("gradient of {name}"), gradient))
-        });
-        let all = [("", self.variables())];
-        let tensor = first_not_finite(named(&all).chain(gradients))?;
-        Ok(tensor.or_else(|| (!loss.is_finite()).then(|| "loss".to_owned())))
-    }
-
-    fn not_finite(&self, tensor: String) -> NetworkError {
-        let update = self.n_updates;
-        NotFinite { update, tensor }.into()
+        Ok(f64::from(loss))
     }
 
     /// Everything that a resumed run needs but settings, seed and [`Self::counters`]: variables by PyTorch's
     /// names, Adam's moments as `adam.first.<name>` and `adam.second.<name>`.
-    ///
-    /// # Errors
-    /// [`NetworkError`] where the device fails.
     pub fn named_tensors(&self) -> Result<Vec<NamedTensor>, NetworkError> {
         Ok(named_numbers(&self.groups())?)
     }

@@ -32,17 +32,13 @@ impl BatchNorm {
         })
     }
 
-    /// `[gamma; beta]`, as our operators take them.
-    pub(crate) fn weights(&self) -> Result<Tensor> {
-        Tensor::stack(&[&self.gamma, &self.beta], 0)
+    /// Gamma and beta, as our operators take them.
+    pub(crate) fn weights(&self) -> [&Tensor; 2] {
+        [&self.gamma, &self.beta]
     }
 
-    /// The moments to normalise with; `of_window` computes those of training.
-    pub(crate) fn moments(
-        &self,
-        pass: &Pass<'_>,
-        of_window: impl FnOnce() -> Result<Moments>,
-    ) -> Result<Moments> {
+    /// The moments to normalise with: in training those of the window.
+    pub(crate) fn moments(&self, pass: &Pass<'_>, of_window: Moments) -> Result<Moments> {
         if !pass.trains() {
             return Ok(Moments {
                 mean: exact(&self.mean)?,
@@ -50,9 +46,8 @@ impl BatchNorm {
                 count: f64::INFINITY,
             });
         }
-        let moments = of_window()?;
-        pass.keep_moments(&self.name, &moments);
-        Ok(moments)
+        pass.keep_moments(&self.name, &of_window);
+        Ok(of_window)
     }
 
     /// The stock path: normalises `u [frames, channels, rows, cols]`.

@@ -3,8 +3,8 @@
 
 use crate::batch_norm::BatchNorm;
 use crate::dropout::Mask;
-use crate::ops::doubling::Doubling;
-use crate::ops::norm::Moments;
+use crate::observation::Observation;
+use crate::ops::decoder::Layers;
 use crate::pass::Pass;
 use crate::shape::{DECODER_CHANNELS, NetworkShape};
 use crate::variables::uniform_init;
@@ -67,46 +67,67 @@ impl Decoder {
         })
     }
 
-    /// Logits of all cells of the padded grid, `[frames, states, rows, cols]`.
+    /// Logits of all cells of the padded grid, `[frames, states, rows, cols]`, for predictions: through our
+    /// operator goes no gradient.
     pub fn forward(&self, hidden: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
+        if self.is_stock {
+            return self.stock(hidden, pass);
+        }
+        let behind = Mask::all(pass.window.len(), self.n_states()?);
+        let layers = self.layers(hidden, pass, &behind);
+        layers.logits(|level, of_window| self.levels[level].norm.moments(pass, of_window))
+    }
+
+    /// The loss of what hidden vectors predict (eqs. 8 and 11): that of the window's targets.
+    pub fn loss(
+        &self,
+        hidden: &Tensor,
+        observation: &Observation,
+        pass: &Pass<'_>,
+    ) -> Result<Tensor> {
+        if self.is_stock {
+            return observation.loss(&self.stock(hidden, pass)?, pass.window);
+        }
+        let behind = Mask::all(pass.window.len(), self.n_states()?);
+        let (layers, matrix) = (self.layers(hidden, pass, &behind), observation.matrix()?);
+        let moments = |level: usize, of_window| self.levels[level].norm.moments(pass, of_window);
+        layers.loss(pass.window, &matrix.contiguous()?, moments)
+    }
+
+    fn n_states(&self) -> Result<usize> {
+        let last = self.levels.last().expect("invariant: four levels");
+        last.kernels.dim(1)
+    }
+
+    fn layers<'a>(
+        &'a self,
+        hidden: &'a Tensor,
+        pass: &'a Pass<'_>,
+        behind: &'a Mask,
+    ) -> Layers<'a> {
+        let masks = (0..self.levels.len()).map(|level| pass.decoder_mask(level));
+        let levels = self.levels.iter().map(|Level { norm, kernels }| {
+            let [gamma, beta] = norm.weights();
+            [gamma, beta, kernels]
+        });
+        Layers {
+            hidden,
+            seed: &self.seed,
+            levels: levels.collect(),
+            masks: masks.chain([behind]).collect(),
+        }
+    }
+
+    fn stock(&self, hidden: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
         let (n_hidden, channels, rows, cols) = self.seed.dims4()?;
         let seed = hidden.matmul(&self.seed.reshape((n_hidden, ()))?)?;
-        // Ours are `[planes, rows, cols]`.
-        let mut z = match self.is_stock {
-            true => seed.reshape(((), channels, rows, cols))?,
-            false => seed.reshape(((), rows, cols))?,
-        };
-        for level in 0..self.levels.len() {
-            z = match self.is_stock {
-                true => self.stock(level, &z, pass)?,
-                false => self.ours(level, &z, pass)?,
-            };
+        let mut z = seed.reshape(((), channels, rows, cols))?;
+        for (level, Level { norm, kernels }) in self.levels.iter().enumerate() {
+            let mask = pass.decoder_mask(level).tensor(z.dtype(), z.device())?;
+            let kept = z.broadcast_mul(&mask.unsqueeze(2)?.unsqueeze(3)?)?;
+            let x = norm.forward(&kept, pass)?.relu()?;
+            z = x.conv_transpose2d(kernels, 1, 0, 2, 1)?;
         }
-        let scale = 1 << self.levels.len();
-        z.reshape((pass.window.len(), (), scale * rows, scale * cols))
-    }
-
-    fn stock(&self, level: usize, z: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
-        let Level { norm, kernels } = &self.levels[level];
-        let mask = pass.decoder_mask(level).tensor(z.dtype(), z.device())?;
-        let kept = z.broadcast_mul(&mask.unsqueeze(2)?.unsqueeze(3)?)?;
-        let x = norm.forward(&kept, pass)?.relu()?;
-        x.conv_transpose2d(kernels, 1, 0, 2, 1)
-    }
-
-    fn ours(&self, level: usize, z: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
-        let Level { norm, kernels } = &self.levels[level];
-        let output = match level + 1 < self.levels.len() {
-            true => pass.decoder_mask(level + 1).clone(),
-            false => Mask::all(pass.window.len(), kernels.dim(1)?),
-        };
-        let input = pass.decoder_mask(level).clone();
-        let moments = norm.moments(pass, || Moments::of(z, &input))?;
-        let op = Doubling {
-            input,
-            output,
-            moments,
-        };
-        z.apply_op3(&norm.weights()?, kernels, op)
+        Ok(z)
     }
 }

@@ -73,11 +73,6 @@ impl Mask {
         &self.kept[self.starts[frame]..self.starts[frame + 1]]
     }
 
-    /// Channels that the frames before one keep.
-    pub(crate) fn start(&self, frame: usize) -> usize {
-        self.starts[frame]
-    }
-
     /// Whether no frame loses a channel.
     pub fn keeps_all(&self) -> bool {
         self.kept.len() == self.scales.len()

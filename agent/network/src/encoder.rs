@@ -2,9 +2,7 @@
 //! layer.
 
 use crate::batch_norm::BatchNorm;
-use crate::ops::conv::Conv;
-use crate::ops::drop_relu_norm::DropReluNorm;
-use crate::ops::visited_conv::VisitedConv;
+use crate::ops::encoder::{Layer, encode};
 use crate::pass::Pass;
 use crate::shape::{ConvShape, NetworkShape};
 use crate::variables::uniform_init;
@@ -73,21 +71,20 @@ impl Encoder {
         x.flatten_from(1)
     }
 
-    /// Maps are `[frames, rows, cols, channels]`.
     fn ours(&self, pass: &Pass<'_>) -> Result<Tensor> {
-        let mut x = self.stages[0].visited_conv(pass)?;
-        for (index, stage) in self.stages.iter().enumerate() {
-            if index > 0 {
-                x = stage.conv(&x)?;
-            }
-            let mask = pass.encoder_mask(index).clone();
-            let of_window = || DropReluNorm::moments(&x, &mask);
-            let moments = stage.norm.moments(pass, of_window)?;
-            x = x.apply_op2(&stage.norm.weights()?, DropReluNorm { mask, moments })?;
-            let [rows, cols] = stage.shape.output;
-            x = x.reshape((pass.window.len(), rows, cols, stage.shape.channels_out))?;
-        }
-        x.permute((0, 3, 1, 2))?.flatten_from(1)
+        let layers = self.stages.iter().enumerate().map(|(index, stage)| {
+            Ok(Layer {
+                shape: stage.shape,
+                kernels: stage.kernels(index == 0)?,
+                bias: &stage.bias,
+                norm: stage.norm.weights(),
+                mask: pass.encoder_mask(index),
+            })
+        });
+        let layers = layers.collect::<Result<Vec<_>>>()?;
+        encode(pass.window, &layers, pass.trains(), |index, of_window| {
+            self.stages[index].norm.moments(pass, of_window)
+        })
     }
 }
 
@@ -105,23 +102,11 @@ impl Stage {
         })
     }
 
-    fn visited_conv(&self, pass: &Pass<'_>) -> Result<Tensor> {
-        let kernels = self.weight.permute((1, 2, 3, 0))?.flatten(0, 2)?;
-        let op = VisitedConv {
-            shape: self.shape,
-            window: pass.window.clone(),
-        };
-        kernels.contiguous()?.apply_op2(&self.bias, op)
-    }
-
-    fn conv(&self, x: &Tensor) -> Result<Tensor> {
-        let kernels = self.weight.permute((2, 3, 1, 0))?.flatten(0, 2)?;
-        let op = Conv {
-            kernel: self.shape.kernel,
-            stride: self.shape.stride,
-        };
-        x.apply_op2(&kernels.contiguous()?, op)?
-            .broadcast_add(&self.bias)
+    /// The weights as our operator takes them: of the first layer, `[channels in, rows, cols, channels out]`;
+    /// of others, the channels in come third.
+    fn kernels(&self, is_first: bool) -> Result<Tensor> {
+        let order = if is_first { (1, 2, 3, 0) } else { (2, 3, 1, 0) };
+        self.weight.permute(order)?.flatten(0, 2)?.contiguous()
     }
 
     fn stock_conv(&self, x: &Tensor) -> Result<Tensor> {

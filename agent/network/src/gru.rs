@@ -1,6 +1,6 @@
 //! The recurrence of paper eq. 9 over a window.
 
-use crate::ops::gru_sequence::GruSequence;
+use crate::ops::gru_sequence::gru_sequence;
 use crate::variables::uniform_init;
 use candle_core::{Device, Result, Tensor};
 use candle_nn::VarBuilder;
@@ -36,12 +36,10 @@ impl Gru {
         if self.is_stock {
             return self.stock(&inputs, first);
         }
-        let first = first.to_vec();
         // On other devices too: a thousand steps of a few numbers are a thousand times a dozen launches.
         let cpu = |tensor: &Tensor| tensor.to_device(&Device::Cpu);
         let (w, b) = (cpu(&self.w_hh)?, cpu(&self.b_hh)?);
-        let hidden = cpu(&inputs)?.apply_op3(&w, &b, GruSequence { first })?;
-        hidden.to_device(x.device())
+        gru_sequence(&cpu(&inputs)?, &w, &b, first)?.to_device(x.device())
     }
 
     fn stock(&self, inputs: &Tensor, first: &[f32]) -> Result<Tensor> {

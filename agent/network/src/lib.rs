@@ -3,8 +3,9 @@
 //!
 //! In reading order: [`Network`] (the model: encoder, [`Gru`], decoder, observation matrix), [`Autoencoder`]
 //! (its updates and steps), [`Adam`], [`Dqn`]. Layers take their variables from a `VarBuilder` of
-//! [`variables`], and candle's `backward()` derives all of it. Five of them have an operator of ours
-//! with a hand-written kernel and gradient (`ops`) beside candle's stock ones, which run on GPUs.
+//! [`variables`], and candle's `backward()` derives all of it. Encoder, recurrence and decoder have an
+//! operator of ours with a hand-written kernel and gradient (`ops`) beside candle's stock ones, which run on
+//! GPUs.
 //!
 //! To add a layer, make it in `Network::new` and call it in `Network::forward`; `examples/second_gru.rs`
 //! does so outside.

@@ -18,10 +18,8 @@ pub struct Stock {
     pub encoder: bool,
     /// The recurrence.
     pub gru: bool,
-    /// The decoder.
+    /// The decoder with the loss.
     pub decoder: bool,
-    /// The loss.
-    pub loss: bool,
 }
 
 impl Stock {
@@ -30,7 +28,6 @@ impl Stock {
         encoder: true,
         gru: true,
         decoder: true,
-        loss: true,
     };
 
     /// What is needed where the variables are: ours are for 32-bit floats on the CPU. The recurrence moves
@@ -42,7 +39,6 @@ impl Stock {
                 encoder: self.encoder || must,
                 gru: self.gru,
                 decoder: self.decoder || must,
-                loss: self.loss || must,
             },
             _ => Self::ALL,
         }
@@ -67,7 +63,7 @@ impl Network {
             encoder: Encoder::new(&vb.pp("encoder"), shape, stock.encoder)?,
             gru: Gru::new(&gru, shape.encoding, shape.hidden, stock.gru)?,
             decoder: Decoder::new(&vb.pp("decoder"), shape, stock.decoder)?,
-            observation: Observation::new(vb, n_observations, n_states, stock.loss)?,
+            observation: Observation::new(vb, n_observations, n_states)?,
         })
     }
 
@@ -81,8 +77,7 @@ impl Network {
     /// The loss of what the window's frames say about their successors (eqs. 8 and 11).
     pub fn loss(&self, pass: &Pass<'_>, first: &[f32]) -> Result<Tensor> {
         let hidden = self.forward(pass, first)?;
-        let logits = self.decoder.forward(&hidden, pass)?;
-        self.observation.loss(&logits, pass.window)
+        self.decoder.loss(&hidden, &self.observation, pass)
     }
 
     /// The predictors that hidden vectors stand for, `[frames, states, rows, cols]` of the padded grid.

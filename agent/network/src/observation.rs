@@ -1,6 +1,6 @@
 //! The observation matrix `O`, and the loss of paper eqs. 8 and 11 behind it.
 
-use crate::ops::cell_loss::{CellLoss, LOG_FLOOR};
+use crate::ops::cell_loss::LOG_FLOOR;
 use crate::window::Window;
 use candle_core::{Result, Tensor};
 use candle_nn::ops::softmax;
@@ -11,21 +11,15 @@ use candle_nn::{Init, VarBuilder};
 pub struct Observation {
     /// Before the softmax of each column, `[observations, states]`.
     weight: Tensor,
-    is_stock: bool,
 }
 
 impl Observation {
-    /// A matrix for so many observations and states, with a loss of stock operators or ours.
-    pub fn new(
-        vb: &VarBuilder<'_>,
-        n_observations: usize,
-        n_states: usize,
-        is_stock: bool,
-    ) -> Result<Self> {
+    /// A matrix for so many observations and states.
+    pub fn new(vb: &VarBuilder<'_>, n_observations: usize, n_states: usize) -> Result<Self> {
         let (mean, stdev) = (0.0, 1.0);
         let dims = (n_observations, n_states);
         let weight = vb.get_with_hints(dims, "W_obs_param", Init::Randn { mean, stdev })?;
-        Ok(Self { weight, is_stock })
+        Ok(Self { weight })
     }
 
     /// The matrix, `[observations, states]`; each column sums to one.
@@ -34,13 +28,9 @@ impl Observation {
     }
 
     /// The cross-entropy of what a window's targets showed, the mean over them, from logits `[frames, states,
-    /// rows, cols]`.
+    /// rows, cols]`, by stock operators.
     pub fn loss(&self, logits: &Tensor, window: &Window) -> Result<Tensor> {
         let (matrix, targets) = (self.matrix()?, window.all_targets());
-        if !self.is_stock {
-            let window = window.clone();
-            return logits.apply_op2(&matrix.contiguous()?, CellLoss { window });
-        }
         let u = softmax(&at_targets(logits, window)?, 1)?;
         let q = u.matmul(&matrix.t()?)?;
         let y = one_hot(window, &q)?;

@@ -19,9 +19,6 @@ pub type Variables = BTreeMap<String, Var>;
 ///
 /// A variable's first value depends on the seed and its own name alone, so a new layer leaves the others'
 /// as they were.
-///
-/// # Errors
-/// As the layers'.
 pub fn build<M>(
     seed: u64,
     dtype: DType,

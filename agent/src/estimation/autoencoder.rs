@@ -25,7 +25,7 @@ impl AutoencoderEstimator {
 
     pub fn at(network: &Autoencoder, follower: Follower) -> Self {
         Self {
-            network: network.shared(),
+            network: network.clone(),
             belief: follower.prediction().clone(),
             follower,
         }

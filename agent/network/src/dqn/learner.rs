@@ -2,8 +2,8 @@
 
 use super::track::{Track, Transition};
 use crate::adam::{Adam, AdamSettings};
-use crate::error::{NetworkError, NotFinite};
-use crate::tensors::{first_not_finite, named};
+use crate::error::NetworkError;
+use crate::tensors::named;
 use crate::variables::{Variables, build, uniform, uniform_init};
 use candle_core::{DType, Device, Result as CandleResult, Tensor};
 use candle_nn::loss::mse;
@@ -241,24 +241,14 @@ impl Dqn {
     }
 
     fn learn_batch(&mut self, batch: &Batch) -> Result<f32, NetworkError> {
-        let groups = self.groups();
-        let known = batch.named().into_iter();
-        self.check(known.chain(named(&groups[..2])))?;
+        let targets = [("dqn.target.", &self.target_variables)];
+        let known = batch.named().into_iter().chain(named(&targets));
+        self.adam.check(known)?;
         let loss = self.loss(batch)?;
-        let gradients = loss.backward()?;
-        let loss = loss.to_scalar::<f32>()?;
-        let of_variables = named(&groups[..1]).zip(groups[0].1.values());
-        self.check(of_variables.filter_map(|((name, _), var)| {
-            let gradient = gradients.get(var)?;
-            Some((format!("gradient of {name}"), gradient))
-        }))?;
-        if !loss.is_finite() {
-            return Err(self.not_finite("loss".into()));
-        }
-        let step = self.adam.step(&self.settings.adam, &gradients)?;
-        let after = step.tensors();
-        self.check(after.map(|(name, tensor)| (format!("dqn.network.{name}"), tensor)))?;
-        self.adam.take(step)?;
+        let settings = &self.settings.adam;
+        let loss = self
+            .adam
+            .update_with(settings, &loss, Vec::new(), "dqn.network.")?;
         let tau = f64::from(self.settings.tau);
         for (name, target) in &self.target_variables {
             let (now, old) = (&self.adam.variables()[name], target.as_detached_tensor());
@@ -280,21 +270,6 @@ impl Dqn {
         let goal = (&batch.reward + (next * gamma)?)?;
         let values = self.network.forward(&batch.input)?;
         mse(&values.gather(&batch.action, 1)?, &goal)
-    }
-
-    fn check<'a>(
-        &self,
-        tensors: impl Iterator<Item = (String, &'a Tensor)>,
-    ) -> Result<(), NetworkError> {
-        match first_not_finite(tensors)? {
-            None => Ok(()),
-            Some(tensor) => Err(self.not_finite(tensor)),
-        }
-    }
-
-    fn not_finite(&self, tensor: String) -> NetworkError {
-        let update = self.n_updates();
-        NotFinite { update, tensor }.into()
     }
 }
 

@@ -1,22 +1,14 @@
-//! What the operators share: tensors as slices, frames in parallel, sums.
+//! What the operators share: tensors as slices, frames in parallel, results with gradients of their own.
 
-use candle_core::{CpuStorage, Device, Layout, Result, Shape, Storage, Tensor};
+use candle_core::{CpuStorage, CustomOp1, Device, Layout, Result, Shape, Storage, Tensor};
 use protocol::vectors::vectorised;
 use rayon::prelude::*;
-use std::mem::take;
 use std::ops::{AddAssign, Deref, Range};
+use std::sync::Mutex;
 
 /// Parts of a window that are worked on at the same time, each with sums of its own, which are added in
 /// their order: the number of threads changes no bit of the result.
 const N_CHUNKS: usize = 8;
-
-/// The numbers of an operator's argument.
-pub(super) fn slice<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
-    let Some((start, end)) = layout.contiguous_offsets() else {
-        candle_core::bail!("expected a contiguous tensor, got {layout:?}");
-    };
-    Ok(&storage.as_slice::<f32>()?[start..end])
-}
 
 /// The numbers of a contiguous tensor on the CPU, which is locked meanwhile.
 pub(super) fn numbers(tensor: &Tensor) -> Result<impl Deref<Target = [f32]> + '_> {
@@ -44,59 +36,113 @@ impl<G: Deref<Target = Storage>> Deref for Numbers<G> {
     }
 }
 
-/// A tensor on the CPU.
-pub(super) fn tensor(numbers: Vec<f32>, shape: impl Into<Shape>) -> Result<Tensor> {
-    Tensor::from_vec(numbers, shape.into(), &Device::Cpu)
+/// A tensor of numbers that were computed from some others, whose gradients `backward` computes from its
+/// own, one after the other.
+pub(super) fn derived(
+    from: &[&Tensor],
+    shape: impl Into<Shape>,
+    numbers: Vec<f32>,
+    backward: impl Fn(&[f32]) -> Vec<f32> + Send + Sync + 'static,
+) -> Result<Tensor> {
+    let flat = from.iter().map(|tensor| tensor.flatten_all());
+    let op = Derived {
+        shape: shape.into(),
+        numbers: Mutex::new(numbers),
+        backward,
+    };
+    Tensor::cat(&flat.collect::<Result<Vec<_>>>()?, 0)?.apply_op1(op)
 }
 
-/// Calls `f(sums, frame, its part of numbers)` for all frames, whose parts begin at `start(frame)`; returns the
-/// sums of each chunk of frames.
+struct Derived<F> {
+    shape: Shape,
+    /// Until they are in the tensor.
+    numbers: Mutex<Vec<f32>>,
+    backward: F,
+}
+
+impl<F: Fn(&[f32]) -> Vec<f32> + Send + Sync> CustomOp1 for Derived<F> {
+    fn name(&self) -> &'static str {
+        "derived"
+    }
+
+    fn cpu_fwd(&self, _: &CpuStorage, _: &Layout) -> Result<(CpuStorage, Shape)> {
+        let mut numbers = self.numbers.lock().expect("invariant: nobody panics here");
+        let numbers = std::mem::take(&mut *numbers);
+        Ok((CpuStorage::F32(numbers), self.shape.clone()))
+    }
+
+    fn bwd(&self, from: &Tensor, _: &Tensor, gradient: &Tensor) -> Result<Option<Tensor>> {
+        let gradient = gradient.contiguous()?;
+        let gradients = (self.backward)(&numbers(&gradient)?);
+        Tensor::from_vec(gradients, from.shape(), &Device::Cpu).map(Some)
+    }
+}
+
+/// Numbers of all frames, in chunks of frames.
+pub(super) struct Frames {
+    chunks: Vec<Chunk>,
+    /// Frames of a chunk.
+    length: usize,
+}
+
+struct Chunk {
+    numbers: Vec<f32>,
+    /// Where each frame's numbers end.
+    ends: Vec<usize>,
+}
+
+/// Calls `f(sums, frame, its numbers)` for all frames, whose `n(frame)` numbers are zeros at first; returns the
+/// numbers, and the sums of each chunk of frames.
 pub(super) fn frames<A: Send>(
-    mut numbers: &mut [f32],
     n_frames: usize,
-    start: impl Fn(usize) -> usize + Sync,
+    n: impl Fn(usize) -> usize + Sync,
     new: impl Fn() -> A + Sync,
     f: impl Fn(&mut A, usize, &mut [f32]) + Sync,
-) -> Vec<A> {
+) -> (Frames, Vec<A>) {
     let length = n_frames.div_ceil(N_CHUNKS).max(1);
-    let mut chunks = Vec::with_capacity(N_CHUNKS);
-    for first in (0..n_frames).step_by(length) {
+    let run = |first: usize| {
         let frames = first..(first + length).min(n_frames);
-        let (part, rest) = numbers.split_at_mut(start(frames.end) - start(frames.start));
-        chunks.push((frames, part));
-        numbers = rest;
-    }
-    let run = |(frames, mut part): (Range<usize>, &mut [f32])| {
         let mut sums = new();
+        let mut ends = Vec::with_capacity(length);
+        let mut numbers = Vec::with_capacity(frames.clone().map(&n).sum());
         vectorised(
             #[inline(always)]
             || {
                 for frame in frames.clone() {
-                    let (own, rest) = take(&mut part).split_at_mut(start(frame + 1) - start(frame));
-                    f(&mut sums, frame, own);
-                    part = rest;
+                    let start = numbers.len();
+                    numbers.resize(start + n(frame), 0.0);
+                    f(&mut sums, frame, &mut numbers[start..]);
+                    ends.push(numbers.len());
                 }
             },
         );
-        sums
+        (Chunk { numbers, ends }, sums)
     };
-    chunks.into_par_iter().with_max_len(1).map(run).collect()
+    let firsts: Vec<usize> = (0..n_frames).step_by(length).collect();
+    let chunks = firsts.into_par_iter().with_max_len(1).map(run);
+    let (chunks, sums) = chunks.unzip();
+    (Frames { chunks, length }, sums)
 }
 
-/// As [`frames`] for sums alone.
-pub(super) fn sums_over_frames<A: Send>(
-    n_frames: usize,
-    new: impl Fn() -> A + Sync,
-    f: impl Fn(&mut A, usize) + Sync,
-) -> Vec<A> {
-    frames(
-        &mut [],
-        n_frames,
-        |_| 0,
-        new,
-        #[inline(always)]
-        |sums, frame, _| f(sums, frame),
-    )
+impl Frames {
+    /// A frame's numbers.
+    #[inline(always)]
+    pub(super) fn frame(&self, frame: usize) -> &[f32] {
+        let (chunk, at) = (&self.chunks[frame / self.length], frame % self.length);
+        let start = at.checked_sub(1).map_or(0, |before| chunk.ends[before]);
+        &chunk.numbers[start..chunk.ends[at]]
+    }
+
+    /// All numbers.
+    pub(super) fn concat(mut self) -> Vec<f32> {
+        match self.chunks.len() {
+            1 => self.chunks.remove(0).numbers,
+            _ => {
+                let chunks = self.chunks.iter().map(|chunk| &chunk.numbers[..]);
+                chunks.collect::<Vec<_>>().concat()
+            }
+        }
+    }
 }
 
 /// Adds the chunks' sums, in their order.
@@ -112,7 +158,14 @@ pub(super) fn total<T: Copy + AddAssign>(sums: impl IntoIterator<Item = Vec<T>>)
 /// `to += numbers`.
 #[inline(always)]
 pub(super) fn add<T: Copy + AddAssign>(to: &mut [T], numbers: &[T]) {
-    for (to, number) in to.iter_mut().zip(numbers) {
+    let (to, to_rest) = to.as_chunks_mut::<16>();
+    let (numbers, rest) = numbers.as_chunks::<16>();
+    for (to, numbers) in to.iter_mut().zip(numbers) {
+        for lane in 0..16 {
+            to[lane] += numbers[lane];
+        }
+    }
+    for (to, number) in to_rest.iter_mut().zip(rest) {
         *to += *number;
     }
 }
@@ -123,6 +176,17 @@ pub(super) fn add_scaled(to: &mut [f32], factor: f32, numbers: &[f32]) {
     for (to, number) in to.iter_mut().zip(numbers) {
         *to += factor * number;
     }
+}
+
+/// The sum in sixteen lanes.
+#[inline(always)]
+pub(super) fn sum(numbers: &[f32]) -> f32 {
+    let (numbers, rest) = numbers.as_chunks::<16>();
+    let mut lanes = [0.0; 16];
+    for numbers in numbers {
+        add(&mut lanes, numbers);
+    }
+    rest.iter().sum::<f32>() + lanes.iter().sum::<f32>()
 }
 
 /// A dot product in eight lanes.

@@ -6,61 +6,91 @@
 //! and the constants of all channels go through the kernels once, as one more frame. Gradients follow the
 //! same split.
 
-use super::cpu::{add, frames, numbers, slice, tensor, total};
-use super::norm::{Moments, Norm, Sums, finish};
-use super::planes::Planes;
-use super::product::{Left, Right, add_product, steps};
+use super::cpu::{Frames, add, frames, sum, total};
+use super::norm::{Norm, NormGradient, Sums};
+use super::product::{Left, Right, add_product, product, steps};
 use super::taps::{PHASES, Sizes, TAPS};
 use crate::dropout::Mask;
-use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor};
 
-/// Arguments: `z [planes, rows, cols]` before its dropout, of all channels or of those that it keeps; `[gamma;
-/// beta]`; kernels `[channels in, channels out, 4, 4]`. The result has the planes that `output` keeps.
-pub(crate) struct Doubling {
+/// From the planes `z` that dropout keeps of each frame, before the normalisation, to those of the result.
+pub(super) struct Doubling<'a> {
+    pub(super) sizes: Sizes,
+    /// `[channels in, channels out, 4, 4]`.
+    pub(super) kernels: &'a [f32],
     /// Dropout of `z`.
-    pub(crate) input: Mask,
+    pub(super) input: &'a Mask,
     /// Dropout of the result.
-    pub(crate) output: Mask,
-    /// Of `z` after its dropout.
-    pub(crate) moments: Moments,
+    pub(super) output: &'a Mask,
+    norm: Norm,
+    /// The constants of lost channels; zero if there are none.
+    floors: Vec<f32>,
+    /// What becomes of them.
+    constants: Vec<f32>,
 }
 
 /// Room for one frame.
-struct Room {
+pub(super) struct Room {
     /// One channel after normalisation and ReLU, less the constant.
     x: Vec<f32>,
+    /// All of them, as [`Sizes::shift`] writes them.
     shifted: Vec<f32>,
     phases: Vec<f32>,
     views: Vec<f32>,
     padded: Vec<f32>,
     patches: Vec<f32>,
-    dx: Vec<f32>,
+    /// The gradient of `x`.
+    pub(super) dx: Vec<f32>,
 }
 
-/// One call: what all frames share.
-struct Call<'a> {
-    op: &'a Doubling,
-    sizes: Sizes,
-    norm: Norm,
-    /// The constants of lost channels; zero if there are none.
-    floors: Vec<f32>,
-    z: Planes<'a>,
-    kernels: &'a [f32],
-}
-
-/// One chunk's sums in the backward pass.
-struct Gradients {
-    room: Room,
-    kernels: Vec<f32>,
+/// Sums of the backward pass.
+pub(super) struct Gradients {
+    pub(super) room: Room,
+    pub(super) kernels: Vec<f32>,
     /// Of the output, over frames.
-    d_out: Vec<f32>,
-    sums: Sums,
+    pub(super) d_out: Vec<f32>,
+    pub(super) sums: Sums,
 }
 
 impl Room {
-    fn new(sizes: &Sizes) -> Self {
-        let (area, zeros) = (sizes.area(), |n: usize| vec![0.0; n]);
-        Self {
+    /// What [`Doubling::read`] has left of a kept channel at a cell.
+    #[inline(always)]
+    pub(super) fn x_at(&self, sizes: &Sizes, index: usize, cell: usize) -> f32 {
+        self.shifted[index * sizes.shifted() + sizes.unshifted() + cell]
+    }
+}
+
+impl<'a> Doubling<'a> {
+    pub(super) fn new(
+        sizes: Sizes,
+        kernels: &'a [f32],
+        [input, output]: [&'a Mask; 2],
+        norm: Norm,
+    ) -> Self {
+        let is_whole = input.keeps_all();
+        let floor = |b: &f32| if is_whole { 0.0 } else { b.max(0.0) };
+        let constants = vec![0.0; sizes.channels_out * sizes.out_area()];
+        let mut doubling = Self {
+            sizes,
+            kernels,
+            input,
+            output,
+            floors: norm.b.iter().map(floor).collect(),
+            norm,
+            constants,
+        };
+        if !is_whole {
+            let (mut room, mut out) = (doubling.floors_in_room(), doubling.constants.clone());
+            let [inputs, outputs] = doubling.all_channels();
+            doubling.forward(&mut room, [&inputs, &outputs], &mut out);
+            doubling.constants = out;
+        }
+        doubling
+    }
+
+    pub(super) fn room(&self) -> Room {
+        let (sizes, zeros) = (&self.sizes, |n: usize| vec![0.0; n]);
+        let area = sizes.area();
+        Room {
             x: zeros(area),
             shifted: zeros(sizes.channels_in * sizes.shifted()),
             phases: zeros(sizes.channels_out * PHASES * area),
@@ -70,33 +100,6 @@ impl Room {
             dx: zeros(sizes.channels_in * area),
         }
     }
-}
-
-impl<'a> Call<'a> {
-    fn new(
-        op: &'a Doubling,
-        sizes: Sizes,
-        z: &'a [f32],
-        weights: &[f32],
-        kernels: &'a [f32],
-    ) -> Self {
-        let norm = Norm::new(weights, &op.moments, op.input.scale());
-        let is_whole = op.input.keeps_all();
-        let floor = |b: &f32| if is_whole { 0.0 } else { b.max(0.0) };
-        Self {
-            floors: norm.b.iter().map(floor).collect(),
-            z: Planes::new(z, sizes.area(), &op.input),
-            op,
-            sizes,
-            norm,
-            kernels,
-        }
-    }
-
-    /// Numbers of an output channel.
-    fn out_area(&self) -> usize {
-        PHASES * self.sizes.area()
-    }
 
     /// Every input and output channel.
     fn all_channels(&self) -> [Vec<usize>; 2] {
@@ -104,21 +107,24 @@ impl<'a> Call<'a> {
     }
 
     /// The constants as a frame.
-    fn write_floors(&self, room: &mut Room) {
+    fn floors_in_room(&self) -> Room {
+        let mut room = self.room();
         let shifted = room.shifted.chunks_exact_mut(self.sizes.shifted());
         for (floor, shifted) in self.floors.iter().zip(shifted) {
             room.x.fill(*floor);
             self.sizes.shift(&room.x, shifted);
         }
+        room
     }
 
     /// A frame's kept channels, normalised and rectified, less the constants.
     #[inline(always)]
-    fn read(&self, frame: usize, room: &mut Room) {
+    pub(super) fn read(&self, frame: usize, z: &Frames, room: &mut Room) {
         let shifted = room.shifted.chunks_exact_mut(self.sizes.shifted());
-        for ((channel, z), shifted) in self.z.kept(frame).zip(shifted) {
-            let (a, b) = (self.norm.a[channel], self.norm.b[channel]);
-            let floor = self.floors[channel];
+        let z = z.frame(frame).chunks_exact(self.sizes.area());
+        for ((channel, z), shifted) in self.input.kept(frame).iter().zip(z).zip(shifted) {
+            let (a, b) = (self.norm.a[*channel], self.norm.b[*channel]);
+            let floor = self.floors[*channel];
             for (x, z) in room.x.iter_mut().zip(z) {
                 *x = (a * z + b).max(0.0) - floor;
             }
@@ -128,25 +134,22 @@ impl<'a> Call<'a> {
 
     /// Where the kernels of some inputs begin.
     fn kernels_of(&self, inputs: &[usize]) -> Vec<usize> {
-        let places = inputs
-            .iter()
-            .map(|input| input * self.sizes.channels_out * TAPS);
-        places.collect()
+        let length = self.sizes.channels_out * TAPS;
+        inputs.iter().map(|input| input * length).collect()
     }
 
     /// What becomes of the frame in `room` of some channels, plus what becomes of the constants.
     #[inline(always)]
-    fn forward(
+    pub(super) fn forward(
         &self,
         room: &mut Room,
         [inputs, outputs]: [&[usize]; 2],
-        constants: &[f32],
         out: &mut [f32],
     ) {
-        let (sizes, area) = (&self.sizes, self.sizes.area());
+        let (sizes, area, out_area) = (&self.sizes, self.sizes.area(), self.sizes.out_area());
         let (kernels, shifted) = (self.kernels_of(inputs), sizes.shifted());
         let rows: Vec<usize> = outputs.iter().map(|output| output * TAPS).collect();
-        room.phases.fill(0.0);
+        let to = steps(outputs.len(), out_area);
         for phase in 0..PHASES {
             let terms = sizes.terms(phase);
             let terms = kernels.iter().enumerate().flat_map(|(index, kernel)| {
@@ -163,21 +166,63 @@ impl<'a> Call<'a> {
                 terms: &right_terms,
                 cols: area,
             };
-            let to = steps(outputs.len(), PHASES * area);
-            add_product(&mut room.phases[phase * area..], &to, left, right);
+            product(&mut room.phases[phase * area..], &to, left, right);
         }
-        let phases = room.phases.chunks_exact(PHASES * area);
-        let out = out.chunks_exact_mut(PHASES * area);
+        let phases = room.phases.chunks_exact(out_area);
+        let out = out.chunks_exact_mut(out_area);
         for ((output, phases), out) in outputs.iter().zip(phases).zip(out) {
-            let start = &constants[output * PHASES * area..][..PHASES * area];
+            let start = &self.constants[output * out_area..][..out_area];
             sizes.interleave(phases, start, out);
         }
+    }
+
+    /// What becomes of the frame in `room` at one cell.
+    #[inline(always)]
+    pub(super) fn logits_at(
+        &self,
+        [row, col]: [usize; 2],
+        frame: usize,
+        room: &Room,
+        logits: &mut [f32],
+    ) {
+        let (sizes, out_area) = (&self.sizes, self.sizes.out_area());
+        for (state, logit) in logits.iter_mut().enumerate() {
+            *logit = self.constants[state * out_area + row * 2 * sizes.cols + col];
+        }
+        for (tap, cell) in sizes.meets(row, col) {
+            for (index, channel) in self.input.kept(frame).iter().enumerate() {
+                let x = room.x_at(sizes, index, cell);
+                let kernels = &self.kernels[channel * sizes.channels_out * TAPS..];
+                let logits = logits.iter_mut().zip(kernels.chunks_exact(TAPS));
+                logits.for_each(|(logit, kernel)| *logit += kernel[tap] * x);
+            }
+        }
+    }
+
+    /// The results of all frames, and the sums of their numbers and squares.
+    pub(super) fn all_frames(&self, z: &Frames) -> (Frames, Sums) {
+        let (input, output, area) = (self.input, self.output, self.sizes.out_area());
+        let (out, chunks) = frames(
+            input.n_frames(),
+            |frame| output.kept(frame).len() * area,
+            || (self.room(), Sums::new(self.sizes.channels_out)),
+            #[inline(always)]
+            |(room, sums), frame, out| {
+                self.read(frame, z, room);
+                self.forward(room, [input.kept(frame), output.kept(frame)], out);
+                for (channel, out) in output.kept(frame).iter().zip(out.chunks_exact(area)) {
+                    sums.add(*channel, out, out);
+                }
+            },
+        );
+        let sums: Vec<Sums> = chunks.into_iter().map(|(_, sums)| sums).collect();
+        (out, Sums::total(&sums))
     }
 
     /// From the gradient of some outputs, that of the frame in `room`, in `room.dx`, and adds that of the
     /// kernels.
     #[inline(always)]
-    fn backward(
+    pub(super) fn backward(
         &self,
         room: &mut Room,
         [inputs, outputs]: [&[usize]; 2],
@@ -186,7 +231,7 @@ impl<'a> Call<'a> {
     ) {
         let (sizes, area) = (&self.sizes, self.sizes.area());
         let (kernels, views) = (self.kernels_of(inputs), sizes.views());
-        let d_out = d_out.chunks_exact(PHASES * area);
+        let d_out = d_out.chunks_exact(sizes.out_area());
         for (d_out, views) in d_out.clone().zip(room.views.chunks_exact_mut(views)) {
             sizes.split(d_out, views);
         }
@@ -204,12 +249,23 @@ impl<'a> Call<'a> {
             terms: &right_terms,
             cols: area,
         };
-        let to = steps(inputs.len(), area);
-        room.dx.fill(0.0);
-        add_product(&mut room.dx, &to, left, right);
+        product(&mut room.dx, &steps(inputs.len(), area), left, right);
+        self.add_kernel_gradient(room, [&kernels, outputs], d_out, d_kernels);
+    }
+
+    /// Adds the gradient of the kernels that begin at `kernels`, those of the inputs in `room`.
+    #[inline(always)]
+    fn add_kernel_gradient<'b>(
+        &self,
+        room: &mut Room,
+        [kernels, outputs]: [&[usize]; 2],
+        d_out: impl Iterator<Item = &'b [f32]>,
+        d_kernels: &mut [f32],
+    ) {
+        let (sizes, area) = (&self.sizes, self.sizes.area());
         let x = Left {
             numbers: &room.shifted[sizes.unshifted()..],
-            rows: &steps(inputs.len(), sizes.shifted()),
+            rows: &steps(kernels.len(), sizes.shifted()),
             terms: &steps(area, 1),
         };
         let cells = steps(area, TAPS);
@@ -220,168 +276,102 @@ impl<'a> Call<'a> {
                 terms: &cells,
                 cols: TAPS,
             };
-            add_product(&mut d_kernels[output * TAPS..], &kernels, x, right);
+            add_product(&mut d_kernels[output * TAPS..], kernels, x, right);
         }
     }
 
-    /// What becomes of the constants.
-    fn output_of_floors(&self) -> Vec<f32> {
-        let zeros = vec![0.0; self.sizes.channels_out * self.out_area()];
-        let mut out = zeros.clone();
-        if !self.op.input.keeps_all() {
-            let (mut room, [inputs, outputs]) = (Room::new(&self.sizes), self.all_channels());
-            self.write_floors(&mut room);
-            self.forward(&mut room, [&inputs, &outputs], &zeros, &mut out);
-        }
-        out
-    }
-
-    fn all_frames(&self) -> Vec<f32> {
-        let (constants, area) = (self.output_of_floors(), self.out_area());
-        let [input, output] = [&self.op.input, &self.op.output];
-        let mut out = vec![0.0; output.start(output.n_frames()) * area];
-        let new = || Room::new(&self.sizes);
-        let start = |frame: usize| output.start(frame) * area;
-        frames(
-            &mut out,
-            input.n_frames(),
-            start,
-            new,
-            #[inline(always)]
-            |room, frame, out| {
-                self.read(frame, room);
-                let channels = [input.kept(frame), output.kept(frame)];
-                self.forward(room, channels, &constants, out);
-            },
-        );
-        out
-    }
-
-    /// Gradients of `z`, of `[gamma; beta]` and of the kernels.
-    fn gradients(&self, d_out: &[f32]) -> [Vec<f32>; 3] {
-        let mut dz = vec![0.0; self.z.len()];
-        let new = || Gradients {
-            room: Room::new(&self.sizes),
+    pub(super) fn gradients(&self) -> Gradients {
+        Gradients {
+            room: self.room(),
             kernels: vec![0.0; self.kernels.len()],
-            d_out: vec![0.0; self.sizes.channels_out * self.out_area()],
+            d_out: vec![0.0; self.sizes.channels_out * self.sizes.out_area()],
             sums: Sums::new(self.sizes.channels_in),
-        };
-        let n_frames = self.op.input.n_frames();
-        let start = |frame| self.z.start(frame);
-        let chunks = frames(
-            &mut dz,
-            n_frames,
-            start,
-            new,
-            #[inline(always)]
-            |chunk, frame, dz| {
-                let d_out = &d_out[self.op.output.start(frame) * self.out_area()..];
-                self.gradients_of_frame(chunk, frame, d_out, dz);
-            },
-        );
+        }
+    }
+
+    /// All gradients of the frame in `room` from that of its kept outputs: the one behind the normalisation in
+    /// `dy`.
+    #[inline(always)]
+    pub(super) fn backward_of_frame(
+        &self,
+        to: &mut Gradients,
+        (frame, z): (usize, &Frames),
+        d_out: &[f32],
+        dy: &mut [f32],
+    ) {
+        let channels = [self.input.kept(frame), self.output.kept(frame)];
+        self.backward(&mut to.room, channels, d_out, &mut to.kernels);
+        self.rectify(to, (frame, z), dy);
+        let area = self.sizes.out_area();
+        for (output, d_out) in channels[1].iter().zip(d_out.chunks_exact(area)) {
+            add(&mut to.d_out[output * area..][..area], d_out);
+        }
+    }
+
+    /// Takes `room.dx` back through the ReLU, and adds it to the normalisation's sums.
+    #[inline(always)]
+    pub(super) fn rectify(&self, to: &mut Gradients, (frame, z): (usize, &Frames), dy: &mut [f32]) {
+        let area = self.sizes.area();
+        let planes = z.frame(frame).chunks_exact(area);
+        let planes = planes.zip(dy.chunks_exact_mut(area));
+        let dx = to.room.dx.chunks_exact(area);
+        for ((channel, dx), (z, dy)) in self.input.kept(frame).iter().zip(dx).zip(planes) {
+            let (a, b) = (self.norm.a[*channel], self.norm.b[*channel]);
+            for (dy, (z, dx)) in dy.iter_mut().zip(z.iter().zip(dx)) {
+                *dy = if a * z + b > 0.0 { *dx } else { 0.0 };
+            }
+            to.sums.add(*channel, dy, z);
+            if !self.input.keeps_all() {
+                // What lost positions get is that of all, less this.
+                to.sums.lost[*channel] -= f64::from(sum(dx));
+            }
+        }
+    }
+
+    /// The chunks' gradients of the kernels and through the normalisation, with those of the constants.
+    pub(super) fn finish(&self, chunks: Vec<Gradients>) -> (Vec<f32>, NormGradient) {
         let (mut kernels, mut d_outs, mut sums) = (vec![], vec![], vec![]);
         for chunk in chunks {
             kernels.push(chunk.kernels);
             d_outs.push(chunk.d_out);
             sums.push(chunk.sums);
         }
-        let (mut d_kernels, mut sums) = (total(kernels), Sums::total(sums));
-        if !self.op.input.keeps_all() {
-            self.gradients_of_floors(&total(d_outs), &mut d_kernels, &mut sums);
+        let (mut d_kernels, mut sums) = (total(kernels), Sums::total(&sums));
+        if !self.input.keeps_all() {
+            self.backward_of_floors(&total(d_outs), &mut d_kernels, &mut sums);
         }
-        let (d_weights, terms) = self.norm.backward(&sums);
-        finish(&terms, &self.z, &mut dz);
-        [dz, d_weights, d_kernels]
-    }
-
-    /// Leaves the gradients behind the normalisation in `dz`.
-    #[inline(always)]
-    fn gradients_of_frame(
-        &self,
-        chunk: &mut Gradients,
-        frame: usize,
-        d_out: &[f32],
-        dz: &mut [f32],
-    ) {
-        let area = self.sizes.area();
-        let channels = [self.op.input.kept(frame), self.op.output.kept(frame)];
-        self.read(frame, &mut chunk.room);
-        self.backward(&mut chunk.room, channels, d_out, &mut chunk.kernels);
-        let dx = chunk.room.dx.chunks_exact(area);
-        for (index, ((channel, z), dx)) in self.z.kept(frame).zip(dx).enumerate() {
-            let dz = &mut dz[self.z.place(frame, index)..][..area];
-            let (a, b) = (self.norm.a[channel], self.norm.b[channel]);
-            for (dz, (z, dx)) in dz.iter_mut().zip(z.iter().zip(dx)) {
-                *dz = if a * z + b > 0.0 { *dx } else { 0.0 };
-            }
-            chunk.sums.add(channel, dz, z);
-            if !self.op.input.keeps_all() {
-                // What lost positions get is that of all, less this.
-                chunk.sums.lost[channel] -= f64::from(dx.iter().sum::<f32>());
-            }
-        }
-        let area = self.out_area();
-        for (output, d_out) in channels[1].iter().zip(d_out.chunks_exact(area)) {
-            add(&mut chunk.d_out[output * area..][..area], d_out);
-        }
+        (d_kernels, self.norm.backward(&sums))
     }
 
     /// The constants' part: `d_out` is the sum over frames.
-    fn gradients_of_floors(&self, d_out: &[f32], d_kernels: &mut [f32], sums: &mut Sums) {
-        let (mut room, [inputs, outputs]) = (Room::new(&self.sizes), self.all_channels());
-        self.write_floors(&mut room);
+    fn backward_of_floors(&self, d_out: &[f32], d_kernels: &mut [f32], sums: &mut Sums) {
+        let (mut room, [inputs, outputs]) = (self.floors_in_room(), self.all_channels());
         self.backward(&mut room, [&inputs, &outputs], d_out, d_kernels);
         let planes = room.dx.chunks_exact(self.sizes.area());
         for (channel, dx) in planes.enumerate() {
-            let lost = sums.lost[channel] + f64::from(dx.iter().sum::<f32>());
-            sums.lost[channel] = if self.norm.b[channel] > 0.0 {
-                lost
-            } else {
-                0.0
-            };
+            let lost = sums.lost[channel] + f64::from(sum(dx));
+            let is_above = self.norm.b[channel] > 0.0;
+            sums.lost[channel] = if is_above { lost } else { 0.0 };
         }
     }
-}
 
-impl CustomOp3 for Doubling {
-    fn name(&self) -> &'static str {
-        "doubling"
-    }
-
-    fn cpu_fwd(
+    /// Puts `dz` in place of a frame's `dy`.
+    #[inline(always)]
+    pub(super) fn normalise_gradient(
         &self,
-        z: &CpuStorage,
-        z_layout: &Layout,
-        weights: &CpuStorage,
-        weights_layout: &Layout,
-        kernels: &CpuStorage,
-        kernels_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let sizes = Sizes::new(z_layout.dims(), kernels_layout.dims());
-        let (z, kernels) = (slice(z, z_layout)?, slice(kernels, kernels_layout)?);
-        let call = Call::new(self, sizes, z, slice(weights, weights_layout)?, kernels);
-        let n_planes = self.output.start(self.output.n_frames());
-        let dims = (n_planes, 2 * sizes.rows, 2 * sizes.cols);
-        Ok((CpuStorage::F32(call.all_frames()), dims.into()))
-    }
-
-    fn bwd(
-        &self,
-        z: &Tensor,
-        weights: &Tensor,
-        kernels: &Tensor,
-        _out: &Tensor,
-        d_out: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let sizes = Sizes::new(z.dims(), kernels.dims());
-        let d_out = d_out.contiguous()?;
-        let arguments = [numbers(z)?, numbers(weights)?, numbers(kernels)?];
-        let call = Call::new(self, sizes, &arguments[0], &arguments[1], &arguments[2]);
-        let [dz, d_weights, d_kernels] = call.gradients(&numbers(&d_out)?);
-        Ok((
-            Some(tensor(dz, z.shape())?),
-            Some(tensor(d_weights, weights.shape())?),
-            Some(tensor(d_kernels, kernels.shape())?),
-        ))
+        gradient: &NormGradient,
+        (frame, z): (usize, &Frames),
+        dy: &[f32],
+        dz: &mut [f32],
+    ) {
+        let area = self.sizes.area();
+        let planes = z.frame(frame).chunks_exact(area);
+        let planes = planes.zip(dy.chunks_exact(area).zip(dz.chunks_exact_mut(area)));
+        for (channel, (z, (dy, dz))) in self.input.kept(frame).iter().zip(planes) {
+            let [p, q, r] = gradient.terms[*channel];
+            for (dz, (dy, z)) in dz.iter_mut().zip(dy.iter().zip(z)) {
+                *dz = p * dy + q * z + r;
+            }
+        }
     }
 }

@@ -1,88 +1,95 @@
 //! A GRU over a sequence as one operator, from what its inputs add to the gates.
 
-use super::cpu::{add, add_scaled, dot, numbers, slice, tensor};
-use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor};
+use super::cpu::{add, add_scaled, derived, numbers};
+use candle_core::{Result, Tensor};
 use protocol::vectors::vectorised;
 
-/// Arguments: `W_ih x + b_ih` of all steps `[steps, 3 n]`, `W_hh [3 n, n]` and `b_hh [3 n]`, gates in torch's
-/// order (r, z, n). The result is `h` of all steps, `[steps, n]`.
-pub(crate) struct GruSequence {
-    /// `h` before the first step.
-    pub(crate) first: Vec<f32>,
+struct Gru {
+    /// Length of `h`.
+    n: usize,
+    /// `W_hh [3 n, n]`.
+    w: Vec<f32>,
+    /// `h` before each step, and behind the last.
+    h: Vec<f32>,
+    /// What each step computes: r, z, the candidate and `W_hn h + b_hn`.
+    steps: Vec<f32>,
 }
 
-/// What one step computes.
-struct Step {
-    r: Vec<f32>,
-    z: Vec<f32>,
-    candidate: Vec<f32>,
-    /// `W_hn h + b_hn`.
-    recurrent: Vec<f32>,
+/// `h` of all steps, `[steps, n]`, from the one before the first. Arguments: `W_ih x + b_ih` of all steps
+/// `[steps, 3 n]`, `W_hh [3 n, n]` and `b_hh [3 n]`, gates in torch's order (r, z, n).
+pub(crate) fn gru_sequence(
+    inputs: &Tensor,
+    w: &Tensor,
+    b: &Tensor,
+    first: &[f32],
+) -> Result<Tensor> {
+    let n = first.len();
+    let mut gru = Gru {
+        n,
+        w: numbers(w)?.to_vec(),
+        h: first.to_vec(),
+        steps: Vec::new(),
+    };
+    let (x, bias) = (numbers(inputs)?, numbers(b)?);
+    vectorised(
+        #[inline(always)]
+        || gru.forward(&x, &bias),
+    );
+    let (dims, out) = ((inputs.dim(0)?, n), gru.h[n..].to_vec());
+    derived(&[inputs, w, b], dims, out, move |d_out| {
+        vectorised(
+            #[inline(always)]
+            || gru.backward(d_out),
+        )
+    })
 }
 
-#[derive(Clone, Copy)]
-struct Weights<'a> {
-    w: &'a [f32],
-    b: &'a [f32],
-}
-
-impl Weights<'_> {
+impl Gru {
     #[inline(always)]
-    fn step(&self, input: &[f32], h: &[f32]) -> Step {
-        let n = h.len();
-        let product = |row: usize| self.b[row] + dot(&self.w[row * n..][..n], h);
+    fn forward(&mut self, inputs: &[f32], b: &[f32]) {
+        let n = self.n;
+        let places = 0..self.w.len();
+        let columns: Vec<f32> = places
+            .map(|at| self.w[at % (3 * n) * n + at / (3 * n)])
+            .collect();
         let sigmoid = |x: f32| 1.0 / (1.0 + (-x).exp());
-        let gate = |row: usize| sigmoid(input[row] + product(row));
-        let r: Vec<f32> = (0..n).map(gate).collect();
-        let recurrent: Vec<f32> = (2 * n..3 * n).map(product).collect();
-        let candidate = |i: usize| (input[2 * n + i] + r[i] * recurrent[i]).tanh();
-        Step {
-            z: (n..2 * n).map(gate).collect(),
-            candidate: (0..n).map(candidate).collect(),
-            r,
-            recurrent,
-        }
-    }
-}
-
-impl GruSequence {
-    #[inline(always)]
-    fn forward(&self, inputs: &[f32], weights: Weights<'_>) -> Vec<f32> {
-        let n = self.first.len();
-        let (mut h, mut out) = (self.first.clone(), Vec::with_capacity(inputs.len() / 3));
+        let (mut h, mut gates) = (self.h.clone(), vec![0.0; 3 * n]);
         for input in inputs.chunks_exact(3 * n) {
-            let step = weights.step(input, &h);
-            for ((h, z), candidate) in h.iter_mut().zip(&step.z).zip(&step.candidate) {
-                *h = (1.0 - z) * candidate + z * *h;
+            gates.copy_from_slice(b);
+            for (h, column) in h.iter().zip(columns.chunks_exact(3 * n)) {
+                add_scaled(&mut gates, *h, column);
             }
-            out.extend_from_slice(&h);
+            let step = self.steps.len();
+            self.steps.resize(step + 4 * n, 0.0);
+            let step = &mut self.steps[step..];
+            for at in 0..2 * n {
+                step[at] = sigmoid(input[at] + gates[at]);
+            }
+            for i in 0..n {
+                let (r, z, recurrent) = (step[i], step[n + i], gates[2 * n + i]);
+                let candidate = (input[2 * n + i] + r * recurrent).tanh();
+                (step[2 * n + i], step[3 * n + i]) = (candidate, recurrent);
+                h[i] = (1.0 - z) * candidate + z * h[i];
+            }
+            self.h.extend_from_slice(&h);
         }
-        out
     }
 
     /// Gradients of the inputs, `W_hh` and `b_hh`.
     #[inline(always)]
-    fn backward(
-        &self,
-        inputs: &[f32],
-        weights: Weights<'_>,
-        out: &[f32],
-        d_out: &[f32],
-    ) -> [Vec<f32>; 3] {
-        let n = self.first.len();
-        let mut d_inputs = vec![0.0; inputs.len()];
-        let (mut dw, mut db) = (vec![0.0; weights.w.len()], vec![0.0; 3 * n]);
+    fn backward(&self, d_out: &[f32]) -> Vec<f32> {
+        let n = self.n;
+        let mut d_inputs = vec![0.0; 3 * d_out.len()];
+        let (mut dw, mut db) = (vec![0.0; self.w.len()], vec![0.0; 3 * n]);
         let (mut dh, mut d_gates) = (vec![0.0; n], vec![0.0; 3 * n]);
-        for at in (0..out.len() / n).rev() {
-            let before = at.checked_sub(1);
-            let h = before.map_or(&self.first[..], |before| &out[before * n..][..n]);
-            let step = weights.step(&inputs[at * 3 * n..][..3 * n], h);
+        for at in (0..d_out.len() / n).rev() {
+            let (h, step) = (&self.h[at * n..][..n], &self.steps[at * 4 * n..][..4 * n]);
             let d_input = &mut d_inputs[at * 3 * n..][..3 * n];
             for i in 0..n {
-                let (r, z, candidate) = (step.r[i], step.z[i], step.candidate[i]);
+                let (r, z, candidate) = (step[i], step[n + i], step[2 * n + i]);
                 let d = dh[i] + d_out[at * n + i];
                 let d_candidate = d * (1.0 - z) * (1.0 - candidate * candidate);
-                d_input[i] = d_candidate * step.recurrent[i] * r * (1.0 - r);
+                d_input[i] = d_candidate * step[3 * n + i] * r * (1.0 - r);
                 d_input[n + i] = d * (h[i] - candidate) * z * (1.0 - z);
                 d_input[2 * n + i] = d_candidate;
                 d_gates[2 * n + i] = d_candidate * r;
@@ -92,63 +99,9 @@ impl GruSequence {
             add(&mut db, &d_gates);
             for (row, d) in d_gates.iter().enumerate() {
                 add_scaled(&mut dw[row * n..][..n], *d, h);
-                add_scaled(&mut dh, *d, &weights.w[row * n..][..n]);
+                add_scaled(&mut dh, *d, &self.w[row * n..][..n]);
             }
         }
-        [d_inputs, dw, db]
-    }
-}
-
-impl CustomOp3 for GruSequence {
-    fn name(&self) -> &'static str {
-        "gru-sequence"
-    }
-
-    fn cpu_fwd(
-        &self,
-        inputs: &CpuStorage,
-        inputs_layout: &Layout,
-        w: &CpuStorage,
-        w_layout: &Layout,
-        b: &CpuStorage,
-        b_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let inputs = slice(inputs, inputs_layout)?;
-        let weights = Weights {
-            w: slice(w, w_layout)?,
-            b: slice(b, b_layout)?,
-        };
-        let out = vectorised(
-            #[inline(always)]
-            || self.forward(inputs, weights),
-        );
-        let n_steps = inputs_layout.dims()[0];
-        Ok((CpuStorage::F32(out), (n_steps, self.first.len()).into()))
-    }
-
-    fn bwd(
-        &self,
-        inputs: &Tensor,
-        w: &Tensor,
-        b: &Tensor,
-        out: &Tensor,
-        d_out: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let d_out = d_out.contiguous()?;
-        let (x, out, d_out) = (numbers(inputs)?, numbers(out)?, numbers(&d_out)?);
-        let arguments = [numbers(w)?, numbers(b)?];
-        let weights = Weights {
-            w: &arguments[0],
-            b: &arguments[1],
-        };
-        let [d_inputs, dw, db] = vectorised(
-            #[inline(always)]
-            || self.backward(&x, weights, &out, &d_out),
-        );
-        Ok((
-            Some(tensor(d_inputs, inputs.shape())?),
-            Some(tensor(dw, w.shape())?),
-            Some(tensor(db, b.shape())?),
-        ))
+        [d_inputs, dw, db].concat()
     }
 }

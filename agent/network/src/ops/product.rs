@@ -24,26 +24,37 @@ pub(super) fn steps(n: usize, step: usize) -> Vec<usize> {
     (0..n).map(|at| at * step).collect()
 }
 
-/// `out += left right`; each row of `out` begins at one of `rows`.
+/// `out = left right`; each row of `out` begins at one of `rows`.
 ///
 /// # Panics
 /// If a number lies outside its slice.
+pub(super) fn product(out: &mut [f32], rows: &[usize], left: Left<'_>, right: Right<'_>) {
+    compute(out, rows, left, right, false);
+}
+
+/// `out += left right`, as [`product`].
 pub(super) fn add_product(out: &mut [f32], rows: &[usize], left: Left<'_>, right: Right<'_>) {
-    let last = |places: &[usize]| places.iter().max().copied();
-    let (Some(row), Some(term)) = (last(left.rows), last(left.terms)) else {
-        return;
-    };
-    let (from, to) = (last(right.terms).unwrap_or(0), last(rows).unwrap_or(0));
+    compute(out, rows, left, right, true);
+}
+
+fn compute(out: &mut [f32], rows: &[usize], left: Left<'_>, right: Right<'_>, adds: bool) {
+    // What lies behind the last number of some places.
+    let end = |places: &[usize]| places.iter().max().map_or(0, |last| last + 1);
+    let (n_left, n_right) = (end(left.rows) + end(left.terms), end(right.terms));
     assert_eq!(rows.len(), left.rows.len(), "rows of a product");
     assert_eq!(left.terms.len(), right.terms.len(), "terms of a product");
-    assert!(row + term < left.numbers.len(), "left factor");
-    assert!(from + right.cols <= right.numbers.len(), "right factor");
-    assert!(to + right.cols <= out.len(), "product");
+    assert!(n_left <= left.numbers.len() + 1, "left factor");
+    assert!(
+        n_right + right.cols <= right.numbers.len() + 1,
+        "right factor"
+    );
+    assert!(end(rows) + right.cols <= out.len() + 1, "product");
     Arch::new().dispatch(Call {
         out,
         rows,
         left,
         right,
+        adds,
     });
 }
 
@@ -53,6 +64,8 @@ struct Call<'a> {
     rows: &'a [usize],
     left: Left<'a>,
     right: Right<'a>,
+    /// Whether the product is added to what is there.
+    adds: bool,
 }
 
 impl WithSimd for Call<'_> {
@@ -60,69 +73,92 @@ impl WithSimd for Call<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
-        let cols = self.right.cols;
-        let wide = 2 * S::F32_LANES;
+        let (cols, wide) = (self.right.cols, 2 * S::F32_LANES);
         let whole = cols / wide * wide;
         for col in (0..whole).step_by(wide) {
             // AVX2 has 16 registers, others of its kind 32.
-            match S::F32_LANES {
-                _ if self.rows.len() <= 4 => self.columns::<S, 4, 2, true>(simd, col),
-                8 => self.columns::<S, 6, 2, true>(simd, col),
-                _ => self.columns::<S, 8, 2, true>(simd, col),
-            }
+            let most = if S::F32_LANES == 8 { 6 } else { 8 };
+            self.columns::<S, 2, true>(simd, col, most);
         }
         for col in (whole..cols).step_by(S::F32_LANES) {
             match col + S::F32_LANES <= cols {
-                true => self.columns::<S, 8, 1, true>(simd, col),
-                false => self.columns::<S, 8, 1, false>(simd, col),
+                true => self.columns::<S, 1, true>(simd, col, 8),
+                false => self.columns::<S, 1, false>(simd, col, 8),
             }
         }
     }
 }
 
 impl Call<'_> {
-    /// `VECTORS` vectors of columns, `ROWS` rows at a time, whose sums stay in registers. The vectors are whole,
-    /// or the row ends in the last.
+    /// `VECTORS` vectors of columns, in blocks of nearly as many rows, `most` or less.
+    #[inline(always)]
+    fn columns<S: Simd, const VECTORS: usize, const WHOLE: bool>(
+        &mut self,
+        simd: S,
+        col: usize,
+        most: usize,
+    ) {
+        let n_rows = self.rows.len();
+        let n_blocks = n_rows.div_ceil(most).max(1);
+        for block in 0..n_blocks {
+            let first = n_rows * block / n_blocks;
+            match n_rows * (block + 1) / n_blocks - first {
+                0 => {}
+                1 => self.block::<S, 1, VECTORS, WHOLE>(simd, col, first),
+                2 => self.block::<S, 2, VECTORS, WHOLE>(simd, col, first),
+                3 => self.block::<S, 3, VECTORS, WHOLE>(simd, col, first),
+                4 => self.block::<S, 4, VECTORS, WHOLE>(simd, col, first),
+                5 => self.block::<S, 5, VECTORS, WHOLE>(simd, col, first),
+                6 => self.block::<S, 6, VECTORS, WHOLE>(simd, col, first),
+                7 => self.block::<S, 7, VECTORS, WHOLE>(simd, col, first),
+                _ => self.block::<S, 8, VECTORS, WHOLE>(simd, col, first),
+            }
+        }
+    }
+
+    /// `ROWS` rows, whose sums stay in registers. The vectors are whole, or the row ends in the last.
     #[inline(always)]
     #[expect(
         unsafe_code,
         reason = "checks in the innermost loop take as long as it"
     )]
-    fn columns<S: Simd, const ROWS: usize, const VECTORS: usize, const WHOLE: bool>(
+    fn block<S: Simd, const ROWS: usize, const VECTORS: usize, const WHOLE: bool>(
         &mut self,
         simd: S,
         col: usize,
+        first: usize,
     ) {
-        let left = self.left.numbers.as_ptr();
         let right = self.right.numbers.as_ptr();
         let vector = Vector::<WHOLE>(self.right.cols - col);
-        for (places, rows) in self.left.rows.chunks(ROWS).zip(self.rows.chunks(ROWS)) {
-            // The last block computes its last row several times.
-            let mut from = [places[places.len() - 1]; ROWS];
-            from[..places.len()].copy_from_slice(places);
-            let mut sums = [[simd.splat_f32s(0.0); VECTORS]; ROWS];
-            for (term, at) in self.left.terms.iter().zip(self.right.terms) {
-                let mut numbers = [simd.splat_f32s(0.0); VECTORS];
-                for (index, numbers) in numbers.iter_mut().enumerate() {
-                    // SAFETY: `add_product` has checked all places.
-                    let at = unsafe { right.add(at + col + index * S::F32_LANES) };
-                    *numbers = vector.load(simd, at);
-                }
-                for row in 0..ROWS {
-                    // SAFETY: as above.
-                    let factor = simd.splat_f32s(unsafe { *left.add(from[row] + term) });
-                    for index in 0..VECTORS {
-                        let sum = sums[row][index];
-                        sums[row][index] = simd.mul_add_f32s(factor, numbers[index], sum);
-                    }
+        let mut left = [self.left.numbers.as_ptr(); ROWS];
+        for (left, row) in left.iter_mut().zip(&self.left.rows[first..]) {
+            // SAFETY: `compute` has checked all places.
+            *left = unsafe { left.add(*row) };
+        }
+        let mut sums = [[simd.splat_f32s(0.0); VECTORS]; ROWS];
+        for (term, at) in self.left.terms.iter().zip(self.right.terms) {
+            let mut numbers = [simd.splat_f32s(0.0); VECTORS];
+            for (index, numbers) in numbers.iter_mut().enumerate() {
+                // SAFETY: as above.
+                let at = unsafe { right.add(at + col + index * S::F32_LANES) };
+                *numbers = vector.load(simd, at);
+            }
+            for row in 0..ROWS {
+                // SAFETY: as above.
+                let factor = simd.splat_f32s(unsafe { *left[row].add(*term) });
+                for index in 0..VECTORS {
+                    let sum = sums[row][index];
+                    sums[row][index] = simd.mul_add_f32s(factor, numbers[index], sum);
                 }
             }
-            for (sums, row) in sums.iter().zip(rows) {
-                for (index, sum) in sums.iter().enumerate() {
-                    // SAFETY: as above.
-                    let to = unsafe { self.out.as_mut_ptr().add(row + col + index * S::F32_LANES) };
-                    vector.add(simd, to, *sum);
-                }
+        }
+        for (sums, row) in sums.iter().zip(&self.rows[first..]) {
+            for (index, sum) in sums.iter().enumerate() {
+                // SAFETY: as above.
+                let to = unsafe { self.out.as_mut_ptr().add(row + col + index * S::F32_LANES) };
+                let before = self.adds.then(|| vector.load(simd, to));
+                let sum = before.map_or(*sum, |before| simd.add_f32s(before, *sum));
+                vector.store(simd, to, sum);
             }
         }
     }
@@ -134,7 +170,7 @@ struct Vector<const WHOLE: bool>(usize);
 
 #[expect(
     unsafe_code,
-    reason = "only `Call::columns` uses it, where its places are checked"
+    reason = "only `Call::block` uses it, where its places are checked"
 )]
 impl<const WHOLE: bool> Vector<WHOLE> {
     #[inline(always)]
@@ -149,14 +185,14 @@ impl<const WHOLE: bool> Vector<WHOLE> {
     }
 
     #[inline(always)]
-    fn add<S: Simd>(self, simd: S, to: *mut f32, numbers: S::f32s) {
-        let sum = simd.add_f32s(self.load(simd, to), numbers);
+    fn store<S: Simd>(self, simd: S, to: *mut f32, numbers: S::f32s) {
         // SAFETY: as above.
         unsafe {
             match WHOLE {
-                true => to.cast::<S::f32s>().write_unaligned(sum),
+                true => to.cast::<S::f32s>().write_unaligned(numbers),
                 false => {
-                    simd.mask_store_ptr_f32s(simd.mask_between_m32s(0, self.0 as u32), to, sum)
+                    let mask = simd.mask_between_m32s(0, self.0 as u32);
+                    simd.mask_store_ptr_f32s(mask, to, numbers);
                 }
             }
         }
@@ -179,13 +215,14 @@ mod tests {
             let (left_terms, right_terms) = (steps(n_terms, 2), steps(n_terms, cols + 1));
             let left = numbers(2 * n_rows * n_terms, 3);
             let right = numbers(n_terms * (cols + 1), 7);
-            let mut out = numbers(n_rows * (cols + 2), 5);
-            let mut expected = out.clone();
+            let before = numbers(n_rows * (cols + 2), 5);
+            let (mut expected, mut sums) = (before.clone(), before.clone());
             for (row, to) in rows.iter().zip(&to) {
                 for col in 0..cols {
-                    for (a, b) in left_terms.iter().zip(&right_terms) {
-                        expected[to + col] += left[row + a] * right[b + col];
-                    }
+                    let terms = left_terms.iter().zip(&right_terms);
+                    let terms = terms.map(|(a, b)| left[row + a] * right[b + col]);
+                    expected[to + col] = terms.sum();
+                    sums[to + col] += expected[to + col];
                 }
             }
             let left = Left {
@@ -198,7 +235,10 @@ mod tests {
                 terms: &right_terms,
                 cols,
             };
+            let mut out = before.clone();
             add_product(&mut out, &to, left, right);
+            assert_eq!(out, sums, "{n_rows} {n_terms} {cols}");
+            product(&mut out, &to, left, right);
             assert_eq!(out, expected, "{n_rows} {n_terms} {cols}");
         }
     }

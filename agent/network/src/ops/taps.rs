@@ -23,19 +23,14 @@ pub(super) struct Sizes {
 }
 
 impl Sizes {
-    /// Of an input `[planes, rows, cols]` and kernels `[channels in, channels out, 4, 4]`.
-    pub(super) fn new(z: &[usize], kernels: &[usize]) -> Self {
-        Self {
-            channels_in: kernels[0],
-            channels_out: kernels[1],
-            rows: z[1],
-            cols: z[2],
-        }
-    }
-
     /// Cells of the input.
     pub(super) fn area(&self) -> usize {
         self.rows * self.cols
+    }
+
+    /// Cells of the output.
+    pub(super) fn out_area(&self) -> usize {
+        PHASES * self.area()
     }
 
     /// Numbers of an input that [`Self::shift`] has written.
@@ -71,6 +66,22 @@ impl Sizes {
             let shifted = (q + right) * (self.rows + 2) * cols + (p + down) * cols;
             (tap, shifted)
         })
+    }
+
+    /// The input cells that an output cell meets, each through a tap.
+    #[inline(always)]
+    pub(super) fn meets(&self, row: usize, col: usize) -> impl Iterator<Item = (usize, usize)> {
+        let (rows, cols) = (self.rows, self.cols);
+        // Rows and columns of the input, from one on.
+        let first = [row, col].map(|at| at / 2 + at % 2);
+        [[0, 0], [0, 1], [1, 0], [1, 1]]
+            .into_iter()
+            .filter_map(move |[down, right]| {
+                let tap = (3 - row % 2 - 2 * down) * SIDE + 3 - col % 2 - 2 * right;
+                let (row, col) = (first[0] + down, first[1] + right);
+                let is_inside = (1..=rows).contains(&row) && (1..=cols).contains(&col);
+                is_inside.then(|| (tap, (row - 1) * cols + col - 1))
+            })
     }
 
     /// Puts an output's phases together, each between `start`'s numbers.

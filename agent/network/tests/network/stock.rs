@@ -152,7 +152,6 @@ fn each_operator_alone_and_none() {
             decoder: false,
             ..all
         },
-        Stock { loss: false, ..all },
     ] {
         let case = Case {
             grid: [32, 32],
