@@ -1,6 +1,6 @@
 //! Parameters for a [`BayesFilter`](crate::estimation::BayesFilter) that are learned: weights `w`, observation matrix `O`
 //! and first belief that maximise the likelihood of what was seen ([`Trainer`]; no bias). Read `parameters`, then
-//! [`window`] for one pass and its derivatives, then [`trainer`].
+//! `window` for one pass and its derivatives, then `trainer`.
 //!
 //! What the data do not tell: the scale of `w` (eq. 3 divides it out), and the order and, in part, the
 //! meaning of the states. Two parameter sets that predict every observation alike cannot be told
