@@ -1,9 +1,9 @@
-"""Beam search on a belief that a network has corrected, learned from frames, in one file.
+"""Beam search on a filter's belief that a network corrects, in one file.
 
 python learned_belief.py --cpu-seconds 300 --evaluate 0..32 --out learned_belief
 
 The filter takes cells as independent: what is seen at one says nothing about those around it. The
-network learns what it says. It adds to the filter's log-probabilities, from what was last seen at
+network learns from frames what it says. It adds to the filter's log-probabilities, from what was last seen at
 each cell and around it, and its loss is how improbable the next observations were, under the
 model's observation matrix. Neither hidden states nor rewards are needed.
 """
