@@ -3,9 +3,9 @@
 python learned_belief.py --cpu-seconds 300 --evaluate 0..32 --out learned_belief
 
 The filter takes cells as independent: what is seen at one says nothing about those around it. The
-network learns from frames what it says. It adds to the filter's log-probabilities, from what was last seen at
-each cell and around it, and its loss is how improbable the next observations were, under the
-model's observation matrix. Neither hidden states nor rewards are needed.
+network learns from frames what it says. It adds to the filter's log-probabilities, from what was
+last seen at each cell and around it, and its loss is how improbable the next observations were,
+under the model's observation matrix. Neither hidden states nor rewards are needed.
 """
 
 from __future__ import annotations

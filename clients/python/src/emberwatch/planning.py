@@ -41,7 +41,7 @@ def beam_search(
         )
     n, n_rows, n_columns = values.shape
     reached_from = _neighbours(n_rows, n_columns)
-    flat, worlds = values.reshape(n, -1), np.arange(n)[:, np.newaxis]
+    flat, worlds = values.reshape(n, -1), np.arange(n, dtype=np.int64)[:, np.newaxis]
     cells = (robots[:, 0] * n_columns + robots[:, 1])[:, np.newaxis]
     seen = np.zeros((n, 1, n_rows * n_columns), np.bool_)
     if visited is not None:
@@ -49,7 +49,7 @@ def beam_search(
     scores, paths = np.zeros((n, 1)), np.empty((n, 1, 0), np.uint8)
     for _ in range(n_moves):
         reached = reached_from[cells].reshape(n, -1)
-        parents = np.repeat(np.arange(cells.shape[1]), 4)[np.newaxis]
+        parents = np.arange(4 * cells.shape[1], dtype=np.int64)[np.newaxis] // 4
         found = ~seen[worlds, parents, reached] * flat[worlds, reached]
         longer = scores[worlds, parents] + found + 1e-6 * rng.random(reached.shape)
         n_kept = min(width, longer.shape[1])
@@ -64,6 +64,6 @@ def beam_search(
 
 def _neighbours(n_rows: int, n_columns: int) -> NDArray[np.int64]:
     """The cell that each move leads to, `(H * W, 4)`: the same one at the edge."""
-    cells = np.stack(np.indices((n_rows, n_columns)), axis=-1).reshape(-1, 1, 2)
+    cells = np.moveaxis(np.indices((n_rows, n_columns)), 0, -1).reshape(-1, 1, 2)
     reached = (cells + _DIRECTIONS).clip(0, (n_rows - 1, n_columns - 1))
     return reached[..., 0] * n_columns + reached[..., 1]
