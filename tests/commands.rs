@@ -265,7 +265,7 @@ fn the_documented_prior_is_written() {
     let command = command.replace("FILE", file.to_str().expect("a plain path"));
     // Fewer and younger worlds than documented: it is the flags that are checked.
     let command = command.replace("--burn-in 10000", "--burn-in 10 --worlds 1");
-    let (_, flags) = command.split_once(' ').expect("program and flags");
+    let (_, flags) = command.trim().split_once(' ').expect("program and flags");
     agent(flags);
     assert!(file.is_file());
 }
