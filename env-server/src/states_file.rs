@@ -184,7 +184,8 @@ impl Sequences {
 
 fn read(path: &Path) -> Result<StatesFile, String> {
     let at = |path: &Path, error: &dyn Display| format!("{}: {error}", path.display());
-    let (files, description) = match path.is_dir() {
+    let metadata = path.metadata().map_err(|error| error.to_string())?;
+    let (files, description) = match metadata.is_dir() {
         true => (files_of(path)?, path.join("states.toml")),
         false => (vec![path.to_owned()], path.with_extension("toml")),
     };

@@ -256,6 +256,7 @@ fn what_is_no_file_is_refused() {
         assert!(error.contains(words), "{error:?} does not say {words:?}");
     };
     let gone = folder.path().join("gone.npz");
+    check(&gone, "gone.npz: No such file");
     write(gone.with_extension("toml"), DESCRIPTION).expect("write");
     check(&gone, "gone.npz: No such file");
     let empty = folder.path().join("empty");

@@ -19,7 +19,7 @@ pub enum DeviceKind {
 
 /// Why a device cannot be used.
 #[derive(Debug, ThisError)]
-#[error("device{0}")]
+#[error("{0}")]
 pub struct DeviceError(String);
 
 impl DeviceKind {
@@ -35,11 +35,11 @@ impl DeviceKind {
         };
         if !is_built {
             return Err(DeviceError(format!(
-                " {self}: expected a program that was built for it, got one without: build it with \
+                "device {self}: expected a program that was built for it, got one without: build it with \
                  `cargo build --release --features {self}`"
             )));
         }
-        let fails = |error: Error| format!(" {self}: expected one that works, got: {error}");
+        let fails = |error: Error| format!("device {self}: expected one that works, got: {error}");
         device(0).map_err(|error| DeviceError(fails(error)))
     }
 }
@@ -50,7 +50,9 @@ impl FromStr for DeviceKind {
     fn from_str(text: &str) -> Result<Self, DeviceError> {
         let mut kinds = [Self::Cpu, Self::Cuda, Self::Metal].into_iter();
         let kind = kinds.find(|kind| kind.to_string() == text);
-        kind.ok_or_else(|| DeviceError(format!(": expected cpu, cuda or metal, got {text:?}")))
+        kind.ok_or_else(|| {
+            DeviceError(format!("device: expected cpu, cuda or metal, got {text:?}"))
+        })
     }
 }
 

@@ -4,11 +4,14 @@ use protocol::channels::ChannelError;
 use protocol::connection::ConnectionError;
 use protocol::message::Status;
 
-/// Whether a server is away and may come.
+/// Whether a server is away, or the way to it is busy, and it may come.
 pub fn is_away(error: &ConnectionError) -> bool {
     match error {
         ConnectionError::ServerGone { .. } | ConnectionError::Timeout { .. } => true,
-        ConnectionError::Channel(channel) => matches!(channel, ChannelError::NoServer { .. }),
+        ConnectionError::Channel(channel) => matches!(
+            channel,
+            ChannelError::NoServer { .. } | ChannelError::Locked { .. }
+        ),
         _ => false,
     }
 }
@@ -41,5 +44,22 @@ pub fn refused(status: Status, detail: u64, message: String) -> ConnectionError 
         status,
         detail,
         message,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::Duration;
+
+    #[test]
+    fn agents_wait_on_while_a_lock_is_held() {
+        let locked = ChannelError::Locked {
+            path: "lock".into(),
+            limit: Duration::ZERO,
+            holder: "pid 1".into(),
+        };
+        assert!(is_away(&locked.into()));
+        assert!(!is_away(&ChannelError::InstanceName("a b".into()).into()));
     }
 }

@@ -231,5 +231,9 @@ mod tests {
         }
         let (what, value) = ("status", Status::ALL.len() as u32);
         assert_eq!(Status::try_from(value), Err(UnknownCode { what, value }));
+        for value in [0, 4, u32::MAX] {
+            let what = "operation";
+            assert_eq!(Operation::try_from(value), Err(UnknownCode { what, value }));
+        }
     }
 }

@@ -2,6 +2,7 @@
 
 use iceoryx2::prelude::ipc;
 use std::fmt::Debug;
+use std::time::Duration;
 use thiserror::Error;
 
 /// iceoryx2's inter-process flavour.
@@ -21,6 +22,18 @@ pub enum ChannelError {
         path: String,
         /// What was expected, and what is there.
         problem: String,
+    },
+    /// Another process had the lock of the channels' directory for too long.
+    #[error(
+        "channel directory {path}: expected the lock within {limit:?}, got it held by {holder}"
+    )]
+    Locked {
+        /// The lock's file.
+        path: String,
+        /// How long it was waited for.
+        limit: Duration,
+        /// Who has it.
+        holder: String,
     },
     /// No server runs on the instance.
     #[error(

@@ -151,8 +151,11 @@ mod tests {
             ..reply
         };
         for (reply, expected) in [(reply, 64 + 2 * (48 + 15)), (team, 64 + 2 * 48 + 15)] {
-            assert!(split_step_payload(&reply, &vec![0; expected]).is_ok());
-            assert_eq!(split_step_payload(&reply, &[0; 3]), Err(expected));
+            // In shared memory a payload begins at any address.
+            assert!(split_step_payload(&reply, &vec![0; expected + 1][1..]).is_ok());
+            for wrong in [3, expected - 1, expected + 1] {
+                assert_eq!(split_step_payload(&reply, &vec![0; wrong]), Err(expected));
+            }
         }
         let huge = StepReply {
             n_worlds: u32::MAX,

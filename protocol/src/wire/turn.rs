@@ -3,7 +3,7 @@
 //! During its turn no other process makes anything: what is unfinished was left by a dead one. The lock is a `flock`,
 //! which ends with its process.
 
-use super::directory::{directory_error, not_usable, own_channel_directory};
+use super::directory::{not_usable, own_channel_directory};
 use super::error::ChannelError;
 use super::process::process_state;
 use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, major, minor, open, stat};
@@ -123,9 +123,11 @@ fn wait(path: &Path, limit: Duration) -> Result<Option<OwnedFd>, ChannelError> {
             }
         }
         if elapsed > limit {
-            let pid = holder(&file).map_or("a process".into(), |pid| format!("pid {pid}"));
-            let problem = format!("expected the lock within {limit:?}, got it held by {pid}");
-            return Err(directory_error(path, problem));
+            return Err(ChannelError::Locked {
+                path: path.display().to_string(),
+                limit,
+                holder: holder(&file).map_or("a process".into(), |pid| format!("pid {pid}")),
+            });
         }
         std::thread::sleep(INTERVAL);
     }
@@ -169,6 +171,10 @@ mod tests {
         let refusal = wait(&path, Duration::from_millis(1)).expect_err("it is taken");
         let pid = format!("held by pid {}", std::process::id());
         assert!(refusal.to_string().contains(&pid), "{refusal}");
+        assert!(
+            matches!(refusal, ChannelError::Locked { .. }),
+            "agents wait on"
+        );
         std::fs::remove_file(&path).expect("remove it");
         let second = wait(&path, Duration::ZERO).expect("another file of that name");
         assert!(first.is_some() && second.is_some());

@@ -101,9 +101,8 @@ mod tests {
         check("decision", "decide reset", |text| {
             parse::<decisions::Request>(text.as_bytes()).is_ok()
         });
-        check("model", "line.toml sparse.toml wildfire.toml", |text| {
-            Model::from_toml(text).is_ok()
-        });
+        let models = "burnout.toml line.toml sparse.toml wildfire.toml";
+        check("model", models, |text| Model::from_toml(text).is_ok());
         let requests = "acquire belief fork hello leave_belief release renew reset reset_none \
                         restore shutdown snapshot status takeover";
         check("control_request", requests, |text| {

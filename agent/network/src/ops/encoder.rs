@@ -49,8 +49,8 @@ struct Gradients {
     x: Vec<f32>,
 }
 
-/// Features `[frames, channels * positions]`. `moments` gives those of a layer from those of the window; where
-/// they are none of the window's, there are no gradients.
+/// Features `[frames, channels * positions]`. `moments` gives those of a layer from those of the window. Without
+/// `trains` no gradient goes through.
 pub(crate) fn encode(
     window: &Window,
     layers: &[Layer<'_>],

@@ -121,12 +121,12 @@ impl FilterStudent {
 
     /// What robots that don't walk at random act by.
     fn policy(&self) -> Policy {
-        let estimator = match self.learned.tables.dimensions.sees_own_state {
-            false => EstimatorKind::Learned,
-            true => EstimatorKind::LearnedOwn,
+        let (name, estimator) = match self.learned.tables.dimensions.sees_own_state {
+            false => ("learned_beam", EstimatorKind::Learned),
+            true => ("learned_own_beam", EstimatorKind::LearnedOwn),
         };
         let target = Target::State(self.learned.target);
-        Policy::new("learned_beam", estimator, PlannerKind::Beam, target)
+        Policy::new(name, estimator, PlannerKind::Beam, target)
     }
 
     /// Worlds whose robots walk at random: all at first, some for good; none of a frozen student.

@@ -8,7 +8,9 @@ use crate::learning::student::decisions::{Decisions, DecisionsStudent};
 use crate::learning::student::filter::FilterStudent;
 use crate::learning::student::network::{NetworkStudent, Progress};
 use crate::learning::student::{Student, Worlds};
-use crate::planning::BasisKind;
+use crate::planning::action::{Action, ActionSet};
+use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
+use crate::planning::{BasisKind, Objective, PlanningProblem, Target};
 use crate::rollout::Robot;
 use protocol::client::Observation;
 use protocol::message::{RobotResult, WorldResult};
@@ -59,6 +61,74 @@ fn observation(step: u64) -> Observation {
     }
 }
 
+fn learned_beam() -> Policy {
+    let target = Target::State(0);
+    Policy::new(
+        "learned_beam",
+        EstimatorKind::Learned,
+        PlannerKind::Beam,
+        target,
+    )
+}
+
+/// The path that a policy's planner finds for an objective.
+fn path(
+    config: &AgentConfig,
+    policy: &Policy,
+    objective: Objective,
+    belief: &Belief,
+    step: u64,
+) -> Vec<Move> {
+    let problem = PlanningProblem {
+        start: ROBOT,
+        n_moves: worlds().n_moves,
+        values: &objective.values(belief),
+        seed: config.planner_seed(0),
+        step,
+    };
+    config.planner(policy).plan(&problem).moves
+}
+
+/// One step: the path, and the posterior after its frame.
+fn fly(student: &mut impl Student, step: u64) -> (Vec<Move>, Belief) {
+    let (mut path, mut posterior) = (Vec::new(), None);
+    let mut fly = |paths: &[Vec<Move>]| {
+        path = paths[0].clone();
+        Ok(vec![observation(step)])
+    };
+    let mut look = |_: usize, robot: &Robot| posterior = Some(robot.agent.belief().clone());
+    student.step(&mut fly, &mut look).expect("possible");
+    (path, posterior.expect("a look"))
+}
+
+/// A frozen student must plan on one of the beliefs. `paths`: what it may choose among on a belief, where
+/// a state pays most, at a step.
+fn check(
+    mut student: impl Student,
+    basis: BasisKind,
+    paths: impl Fn(&Belief, usize, u64) -> Vec<Vec<Move>>,
+) {
+    student.freeze();
+    student.attach(vec![observation(0)]).expect("possible");
+    let (mut all, mut before) = ([true; 2], None);
+    for step in 1..9 {
+        let (path, estimate) = fly(&mut student, step);
+        let (predictor, target) = student.belief().expect("a belief");
+        let now = [&estimate, predictor].map(|belief| paths(belief, target, step));
+        let Some(paths) = before.replace(now) else {
+            continue;
+        };
+        for (all, paths) in all.iter_mut().zip(&paths) {
+            *all &= paths.contains(&path);
+        }
+    }
+    let expected = match basis {
+        BasisKind::Estimate => [true, false],
+        BasisKind::Predictor => [false, true],
+    };
+    assert_eq!(all, expected, "{}, {basis:?}", student.kind());
+}
+
 #[test]
 fn students_plan_on_the_belief_that_settings_say() {
     for basis in [BasisKind::Predictor, BasisKind::Estimate] {
@@ -69,40 +139,36 @@ fn students_plan_on_the_belief_that_settings_say() {
             kernel: (3, 3),
             sees_own_state: false,
         };
+        let student = FilterStudent::new(dimensions, worlds(), config);
+        check(student, basis, |belief, target, step| {
+            let policy = learned_beam();
+            let objective = Objective {
+                target: Target::State(target),
+                ..config.objective(&policy)
+            };
+            vec![path(config, &policy, objective, belief, step)]
+        });
         let progress = Progress::first(&worlds(), config, &::network::Device::Cpu);
+        let student = NetworkStudent::new(progress.expect("a network"), worlds(), config);
+        check(student, basis, |belief, _, step| {
+            let choices = Policy::network_choices(3);
+            let path = |choice| path(config, choice, config.objective(choice), belief, step);
+            choices.iter().map(path).collect()
+        });
         let model = Model::wildfire();
         let filter = BayesFilter::known(&model, Belief::uniform(3, worlds().shape)).expect("valid");
         let decisions = Decisions::first(&model, &config.decisions, 0);
-        let students: [Box<dyn Student>; 3] = [
-            Box::new(FilterStudent::new(dimensions, worlds(), config)),
-            Box::new(NetworkStudent::new(
-                progress.expect("a network"),
-                worlds(),
-                config,
-            )),
-            Box::new(DecisionsStudent::new(
-                decisions,
-                filter,
-                &model,
-                worlds(),
-                config,
-            )),
-        ];
-        for mut student in students {
-            student.attach(vec![observation(0)]).expect("possible");
-            for step in 1..4 {
-                let mut n_looks = 0;
-                let mut look = |_: usize, robot: &Robot| {
-                    n_looks += 1;
-                    assert_eq!(robot.agent.basis, basis);
-                    // The one that its path was planned on.
-                    let has_estimate = robot.agent.estimate().is_some();
-                    assert_eq!(has_estimate, basis == BasisKind::Estimate);
-                };
-                let mut fly = |_: &[Vec<Move>]| Ok(vec![observation(step)]);
-                student.step(&mut fly, &mut look).expect("possible");
-                assert_eq!(n_looks, 1, "{}", student.kind());
-            }
-        }
+        let student = DecisionsStudent::new(decisions, filter, &model, worlds(), config);
+        let actions = ActionSet::beam(&model);
+        let beam = learned_beam();
+        check(student, basis, |belief, _, step| {
+            let path = |action: &Action| {
+                let random = (config.planner_seed(0), step);
+                let mut planner = config.planner(&beam);
+                let plans = action.plan(&mut *planner, belief, &[ROBOT], worlds().n_moves, random);
+                plans[0].moves.clone()
+            };
+            actions.actions().iter().map(path).collect()
+        });
     }
 }

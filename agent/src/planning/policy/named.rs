@@ -2,7 +2,7 @@
 
 use crate::planning::action::{Action, ActionSet};
 use crate::planning::objective::{BEAM_BONUS, Objective, Target};
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail};
 use protocol::Model;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -135,20 +135,19 @@ impl Policy {
         let mut rests = of_model
             .iter()
             .filter_map(|family| name.strip_prefix(family));
-        let all = Self::all(&Model::wildfire());
-        let is_known = all.iter().any(|policy| policy.name == name);
+        let model = Model::wildfire();
+        let all = Self::all(&model);
+        if rests.any(|rest| !rest.is_empty()) || all.iter().any(|policy| policy.name == name) {
+            return Ok(());
+        }
         let is_general = |name: &&str| {
             let (family, rest) = name.split_once('_').unwrap_or_default();
-            family != "act" && Model::wildfire().state_named(rest).is_none()
+            family != "act" && model.state_named(rest).is_none()
         };
         let names = all.iter().map(|policy| &*policy.name).filter(is_general);
         let patterns = ["shooting_STATE", "beam_STATE", "act_ACTION"];
         let names: Vec<&str> = names.chain(patterns).collect();
-        ensure!(
-            is_known || rests.any(|rest| !rest.is_empty()),
-            unknown(name, &names)
-        );
-        Ok(())
+        bail!(unknown(name, &names))
     }
 
     /// All policies of a model: the ladder, then the others.
@@ -304,6 +303,53 @@ mod tests {
                 "{error}"
             );
         }
+    }
+
+    #[test]
+    fn the_wildfires_policies_are_these() {
+        let expected = [
+            ("none", "random_walk coverage"),
+            (
+                "known_model",
+                "shooting_explore shooting_normal shooting_latent shooting_exploit \
+                 shooting_exploit_only beam_exploit",
+            ),
+            ("spatial_filter", "spatial_shooting spatial_beam"),
+            ("truth", "oracle_shooting oracle_beam"),
+            ("next_truth", "clairvoyant_beam"),
+            ("known_model", "beam_explore beam_exploit_only"),
+            ("next_truth", "clairvoyant_shooting"),
+            ("learned_filter", "learned_shooting learned_beam"),
+            (
+                "learned_spatial_filter",
+                "learned_spatial_shooting learned_spatial_beam",
+            ),
+            (
+                "learned_own_filter",
+                "learned_own_shooting learned_own_beam",
+            ),
+            (
+                "learned_own_spatial_filter",
+                "learned_own_spatial_shooting learned_own_spatial_beam",
+            ),
+            ("known_model", "dqn_beam"),
+            (
+                "autoencoder",
+                "autoencoder_explore autoencoder_exploit autoencoder_policy autoencoder_beam",
+            ),
+            (
+                "known_model",
+                "shooting_fire beam_normal beam_latent beam_fire",
+            ),
+        ];
+        let expected = expected.iter().flat_map(|(estimator, names)| {
+            let names = names.split_whitespace();
+            names.map(move |name| (name.to_owned(), *estimator))
+        });
+        let policies = Policy::all(&Model::wildfire()).into_iter();
+        let named = policies.filter(|policy| policy.action.is_none());
+        let named = named.map(|policy| (policy.name, policy.estimator.label()));
+        assert_eq!(named.collect::<Vec<_>>(), expected.collect::<Vec<_>>());
     }
 
     #[test]
