@@ -29,7 +29,7 @@ from emberwatch.planning import beam_search
 ENV = "emberwatch/Wildfire-v0"
 PARTS = ("belief", "frame", "robot")
 UNOBSERVED = 255
-#: Columns of the log: what has been used, then means since the last row.
+#: Columns of the log: means since the last row, but for what has been used in all.
 COLUMNS = ("cpu_seconds", "moves", "reward_per_path", "loss", "filters_loss", "env_seconds")
 
 
@@ -79,12 +79,12 @@ class Belief(nn.Module):
         nn.init.zeros_(self.layers[-1].weight)
         nn.init.zeros_(self.layers[-1].bias)
 
-    def filters(self, images: torch.Tensor) -> torch.Tensor:
+    def filtered(self, images: torch.Tensor) -> torch.Tensor:
         # A belief comes in steps of 1 / 255.
         return images[:, : self.n_states].clamp(min=1 / 510).log().log_softmax(1)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
-        return (self.filters(images) + self.layers(images)).log_softmax(1)
+        return (self.filtered(images) + self.layers(images)).log_softmax(1)
 
 
 class Policy:
@@ -144,7 +144,7 @@ class Training:
     def __init__(self, args: argparse.Namespace) -> None:
         torch.set_num_threads(args.threads)
         torch.manual_seed(args.seed)
-        self.args, self.rng = args, np.random.default_rng(args.seed)
+        self.args, self.rng = args, np.random.default_rng([args.seed, 1])
         self.envs = gymnasium.make_vec(
             ENV,
             num_envs=args.worlds,
@@ -180,16 +180,24 @@ class Training:
             self.policy.sightings.forget(truncated)
             images = self.policy.look(seen)
             losses = [self.update(optimizer, replay) for _ in range(args.updates)]
-            log.add(rewards[~explores].mean(), *np.mean(losses, axis=0))
+            log.add(rewards.mean(), *np.mean(losses, axis=0))
             n_steps += 1
             if n_steps % 100 == 0:
                 log.write(used, n_steps * args.worlds * args.n_moves, env_seconds)
-                torch.save(self.belief.state_dict(), args.out / "belief.pt")
+                self.save()
+        if log.added:
+            log.write(used, n_steps * args.worlds * args.n_moves, env_seconds)
+        self.save()
+
+    def save(self) -> None:
+        torch.save(self.belief.state_dict(), self.args.out / "belief.pt")
 
     def update(self, optimizer: Any, replay: Replay) -> tuple[float, float]:
         """The network's loss and the filter's, in nats per visited cell."""
         images, frames = replay.sample(64, self.rng)
         visited = frames != UNOBSERVED
+        if not visited.any():
+            return np.nan, np.nan
         observed = frames[visited].long()[:, None]
 
         def loss_of(log_probabilities: torch.Tensor) -> torch.Tensor:
@@ -200,7 +208,7 @@ class Training:
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        return loss.item(), loss_of(self.belief.filters(images)).item()
+        return loss.item(), loss_of(self.belief.filtered(images)).item()
 
 
 class Log:
@@ -216,7 +224,7 @@ class Log:
         self.added.append(numbers)
 
     def write(self, used: float, moves: int, env_seconds: float) -> None:
-        reward, loss, filters = np.mean(self.added, axis=0)
+        reward, loss, filters = np.nanmean(self.added, axis=0)
         self.added.clear()
         self.rows.writerow((used, moves, reward, loss, filters, env_seconds))
         print(f"{used:4.0f} s: reward {reward:.2f}, loss {loss:.4f}, the filter's {filters:.4f}")
@@ -240,26 +248,45 @@ def world(args: argparse.Namespace) -> dict[str, Any]:
     return {name: getattr(args, name) for name in names} | {"timeout": 60.0}
 
 
+def seeds(text: str) -> range:
+    first, _, end = text.partition("..")
+    if not (first.isdigit() and end.isdigit() and int(first) < int(end)):
+        raise argparse.ArgumentTypeError(f"expected FIRST..END, got {text!r}")
+    return range(int(first), int(end))
+
+
+def positive(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected an integer from 1 on, got {text!r}")
+    return int(text)
+
+
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--cpu-seconds", type=float, default=300, help="of the training")
     parser.add_argument("--out", type=Path, default=Path("learned_belief"), help="a folder")
     parser.add_argument(
-        "--evaluate", default="5000..5008", help="seeds, FIRST..END; below 1000: test"
+        "--evaluate",
+        type=seeds,
+        default="5000..5008",
+        help="seeds, FIRST..END; below 1000: test",
     )
-    parser.add_argument("--steps", type=int, default=100, help="paths of each world evaluated")
+    parser.add_argument("--steps", type=positive, default=100, help="paths of each world evaluated")
     parser.add_argument("--load", type=Path, help="a network to begin with")
     parser.add_argument("--name", default="learned_belief", help="in the benchmark's table")
     parser.add_argument("--seed", type=int, default=1000, help="of the first training world, too")
     parser.add_argument("--model", default="wildfire-small")
     for name, default in (("height", 16), ("width", 16), ("n-moves", 16), ("burn-in", 3000)):
         parser.add_argument(f"--{name}", type=int, default=default)
-    parser.add_argument("--beam", type=int, default=64, help="width of the beam")
-    parser.add_argument("--worlds", type=int, default=64)
-    parser.add_argument("--episode", type=int, default=400, help="paths of an episode")
-    parser.add_argument("--updates", type=int, default=2, help="for each step of the worlds")
-    parser.add_argument("--threads", type=int, default=1)
-    return parser.parse_args()
+    parser.add_argument("--beam", type=positive, default=64, help="width of the beam")
+    parser.add_argument("--worlds", type=positive, default=64)
+    parser.add_argument("--episode", type=positive, default=400, help="paths of an episode")
+    parser.add_argument("--updates", type=positive, default=2, help="for each step of the worlds")
+    parser.add_argument("--threads", type=positive, default=1)
+    args = parser.parse_args()
+    if (args.out / "log.csv").exists():
+        parser.error(f"--out: expected a folder without an earlier training, got {args.out}")
+    return args
 
 
 def main() -> None:
@@ -269,13 +296,12 @@ def main() -> None:
     training.learn()
     training.envs.close()
     draw(args.out)
-    first, end = map(int, args.evaluate.split(".."))
     rows = evaluate(
         training.policy,
         name=args.name,
         env=ENV,
         estimator="network",
-        seeds=range(first, end),
+        seeds=args.evaluate,
         steps=args.steps,
         csv=args.out / "rows.csv",
         observation=PARTS,

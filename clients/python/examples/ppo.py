@@ -151,7 +151,7 @@ class Training:
                 paths = beam_search(
                     *(values, seen["robot"], left),
                     rng=self.rng,
-                    visited=seen["visited"],
+                    visited=seen["visited"][..., 0],
                     width=32,
                 )
                 best = paths[:, 0].astype(np.int64)

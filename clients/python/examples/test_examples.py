@@ -27,7 +27,7 @@ EXAMPLES = [
     (
         "learned_belief.py",
         "--worlds 8 --cpu-seconds 6 --steps 5 --out OUT",
-        r"learned_belief: \d\S* \+- \S+ a step on 8 worlds",
+        r" s: reward \d\S+ loss \d(.*\n)+learned_belief: \d\S* \+- \S+ a step on 8 worlds",
     ),
     (
         "sb3_objective.py",

@@ -30,9 +30,11 @@ def deadline() -> Iterator[None]:
     before = signal.signal(signal.SIGALRM, late)
     signal.alarm(DEADLINE)
     yield
-    at_the_end.close()
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
+    try:
+        at_the_end.close()
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
 
 
 @pytest.fixture(autouse=True)

@@ -422,6 +422,7 @@ def test_wrong_options_are_named(keywords: dict[str, Any], message: str) -> None
         ),
         ({"start": "7,0"}, r"start: expected a cell on the 7 x 5 grid, got \(7, 0\)"),
         ({"truth": "no"}, "truth: expected bool, got 'no'"),
+        ({"truth": None}, "truth: expected bool, got None"),
         ({"takeover": 1}, "takeover: expected bool, got 1"),
         ({"instance": 5}, r"instance: expected str \| None, got 5"),
         ({"model": 5}, r"model: expected str \| Path \| None, got 5"),

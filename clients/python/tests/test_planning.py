@@ -1,6 +1,7 @@
 """Beam search in NumPy."""
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,6 +39,27 @@ def test_visited_cells_are_worth_nothing() -> None:
     assert paths.tolist() == [[0]]
 
 
-def test_a_path_without_moves_is_refused() -> None:
-    with pytest.raises(InvalidArgumentError, match="at least 1, got 0 and 50"):
-        beam_search(np.zeros((1, 2, 2)), np.zeros((1, 2), np.int64), 0, rng=RNG)
+def test_small_integers_are_cells_too() -> None:
+    values = np.zeros((1, 64, 64))
+    values[0, 40, 41] = 1.0
+    assert beam_search(values, np.array([(40, 40)], np.uint8), 1, rng=RNG).tolist() == [[3]]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"n_moves": 0}, "n_moves: expected an integer from 1 on, got 0"),
+        ({"width": 2.5}, "width: expected an integer from 1 on, got 2.5"),
+        ({"values": np.zeros((2, 2))}, r"values: expected .*, got shape \(2, 2\)"),
+        ({"values": np.full((1, 2, 2), np.nan)}, "values: expected finite numbers"),
+        ({"robots": np.zeros((1, 2))}, "robots: expected integers .*, got float64"),
+        ({"robots": np.zeros((2, 2), int)}, r"robots: expected .* of shape \(1, 2\)"),
+        ({"robots": np.array([(0, 2)])}, "robots: expected cells of a 2 x 2 grid"),
+        ({"visited": np.zeros(4)}, r"visited: expected shape \(1, 2, 2\), got \(4,\)"),
+    ],
+    ids=str,
+)
+def test_wrong_input_is_named(wrong: dict[str, Any], message: str) -> None:
+    right = {"values": np.zeros((1, 2, 2)), "robots": np.zeros((1, 2), int), "n_moves": 1}
+    with pytest.raises(InvalidArgumentError, match=message):
+        beam_search(**{**right, **wrong}, rng=RNG)

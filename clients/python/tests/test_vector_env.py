@@ -26,7 +26,7 @@ from failures import fails, refuses
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 import emberwatch
-from emberwatch.errors import LeaseLostError
+from emberwatch.errors import InvalidArgumentError, LeaseLostError
 
 PARTS = ("frame", "robot", "age")
 
@@ -267,6 +267,24 @@ def test_an_episode_that_ended_before_does_not_end_at_a_move() -> None:
 
 
 # step
+
+
+@pytest.mark.parametrize(
+    ("paths", "message"),
+    [
+        (np.full((2, 4), 4), r"expected moves 0 to 3, got 4 at \(0, 0\)"),
+        (np.zeros((2, 3), int), r"expected shape \(2, 4\), got \(2, 3\)"),
+        (np.zeros((3, 4), int), r"expected shape \(2, 4\), got \(3, 4\)"),
+        (np.zeros((2, 4)), "expected integers, got float64"),
+    ],
+    ids=str,
+)
+def test_wrong_paths_are_named_and_not_flown(paths: Any, message: str) -> None:
+    env = make_vec(2)
+    env.reset(seed=1)
+    with pytest.raises(InvalidArgumentError, match=message):
+        env.step(paths)
+    assert env.step(np.zeros((2, 4), int))[4]["step"].tolist() == [1, 1]
 
 
 @by_name

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.errors import InvalidArgumentError
+from emberwatch.errors import invalid
 from emberwatch.view import DIRECTIONS
 
 _DIRECTIONS: Final = np.array(DIRECTIONS, np.int64)
@@ -28,24 +28,23 @@ def beam_search(
         values: What a visit to each cell is worth, `(n, H, W)`.
         robots: Row and column of each robot, `(n, 2)`; its cell counts only if it is flown over.
         n_moves: Moves of a path, at least 1.
-        rng: Breaks ties between equal paths.
+        rng: Breaks ties, between paths that differ by less than 1e-6 for each move.
         visited: Cells that are worth nothing any more, where not 0, `(n, H, W)`.
         width: Paths kept after each move, at least 1.
 
     Returns:
         The moves, `(n, n_moves)`: 0 up, 1 down, 2 left, 3 right.
     """
-    if n_moves < 1 or width < 1:
-        raise InvalidArgumentError(
-            f"beam_search: expected n_moves and width of at least 1, got {n_moves} and {width}"
-        )
+    values, cells = np.asarray(values), np.asarray(robots)
+    _check(values, cells, visited, n_moves=n_moves, width=width)
     n, n_rows, n_columns = values.shape
     reached_from = _neighbours(n_rows, n_columns)
     flat, worlds = values.reshape(n, -1), np.arange(n, dtype=np.int64)[:, np.newaxis]
-    cells = (robots[:, 0] * n_columns + robots[:, 1])[:, np.newaxis]
+    cells = cells.astype(np.int64)
+    cells = (cells[:, 0] * n_columns + cells[:, 1])[:, np.newaxis]
     seen = np.zeros((n, 1, n_rows * n_columns), np.bool_)
     if visited is not None:
-        seen |= visited.reshape(seen.shape) != 0
+        seen |= np.asarray(visited).reshape(seen.shape) != 0
     scores, paths = np.zeros((n, 1)), np.empty((n, 1, 0), np.uint8)
     for _ in range(n_moves):
         reached = reached_from[cells].reshape(n, -1)
@@ -60,6 +59,26 @@ def beam_search(
         seen = seen[worlds, parents]
         seen[worlds, np.arange(n_kept)[np.newaxis], cells] = True
     return paths[np.arange(n), scores.argmax(axis=1)]
+
+
+def _check(
+    values: NDArray[np.floating],
+    robots: NDArray[np.integer],
+    visited: NDArray[np.generic] | None,
+    **numbers: int,
+) -> None:
+    for name, number in numbers.items():
+        if not isinstance(number, int | np.integer) or number < 1:  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise invalid(name, "an integer from 1 on", repr(number))
+    if values.ndim != 3 or values.size == 0 or not np.isfinite(values).all():
+        raise invalid("values", "finite numbers (n, H, W), some of each", f"shape {values.shape}")
+    if robots.shape != (len(values), 2) or robots.dtype.kind not in "iu":
+        got = f"{robots.dtype} of shape {robots.shape}"
+        raise invalid("robots", f"integers of shape ({len(values)}, 2)", got)
+    if ((robots < 0) | (robots >= values.shape[1:])).any():
+        raise invalid("robots", f"cells of a {values.shape[1]} x {values.shape[2]} grid", "others")
+    if visited is not None and np.shape(visited) != values.shape:
+        raise invalid("visited", f"shape {values.shape}", np.shape(visited))
 
 
 def _neighbours(n_rows: int, n_columns: int) -> NDArray[np.int64]:

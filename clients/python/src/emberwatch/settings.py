@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
 from inspect import signature
 from pathlib import Path
@@ -102,9 +102,8 @@ class Settings:
                     f"{environment.__name__}() got an unexpected keyword argument {name!r}{hint}; "
                     f"known are {', '.join(sorted(known))}"
                 )
-        reveals = world.get("truth", False)
-        arguments: WorldArguments = {**world, "truth": reveals or needs_truth}
-        return cls(**arguments, reveals=reveals)
+        asked = cls(**world)
+        return replace(asked, truth=asked.truth or needs_truth, reveals=asked.truth)
 
     def server_flags(self, n_worlds: int) -> list[str]:
         """The flags of a private server with these worlds."""
