@@ -173,6 +173,9 @@ class AgentSession(Session):
         return self._began(self._asked().reset(seeds, worlds=worlds))
 
     def _observe(self) -> StepAnswer:
+        if self._program is not None and self._program.exit_code() is not None:
+            # An agent answers from memory until it notices.
+            raise ServerGoneError(f"the server of instance {self.instance!r} has ended")
         return self._began(self._asked().last(timeout=self.settings.timeout))
 
     def _began(self, decisions: tuple[Decision, ...]) -> StepAnswer:
