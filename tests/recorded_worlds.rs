@@ -355,7 +355,7 @@ fn settings_that_a_states_file_decides_are_refused_as_flags() {
     }
     let table = "--states-offset 3 => expected none without a states file
 STATES --states-offset 2 => states_offset: expected 0 to 1
---states no/such.npz => states file no/such.npz: description no/such.toml: No such file";
+--states no/such.npz => states file no/such.npz: No such file";
     check_table(SERVER, &table.replace("STATES", &states));
     for (command, flag) in [("compare", "--height"), ("train --out x", "--burn-in")] {
         let words = format!("--states <FILE|FOLDER> | cannot be used with | {flag}");

@@ -71,12 +71,8 @@ pub fn make_folder_of(path: &Path) -> Result<()> {
 }
 
 pub fn make_folder(path: &Path) -> Result<()> {
-    std::fs::create_dir_all(path).with_context(|| {
-        format!(
-            "expected a folder, or a path where one can be made, got {}",
-            path.display()
-        )
-    })
+    let expected = "expected a folder, or a path where one can be made";
+    std::fs::create_dir_all(path).with_context(|| format!("create {}: {expected}", path.display()))
 }
 
 pub fn write(text: &str) -> Result<()> {
