@@ -143,7 +143,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, states: Path) -> None:
         ({"height": 4}, "height: expected no flag beside a states file"),
         ({"states_offset": 4}, "states_offset: expected 0 to 3"),
         ({"observation": "belief"}, "expected simulated worlds, as recorded ones have no model"),
-        ({"states": tmp_path / "none.npz"}, "description"),
+        ({"states": tmp_path / "none.npz"}, "none.npz: No such file"),
     ]
     usual: dict[str, Any] = {"states": states, "timeout": 0.1}
     for keywords, words in wrong:
