@@ -18,7 +18,7 @@ pub struct Stepper {
 }
 
 impl Stepper {
-    /// Takes robots from whoever holds them.
+    /// Takes robots from their holders.
     pub fn new(mut connection: Connection, robots: Range<u32>) -> Self {
         let (first_robot, n_robots) = (robots.start, robots.len() as u32);
         let acquire = Request::Acquire {

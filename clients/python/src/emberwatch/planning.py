@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
 from emberwatch.errors import invalid
 from emberwatch.view import DIRECTIONS
-
-_DIRECTIONS: Final = np.array(DIRECTIONS, np.int64)
 
 
 def beam_search(
@@ -84,5 +80,5 @@ def _check(
 def _neighbours(n_rows: int, n_columns: int) -> NDArray[np.int64]:
     """The cell that each move leads to, `(H * W, 4)`: the same one at the edge."""
     cells = np.moveaxis(np.indices((n_rows, n_columns)), 0, -1).reshape(-1, 1, 2)
-    reached = (cells + _DIRECTIONS).clip(0, (n_rows - 1, n_columns - 1))
+    reached = (cells + DIRECTIONS).clip(0, (n_rows - 1, n_columns - 1))
     return reached[..., 0] * n_columns + reached[..., 1]
