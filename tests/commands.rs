@@ -1,6 +1,6 @@
 //! Wrong input to every command: an exit code, one line that says what was expected, no panic.
 
-use agent::planning::policy;
+use agent::policy;
 use protocol::Model;
 use rustix::process::Signal;
 use std::time::{Duration, Instant};

@@ -3,7 +3,7 @@
 use agent::acting::decider::{Assignment, Decider};
 use agent::acting::mission::prepare;
 use agent::config::AgentConfig;
-use agent::planning::policy::{EstimatorKind, PlannerKind};
+use agent::policy::{EstimatorKind, PlannerKind};
 use agent::server::errors;
 use protocol::Client;
 use protocol::channels::{ChannelError, Instance};

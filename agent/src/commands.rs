@@ -16,7 +16,7 @@ pub use prior::PriorCommand;
 pub use run::RunCommand;
 pub use train::TrainCommand;
 
-use agent::planning::policy;
+use agent::policy;
 use agent::server::errors::refusal;
 use protocol::Model;
 use protocol::message::Status;

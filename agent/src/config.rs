@@ -7,11 +7,13 @@ pub use sections::{
 };
 
 use self::sections::check;
-use crate::estimation::Prior;
-use crate::planning::policy::{PlannerKind, Policy};
-use crate::planning::{BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target};
+use crate::policy::{PlannerKind, Policy};
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
+use emberwatch_belief::estimation::Prior;
+use emberwatch_belief::planning::{
+    BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target,
+};
 use protocol::program::read_text;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};

@@ -10,8 +10,8 @@
 //! - [`server`] -- the ends of the wire
 //! - [`config`] -- settings
 //! - [`mod@file`] -- files written whole or not at all
-//! - [`planning`] -- from a belief to a path
-//! - [`estimation`] -- from frames to a belief
+//! - [`policy`] -- policies by name
+//! - [`estimation`] -- estimators that need networks; the others are in the crate `emberwatch-belief`
 
 #![allow(missing_docs, reason = "a program: what names say is not said again")]
 
@@ -21,9 +21,6 @@ pub mod config;
 pub mod estimation;
 pub mod file;
 pub mod learning;
-pub mod planning;
+pub mod policy;
 pub mod rollout;
 pub mod server;
-
-pub use estimation::belief::{Belief, EntropyKind};
-pub use planning::{Objective, Planner, PlanningProblem};

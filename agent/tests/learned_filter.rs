@@ -1,11 +1,11 @@
 //! The learned filter against the known-model filter, finite differences and itself.
 
-use agent::Belief;
 use agent::config::{AgentConfig, LearningConfig};
-use agent::estimation::parameters::{Dimensions, Parameters, Tables};
-use agent::estimation::{BayesFilter, Estimator};
 use agent::learning::filter::{Trainer, Update, Window};
 use agent::learning::replay::{Replay, Sighting};
+use emberwatch_belief::Belief;
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use protocol::randomness::split_mix;
 use protocol::{Cell, Frame, Model, Probabilities, Shape};
 

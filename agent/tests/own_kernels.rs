@@ -1,10 +1,10 @@
 //! Kernels that see the cell's own state, learned from frames of worlds that have such kernels.
 
-use agent::Belief;
 use agent::config::AgentConfig;
-use agent::estimation::parameters::{Dimensions, Parameters, Tables};
-use agent::estimation::{BayesFilter, Estimator};
 use agent::learning::learner::{LearnedModel, Learner};
+use emberwatch_belief::Belief;
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use protocol::path::fly;
 use protocol::randomness::split_mix;
 use protocol::{Cell, Dynamics, Frame, Grid, Model, Move, Shape};

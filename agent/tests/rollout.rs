@@ -1,11 +1,11 @@
 //! The step of agents that plan for one robot or several.
 
-use agent::Belief;
 use agent::acting::registry::{Task, agent};
 use agent::config::AgentConfig;
 use agent::learning::learned::Learned;
-use agent::planning::policy::Policy;
+use agent::policy::Policy;
 use agent::rollout::{self, Robot, Seen};
+use emberwatch_belief::Belief;
 use protocol::client::Observation;
 use protocol::message::{RobotResult, WorldResult};
 use protocol::path::fly;

@@ -3,10 +3,10 @@
 //!
 //! `cargo run --release -p tests --example switching -- MODEL MOVES BURN_IN FIRST_SEED WORLDS STEPS`
 
-use agent::estimation::belief::Belief;
-use agent::estimation::{BayesFilter, Estimator, Prior};
-use agent::planning::BeamSearch;
-use agent::planning::action::{ActionSet, Region};
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::{BayesFilter, Estimator, Prior};
+use emberwatch_belief::planning::BeamSearch;
+use emberwatch_belief::planning::action::{ActionSet, Region};
 use env_server::world::{Episode, Flown, Rules, Start};
 use protocol::{Cell, Model, Shape};
 use std::io::Write;

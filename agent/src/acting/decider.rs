@@ -6,16 +6,16 @@
 use crate::acting::handover::{leave, resume};
 use crate::acting::registry::{self, Task};
 use crate::config::AgentConfig;
-use crate::estimation::belief::Belief;
-use crate::estimation::summary::{summarise, summary_names};
 use crate::learning::learned::Learned;
-use crate::planning::Objective;
-use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
-use crate::rollout::{self, Robot, Seen, in_parallel};
+use crate::policy::{EstimatorKind, PlannerKind, Policy};
+use crate::rollout::{Rollout, Seen, in_parallel, see_all};
 use crate::server::errors::refused;
-use crate::server::feed::Feed;
+use crate::server::feed::{Feed, View};
 use crate::server::info::connect;
 use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::summary::{summarise, summary_names};
+use emberwatch_belief::planning::Objective;
 use protocol::channels::Instance;
 use protocol::client::{Claim, Observation};
 use protocol::connection::ConnectionError;
@@ -59,7 +59,7 @@ pub struct Decider {
 /// A world with its robot, and where the belief about it stands.
 struct World {
     number: u32,
-    robot: Robot,
+    rollout: Rollout,
     last: Decision,
 }
 
@@ -85,14 +85,15 @@ impl Decider {
             worlds: Vec::new(),
         };
         for (number, observation) in task.worlds.clone().zip(observations) {
-            let mut robot = decider.robot(observation)?;
-            if !resume(&mut decider.client, number, &mut robot)? {
-                robot.begin(None, |_| ())?;
+            let mut rollout = decider.rollout(observation)?;
+            if !resume(&mut decider.client, number, &mut rollout)? {
+                rollout.correct()?;
+                rollout.agent.predict();
             }
-            let last = decision(&robot, decider.n_moves(), None);
+            let last = decision(&rollout, decider.n_moves(), None);
             decider.worlds.push(World {
                 number,
-                robot,
+                rollout,
                 last,
             });
         }
@@ -123,14 +124,15 @@ impl Decider {
         let shown = self.feed.turn(seeds.len());
         for (turn, &WorldSeed { world, .. }) in seeds.iter().enumerate() {
             let index = (world - worlds.start) as usize;
-            let mut robot = self.robot(observations[index].clone())?;
-            robot.begin(None, |robot| {
-                if shown.contains(&turn) {
-                    self.feed.show(&robot.view(world, world..world + 1));
-                }
-            })?;
-            let last = decision(&robot, self.n_moves(), None);
-            (self.worlds[index].robot, self.worlds[index].last) = (robot, last);
+            let mut rollout = self.rollout(observations[index].clone())?;
+            rollout.correct()?;
+            if shown.contains(&turn) {
+                let view = View::of(&rollout, world, world..world + 1, Duration::ZERO);
+                self.feed.show(&view);
+            }
+            rollout.agent.predict();
+            let last = decision(&rollout, self.n_moves(), None);
+            (self.worlds[index].rollout, self.worlds[index].last) = (rollout, last);
         }
         Ok(self.last())
     }
@@ -142,38 +144,34 @@ impl Decider {
     pub fn decide(&mut self, objectives: &[Option<u64>]) -> Result<Vec<Decision>> {
         let targets = self.targets(objectives)?;
         let n_moves = self.n_moves();
-        let runs = self.worlds.iter_mut().zip(&targets);
-        let runs = runs.filter_map(|(world, target)| Some((world, (*target)?)));
-        let mut runs: Vec<(&mut World, (u64, Objective))> = runs.collect();
-        if runs.is_empty() {
+        let asked = self.worlds.iter_mut().zip(&targets);
+        let asked = asked.filter_map(|(world, target)| Some((world, (*target)?)));
+        let mut asked: Vec<(&mut World, (u64, Objective))> = asked.collect();
+        if asked.is_empty() {
             return Ok(self.last());
         }
-        let worlds: Vec<u32> = runs.iter().map(|run| run.0.number).collect();
-        let shown = self.feed.turn(runs.len());
-        rollout::step(
-            &mut runs,
-            |(world, _)| &mut world.robot,
-            |(world, (_, objective))| {
-                let robot = &mut world.robot;
-                robot.plan_with(|agent, robots, step| agent.plan_for(*objective, robots, step))
-            },
-            |paths| {
-                let observations = step(&mut self.client, &worlds, paths)?;
-                self.last_use = Instant::now();
-                let seen = observations.into_iter();
-                Ok(seen.map(|observation| Seen::new([observation])).collect())
-            },
-            |turn, (world, _), _| {
-                if shown.contains(&turn) {
-                    let number = world.number;
-                    self.feed
-                        .show(&world.robot.view(number, number..number + 1));
-                }
-                Ok(())
-            },
-        )?;
-        in_parallel(runs.into_iter(), |(world, (asked, _))| {
-            world.last = decision(&world.robot, n_moves, Some(asked));
+        let worlds: Vec<u32> = asked.iter().map(|(world, _)| world.number).collect();
+        let start = Instant::now();
+        let paths = in_parallel(&mut asked, |(world, (_, objective))| {
+            let rollout = &mut world.rollout;
+            let (cells, step) = (rollout.cells(), rollout.step());
+            let mut plans = rollout.agent.plan_for(*objective, &cells, step);
+            plans.remove(0).moves
+        });
+        let planning = start.elapsed() / worlds.len() as u32;
+        let observations = step(&mut self.client, &worlds, &paths)?;
+        self.last_use = Instant::now();
+        let seen = observations.into_iter();
+        let seen = seen.map(|observation| Seen::new([observation])).collect();
+        see_all(asked.iter_mut().map(|(world, _)| &mut world.rollout), seen)?;
+        for turn in self.feed.turn(worlds.len()) {
+            let number = worlds[turn];
+            let view = View::of(&asked[turn].0.rollout, number, number..number + 1, planning);
+            self.feed.show(&view);
+        }
+        in_parallel(asked, |(world, (objective, _))| {
+            world.rollout.agent.predict();
+            world.last = decision(&world.rollout, n_moves, Some(objective));
         });
         Ok(self.last())
     }
@@ -200,8 +198,8 @@ impl Decider {
     }
 
     pub fn release(mut self) -> Result<()> {
-        for world in &self.worlds {
-            leave(&mut self.client, world.number, &world.robot)?;
+        for world in &mut self.worlds {
+            leave(&mut self.client, world.number, &mut world.rollout)?;
         }
         Ok(self.client.release()?)
     }
@@ -210,8 +208,8 @@ impl Decider {
         self.client.info().n_moves
     }
 
-    /// A robot before it takes in what its world shows.
-    fn robot(&self, observation: Observation) -> Result<Robot> {
+    /// An agent before it takes in what its world shows.
+    fn rollout(&self, observation: Observation) -> Result<Rollout> {
         let task = Task {
             model: &self.model,
             shape: self.client.shape(),
@@ -222,7 +220,7 @@ impl Decider {
         };
         // Any choice will do: each has the same estimator and planner.
         let agent = registry::agent(&self.choices[0], &self.config, task)?;
-        Ok(Robot::new(agent, Seen::new([observation])))
+        Ok(Rollout::new(agent, Seen::new([observation])))
     }
 
     /// What each world is to move for, if at all; all are checked before any moves.
@@ -248,7 +246,7 @@ impl Decider {
             let message = format!("{expected}, got {index} for world {}", world.number);
             return Err(refused(status, detail, message));
         };
-        if world.robot.observation().world.truncated != 0 {
+        if world.rollout.observation().world.truncated != 0 {
             let (status, detail) = (Status::EpisodeOver, world.number.into());
             return Err(refused(status, detail, status.explain(detail)));
         }
@@ -277,8 +275,8 @@ fn no_such_world(worlds: &Range<u32>, got: u32) -> ConnectionError {
     refused(Status::NoSuchWorld, worlds.len() as u64, message)
 }
 
-fn decision(robot: &Robot, n_moves: usize, objective: Option<u64>) -> Decision {
-    let observation = robot.observation();
+fn decision(rollout: &Rollout, n_moves: usize, objective: Option<u64>) -> Decision {
+    let observation = rollout.observation();
     let (result, cell) = (&observation.world, observation.robot.cell());
     Decision {
         step: result.step,
@@ -292,7 +290,7 @@ fn decision(robot: &Robot, n_moves: usize, objective: Option<u64>) -> Decision {
         seed: result.seed,
         episode: result.episode,
         objective,
-        summary: summarise(robot.agent.belief(), cell, n_moves),
+        summary: summarise(rollout.agent.belief(), cell, n_moves),
     }
 }
 

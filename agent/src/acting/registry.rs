@@ -1,19 +1,18 @@
 //! Where a policy's agent is put together: estimator, planner, and what decides. A new estimator is a line here.
 
 use crate::config::AgentConfig;
-use crate::estimation::belief::Belief;
-use crate::estimation::truth::{Clairvoyant, Oracle};
-use crate::estimation::{
-    AutoencoderEstimator, BayesFilter, Correlations, Estimator, SpatialFilter,
-};
+use crate::estimation::AutoencoderEstimator;
 use crate::learning::learned::Learned;
 use crate::learning::learner::LearnedModel;
 use crate::learning::student::decisions::Decisions;
-use crate::planning::BasisKind;
-use crate::planning::action::Action;
-use crate::planning::policy::{EstimatorKind, Policy, numbered_states};
+use crate::policy::{EstimatorKind, Policy, numbered_states};
 use crate::rollout::agent::{Agent, Decider, Setup};
 use anyhow::{Context, Result, ensure};
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::truth::{Clairvoyant, Oracle, Unchanging};
+use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, SpatialFilter};
+use emberwatch_belief::planning::BasisKind;
+use emberwatch_belief::planning::action::Action;
 use protocol::{Model, Shape};
 
 /// What a misfit is told of.
@@ -73,7 +72,8 @@ fn estimator(policy: &Policy, task: &Task<'_>) -> Result<Box<dyn Estimator>> {
         }
         EstimatorKind::Autoencoder => Box::new(autoencoder(policy, task)?),
         EstimatorKind::Truth => Box::new(Oracle::new(task.model, prior)?),
-        EstimatorKind::None | EstimatorKind::NextTruth => Box::new(Clairvoyant(prior)),
+        EstimatorKind::NextTruth => Box::new(Clairvoyant(prior)),
+        EstimatorKind::None => Box::new(Unchanging(prior)),
     })
 }
 
@@ -111,9 +111,9 @@ fn decider(policy: &Policy, task: &Task<'_>, config: &AgentConfig) -> Result<Dec
     let action = |choice: &Policy| Action::plain(&choice.name, config.objective(choice));
     let actions: Vec<Action> = choices.iter().map(action).collect();
     Ok(Box::new(move |estimator, robot, n_moves| {
-        let follower = estimator.follower();
-        let follower = follower.expect("invariant: it decides for an autoencoder");
-        let input = network.input.of(follower, robot, n_moves);
+        let hidden = estimator.hidden();
+        let hidden = hidden.expect("invariant: it decides for an autoencoder");
+        let input = network.input.of(hidden, estimator.belief(), robot, n_moves);
         actions[network.dqn.best(&input)].clone()
     }))
 }

@@ -5,14 +5,14 @@
 
 use crate::benchmark::arena::Arena;
 use crate::config::AgentConfig;
-use crate::estimation::belief::Belief;
 use crate::estimation::first_belief::first_belief;
-use crate::estimation::scoring::Score;
 use crate::learning::learned::Learned;
-use crate::planning::policy::Policy;
+use crate::policy::Policy;
 use crate::rollout::agent::Agent;
-use crate::rollout::{self, Robot, Seen};
+use crate::rollout::{Rollout, Seen, paths_of, plan_all, predict_all, see_all};
 use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::scoring::Score;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -48,13 +48,10 @@ pub fn examine(arena: &mut Arena, examination: &Examination<'_>) -> Result<Vec<M
             |(&seed, seen): (&u64, Seen)| Examinee::new(arena, examination, &prior, seed, seen);
         let mut examinees: Vec<Examinee> = examinees.map(examinee).collect::<Result<_, _>>()?;
         for step in 1..=examination.steps {
-            rollout::step(
-                &mut examinees,
-                |examinee| &mut examinee.guide,
-                |examinee| examinee.guide.plan(),
-                |paths| arena.step(batch, paths, step),
-                |_, _, _| Ok(()),
-            )?;
+            let plans = plan_all(guides(&mut examinees));
+            let seen = arena.step(batch, &paths_of(&plans), step)?;
+            see_all(guides(&mut examinees), seen)?;
+            predict_all(guides(&mut examinees));
             examinees.par_iter_mut().try_for_each(Examinee::look)?;
         }
         marks.extend(examinees.into_iter().map(|examinee| examinee.marks));
@@ -78,9 +75,13 @@ pub fn score_of_frequencies(all: &[Marks], counts: &[u64]) -> Score {
 
 /// Estimators on one world, and who chooses the paths.
 struct Examinee {
-    guide: Robot,
+    guide: Rollout,
     estimators: Vec<Agent>,
     marks: Marks,
+}
+
+fn guides(examinees: &mut [Examinee]) -> impl Iterator<Item = &mut Rollout> {
+    examinees.iter_mut().map(|examinee| &mut examinee.guide)
 }
 
 impl Examinee {
@@ -97,7 +98,7 @@ impl Examinee {
         let guide = Policy::named(examination.guide, model)?;
         let estimators = examination.policies.iter().map(agent);
         let mut examinee = Self {
-            guide: Robot::at(agent(&guide)?, seen)?,
+            guide: Rollout::begun(agent(&guide)?, seen)?,
             estimators: estimators.collect::<Result<_, _>>()?,
             marks: Marks {
                 seed,
@@ -114,7 +115,7 @@ impl Examinee {
         let frame = &self.guide.observation().frame;
         let scores = self.marks.scores.iter_mut().zip(&self.estimators);
         for (sum, agent) in scores {
-            *sum += agent.score(frame)?.unwrap_or_default();
+            *sum += agent.score(frame).unwrap_or_default();
         }
         for (_, value) in frame.observed() {
             self.marks.counts[usize::from(value)] += 1;

@@ -5,7 +5,6 @@ use super::worlds::WorldFlags;
 use agent::acting::registry::needs_checkpoint;
 use agent::benchmark::arena::Arena;
 use agent::benchmark::compare::{Comparison, Results, compare};
-use agent::benchmark::merit::RECENT_STEPS;
 use agent::benchmark::report::added::{check_settings, check_worlds, read_csv};
 use agent::benchmark::report::{
     PolicyRun, draw_ladder, draw_rewards, draw_snapshot, draw_teams, figures::FIRE_CELLS_PER_STEP,
@@ -14,10 +13,11 @@ use agent::benchmark::report::{
 use agent::benchmark::team::Team;
 use agent::config::{AgentConfig, AgentFlags};
 use agent::learning::learned::Learned;
-use agent::planning::policy::{EstimatorKind, Policy};
+use agent::policy::{EstimatorKind, Policy};
 use agent::server::launch::OwnDashboard;
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
+use emberwatch_belief::merit::RECENT_STEPS;
 use indicatif::{ProgressBar, ProgressStyle};
 use network::DeviceKind;
 use protocol::Model;

@@ -4,7 +4,7 @@ use super::shared::{WaitFlag, model_named};
 use agent::acting::decider::Assignment;
 use agent::acting::decisions::serve_decisions;
 use agent::config::AgentFlags;
-use agent::planning::policy::{EstimatorKind, PlannerKind};
+use agent::policy::{EstimatorKind, PlannerKind};
 use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
 use protocol::channels::Instance;

@@ -6,15 +6,15 @@ use super::worlds::WorldFlags;
 use agent::benchmark::arena::Arena;
 use agent::benchmark::compare::Comparison;
 use agent::benchmark::evaluate::{Examination, Marks, examine, score_of_frequencies};
-use agent::benchmark::merit::RECENT_STEPS;
 use agent::benchmark::report::{render_table, statistics::Estimate, write_csv};
 use agent::benchmark::team::Team;
 use agent::config::{AgentConfig, AgentFlags};
-use agent::estimation::scoring::Score;
 use agent::learning::learned::Learned;
-use agent::planning::policy::Policy;
+use agent::policy::Policy;
 use anyhow::Result;
 use clap::Args;
+use emberwatch_belief::estimation::scoring::Score;
+use emberwatch_belief::merit::RECENT_STEPS;
 use network::DeviceKind;
 use std::path::PathBuf;
 

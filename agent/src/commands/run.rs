@@ -5,7 +5,7 @@ use agent::acting::mission::{Company, Mission};
 use agent::acting::run::run;
 use agent::config::AgentFlags;
 use agent::learning::learned::Learned;
-use agent::planning::policy::Policy;
+use agent::policy::Policy;
 use anyhow::{Context, Result};
 use clap::Args;
 use network::DeviceKind;

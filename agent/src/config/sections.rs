@@ -1,10 +1,10 @@
 //! The sections of `config/agent.toml`, which says what each setting means.
 
-use crate::estimation::belief::EntropyKind;
 use crate::estimation::dqn_input::DqnInput;
-use crate::planning::BasisKind;
 use ::network::{AdamSettings, AutoencoderSettings, DqnSettings};
 use anyhow::{Result, bail};
+use emberwatch_belief::estimation::belief::EntropyKind;
+use emberwatch_belief::planning::BasisKind;
 use serde::{Deserialize, Serialize};
 
 /// Below 1, so that Adam's means move.

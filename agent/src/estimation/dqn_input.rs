@@ -1,7 +1,7 @@
 //! What the DQN of Algorithm 1 sees when it chooses an action (paper eq. 17).
 
-use crate::estimation::follower::Follower;
-use crate::estimation::summary::{spread_summary, summary_length};
+use emberwatch_belief::Belief;
+use emberwatch_belief::estimation::summary::{spread_summary, summary_length};
 use protocol::Cell;
 use serde::{Deserialize, Serialize};
 
@@ -32,10 +32,10 @@ impl DqnInput {
     }
 
     /// The input after a frame was read.
-    pub fn of(self, follower: &Follower, robot: Cell, n_moves: usize) -> Vec<f32> {
+    pub fn of(self, hidden: &[f32], predictor: &Belief, robot: Cell, n_moves: usize) -> Vec<f32> {
         match self {
-            Self::AfterFrame => follower.hidden().to_vec(),
-            Self::Summary => spread_summary(follower.prediction(), robot, n_moves),
+            Self::AfterFrame => hidden.to_vec(),
+            Self::Summary => spread_summary(predictor, robot, n_moves),
         }
     }
 }
@@ -43,21 +43,20 @@ impl DqnInput {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::estimation::belief::Belief;
     use protocol::Shape;
 
     #[test]
     fn inputs_are_the_hidden_vector_and_the_summary_of_the_predictor() {
         let shape = Shape::new(8, 6).expect("test shape");
-        let follower = Follower::at(vec![0.5, -1.0, 2.0, 0.0], Belief::uniform(2, shape));
+        let (hidden, belief) = ([0.5, -1.0, 2.0, 0.0], Belief::uniform(2, shape));
         let robot = Cell { row: 2, col: 5 };
         for input in [DqnInput::AfterFrame, DqnInput::Summary] {
-            let numbers = input.of(&follower, robot, 4);
+            let numbers = input.of(&hidden, &belief, robot, 4);
             assert_eq!(numbers.len(), input.length(4, 2), "{}", input.label());
         }
-        let after = DqnInput::AfterFrame.of(&follower, robot, 4);
-        assert_eq!(after, follower.hidden());
-        let summary = DqnInput::Summary.of(&follower, robot, 4);
+        let after = DqnInput::AfterFrame.of(&hidden, &belief, robot, 4);
+        assert_eq!(after, hidden);
+        let summary = DqnInput::Summary.of(&hidden, &belief, robot, 4);
         assert_eq!(summary[summary.len() - 1], 1.0, "the robot's column");
         assert!((summary[0] - 0.5_f32.sqrt()).abs() < 1e-5);
     }

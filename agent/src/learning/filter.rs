@@ -1,4 +1,4 @@
-//! Parameters for a [`BayesFilter`](crate::estimation::BayesFilter) that are learned: weights `w`, observation matrix `O`
+//! Parameters for a [`BayesFilter`](emberwatch_belief::estimation::BayesFilter) that are learned: weights `w`, observation matrix `O`
 //! and first belief that maximise the likelihood of what was seen ([`Trainer`]; no bias). Read `parameters`, then
 //! `window` for one pass and its derivatives, then `trainer`.
 //!

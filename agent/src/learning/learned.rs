@@ -1,13 +1,13 @@
 //! What checkpoints hold, by kind: all that policies on a learned belief need.
 
-use crate::estimation::parameters::Dimensions;
 use crate::learning::checkpoint::{self, Contents, wrong};
 use crate::learning::learner::{self, LearnedModel};
 use crate::learning::student::filter::SavedFilter;
 use crate::learning::student::{decisions, network};
-use crate::planning::policy::{EstimatorKind, Policy};
+use crate::policy::{EstimatorKind, Policy};
 use ::network::Device;
 use anyhow::{Context, Result, ensure};
+use emberwatch_belief::estimation::parameters::Dimensions;
 use protocol::Model;
 use std::path::Path;
 use std::sync::Arc;

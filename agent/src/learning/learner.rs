@@ -5,15 +5,15 @@ mod neighbours;
 pub use self::neighbours::Neighbours;
 
 use crate::config::{AgentConfig, LearningConfig};
-use crate::estimation::Correlations;
-use crate::estimation::belief::Belief;
-use crate::estimation::parameters::{Dimensions, Parameters, Tables};
 use crate::learning::checkpoint::{Contents, check, check_counts};
 use crate::learning::filter::{Trainer, Update};
 use crate::learning::replay::Replay;
 use crate::learning::reward::{RewardEstimate, met};
 use ::network::NamedTensor;
 use anyhow::Result;
+use emberwatch_belief::estimation::Correlations;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
 use protocol::{Frame, Shape};
 use serde::{Deserialize, Serialize};
 
@@ -221,7 +221,7 @@ fn replay(config: &LearningConfig) -> Replay {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::estimation::belief::Belief;
+    use emberwatch_belief::estimation::belief::Belief;
 
     const DIMENSIONS: Dimensions = Dimensions {
         n_states: 3,

@@ -1,8 +1,8 @@
 //! Metrics of a training as CSV: one row per update, and one per step without any.
 
-use crate::estimation::scoring::Score;
 use anyhow::{Context, Result, ensure};
 use csv::StringRecord;
+use emberwatch_belief::estimation::scoring::Score;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 

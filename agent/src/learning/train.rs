@@ -12,19 +12,18 @@ pub use self::training::{CHECKPOINT, Training};
 
 use self::events::Events;
 use self::students::student;
-use crate::estimation::scoring::Score;
 use crate::learning::checkpoint::{self, Contents};
 use crate::learning::metrics::{FROZEN, METRICS, Metrics, ModelUpdate, Tick};
 use crate::learning::student::Student;
-use crate::rollout::Robot;
-use crate::server::feed::Feed;
+use crate::server::feed::{Feed, View};
 use crate::server::info::connect;
 use anyhow::{Result, bail};
+use emberwatch_belief::estimation::scoring::Score;
+use protocol::Client;
 use protocol::channels::Instance;
 use protocol::client::{Claim, Observation};
 use protocol::connection::ConnectionError;
 use protocol::control::WorldSeed;
-use protocol::{Client, Move};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -180,43 +179,41 @@ impl Trainer {
 
     /// One step of each robot; worlds at the end of their episodes begin again.
     fn step(&mut self) -> Result<Tick> {
-        let Self {
-            client,
-            student,
-            feed,
-            ..
-        } = self;
-        let (robots, wants_full) = (client.robots(), student.wants_full_frames());
-        let shown = feed
-            .as_ref()
-            .map_or_else(Vec::new, |feed| feed.turn(robots.len()));
-        let policy = format!("train {}", student.kind());
-        let (team, mut over) = (client.info().n_robots, Vec::new());
-        let mut fly = |paths: &[Vec<Move>]| {
-            let observations = match wants_full {
-                true => client.step_full(robots.clone(), paths)?,
-                false => client.step(robots.clone(), paths)?,
-            };
-            over = ended(client, &observations);
-            Ok(observations)
+        let start = Instant::now();
+        let paths = self.student.plan();
+        let planning = start.elapsed() / paths.len().max(1) as u32;
+        let robots = self.client.robots();
+        let observations = if self.student.wants_full_frames() {
+            self.client.step_full(robots, &paths)?
+        } else {
+            self.client.step(robots, &paths)?
         };
-        let mut look = |index: usize, robot: &Robot| {
-            if let Some(feed) = feed.as_mut().filter(|_| shown.contains(&index)) {
-                let number = robots.start + index as u32;
-                let mut view = robot.view(number / team, number..number + 1);
-                view.intent.policy.clone_from(&policy);
-                feed.show(&view);
-            }
-        };
-        let tick = student.step(&mut fly, &mut look)?;
+        let over = ended(&self.client, &observations);
+        let tick = self.student.see(observations)?;
+        self.show(planning);
+        self.student.predict();
         for world in over {
-            for (robot, observation) in reset(client, world)? {
-                student.begin(robot, observation)?;
+            for (robot, observation) in reset(&mut self.client, world)? {
+                self.student.begin(robot, observation)?;
             }
         }
         self.summary.steps += tick.n_worlds;
         self.summary.reward += tick.reward;
         Ok(tick)
+    }
+
+    /// Shows the posteriors of the robots whose turn it is; `planning`: time that a plan took.
+    fn show(&mut self, planning: Duration) {
+        let (robots, team) = (self.client.robots(), self.client.info().n_robots);
+        let Some(feed) = &mut self.feed else {
+            return;
+        };
+        for index in feed.turn(robots.len()) {
+            let (number, rollout) = (robots.start + index as u32, self.student.rollout(index));
+            let mut view = View::of(rollout, number / team, number..number + 1, planning);
+            view.intent.policy = format!("train {}", self.student.kind());
+            feed.show(&view);
+        }
     }
 
     /// Writes the checkpoint, unless nothing is learned, and the metrics.

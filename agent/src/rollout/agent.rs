@@ -1,20 +1,22 @@
 //! One agent on one world: plan, then correct and predict. Pure; the wire is elsewhere.
 
 use crate::config::AgentConfig;
-use crate::estimation::Estimator;
-use crate::estimation::belief::{Belief, BeliefError};
-use crate::estimation::scoring::Score;
-use crate::planning::action::Action;
-use crate::planning::policy::{PlannerKind, Policy};
-use crate::planning::team::{ROUNDS, plan_team};
-use crate::planning::{BasisKind, Objective, Plan, Planner, RandomWalk, Target};
-use anyhow::Result;
+use crate::policy::{PlannerKind, Policy};
+use anyhow::{Context, Result};
+use emberwatch_belief::estimation::Estimator;
+use emberwatch_belief::estimation::belief::{Belief, BeliefError};
+use emberwatch_belief::estimation::scoring::{Score, score};
+use emberwatch_belief::planning::action::Action;
+use emberwatch_belief::planning::team::{ROUNDS, plan_team};
+use emberwatch_belief::planning::{BasisKind, Objective, Plan, Planner, RandomWalk, Target};
 use protocol::agent_belief::Intent;
 use protocol::{Cell, Frame, Grid};
 use std::time::Duration;
 
 /// What a path that was not planned was for.
 const RANDOM_MOVES: &str = "random moves";
+
+const NO_TRUTH: &str = "the policy needs the truth channel: start the server with --publish-truth";
 
 /// A policy at work on one world.
 pub struct Agent {
@@ -130,16 +132,21 @@ impl Agent {
     }
 
     /// How well the belief predicts a frame; `None` of an estimator that predicts none.
-    pub fn score(&self, frame: &Frame) -> Result<Option<Score>> {
-        Ok(self.estimator.score(frame)?)
+    pub fn score(&self, frame: &Frame) -> Option<Score> {
+        let likelihood = self.estimator.likelihood()?;
+        Some(score(self.estimator.belief(), &likelihood, frame))
     }
 
-    /// Takes in a frame of X_k (paper eq. 5); `truth` is X_k, for policies that are fed with it.
+    /// Takes in a frame of X_k (paper eq. 5); `truth` is X_k, for upper bounds that must be told it.
     ///
     /// # Errors
-    /// The belief is then as it was.
+    /// Also if an upper bound is not told. The belief is then as it was.
     pub fn correct(&mut self, frame: &Frame, truth: Option<&Grid<u8>>) -> Result<()> {
-        Ok(self.estimator.correct(frame, truth)?)
+        self.estimator.correct(frame)?;
+        if let Some(told) = self.estimator.told() {
+            told.tell(truth.context(NO_TRUTH)?)?;
+        }
+        Ok(())
     }
 
     /// Moves the belief from X_k to X_{k+1} (paper eq. 6).
@@ -157,9 +164,9 @@ impl Agent {
         }
     }
 
-    /// Tells a clairvoyant agent the state X_{k+1} that its next path will meet; others ignore it.
+    /// Tells an upper bound the state X_{k+1} that its next path will meet; others ignore it.
     pub fn foresee(&mut self, next: &Grid<u8>) -> Result<(), BeliefError> {
-        self.estimator.foresee(next)
+        self.estimator.told().map_or(Ok(()), |told| told.tell(next))
     }
 
     /// The belief: about X_k after `correct`, about X_{k+1} after `predict`.
@@ -173,6 +180,11 @@ impl Agent {
 
     pub fn estimator_mut(&mut self) -> &mut dyn Estimator {
         &mut *self.estimator
+    }
+
+    /// Goes on with another estimator, such as one with newer parameters.
+    pub fn set_estimator(&mut self, estimator: Box<dyn Estimator>) {
+        self.estimator = estimator;
     }
 
     /// The estimate p_k, where paths are planned on it.

@@ -1,6 +1,7 @@
 //! Shows beliefs to observers, as often as a screen shows: the agent's side of the channel `agent`.
 
-use crate::estimation::belief::Belief;
+use crate::rollout::Rollout;
+use emberwatch_belief::Belief;
 use protocol::agent_belief::{BeliefPublisher, Intent};
 use protocol::channels::{AGENT_BUFFER, Instance};
 use protocol::message::{AgentHeader, WorldResult};
@@ -35,6 +36,19 @@ pub struct View<'a> {
     pub belief: &'a Belief,
     /// Who believes it, and what the path was for.
     pub intent: Intent,
+}
+
+impl<'a> View<'a> {
+    /// What an agent believes after a step; `planning`: time that its plan took.
+    pub fn of(rollout: &'a Rollout, world: u32, robots: Range<u32>, planning: Duration) -> Self {
+        Self {
+            world,
+            robots,
+            result: &rollout.observation().world,
+            belief: rollout.agent.belief(),
+            intent: rollout.agent.intent(planning),
+        }
+    }
 }
 
 impl Feed {

@@ -3,8 +3,6 @@
 use super::target::Seed;
 use agent::config::AgentConfig;
 use agent::estimation::Follower;
-use agent::estimation::belief::Belief;
-use agent::estimation::parameters::Dimensions;
 use agent::learning::checkpoint::{Contents, WrongDigest, decode, encode};
 use agent::learning::learned::Learned;
 use agent::learning::learner::{self, Learner};
@@ -13,6 +11,8 @@ use agent::learning::student::decisions::{self, Decisions};
 use agent::learning::student::filter::{FilterStudent, SavedFilter};
 use agent::learning::student::network::{self, Position, SavedNetwork};
 use agent::learning::student::{Student, Worlds};
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::parameters::Dimensions;
 use ndarray::{Array3, Axis};
 use protocol::model::ModelFile;
 use protocol::{Dynamics, Frame, Model, Shape, Transition};

@@ -97,7 +97,7 @@ fn plans(policy: &str, config: &AgentConfig, learned: &Learned) -> [bool; 2] {
 fn every_policy_plans_on_the_belief_that_settings_say() {
     let network = network(DqnInput::AfterFrame, BasisKind::Predictor, |_| true);
     let filter = |sees_own_state| {
-        let dimensions = crate::estimation::parameters::Dimensions {
+        let dimensions = emberwatch_belief::estimation::parameters::Dimensions {
             n_states: 3,
             n_observations: 3,
             kernel: (3, 3),

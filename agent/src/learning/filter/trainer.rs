@@ -6,12 +6,12 @@
 //! though gradients only run back through the window.
 
 use crate::config::LearningConfig;
-use crate::estimation::parameters::{Dimensions, Parameters};
 use crate::learning::checkpoint::{check, check_counts, check_numbers};
 use crate::learning::filter::adam::Adam;
 use crate::learning::filter::window::{Outcome, Window};
 use crate::learning::replay::{Block, Replay};
 use anyhow::{Result, anyhow};
+use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
 use protocol::Shape;
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;

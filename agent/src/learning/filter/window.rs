@@ -6,11 +6,11 @@
 //! (truncated backpropagation). Gradients are zero far from the cells that later frames visit, and
 //! only the region where they are not is computed.
 
-use crate::estimation::parameters::Tables;
 use crate::learning::filter::correlation::Region;
 use crate::learning::filter::layout::Layout;
 use crate::learning::filter::operator::Operator;
 use crate::learning::replay::Sighting;
+use emberwatch_belief::estimation::parameters::Tables;
 use protocol::Shape;
 use pulp::{Arch, Simd, WithSimd};
 

@@ -1,9 +1,9 @@
 //! What the frames of all worlds say of correlations between neighbours, while the filter is learned.
 
-use crate::estimation::Correlations;
-use crate::estimation::belief::Belief;
-use crate::estimation::correlations::{Ages, Evidence};
-use crate::estimation::parameters::Tables;
+use emberwatch_belief::estimation::Correlations;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::correlations::{Ages, Evidence};
+use emberwatch_belief::estimation::parameters::Tables;
 use protocol::Frame;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;

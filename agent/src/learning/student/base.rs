@@ -1,17 +1,16 @@
 //! What every student does, and what it is told.
 
 use crate::config::AgentConfig;
-use crate::estimation::Estimator;
-use crate::estimation::belief::Belief;
 use crate::learning::checkpoint::Contents;
 use anyhow::Result;
+use emberwatch_belief::estimation::Estimator;
+use emberwatch_belief::estimation::belief::Belief;
 
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::planning::policy::Policy;
+use crate::policy::Policy;
 use crate::rollout::agent::{Agent, Setup};
-use crate::rollout::{Robot, Seen};
+use crate::rollout::{Rollout, Seen};
 use protocol::client::Observation;
-use protocol::connection::ConnectionError;
 use protocol::{Move, Shape};
 use std::ops::Range;
 use std::time::Duration;
@@ -28,14 +27,14 @@ pub struct Worlds {
 
 impl Worlds {
     /// One of them before it takes in what its world shows.
-    pub(super) fn robot(
+    pub(super) fn rollout(
         &self,
         config: &AgentConfig,
         policy: &Policy,
         estimator: Box<dyn Estimator>,
         state_names: Vec<String>,
         observation: Observation,
-    ) -> Robot {
+    ) -> Rollout {
         let setup = Setup {
             basis: config.objective.belief,
             state_names,
@@ -45,18 +44,12 @@ impl Worlds {
             decider: None,
         };
         let agent = Agent::new(estimator, policy, config, setup);
-        Robot::new(agent, Seen::new([observation]))
+        Rollout::new(agent, Seen::new([observation]))
     }
 }
 
 /// Which step of which run a robot saw, and from where: seed, episode, step k, row, column.
 pub type Place = [u64; 5];
-
-/// Flies a path with each robot; gives what they see then, in order.
-pub type Fly<'a> = &'a mut dyn FnMut(&[Vec<Move>]) -> Result<Vec<Observation>, ConnectionError>;
-
-/// Is told of each robot, by its index, when its belief is the posterior.
-pub type Look<'a> = &'a mut dyn FnMut(usize, &Robot);
 
 pub trait Student {
     /// How its checkpoints call it.
@@ -76,8 +69,17 @@ pub trait Student {
 
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()>;
 
-    /// One step of the rollout of all robots: plans, flies, scores, corrects, remembers, predicts.
-    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick>;
+    /// The next path of each robot.
+    fn plan(&mut self) -> Vec<Vec<Move>>;
+
+    /// Takes in what the robots saw on these paths; their beliefs are then posteriors.
+    fn see(&mut self, observations: Vec<Observation>) -> Result<Tick>;
+
+    /// A robot's agent at its world, by its index.
+    fn rollout(&self, index: usize) -> &Rollout;
+
+    /// Moves the beliefs to the next step.
+    fn predict(&mut self);
 
     /// Makes the updates that the steps since the last call have earned.
     fn learn(&mut self) -> Result<Vec<ModelUpdate>>;

@@ -2,20 +2,19 @@
 //! known-model filter's belief, and a DQN that sees a summary of it chooses what each path is for.
 
 use crate::config::{AgentConfig, DecisionsConfig};
-use crate::estimation::BayesFilter;
-use crate::estimation::belief::Belief;
-use crate::estimation::summary::{spread_summary, summary_length};
 use crate::learning::checkpoint::{Contents, check, check_counts};
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
-use crate::planning::action::{Action, ActionSet};
-use crate::planning::policy::Policy;
-use crate::rollout::{self, Robot};
+use crate::learning::student::base::{Student, Worlds, without_truth};
+use crate::policy::Policy;
+use crate::rollout::{Rollout, in_parallel, predict_all, see_all};
 use ::network::{Dqn, SavedDqn, Track, Transition};
 use anyhow::Result;
+use emberwatch_belief::estimation::BayesFilter;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::summary::{spread_summary, summary_length};
+use emberwatch_belief::planning::action::{Action, ActionSet};
 use protocol::client::Observation;
-use protocol::{Cell, Model};
-use rayon::prelude::*;
+use protocol::{Cell, Model, Move};
 use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
 
@@ -58,7 +57,7 @@ pub struct DecisionsStudent {
 }
 
 struct Run {
-    robot: Robot,
+    rollout: Rollout,
     /// What the last decision went by, and what it was.
     input: Vec<f32>,
     action: usize,
@@ -137,23 +136,24 @@ impl DecisionsStudent {
     fn run(&self, observation: Observation) -> Result<Run> {
         let (filter, names) = (Box::new(self.filter.clone()), self.state_names.clone());
         let (policy, config) = (&self.policy, &self.config);
-        let mut robot = self
+        let mut rollout = self
             .worlds
-            .robot(config, policy, filter, names, observation);
-        robot.begin(None, |_| ())?;
+            .rollout(config, policy, filter, names, observation);
+        rollout.correct()?;
+        rollout.agent.predict();
         Ok(Run {
-            input: input(&robot, self.worlds.n_moves),
-            robot,
+            input: input(&rollout, self.worlds.n_moves),
+            rollout,
             action: 0,
             track: self.decisions.dqn.track(),
         })
     }
 }
 
-fn input(robot: &Robot, n_moves: usize) -> Vec<f32> {
+fn input(rollout: &Rollout, n_moves: usize) -> Vec<f32> {
     spread_summary(
-        robot.agent.belief(),
-        robot.observation().robot.cell(),
+        rollout.agent.belief(),
+        rollout.observation().robot.cell(),
         n_moves,
     )
 }
@@ -161,11 +161,11 @@ fn input(robot: &Robot, n_moves: usize) -> Vec<f32> {
 impl Run {
     /// Takes in what an action brought, and gives the transition that is complete by then.
     fn bring(&mut self, reward_scale: f32, n_moves: usize) -> Option<Transition> {
-        let next = input(&self.robot, n_moves);
+        let next = input(&self.rollout, n_moves);
         self.track.add(Transition {
             input: std::mem::replace(&mut self.input, next.clone()),
             action: self.action,
-            reward: self.robot.observation().robot.reward as f32 * reward_scale,
+            reward: self.rollout.observation().robot.reward as f32 * reward_scale,
             next,
         })
     }
@@ -193,48 +193,52 @@ impl Student for DecisionsStudent {
         Ok(())
     }
 
-    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick> {
+    fn plan(&mut self) -> Vec<Vec<Move>> {
         let start = Instant::now();
         let (decisions, is_frozen) = (&self.decisions, self.is_frozen);
-        for (index, run) in self.runs.iter_mut().enumerate() {
-            run.action = match is_frozen {
-                true => decisions.dqn.best(&run.input),
-                false => decisions
-                    .dqn
-                    .act(&run.input, decisions.world_steps + index as u64),
+        let runs = self.runs.iter_mut().enumerate();
+        let paths = in_parallel(runs, |(index, run)| {
+            run.action = if is_frozen {
+                decisions.dqn.best(&run.input)
+            } else {
+                let step = decisions.world_steps + index as u64;
+                decisions.dqn.act(&run.input, step)
             };
-        }
+            let action = &decisions.actions.actions()[run.action];
+            let (cells, step) = (run.rollout.cells(), run.rollout.step());
+            let mut plans = run.rollout.agent.plan_action(action, &cells, step);
+            plans.remove(0).moves
+        });
+        self.times[0].1 += start.elapsed();
+        paths
+    }
+
+    fn see(&mut self, observations: Vec<Observation>) -> Result<Tick> {
+        let seen = without_truth(observations);
+        let turns = see_all(self.runs.iter_mut().map(|run| &mut run.rollout), seen)?;
         let mut tick = Tick::default();
-        rollout::step(
-            &mut self.runs,
-            |run| &mut run.robot,
-            |run| {
-                let action = &decisions.actions.actions()[run.action];
-                run.robot
-                    .plan_with(|agent, robots, step| agent.plan_action(action, robots, step))
-            },
-            |paths| {
-                self.times[0].1 += start.elapsed();
-                anyhow::Ok(without_truth(fly(paths)?))
-            },
-            |index, run, turn| {
-                tick.reward += run.robot.observation().robot.reward;
-                tick.score += turn.score.unwrap_or_default();
-                look(index, &run.robot);
-                Ok(())
-            },
-        )?;
-        let (n_moves, config) = (self.worlds.n_moves, &self.config.decisions);
-        let bring = |run: &mut Run| run.bring(config.reward_scale, n_moves);
-        let transitions: Vec<_> = self.runs.par_iter_mut().map(bring).collect();
-        for transition in transitions.into_iter().flatten() {
-            self.decisions.dqn.remember(transition);
+        for (run, turn) in self.runs.iter().zip(turns) {
+            tick.reward += run.rollout.observation().robot.reward;
+            tick.score += turn.score.unwrap_or_default();
         }
         tick.n_worlds = self.runs.len() as u64;
         self.decisions.world_steps += tick.n_worlds;
         tick.world_steps = self.decisions.world_steps;
-        self.owed += tick.n_worlds as f64 * config.updates_per_step;
+        self.owed += tick.n_worlds as f64 * self.config.decisions.updates_per_step;
         Ok(tick)
+    }
+
+    fn rollout(&self, index: usize) -> &Rollout {
+        &self.runs[index].rollout
+    }
+
+    fn predict(&mut self) {
+        predict_all(self.runs.iter_mut().map(|run| &mut run.rollout));
+        let (n_moves, scale) = (self.worlds.n_moves, self.config.decisions.reward_scale);
+        let transitions = in_parallel(&mut self.runs, |run| run.bring(scale, n_moves));
+        for transition in transitions.into_iter().flatten() {
+            self.decisions.dqn.remember(transition);
+        }
     }
 
     fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
@@ -276,7 +280,7 @@ impl Student for DecisionsStudent {
 
     fn belief(&self) -> Option<(&Belief, usize)> {
         let run = self.runs.first()?;
-        Some((run.robot.agent.belief(), self.target))
+        Some((run.rollout.agent.belief(), self.target))
     }
 
     fn contents(&self) -> Result<Contents> {

@@ -7,45 +7,30 @@ pub use self::saved::SavedFilter;
 
 use self::saved::SavedWorld;
 use crate::config::AgentConfig;
-use crate::estimation::BayesFilter;
-use crate::estimation::belief::Belief;
-use crate::estimation::parameters::{Dimensions, Tables};
 use crate::learning::checkpoint::Contents;
 use crate::learning::learner::{LearnedModel, Learner};
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::learning::student::base::{Fly, Look, Student, Worlds, without_truth};
-use crate::planning::policy::{EstimatorKind, PlannerKind, Policy, numbered_states};
-use crate::planning::{Objective, Plan, Target};
-use crate::rollout::{self, Robot};
+use crate::learning::student::base::{Student, Worlds, without_truth};
+use crate::policy::{EstimatorKind, PlannerKind, Policy, numbered_states};
+use crate::rollout::{Rollout, in_parallel, predict_all, see_all};
 use anyhow::Result;
+use emberwatch_belief::estimation::BayesFilter;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::parameters::Dimensions;
+use emberwatch_belief::planning::{Plan, Target};
 use protocol::client::Observation;
-use protocol::path;
+use protocol::{Move, path};
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
-
-struct Run {
-    robot: Robot,
-    is_walking: bool,
-    /// The belief before the last frame, unless that was the first.
-    predictor: Option<Belief>,
-}
-
-impl From<Robot> for Run {
-    fn from(robot: Robot) -> Self {
-        Self {
-            robot,
-            is_walking: false,
-            predictor: None,
-        }
-    }
-}
 
 pub struct FilterStudent {
     worlds: Worlds,
     config: AgentConfig,
     learner: Learner,
     learned: LearnedModel,
-    runs: Vec<Run>,
+    rollouts: Vec<Rollout>,
+    /// What was planned last, of each robot: its belief then, and its path.
+    planned: Vec<(Belief, Plan)>,
     /// Where a checkpoint left the worlds.
     left: BTreeMap<u32, SavedWorld>,
     is_frozen: bool,
@@ -92,7 +77,8 @@ impl FilterStudent {
             left,
             worlds,
             config: config.clone(),
-            runs: Vec::new(),
+            rollouts: Vec::new(),
+            planned: Vec::new(),
             is_frozen: false,
             planning: Duration::ZERO,
             learning: Duration::ZERO,
@@ -100,23 +86,24 @@ impl FilterStudent {
     }
 
     /// A robot before it takes in what its world shows.
-    fn robot(&self, observation: Observation) -> Robot {
+    fn rollout_at(&self, observation: Observation) -> Rollout {
         let tables = &self.learned.tables;
         let filter = BayesFilter::learned(tables, tables.prior(self.worlds.shape));
         let names = numbered_states(tables.dimensions.n_states);
         let (policy, config) = (self.policy(), &self.config);
         let worlds = &self.worlds;
-        worlds.robot(config, &policy, Box::new(filter), names, observation)
+        worlds.rollout(config, &policy, Box::new(filter), names, observation)
     }
 
     /// A robot that has taken in what its world shows, with a track that begins there.
-    fn begun(&mut self, world: u32, observation: Observation) -> Result<Run> {
+    fn begun(&mut self, world: u32, observation: Observation) -> Result<Rollout> {
         self.learner.begin(world);
         let frame = &observation.frame;
         self.learner.see(world, frame, None, &self.learned);
-        let mut robot = self.robot(observation);
-        robot.begin(None, |_| ())?;
-        Ok(robot.into())
+        let mut rollout = self.rollout_at(observation);
+        rollout.correct()?;
+        rollout.agent.predict();
+        Ok(rollout)
     }
 
     /// What robots that don't walk at random act by.
@@ -136,9 +123,9 @@ impl FilterStudent {
         }
         let learning = &self.config.learning;
         if self.learner.world_steps < learning.explore_steps {
-            return self.runs.len();
+            return self.rollouts.len();
         }
-        (learning.explore_share * self.runs.len() as f64).round() as usize
+        (learning.explore_share * self.rollouts.len() as f64).round() as usize
     }
 }
 
@@ -162,64 +149,76 @@ impl Student for FilterStudent {
             let left = self.left.get(&world);
             let left =
                 left.filter(|left| left.is_of(&observation) && self.learner.has_track(world));
-            let run = if let Some(left) = left {
-                let mut robot = self.robot(observation);
-                left.restore(&mut robot.agent);
+            let rollout = if let Some(left) = left {
+                let mut rollout = self.rollout_at(observation);
+                left.restore(&mut rollout.agent);
                 n_gone_on += 1;
-                robot.into()
+                rollout
             } else {
                 self.begun(world, observation)?
             };
-            self.runs.push(run);
+            self.rollouts.push(rollout);
         }
         Ok(n_gone_on)
     }
 
     fn begin(&mut self, world: u32, observation: Observation) -> Result<()> {
-        let run = self.begun(world, observation)?;
-        self.runs[(world - self.worlds.numbers.start) as usize] = run;
+        let rollout = self.begun(world, observation)?;
+        self.rollouts[(world - self.worlds.numbers.start) as usize] = rollout;
         Ok(())
     }
 
-    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick> {
+    fn plan(&mut self) -> Vec<Vec<Move>> {
         let start = Instant::now();
         if !self.is_frozen {
             self.learned = self.learner.learned();
         }
-        let (n_walking, first_world) = (self.n_walking(), self.worlds.numbers.start);
-        for (index, run) in self.runs.iter_mut().enumerate() {
-            run.is_walking = index < n_walking;
-            run.predictor = Some(run.robot.agent.belief().clone());
-        }
+        let (n_walking, tables) = (self.n_walking(), &self.learned.tables);
         let objective = self.config.objective(&self.policy());
+        let rollouts = self.rollouts.iter_mut().enumerate();
+        self.planned = in_parallel(rollouts, |(index, rollout)| {
+            let belief = rollout.agent.belief().clone();
+            let filter = BayesFilter::learned(tables, belief.clone());
+            rollout.agent.set_estimator(Box::new(filter));
+            let (cells, step) = (rollout.cells(), rollout.step());
+            let mut plans = if index < n_walking {
+                rollout.agent.walk(&cells, step)
+            } else {
+                rollout.agent.plan_for(objective, &cells, step)
+            };
+            (belief, plans.remove(0))
+        });
+        self.planning += start.elapsed();
+        let plans = self.planned.iter();
+        plans.map(|(_, plan)| plan.moves.clone()).collect()
+    }
+
+    fn see(&mut self, observations: Vec<Observation>) -> Result<Tick> {
+        let turns = see_all(&mut self.rollouts, without_truth(observations))?;
         let mut tick = Tick::default();
-        rollout::step(
-            &mut self.runs,
-            |run| &mut run.robot,
-            |run| run.plan(&self.learned.tables, objective),
-            |paths| {
-                self.planning += start.elapsed();
-                anyhow::Ok(without_truth(fly(paths)?))
-            },
-            |index, run, turn| {
-                let (agent, observation) = (&run.robot.agent, run.robot.observation());
-                let path = &turn.plans[0].moves;
-                let visited = path::fly(self.worlds.shape, turn.before.robot.cell(), path);
-                let reward = observation.robot.reward;
-                let (world, predictor) = (first_world + index as u32, run.predictor.as_ref());
-                self.learner
-                    .see(world, &observation.frame, predictor, &self.learned);
-                self.learner
-                    .reward(agent.belief(), &visited.visited, reward);
-                tick.reward += reward;
-                tick.score += turn.score.unwrap_or_default();
-                look(index, &run.robot);
-                Ok(())
-            },
-        )?;
-        tick.n_worlds = self.runs.len() as u64;
+        let runs = self.rollouts.iter().zip(&self.planned).zip(turns);
+        for (world, ((rollout, (predictor, plan)), turn)) in (self.worlds.numbers.start..).zip(runs)
+        {
+            let (belief, observation) = (rollout.agent.belief(), rollout.observation());
+            let reward = observation.robot.reward;
+            let flight = path::fly(self.worlds.shape, turn.before.robot.cell(), &plan.moves);
+            self.learner
+                .see(world, &observation.frame, Some(predictor), &self.learned);
+            self.learner.reward(belief, &flight.visited, reward);
+            tick.reward += reward;
+            tick.score += turn.score.unwrap_or_default();
+        }
+        tick.n_worlds = self.rollouts.len() as u64;
         tick.world_steps = self.learner.world_steps;
         Ok(tick)
+    }
+
+    fn rollout(&self, index: usize) -> &Rollout {
+        &self.rollouts[index]
+    }
+
+    fn predict(&mut self) {
+        predict_all(&mut self.rollouts);
     }
 
     fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
@@ -248,12 +247,12 @@ impl Student for FilterStudent {
     }
 
     fn belief(&self) -> Option<(&Belief, usize)> {
-        let run = self.runs.first()?;
-        Some((run.robot.agent.belief(), self.learned.target))
+        let rollout = self.rollouts.first()?;
+        Some((rollout.agent.belief(), self.learned.target))
     }
 
     fn contents(&self) -> Result<Contents> {
-        let saved = self.runs.iter().map(|run| SavedWorld::of(&run.robot));
+        let saved = self.rollouts.iter().map(SavedWorld::of);
         let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(saved).collect();
         // As `SavedFilter`, without a copy of the learner.
         let state = (&self.learner, worlds);
@@ -262,18 +261,5 @@ impl Student for FilterStudent {
 
     fn times(&self) -> Vec<(&'static str, Duration)> {
         vec![("planning", self.planning), ("updates", self.learning)]
-    }
-}
-
-impl Run {
-    /// The next path on newer parameters.
-    fn plan(&mut self, tables: &Tables, objective: Objective) -> Vec<Plan> {
-        let is_walking = self.is_walking;
-        self.robot.agent.estimator_mut().set_tables(tables);
-        self.robot
-            .plan_with(|agent, robots, step| match is_walking {
-                true => agent.walk(robots, step),
-                false => agent.plan_for(objective, robots, step),
-            })
     }
 }

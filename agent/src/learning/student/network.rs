@@ -13,17 +13,17 @@ use self::progress::follower;
 use anyhow::Result;
 
 use crate::config::AgentConfig;
-use crate::estimation::belief::Belief;
 use crate::estimation::{AutoencoderEstimator, Follower};
 use crate::learning::checkpoint::Contents;
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::reward::met;
-use crate::learning::student::base::{Fly, Look, Student, Worlds, place, without_truth};
-use crate::planning::policy::{Policy, numbered_states};
-use crate::rollout::{self, Robot};
+use crate::learning::student::base::{Student, Worlds, place, without_truth};
+use crate::policy::{Policy, numbered_states};
+use crate::rollout::{Rollout, predict_all, see_all};
 use ::network::{Transition, Window};
+use emberwatch_belief::estimation::belief::Belief;
 use protocol::client::Observation;
-use protocol::path;
+use protocol::{Move, path};
 use std::time::{Duration, Instant};
 
 pub const KIND: &str = "autoencoder";
@@ -37,17 +37,19 @@ pub struct NetworkStudent {
     progress: Progress,
     choices: Vec<Policy>,
     /// Its world's, once it is attached.
-    robot: Option<Robot>,
+    rollout: Option<Rollout>,
+    /// The last decision, and the path that was planned for it.
     decision: Option<Decision>,
     is_frozen: bool,
     times: [(&'static str, Duration); 3],
 }
 
-/// The action of a step, and what it was chosen on.
+/// The action of a step, what it was chosen on, and the path for it.
 struct Decision {
     input: Vec<f32>,
     action: usize,
     value: f32,
+    path: Vec<Move>,
 }
 
 impl NetworkStudent {
@@ -58,50 +60,66 @@ impl NetworkStudent {
             progress,
             worlds,
             config: config.clone(),
-            robot: None,
+            rollout: None,
             decision: None,
             is_frozen: false,
             times: ["planning", "dqn", "autoencoder"].map(|part| (part, Duration::ZERO)),
         }
     }
 
-    /// A robot whose hidden vector is where another was, before it takes in what its world shows.
-    fn robot(&self, follower: Follower, observation: Observation) -> Robot {
+    /// A rollout whose hidden vector is where another was, before it takes in what its world shows.
+    fn rollout_at(&self, follower: Follower, observation: Observation) -> Rollout {
         let network = &self.progress.autoencoder;
         let estimator = AutoencoderEstimator::at(network, follower);
         let names = numbered_states(network.shape().n_states);
         let (policy, config) = (&self.choices[0], &self.config);
         let worlds = &self.worlds;
-        worlds.robot(config, policy, Box::new(estimator), names, observation)
+        worlds.rollout(config, policy, Box::new(estimator), names, observation)
+    }
+
+    fn at_world(&self) -> &Rollout {
+        let rollout = self.rollout.as_ref();
+        rollout.expect("invariant: a world begins before it is acted on")
+    }
+
+    fn at_world_mut(&mut self) -> &mut Rollout {
+        let rollout = self.rollout.as_mut();
+        rollout.expect("invariant: a world begins before it is acted on")
     }
 
     /// What the next action goes by.
-    fn input(&self, robot: &Robot) -> Vec<f32> {
-        let cell = robot.observation().robot.cell();
-        self.progress
-            .input
-            .of(follower(robot), cell, self.worlds.n_moves)
+    fn input(&self) -> Vec<f32> {
+        let rollout = self.at_world();
+        let Follower { hidden, prediction } = follower(rollout);
+        let cell = rollout.observation().robot.cell();
+        let n_moves = self.worlds.n_moves;
+        self.progress.input.of(&hidden, &prediction, cell, n_moves)
     }
 
-    fn decide(&self, robot: &Robot) -> Decision {
-        let (dqn, input) = (&self.progress.dqn, self.input(robot));
-        let action = match self.is_frozen {
-            true => dqn.best(&input),
-            false => dqn.act(&input, self.progress.position.iterations),
+    fn decide(&self) -> Decision {
+        let (dqn, input) = (&self.progress.dqn, self.input());
+        let action = if self.is_frozen {
+            dqn.best(&input)
+        } else {
+            dqn.act(&input, self.progress.position.iterations)
         };
         Decision {
             value: dqn.values(&input)[action],
             input,
             action,
+            path: Vec::new(),
         }
     }
 
-    fn remember(&mut self, robot: &Robot, decision: &Decision) {
+    /// Remembers what the last decision brought.
+    fn remember(&mut self) {
+        let decision = self.decision.as_ref();
+        let decision = decision.expect("invariant: a step begins with a decision");
         let step = Transition {
             input: decision.input.clone(),
             action: decision.action,
-            reward: robot.observation().robot.reward as f32,
-            next: self.input(robot),
+            reward: self.at_world().observation().robot.reward as f32,
+            next: self.input(),
         };
         if let Some(transition) = self.progress.position.track.add(step) {
             self.progress.dqn.remember(transition);
@@ -137,41 +155,6 @@ impl NetworkStudent {
         self.times[2].1 += start.elapsed();
         Ok([Some(loss?), Some(rate)])
     }
-
-    fn step_with(&mut self, robot: &mut Robot, fly: Fly<'_>, look: Look<'_>) -> Result<Tick> {
-        let start = Instant::now();
-        let decision = self.decide(robot);
-        let objective = self.config.objective(&self.choices[decision.action]);
-        let (mut planning, mut tick) = (Duration::ZERO, Tick::default());
-        rollout::step(
-            std::slice::from_mut(robot),
-            |robot| robot,
-            |robot| robot.plan_with(|agent, robots, step| agent.plan_for(objective, robots, step)),
-            |paths| {
-                planning = start.elapsed();
-                anyhow::Ok(without_truth(fly(paths)?))
-            },
-            |index, robot, turn| {
-                tick.score = turn.score.unwrap_or_default();
-                tick.reward = robot.observation().robot.reward;
-                let path = &turn.plans[0].moves;
-                let cells = path::fly(self.worlds.shape, turn.before.robot.cell(), path);
-                let met = met(robot.agent.belief(), cells.visited.iter().copied());
-                self.progress.position.reward.add(&met, tick.reward);
-                look(index, robot);
-                Ok(())
-            },
-        )?;
-        self.times[0].1 += planning;
-        self.remember(robot, &decision);
-        self.decision = Some(decision);
-        let frame = robot.observation().frame.clone();
-        self.progress.replay.push(frame);
-        self.progress.position.iterations += 1;
-        tick.world_steps = self.progress.position.iterations;
-        tick.n_worlds = 1;
-        Ok(tick)
-    }
 }
 
 impl Student for NetworkStudent {
@@ -193,10 +176,11 @@ impl Student for NetworkStudent {
         let goes_on = self.progress.position.place == Some(place(&observation))
             && shown == Some(&observation.frame);
         if goes_on {
-            let mut robot = self.robot(self.progress.position.follower.clone(), observation);
+            let follower = self.progress.position.follower.clone();
+            let mut rollout = self.rollout_at(follower, observation);
             let estimate = self.progress.position.estimate.as_ref();
-            robot.agent.remember_estimate(estimate);
-            self.robot = Some(robot);
+            rollout.agent.remember_estimate(estimate);
+            self.rollout = Some(rollout);
         } else {
             self.begin(self.worlds.numbers.start, observation)?;
         }
@@ -208,18 +192,59 @@ impl Student for NetworkStudent {
         self.progress.replay.begin();
         self.progress.replay.push(observation.frame.clone());
         let follower = Follower::new(&self.progress.autoencoder)?;
-        let mut robot = self.robot(follower, observation);
-        robot.begin(None, |_| ())?;
-        self.robot = Some(robot);
+        let mut rollout = self.rollout_at(follower, observation);
+        rollout.correct()?;
+        rollout.agent.predict();
+        self.rollout = Some(rollout);
         Ok(())
     }
 
-    fn step(&mut self, fly: Fly<'_>, look: Look<'_>) -> Result<Tick> {
-        let robot = self.robot.take();
-        let mut robot = robot.expect("invariant: a world begins before it is acted on");
-        let stepped = self.step_with(&mut robot, fly, look);
-        self.robot = Some(robot);
-        stepped
+    fn plan(&mut self) -> Vec<Vec<Move>> {
+        let start = Instant::now();
+        let mut decision = self.decide();
+        let objective = self.config.objective(&self.choices[decision.action]);
+        let rollout = self.at_world_mut();
+        let (cells, step) = (rollout.cells(), rollout.step());
+        decision.path = rollout
+            .agent
+            .plan_for(objective, &cells, step)
+            .remove(0)
+            .moves;
+        let paths = vec![decision.path.clone()];
+        self.decision = Some(decision);
+        self.times[0].1 += start.elapsed();
+        paths
+    }
+
+    fn see(&mut self, observations: Vec<Observation>) -> Result<Tick> {
+        let turns = see_all(&mut self.rollout, without_truth(observations))?;
+        let (turn, rollout) = (&turns[0], self.at_world());
+        let path = self.decision.as_ref().map(|decision| &*decision.path);
+        let start = turn.before.robot.cell();
+        let flight = path::fly(self.worlds.shape, start, path.unwrap_or_default());
+        let (met, observation) = (
+            met(rollout.agent.belief(), flight.visited.iter().copied()),
+            rollout.observation().clone(),
+        );
+        let position = &mut self.progress.position;
+        position.reward.add(&met, observation.robot.reward);
+        position.iterations += 1;
+        self.progress.replay.push(observation.frame);
+        Ok(Tick {
+            reward: observation.robot.reward,
+            score: turn.score.unwrap_or_default(),
+            n_worlds: 1,
+            world_steps: self.progress.position.iterations,
+        })
+    }
+
+    fn rollout(&self, _: usize) -> &Rollout {
+        self.at_world()
+    }
+
+    fn predict(&mut self) {
+        predict_all(&mut self.rollout);
+        self.remember();
     }
 
     fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
@@ -260,14 +285,12 @@ impl Student for NetworkStudent {
     }
 
     fn belief(&self) -> Option<(&Belief, usize)> {
-        let belief = follower(self.robot.as_ref()?).prediction();
-        Some((belief, self.progress.target()))
+        let rollout = self.rollout.as_ref()?;
+        Some((rollout.agent.belief(), self.progress.target()))
     }
 
     fn contents(&self) -> Result<Contents> {
-        let robot = self.robot.as_ref();
-        let robot = robot.expect("invariant: a world begins before it is saved");
-        Ok(self.progress.to_contents(robot)?)
+        Ok(self.progress.to_contents(self.at_world())?)
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {

@@ -1,17 +1,17 @@
 //! Which belief students plan on.
 
 use crate::config::AgentConfig;
-use crate::estimation::BayesFilter;
-use crate::estimation::belief::Belief;
-use crate::estimation::parameters::Dimensions;
 use crate::learning::student::decisions::{Decisions, DecisionsStudent};
 use crate::learning::student::filter::FilterStudent;
 use crate::learning::student::network::{NetworkStudent, Progress};
 use crate::learning::student::{Student, Worlds};
-use crate::planning::action::{Action, ActionSet};
-use crate::planning::policy::{EstimatorKind, PlannerKind, Policy};
-use crate::planning::{BasisKind, Objective, PlanningProblem, Target};
+use crate::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::rollout::Robot;
+use emberwatch_belief::estimation::BayesFilter;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::parameters::Dimensions;
+use emberwatch_belief::planning::action::{Action, ActionSet};
+use emberwatch_belief::planning::{BasisKind, Objective, PlanningProblem, Target};
 use protocol::client::Observation;
 use protocol::message::{RobotResult, WorldResult};
 use protocol::randomness::split_mix;

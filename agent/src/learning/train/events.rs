@@ -1,10 +1,10 @@
 //! What TensorBoard shows of a training: the columns of the CSV, and now and then the belief.
 
-use crate::estimation::belief::Belief;
 use crate::learning::metrics::{ModelUpdate, Tick, averages};
 use crate::learning::student::Student;
 use crate::learning::tensorboard::{EventFile, Value};
 use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
 use figures::{Heat, heat};
 use std::path::Path;
 

@@ -1,9 +1,7 @@
 //! Which student the settings ask for.
 
 use crate::config::{AgentConfig, LearnerKind};
-use crate::estimation::BayesFilter;
 use crate::estimation::first_belief::first_belief;
-use crate::estimation::parameters::Dimensions;
 use crate::learning::checkpoint::Contents;
 use crate::learning::student::decisions::{Decisions, DecisionsStudent};
 use crate::learning::student::filter::FilterStudent;
@@ -11,6 +9,8 @@ use crate::learning::student::network::{self, NetworkStudent};
 use crate::learning::student::{Student, Worlds};
 use crate::learning::train::training::Training;
 use anyhow::{Context, Result, bail};
+use emberwatch_belief::estimation::BayesFilter;
+use emberwatch_belief::estimation::parameters::Dimensions;
 use protocol::control::CoverageRule;
 use protocol::{Client, Model};
 use std::path::Path;
@@ -86,5 +86,5 @@ fn dimensions(config: &AgentConfig, n_observations: usize) -> Result<Dimensions>
         kernel,
         sees_own_state: config.learner == LearnerKind::OwnFilter,
     };
-    dimensions.check()
+    Ok(dimensions.check()?)
 }

@@ -1,12 +1,12 @@
 //! A learned filter in a checkpoint: the learner, and where its robots are.
 
-use crate::estimation::belief::Belief;
 use crate::learning::checkpoint::check_belief;
 use crate::learning::learner::Learner;
 use crate::learning::student::base::{Place, place};
-use crate::rollout::Robot;
+use crate::rollout::Rollout;
 use crate::rollout::agent::Agent;
 use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
 use protocol::Shape;
 use protocol::client::Observation;
 use serde::{Deserialize, Serialize};
@@ -31,8 +31,8 @@ pub struct SavedWorld {
 }
 
 impl SavedWorld {
-    pub fn of(robot: &Robot) -> Self {
-        let (agent, observation) = (&robot.agent, robot.observation());
+    pub fn of(rollout: &Rollout) -> Self {
+        let (agent, observation) = (&rollout.agent, rollout.observation());
         Self {
             place: place(observation),
             frame: observation.frame.as_bytes().to_vec(),
@@ -61,7 +61,8 @@ impl SavedWorld {
 
     /// Gives an agent the belief, and the estimate if its paths are planned on that.
     pub fn restore(&self, agent: &mut Agent) {
-        let is_taken = agent.estimator_mut().remember(&self.belief.to_bytes());
+        let memory = agent.estimator_mut().memory();
+        let is_taken = memory.is_some_and(|memory| memory.restore(&self.belief.to_bytes()));
         debug_assert!(is_taken, "invariant: the belief was checked");
         agent.remember_estimate(self.estimate.as_ref());
     }

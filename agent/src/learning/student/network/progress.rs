@@ -2,18 +2,18 @@
 
 use crate::config::AgentConfig;
 use crate::estimation::Follower;
-use crate::estimation::belief::Belief;
 use crate::estimation::dqn_input::DqnInput;
 use crate::learning::checkpoint::{
     Contents, check, check_belief, check_counts, check_numbers, wrong,
 };
 use crate::learning::reward::RewardEstimate;
 use crate::learning::student::base::{Place, Worlds, place};
-use crate::planning::BasisKind;
-use crate::planning::policy::Policy;
-use crate::rollout::Robot;
+use crate::policy::Policy;
+use crate::rollout::Rollout;
 use ::network::{Autoencoder, Device, Dqn, NetworkError, NetworkShape, Replay, SavedDqn, Track};
 use anyhow::Result;
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::planning::BasisKind;
 use protocol::model::MAX_VALUES;
 use protocol::{Frame, Shape};
 use serde::{Deserialize, Serialize};
@@ -100,8 +100,8 @@ impl Progress {
         reward.target().unwrap_or(reward.rewards.len() - 1)
     }
 
-    /// As a checkpoint, without the settings: a robot stands in the world.
-    pub fn to_contents(&self, robot: &Robot) -> Result<Contents, NetworkError> {
+    /// As a checkpoint, without the settings: an agent stands in its world.
+    pub fn to_contents(&self, rollout: &Rollout) -> Result<Contents, NetworkError> {
         let shape = self.autoencoder.shape();
         let frames = self.replay.frames();
         let state = SavedNetwork {
@@ -112,9 +112,9 @@ impl Progress {
             frames: frames.map(|frame| frame.as_bytes().to_vec()).collect(),
             tracks: self.replay.tracks().collect(),
             position: Position {
-                follower: follower(robot).clone(),
-                estimate: robot.agent.estimate().cloned(),
-                place: Some(place(robot.observation())),
+                follower: follower(rollout),
+                estimate: rollout.agent.estimate().cloned(),
+                place: Some(place(rollout.observation())),
                 ..self.position.clone()
             },
         };
@@ -195,10 +195,11 @@ impl Progress {
     }
 }
 
-/// What the network of a robot's agent knows of its world.
-pub(super) fn follower(robot: &Robot) -> &Follower {
-    let follower = robot.agent.estimator().follower();
-    follower.expect("invariant: its estimator is an autoencoder")
+/// What the network of an agent knows of its world, after a prediction.
+pub(super) fn follower(rollout: &Rollout) -> Follower {
+    let (agent, hidden) = (&rollout.agent, rollout.agent.estimator().hidden());
+    let hidden = hidden.expect("invariant: its estimator is an autoencoder");
+    Follower::at(hidden.to_vec(), agent.belief().clone())
 }
 
 fn network_shape(grid: Shape, n_observations: usize, config: &AgentConfig) -> NetworkShape {

@@ -1,8 +1,8 @@
 //! Plans of several robots.
 
 use crate::fields::{Field, RANDOM, fields, objectives, paths};
-use agent::planning::team::{ROUNDS, plan_team, robot_seed};
-use agent::planning::{
+use emberwatch_belief::planning::team::{ROUNDS, plan_team, robot_seed};
+use emberwatch_belief::planning::{
     BeamSearch, CellValues, Integration, Objective, Plan, Planner, Shooting, Target,
 };
 use proptest::prelude::*;

@@ -8,14 +8,14 @@
 use crate::estimation::bayes::ZeroEvidence;
 use crate::estimation::belief::Belief;
 use crate::estimation::correlations::{Ages, Correlations, Evidence};
-use crate::estimation::estimator::{Estimator, EstimatorError};
+use crate::estimation::estimator::{Estimator, EstimatorError, Memory};
 use crate::estimation::filter::BayesFilter;
 use crate::estimation::innovation::Innovation;
-use crate::estimation::parameters::Tables;
-use crate::estimation::scoring::Score;
 use crate::estimation::spread::Spread;
 use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
-use protocol::{Frame, Grid};
+use ndarray::Array2;
+use protocol::Frame;
+use std::borrow::Cow;
 
 /// How ages and sums are written. The limit is more than any grid's.
 const FORM: Configuration<LittleEndian, Fixint, Limit<{ 1 << 25 }>> = bincode::config::standard()
@@ -57,7 +57,7 @@ impl SpatialFilter {
         &mut self,
         seen: impl Iterator<Item = (usize, u8)>,
     ) -> Result<(), ZeroEvidence> {
-        let (belief, likelihood) = (self.filter.belief(), self.filter.likelihood());
+        let (belief, likelihood) = self.filter.parts();
         self.spread
             .begin(belief, &self.ages, seen, &self.correlations);
         for index in 0..self.spread.n_seen() {
@@ -81,10 +81,10 @@ impl SpatialFilter {
 impl Estimator for SpatialFilter {
     /// # Panics
     /// If the frame is of another grid.
-    fn correct(&mut self, frame: &Frame, _: Option<&Grid<u8>>) -> Result<(), EstimatorError> {
+    fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
         let (dim, expected) = (frame.values().dim(), self.belief().shape().dim());
         assert_eq!(dim, expected, "frame: expected the belief's grid");
-        let (belief, likelihood) = (self.filter.belief(), self.filter.likelihood());
+        let (belief, likelihood) = self.filter.parts();
         let evidence = Evidence::of(frame, belief, likelihood, self.state, &self.ages);
         self.correct_in_order(frame.observed())?;
         self.correlations.learn(&evidence);
@@ -100,31 +100,30 @@ impl Estimator for SpatialFilter {
         self.filter.belief()
     }
 
-    fn score(&self, frame: &Frame) -> Result<Option<Score>, EstimatorError> {
-        self.filter.score(frame)
+    fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
+        self.filter.likelihood()
     }
 
-    fn set_tables(&mut self, tables: &Tables) {
-        self.filter.set_tables(tables);
+    fn memory(&mut self) -> Option<&mut dyn Memory> {
+        Some(self)
+    }
+}
+
+impl Memory for SpatialFilter {
+    fn kind(&self) -> String {
+        let (filter, state) = (self.filter.kind(), self.state);
+        format!("spatial {filter}, ages and sums of state {state} as bincode")
     }
 
-    fn kind(&self) -> Option<String> {
-        let filter = self.filter.kind()?;
-        let state = self.state;
-        Some(format!(
-            "spatial {filter}, ages and sums of state {state} as bincode"
-        ))
-    }
-
-    fn memory(&self) -> Vec<u8> {
+    fn to_bytes(&self) -> Vec<u8> {
         let own = bincode::serde::encode_to_vec((&self.ages, &self.correlations), FORM);
         let own = own.expect("invariant: numbers can be encoded");
-        [self.filter.memory(), own].concat()
+        [self.filter.to_bytes(), own].concat()
     }
 
-    fn remember(&mut self, memory: &[u8]) -> bool {
+    fn restore(&mut self, bytes: &[u8]) -> bool {
         let n_bytes = 4 * self.belief().as_slice().len();
-        let Some((belief, own)) = memory.split_at_checked(n_bytes) else {
+        let Some((belief, own)) = bytes.split_at_checked(n_bytes) else {
             return false;
         };
         let decoded = bincode::serde::decode_from_slice::<(Ages, Correlations), _>(own, FORM);
@@ -132,7 +131,7 @@ impl Estimator for SpatialFilter {
             return false;
         };
         let fits = n_read == own.len() && ages.as_slice().len() == self.ages.as_slice().len();
-        let is_taken = fits && self.filter.remember(belief);
+        let is_taken = fits && self.filter.restore(belief);
         if is_taken {
             (self.ages, self.correlations) = (ages, correlations);
         }

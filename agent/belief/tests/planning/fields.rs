@@ -1,7 +1,7 @@
 //! Random problems.
 
-use agent::Belief;
-use agent::planning::{CellValues, Objective, PlanningProblem, Target};
+use emberwatch_belief::Belief;
+use emberwatch_belief::planning::{CellValues, Objective, PlanningProblem, Target};
 use proptest::prelude::*;
 use protocol::randomness::split_mix;
 use protocol::{Cell, Move, Probabilities, Shape};

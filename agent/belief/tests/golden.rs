@@ -9,12 +9,12 @@
 //!     np.savez(f"{name}.npz", **{k: z[k] for k in z.files if z[k].dtype.kind != "U"})
 //! ```
 
-#[path = "../network/tests/network/golden_file.rs"]
+#[path = "../../network/tests/network/golden_file.rs"]
 mod golden_file;
 
-use agent::estimation::belief::Belief;
-use agent::estimation::{BayesFilter, Estimator};
-use agent::planning::{Integration, Objective, Target};
+use emberwatch_belief::estimation::belief::Belief;
+use emberwatch_belief::estimation::{BayesFilter, Estimator};
+use emberwatch_belief::planning::{Integration, Objective, Target};
 use golden_file::{Golden, frame_from};
 use ndarray::{Array1, Array2, Array3, Array4, ArrayView3, s};
 use protocol::frame::Frame;

@@ -2,13 +2,13 @@
 //!
 //! The authors' PyTorch code, one CPU thread: planner with 2048 samples 1.5 s, Bayes update 0.12 ms.
 
-use agent::estimation::belief::{Belief, EntropyKind};
-use agent::estimation::{BayesFilter, Correlations, Estimator, SpatialFilter};
-use agent::planning::team::{ROUNDS, plan_team};
-use agent::planning::{
+use criterion::{Criterion, criterion_group, criterion_main};
+use emberwatch_belief::estimation::belief::{Belief, EntropyKind};
+use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, SpatialFilter};
+use emberwatch_belief::planning::team::{ROUNDS, plan_team};
+use emberwatch_belief::planning::{
     BeamSearch, CellValues, Objective, Planner, PlanningProblem, RandomWalk, Shooting, Target,
 };
-use criterion::{Criterion, criterion_group, criterion_main};
 use protocol::frame::Frame;
 use protocol::grid::{Cell, Shape};
 use protocol::model::Model;

@@ -1,7 +1,7 @@
 //! What each policy does, in a line.
 
 use super::named::{EstimatorKind, PlannerKind, Policy};
-use crate::planning::objective::Target;
+use emberwatch_belief::planning::objective::Target;
 use protocol::Model;
 
 /// All policies of a model, a line each: name, planner, objective, belief.

@@ -1,8 +1,8 @@
 //! What a policy is, and policies by name.
 
-use crate::planning::action::{Action, ActionSet};
-use crate::planning::objective::{BEAM_BONUS, Objective, Target};
 use anyhow::{Context, Result, bail};
+use emberwatch_belief::planning::action::{Action, ActionSet};
+use emberwatch_belief::planning::objective::{BEAM_BONUS, Objective, Target};
 use protocol::Model;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -65,6 +65,11 @@ impl EstimatorKind {
                 | Self::LearnedOwnSpatial
                 | Self::Autoencoder
         )
+    }
+
+    /// Whether frames change its belief.
+    pub fn sees_frames(self) -> bool {
+        !matches!(self, Self::None | Self::Truth | Self::NextTruth)
     }
 
     pub fn label(self) -> &'static str {

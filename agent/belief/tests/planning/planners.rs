@@ -1,10 +1,10 @@
 //! Planners of one robot, filters and summaries.
 
 use crate::fields::{Field, fields, objectives, paths};
-use agent::Belief;
-use agent::estimation::summary::{N_BLOCKS, summarise, summary_length};
-use agent::estimation::{BayesFilter, Estimator};
-use agent::planning::{
+use emberwatch_belief::Belief;
+use emberwatch_belief::estimation::summary::{N_BLOCKS, summarise, summary_length};
+use emberwatch_belief::estimation::{BayesFilter, Estimator};
+use emberwatch_belief::planning::{
     BeamSearch, CellValues, Integration, Objective, Plan, Planner, PlanningProblem, RandomWalk,
     Shooting, Target,
 };

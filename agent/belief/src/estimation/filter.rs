@@ -6,14 +6,14 @@
 
 use crate::estimation::bayes::correct;
 use crate::estimation::belief::Belief;
-use crate::estimation::estimator::{Estimator, EstimatorError};
+use crate::estimation::estimator::{Estimator, EstimatorError, Memory};
 use crate::estimation::parameters::Tables;
-use crate::estimation::scoring::{Score, score};
 use ndarray::{Array2, Array4};
 use protocol::frame::Frame;
-use protocol::grid::{Grid, Probabilities};
+use protocol::grid::Probabilities;
 use protocol::model::{Model, ModelError};
 use protocol::transition::Transition;
+use std::borrow::Cow;
 
 /// Filter of one world.
 #[derive(Debug, Clone)]
@@ -61,9 +61,14 @@ impl BayesFilter {
         }
     }
 
-    /// `P(y | x)`, shape `[S, O]`.
-    pub fn likelihood(&self) -> &Array2<f64> {
-        &self.likelihood
+    /// Takes newer learned parameters of the same dimensions; the belief stays.
+    pub fn set_tables(&mut self, tables: &Tables) {
+        (self.transition, self.likelihood, self.checksum) = parameters(tables, &self.belief);
+    }
+
+    /// The belief and `P(y | x)`, shape `[S, O]`.
+    pub(super) fn parts(&self) -> (&Belief, &Array2<f64>) {
+        (&self.belief, &self.likelihood)
     }
 
     pub(super) fn belief_mut(&mut self) -> &mut Belief {
@@ -74,7 +79,7 @@ impl BayesFilter {
 impl Estimator for BayesFilter {
     /// # Panics
     /// If the frame is of another grid or was decoded for more observations than the model has.
-    fn correct(&mut self, frame: &Frame, _: Option<&Grid<u8>>) -> Result<(), EstimatorError> {
+    fn correct(&mut self, frame: &Frame) -> Result<(), EstimatorError> {
         Ok(correct(&mut self.belief, &self.likelihood, frame)?)
     }
 
@@ -89,26 +94,29 @@ impl Estimator for BayesFilter {
         &self.belief
     }
 
-    fn score(&self, frame: &Frame) -> Result<Option<Score>, EstimatorError> {
-        Ok(Some(score(&self.belief, &self.likelihood, frame)))
+    fn likelihood(&self) -> Option<Cow<'_, Array2<f64>>> {
+        Some(Cow::Borrowed(&self.likelihood))
     }
 
-    fn set_tables(&mut self, tables: &Tables) {
-        (self.transition, self.likelihood, self.checksum) = parameters(tables, &self.belief);
-    }
-
-    fn kind(&self) -> Option<String> {
-        Some(kind(self.checksum))
-    }
-
-    fn remember(&mut self, memory: &[u8]) -> bool {
-        let belief = Belief::from_bytes(memory, self.belief.probabilities().dim());
-        belief.map(|belief| self.belief = belief).is_some()
+    fn memory(&mut self) -> Option<&mut dyn Memory> {
+        Some(self)
     }
 }
 
-fn kind(checksum: u32) -> String {
-    format!("bayes_filter {checksum:08x}, probabilities [S, H, W] as f32")
+impl Memory for BayesFilter {
+    fn kind(&self) -> String {
+        let checksum = self.checksum;
+        format!("bayes_filter {checksum:08x}, probabilities [S, H, W] as f32")
+    }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        self.belief.to_bytes()
+    }
+
+    fn restore(&mut self, bytes: &[u8]) -> bool {
+        let belief = Belief::from_bytes(bytes, self.belief.probabilities().dim());
+        belief.map(|belief| self.belief = belief).is_some()
+    }
 }
 
 fn known_checksum(model: &Model) -> u32 {
@@ -156,7 +164,7 @@ mod tests {
         let mut filter =
             BayesFilter::known(&Model::wildfire(), Belief::uniform(3, shape)).expect("valid");
         filter
-            .correct(&frame(shape, &[255, 2, 255]), None)
+            .correct(&frame(shape, &[255, 2, 255]))
             .expect("possible");
         let fire = filter.belief().probability(2);
         assert_eq!([fire[[0, 0]], fire[[0, 2]]], [1.0 / 3.0; 2]);
@@ -175,7 +183,7 @@ mod tests {
         file.states[2].observed_as = vec![0.999, 0.0005, 0.0005];
         let mut filter =
             BayesFilter::known(&Model::new(file).expect("valid"), prior).expect("valid");
-        filter.correct(&frame(shape, &[2]), None).expect("possible");
+        filter.correct(&frame(shape, &[2])).expect("possible");
         assert_eq!(filter.belief().probability(2)[[0, 0]], 1.0);
     }
 }

@@ -7,7 +7,6 @@ pub mod action;
 pub mod beam;
 pub mod objective;
 mod planner;
-pub mod policy;
 pub mod random_walk;
 pub mod shooting;
 pub mod team;

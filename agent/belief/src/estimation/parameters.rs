@@ -5,12 +5,12 @@
 //! by zero.
 
 use crate::estimation::belief::Belief;
-use anyhow::{Result, ensure};
 use ndarray::Array2;
 use protocol::model::{MAX_KERNEL_SIDE, MAX_VALUES};
 use protocol::randomness::split_mix;
 use protocol::{Model, Shape};
 use serde::{Deserialize, Serialize};
+use thiserror::Error;
 
 /// Largest size of a free number: weights from 1e-7, probabilities from 1e-14 on.
 pub const BOUND: f32 = 16.0;
@@ -60,24 +60,42 @@ pub struct Tables {
     pub initial: Vec<f32>,
 }
 
+/// Dimensions that no model has.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum DimensionsError {
+    #[error("learned filter: {name}: expected {least} to {MAX_VALUES}, got {got}")]
+    Count {
+        name: &'static str,
+        least: usize,
+        got: usize,
+    },
+    #[error(
+        "learned filter: kernel: expected odd sides up to {MAX_KERNEL_SIDE}, got {height} x {width}"
+    )]
+    Kernel { height: usize, width: usize },
+}
+
 impl Dimensions {
     /// Checks them against the limits of a model.
-    pub fn check(self) -> Result<Self> {
-        let side = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
-        let (n_states, n_observations) = (self.n_states, self.n_observations);
-        ensure!(
-            (2..=MAX_VALUES).contains(&n_states),
-            "learned filter: states: expected 2 to {MAX_VALUES}, got {n_states}"
-        );
-        ensure!(
-            (1..=MAX_VALUES).contains(&n_observations),
-            "learned filter: observations: expected 1 to {MAX_VALUES}, got {n_observations}"
-        );
+    ///
+    /// # Errors
+    /// Names the first that is out of range.
+    pub fn check(self) -> Result<Self, DimensionsError> {
+        let counts = [
+            ("states", 2, self.n_states),
+            ("observations", 1, self.n_observations),
+        ];
+        for (name, least, got) in counts {
+            if !(least..=MAX_VALUES).contains(&got) {
+                return Err(DimensionsError::Count { name, least, got });
+            }
+        }
+        let is_side = |side: usize| side % 2 == 1 && side <= MAX_KERNEL_SIDE;
         let (height, width) = self.kernel;
-        ensure!(
-            side(height) && side(width),
-            "learned filter: kernel: expected odd sides up to {MAX_KERNEL_SIDE}, got {height} x {width}"
-        );
+        if !(is_side(height) && is_side(width)) {
+            return Err(DimensionsError::Kernel { height, width });
+        }
         Ok(self)
     }
 
