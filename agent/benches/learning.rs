@@ -1,12 +1,12 @@
 //! Time of learning at the paper's size: 64 x 64 cells, 64 moves, 3 states, 16 streams x 16 frames.
 
 use agent::config::AgentConfig;
-use agent::estimation::{BayesFilter, Estimator};
 use agent::learning::filter::Trainer;
 use agent::learning::replay::Replay;
 use criterion::{Criterion, criterion_group, criterion_main};
 use emberwatch_belief::Belief;
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters, Tables};
+use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use protocol::path::fly;
 use protocol::randomness::split_mix;
 use protocol::{Cell, Frame, Move, Shape};

@@ -65,8 +65,8 @@ fn with_the_true_parameters_it_is_the_known_model_filter() {
             let mut learned = BayesFilter::learned(&Tables::of_model(&model), prior);
             for number in 0..30 {
                 let frame = frame(shape, model.n_observations(), number);
-                known.correct(&frame, None).expect("possible");
-                learned.correct(&frame, None).expect("possible");
+                known.correct(&frame).expect("possible");
+                learned.correct(&frame).expect("possible");
                 known.predict();
                 learned.predict();
             }
@@ -223,9 +223,7 @@ fn check_window(tables: Tables) {
     let mut end = vec![0.0; 3 * shape.n_cells()];
     window.run(None, &frames, &mut end);
     for number in 0..8 {
-        filter
-            .correct(&frame(shape, 3, number), None)
-            .expect("possible");
+        filter.correct(&frame(shape, 3, number)).expect("possible");
         filter.predict();
     }
     let most = filter.belief().as_slice().iter().zip(&end);

@@ -90,7 +90,7 @@ fn learn(model: &Model, sees_own_state: bool) -> LearnedModel {
         for (number, world) in (0..N_WORLDS).zip(&mut worlds) {
             let (frame, visited) = world.fly(model, step);
             learner.see(number, &frame, Some(world.filter.belief()), &learned);
-            world.filter.correct(&frame, None).expect("possible");
+            world.filter.correct(&frame).expect("possible");
             let states = world.states.as_slice().expect("row-major");
             let burning = visited.iter().filter(|&&cell| states[cell] == 1).count();
             learner.reward(world.filter.belief(), &visited, burning as f64);

@@ -7,10 +7,11 @@ use std::path::{Path, PathBuf};
 const ARCHITECTURE: &str = include_str!("../../ARCHITECTURE.md");
 
 /// Folders of sources: each folder in them that has any is a room.
-const SOURCES: [&str; 9] = [
+const SOURCES: [&str; 10] = [
     "protocol/src",
     "env-server/src",
     "agent/src",
+    "agent/belief/src",
     "agent/figures/src",
     "agent/network/src",
     "clients/dashboard/src",
@@ -19,10 +20,11 @@ const SOURCES: [&str; 9] = [
     "clients/python/src/emberwatch",
 ];
 
-const CRATES: [&str; 8] = [
+const CRATES: [&str; 9] = [
     "protocol",
     "env-server",
     "agent",
+    "agent/belief",
     "agent/figures",
     "agent/network",
     "clients/dashboard",

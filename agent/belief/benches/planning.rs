@@ -35,7 +35,7 @@ fn settled<E: Estimator>(mut estimator: E) -> E {
 }
 
 fn take_in(estimator: &mut dyn Estimator, frame: &Frame) {
-    estimator.correct(frame, None).expect("possible frame");
+    estimator.correct(frame).expect("possible frame");
     estimator.predict();
 }
 

@@ -56,7 +56,7 @@ fn the_filter_reproduces_posterior_and_predictor() {
         for (step, observed) in observations.outer_iter().enumerate() {
             let index = saved.iter().position(|&at| at == step as i64);
             let frame = frame_from(observed, everything.view());
-            filter.correct(&frame, None).expect("possible frame");
+            filter.correct(&frame).expect("possible frame");
             if let Some(index) = index {
                 let expected = posteriors.slice(s![index, .., .., ..]);
                 assert_close(
@@ -99,7 +99,7 @@ fn check_masked(
 ) {
     let model = model_observed_through(weights);
     let mut filter = BayesFilter::known(&model, belief_from(prior)).expect("valid model");
-    filter.correct(frame, None).expect("possible frame");
+    filter.correct(frame).expect("possible frame");
     assert_close(filter.belief(), posterior, what);
 }
 

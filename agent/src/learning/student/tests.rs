@@ -6,7 +6,6 @@ use crate::learning::student::filter::FilterStudent;
 use crate::learning::student::network::{NetworkStudent, Progress};
 use crate::learning::student::{Student, Worlds};
 use crate::policy::{EstimatorKind, PlannerKind, Policy};
-use crate::rollout::Robot;
 use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
@@ -91,14 +90,11 @@ fn path(
 
 /// One step: the path, and the posterior after its frame.
 fn fly(student: &mut impl Student, step: u64) -> (Vec<Move>, Belief) {
-    let (mut path, mut posterior) = (Vec::new(), None);
-    let mut fly = |paths: &[Vec<Move>]| {
-        path = paths[0].clone();
-        Ok(vec![observation(step)])
-    };
-    let mut look = |_: usize, robot: &Robot| posterior = Some(robot.agent.belief().clone());
-    student.step(&mut fly, &mut look).expect("possible");
-    (path, posterior.expect("a look"))
+    let path = student.plan().remove(0);
+    student.see(vec![observation(step)]).expect("possible");
+    let posterior = student.rollout(0).agent.belief().clone();
+    student.predict();
+    (path, posterior)
 }
 
 /// A frozen student must plan on one of the beliefs. `paths`: what it may choose among on a belief, where

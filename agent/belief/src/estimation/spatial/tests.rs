@@ -69,14 +69,14 @@ fn an_impossible_frame_is_rejected_whole_with_neighbours_or_without() {
     let spatial = SpatialFilter::new(filter.clone(), FIRE, Correlations::default());
     let filters: [Box<dyn Estimator>; 2] = [Box::new(filter), Box::new(spatial)];
     for mut filter in filters {
-        let before = filter.memory();
-        let error = filter.correct(&frame, None);
+        let before = filter.to_bytes();
+        let error = filter.correct(&frame);
         let error = error.expect_err("a normal cell seen as fire");
         let EstimatorError::ZeroEvidence(error) = error else {
             panic!("{error}");
         };
         assert_eq!((error.cell, error.observed), (Cell { row: 1, col: 0 }, 2));
-        assert_eq!(filter.memory(), before);
+        assert_eq!(filter.to_bytes(), before);
     }
 }
 
@@ -92,7 +92,7 @@ fn a_tiny_probability_is_evidence_with_neighbours_too() {
     let mut filter = SpatialFilter::new(filter, FIRE, Correlations::default());
     let shape = Shape::new(1, 1).expect("a grid");
     let frame = Frame::from_bytes(shape, 3, &[0]).expect("a frame");
-    filter.correct(&frame, None).expect("possible");
+    filter.correct(&frame).expect("possible");
     assert_eq!(filter.belief().as_slice(), [1.0, 0.0, 0.0]);
 }
 
@@ -130,18 +130,18 @@ proptest! {
             let bytes: Vec<u8> = seen.map(|&value| if value < 3 { value } else { 255 }).collect();
             let frame = Frame::from_bytes(shape, 3, &bytes).expect("a frame");
             let mut other = new();
-            prop_assert!(other.remember(&filter.memory()));
+            prop_assert!(other.restore(&filter.to_bytes()));
             for filter in [&mut filter, &mut other] {
-                filter.correct(&frame, None).expect("possible");
+                filter.correct(&frame).expect("possible");
                 let belief = filter.belief().probabilities().clone();
                 prop_assert!(Belief::from_probabilities(belief).is_ok());
                 filter.predict();
             }
-            prop_assert_eq!(filter.memory(), other.memory());
+            prop_assert_eq!(filter.to_bytes(), other.to_bytes());
         }
-        let memory = filter.memory();
-        prop_assert!(!filter.remember(&memory[1..]));
-        prop_assert_eq!(filter.memory(), memory);
+        let memory = filter.to_bytes();
+        prop_assert!(!filter.restore(&memory[1..]));
+        prop_assert_eq!(filter.to_bytes(), memory);
     }
 }
 
