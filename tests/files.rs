@@ -133,9 +133,10 @@ fn the_documented_files_are_accepted() {
         "config/models/wildfire-burnout.toml",
     ] {
         let path = repository().join(file);
-        let flag = match file.contains("models") {
-            true => "--model",
-            false => "--config",
+        let flag = if file.contains("models") {
+            "--model"
+        } else {
+            "--config"
         };
         run(SERVER, &format!("--check {flag} {}", path.display())).check(0);
     }

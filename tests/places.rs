@@ -12,9 +12,10 @@ fn apart(script: &str) -> Option<Output> {
     let run = |script: &str| {
         let mut command = Command::new("unshare");
         let script = format!("mount -t tmpfs tmpfs /dev/shm && {script}");
-        let kind = match rustix::process::getuid().is_root() {
-            true => "-m",
-            false => "-rm",
+        let kind = if rustix::process::getuid().is_root() {
+            "-m"
+        } else {
+            "-rm"
         };
         command
             .args([kind, "timeout", "60", "sh", "-c", &script])

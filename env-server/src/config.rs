@@ -138,11 +138,11 @@ impl ServerConfig {
     pub fn check(mut self) -> Result<Checked, ConfigError> {
         let instance = Instance::new(&self.instance)?;
         self.check_ranges()?;
-        let (model, recorded) = match self.states.is_empty() {
-            true => (None, None),
-            false => self
-                .read_states()
-                .map(|(model, it)| (Some(model), Some(it)))?,
+        let (model, recorded) = if self.states.is_empty() {
+            (None, None)
+        } else {
+            self.read_states()
+                .map(|(model, it)| (Some(model), Some(it)))?
         };
         let shape = Shape::new(self.height, self.width)?;
         self.check_robots(shape)?;

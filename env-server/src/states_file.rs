@@ -100,9 +100,10 @@ impl Sequences {
             let n_bytes = member.size();
             self.add_array(bare(name), n_bytes, member)?;
         }
-        match names.is_empty() {
-            true => Err("expected at least one array, got none".into()),
-            false => Ok(()),
+        if names.is_empty() {
+            Err("expected at least one array, got none".into())
+        } else {
+            Ok(())
         }
     }
 
@@ -141,9 +142,10 @@ impl Sequences {
         let layout = dim.set_f(header.layout.is_fortran());
         let array = Array3::from_shape_vec(layout, values)
             .expect("invariant: there are as many values as cells");
-        let array = match array.is_standard_layout() {
-            true => array,
-            false => array.as_standard_layout().into_owned(),
+        let array = if array.is_standard_layout() {
+            array
+        } else {
+            array.as_standard_layout().into_owned()
         };
         self.check_states(&array)?;
         Ok(array)
@@ -185,9 +187,10 @@ impl Sequences {
 fn read(path: &Path) -> Result<StatesFile, String> {
     let at = |path: &Path, error: &dyn Display| format!("{}: {error}", path.display());
     let metadata = path.metadata().map_err(|error| error.to_string())?;
-    let (files, description) = match metadata.is_dir() {
-        true => (files_of(path)?, path.join("states.toml")),
-        false => (vec![path.to_owned()], path.with_extension("toml")),
+    let (files, description) = if metadata.is_dir() {
+        (files_of(path)?, path.join("states.toml"))
+    } else {
+        (vec![path.to_owned()], path.with_extension("toml"))
     };
     if let Some(other) = files
         .iter()
@@ -199,17 +202,17 @@ fn read(path: &Path) -> Result<StatesFile, String> {
             other.file_name().unwrap_or_default()
         ));
     }
-    let wrong = |error: &dyn Display| format!("description {}", at(&description, error));
-    check_regular(&description).map_err(|error| wrong(&error))?;
-    let text = read_text(&description).map_err(|error| wrong(&error))?;
-    let description: Description = toml::from_str(&text).map_err(|error| wrong(&error))?;
-    let model = description.unchanging().map_err(|error| wrong(&error))?;
+    let (description, model) = read_description(&description)
+        .map_err(|error| format!("description {}", at(&description, &error)))?;
     let mut sequences = Sequences::new(model.n_states());
     for file in &files {
         let added = add_file(&mut sequences, file);
-        added.map_err(|problem| match file == path {
-            true => problem,
-            false => at(Path::new(file.file_name().unwrap_or_default()), &problem),
+        added.map_err(|problem| {
+            if file == path {
+                problem
+            } else {
+                at(Path::new(file.file_name().unwrap_or_default()), &problem)
+            }
         })?;
     }
     Ok(StatesFile {
@@ -220,6 +223,13 @@ fn read(path: &Path) -> Result<StatesFile, String> {
     })
 }
 
+fn read_description(path: &Path) -> anyhow::Result<(Description, Model)> {
+    check_regular(path).map_err(anyhow::Error::msg)?;
+    let description: Description = toml::from_str(&read_text(path)?)?;
+    let model = description.unchanging()?;
+    Ok((description, model))
+}
+
 /// The arrays and archives in a folder, in the order of their names.
 fn files_of(folder: &Path) -> Result<Vec<PathBuf>, String> {
     let entries = std::fs::read_dir(folder).map_err(|error| error.to_string())?;
@@ -228,30 +238,31 @@ fn files_of(folder: &Path) -> Result<Vec<PathBuf>, String> {
     let mut files = paths.map_err(|error| error.to_string())?;
     files.retain(|file| is_array(file) || is_archive(file));
     files.sort();
-    match files.is_empty() {
-        true => Err("expected .npz or .npy files in the folder, got none".into()),
-        false => Ok(files),
+    if files.is_empty() {
+        Err("expected .npz or .npy files in the folder, got none".into())
+    } else {
+        Ok(files)
     }
 }
 
 fn add_file(sequences: &mut Sequences, path: &Path) -> Result<(), String> {
     let n_bytes = check_regular(path)?;
     let file = File::open(path).map_err(|error| error.to_string())?;
-    match is_archive(path) {
-        true => sequences.add_archive(BufReader::new(file)),
-        false => {
-            let name = path.file_stem().unwrap_or_default().to_string_lossy();
-            sequences.add_array(&name, n_bytes, file)
-        }
+    if is_archive(path) {
+        sequences.add_archive(BufReader::new(file))
+    } else {
+        let name = path.file_stem().unwrap_or_default().to_string_lossy();
+        sequences.add_array(&name, n_bytes, file)
     }
 }
 
 /// The length of a file that can be opened; where it is a pipe, that would wait for a writer.
 fn check_regular(path: &Path) -> Result<u64, String> {
     let metadata = std::fs::metadata(path).map_err(|error| error.to_string())?;
-    match metadata.is_file() {
-        true => Ok(metadata.len()),
-        false => Err("expected a regular file, got something else".into()),
+    if metadata.is_file() {
+        Ok(metadata.len())
+    } else {
+        Err("expected a regular file, got something else".into())
     }
 }
 

@@ -55,9 +55,10 @@ fn source_files(folder: &str) -> Vec<String> {
     let below = |entry: std::io::Result<std::fs::DirEntry>| {
         let entry = entry.expect("a readable folder");
         let path = format!("{folder}/{}", entry.file_name().display());
-        match entry.file_type().expect("a file type").is_dir() {
-            true => source_files(&path),
-            false => vec![path],
+        if entry.file_type().expect("a file type").is_dir() {
+            source_files(&path)
+        } else {
+            vec![path]
         }
     };
     let files = entries.flat_map(below);

@@ -380,9 +380,10 @@ fn records() -> impl Strategy<Value = Vec<Record>> {
                     vec(any::<u8>(), length).prop_map(move |bytes| Record {
                         nanos,
                         n_lost,
-                        event: match is_frame {
-                            true => Event::Frame(frame(sequence, grid, n_moves, &bytes)),
-                            false => truth(sequence, grid, bytes),
+                        event: if is_frame {
+                            Event::Frame(frame(sequence, grid, n_moves, &bytes))
+                        } else {
+                            truth(sequence, grid, bytes)
                         },
                     })
                 },

@@ -54,9 +54,10 @@ impl Attacker {
 
     /// Sends one message, and mostly waits for its answer.
     pub fn strike(&mut self) {
-        let status = match self.rng.random() {
-            true => self.strike_step(),
-            false => self.strike_control(),
+        let status = if self.rng.random() {
+            self.strike_step()
+        } else {
+            self.strike_control()
         };
         match status {
             None => {}

@@ -84,10 +84,12 @@ impl Axis {
 
     pub fn label(&self, tick: f64) -> String {
         let most = self.range.0.abs().max(self.range.1.abs());
-        match self.decimals > 6 || most >= 1e7 {
-            true if tick != 0.0 => format!("{:e}", format!("{tick:.2e}").parse().unwrap_or(tick)),
-            true => "0".into(),
-            false => format!("{tick:.*}", self.decimals),
+        if self.decimals <= 6 && most < 1e7 {
+            format!("{tick:.*}", self.decimals)
+        } else if tick == 0.0 {
+            "0".into()
+        } else {
+            format!("{:e}", format!("{tick:.2e}").parse().unwrap_or(tick))
         }
     }
 }

@@ -33,28 +33,9 @@ pub fn draw_legend(
     unobserved: Color,
     corner: Point,
 ) -> f64 {
-    let group = |heading: &str, named: &[Named]| {
-        let heading = (Mark::Heading, heading.to_owned());
-        let marks = named
-            .iter()
-            .map(|it| (Mark::Color(it.color), it.name.clone()));
-        std::iter::once(heading).chain(marks).collect::<Vec<_>>()
-    };
-    let mut groups = match states == observations {
-        true => vec![group("state, observed value:", states)],
-        false => vec![
-            group("state:", states),
-            group("observed value:", observations),
-        ],
-    };
-    if let Some(last) = groups.last_mut() {
-        last.push((Mark::Color(unobserved), "not observed".into()));
-        last.extend([(Mark::Path, "path".into()), (Mark::Start, "start".into())]);
-        last.push((Mark::Robot, "robot".into()));
-    }
     let (left, top) = corner;
     let mut middle = top;
-    for group in groups {
+    for group in groups(states, observations, unobserved) {
         let mut x = left;
         for (mark, name) in group {
             let name = TextStyle::LABEL.fit(&name, WIDTH - left - MARGIN - 30.0);
@@ -70,6 +51,31 @@ pub fn draw_legend(
         middle += LINE;
     }
     middle - top
+}
+
+/// Marks with their names, by line.
+fn groups(states: &[Named], observations: &[Named], unobserved: Color) -> Vec<Vec<(Mark, String)>> {
+    let group = |heading: &str, named: &[Named]| {
+        let heading = (Mark::Heading, heading.to_owned());
+        let marks = named
+            .iter()
+            .map(|it| (Mark::Color(it.color), it.name.clone()));
+        std::iter::once(heading).chain(marks).collect::<Vec<_>>()
+    };
+    let mut groups = if states == observations {
+        vec![group("state, observed value:", states)]
+    } else {
+        vec![
+            group("state:", states),
+            group("observed value:", observations),
+        ]
+    };
+    if let Some(last) = groups.last_mut() {
+        last.push((Mark::Color(unobserved), "not observed".into()));
+        last.extend([(Mark::Path, "path".into()), (Mark::Start, "start".into())]);
+        last.push((Mark::Robot, "robot".into()));
+    }
+    groups
 }
 
 impl Mark {

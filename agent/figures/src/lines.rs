@@ -258,18 +258,7 @@ impl<'a> Drawn<'a> {
         if let Some(shade) = &self.panel.shade {
             shade.draw(page, frame, (upper, lower));
         }
-        for &tick in &values.ticks {
-            let is_zero = tick == 0.0 && self.panel.scale == Scale::Linear;
-            let (at, color) = (y(tick), if is_zero { INK } else { GRID });
-            page.rule((frame.left, at), (frame.right, at), 1.0, color);
-            let label = self.label(&values, tick);
-            page.text(
-                (frame.left - 10.0, at),
-                Align::Right,
-                TextStyle::NOTE,
-                &label,
-            );
-        }
+        self.draw_ticks(page, frame, &values, y);
         for curve in &self.curves {
             let edge = |index: usize| curve.band.iter().map(move |&(x, edges)| (x, edges[index]));
             let area: Vec<Point> = edge(0).chain(edge(1).rev()).map(place).collect();
@@ -293,6 +282,21 @@ impl<'a> Drawn<'a> {
             .iter()
             .filter_map(|curve| curve.points.last().copied().map(place));
         self.draw_names(page, frame, &ends.collect::<Vec<_>>(), (upper, lower));
+    }
+
+    fn draw_ticks(&self, page: &mut Svg, frame: &Frame, values: &Axis, y: impl Fn(f64) -> f64) {
+        for &tick in &values.ticks {
+            let is_zero = tick == 0.0 && self.panel.scale == Scale::Linear;
+            let (at, color) = (y(tick), if is_zero { INK } else { GRID });
+            page.rule((frame.left, at), (frame.right, at), 1.0, color);
+            let label = self.label(values, tick);
+            page.text(
+                (frame.left - 10.0, at),
+                Align::Right,
+                TextStyle::NOTE,
+                &label,
+            );
+        }
     }
 
     /// Names at the curves' ends, moved apart where ends are close, with a leader to each.

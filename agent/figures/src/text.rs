@@ -55,9 +55,10 @@ impl TextStyle {
     /// The text as an SVG element at a place.
     pub fn element(self, at: &str, more: &str, text: &str) -> String {
         let (size, color) = (self.size, self.color);
-        let weight = match self.is_bold {
-            true => " font-weight=\"bold\"",
-            false => "",
+        let weight = if self.is_bold {
+            " font-weight=\"bold\""
+        } else {
+            ""
         };
         let text = escaped(text);
         format!("<text {at} font-size=\"{size}\"{weight}{more} fill=\"{color}\">{text}</text>")

@@ -146,10 +146,11 @@ impl Autoencoder {
         assert!(window.fits(&self.shape), "frame: grid or observations");
         let hidden = self.network.forward(&Pass::inference(window), hidden)?;
         let hidden = numbers_of(&hidden)?;
-        match hidden.iter().all(|number| number.is_finite()) {
-            true => Ok(hidden),
+        if hidden.iter().all(|number| number.is_finite()) {
+            Ok(hidden)
+        } else {
             // Softmax and ReLU would make numbers again of what is none.
-            false => Err(self.adam.not_finite("the hidden vector".into())),
+            Err(self.adam.not_finite("the hidden vector".into()))
         }
     }
 

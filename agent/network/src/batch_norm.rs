@@ -54,20 +54,19 @@ impl BatchNorm {
     pub(crate) fn forward(&self, u: &Tensor, pass: &Pass<'_>) -> Result<Tensor> {
         let channels = u.dim(1)?;
         let per_channel = |tensor: &Tensor| tensor.reshape((1, channels, 1, 1));
-        let (mean, variance) = match pass.trains() {
-            true => {
-                let flat = u.transpose(0, 1)?.flatten_from(1)?;
-                let mean = flat.mean_keepdim(1)?;
-                let variance = flat.broadcast_sub(&mean)?.sqr()?.mean_keepdim(1)?;
-                let moments = Moments {
-                    mean: exact(&mean)?,
-                    variance: exact(&variance)?,
-                    count: flat.dim(1)? as f64,
-                };
-                pass.keep_moments(&self.name, &moments);
-                (mean, variance)
-            }
-            false => (self.mean.clone(), self.variance.clone()),
+        let (mean, variance) = if pass.trains() {
+            let flat = u.transpose(0, 1)?.flatten_from(1)?;
+            let mean = flat.mean_keepdim(1)?;
+            let variance = flat.broadcast_sub(&mean)?.sqr()?.mean_keepdim(1)?;
+            let moments = Moments {
+                mean: exact(&mean)?,
+                variance: exact(&variance)?,
+                count: flat.dim(1)? as f64,
+            };
+            pass.keep_moments(&self.name, &moments);
+            (mean, variance)
+        } else {
+            (self.mean.clone(), self.variance.clone())
         };
         let deviation = (variance + EPSILON)?.sqrt()?;
         u.broadcast_sub(&per_channel(&mean)?)?

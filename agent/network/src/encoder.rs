@@ -47,9 +47,10 @@ impl Encoder {
 
     /// The encodings of all frames, `[frames, encoding]`.
     pub fn forward(&self, pass: &Pass<'_>) -> Result<Tensor> {
-        let features = match self.is_stock {
-            true => self.stock(pass)?,
-            false => self.ours(pass)?,
+        let features = if self.is_stock {
+            self.stock(pass)?
+        } else {
+            self.ours(pass)?
         };
         self.linear.forward(&features)
     }

@@ -63,9 +63,10 @@ impl Window {
 
     /// What is to be predicted after a frame: the visited cells of the next one, none after the last.
     pub(crate) fn targets(&self, frame: usize) -> &[Visit] {
-        match frame + 1 < self.len() {
-            true => self.visits(frame + 1),
-            false => &[],
+        if frame + 1 < self.len() {
+            self.visits(frame + 1)
+        } else {
+            &[]
         }
     }
 

@@ -77,18 +77,10 @@ fn run(cli: &Cli) -> Result<()> {
     let address = listener.local_addr().context("the page's address")?;
     let (stage, threads) = start(cli, &stop)?;
     announce(address, cli.open)?;
-    let end = async {
-        while !stop.load(Ordering::Relaxed)
-            && !exit_with.as_ref().is_some_and(WatchedProcess::has_ended)
-        {
-            tokio::time::sleep(TICK).await;
-        }
-        Ok(())
-    };
     let served = runtime.block_on(async {
         tokio::select! {
             served = server::serve(listener, stage, &cli.name) => served,
-            ended = end => ended,
+            () = end(&stop, exit_with.as_ref()) => Ok(()),
         }
     });
     // Ports are closed by the threads that opened them.
@@ -97,6 +89,13 @@ fn run(cli: &Cli) -> Result<()> {
     let n_panics = ended.filter(Result::is_err).count();
     ensure!(n_panics == 0, "{n_panics} threads failed");
     served.context("serve the page")
+}
+
+/// Returns when the program or the process that it ends with is to stop.
+async fn end(stop: &AtomicBool, exit_with: Option<&WatchedProcess>) {
+    while !stop.load(Ordering::Relaxed) && !exit_with.is_some_and(WatchedProcess::has_ended) {
+        tokio::time::sleep(TICK).await;
+    }
 }
 
 /// Begins to watch, or to play.

@@ -160,10 +160,7 @@ pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
     let is_live = |entry: &Entry| now.duration_since(entry.at) < SILENCE;
     let header = Header {
         instance: &scene.instance,
-        source: match scene.player {
-            Some(_) => "recording",
-            None => "live",
-        },
+        source: scene.player.as_ref().map_or("live", |_| "recording"),
         state: if scene.is_serving {
             "serving"
         } else {
@@ -184,9 +181,7 @@ pub fn picture(scene: &Scene, ask: &Ask, now: Instant) -> Vec<u8> {
         series,
         arrays: arrays.listings,
     };
-    let mut bytes = framed(&header);
-    bytes.extend(arrays.bytes);
-    bytes
+    [framed(&header), arrays.bytes].concat()
 }
 
 /// The newest step, or the newest with a belief if that is hardly older.
@@ -330,11 +325,14 @@ impl ShownRobot {
         let is_among = |robots: u64| robots >> index & 1 == 1;
         let path = robot.path(entry.shape).into_iter();
         Self {
-            state: match robot.moves.is_empty() {
-                _ if is_among(entry.result.hovered) => "hovered",
-                _ if is_among(entry.result.late) => "late",
-                true => "new",
-                false => "flew",
+            state: if is_among(entry.result.hovered) {
+                "hovered"
+            } else if is_among(entry.result.late) {
+                "late"
+            } else if robot.moves.is_empty() {
+                "new"
+            } else {
+                "flew"
             },
             cell: [robot.result.row, robot.result.col],
             path: path.map(|cell| [cell.row, cell.col]).collect(),

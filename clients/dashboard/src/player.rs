@@ -130,9 +130,10 @@ impl<'a> Playing<'a> {
                 return true;
             }
             let missing = moment.saturating_sub(self.clock);
-            std::thread::sleep(match playing {
-                true => TICK.min(missing.div_f64(speed.max(1e-3))),
-                false => TICK,
+            std::thread::sleep(if playing {
+                TICK.min(missing.div_f64(speed.max(1e-3)))
+            } else {
+                TICK
             });
         }
     }

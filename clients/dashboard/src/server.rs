@@ -181,10 +181,8 @@ async fn answer(mut socket: WebSocket, stage: &Stage) {
         before = wanted;
         sent = Instant::now();
         let bytes = picture(&stage.look(), &ask, sent);
-        if send(&mut socket, Message::Binary(bytes.into()))
-            .await
-            .is_none()
-        {
+        let message = Message::Binary(bytes.into());
+        if send(&mut socket, message).await.is_none() {
             return;
         }
     }

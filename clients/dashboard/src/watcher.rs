@@ -186,9 +186,10 @@ impl Reader {
             if self.look(stage)? {
                 busy = Instant::now();
             }
-            std::thread::sleep(match busy.elapsed() < BUSY {
-                true => LEAST_INTERVAL,
-                false => MOST_INTERVAL,
+            std::thread::sleep(if busy.elapsed() < BUSY {
+                LEAST_INTERVAL
+            } else {
+                MOST_INTERVAL
             });
         }
         Ok(())

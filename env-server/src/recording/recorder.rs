@@ -98,11 +98,7 @@ pub fn record(options: &RecordOptions, stop: &AtomicBool) -> Result<RecordSummar
         n_steps: 0,
         n_unknown: 0,
     };
-    let instance = options.instance.name();
-    match recorder.first_server.is_some() {
-        true => tracing::info!(instance, "recording"),
-        false => tracing::info!(instance, "no server yet; recording when there is one"),
-    }
+    recorder.announce();
     while !stop.load(Ordering::Relaxed) && recorder.goes_on() {
         recorder.run_once(&frames, truths.as_ref(), TICK)?;
     }
@@ -142,6 +138,15 @@ struct Channel {
 }
 
 impl Recorder<'_> {
+    fn announce(&self) {
+        let instance = self.options.instance.name();
+        if self.first_server.is_some() {
+            tracing::info!(instance, "recording");
+        } else {
+            tracing::info!(instance, "no server yet; recording when there is one");
+        }
+    }
+
     /// Waits for a frame; records it after the hidden states before it. Returns whether there was one.
     fn run_once(
         &mut self,

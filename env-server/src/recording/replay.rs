@@ -4,7 +4,7 @@
 
 use super::pace::Pace;
 use super::replies::{ConnectionCounts, Next, ReplayState};
-use crate::server::{Clients, PortConfig, Ports, frame_bytes};
+use crate::server::{Clients, PortConfig, Ports};
 use anyhow::{Context, Error, Result, bail};
 use protocol::channels::{Instance, ipc_error};
 use protocol::control::{Reply, ServerInfo};
@@ -94,33 +94,23 @@ struct Replay<'a> {
 
 impl RecordingSummary {
     fn of(options: &ReplayOptions) -> Result<Self> {
-        let mut config = PortConfig {
-            instance: options.instance.clone(),
-            n_cells: 0,
-            frame_bytes: 0,
-            answer_bytes: 0,
-            publish_truth: false,
-        };
+        let mut config = PortConfig::empty(options.instance.clone());
         let (mut first, mut is_empty, mut end) = (None, true, None);
         let mut reader = open(&options.file)?;
         for record in reader.by_ref() {
-            let record = match record {
-                Ok(record) => record,
+            match record {
+                Ok(record) => match record.event {
+                    Event::Server(info) => {
+                        config.fit(&info);
+                        first.get_or_insert(*info);
+                    }
+                    _ => is_empty &= Duration::from_nanos(record.nanos) < options.from,
+                },
                 Err(problem) if !options.strict && problem.leaves_good_records() => {
                     end = Some(problem);
                     break;
                 }
                 Err(problem) => return Err(file_error(&options.file, problem)),
-            };
-            match record.event {
-                Event::Server(info) => {
-                    config.n_cells = config.n_cells.max(info.height * info.width);
-                    let n_bytes =
-                        frame_bytes(info.n_robots, info.height * info.width, info.n_moves);
-                    config.frame_bytes = config.frame_bytes.max(n_bytes);
-                    first.get_or_insert(*info);
-                }
-                _ => is_empty &= Duration::from_nanos(record.nanos) < options.from,
             }
         }
         let totals = reader.totals();

@@ -12,12 +12,14 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{CallbackProgression, PortFactory};
 use iceoryx2::service::dynamic_config::publish_subscribe::SubscriberDetails;
 use iceoryx2::service::dynamic_config::request_response::ClientDetails;
+use iceoryx2::service::port_factory::publish_subscribe;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use protocol::channels::{
     Channel, ChannelError, ControlService, Entries, FRAME_BUFFER, FrameService, Instance, Ipc,
     MAX_CLIENTS, MAX_OBSERVERS, MAX_TRUTH_READERS, RequestResponse, SHARED_MEMORY, Services,
     StepService, TRUTH_BUFFER, TruthService, create_node, ipc_error,
 };
+use protocol::control::ServerInfo;
 use protocol::failed_connections::FailedConnections;
 use protocol::message::{FrameHeader, Header, StepReply, StepRequest, TruthHeader};
 use protocol::payload::{ROBOT_BYTES, WORLD_BYTES};
@@ -53,6 +55,27 @@ pub struct PortConfig {
     pub answer_bytes: usize,
     /// Whether to publish hidden states.
     pub publish_truth: bool,
+}
+
+impl PortConfig {
+    /// Of an instance that serves nothing yet.
+    pub fn empty(instance: Instance) -> Self {
+        Self {
+            instance,
+            n_cells: 0,
+            frame_bytes: 0,
+            answer_bytes: 0,
+            publish_truth: false,
+        }
+    }
+
+    /// Makes room for the samples of a server's worlds.
+    pub fn fit(&mut self, info: &ServerInfo) {
+        let n_cells = info.height * info.width;
+        let n_bytes = frame_bytes(info.n_robots, n_cells, info.n_moves);
+        self.n_cells = self.n_cells.max(n_cells);
+        self.frame_bytes = self.frame_bytes.max(n_bytes);
+    }
 }
 
 /// All ports of a server.
@@ -113,39 +136,16 @@ impl Ports {
             instance: &config.instance,
         };
         let (control_service, step_service) = (services.create_control()?, services.create_step()?);
-        let failed_connections = FailedConnections::default();
-        let control = control_server(&control_service, &failed_connections);
-        let control = control.map_err(|error| taken(config, &control_service, error))?;
-        let step = step_service
-            .server_builder()
-            .initial_max_slice_len(config.answer_bytes.max(1))
-            .set_request_degradation_handler(failed_connections.counter())
-            .set_response_degradation_handler(failed_connections.counter());
-        let step = step.max_loaned_responses_per_request(1).create();
-        let step = step.map_err(|error| taken(config, &step_service, error))?;
+        let failed = FailedConnections::default();
+        let control = control_server(&control_service, &failed)
+            .map_err(|error| taken(config, &control_service, error))?;
+        let step = step_server(&step_service, config.answer_bytes, &failed)
+            .map_err(|error| taken(config, &step_service, error))?;
         let frame_service = services.frames()?;
-        let frames = frame_service
-            .publisher_builder()
-            .initial_max_slice_len(config.frame_bytes)
-            .set_degradation_handler(failed_connections.counter())
-            .max_loaned_samples(1);
-        let frames = frames.create().map_err(ipc_error("publish frames"))?;
-        let truth_service = if config.publish_truth {
-            Some(services.truth()?)
-        } else {
-            None
-        };
-        let truth = truth_service.as_ref().map(|service| {
-            let publisher = service
-                .publisher_builder()
-                .set_degradation_handler(failed_connections.counter())
-                .initial_max_slice_len(config.n_cells);
-            publisher
-                .max_loaned_samples(1)
-                .create()
-                .map_err(ipc_error("publish the truth"))
-        });
-        let truth = truth.transpose()?;
+        let frames = publisher(&frame_service, config.frame_bytes, &failed)?;
+        let truth_service = config.publish_truth.then(|| services.truth()).transpose()?;
+        let truth = truth_service.as_ref();
+        let truth = truth.map(|service| publisher(service, config.n_cells, &failed));
         let listener = services.listener(Channel::WakeServer)?;
         let answers = Answers::new(&services)?;
         let entries = Entries::of(&node)?;
@@ -153,10 +153,10 @@ impl Ports {
             step,
             control,
             frames,
-            truth,
+            truth: truth.transpose()?,
             listener,
             answers,
-            failed_connections,
+            failed_connections: failed,
             unpublished: RefCell::default(),
             control_service,
             step_service,
@@ -296,6 +296,34 @@ impl Ports {
     }
 }
 
+fn step_server(
+    service: &StepService,
+    answer_bytes: usize,
+    failed: &FailedConnections,
+) -> Result<Server<Ipc, [u8], StepRequest, [u8], StepReply>, ServerCreateError> {
+    service
+        .server_builder()
+        .initial_max_slice_len(answer_bytes.max(1))
+        .set_request_degradation_handler(failed.counter())
+        .set_response_degradation_handler(failed.counter())
+        .max_loaned_responses_per_request(1)
+        .create()
+}
+
+fn publisher<H: Header>(
+    service: &publish_subscribe::PortFactory<Ipc, [u8], H>,
+    sample_bytes: usize,
+    failed: &FailedConnections,
+) -> Result<Publisher<Ipc, [u8], H>, ChannelError> {
+    service
+        .publisher_builder()
+        .initial_max_slice_len(sample_bytes)
+        .set_degradation_handler(failed.counter())
+        .max_loaned_samples(1)
+        .create()
+        .map_err(ipc_error("create a publisher"))
+}
+
 fn publish<H: Header>(
     publisher: &Publisher<Ipc, [u8], H>,
     header: H,
@@ -309,7 +337,7 @@ fn publish<H: Header>(
 }
 
 /// The longest payload of a sample on `frames`.
-pub fn frame_bytes(n_robots: u32, n_cells: usize, n_moves: usize) -> usize {
+fn frame_bytes(n_robots: u32, n_cells: usize, n_moves: usize) -> usize {
     n_robots as usize * (ROBOT_BYTES + n_cells + n_moves)
 }
 

@@ -7,7 +7,7 @@ use super::ports::{ActiveStep, Ports};
 use super::publications::Publications;
 use super::resets::Resets;
 use crate::config::Checked;
-use crate::simulator::{PendingFile, PendingReply, Simulator, Ticket};
+use crate::simulator::{PendingFile, PendingReply, ResetJob, Simulator, Ticket};
 use anyhow::{Context, Result};
 use protocol::control::Reply;
 use protocol::message::Status;
@@ -66,33 +66,10 @@ impl Server {
     pub(super) fn start(checked: Checked, exit_with: Option<i32>) -> Result<Self> {
         let exit_with = exit_with.map(WatchedProcess::watch).transpose()?;
         let ports = Ports::open(&checked)?;
-        let (instance, config) = (checked.instance.name().to_owned(), &checked.config);
-        tracing::info!(
-            instance,
-            pid = std::process::id(),
-            worlds = config.worlds,
-            seed = config.seed,
-            "serving"
-        );
-        if checked.model.reward().iter().all(|&reward| reward == 0.0) {
-            let model = checked.model.name();
-            tracing::warn!(
-                model,
-                "no state pays: every reward will be 0; give a state a `reward` in the model file"
-            );
-        }
-        let n_threads = config.threads;
+        announce(&checked);
+        let n_threads = checked.config.threads;
         let autosave = Autosave::new(&checked)?;
-        let settings = checked.clone();
-        let (mut simulator, mut resets_due) =
-            Simulator::new(checked, threads(n_threads)?, token_source())?;
-        if let Some(FirstWorlds { path, worlds }) = first_worlds(&settings, simulator.spec())? {
-            tracing::info!(file = %path.display(), "restored");
-            let worlds = worlds.into_iter().enumerate();
-            resets_due = worlds
-                .filter_map(|(world, restored)| simulator.start_with(world, restored))
-                .collect();
-        }
+        let (simulator, resets_due) = simulator(checked)?;
         let spec = simulator.spec().clone();
         let resets = Resets::new(threads(n_threads)?, spec.rules.clone());
         let resets = resets.context("start the threads for resets")?;
@@ -115,11 +92,7 @@ impl Server {
             publications: Publications::default(),
             expired_leases: Throttle::default(),
             has_warned_of_barren: false,
-            rate: Rate {
-                since: now,
-                n_steps: 0,
-                per_second: 0.0,
-            },
+            rate: Rate::since(now),
             started: now,
             last_tick: now,
             n_rounds: 0,
@@ -188,6 +161,14 @@ impl Server {
 }
 
 impl Rate {
+    fn since(now: Instant) -> Self {
+        Self {
+            since: now,
+            n_steps: 0,
+            per_second: 0.0,
+        }
+    }
+
     pub(super) fn update(&mut self, now: Instant, n_steps: u64) {
         let elapsed = now - self.since;
         if elapsed >= RATE_WINDOW {
@@ -199,6 +180,38 @@ impl Rate {
             };
         }
     }
+}
+
+fn announce(checked: &Checked) {
+    let config = &checked.config;
+    tracing::info!(
+        instance = checked.instance.name(),
+        pid = std::process::id(),
+        worlds = config.worlds,
+        seed = config.seed,
+        "serving"
+    );
+    if checked.model.reward().iter().all(|&reward| reward == 0.0) {
+        tracing::warn!(
+            model = checked.model.name(),
+            "no state pays: every reward will be 0; give a state a `reward` in the model file"
+        );
+    }
+}
+
+/// The worlds, restored if there is a snapshot of them, and the resets that start the others.
+fn simulator(checked: Checked) -> Result<(Simulator, Vec<ResetJob>)> {
+    let settings = checked.clone();
+    let pool = threads(checked.config.threads)?;
+    let (mut simulator, mut resets) = Simulator::new(checked, pool, token_source())?;
+    if let Some(FirstWorlds { path, worlds }) = first_worlds(&settings, simulator.spec())? {
+        tracing::info!(file = %path.display(), "restored");
+        let worlds = worlds.into_iter().enumerate();
+        resets = worlds
+            .filter_map(|(world, restored)| simulator.start_with(world, restored))
+            .collect();
+    }
+    Ok((simulator, resets))
 }
 
 fn threads(n_threads: usize) -> Result<ThreadPool> {

@@ -53,19 +53,8 @@ impl Beliefs {
         at: &WorldResult,
         part: &BeliefPart<'_>,
     ) -> Result<(), String> {
-        let longest = self.longest;
-        if part.length > longest {
-            let got = part.length;
-            return Err(format!(
-                "length: expected at most {longest} bytes, got {got}"
-            ));
-        }
-        if part.bytes.len() > MAX_BELIEF_PART {
-            let got = part.bytes.len();
-            return Err(format!(
-                "data: expected at most {MAX_BELIEF_PART} bytes, got {got}"
-            ));
-        }
+        check_at_most("length", self.longest, part.length)?;
+        check_at_most("data", MAX_BELIEF_PART as u64, part.bytes.len() as u64)?;
         let info = BeliefInfo {
             kind: part.kind.into(),
             seed: at.seed,
@@ -107,4 +96,11 @@ impl Beliefs {
     pub fn forget(&mut self, robots: Range<usize>) {
         self.left[robots].fill_with(|| None);
     }
+}
+
+fn check_at_most(name: &str, most: u64, got: u64) -> Result<(), String> {
+    if got > most {
+        return Err(format!("{name}: expected at most {most} bytes, got {got}"));
+    }
+    Ok(())
 }

@@ -11,6 +11,7 @@ use protocol::control::{
 use protocol::message::{Status, VERSION, WorldResult};
 use protocol::randomness::{Purpose, stream};
 use rand_chacha::rand_core::Rng;
+use std::ops::Range;
 use std::time::{Duration, Instant};
 
 /// Longest lease a client may ask for: a day.
@@ -29,7 +30,8 @@ impl Simulator {
         text: &[u8],
         stats: &ServerStats,
     ) -> Outcome {
-        let outcome = self.try_control(now, client, version, text, stats);
+        let outcome =
+            read(version, text).and_then(|request| self.try_control(now, client, request, stats));
         outcome.unwrap_or_else(|reply| {
             self.n_refused += 1;
             Outcome::Answer(reply)
@@ -38,39 +40,28 @@ impl Simulator {
 
     /// The answer to a request that had to wait, once its worlds are ready.
     pub fn pending_reply(&mut self, now: Instant, pending: &PendingReply) -> Option<Reply> {
-        if pending
-            .worlds
-            .iter()
-            .any(|&world| self.episode(world).is_none())
-        {
+        let mut worlds = pending.worlds.iter();
+        if worlds.any(|&world| self.episode(world).is_none()) {
             return None;
         }
-        let worlds = pending
-            .worlds
-            .iter()
-            .map(|&world| self.world_info(world))
-            .collect();
+        let worlds = pending.worlds.iter();
+        let worlds = worlds.map(|&world| self.world_info(world)).collect();
         let held = self.leases.robots_held(pending.lease);
         // A burn-in longer than the lease must not end it.
         self.leases.end_wait(now, pending.lease);
         if !pending.tells_lease {
             return Some(Reply::Reset { worlds });
         }
-        Some(
-            match self
-                .leases
-                .renew(now, pending.lease, pending.client)
-                .cloned()
-            {
-                Ok(lease) => Reply::Lease(LeaseInfo {
-                    lease: pending.lease,
-                    ttl_millis: lease.time_to_live.as_millis() as u64,
-                    robots: held.iter().map(|&robot| robot as u32).collect(),
-                    worlds,
-                }),
-                Err(lost) => refusal(lost),
-            },
-        )
+        let lease = self.leases.renew(now, pending.lease, pending.client);
+        Some(match lease {
+            Ok(lease) => Reply::Lease(LeaseInfo {
+                lease: pending.lease,
+                ttl_millis: lease.time_to_live.as_millis() as u64,
+                robots: held.iter().map(|&robot| robot as u32).collect(),
+                worlds,
+            }),
+            Err(lost) => refusal(lost),
+        })
     }
 
     /// Cancels the wait for a reply that no client waits for any more.
@@ -82,66 +73,41 @@ impl Simulator {
         &mut self,
         now: Instant,
         client: ClientId,
-        version: u32,
-        text: &[u8],
+        request: Request,
         stats: &ServerStats,
     ) -> Result<Outcome, Reply> {
-        if version != VERSION {
-            return Err(Reply::version_mismatch(version));
-        }
-        Ok(
-            match parse(text).map_err(|message| Reply::error(Status::Malformed, 0, message))? {
-                Request::Hello { protocol, .. } if protocol != VERSION => {
-                    return Err(Reply::version_mismatch(protocol));
-                }
-                Request::Hello { .. } => Outcome::Answer(Reply::Hello(Box::new(self.info()))),
-                Request::Acquire {
-                    first_robot,
-                    n_robots,
-                    takeover,
-                    ttl_millis,
-                } => {
-                    let robots = self.robot_range(first_robot, n_robots).map_err(refusal)?;
-                    let time_to_live = self.time_to_live(ttl_millis);
-                    self.acquire(
-                        now,
-                        Claim {
-                            client,
-                            robots,
-                            takeover,
-                            time_to_live,
-                        },
-                    )?
-                }
-                Request::Renew { lease } => {
-                    self.leases.renew(now, lease, client).map_err(refusal)?;
-                    self.tell_lease(lease, client)
-                }
-                Request::Release { lease } => {
-                    self.leases.release(now, lease, client).map_err(refusal)?;
-                    self.settle(now);
-                    Outcome::Answer(Reply::Done)
-                }
-                Request::Reset { lease, worlds } => self.reset(now, client, lease, &worlds)?,
-                Request::Snapshot {
-                    first_world,
-                    n_worlds,
-                    path,
-                } => self.snapshot_job(first_world, n_worlds, path)?,
-                Request::Restore {
-                    lease,
-                    first_world,
-                    n_worlds,
-                    from,
-                    path,
-                } => self.restore_job(now, client, lease, (first_world, n_worlds, from), path)?,
-                Request::Fork { lease, from, to } => self.fork(now, client, lease, (from, to))?,
-                Request::LeaveBelief(part) => self.leave_belief(now, client, &part)?,
-                Request::Belief { robot, offset } => self.belief(robot, offset)?,
-                Request::Status {} => Outcome::Answer(Reply::Status(self.status(stats))),
-                Request::Shutdown {} => Outcome::Shutdown,
-            },
-        )
+        Ok(match request {
+            Request::Hello { .. } => Outcome::Answer(Reply::Hello(Box::new(self.info()))),
+            Request::Acquire {
+                first_robot,
+                n_robots,
+                takeover,
+                ttl_millis,
+            } => {
+                let robots = self.robot_range(first_robot, n_robots).map_err(refusal)?;
+                self.acquire(now, client, robots, takeover, ttl_millis)?
+            }
+            Request::Renew { lease } => self.renew(now, client, lease)?,
+            Request::Release { lease } => self.release(now, client, lease)?,
+            Request::Reset { lease, worlds } => self.reset(now, client, lease, &worlds)?,
+            Request::Snapshot {
+                first_world,
+                n_worlds,
+                path,
+            } => self.snapshot_job(first_world, n_worlds, path)?,
+            Request::Restore {
+                lease,
+                first_world,
+                n_worlds,
+                from,
+                path,
+            } => self.restore_job(now, client, lease, (first_world, n_worlds, from), path)?,
+            Request::Fork { lease, from, to } => self.fork(now, client, lease, (from, to))?,
+            Request::LeaveBelief(part) => self.leave_belief(now, client, &part)?,
+            Request::Belief { robot, offset } => self.belief(robot, offset)?,
+            Request::Status {} => Outcome::Answer(Reply::Status(self.status(stats))),
+            Request::Shutdown {} => Outcome::Shutdown,
+        })
     }
 
     fn time_to_live(&self, ttl_millis: Option<u64>) -> Duration {
@@ -149,11 +115,35 @@ impl Simulator {
         Duration::from_millis(millis).clamp(SHORTEST_LEASE, LONGEST_LEASE)
     }
 
-    fn acquire(&mut self, now: Instant, claim: Claim) -> Result<Outcome, Reply> {
-        let (token, client) = ((self.next_token)(), claim.client);
+    fn acquire(
+        &mut self,
+        now: Instant,
+        client: ClientId,
+        robots: Range<usize>,
+        takeover: bool,
+        ttl_millis: Option<u64>,
+    ) -> Result<Outcome, Reply> {
+        let claim = Claim {
+            client,
+            robots,
+            takeover,
+            time_to_live: self.time_to_live(ttl_millis),
+        };
+        let token = (self.next_token)();
         self.leases.acquire(now, claim, token).map_err(refusal)?;
         self.settle(now);
         Ok(self.tell_lease(token, client))
+    }
+
+    fn renew(&mut self, now: Instant, client: ClientId, lease: u64) -> Result<Outcome, Reply> {
+        self.leases.renew(now, lease, client).map_err(refusal)?;
+        Ok(self.tell_lease(lease, client))
+    }
+
+    fn release(&mut self, now: Instant, client: ClientId, lease: u64) -> Result<Outcome, Reply> {
+        self.leases.release(now, lease, client).map_err(refusal)?;
+        self.settle(now);
+        Ok(Outcome::Answer(Reply::Done))
     }
 
     /// An answer when its worlds are ready; the lease lives until then.
@@ -296,6 +286,19 @@ impl Simulator {
             n_observers: stats.n_observers,
             worlds: self.worlds().map(world_status).collect(),
         }
+    }
+}
+
+/// The request in a message of this version.
+fn read(version: u32, text: &[u8]) -> Result<Request, Reply> {
+    if version != VERSION {
+        return Err(Reply::version_mismatch(version));
+    }
+    match parse(text).map_err(|message| Reply::error(Status::Malformed, 0, message))? {
+        Request::Hello { protocol, .. } if protocol != VERSION => {
+            Err(Reply::version_mismatch(protocol))
+        }
+        request => Ok(request),
     }
 }
 

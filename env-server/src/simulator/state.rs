@@ -70,42 +70,35 @@ impl Simulator {
         next_token: Box<dyn FnMut() -> u64>,
     ) -> Result<(Self, Vec<ResetJob>), ModelError> {
         let config = &checked.config;
-        let spec = WorldSpec::of(&checked)?;
-        let n_robots = config.worlds as usize * config.robots as usize;
-        let beliefs = Beliefs::new(n_robots, checked.shape.n_cells(), checked.model.n_states());
-        let (n_worlds, first_seed) = (config.worlds as usize, config.seed);
+        let (n_worlds, team) = (config.worlds as usize, config.robots as usize);
         let start = |world: usize| ResetJob {
             world,
             before: None,
             episode: 0,
-            seed: first_seed.wrapping_add(world as u64),
+            seed: config.seed.wrapping_add(world as u64),
         };
         let jobs: Vec<ResetJob> = (0..n_worlds).map(start).collect();
-        let (team, n_moves) = (config.robots as usize, config.moves);
         let place = |job| Place {
             slot: Slot::resetting(job, team),
-            barrier: Barrier::new(team, n_moves),
+            barrier: Barrier::new(team, config.moves),
         };
-        let places = jobs.iter().map(place).collect();
-        let leases = Leases::new(n_robots);
-        Ok((
-            Self {
-                checked,
-                spec,
-                beliefs,
-                places,
-                leases,
-                waiting_worlds: Vec::new(),
-                settled: VecDeque::new(),
-                moved: Vec::new(),
-                n_tickets: 0,
-                threads,
-                next_token,
-                n_steps: 0,
-                n_refused: 0,
-            },
-            jobs,
-        ))
+        let (n_robots, n_cells) = (n_worlds * team, checked.shape.n_cells());
+        let simulator = Self {
+            spec: WorldSpec::of(&checked)?,
+            beliefs: Beliefs::new(n_robots, n_cells, checked.model.n_states()),
+            places: jobs.iter().map(place).collect(),
+            leases: Leases::new(n_robots),
+            checked,
+            waiting_worlds: Vec::new(),
+            settled: VecDeque::new(),
+            moved: Vec::new(),
+            n_tickets: 0,
+            threads,
+            next_token,
+            n_steps: 0,
+            n_refused: 0,
+        };
+        Ok((simulator, jobs))
     }
 
     /// Replaces a world, for example by the same one after its reset.

@@ -61,17 +61,10 @@ impl Simulator {
         if request.version != VERSION {
             return Err(Refusal::new(Status::VersionMismatch, VERSION.into()));
         }
-        let operation = Operation::try_from(request.operation);
-        let operation = operation
+        let operation = Operation::try_from(request.operation)
             .map_err(|unknown| Refusal::new(Status::UnknownOperation, unknown.value.into()))?;
         let robots = self.robot_range(request.first_robot, request.n_robots)?;
-        let allowed = match operation {
-            Operation::Step => FLAG_FULL_COVERAGE | FLAG_TEAM_FRAMES,
-            _ => FLAG_TEAM_FRAMES,
-        };
-        if request.flags & !allowed != 0 {
-            return Err(Refusal::new(Status::UnknownFlags, request.flags.into()));
-        }
+        check_flags(operation, request.flags)?;
         match operation {
             Operation::Observe => {
                 check_length(body, 0)?;
@@ -108,7 +101,7 @@ impl Simulator {
     ) -> Option<Ticket> {
         let (first, n_robots) = (request.first_robot as usize, request.n_robots as usize);
         let worlds = self.worlds_of(&(first..first + n_robots));
-        let (team, n_moves) = (self.spec.rules.n_robots, self.spec.rules.n_moves);
+        let n_moves = self.spec.rules.n_moves;
         let mut paths = &body[worlds.len() * size_of::<u64>()..];
         let is_full = coverage == Coverage::Full;
         for world in worlds.clone() {
@@ -123,14 +116,29 @@ impl Simulator {
             self.advance(now, worlds);
             return None;
         }
-        let world = worlds.start;
+        self.leases.begin_wait(request.lease);
+        Some(self.wait(now, client, request, worlds.start))
+    }
+
+    /// Has a request wait for the other paths of its world.
+    fn wait(
+        &mut self,
+        now: Instant,
+        client: ClientId,
+        request: &StepRequest,
+        world: usize,
+    ) -> Ticket {
         let ticket = self.new_ticket();
+        let first_robot = self.robots_of(world).start;
         let barrier = &mut self.places[world].barrier;
         barrier.waiters.push(Waiter {
             ticket,
             client,
             request: *request,
-            robots: mask(first - world * team, n_robots),
+            robots: mask(
+                request.first_robot as usize - first_robot,
+                request.n_robots as usize,
+            ),
         });
         let deadline_millis = self.checked.config.deadline_millis;
         if barrier.deadline.is_none() && deadline_millis > 0 {
@@ -139,8 +147,7 @@ impl Simulator {
         if barrier.waiters.len() == 1 {
             self.waiting_worlds.push(world);
         }
-        self.leases.begin_wait(request.lease);
-        Some(ticket)
+        ticket
     }
 
     /// Checks that worlds kept what steps showed.
@@ -222,6 +229,17 @@ impl Simulator {
         }
         Ok(())
     }
+}
+
+fn check_flags(operation: Operation, flags: u32) -> Result<(), Refusal> {
+    let allowed = match operation {
+        Operation::Step => FLAG_FULL_COVERAGE | FLAG_TEAM_FRAMES,
+        Operation::Observe | Operation::Recall => FLAG_TEAM_FRAMES,
+    };
+    if flags & !allowed != 0 {
+        return Err(Refusal::new(Status::UnknownFlags, flags.into()));
+    }
+    Ok(())
 }
 
 fn check_length(body: &[u8], expected: usize) -> Result<(), Refusal> {

@@ -98,11 +98,12 @@ fn may_be_replaced(path: &Path) -> io::Result<()> {
         Ok(_) => {
             let mut magic = [0; MAGIC.len()];
             let _ = open(path)?.read(&mut magic)?;
-            match magic == MAGIC {
-                true => Ok(()),
-                false => Err(io::Error::other(
+            if magic == MAGIC {
+                Ok(())
+            } else {
+                Err(io::Error::other(
                     "expected no file or a snapshot to replace, got another kind of file",
-                )),
+                ))
             }
         }
     }

@@ -98,10 +98,12 @@ impl Recorded {
 
     fn choice(&self, seed: u64) -> Choice {
         let n_sequences = self.sequences.len() as u64;
-        let n_symmetries = match self.shape.height() == self.shape.width() {
-            _ if !self.with_symmetries => 1,
-            true => 8,
-            false => 4,
+        let n_symmetries = if !self.with_symmetries {
+            1
+        } else if self.shape.height() == self.shape.width() {
+            8
+        } else {
+            4
         };
         let mut random = stream(seed, Purpose::Offset, 0);
         Choice {

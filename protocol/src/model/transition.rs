@@ -9,18 +9,21 @@
 //! sees `o` itself: `u[m] = sum_o p[o] phi[m | o] / sum_m phi[m | o]`. This is a mean field: it takes the
 //! cell and its neighbours for independent, as the filter does.
 //!
+//! `tests/model/transition.rs` and `own_state.rs` have these sums as they stand, and compare for any models and grids.
+//!
 //! Two things make it fast, both without a change of meaning. The belief is copied into planes with
-//! a margin of zeros, so no cell is special. And taps of one state that weigh alike (the eight
-//! neighbours in most of the wildfire kernel) are added up before they are multiplied, once for all
-//! next states: 35 additions and 16 multiplications a cell where the sum above has 54 of each.
-//! Every lane does the same operations in the same order and none is fused, so results are
-//! bit-identical on every platform.
+//! a margin of zeros, so no cell is special and many are computed at once. And taps that weigh alike are added up
+//! before they are multiplied ([`rows`]). Every lane does the same operations in the same order and none is fused, so
+//! results are bit-identical on every platform.
+
+mod rows;
 
 use super::file::ModelError;
 use super::grid::Shape;
 use super::parameters::Model;
 use super::vectors::vectorised;
-use ndarray::{Array3, Array4, NdFloat, s};
+use ndarray::{Array3, Array4, NdFloat};
+use rows::{Kernels, Own, kernel_rows, taps_that_weigh_alike};
 
 /// Cells computed at once, four AVX2 registers of `f32`. Independent sums hide the latency of adds.
 const LANES: usize = 32;
@@ -44,34 +47,6 @@ pub struct Transition<T = f32> {
     weights: Vec<[T; LANES]>,
     /// The same in one own state.
     own_weights: Vec<[T; LANES]>,
-}
-
-/// For each next state its bias and its weight for some of the groups.
-type Rows<T> = Vec<Row<T>>;
-
-#[derive(Debug, Clone)]
-enum Kernels<T> {
-    /// Of every cell.
-    Alike(Rows<T>),
-    /// By the cell's own state.
-    Own(Vec<Own<T>>),
-}
-
-/// What a cell in one state itself turns into.
-#[derive(Debug, Clone)]
-enum Own<T> {
-    /// Whatever its neighbours, the probability of each next state that is possible.
-    Fixed(Vec<(usize, T)>),
-    /// The rows of the next states that are possible.
-    Weighed(Vec<(usize, Row<T>)>),
-}
-
-/// One next state's part of eq. 2.
-#[derive(Debug, Clone)]
-struct Row<T> {
-    bias: T,
-    /// Group and weight.
-    terms: Vec<(usize, T)>,
 }
 
 /// Where a cell of a state lies in the planes: half a kernel of margin on each side, and on the
@@ -104,7 +79,7 @@ impl<T: NdFloat> Transition<T> {
         let sees_own_state = kernels.len() > 1;
         let (columns, groups): (Vec<_>, Vec<_>) =
             taps_that_weigh_alike(kernels, layout).into_iter().unzip();
-        let rows = |own: usize| rows(own, &kernels[own], bias, sees_own_state, &columns);
+        let rows = |own: usize| kernel_rows(own, &kernels[own], bias, sees_own_state, &columns);
         let kernels = if sees_own_state {
             Kernels::Own((0..n_states).map(|own| Own::new(rows(own))).collect())
         } else {
@@ -222,99 +197,6 @@ impl Layout {
     }
 }
 
-impl<T: NdFloat> Own<T> {
-    fn new(rows: Rows<T>) -> Self {
-        let sees_neighbours = rows.iter().any(|row| !row.terms.is_empty());
-        let total = rows.iter().fold(T::zero(), |sum, row| sum + row.bias);
-        let is_possible = |row: &Row<T>| row.bias > T::zero() || !row.terms.is_empty();
-        let possible = rows.into_iter().enumerate();
-        let possible = possible.filter(|(_, row)| is_possible(row));
-        if sees_neighbours {
-            Self::Weighed(possible.collect())
-        } else {
-            Self::Fixed(possible.map(|(to, row)| (to, row.bias / total)).collect())
-        }
-    }
-
-    /// Adds what becomes of the cells that are in this state with probability `p`.
-    #[inline(always)]
-    fn add(
-        &self,
-        p: &[T; LANES],
-        sums: &[[T; LANES]],
-        weights: &mut [[T; LANES]],
-        next: &mut [[T; LANES]],
-    ) {
-        match self {
-            Self::Fixed(probabilities) => {
-                for &(to, probability) in probabilities {
-                    for (next, &p) in next[to].iter_mut().zip(p) {
-                        *next += p * probability;
-                    }
-                }
-            }
-            Self::Weighed(rows) => {
-                let mut total = [T::zero(); LANES];
-                for (weight, (_, row)) in weights.iter_mut().zip(rows) {
-                    *weight = row.weigh(sums);
-                    for (total, &weight) in total.iter_mut().zip(&*weight) {
-                        *total += weight;
-                    }
-                }
-                let mut factor = *p;
-                for (factor, total) in factor.iter_mut().zip(total) {
-                    *factor /= total;
-                }
-                for ((to, _), weight) in rows.iter().zip(weights) {
-                    let lanes = next[*to].iter_mut().zip(&*weight).zip(&factor);
-                    for ((next, &weight), &factor) in lanes {
-                        *next += weight * factor;
-                    }
-                }
-            }
-        }
-    }
-}
-
-impl<T: NdFloat> Row<T> {
-    #[inline(always)]
-    fn weigh(&self, sums: &[[T; LANES]]) -> [T; LANES] {
-        let mut weight = [self.bias; LANES];
-        for &(group, factor) in &self.terms {
-            for (weight, &sum) in weight.iter_mut().zip(&sums[group]) {
-                *weight += factor * sum;
-            }
-        }
-        weight
-    }
-}
-
-/// Eq. 2 for the cells in state `own`, or for all; `columns` are the weights of the groups.
-fn rows<T: NdFloat>(
-    own: usize,
-    kernel: &Array4<f64>,
-    bias: &[f64],
-    sees_own_state: bool,
-    columns: &[Vec<f64>],
-) -> Rows<T> {
-    // Eq. 3 cancels a common factor; taken out, no weight overflows T.
-    let largest = kernel.iter().chain(bias).copied().fold(0.0, f64::max);
-    let scaled = |weight: f64| T::from(weight / largest).expect("invariant: f64 casts to T");
-    let (n_states, _, height, width) = kernel.dim();
-    let row = |to: usize| {
-        let centre = kernel[[to, own, height / 2, width / 2]];
-        let weights = columns.iter().map(|column| column[own * n_states + to]);
-        let terms = weights.enumerate().filter(|&(_, weight)| weight > 0.0);
-        Row {
-            bias: scaled(bias[to] + if sees_own_state { centre } else { 0.0 }),
-            terms: terms
-                .map(|(group, weight)| (group, scaled(weight)))
-                .collect(),
-        }
-    };
-    (0..n_states).map(row).collect()
-}
-
 /// The [`LANES`] values from a place on.
 #[inline(always)]
 fn lanes_from<T>(planes: &[T], at: usize) -> &[T; LANES] {
@@ -333,32 +215,4 @@ fn add_up<T: NdFloat>(planes: &[T], offsets: &[usize]) -> [T; LANES] {
         }
     }
     sum
-}
-
-/// The taps of each state, or of all, by the column of weights `w[.., n, a, c]` they share, one kernel's after the
-/// other's: `(column, offsets)`. Taps without weight are left out, as is the centre where it sees the
-/// cell's own state.
-fn taps_that_weigh_alike(kernels: &[Array4<f64>], layout: Layout) -> Vec<(Vec<f64>, Vec<usize>)> {
-    let (n_states, _, kernel_height, kernel_width) = kernels[0].dim();
-    let is_own = |tap| kernels.len() > 1 && tap == (kernel_height / 2, kernel_width / 2);
-    let mut groups: Vec<(Vec<f64>, Vec<usize>)> = Vec::new();
-    for from in 0..n_states {
-        // Sums within one state alone keep what all kernels alike have always predicted, to the bit.
-        let first = if kernels.len() > 1 { 0 } else { groups.len() };
-        for (row, col) in (0..kernel_height).flat_map(|a| (0..kernel_width).map(move |c| (a, c))) {
-            let columns = kernels
-                .iter()
-                .map(|kernel| kernel.slice(s![.., from, row, col]));
-            let column: Vec<f64> = columns.flat_map(|column| column.to_vec()).collect();
-            if is_own((row, col)) || column.iter().all(|&weight| weight == 0.0) {
-                continue;
-            }
-            let offset = from * layout.plane + row * layout.stride + col;
-            match groups[first..].iter_mut().find(|group| group.0 == column) {
-                Some((_, offsets)) => offsets.push(offset),
-                None => groups.push((column, vec![offset])),
-            }
-        }
-    }
-    groups
 }

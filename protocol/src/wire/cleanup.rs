@@ -134,9 +134,10 @@ fn remove_if(
     let mut n_removed = 0;
     for path in paths {
         if is_left(&path)? {
-            let removed = match path.is_dir() {
-                true => std::fs::remove_dir_all(&path),
-                false => std::fs::remove_file(&path),
+            let removed = if path.is_dir() {
+                std::fs::remove_dir_all(&path)
+            } else {
+                std::fs::remove_file(&path)
             };
             n_removed += usize::from(removed.is_ok());
         }
@@ -175,9 +176,10 @@ mod tests {
             .flat_map(|folder| entries(folder).expect("a folder"))
             .collect();
         for node in entries(&nodes).expect("a folder") {
-            all.extend(match node.is_dir() {
-                true => entries(&node).expect("a folder"),
-                false => Vec::new(),
+            all.extend(if node.is_dir() {
+                entries(&node).expect("a folder")
+            } else {
+                Vec::new()
             });
         }
         all.extend(files.segments().expect("a folder"));

@@ -306,9 +306,10 @@ impl Client {
     }
 
     fn request(&self, operation: Operation, robots: &Range<u32>) -> StepRequest {
-        let flags = match self.shares_frames {
-            true => FLAG_TEAM_FRAMES,
-            false => 0,
+        let flags = if self.shares_frames {
+            FLAG_TEAM_FRAMES
+        } else {
+            0
         };
         StepRequest {
             operation: operation as u32,

@@ -146,9 +146,10 @@ impl Connection {
     /// # Errors
     /// If it has ended.
     pub fn check_server(&self) -> Result<(), ConnectionError> {
-        match self.ports.exchange.server_process.has_ended() {
-            true => Err(self.ports.exchange.server_gone()),
-            false => Ok(()),
+        if self.ports.exchange.server_process.has_ended() {
+            Err(self.ports.exchange.server_gone())
+        } else {
+            Ok(())
         }
     }
 

@@ -85,12 +85,13 @@ fn own_segments(folder: &std::path::Path, prefix: &str) -> Result<(), ChannelErr
         std::fs::read_dir(folder).map_err(|error| directory_error(folder, error.to_string()))?;
     for entry in entries.flatten() {
         let name = entry.file_name();
-        let found = match name.as_encoded_bytes().starts_with(prefix.as_bytes()) {
-            true => entry.metadata(),
-            false => continue,
-        };
+        if !name.as_encoded_bytes().starts_with(prefix.as_bytes()) {
+            continue;
+        }
         // What is gone by now belonged to a process that ended.
-        let Ok(found) = found else { continue };
+        let Ok(found) = entry.metadata() else {
+            continue;
+        };
         if !found.is_file() || found.uid() != rustix::process::getuid().as_raw() {
             let problem = "expected shared memory of this user, got something of user";
             return Err(directory_error(

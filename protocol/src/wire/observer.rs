@@ -184,9 +184,10 @@ impl Polling {
         if self.n_found.replace(0) > self.buffer / 4 {
             self.busy.set(now);
         }
-        match self.is_eager || now.duration_since(self.busy.get()) < BUSY {
-            true => BUSY_INTERVAL,
-            false => IDLE_INTERVAL,
+        if self.is_eager || now.duration_since(self.busy.get()) < BUSY {
+            BUSY_INTERVAL
+        } else {
+            IDLE_INTERVAL
         }
     }
 }

@@ -63,12 +63,13 @@ impl Turn {
     /// As [`Self::take`], but waits no longer than a limit.
     pub(crate) fn take_within(limit: Duration) -> Result<Self, ChannelError> {
         let is_outermost = HELD.get() == Held::No;
-        let lock = match is_outermost {
-            true => wait(
+        let lock = if is_outermost {
+            wait(
                 &own_channel_directory()?.join(LOCK),
                 limit.min(LONGEST_WAIT),
-            )?,
-            false => None,
+            )?
+        } else {
+            None
         };
         if is_outermost {
             HELD.set(if lock.is_some() {

@@ -57,9 +57,10 @@ impl Siege {
             return false;
         }
         let robots = request.first_robot as usize..(request.first_robot + reply.n_robots) as usize;
-        let stepped = match request.operation == Operation::Step as u32 {
-            true => self.simulator.worlds_of(&robots),
-            false => 0..0,
+        let stepped = if request.operation == Operation::Step as u32 {
+            self.simulator.worlds_of(&robots)
+        } else {
+            0..0
         };
         assert!(
             stepped.is_empty() || robots.end <= N_THEIRS as usize,
@@ -71,9 +72,10 @@ impl Siege {
         );
         for (world, (before, after)) in before.iter().zip(&after).enumerate() {
             let k = |seen: &Option<WorldSeen>| seen.as_ref().map(|(result, _)| result.step);
-            match stepped.contains(&world) {
-                true => assert_eq!(k(after), k(before).map(|k| k + 1)),
-                false => assert!(before == after, "world {world} changed"),
+            if stepped.contains(&world) {
+                assert_eq!(k(after), k(before).map(|k| k + 1))
+            } else {
+                assert!(before == after, "world {world} changed")
             }
         }
         true

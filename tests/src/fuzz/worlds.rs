@@ -180,9 +180,10 @@ pub fn recording_seeds() -> Vec<Seed> {
 /// Recorded states of three kinds, an archive or one array: refused, or all sequences have one shape.
 pub fn states(bytes: &[u8]) -> bool {
     let mut sequences = Sequences::new(3);
-    let added = match bytes.starts_with(b"\x93NUMPY") {
-        true => sequences.add_array("one", bytes.len() as u64, bytes),
-        false => sequences.add_archive(Cursor::new(bytes)),
+    let added = if bytes.starts_with(b"\x93NUMPY") {
+        sequences.add_array("one", bytes.len() as u64, bytes)
+    } else {
+        sequences.add_archive(Cursor::new(bytes))
     };
     let shape = |array: &Array3<u8>| [1, 2].map(|axis| array.len_of(Axis(axis)));
     for array in &sequences.arrays {

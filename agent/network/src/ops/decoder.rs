@@ -100,8 +100,8 @@ impl<'a> Layers<'a> {
         let weights_of = |[gamma, beta, kernels]: &[&'a Tensor; 3]| {
             Ok([numbers(gamma)?, numbers(beta)?, numbers(kernels)?])
         };
-        let weights_of_levels = self.levels.iter().map(weights_of);
-        let weights_of_levels = weights_of_levels.collect::<Result<Vec<_>>>()?;
+        let weights_of_levels: Vec<_> =
+            self.levels.iter().map(weights_of).collect::<Result<_>>()?;
         let seed = Seed {
             hidden: &hidden,
             weights: &weights,
@@ -293,9 +293,10 @@ impl Forward<'_> {
             #[inline(always)]
             |to, frame, dy| {
                 let targets = window.targets(frame);
-                match targets.len() * SPARSE < last.sizes.out_area() {
-                    true => to.few(last, (frame, z), targets, dy),
-                    false => to.many(last, (frame, z), targets, dy),
+                if targets.len() * SPARSE < last.sizes.out_area() {
+                    to.few(last, (frame, z), targets, dy)
+                } else {
+                    to.many(last, (frame, z), targets, dy)
                 }
             },
         )

@@ -81,9 +81,10 @@ impl WithSimd for Call<'_> {
             self.columns::<S, 2, true>(simd, col, most);
         }
         for col in (whole..cols).step_by(S::F32_LANES) {
-            match col + S::F32_LANES <= cols {
-                true => self.columns::<S, 1, true>(simd, col, 8),
-                false => self.columns::<S, 1, false>(simd, col, 8),
+            if col + S::F32_LANES <= cols {
+                self.columns::<S, 1, true>(simd, col, 8);
+            } else {
+                self.columns::<S, 1, false>(simd, col, 8);
             }
         }
     }
@@ -177,9 +178,10 @@ impl<const WHOLE: bool> Vector<WHOLE> {
     fn load<S: Simd>(self, simd: S, from: *const f32) -> S::f32s {
         // SAFETY: the numbers are within their slice.
         unsafe {
-            match WHOLE {
-                true => from.cast::<S::f32s>().read_unaligned(),
-                false => simd.mask_load_ptr_f32s(simd.mask_between_m32s(0, self.0 as u32), from),
+            if WHOLE {
+                from.cast::<S::f32s>().read_unaligned()
+            } else {
+                simd.mask_load_ptr_f32s(simd.mask_between_m32s(0, self.0 as u32), from)
             }
         }
     }
@@ -188,12 +190,11 @@ impl<const WHOLE: bool> Vector<WHOLE> {
     fn store<S: Simd>(self, simd: S, to: *mut f32, numbers: S::f32s) {
         // SAFETY: as above.
         unsafe {
-            match WHOLE {
-                true => to.cast::<S::f32s>().write_unaligned(numbers),
-                false => {
-                    let mask = simd.mask_between_m32s(0, self.0 as u32);
-                    simd.mask_store_ptr_f32s(mask, to, numbers);
-                }
+            if WHOLE {
+                to.cast::<S::f32s>().write_unaligned(numbers)
+            } else {
+                let mask = simd.mask_between_m32s(0, self.0 as u32);
+                simd.mask_store_ptr_f32s(mask, to, numbers);
             }
         }
     }

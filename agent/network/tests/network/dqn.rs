@@ -201,9 +201,10 @@ fn load(dqn: &mut Dqn, (tensors, saved): &Saved) -> std::result::Result<(), Prob
     let find = |name: &str, dims: &[usize]| {
         let found = tensors.iter().find(|tensor| tensor.0 == name);
         let found = found.ok_or_else(|| Problem(format!("{name}: missing")))?;
-        match found.1 == dims {
-            true => Ok(found.2.clone()),
-            false => Err(Problem(format!("{name}: {dims:?}, got {:?}", found.1))),
+        if found.1 == dims {
+            Ok(found.2.clone())
+        } else {
+            Err(Problem(format!("{name}: {dims:?}, got {:?}", found.1)))
         }
     };
     dqn.load(find, saved)

@@ -97,9 +97,10 @@ fn check_with(case: Case, stock: Stock) {
         case.n_frames,
         case.one_in,
     );
-    let dropout = match case.drops {
-        true => dropout(frames.len(), 2.0, coin),
-        false => dropout(frames.len(), 1.0, |_, _, _| true),
+    let dropout = if case.drops {
+        dropout(frames.len(), 2.0, coin)
+    } else {
+        dropout(frames.len(), 1.0, |_, _, _| true)
     };
     let window = Window::new(&frames);
     let pass = Pass::training(&window, &dropout);

@@ -9,8 +9,6 @@ pub mod dynamics;
 pub mod file;
 pub mod frame;
 pub mod grid;
-mod lanes;
-mod mixture;
 mod parameters;
 pub mod path;
 pub mod randomness;

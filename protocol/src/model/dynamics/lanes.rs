@@ -1,16 +1,16 @@
-//! The vectorised part of [`super::dynamics`]: work on [`LANES`] cells at once.
+//! The vectorised part of [`super::bytes`]: work on [`LANES`] cells at once.
 //!
 //! Plain loops over arrays, inlined so that LLVM compiles them for their caller's vectors.
 
-use super::mixture::ESCAPED;
-use super::randomness::split_mix;
+use super::super::randomness::split_mix;
+use super::parents::ESCAPED;
 
 /// Cells decided at once by the first byte, and searched at once for undecided ones.
-pub(crate) const LANES: usize = 64;
+pub(super) const LANES: usize = 64;
 
 /// The byte values that stand for one tap.
 #[derive(Debug)]
-pub(crate) struct FastTap {
+pub(super) struct FastTap {
     offset: usize,
     /// The last of them (the first follows on the tap before), in every lane.
     last: [u8; LANES],
@@ -18,19 +18,19 @@ pub(crate) struct FastTap {
 
 /// What bytes stand for in cells of one own state: first the centre, then the other taps.
 #[derive(Debug)]
-pub(crate) struct FastOwn {
-    pub(crate) own: u8,
+pub(super) struct FastOwn {
+    pub(super) own: u8,
     /// The state that the cell itself leads to.
-    pub(crate) likeliest: u8,
+    pub(super) likeliest: u8,
     /// How many byte values stand for it.
-    pub(crate) count: usize,
-    pub(crate) neighbours: Vec<FastTap>,
+    pub(super) count: usize,
+    pub(super) neighbours: Vec<FastTap>,
     /// Where a neighbour's state mostly leads to another: that state, and the other.
-    pub(crate) changes: Vec<(u8, u8)>,
+    pub(super) changes: Vec<(u8, u8)>,
 }
 
 /// The taps that bytes from `first` on stand for, with the last byte value of each.
-pub(crate) fn fast_taps(first: usize, taps: impl Iterator<Item = (usize, usize)>) -> Vec<FastTap> {
+pub(super) fn fast_taps(first: usize, taps: impl Iterator<Item = (usize, usize)>) -> Vec<FastTap> {
     let mut end = first;
     let mut fast = Vec::new();
     for (count, offset) in taps {
@@ -48,16 +48,40 @@ pub(crate) fn fast_taps(first: usize, taps: impl Iterator<Item = (usize, usize)>
 
 /// Words `first..` of the SplitMix64 generator of a key; `bytes` are whole words.
 #[inline(always)]
-pub(crate) fn fill(bytes: &mut [u8], key: u64, first: usize) {
+pub(super) fn fill(bytes: &mut [u8], key: u64, first: usize) {
     let (words, _) = bytes.as_chunks_mut();
     for (index, word) in (first..).zip(words) {
         *word = split_mix(key, index as u64).to_le_bytes();
     }
 }
 
+/// The words of a key's SplitMix64 generator, one after the other.
+#[derive(Debug)]
+pub(super) struct Words {
+    key: u64,
+    n_drawn: usize,
+}
+
+impl Words {
+    pub(super) fn new(key: u64) -> Self {
+        Self { key, n_drawn: 0 }
+    }
+
+    #[inline(always)]
+    pub(super) fn fill(&mut self, bytes: &mut [u8]) {
+        fill(bytes, self.key, self.n_drawn);
+        self.n_drawn += bytes.len() / 8;
+    }
+
+    pub(super) fn draw(&mut self) -> u64 {
+        self.n_drawn += 1;
+        split_mix(self.key, self.n_drawn as u64 - 1)
+    }
+}
+
 /// Replaces each byte by the parent under the tap that it stands for, or by [`ESCAPED`].
 #[inline(always)]
-pub(crate) fn blend(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
+pub(super) fn blend(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
     let mut states = [ESCAPED; LANES];
     // From the last tap back, so that each overwrites the lanes of the taps after it.
     for tap in fast.iter().rev() {
@@ -75,7 +99,7 @@ pub(crate) fn blend(lanes: &mut [u8; LANES], fast: &[FastTap], parents: &[u8]) {
 
 /// The same where the cell's own state, which lies under `centre`, tells what bytes stand for.
 #[inline(always)]
-pub(crate) fn blend_own(lanes: &mut [u8; LANES], fast: &[FastOwn], parents: &[u8], centre: usize) {
+pub(super) fn blend_own(lanes: &mut [u8; LANES], fast: &[FastOwn], parents: &[u8], centre: usize) {
     let own: &[u8; LANES] = parents[centre..]
         .first_chunk()
         .expect("invariant: a whole chunk of places is under every tap");
@@ -111,7 +135,7 @@ fn replace(lanes: &mut [u8; LANES], by: u8, is_chosen: impl Fn(usize) -> bool) {
 /// The high bit of every lane, that of lane `8 w + b` at position `8 b + w`: an order that takes one
 /// shift a word, with no multiplication to gather its bits.
 #[inline]
-pub(crate) fn high_bits(lanes: &[u8; LANES]) -> u64 {
+pub(super) fn high_bits(lanes: &[u8; LANES]) -> u64 {
     let (words, _) = lanes.as_chunks();
     let high = |word| u64::from_le_bytes(word) >> 7 & 0x0101_0101_0101_0101;
     let bits = words
@@ -123,7 +147,7 @@ pub(crate) fn high_bits(lanes: &[u8; LANES]) -> u64 {
 
 /// The lane of a bit's position in [`high_bits`], and the position of a lane's bit.
 #[inline]
-pub(crate) fn transposed(at: u32) -> u32 {
+pub(super) fn transposed(at: u32) -> u32 {
     at % 8 * 8 + at / 8
 }
 
@@ -132,7 +156,7 @@ pub(crate) fn transposed(at: u32) -> u32 {
 /// Eight at a time, needed or not, as in simdjson's `flatten_bits`: a loop over the bits alone would
 /// mispredict its end in most chunks.
 #[inline]
-pub(crate) fn list_lanes(mut bits: u64, first: u32, to: &mut [u32; LANES]) {
+pub(super) fn list_lanes(mut bits: u64, first: u32, to: &mut [u32; LANES]) {
     for eight in to.as_chunks_mut::<8>().0 {
         for lane in eight {
             *lane = first + transposed(bits.trailing_zeros() % 64);

@@ -14,5 +14,5 @@ mod state;
 mod taken;
 
 pub use liveness::Clients;
-pub use ports::{PortConfig, Ports, frame_bytes};
+pub use ports::{PortConfig, Ports};
 pub use serve::serve;

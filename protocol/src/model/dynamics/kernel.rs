@@ -1,0 +1,76 @@
+//! The weights of paper eq. 2 by tap, and the draw of a state in proportion to weights.
+
+use super::super::parameters::Model;
+use ndarray::Array4;
+
+/// The weights of eq. 2: of all cells, or of those in one state themselves.
+#[derive(Debug, Clone)]
+pub(super) struct Kernel {
+    pub(super) n_states: usize,
+    pub(super) n_taps: usize,
+    /// `w[m, n, t]` as `[tap][from][to]`. The bias counts as weight of the centre tap, whose neighbour is the cell
+    /// itself and always there. Where the cell's own state is known, the centre has its weights in place of all others.
+    pub(super) weights: Vec<f64>,
+}
+
+impl Kernel {
+    /// One for all cells, or one for each state that a cell itself can be in.
+    pub(super) fn of_model(model: &Model) -> Vec<Self> {
+        let bias = model.bias().to_vec();
+        let own = |state| model.sees_own_state().then_some(state);
+        let kernels = model.kernels().iter().enumerate();
+        kernels
+            .map(|(state, kernel)| Self::new(kernel, &bias, own(state)))
+            .collect()
+    }
+
+    fn new(kernel: &Array4<f64>, bias: &[f64], own: Option<usize>) -> Self {
+        let (n_states, _, kernel_height, kernel_width) = kernel.dim();
+        let n_taps = kernel_height * kernel_width;
+        // Eq. 3 cancels a common factor; taken out, no sum of weights overflows.
+        let largest = kernel.iter().chain(bias).copied().fold(0.0, f64::max);
+        let mut weights = Vec::with_capacity(n_taps * n_states * n_states);
+        for tap in 0..n_taps {
+            let (row, col) = (tap / kernel_width, tap % kernel_width);
+            let is_centre = tap == n_taps / 2;
+            for neighbour in 0..n_states {
+                let from = own.filter(|_| is_centre).unwrap_or(neighbour);
+                weights.extend((0..n_states).map(|to| {
+                    let bias = if is_centre { bias[to] } else { 0.0 };
+                    (kernel[[to, from, row, col]] + bias) / largest
+                }));
+            }
+        }
+        Self {
+            n_states,
+            n_taps,
+            weights,
+        }
+    }
+
+    /// The weight of each next state, given a tap and the state of the neighbour under it.
+    pub(super) fn weights(&self, tap: usize, from: usize) -> &[f64] {
+        &self.weights[(tap * self.n_states + from) * self.n_states..][..self.n_states]
+    }
+}
+
+/// A number in `[0, 1)` from the high 53 bits.
+pub(super) fn uniform(random: u64) -> f64 {
+    (random >> 11) as f64 * 2f64.powi(-53)
+}
+
+/// The state at `uniform` of the cumulated weights, which need not sum to one.
+pub(super) fn invert(weights: &[f64], uniform: f64) -> u8 {
+    let target = uniform * weights.iter().sum::<f64>();
+    let mut sum = 0.0;
+    let reached = weights.iter().position(|weight| {
+        sum += weight;
+        target < sum
+    });
+    // Rounding can leave the target at the very end: that is the last state with a weight.
+    let last = || weights.iter().rposition(|&weight| weight > 0.0);
+    let state = reached
+        .or_else(last)
+        .expect("invariant: the weights have a positive sum");
+    state as u8
+}

@@ -1,0 +1,64 @@
+//! The work space of [`super::Dynamics`]: states with a margin around the grid, so that no cell is special.
+//!
+//! It has a place for every cell and for a margin of half a kernel. A cell's *home* is the place under the upper left
+//! tap of its kernel; every tap reads at a fixed offset from there.
+
+use super::super::grid::Shape;
+use super::super::parameters::Model;
+use super::lanes::LANES;
+
+/// The state of places off the grid.
+pub(super) const OFF_GRID: u8 = 255;
+
+#[derive(Debug, Clone)]
+pub(super) struct Places {
+    width: usize,
+    pub(super) stride: usize,
+    margins: [usize; 2],
+    /// `X_k`, and [`OFF_GRID`] in the margin.
+    pub(super) states: Vec<u8>,
+    /// By home: random bytes, then states and marks of undecided cells, then `X_{k+1}`.
+    pub(super) next: Vec<u8>,
+}
+
+impl Places {
+    pub(super) fn new(model: &Model, shape: Shape) -> Self {
+        let (_, _, kernel_height, kernel_width) = model.kernel().dim();
+        let stride = shape.width() + kernel_width - 1;
+        let n_homes = (shape.height() * stride).next_multiple_of(LANES);
+        let n_places = n_homes + (kernel_height - 1) * stride + kernel_width - 1;
+        Self {
+            width: shape.width(),
+            stride,
+            margins: [kernel_height / 2, kernel_width / 2],
+            states: vec![OFF_GRID; n_places],
+            next: vec![0; n_homes],
+        }
+    }
+
+    /// Where each tap of a model's kernel reads, relative to a cell's home.
+    pub(super) fn offsets(&self, model: &Model) -> Vec<usize> {
+        let (_, _, kernel_height, kernel_width) = model.kernel().dim();
+        let taps = ndarray::indices((kernel_height, kernel_width)).into_iter();
+        taps.map(|(row, col)| row * self.stride + col).collect()
+    }
+
+    /// Copies the states inside the margins.
+    #[inline(always)]
+    pub(super) fn load(&mut self, cells: &[u8]) {
+        let ([above, left], width) = (self.margins, self.width);
+        let rows = self.states.chunks_exact_mut(self.stride).skip(above);
+        for (from, to) in cells.chunks_exact(width).zip(rows) {
+            to[left..left + width].copy_from_slice(from);
+        }
+    }
+
+    /// Copies the next states out.
+    #[inline(always)]
+    pub(super) fn store(&self, cells: &mut [u8]) {
+        let rows = self.next.chunks(self.stride);
+        for (to, from) in cells.chunks_exact_mut(self.width).zip(rows) {
+            to.copy_from_slice(&from[..self.width]);
+        }
+    }
+}
