@@ -71,7 +71,7 @@ impl Pilot {
             policy.name
         );
         ensure!(
-            !policy.is_decided || mission.company != Company::Team,
+            !policy.is_decided() || mission.company != Company::Team,
             "policy {:?} decides for one robot, not for a team",
             policy.name
         );

@@ -188,7 +188,7 @@ impl Match<'_> {
     fn check(&self, arena: &Arena) -> Result<()> {
         let Contestant { policy, team } = self.contestant;
         ensure!(
-            !(policy.is_decided && team.is_joint() && arena.n_robots() > 1),
+            !(policy.is_decided() && team.is_joint() && arena.n_robots() > 1),
             "it decides for one robot: expected --team alone or shared, got {}",
             team.label()
         );
@@ -315,16 +315,16 @@ impl World {
         }
         let agent = &robot.agent;
         let brier = turn.truth.as_ref().map(|truth| {
-            let own = agent.target(target);
+            let own = agent.target();
             brier_score(agent.belief(), truth, target, own)
         });
         self.tally.add(&robot.observation().world, brier);
         if is_last {
-            self.snapshot = self.snapshot(robot, turn, target);
+            self.snapshot = self.snapshot(robot, turn);
         }
     }
 
-    fn snapshot(&self, robot: &Robot, turn: Turn, target: usize) -> Option<Snapshot> {
+    fn snapshot(&self, robot: &Robot, turn: Turn) -> Option<Snapshot> {
         let (agent, observation) = (&robot.agent, robot.observation());
         let (shape, start) = (agent.belief().shape(), turn.before.robot.cell());
         let estimator = agent.policy().estimator;
@@ -339,7 +339,7 @@ impl World {
             frame: observation.frame.clone(),
             path_cells,
             belief: is_own.then(|| agent.belief().clone()),
-            learned_target: estimator.is_learned().then(|| agent.target(target)),
+            learned_target: estimator.is_learned().then(|| agent.target()),
         })
     }
 }

@@ -7,7 +7,6 @@ pub mod autoencoder;
 pub mod bayes;
 pub mod belief;
 pub mod correlations;
-pub mod dqn_input;
 pub mod estimator;
 pub mod filter;
 pub mod first_belief;

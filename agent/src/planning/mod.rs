@@ -3,7 +3,6 @@
 //! An [`Objective`] turns a belief into [`CellValues`] once; a [`Planner`] then looks for the path
 //! with the best score, which is eq. 15 with the sign turned and without its constant factor.
 
-pub mod action;
 pub mod beam;
 pub mod memory;
 pub mod objective;

@@ -136,6 +136,7 @@ impl Robot {
         let score = self.agent.score(&seen.observation.frame)?;
         let (before, truth) = self.take_in(seen);
         self.correct(truth.as_ref())?;
+        self.agent.earn(self.observation.robot.reward);
         Ok(Turn {
             before,
             plans,

@@ -8,7 +8,8 @@ use anyhow::Result;
 
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::planning::policy::Policy;
-use crate::rollout::agent::{Agent, Setup};
+use crate::planning::Target;
+use crate::rollout::agent::{Agent, Chooser, Setup};
 use crate::rollout::{Robot, Seen};
 use protocol::client::Observation;
 use protocol::connection::ConnectionError;
@@ -36,13 +37,17 @@ impl Worlds {
         state_names: Vec<String>,
         observation: Observation,
     ) -> Robot {
+        let objective = config.objective(policy);
         let setup = Setup {
             basis: config.objective.belief,
             state_names,
             n_moves: self.n_moves,
             seed: config.planner_seed(observation.world.seed),
-            target: None,
-            decider: None,
+            target: match objective.target {
+                Target::State(state) => state,
+                _ => 0,
+            },
+            chooser: Chooser::Objective(objective),
         };
         let agent = Agent::new(estimator, policy, config, setup);
         Robot::new(agent, Seen::new([observation]))

@@ -76,15 +76,12 @@ impl NetworkStudent {
     }
 
     /// What the next action goes by.
-    fn input(&self, robot: &Robot) -> Vec<f32> {
-        let cell = robot.observation().robot.cell();
-        self.progress
-            .input
-            .of(follower(robot), cell, self.worlds.n_moves)
+    fn input(robot: &Robot) -> Vec<f32> {
+        follower(robot).hidden().to_vec()
     }
 
     fn decide(&self, robot: &Robot) -> Decision {
-        let (dqn, input) = (&self.progress.dqn, self.input(robot));
+        let (dqn, input) = (&self.progress.dqn, Self::input(robot));
         let action = match self.is_frozen {
             true => dqn.best(&input),
             false => dqn.act(&input, self.progress.position.iterations),
@@ -101,7 +98,7 @@ impl NetworkStudent {
             input: decision.input.clone(),
             action: decision.action,
             reward: robot.observation().robot.reward as f32,
-            next: self.input(robot),
+            next: Self::input(robot),
         };
         if let Some(transition) = self.progress.position.track.add(step) {
             self.progress.dqn.remember(transition);
