@@ -2,7 +2,7 @@
 
 use agent::server::left_belief::{leave_belief, left_belief};
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_belief::estimation::{BayesFilter, Memory};
+use emberwatch_belief::estimation::{BayesFilter, Handover};
 use protocol::control::{LeftPart, Reply, Request};
 use protocol::message::{FrameHeader, Status};
 use protocol::observer::Observer;

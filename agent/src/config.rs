@@ -60,7 +60,7 @@ pub enum LearnerKind {
     OwnFilter,
     /// The paper's Algorithm 1: a dynamic autoencoder, and a DQN that chooses objectives
     Autoencoder,
-    /// A DQN that chooses among actions of beam search on the known model's belief
+    /// A DQN that chooses among options on an estimator's belief; the filter is learned first, unless it is given
     Decisions,
 }
 
@@ -296,8 +296,8 @@ mod tests {
                 "unknown variant `prior`, expected `predictor` or `estimate`",
             ),
             (
-                "[dqn]\ninput = \"h\"",
-                "unknown variant `h`, expected `after_frame` or `summary`",
+                "[decisions]\nestimator = \"filter\"",
+                "expected one of known_model, spatial_filter, learned_filter",
             ),
         ] {
             let error = AgentConfig::from_toml(text).expect_err("no such name");

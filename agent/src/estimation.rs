@@ -1,7 +1,6 @@
 //! Estimators that need networks, and the first belief of the others.
 
 pub mod autoencoder;
-pub mod dqn_input;
 pub mod first_belief;
 pub mod follower;
 

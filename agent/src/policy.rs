@@ -4,4 +4,4 @@ mod list;
 mod named;
 
 pub use list::list;
-pub use named::{EstimatorKind, PlannerKind, Policy, numbered_states};
+pub use named::{Choice, EstimatorKind, PlannerKind, Policy, numbered_states};

@@ -74,6 +74,7 @@ impl Rollout {
         let score = self.agent.score(&seen.observation.frame);
         let before = std::mem::replace(&mut self.seen, seen);
         self.correct()?;
+        self.agent.earn(self.observation().robot.reward);
         Ok(Turn {
             before: before.observation,
             score,

@@ -17,7 +17,7 @@ pub mod truth;
 
 pub use bayes::ZeroEvidence;
 pub use correlations::Correlations;
-pub use estimator::{Estimator, EstimatorError, Memory, Told};
+pub use estimator::{Estimator, EstimatorError, Handover, Told};
 pub use filter::BayesFilter;
 pub use prior::Prior;
 pub use spatial::SpatialFilter;

@@ -3,9 +3,11 @@
 //! An [`Objective`] turns a belief into [`CellValues`] once; a [`Planner`] then looks for the path
 //! with the best score, which is eq. 15 with the sign turned and without its constant factor.
 
-pub mod action;
 pub mod beam;
+pub mod memory;
 pub mod objective;
+pub mod options;
+pub mod outlook;
 mod planner;
 pub mod random_walk;
 pub mod shooting;
@@ -13,7 +15,10 @@ pub mod team;
 mod window;
 
 pub use beam::BeamSearch;
+pub use memory::Memory;
 pub use objective::{BasisKind, CellValues, Objective, Target};
+pub use options::{OPTIONS, OptionPlanner, PathOption, Proposal};
+pub use outlook::Outlook;
 pub use planner::{Plan, Planner, PlanningProblem};
 pub use random_walk::RandomWalk;
 pub use shooting::{Integration, Shooting};

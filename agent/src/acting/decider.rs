@@ -198,8 +198,8 @@ impl Decider {
     }
 
     pub fn release(mut self) -> Result<()> {
-        for world in &mut self.worlds {
-            leave(&mut self.client, world.number, &mut world.rollout)?;
+        for world in &self.worlds {
+            leave(&mut self.client, world.number, &world.rollout)?;
         }
         Ok(self.client.release()?)
     }

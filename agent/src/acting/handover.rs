@@ -1,7 +1,6 @@
 //! How an agent goes on with what another believed: from the belief that it left with the server, or
 //! else from the frames that the server keeps.
 
-use crate::rollout::agent::Agent;
 use crate::rollout::{Rollout, Seen};
 use crate::server::left_belief::{leave_belief, left_belief};
 use anyhow::Result;
@@ -75,13 +74,13 @@ pub fn take_over_left(
     rollout: &mut Rollout,
 ) -> Result<bool, ConnectionError> {
     let step = rollout.step();
-    let Some(memory) = rollout.agent.estimator_mut().memory() else {
+    let Some(estimator) = rollout.agent.estimator_mut().handover_mut() else {
         return Ok(false);
     };
-    let Some(left) = left_belief(client, number, &memory.kind())? else {
+    let Some(left) = left_belief(client, number, &estimator.kind())? else {
         return Ok(false);
     };
-    let is_taken = memory.restore(&left);
+    let is_taken = estimator.restore(&left);
     if is_taken {
         tracing::info!(
             robot = number,
@@ -93,16 +92,13 @@ pub fn take_over_left(
 }
 
 /// Leaves an agent's belief about X_{k+1}, after its last observation, to the next one of a robot.
-pub fn leave(
-    client: &mut Client,
-    number: u32,
-    rollout: &mut Rollout,
-) -> Result<(), ConnectionError> {
+pub fn leave(client: &mut Client, number: u32, rollout: &Rollout) -> Result<(), ConnectionError> {
     let present = rollout.observation().world;
-    let Some(memory) = rollout.agent.estimator_mut().memory() else {
+    let Some(estimator) = rollout.agent.estimator().handover() else {
         return Ok(());
     };
-    match leave_belief(client, number, &present, &memory.kind(), &memory.to_bytes()) {
+    let (kind, bytes) = (estimator.kind(), estimator.to_bytes());
+    match leave_belief(client, number, &present, &kind, &bytes) {
         // A server that keeps no beliefs, or none that is so long.
         Err(ConnectionError::Refused {
             status: Status::Malformed,
@@ -114,11 +110,6 @@ pub fn leave(
         }
         left => left,
     }
-}
-
-/// Names the memory that an agent can go on from, if it can.
-pub fn kind_of(agent: &mut Agent) -> Option<String> {
-    agent.estimator_mut().memory().map(|memory| memory.kind())
 }
 
 /// The first step from which on all frames are kept; the present one where a server keeps none.

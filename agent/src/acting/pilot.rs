@@ -1,6 +1,6 @@
 //! An agent that flies robots of one world through a connection: attach, step, catch up.
 
-use crate::acting::handover::{catch_up, kind_of, leave, resume, take_over_left};
+use crate::acting::handover::{catch_up, leave, resume, take_over_left};
 use crate::acting::mission::{Company, Mission, info_of, model_of, recorded_states};
 use crate::acting::registry::{self, Task, needs_model};
 use crate::estimation::first_belief::first_belief;
@@ -65,7 +65,7 @@ impl Pilot {
             policy.name
         );
         ensure!(
-            !policy.is_decided || mission.company != Company::Team,
+            !policy.is_decided() || mission.company != Company::Team,
             "policy {:?} decides for one robot, not for a team",
             policy.name
         );
@@ -102,8 +102,8 @@ impl Pilot {
             seed: 0,
             learned: &mission.learned,
         };
-        let mut agent = registry::agent(policy, &mission.config, task)?;
-        let Some(kind) = kind_of(&mut agent) else {
+        let agent = registry::agent(policy, &mission.config, task)?;
+        let Some(kind) = agent.estimator().handover().map(|it| it.kind()) else {
             return Ok(None);
         };
         if !is_belief_left(&mission.instance, numbers.start, &kind)? {
@@ -271,7 +271,7 @@ impl Pilot {
     /// Leaves the belief to the next agent of each robot.
     pub fn leave(&mut self) -> Result<(), ConnectionError> {
         let mut numbers = self.client.robots();
-        numbers.try_for_each(|number| leave(&mut self.client, number, &mut self.rollout))
+        numbers.try_for_each(|number| leave(&mut self.client, number, &self.rollout))
     }
 
     /// Gives the robots back, and ends when observers have had time to see the last belief.

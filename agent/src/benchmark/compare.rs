@@ -189,7 +189,7 @@ impl Match<'_> {
     fn check(&self, arena: &Arena) -> Result<()> {
         let Contestant { policy, team } = self.contestant;
         ensure!(
-            !(policy.is_decided && team.is_joint() && arena.n_robots() > 1),
+            !(policy.is_decided() && team.is_joint() && arena.n_robots() > 1),
             "it decides for one robot: expected --team alone or shared, got {}",
             team.label()
         );
@@ -264,7 +264,7 @@ impl Match<'_> {
             if index % n_agents == 0 {
                 world.look(rollout, target);
                 if is_last {
-                    world.snapshot = world.snapshot(rollout, turn, plans, target);
+                    world.snapshot = world.snapshot(rollout, turn, plans);
                 }
             }
         }
@@ -318,17 +318,11 @@ impl World {
         let agent = &rollout.agent;
         let brier = rollout
             .truth()
-            .map(|truth| brier_score(agent.belief(), truth, target, agent.target(target)));
+            .map(|truth| brier_score(agent.belief(), truth, target, agent.target()));
         self.tally.add(&rollout.observation().world, brier);
     }
 
-    fn snapshot(
-        &self,
-        rollout: &Rollout,
-        turn: Turn,
-        plans: &[Plan],
-        target: usize,
-    ) -> Option<Snapshot> {
+    fn snapshot(&self, rollout: &Rollout, turn: Turn, plans: &[Plan]) -> Option<Snapshot> {
         let (agent, observation) = (&rollout.agent, rollout.observation());
         let (shape, start) = (agent.belief().shape(), turn.before.robot.cell());
         let estimator = agent.policy().estimator;
@@ -343,7 +337,7 @@ impl World {
             frame: observation.frame.clone(),
             path_cells,
             belief: is_own.then(|| agent.belief().clone()),
-            learned_target: estimator.is_learned().then(|| agent.target(target)),
+            learned_target: estimator.is_learned().then(|| agent.target()),
         })
     }
 }

@@ -31,10 +31,23 @@ const MAX_OWED: f64 = 2e6;
 /// What was learned: all that acting on it needs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LearnedModel {
+    /// The free numbers, and what they stand for.
+    pub parameters: Parameters,
     pub tables: Tables,
     pub target: usize,
     /// How much that state of one cell says of its neighbours'.
     pub correlations: Correlations,
+}
+
+impl LearnedModel {
+    pub fn new(parameters: Parameters, target: usize, correlations: Correlations) -> Self {
+        Self {
+            tables: parameters.tables(),
+            parameters,
+            target,
+            correlations,
+        }
+    }
 }
 
 /// Learns from frames as they come. A checkpoint holds it as it is, its tensors apart.
@@ -121,11 +134,8 @@ impl Learner {
         let parameters = self.trainer.parameters();
         let last = parameters.dimensions.n_states - 1;
         let target = self.reward.target().unwrap_or(last);
-        LearnedModel {
-            tables: parameters.tables(),
-            target,
-            correlations: self.neighbours.correlations_of(target),
-        }
+        let correlations = self.neighbours.correlations_of(target);
+        LearnedModel::new(parameters.clone(), target, correlations)
     }
 
     pub fn kind(&self) -> &'static str {

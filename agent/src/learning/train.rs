@@ -115,10 +115,9 @@ impl Trainer {
             student.freeze();
         }
         let mut observations = client.observe(client.robots())?;
-        for world in ended(&client, &observations) {
-            for (robot, seen) in reset(&mut client, world)? {
-                observations[(robot - client.robots().start) as usize] = seen;
-            }
+        let over = ended(&client, &observations);
+        for (robot, seen) in reset(&mut client, &over)? {
+            observations[(robot - client.robots().start) as usize] = seen;
         }
         let attached = student.attach(observations);
         let n_gone_on = attached.map_err(|problem| training.stopped(problem, &*student))?;
@@ -169,7 +168,7 @@ impl Trainer {
             }
             self.metrics.add(&tick, &updates)?;
             self.events.add(&tick, &updates, &*self.student)?;
-            self.report(&tick);
+            self.report(&tick, training.steps);
             if self.saved.elapsed() > SAVE_INTERVAL {
                 self.save(training)?;
             }
@@ -192,10 +191,8 @@ impl Trainer {
         let tick = self.student.see(observations)?;
         self.show(planning);
         self.student.predict();
-        for world in over {
-            for (robot, observation) in reset(&mut self.client, world)? {
-                self.student.begin(robot, observation)?;
-            }
+        for (robot, observation) in reset(&mut self.client, &over)? {
+            self.student.begin(robot, observation)?;
         }
         self.summary.steps += tick.n_worlds;
         self.summary.reward += tick.reward;
@@ -230,15 +227,18 @@ impl Trainer {
         self.events.flush()
     }
 
-    fn report(&mut self, tick: &Tick) {
+    fn report(&mut self, tick: &Tick, all_steps: u64) {
         let told = &mut self.told;
         told.score += tick.score;
         if told.at.elapsed() < REPORT_INTERVAL {
             return;
         }
         let steps = self.summary.steps - told.steps;
+        let before = tick.world_steps - self.summary.steps;
+        let of = (all_steps > 0).then_some(before + all_steps);
         tracing::info!(
             world_steps = tick.world_steps,
+            of = of,
             updates = self.student.n_updates(),
             log_likelihood = told.score.mean(),
             mean_reward = (self.summary.reward - told.reward) / steps.max(1) as f64,
@@ -274,15 +274,19 @@ fn ended(client: &Client, observations: &[Observation]) -> Vec<u32> {
     worlds
 }
 
-/// Starts a world's next episode; returns what each of its robots shows.
-fn reset(
-    client: &mut Client,
-    world: u32,
-) -> Result<impl Iterator<Item = (u32, Observation)> + use<>, ConnectionError> {
-    client.reset(&[WorldSeed { world, seed: None }])?;
-    let team = client.info().n_robots;
-    let robots = world * team..(world + 1) * team;
-    Ok(robots.clone().zip(client.observe(robots)?))
+/// Starts the next episode of some worlds; returns what each of their robots shows.
+fn reset(client: &mut Client, worlds: &[u32]) -> Result<Vec<(u32, Observation)>, ConnectionError> {
+    if worlds.is_empty() {
+        return Ok(Vec::new());
+    }
+    let seeds = worlds.iter().map(|&world| WorldSeed { world, seed: None });
+    client.reset(&seeds.collect::<Vec<_>>())?;
+    let (team, mut seen) = (client.info().n_robots, Vec::new());
+    for world in worlds {
+        let robots = world * team..(world + 1) * team;
+        seen.extend(robots.clone().zip(client.observe(robots)?));
+    }
+    Ok(seen)
 }
 
 /// The file of metrics: a run without learning has one of its own.

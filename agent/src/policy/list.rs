@@ -1,19 +1,31 @@
 //! What each policy does, in a line.
 
-use super::named::{EstimatorKind, PlannerKind, Policy};
+use super::named::{Choice, EstimatorKind, PlannerKind, Policy};
 use emberwatch_belief::planning::objective::Target;
+use emberwatch_belief::planning::options::OPTIONS;
 use protocol::Model;
 
-/// All policies of a model, a line each: name, planner, objective, belief.
+/// All policies of a model, a line each: name, planner, objective, belief; those of single options together.
 pub fn list(model: &Model) -> String {
-    let policies = Policy::all(model);
+    let mut policies = Policy::all(model);
+    policies.retain(|policy| !policy.is_option());
     let width = policies.iter().map(|policy| policy.name.len()).max();
     let width = width.unwrap_or(0);
     let lines = policies.iter().map(|policy| {
         let (name, words) = (&policy.name, description(policy, model));
         format!("  {name:width$}  {words}\n")
     });
-    lines.collect()
+    lines.collect::<String>() + &options()
+}
+
+/// How the policies of single options are called.
+fn options() -> String {
+    let beliefs = EstimatorKind::FAMILIES.map(|(family, _)| family).join(", ");
+    let names = OPTIONS.map(|option| option.name).join(", ");
+    format!(
+        "  BELIEF_OPTION: one option of BELIEF_policy, always\n    BELIEF: {beliefs}\n    OPTION: {names}; \
+         rule: the best region if it promises more, else exploit\n"
+    )
 }
 
 fn description(policy: &Policy, model: &Model) -> String {
@@ -23,7 +35,7 @@ fn description(policy: &Policy, model: &Model) -> String {
         PlannerKind::Beam => "beam search",
     };
     let belief = match policy.estimator {
-        EstimatorKind::KnownModel if policy.is_decided => ", needs --checkpoint",
+        EstimatorKind::KnownModel if policy.is_decided() => ", needs --checkpoint",
         EstimatorKind::None | EstimatorKind::KnownModel => "",
         EstimatorKind::Spatial => "; corrections reach neighbours",
         EstimatorKind::Learned => "; learned filter, needs --checkpoint",
@@ -38,11 +50,12 @@ fn description(policy: &Policy, model: &Model) -> String {
 }
 
 fn goal(policy: &Policy, model: &Model) -> String {
-    if policy.is_decided {
-        return "what a learned DQN chooses".into();
-    }
-    if let Some(action) = &policy.action {
-        return format!("the action {:?} of dqn_beam, always", action.name);
+    match policy.choice {
+        Choice::Network => return "what a learned DQN chooses".into(),
+        Choice::Scorer => return "the option that a learned DQN values most".into(),
+        Choice::Rule => return "the best region if it promises more than here".into(),
+        Choice::Option(option) => return format!("the option {}, always", option.name),
+        Choice::Objective => (),
     }
     let is_learned = policy.estimator.is_learned();
     let goal = match policy.objective.target {
@@ -54,9 +67,10 @@ fn goal(policy: &Policy, model: &Model) -> String {
         }
         Target::State(state) => model.file().states[state].name.clone(),
     };
-    match policy.objective.coverage_bonus > 0.0 {
-        true => goal,
-        false => format!("{goal}, and nothing else"),
+    if policy.objective.coverage_bonus > 0.0 {
+        goal
+    } else {
+        format!("{goal}, and nothing else")
     }
 }
 
@@ -68,11 +82,15 @@ mod tests {
     fn the_list_has_a_line_for_every_policy() {
         let model = Model::wildfire();
         let list = list(&model);
-        let named: Vec<&str> = list
+        let (lines, options) = list.split_once("  BELIEF_OPTION").expect("options");
+        assert!(options.contains("best_region") && options.contains("learned_spatial"));
+        let named: Vec<&str> = lines
             .lines()
             .filter_map(|line| line.split_whitespace().next())
             .collect();
-        let names = Policy::all(&model).into_iter().map(|policy| policy.name);
+        let policies = Policy::all(&model).into_iter();
+        let policies = policies.filter(|policy| !policy.is_option());
+        let names = policies.map(|policy| policy.name);
         assert_eq!(named, names.collect::<Vec<_>>());
         let line = |name: &str| list.lines().find(|line| line.trim().starts_with(name));
         assert_eq!(
@@ -82,6 +100,6 @@ mod tests {
                  states, only in `compare`"
             )
         );
-        assert!(list.lines().all(|line| line.len() <= 120), "{list}");
+        assert!(list.lines().all(|line| line.len() <= 160), "{list}");
     }
 }

@@ -1,11 +1,14 @@
 //! What a policy is, and policies by name.
 
 use anyhow::{Context, Result, bail};
-use emberwatch_belief::planning::action::{Action, ActionSet};
 use emberwatch_belief::planning::objective::{BEAM_BONUS, Objective, Target};
+use emberwatch_belief::planning::options::{OPTIONS, PathOption};
 use protocol::Model;
+use serde::{Deserialize, Serialize};
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+/// In settings and tables by [`EstimatorKind::label`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(into = "&'static str", try_from = "String")]
 pub enum EstimatorKind {
     None,
     /// The Bayes filter with the true parameters (paper section III.A, masked as in III.C).
@@ -44,13 +47,68 @@ pub struct Policy {
     pub estimator: EstimatorKind,
     pub planner: PlannerKind,
     pub objective: Objective,
-    /// Whether a DQN chooses what each path is for instead (paper section III.E).
-    pub is_decided: bool,
-    /// What each path is for instead, always the same.
-    pub action: Option<Action>,
+    pub choice: Choice,
+}
+
+/// What says what each path is for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Choice {
+    /// The policy's objective, always.
+    Objective,
+    /// A DQN on the autoencoder's hidden vector, among objectives (paper section III.E).
+    Network,
+    /// One option, always.
+    Option(&'static PathOption),
+    /// The rule by hand, among options.
+    Rule,
+    /// A DQN that scores options by their features.
+    Scorer,
 }
 
 impl EstimatorKind {
+    /// Those whose beliefs options are planned on, with what names of policies begin with.
+    pub const FAMILIES: [(&'static str, Self); 7] = [
+        ("known", Self::KnownModel),
+        ("spatial", Self::Spatial),
+        ("learned", Self::Learned),
+        ("learned_spatial", Self::LearnedSpatial),
+        ("learned_own", Self::LearnedOwn),
+        ("learned_own_spatial", Self::LearnedOwnSpatial),
+        ("oracle", Self::Truth),
+    ];
+
+    const ALL: [Self; 10] = [
+        Self::None,
+        Self::KnownModel,
+        Self::Spatial,
+        Self::Learned,
+        Self::LearnedSpatial,
+        Self::LearnedOwn,
+        Self::LearnedOwnSpatial,
+        Self::Autoencoder,
+        Self::Truth,
+        Self::NextTruth,
+    ];
+
+    /// Whether decisions can be learned on its belief, from frames alone.
+    pub fn suits_decisions(self) -> bool {
+        let mut families = Self::FAMILIES.iter();
+        self != Self::Truth && families.any(|(_, kind)| *kind == self)
+    }
+
+    /// Whether its kernels see the cell's own state.
+    pub fn sees_own_state(self) -> bool {
+        matches!(self, Self::LearnedOwn | Self::LearnedOwnSpatial)
+    }
+
+    /// Whether its corrections reach the neighbours of visited cells.
+    pub fn is_spatial(self) -> bool {
+        matches!(
+            self,
+            Self::Spatial | Self::LearnedSpatial | Self::LearnedOwnSpatial
+        )
+    }
+
     pub fn knows_model(self) -> bool {
         matches!(self, Self::KnownModel | Self::Spatial)
     }
@@ -88,6 +146,25 @@ impl EstimatorKind {
     }
 }
 
+impl From<EstimatorKind> for &'static str {
+    fn from(kind: EstimatorKind) -> Self {
+        kind.label()
+    }
+}
+
+impl TryFrom<String> for EstimatorKind {
+    type Error = String;
+
+    fn try_from(name: String) -> Result<Self, String> {
+        let kind = Self::ALL.into_iter().find(|kind| kind.label() == name);
+        kind.ok_or_else(|| {
+            let names = Self::ALL.into_iter().filter(|kind| kind.suits_decisions());
+            let names: Vec<&str> = names.map(Self::label).collect();
+            format!("expected one of {}, got {name:?}", names.join(", "))
+        })
+    }
+}
+
 impl PlannerKind {
     pub fn label(self) -> &'static str {
         match self {
@@ -116,8 +193,7 @@ impl Policy {
             estimator,
             planner,
             objective,
-            is_decided: false,
-            action: None,
+            choice: Choice::Objective,
         }
     }
 
@@ -136,7 +212,7 @@ impl Policy {
     /// # Errors
     /// If it is a policy's under no model.
     pub fn check_name(name: &str) -> Result<()> {
-        let of_model = ["shooting_", "beam_", "act_"];
+        let of_model = ["shooting_", "beam_"];
         let mut rests = of_model
             .iter()
             .filter_map(|family| name.strip_prefix(family));
@@ -145,12 +221,13 @@ impl Policy {
         if rests.any(|rest| !rest.is_empty()) || all.iter().any(|policy| policy.name == name) {
             return Ok(());
         }
-        let is_general = |name: &&str| {
-            let (family, rest) = name.split_once('_').unwrap_or_default();
-            family != "act" && model.state_named(rest).is_none()
+        let is_general = |policy: &&Self| {
+            let rest = policy.name.split_once('_').unwrap_or_default().1;
+            !policy.is_option() && model.state_named(rest).is_none()
         };
-        let names = all.iter().map(|policy| &*policy.name).filter(is_general);
-        let patterns = ["shooting_STATE", "beam_STATE", "act_ACTION"];
+        let names = all.iter().filter(is_general);
+        let names = names.map(|policy| &*policy.name);
+        let patterns = ["shooting_STATE", "beam_STATE", "BELIEF_OPTION"];
         let names: Vec<&str> = names.chain(patterns).collect();
         bail!(unknown(name, &names))
     }
@@ -177,11 +254,12 @@ impl Policy {
                 all.push(Self::new(&name, estimator, planner, target));
             }
         }
-        all.push(Self::decided("dqn_beam", KnownModel, Beam, target));
-        all.extend(ActionSet::beam(model).actions().iter().map(|action| Self {
-            objective: action.objective,
-            action: Some(action.clone()),
-            ..Self::new(&format!("act_{}", action.name), KnownModel, Beam, target)
+        let families = EstimatorKind::FAMILIES.into_iter();
+        all.extend(families.flat_map(|(family, estimator)| {
+            let mut policies = Self::of_options(family, estimator, target);
+            // That one is in the ladder.
+            policies.retain(|policy| estimator != Truth || policy.is_option());
+            policies
         }));
         all.extend([
             Self::new(
@@ -191,7 +269,10 @@ impl Policy {
                 Target::Entropy,
             ),
             Self::new("autoencoder_exploit", Autoencoder, Shooting, target),
-            Self::decided("autoencoder_policy", Autoencoder, Shooting, target),
+            Self {
+                choice: Choice::Network,
+                ..Self::new("autoencoder_policy", Autoencoder, Shooting, target)
+            },
             Self::new("autoencoder_beam", Autoencoder, Beam, target),
         ]);
         let of_state = |planner: PlannerKind, state: usize| {
@@ -227,6 +308,10 @@ impl Policy {
             Self::new("spatial_beam", Spatial, Beam, target),
             Self::new("oracle_shooting", Truth, Shooting, target),
             Self::new("oracle_beam", Truth, Beam, target),
+            Self {
+                choice: Choice::Rule,
+                ..Self::new("oracle_policy", Truth, Beam, target)
+            },
             Self::new("clairvoyant_beam", NextTruth, Beam, target),
         ];
         first.into_iter().chain(others).chain(rest).collect()
@@ -240,17 +325,55 @@ impl Policy {
         }
     }
 
-    /// One for which a DQN chooses.
-    fn decided(name: &str, estimator: EstimatorKind, planner: PlannerKind, target: Target) -> Self {
-        Self {
-            is_decided: true,
-            ..Self::new(name, estimator, planner, target)
-        }
+    /// Each option on a belief, the rule, and what was learned; of those who are told the states, the rule is the
+    /// policy.
+    fn of_options(family: &str, estimator: EstimatorKind, target: Target) -> Vec<Self> {
+        let policy = |name: &str, choice| Self {
+            choice,
+            ..Self::new(
+                &format!("{family}_{name}"),
+                estimator,
+                PlannerKind::Beam,
+                target,
+            )
+        };
+        let fixed = OPTIONS
+            .iter()
+            .map(|option| policy(option.name, Choice::Option(option)));
+        let chosen = match estimator {
+            EstimatorKind::Truth => vec![],
+            _ => vec![
+                policy("rule", Choice::Rule),
+                policy("policy", Choice::Scorer),
+            ],
+        };
+        fixed.chain(chosen).collect()
+    }
+
+    /// What is read off one table: random moves, then each option on a belief, the rule, and the learned choice.
+    pub fn table_of_options(model: &Model, estimator: EstimatorKind) -> Vec<Self> {
+        let all = Self::all(model).into_iter();
+        let is_on = |policy: &Self| match policy.choice {
+            Choice::Option(_) | Choice::Rule | Choice::Scorer => policy.estimator == estimator,
+            _ => policy.planner == PlannerKind::RandomWalk,
+        };
+        all.filter(is_on).collect()
+    }
+
+    /// Whether it flies one option, or goes by the rule, on a belief.
+    pub fn is_option(&self) -> bool {
+        let is_rule = self.choice == Choice::Rule && self.estimator != EstimatorKind::Truth;
+        is_rule || matches!(self.choice, Choice::Option(_))
+    }
+
+    /// Whether a DQN decides.
+    pub fn is_decided(&self) -> bool {
+        matches!(self.choice, Choice::Network | Choice::Scorer)
     }
 
     /// Whether it acts on what `train` learned.
     pub fn needs_checkpoint(&self) -> bool {
-        self.is_decided || self.estimator.is_learned()
+        self.is_decided() || self.estimator.is_learned()
     }
 
     /// What a high-level decision chooses among (the paper's actions `a_k`): the probability of each
@@ -298,7 +421,7 @@ mod tests {
             "",
             "beam",
             "beam_",
-            "oracle_exploit",
+            "oracle_rule",
             "shooting_ash",
             "Random_walk",
         ] {
@@ -320,7 +443,7 @@ mod tests {
                  shooting_exploit_only beam_exploit",
             ),
             ("spatial_filter", "spatial_shooting spatial_beam"),
-            ("truth", "oracle_shooting oracle_beam"),
+            ("truth", "oracle_shooting oracle_beam oracle_policy"),
             ("next_truth", "clairvoyant_beam"),
             ("known_model", "beam_explore beam_exploit_only"),
             ("next_truth", "clairvoyant_shooting"),
@@ -337,7 +460,12 @@ mod tests {
                 "learned_own_spatial_filter",
                 "learned_own_spatial_shooting learned_own_spatial_beam",
             ),
-            ("known_model", "dqn_beam"),
+            ("known_model", "known_policy"),
+            ("spatial_filter", "spatial_policy"),
+            ("learned_filter", "learned_policy"),
+            ("learned_spatial_filter", "learned_spatial_policy"),
+            ("learned_own_filter", "learned_own_policy"),
+            ("learned_own_spatial_filter", "learned_own_spatial_policy"),
             (
                 "autoencoder",
                 "autoencoder_explore autoencoder_exploit autoencoder_policy autoencoder_beam",
@@ -352,7 +480,7 @@ mod tests {
             names.map(move |name| (name.to_owned(), *estimator))
         });
         let policies = Policy::all(&Model::wildfire()).into_iter();
-        let named = policies.filter(|policy| policy.action.is_none());
+        let named = policies.filter(|policy| !policy.is_option());
         let named = named.map(|policy| (policy.name, policy.estimator.label()));
         assert_eq!(named.collect::<Vec<_>>(), expected.collect::<Vec<_>>());
     }
@@ -364,14 +492,49 @@ mod tests {
                 Policy::check_name(&policy.name).expect("known");
             }
         }
-        for wrong in ["", "bem_exploit", "beam_", "act_", "oracle_exploit", "fire"] {
+        for wrong in [
+            "",
+            "bem_exploit",
+            "beam_",
+            "learned_",
+            "oracle_rule",
+            "fire",
+        ] {
             let error = Policy::check_name(wrong).expect_err(wrong).to_string();
             assert!(
                 error.contains("coverage, shooting_explore, shooting_exploit, ")
-                    && error.contains("shooting_STATE, beam_STATE, act_ACTION, got"),
+                    && error.contains("shooting_STATE, beam_STATE, BELIEF_OPTION, got"),
                 "{error}"
             );
         }
+    }
+
+    #[test]
+    fn options_have_a_policy_each_on_every_belief() {
+        let model = Model::wildfire();
+        for (family, estimator) in EstimatorKind::FAMILIES {
+            let table = Policy::table_of_options(&model, estimator);
+            let names: Vec<&str> = table.iter().map(|policy| &*policy.name).collect();
+            let exploit = format!("{family}_exploit");
+            let policy = format!("{family}_policy");
+            assert_eq!(names[..2], ["random_walk", &*exploit].as_slice()[..2]);
+            assert!(names.contains(&&*policy), "{names:?}");
+            let n_chosen = if estimator == EstimatorKind::Truth {
+                1
+            } else {
+                2
+            };
+            assert_eq!(names.len(), 1 + OPTIONS.len() + n_chosen);
+            assert_eq!(
+                EstimatorKind::try_from(estimator.label().to_owned()),
+                Ok(estimator)
+            );
+        }
+        let error = EstimatorKind::try_from("filter".to_owned()).expect_err("no name");
+        assert!(
+            error.ends_with("learned_own_spatial_filter, got \"filter\""),
+            "{error}"
+        );
     }
 
     #[test]

@@ -34,8 +34,13 @@ pub trait Estimator: Send {
         None
     }
 
-    /// The memory of an estimator from which another of its kind can go on.
-    fn memory(&mut self) -> Option<&mut dyn Memory> {
+    /// An estimator from whose bytes another of its kind can go on.
+    fn handover(&self) -> Option<&dyn Handover> {
+        None
+    }
+
+    /// As [`Self::handover`], to go on from bytes.
+    fn handover_mut(&mut self) -> Option<&mut dyn Handover> {
         None
     }
 
@@ -45,8 +50,8 @@ pub trait Estimator: Send {
     }
 }
 
-/// All that an estimator remembers of its world before X_{k+1}.
-pub trait Memory {
+/// All that an estimator knows of its world before X_{k+1}, as bytes.
+pub trait Handover {
     /// Names what the bytes mean: only estimators of the same kind can read them.
     fn kind(&self) -> String;
 

@@ -6,7 +6,7 @@
 
 use crate::estimation::bayes::correct;
 use crate::estimation::belief::Belief;
-use crate::estimation::estimator::{Estimator, EstimatorError, Memory};
+use crate::estimation::estimator::{Estimator, EstimatorError, Handover};
 use crate::estimation::parameters::Tables;
 use ndarray::{Array2, Array4};
 use protocol::frame::Frame;
@@ -98,12 +98,16 @@ impl Estimator for BayesFilter {
         Some(Cow::Borrowed(&self.likelihood))
     }
 
-    fn memory(&mut self) -> Option<&mut dyn Memory> {
+    fn handover(&self) -> Option<&dyn Handover> {
+        Some(self)
+    }
+
+    fn handover_mut(&mut self) -> Option<&mut dyn Handover> {
         Some(self)
     }
 }
 
-impl Memory for BayesFilter {
+impl Handover for BayesFilter {
     fn kind(&self) -> String {
         let checksum = self.checksum;
         format!("bayes_filter {checksum:08x}, probabilities [S, H, W] as f32")

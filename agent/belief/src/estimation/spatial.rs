@@ -8,7 +8,7 @@
 use crate::estimation::bayes::ZeroEvidence;
 use crate::estimation::belief::Belief;
 use crate::estimation::correlations::{Ages, Correlations, Evidence};
-use crate::estimation::estimator::{Estimator, EstimatorError, Memory};
+use crate::estimation::estimator::{Estimator, EstimatorError, Handover};
 use crate::estimation::filter::BayesFilter;
 use crate::estimation::innovation::Innovation;
 use crate::estimation::spread::Spread;
@@ -104,12 +104,16 @@ impl Estimator for SpatialFilter {
         self.filter.likelihood()
     }
 
-    fn memory(&mut self) -> Option<&mut dyn Memory> {
+    fn handover(&self) -> Option<&dyn Handover> {
+        Some(self)
+    }
+
+    fn handover_mut(&mut self) -> Option<&mut dyn Handover> {
         Some(self)
     }
 }
 
-impl Memory for SpatialFilter {
+impl Handover for SpatialFilter {
     fn kind(&self) -> String {
         let (filter, state) = (self.filter.kind(), self.state);
         format!("spatial {filter}, ages and sums of state {state} as bincode")

@@ -8,8 +8,9 @@ use emberwatch_belief::estimation::belief::Belief;
 
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::policy::Policy;
-use crate::rollout::agent::{Agent, Setup};
+use crate::rollout::agent::{Agent, Chooser, Setup};
 use crate::rollout::{Rollout, Seen};
+use emberwatch_belief::planning::Target;
 use protocol::client::Observation;
 use protocol::{Move, Shape};
 use std::ops::Range;
@@ -35,13 +36,17 @@ impl Worlds {
         state_names: Vec<String>,
         observation: Observation,
     ) -> Rollout {
+        let objective = config.objective(policy);
         let setup = Setup {
             basis: config.objective.belief,
             state_names,
             n_moves: self.n_moves,
             seed: config.planner_seed(observation.world.seed),
-            target: None,
-            decider: None,
+            target: match objective.target {
+                Target::State(state) => state,
+                _ => 0,
+            },
+            chooser: Chooser::Objective(objective),
         };
         let agent = Agent::new(estimator, policy, config, setup);
         Rollout::new(agent, Seen::new([observation]))

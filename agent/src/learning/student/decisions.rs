@@ -1,172 +1,238 @@
-//! Learns which action of [`ActionSet::beam`] to take (paper section III.E): beam search plans on the
-//! known-model filter's belief, and a DQN that sees a summary of it chooses what each path is for.
+//! Learns which option to fly (paper section III.E): on an estimator's belief all options are planned, and a DQN that
+//! reads each one's features says what it is worth.
 
-use crate::config::{AgentConfig, DecisionsConfig};
-use crate::learning::checkpoint::{Contents, check, check_counts};
+mod saved;
+
+pub use self::saved::{LearnedDecisions, SavedDecisions};
+
+use self::saved::SavedRun;
+use crate::config::AgentConfig;
+use crate::learning::checkpoint::Contents;
+use crate::learning::learner::LearnedModel;
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::student::base::{Student, Worlds, without_truth};
-use crate::policy::Policy;
+use crate::policy::{EstimatorKind, PlannerKind, Policy, numbered_states};
 use crate::rollout::{Rollout, in_parallel, predict_all, see_all};
-use ::network::{Dqn, SavedDqn, Track, Transition};
+use ::network::{Dqn, DqnShape, Track, Transition};
 use anyhow::Result;
-use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
-use emberwatch_belief::estimation::summary::{spread_summary, summary_length};
-use emberwatch_belief::planning::action::{Action, ActionSet};
+use emberwatch_belief::estimation::{BayesFilter, Correlations, Estimator, SpatialFilter};
+use emberwatch_belief::planning::options::N_FEATURES;
+use emberwatch_belief::planning::{OPTIONS, Proposal, Target};
 use protocol::client::Observation;
-use protocol::{Cell, Model, Move};
+use protocol::randomness::{Purpose, stream};
+use protocol::{Model, Move, Shape};
+use rand_chacha::rand_core::Rng;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 pub const KIND: &str = "decisions";
 
-/// A DQN over the actions of a model.
-#[derive(Debug)]
-pub struct Decisions {
-    pub dqn: Dqn,
-    /// The actions, in the order of the values.
-    pub actions: ActionSet,
-    /// World steps that were learned from.
-    pub world_steps: u64,
-    n_states: usize,
+/// What a decision is made on, and among.
+pub const SHAPE: DqnShape = DqnShape {
+    n_inputs: N_FEATURES,
+    n_outputs: 1,
+    n_candidates: OPTIONS.len(),
+};
+
+/// What keeps the beliefs that decisions are made on, before a world's first frame.
+pub struct Base {
+    pub kind: EstimatorKind,
+    filter: BayesFilter,
+    /// The state that pays most.
+    target: usize,
+    correlations: Correlations,
+    state_names: Vec<String>,
+    /// What the filter learned, unless the model is known.
+    model: Option<LearnedModel>,
 }
 
-/// All of a checkpoint of decisions but the tensors.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct SavedDecisions {
-    pub n_states: usize,
-    pub actions: Vec<String>,
-    /// World steps that were learned from.
-    pub world_steps: u64,
-    pub dqn: SavedDqn,
-}
-
-/// A DQN that learns on several worlds.
+/// A DQN over options that learns on several worlds.
 pub struct DecisionsStudent {
     worlds: Worlds,
     config: AgentConfig,
+    base: Base,
     policy: Policy,
-    decisions: Decisions,
-    filter: BayesFilter,
-    target: usize,
-    state_names: Vec<String>,
+    dqn: Dqn,
     runs: Vec<Run>,
-    owed: f64,
+    /// Where a checkpoint left the worlds.
+    left: BTreeMap<u32, SavedRun>,
+    world_steps: u64,
+    /// Updates that steps have earned and that are not made yet.
+    earned: f64,
     is_frozen: bool,
     times: [(&'static str, Duration); 2],
 }
 
 struct Run {
     rollout: Rollout,
-    /// What the last decision went by, and what it was.
-    input: Vec<f32>,
-    action: usize,
+    /// The features of the option flown last and its reward, until what follows is known.
+    last: Option<(Vec<f32>, f32)>,
     track: Track,
+    held: Held,
+    /// What is flown next.
+    next: Option<(usize, Proposal)>,
 }
 
-impl Decisions {
-    /// Before the first step, for worlds of a model.
-    pub fn first(model: &Model, config: &DecisionsConfig, seed: u64) -> Self {
-        let actions = ActionSet::beam(model);
-        let (n_states, n_actions) = (model.n_states(), actions.actions().len());
+/// A random option that is flown for some steps in a row.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+struct Held {
+    option: usize,
+    n_steps: u64,
+}
+
+impl Base {
+    /// On a known model, whose filter is given.
+    pub fn known(kind: EstimatorKind, filter: BayesFilter, model: &Model) -> Self {
         Self {
-            dqn: Dqn::new(config.settings(), summary_length(n_states), n_actions, seed),
-            actions,
-            world_steps: 0,
-            n_states,
+            kind,
+            filter,
+            target: model.target_state(),
+            correlations: Correlations::default(),
+            state_names: model.state_names(),
+            model: None,
         }
     }
 
-    /// The action that is worth most on a belief.
-    pub fn best_action(&self, belief: &Belief, robot: Cell, n_moves: usize) -> &Action {
-        &self.actions.actions()[self.dqn.best(&spread_summary(belief, robot, n_moves))]
+    pub fn learned(kind: EstimatorKind, model: LearnedModel, shape: Shape) -> Self {
+        Self {
+            kind,
+            filter: BayesFilter::learned(&model.tables, model.tables.prior(shape)),
+            target: model.target,
+            correlations: model.correlations.clone(),
+            state_names: numbered_states(model.tables.dimensions.n_states),
+            model: Some(model),
+        }
     }
 
-    pub fn to_contents(&self) -> Contents {
-        let state = SavedDecisions {
-            n_states: self.n_states,
-            actions: self.actions.names(),
-            world_steps: self.world_steps,
-            dqn: self.dqn.saved(),
-        };
-        Contents::new(self.dqn.named_tensors(), &state)
-    }
-
-    pub fn load(&mut self, contents: &Contents) -> Result<()> {
-        let saved: SavedDecisions = contents.state()?;
-        let [expected, got] = [self.n_states, saved.n_states];
-        check(got == expected, "states", expected, got)?;
-        let [expected, got] = [self.actions.names(), saved.actions].map(|names| names.join(" "));
-        check(got == expected, "actions", &expected, &got)?;
-        let (updates, world_steps) = (saved.dqn.n_updates, saved.world_steps);
-        check_counts(&[("dqn.n_updates", updates), ("world_steps", world_steps)])?;
-        contents.check_squares()?;
-        let find = |name: &str, shape: &[usize]| contents.tensor(name, shape);
-        self.dqn.load(find, &saved.dqn)?;
-        self.world_steps = world_steps;
-        Ok(())
+    fn estimator(&self) -> Box<dyn Estimator> {
+        let filter = self.filter.clone();
+        if self.kind.is_spatial() {
+            let correlations = self.correlations.clone();
+            Box::new(SpatialFilter::new(filter, self.target, correlations))
+        } else {
+            Box::new(filter)
+        }
     }
 }
 
 impl DecisionsStudent {
-    /// Goes on from some decisions, or begins. `filter` is that of the worlds' model before its first frame.
+    /// Before the first step, or going on from a checkpoint of decisions on such a base.
     pub fn new(
-        decisions: Decisions,
-        filter: BayesFilter,
-        model: &Model,
+        base: Base,
+        contents: Option<&Contents>,
         worlds: Worlds,
         config: &AgentConfig,
-    ) -> Self {
-        Self {
-            worlds,
-            config: config.clone(),
-            policy: Policy::named("dqn_beam", model).expect("invariant: every model has it"),
-            decisions,
-            filter,
-            target: model.target_state(),
-            state_names: model.state_names(),
+    ) -> Result<Self> {
+        let target = Target::State(base.target);
+        let mut student = Self {
+            policy: Policy::new("decisions", base.kind, PlannerKind::Beam, target),
+            base,
+            dqn: Dqn::new(config.decisions.settings(), SHAPE, config.seed),
             runs: Vec::new(),
-            owed: 0.0,
+            left: BTreeMap::new(),
+            world_steps: 0,
+            earned: 0.0,
             is_frozen: false,
             times: ["planning", "learning"].map(|part| (part, Duration::ZERO)),
+            worlds,
+            config: config.clone(),
+        };
+        if let Some(contents) = contents {
+            student.load(contents)?;
         }
+        Ok(student)
     }
 
-    /// A robot that has taken in what its world shows.
-    fn run(&self, observation: Observation) -> Result<Run> {
-        let (filter, names) = (Box::new(self.filter.clone()), self.state_names.clone());
-        let (policy, config) = (&self.policy, &self.config);
-        let mut rollout = self
-            .worlds
-            .rollout(config, policy, filter, names, observation);
+    /// An agent before it takes in what its world shows.
+    fn rollout_at(&self, observation: Observation) -> Rollout {
+        let (base, names) = (&self.base, self.base.state_names.clone());
+        let (config, policy) = (&self.config, &self.policy);
+        self.worlds
+            .rollout(config, policy, base.estimator(), names, observation)
+    }
+
+    /// A run that begins with what its world shows.
+    fn begun(&self, observation: Observation) -> Result<Run> {
+        let mut rollout = self.rollout_at(observation);
         rollout.correct()?;
         rollout.agent.predict();
         Ok(Run {
-            input: input(&rollout, self.worlds.n_moves),
             rollout,
-            action: 0,
-            track: self.decisions.dqn.track(),
+            last: None,
+            track: self.dqn.track(),
+            held: Held::default(),
+            next: None,
         })
+    }
+
+    /// Chooses a run's option: the best one, or while one is held at random, that.
+    fn choose(&self, index: usize, features: &[f32], held: &mut Held) -> usize {
+        if self.is_frozen {
+            return self.dqn.best(features);
+        }
+        let step = self.world_steps + index as u64;
+        let mut rng = stream(self.config.seed, Purpose::Exploration, step);
+        let mut random = |below: u64| rng.next_u64() % below;
+        let epsilon = self.dqn.settings().epsilon_at(self.world_steps);
+        // A held option lasts two or three steps, so that half as many begin.
+        if held.n_steps == 0 && (random(1 << 24) as f32) < epsilon / 2.0 * (1 << 24) as f32 {
+            held.option = random(OPTIONS.len() as u64) as usize;
+            held.n_steps = 1 + random(self.config.decisions.longest_hold);
+        }
+        if held.n_steps == 0 {
+            return self.dqn.best(features);
+        }
+        held.n_steps -= 1;
+        held.option
+    }
+
+    /// Plans all options of all robots, remembers what the last ones led to, and chooses the next ones.
+    fn decide(&mut self) {
+        let proposals = in_parallel(self.runs.iter_mut(), Run::propose);
+        let mut runs = std::mem::take(&mut self.runs);
+        for (index, (run, mut proposals)) in runs.iter_mut().zip(proposals).enumerate() {
+            let features: Vec<f32> = proposals.iter().flat_map(|it| it.features).collect();
+            if let Some(transition) = run.led_to(&features) {
+                self.dqn.remember(transition);
+            }
+            let option = self.choose(index, &features, &mut run.held);
+            run.next = Some((option, proposals.swap_remove(option)));
+        }
+        self.runs = runs;
+    }
+
+    /// Share of the step size by now: falls linearly over the steps of a training.
+    fn rate_share(&self) -> f32 {
+        let config = &self.config.decisions;
+        let done = self.world_steps as f32 / config.steps.max(1) as f32;
+        (1.0 - done).max(config.final_rate)
     }
 }
 
-fn input(rollout: &Rollout, n_moves: usize) -> Vec<f32> {
-    spread_summary(
-        rollout.agent.belief(),
-        rollout.observation().robot.cell(),
-        n_moves,
-    )
-}
-
 impl Run {
-    /// Takes in what an action brought, and gives the transition that is complete by then.
-    fn bring(&mut self, reward_scale: f32, n_moves: usize) -> Option<Transition> {
-        let next = input(&self.rollout, n_moves);
+    fn propose(&mut self) -> Vec<Proposal> {
+        let cell = self.rollout.observation().robot.cell();
+        self.rollout.agent.propose(cell)
+    }
+
+    /// The path of the option that was chosen.
+    fn take_up(&mut self) -> Vec<Move> {
+        let next = self.next.take();
+        let (option, proposal) = next.expect("invariant: an option was chosen");
+        self.last = Some((proposal.features.to_vec(), 0.0));
+        self.rollout.agent.take_up(option, proposal).moves
+    }
+
+    /// Takes in the features of what can be flown now; gives the transition that is complete by then.
+    fn led_to(&mut self, features: &[f32]) -> Option<Transition> {
+        let (input, reward) = self.last.take()?;
         self.track.add(Transition {
-            input: std::mem::replace(&mut self.input, next.clone()),
-            action: self.action,
-            reward: self.rollout.observation().robot.reward as f32 * reward_scale,
-            next,
+            input,
+            action: 0,
+            reward,
+            next: features.to_vec(),
         })
     }
 }
@@ -181,50 +247,52 @@ impl Student for DecisionsStudent {
     }
 
     fn attach(&mut self, observations: Vec<Observation>) -> Result<usize> {
-        let runs = observations.into_iter().map(|seen| self.run(seen));
-        self.runs = runs.collect::<Result<_, _>>()?;
-        // Beliefs begin again, wherever the worlds stand.
-        Ok(0)
+        let mut n_gone_on = 0;
+        for (world, observation) in self.worlds.numbers.clone().zip(observations) {
+            let left = self.left.remove(&world);
+            let run = match left.filter(|left| left.is_of(&observation)) {
+                Some(left) => {
+                    n_gone_on += 1;
+                    left.restore(self.rollout_at(observation), &self.dqn)?
+                }
+                None => self.begun(observation)?,
+            };
+            self.runs.push(run);
+        }
+        Ok(n_gone_on)
     }
 
     fn begin(&mut self, robot: u32, observation: Observation) -> Result<()> {
-        let run = self.run(observation)?;
+        let run = self.begun(observation)?;
         self.runs[(robot - self.worlds.numbers.start) as usize] = run;
         Ok(())
     }
 
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let start = Instant::now();
-        let (decisions, is_frozen) = (&self.decisions, self.is_frozen);
-        let runs = self.runs.iter_mut().enumerate();
-        let paths = in_parallel(runs, |(index, run)| {
-            run.action = if is_frozen {
-                decisions.dqn.best(&run.input)
-            } else {
-                let step = decisions.world_steps + index as u64;
-                decisions.dqn.act(&run.input, step)
-            };
-            let action = &decisions.actions.actions()[run.action];
-            let (cells, step) = (run.rollout.cells(), run.rollout.step());
-            let mut plans = run.rollout.agent.plan_action(action, &cells, step);
-            plans.remove(0).moves
-        });
+        self.decide();
+        let paths = self.runs.iter_mut().map(Run::take_up).collect();
         self.times[0].1 += start.elapsed();
         paths
     }
 
     fn see(&mut self, observations: Vec<Observation>) -> Result<Tick> {
-        let seen = without_truth(observations);
-        let turns = see_all(self.runs.iter_mut().map(|run| &mut run.rollout), seen)?;
+        let rollouts = self.runs.iter_mut().map(|run| &mut run.rollout);
+        let turns = see_all(rollouts, without_truth(observations))?;
+        let scale = self.config.decisions.reward_scale / self.worlds.n_moves as f32;
         let mut tick = Tick::default();
-        for (run, turn) in self.runs.iter().zip(turns) {
-            tick.reward += run.rollout.observation().robot.reward;
+        for (run, turn) in self.runs.iter_mut().zip(turns) {
+            let reward = run.rollout.observation().robot.reward;
+            if let Some((_, scaled)) = &mut run.last {
+                *scaled = reward as f32 * scale;
+            }
+            tick.reward += reward;
             tick.score += turn.score.unwrap_or_default();
         }
         tick.n_worlds = self.runs.len() as u64;
-        self.decisions.world_steps += tick.n_worlds;
-        tick.world_steps = self.decisions.world_steps;
-        self.owed += tick.n_worlds as f64 * self.config.decisions.updates_per_step;
+        self.world_steps += tick.n_worlds;
+        tick.world_steps = self.world_steps;
+        self.earned += tick.n_worlds as f64 * self.config.decisions.updates_per_step;
         Ok(tick)
     }
 
@@ -234,32 +302,24 @@ impl Student for DecisionsStudent {
 
     fn predict(&mut self) {
         predict_all(self.runs.iter_mut().map(|run| &mut run.rollout));
-        let (n_moves, scale) = (self.worlds.n_moves, self.config.decisions.reward_scale);
-        let transitions = in_parallel(&mut self.runs, |run| run.bring(scale, n_moves));
-        for transition in transitions.into_iter().flatten() {
-            self.decisions.dqn.remember(transition);
-        }
     }
 
     fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
         let start = Instant::now();
-        let settings = self.config.decisions.settings();
-        let epsilon = f64::from(settings.epsilon_at(self.decisions.world_steps));
+        let rate = self.config.decisions.rate * self.rate_share();
+        self.dqn.set_learning_rate(rate);
+        let epsilon = self.dqn.settings().epsilon_at(self.world_steps);
         let mut updates = Vec::new();
-        while self.owed >= 1.0 {
-            self.owed -= 1.0;
-            let Some(loss) = self.decisions.dqn.update()? else {
+        while self.earned >= 1.0 {
+            self.earned -= 1.0;
+            let Some(loss) = self.dqn.update()? else {
                 continue;
             };
             updates.push(ModelUpdate {
                 number: self.n_updates(),
                 loss: None,
                 rate: None,
-                more: vec![
-                    Some(f64::from(loss)),
-                    Some(f64::from(settings.adam.learning_rate)),
-                    Some(epsilon),
-                ],
+                more: [loss, rate, epsilon].map(|it| Some(it.into())).into(),
             });
         }
         self.times[1].1 += start.elapsed();
@@ -271,55 +331,23 @@ impl Student for DecisionsStudent {
     }
 
     fn world_steps(&self) -> u64 {
-        self.decisions.world_steps
+        self.world_steps
     }
 
     fn n_updates(&self) -> u64 {
-        self.decisions.dqn.n_updates()
+        self.dqn.n_updates()
     }
 
     fn belief(&self) -> Option<(&Belief, usize)> {
         let run = self.runs.first()?;
-        Some((run.rollout.agent.belief(), self.target))
+        Some((run.rollout.agent.belief(), self.base.target))
     }
 
     fn contents(&self) -> Result<Contents> {
-        Ok(self.decisions.to_contents())
+        Ok(self.saved())
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {
         self.times.to_vec()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn decisions_survive_a_checkpoint_and_others_are_refused_by_name() {
-        let model = Model::wildfire();
-        let config = AgentConfig::default().decisions;
-        let decisions = Decisions::first(&model, &config, 3);
-        let contents = decisions.to_contents();
-        let mut again = Decisions::first(&model, &config, 4);
-        again.load(&contents).expect("of the same model");
-        assert_eq!(again.to_contents(), contents);
-        let mut refused = |change: fn(&mut SavedDecisions), words: &str| {
-            let (mut other, mut saved) = (contents.clone(), contents.state().expect("its state"));
-            change(&mut saved);
-            other.set_state(&saved);
-            let error = again.load(&other).expect_err(words).to_string();
-            assert!(error.starts_with(words), "{error}");
-        };
-        refused(|saved| saved.n_states = 4, "states: expected 3, got 4");
-        refused(
-            |saved| saved.actions.truncate(1),
-            "actions: expected exploit exploit_explore",
-        );
-        refused(
-            |saved| saved.dqn.n_updates = u64::MAX,
-            "dqn.n_updates: expected at most",
-        );
     }
 }

@@ -87,13 +87,9 @@ impl NetworkStudent {
         rollout.expect("invariant: a world begins before it is acted on")
     }
 
-    /// What the next action goes by.
+    /// What the next action goes by: `h_{k+1}`, which has read the last frame.
     fn input(&self) -> Vec<f32> {
-        let rollout = self.at_world();
-        let Follower { hidden, prediction } = follower(rollout);
-        let cell = rollout.observation().robot.cell();
-        let n_moves = self.worlds.n_moves;
-        self.progress.input.of(&hidden, &prediction, cell, n_moves)
+        follower(self.at_world()).hidden
     }
 
     fn decide(&self) -> Decision {

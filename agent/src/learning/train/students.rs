@@ -3,16 +3,16 @@
 use crate::config::{AgentConfig, LearnerKind};
 use crate::estimation::first_belief::first_belief;
 use crate::learning::checkpoint::Contents;
-use crate::learning::student::decisions::{Decisions, DecisionsStudent};
+use crate::learning::student::decisions::{Base, DecisionsStudent};
 use crate::learning::student::filter::FilterStudent;
 use crate::learning::student::network::{self, NetworkStudent};
 use crate::learning::student::{Student, Worlds};
 use crate::learning::train::training::Training;
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::parameters::Dimensions;
-use protocol::control::CoverageRule;
-use protocol::{Client, Model};
+use protocol::control::{CoverageRule, ServerInfo};
+use protocol::{Client, Model, Shape};
 use std::path::Path;
 
 /// What the settings say that learns, going on from a checkpoint's contents if there are any.
@@ -55,22 +55,41 @@ pub fn student(
             Box::new(NetworkStudent::new(progress, worlds, config))
         }
         LearnerKind::Decisions => {
-            let model = info.model.as_deref().context(
-                "learning decisions needs the server's model: start it with --reveal-model true, not with --states",
-            )?;
-            let model = Model::from_toml(model)?;
-            let mut decisions = Decisions::first(&model, &config.decisions, config.seed);
-            if let Some(contents) = contents {
-                decisions.load(contents).with_context(of_file)?;
-            }
-            let prior = config.prior(info.burn_in);
-            let prior = first_belief(prior, &model, worlds.shape, config.seed)?;
-            let filter = BayesFilter::known(&model, prior)?;
-            Box::new(DecisionsStudent::new(
-                decisions, filter, &model, worlds, config,
-            ))
+            let saved = contents.map(|contents| Base::saved(contents, worlds.shape));
+            let base = match saved.transpose().with_context(of_file)?.flatten() {
+                Some(base) => base,
+                None => base(training, info, worlds.shape)?,
+            };
+            let student = DecisionsStudent::new(base, contents, worlds, config);
+            Box::new(student.with_context(of_file)?)
         }
     })
+}
+
+/// What keeps the beliefs that decisions are learned on: a filter that was learned, or that of the server's model.
+fn base(training: &Training, info: &ServerInfo, shape: Shape) -> Result<Base> {
+    let (kind, config) = (training.config.decisions.estimator, &training.config);
+    if kind.is_learned() {
+        let filter = training.learned.filter(kind);
+        let filter = filter.context("decisions: expected a checkpoint of a filter, got none")?;
+        let (expected, got) = (info.n_observations, filter.tables.dimensions.n_observations);
+        ensure!(
+            got == expected,
+            "checkpoint: expected {expected} observations as the world's, got {got}"
+        );
+        return Ok(Base::learned(kind, filter.clone(), shape));
+    }
+    let model = info.model.as_deref().with_context(|| {
+        format!(
+            "decisions on the belief of {} need the server's model: start it with --reveal-model true, not with \
+             --states",
+            kind.label()
+        )
+    })?;
+    let model = Model::from_toml(model)?;
+    let prior = first_belief(config.prior(info.burn_in), &model, shape, config.seed)?;
+    let filter = BayesFilter::known(&model, prior)?;
+    Ok(Base::known(kind, filter, &model))
 }
 
 fn dimensions(config: &AgentConfig, n_observations: usize) -> Result<Dimensions> {

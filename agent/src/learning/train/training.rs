@@ -2,7 +2,9 @@
 
 use crate::config::{AgentConfig, LearnerKind};
 use crate::learning::checkpoint::{self, Contents};
+use crate::learning::learned::Learned;
 use crate::learning::learner;
+use crate::learning::student::filter::SavedFilter;
 use crate::learning::student::{Student, decisions, network};
 use ::network::Device;
 use anyhow::{Context, Result, anyhow, bail, ensure};
@@ -29,6 +31,8 @@ pub struct Training {
     pub freeze: bool,
     pub device: Device,
     pub config: AgentConfig,
+    /// What was learned before, for decisions on it.
+    pub learned: Learned,
 }
 
 impl Training {
@@ -63,6 +67,31 @@ impl Training {
             );
         }
         Ok(Some(contents))
+    }
+
+    /// The training of the filter whose belief decisions are learned on, in a folder within this one's; `None` if there
+    /// is nothing more to learn of it.
+    pub fn of_filter(&self) -> Result<Option<Self>> {
+        let decisions = &self.config.decisions;
+        let mut filter = self.clone();
+        filter.out = self.filter_folder();
+        filter.config.learner = if decisions.estimator.sees_own_state() {
+            LearnerKind::OwnFilter
+        } else {
+            LearnerKind::Filter
+        };
+        filter.resume = self.resume && filter.out.join(CHECKPOINT).exists();
+        let learned = match filter.check()? {
+            Some(contents) => contents.state::<SavedFilter>()?.learner.world_steps,
+            None => 0,
+        };
+        filter.steps = decisions.filter_steps.saturating_sub(learned);
+        Ok((filter.steps > 0).then_some(filter))
+    }
+
+    /// Where [`Self::of_filter`] leaves its checkpoint.
+    pub fn filter_folder(&self) -> PathBuf {
+        self.out.join("filter")
     }
 
     /// The numbers of the robots on a server.

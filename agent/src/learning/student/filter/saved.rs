@@ -61,8 +61,8 @@ impl SavedWorld {
 
     /// Gives an agent the belief, and the estimate if its paths are planned on that.
     pub fn restore(&self, agent: &mut Agent) {
-        let memory = agent.estimator_mut().memory();
-        let is_taken = memory.is_some_and(|memory| memory.restore(&self.belief.to_bytes()));
+        let filter = agent.estimator_mut().handover_mut();
+        let is_taken = filter.is_some_and(|filter| filter.restore(&self.belief.to_bytes()));
         debug_assert!(is_taken, "invariant: the belief was checked");
         agent.remember_estimate(self.estimate.as_ref());
     }

@@ -2,7 +2,6 @@
 
 use crate::config::AgentConfig;
 use crate::estimation::Follower;
-use crate::estimation::dqn_input::DqnInput;
 use crate::learning::checkpoint::{
     Contents, check, check_belief, check_counts, check_numbers, wrong,
 };
@@ -10,7 +9,9 @@ use crate::learning::reward::RewardEstimate;
 use crate::learning::student::base::{Place, Worlds, place};
 use crate::policy::Policy;
 use crate::rollout::Rollout;
-use ::network::{Autoencoder, Device, Dqn, NetworkError, NetworkShape, Replay, SavedDqn, Track};
+use ::network::{
+    Autoencoder, Device, Dqn, DqnShape, NetworkError, NetworkShape, Replay, SavedDqn, Track,
+};
 use anyhow::Result;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::BasisKind;
@@ -23,8 +24,6 @@ use serde::{Deserialize, Serialize};
 pub struct Progress {
     pub autoencoder: Autoencoder,
     pub dqn: Dqn,
-    /// What the DQN sees.
-    pub input: DqnInput,
     /// What the paths are planned on that the DQN values.
     pub basis: BasisKind,
     /// The frames that are learned from.
@@ -73,9 +72,8 @@ impl Progress {
         let (settings, n_states) = (config.autoencoder.settings(), shape.n_states);
         let autoencoder = Autoencoder::new(settings, shape, config.seed, device)?;
         let n_actions = Policy::network_choices(n_states).len();
-        let input = config.dqn.input;
-        let n_inputs = input.length(settings.hidden, n_states);
-        let dqn = Dqn::new(config.dqn.settings(), n_inputs, n_actions, config.seed);
+        let actions = DqnShape::of_actions(settings.hidden, n_actions);
+        let dqn = Dqn::new(config.dqn.settings(), actions, config.seed);
         let position = Position {
             follower: Follower::new(&autoencoder)?,
             estimate: None,
@@ -87,7 +85,6 @@ impl Progress {
         Ok(Self {
             autoencoder,
             dqn,
-            input,
             basis: config.objective.belief,
             replay: Replay::new(settings.replay),
             position,
@@ -148,8 +145,6 @@ impl Progress {
 
     /// Takes over a checkpoint of the same sizes.
     pub fn load(&mut self, contents: &Contents) -> Result<()> {
-        let [expected, got] = [self.input, contents.settings()?.dqn.input].map(DqnInput::label);
-        check(got == expected, "dqn.input", expected, got)?;
         let saved: SavedNetwork = contents.state()?;
         let (mut position, n_updates) = (saved.position, saved.dqn.n_updates);
         check_counts(&[
