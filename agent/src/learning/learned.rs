@@ -3,8 +3,8 @@
 use crate::estimation::parameters::Dimensions;
 use crate::learning::checkpoint::{self, Contents, wrong};
 use crate::learning::learner::{self, LearnedModel};
-use crate::learning::student::filter::SavedFilter;
 use crate::learning::student::decisions::{self, LearnedDecisions};
+use crate::learning::student::filter::SavedFilter;
 use crate::learning::student::network;
 use crate::planning::policy::{Choice, EstimatorKind, Policy};
 use ::network::Device;
@@ -76,7 +76,9 @@ impl Learned {
             } else {
                 (&mut self.filter, learner::KIND)
             };
-            let is_other = filter.replace(model.clone()).is_some_and(|filter| filter != model);
+            let is_other = filter
+                .replace(model.clone())
+                .is_some_and(|filter| filter != model);
             ensure!(
                 !is_other,
                 "expected one {kind}, got two: that of the decisions, and another"

@@ -278,10 +278,7 @@ fn ended(client: &Client, observations: &[Observation]) -> Vec<u32> {
 }
 
 /// Starts the next episode of some worlds; returns what each of their robots shows.
-fn reset(
-    client: &mut Client,
-    worlds: &[u32],
-) -> Result<Vec<(u32, Observation)>, ConnectionError> {
+fn reset(client: &mut Client, worlds: &[u32]) -> Result<Vec<(u32, Observation)>, ConnectionError> {
     if worlds.is_empty() {
         return Ok(Vec::new());
     }

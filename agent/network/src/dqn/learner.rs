@@ -173,7 +173,12 @@ impl Perceptron {
 impl Dqn {
     /// A learner whose target starts equal.
     pub fn new(settings: DqnSettings, shape: DqnShape, seed: u64) -> Self {
-        let sizes = [shape.n_inputs, settings.width, settings.width, shape.n_outputs];
+        let sizes = [
+            shape.n_inputs,
+            settings.width,
+            settings.width,
+            shape.n_outputs,
+        ];
         let perceptron = |vb: VarBuilder<'_>| Perceptron::new(&vb, sizes);
         // First values depend on the seed and names alone.
         let made = || on_cpu(build(seed, DType::F32, &Device::Cpu, perceptron));
@@ -225,7 +230,9 @@ impl Dqn {
     fn choices(&self, network: &Perceptron, input: &Tensor) -> CandleResult<Tensor> {
         let n = input.dim(0)?;
         let input = input.reshape((n * self.shape.n_candidates, self.shape.n_inputs))?;
-        network.forward(&input)?.reshape((n, self.shape.n_choices()))
+        network
+            .forward(&input)?
+            .reshape((n, self.shape.n_choices()))
     }
 
     /// The action of the largest value.

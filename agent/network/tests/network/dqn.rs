@@ -2,7 +2,9 @@
 
 use candle_core::{DType, Device, Result, Tensor, Var};
 use candle_nn::{AdamW, Optimizer, ParamsAdamW};
-use network::{Dqn, DqnSettings, DqnShape, NamedTensor, NetworkError, NotFinite, SavedDqn, Transition};
+use network::{
+    Dqn, DqnSettings, DqnShape, NamedTensor, NetworkError, NotFinite, SavedDqn, Transition,
+};
 use protocol::randomness::split_mix;
 
 const N_INPUTS: usize = 6;

@@ -7,8 +7,8 @@ use crate::learning::checkpoint::Contents;
 use anyhow::Result;
 
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::planning::policy::Policy;
 use crate::planning::Target;
+use crate::planning::policy::Policy;
 use crate::rollout::agent::{Agent, Chooser, Setup};
 use crate::rollout::{Robot, Seen};
 use protocol::client::Observation;

@@ -149,7 +149,13 @@ impl DecisionsStudent {
     fn robot(&self, observation: Observation) -> Robot {
         let (base, worlds) = (&self.base, &self.worlds);
         let names = base.state_names.clone();
-        worlds.robot(&self.config, &self.policy, base.estimator(), names, observation)
+        worlds.robot(
+            &self.config,
+            &self.policy,
+            base.estimator(),
+            names,
+            observation,
+        )
     }
 
     /// A run that begins with what its world shows.

@@ -325,12 +325,22 @@ impl Policy {
     fn of_options(family: &str, estimator: EstimatorKind, target: Target) -> Vec<Self> {
         let policy = |name: &str, choice| Self {
             choice,
-            ..Self::new(&format!("{family}_{name}"), estimator, PlannerKind::Beam, target)
+            ..Self::new(
+                &format!("{family}_{name}"),
+                estimator,
+                PlannerKind::Beam,
+                target,
+            )
         };
-        let fixed = OPTIONS.iter().map(|option| policy(option.name, Choice::Option(option)));
+        let fixed = OPTIONS
+            .iter()
+            .map(|option| policy(option.name, Choice::Option(option)));
         let chosen = match estimator {
             EstimatorKind::Truth => vec![],
-            _ => vec![policy("rule", Choice::Rule), policy("policy", Choice::Scorer)],
+            _ => vec![
+                policy("rule", Choice::Rule),
+                policy("policy", Choice::Scorer),
+            ],
         };
         fixed.chain(chosen).collect()
     }
@@ -477,7 +487,14 @@ mod tests {
                 Policy::check_name(&policy.name).expect("known");
             }
         }
-        for wrong in ["", "bem_exploit", "beam_", "learned_", "oracle_rule", "fire"] {
+        for wrong in [
+            "",
+            "bem_exploit",
+            "beam_",
+            "learned_",
+            "oracle_rule",
+            "fire",
+        ] {
             let error = Policy::check_name(wrong).expect_err(wrong).to_string();
             assert!(
                 error.contains("coverage, shooting_explore, shooting_exploit, ")
@@ -497,12 +514,22 @@ mod tests {
             let policy = format!("{family}_policy");
             assert_eq!(names[..2], ["random_walk", &*exploit].as_slice()[..2]);
             assert!(names.contains(&&*policy), "{names:?}");
-            let n_chosen = if estimator == EstimatorKind::Truth { 1 } else { 2 };
+            let n_chosen = if estimator == EstimatorKind::Truth {
+                1
+            } else {
+                2
+            };
             assert_eq!(names.len(), 1 + OPTIONS.len() + n_chosen);
-            assert_eq!(EstimatorKind::try_from(estimator.label().to_owned()), Ok(estimator));
+            assert_eq!(
+                EstimatorKind::try_from(estimator.label().to_owned()),
+                Ok(estimator)
+            );
         }
         let error = EstimatorKind::try_from("filter".to_owned()).expect_err("no name");
-        assert!(error.ends_with("learned_own_spatial_filter, got \"filter\""), "{error}");
+        assert!(
+            error.ends_with("learned_own_spatial_filter, got \"filter\""),
+            "{error}"
+        );
     }
 
     #[test]

@@ -101,7 +101,12 @@ impl SavedDecisions {
         let dimensions =
             dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
         let (n_states, target) = (dimensions.n_states, saved.target);
-        check(target < n_states, "target", format!("less than {n_states}"), target)?;
+        check(
+            target < n_states,
+            "target",
+            format!("less than {n_states}"),
+            target,
+        )?;
         let mut parameters = Parameters::zeros(dimensions);
         for (at, shape) in dimensions.shapes().iter().enumerate() {
             let name = format!("{FILTER}{}", Parameters::NAMES[at]);
@@ -150,7 +155,10 @@ impl DecisionsStudent {
             worlds: self.worlds.numbers.clone().zip(runs).collect(),
         };
         let of_filter = model.into_iter().flat_map(filter_tensors);
-        Contents::new(self.dqn.named_tensors().into_iter().chain(of_filter), &state)
+        Contents::new(
+            self.dqn.named_tensors().into_iter().chain(of_filter),
+            &state,
+        )
     }
 
     /// Goes on from a checkpoint on the same base.
@@ -201,9 +209,15 @@ impl SavedRun {
 
     fn check(&self, n_states: usize, shape: Shape) -> Result<()> {
         let mut estimates = self.estimate.iter();
-        estimates.try_for_each(|estimate| check_belief("worlds.estimate", estimate, n_states, shape))?;
+        estimates
+            .try_for_each(|estimate| check_belief("worlds.estimate", estimate, n_states, shape))?;
         let expected = format!("that of a {shape} grid");
-        check(self.memory.is_of(shape), "worlds.memory", expected, "another")?;
+        check(
+            self.memory.is_of(shape),
+            "worlds.memory",
+            expected,
+            "another",
+        )?;
         if let Some((features, reward)) = &self.last {
             check_numbers("worlds.last", features, N_FEATURES)?;
             check_numbers("worlds.last", &[*reward], 1)?;
@@ -216,7 +230,12 @@ impl SavedRun {
     pub(super) fn restore(self, mut robot: Robot, dqn: &Dqn) -> Result<Run> {
         let agent = &mut robot.agent;
         let is_taken = agent.estimator_mut().remember(&self.belief);
-        check(is_taken, "worlds.belief", "that of its estimator", "another")?;
+        check(
+            is_taken,
+            "worlds.belief",
+            "that of its estimator",
+            "another",
+        )?;
         agent.remember_estimate(self.estimate.as_ref());
         agent.memory = self.memory;
         Ok(Run {
@@ -232,10 +251,12 @@ impl SavedRun {
 fn filter_tensors(model: &LearnedModel) -> impl Iterator<Item = NamedTensor> {
     let parameters = &model.parameters;
     let shapes = parameters.dimensions.shapes().into_iter();
-    let named = Parameters::NAMES.iter().zip(shapes).zip(&parameters.tensors);
-    let named = named.map(|((name, shape), numbers)| {
-        (format!("{FILTER}{name}"), shape, numbers.clone())
-    });
+    let named = Parameters::NAMES
+        .iter()
+        .zip(shapes)
+        .zip(&parameters.tensors);
+    let named =
+        named.map(|((name, shape), numbers)| (format!("{FILTER}{name}"), shape, numbers.clone()));
     named.collect::<Vec<_>>().into_iter()
 }
 
@@ -270,9 +291,18 @@ mod tests {
             let error = read(&other).expect_err(words).to_string();
             assert!(error.starts_with(words), "{error}");
         };
-        refused(|saved| saved.options.truncate(1), "options: expected exploit exploit_entropy");
-        refused(|saved| saved.estimator = EstimatorKind::Truth, "estimator: expected one");
-        refused(|saved| saved.dqn.n_updates = u64::MAX, "dqn.n_updates: expected at most");
+        refused(
+            |saved| saved.options.truncate(1),
+            "options: expected exploit exploit_entropy",
+        );
+        refused(
+            |saved| saved.estimator = EstimatorKind::Truth,
+            "estimator: expected one",
+        );
+        refused(
+            |saved| saved.dqn.n_updates = u64::MAX,
+            "dqn.n_updates: expected at most",
+        );
         refused(|saved| saved.earned = f64::NAN, "earned: expected 0 to");
     }
 }

@@ -11,7 +11,9 @@ use crate::learning::student::base::{Place, Worlds, place};
 use crate::planning::BasisKind;
 use crate::planning::policy::Policy;
 use crate::rollout::Robot;
-use ::network::{Autoencoder, Device, Dqn, DqnShape, NetworkError, NetworkShape, Replay, SavedDqn, Track};
+use ::network::{
+    Autoencoder, Device, Dqn, DqnShape, NetworkError, NetworkShape, Replay, SavedDqn, Track,
+};
 use anyhow::Result;
 use protocol::model::MAX_VALUES;
 use protocol::{Frame, Shape};
