@@ -4,6 +4,7 @@
 //! with the best score, which is eq. 15 with the sign turned and without its constant factor.
 
 pub mod action;
+pub mod ahead;
 pub mod beam;
 pub mod objective;
 mod planner;
@@ -13,6 +14,7 @@ pub mod shooting;
 pub mod team;
 mod window;
 
+pub use ahead::Ahead;
 pub use beam::BeamSearch;
 pub use objective::{BasisKind, CellValues, Objective, Target};
 pub use planner::{Plan, Planner, PlanningProblem};

@@ -5,14 +5,14 @@ use agent::Belief;
 use agent::estimation::summary::{N_BLOCKS, summarise, summary_length};
 use agent::estimation::{BayesFilter, Estimator};
 use agent::planning::{
-    BeamSearch, CellValues, Integration, Objective, Plan, Planner, PlanningProblem, RandomWalk,
+    Ahead, BeamSearch, CellValues, Integration, Objective, Plan, Planner, PlanningProblem, RandomWalk,
     Shooting, Target,
 };
 use proptest::prelude::*;
 use protocol::frame::{Frame, UNOBSERVED};
 use protocol::path::fly;
 use protocol::randomness::{Purpose, split_mix, stream};
-use protocol::{Cell, Model, Move, Probabilities, Shape};
+use protocol::{Cell, Grid, Model, Move, Probabilities, Shape};
 use rand_chacha::rand_core::Rng;
 
 /// The score from `protocol::path::fly`, whose flight says nothing of revisits.
@@ -32,13 +32,14 @@ fn score_of_flight(values: &CellValues, start: Cell, moves: &[Move]) -> f32 {
             .sum::<f32>()
 }
 
-fn planners() -> [Box<dyn Planner>; 5] {
+fn planners() -> [Box<dyn Planner>; 6] {
     [
         Box::new(RandomWalk),
         Box::new(Shooting::new(20, Integration::ClampEachMove)),
         Box::new(Shooting::new(20, Integration::ClampSum)),
         Box::new(BeamSearch::new(1)),
         Box::new(BeamSearch::new(20)),
+        Box::new(Ahead::new(20)),
     ]
 }
 
@@ -257,4 +258,19 @@ fn the_cost_of_a_plan_does_not_grow_with_the_grid() {
         BeamSearch::new(30).plan(&field.problem(&values))
     };
     assert_eq!(plan(small), plan(large));
+}
+
+#[test]
+fn a_plan_of_several_paths_sets_out_for_what_one_cannot_reach() {
+    let shape = Shape::new(16, 8).expect("valid sides");
+    let mut states = Grid::zeros(shape.dim());
+    states[[15, 0]] = 1;
+    let field = Field {
+        belief: Belief::from_states(&states, 2).expect("valid states"),
+        starts: vec![Cell { row: 0, col: 0 }],
+        n_moves: 4,
+    };
+    let values = Objective::new(Target::State(1)).values(&field.belief);
+    let plan = Ahead::new(50).plan(&field.problem(&values));
+    assert_eq!((plan.moves, plan.score), (vec![Move::Down; 4], 0.0));
 }

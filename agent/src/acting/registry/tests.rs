@@ -116,6 +116,7 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
         "beam_exploit",
         "act_exploit_at_0_3",
         "oracle_beam",
+        "oracle_ahead",
         "learned_beam",
         "learned_own_spatial_beam",
         "autoencoder_explore",
