@@ -6,7 +6,10 @@
 pub mod action;
 pub mod ahead;
 pub mod beam;
+pub mod memory;
 pub mod objective;
+pub mod options;
+pub mod outlook;
 mod planner;
 pub mod policy;
 pub mod random_walk;
@@ -16,7 +19,10 @@ mod window;
 
 pub use ahead::Ahead;
 pub use beam::BeamSearch;
+pub use memory::Memory;
 pub use objective::{BasisKind, CellValues, Objective, Target};
+pub use options::{OPTIONS, OptionPlanner, PathOption, Proposal};
+pub use outlook::Outlook;
 pub use planner::{Plan, Planner, PlanningProblem};
 pub use random_walk::RandomWalk;
 pub use shooting::{Integration, Shooting};

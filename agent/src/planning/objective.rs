@@ -106,6 +106,17 @@ impl Objective {
 }
 
 impl CellValues {
+    /// Values of shape `[H, W]`, finite, and what each distinct cell is worth besides.
+    pub fn new(value: Grid<f32>, coverage_bonus: f32) -> Self {
+        let (height, width) = value.dim();
+        Self {
+            shape: Shape::new(height, width).expect("invariant: a grid of cells"),
+            value,
+            coverage_bonus,
+            revisits: false,
+        }
+    }
+
     pub fn shape(&self) -> Shape {
         self.shape
     }
