@@ -121,6 +121,11 @@ impl Agent {
         self.plan_action(&Action::plain(&name, objective), robots, step)
     }
 
+    /// Tells observers what a path that was planned elsewhere is for.
+    pub fn aim_at(&mut self, aim: &str) {
+        self.aim = aim.into();
+    }
+
     /// As [`Self::plan`], paths of random moves.
     pub fn walk(&mut self, robots: &[Cell], step: u64) -> Vec<Plan> {
         self.aim = RANDOM_MOVES.into();

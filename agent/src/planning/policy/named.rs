@@ -22,9 +22,9 @@ pub enum EstimatorKind {
     LearnedOwnSpatial,
     /// The paper's dynamic autoencoder (sections III.B and III.C).
     Autoencoder,
-    /// The hidden state X_k, predicted one step ahead: an upper bound on estimation.
+    /// The hidden state X_k, predicted one step ahead: an oracle.
     Truth,
-    /// The hidden state X_{k+1} that the path will meet: an upper bound on prediction too.
+    /// The hidden state X_{k+1} that the path will meet: a clairvoyant.
     NextTruth,
 }
 
