@@ -9,7 +9,9 @@ pub use sections::{
 use self::sections::check;
 use crate::estimation::Prior;
 use crate::planning::policy::{PlannerKind, Policy};
-use crate::planning::{BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target};
+use crate::planning::{
+    Ahead, BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target,
+};
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use protocol::program::read_text;
@@ -167,7 +169,7 @@ impl AgentConfig {
         let keeps = own.coverage_bonus == 0.0 || own.target == Target::Coverage;
         let coverage_bonus = match policy.planner {
             _ if keeps => own.coverage_bonus,
-            PlannerKind::Beam => settings.beam_bonus,
+            PlannerKind::Beam | PlannerKind::BeamAhead => settings.beam_bonus,
             PlannerKind::Shooting | PlannerKind::RandomWalk => settings.shooting_bonus,
         };
         Objective {
@@ -191,6 +193,7 @@ impl AgentConfig {
                 self.shooting_integration,
             )),
             PlannerKind::Beam => Box::new(BeamSearch::new(self.beam_width)),
+            PlannerKind::BeamAhead => Box::new(Ahead::new(self.beam_width)),
         }
     }
 }

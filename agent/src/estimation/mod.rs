@@ -17,7 +17,6 @@ pub mod prior;
 pub mod scoring;
 pub mod spatial;
 mod spread;
-pub mod summary;
 pub mod truth;
 
 pub use autoencoder::AutoencoderEstimator;

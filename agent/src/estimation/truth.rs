@@ -1,4 +1,4 @@
-//! Bounds on what estimation can reach: beliefs of those who are told the hidden states, and of who is told nothing.
+//! Beliefs of those who are told the hidden states, and of who is told nothing: what better estimation could bring.
 
 use crate::estimation::belief::{Belief, BeliefError};
 use crate::estimation::estimator::{Estimator, EstimatorError};

@@ -117,6 +117,7 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
         "known_entropy",
         "learned_spatial_rule",
         "oracle_beam",
+        "oracle_ahead",
         "learned_beam",
         "learned_own_spatial_beam",
         "autoencoder_explore",
