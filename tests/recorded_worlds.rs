@@ -301,6 +301,7 @@ fn agents_act_without_a_model_in_one_episode_after_the_other() {
     for policy in [
         "coverage",
         "oracle_beam",
+        "oracle_ahead",
         "random_walk",
         "learned_beam",
         "learned_spatial_beam",

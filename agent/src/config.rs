@@ -12,7 +12,7 @@ use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::planning::{
-    BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target,
+    Ahead, BeamSearch, Integration, Objective, Planner, RandomWalk, Shooting, Target,
 };
 use protocol::program::read_text;
 use serde::{Deserialize, Serialize};
@@ -169,7 +169,7 @@ impl AgentConfig {
         let keeps = own.coverage_bonus == 0.0 || own.target == Target::Coverage;
         let coverage_bonus = match policy.planner {
             _ if keeps => own.coverage_bonus,
-            PlannerKind::Beam => settings.beam_bonus,
+            PlannerKind::Beam | PlannerKind::BeamAhead => settings.beam_bonus,
             PlannerKind::Shooting | PlannerKind::RandomWalk => settings.shooting_bonus,
         };
         Objective {
@@ -193,6 +193,7 @@ impl AgentConfig {
                 self.shooting_integration,
             )),
             PlannerKind::Beam => Box::new(BeamSearch::new(self.beam_width)),
+            PlannerKind::BeamAhead => Box::new(Ahead::new(self.beam_width)),
         }
     }
 }

@@ -12,7 +12,6 @@ pub mod prior;
 pub mod scoring;
 pub mod spatial;
 mod spread;
-pub mod summary;
 pub mod truth;
 
 pub use bayes::ZeroEvidence;

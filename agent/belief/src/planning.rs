@@ -3,6 +3,7 @@
 //! An [`Objective`] turns a belief into [`CellValues`] once; a [`Planner`] then looks for the path
 //! with the best score, which is eq. 15 with the sign turned and without its constant factor.
 
+pub mod ahead;
 pub mod beam;
 pub mod memory;
 pub mod objective;
@@ -14,6 +15,7 @@ pub mod shooting;
 pub mod team;
 mod window;
 
+pub use ahead::Ahead;
 pub use beam::BeamSearch;
 pub use memory::Memory;
 pub use objective::{BasisKind, CellValues, Objective, Target};

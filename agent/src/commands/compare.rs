@@ -189,9 +189,12 @@ impl CompareCommand {
 
     fn policies(&self, model: &Model, learned: &Learned) -> Result<Vec<Policy>> {
         let named = |name: &String| Policy::named(name, model);
-        let with_options = |name: &String| match name == OPTIONS {
-            true => options(model, learned),
-            false => Ok(vec![named(name)?]),
+        let with_options = |name: &String| {
+            if name == OPTIONS {
+                options(model, learned)
+            } else {
+                Ok(vec![named(name)?])
+            }
         };
         let policies = match self.policies.as_slice() {
             [] if self.has_teams() => vec![named(&OF_TEAMS.to_owned())?],

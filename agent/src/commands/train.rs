@@ -86,9 +86,10 @@ impl TrainCommand {
     pub fn run(&self) -> Result<()> {
         let stop = stop_on_signals().context("handle signals")?;
         let mut training = self.training()?;
-        let contents = match self.resume && self.goes_on_with_filter(&training) {
-            true => None,
-            false => training.check()?,
+        let contents = if self.resume && self.goes_on_with_filter(&training) {
+            None
+        } else {
+            training.check()?
         };
         let (instance, own) = self.server(&training)?;
         if own.is_none() && !self.wait.for_server(&instance, || stop.load(Relaxed))? {

@@ -33,6 +33,7 @@ fn description(policy: &Policy, model: &Model) -> String {
         PlannerKind::RandomWalk => return "random moves, the paper's baseline".into(),
         PlannerKind::Shooting => "best of random paths",
         PlannerKind::Beam => "beam search",
+        PlannerKind::BeamAhead => "beam search six paths ahead",
     };
     let belief = match policy.estimator {
         EstimatorKind::KnownModel if policy.is_decided() => ", needs --checkpoint",

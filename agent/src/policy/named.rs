@@ -25,9 +25,9 @@ pub enum EstimatorKind {
     LearnedOwnSpatial,
     /// The paper's dynamic autoencoder (sections III.B and III.C).
     Autoencoder,
-    /// The hidden state X_k, predicted one step ahead: an upper bound on estimation.
+    /// The hidden state X_k, predicted one step ahead: an oracle.
     Truth,
-    /// The hidden state X_{k+1} that the path will meet: an upper bound on prediction too.
+    /// The hidden state X_{k+1} that the path will meet: a clairvoyant.
     NextTruth,
 }
 
@@ -38,6 +38,8 @@ pub enum PlannerKind {
     /// The best of many random paths (paper section III.D).
     Shooting,
     Beam,
+    /// Beam search over several paths, of which the first is flown.
+    BeamAhead,
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -171,6 +173,7 @@ impl PlannerKind {
             Self::RandomWalk => "random_walk",
             Self::Shooting => "shooting",
             Self::Beam => "beam",
+            Self::BeamAhead => "beam_ahead",
         }
     }
 }
@@ -182,7 +185,7 @@ impl Policy {
         let objective = match planner {
             // The authors' for shooting; for beam search hardly any bonus.
             PlannerKind::Shooting if target != Target::Coverage => Objective::paper(target),
-            PlannerKind::Beam => Objective {
+            PlannerKind::Beam | PlannerKind::BeamAhead => Objective {
                 coverage_bonus: BEAM_BONUS,
                 ..Objective::new(target)
             },
@@ -235,13 +238,14 @@ impl Policy {
     /// All policies of a model: the ladder, then the others.
     pub fn all(model: &Model) -> Vec<Self> {
         use EstimatorKind::*;
-        use PlannerKind::{Beam, Shooting};
+        use PlannerKind::{Beam, BeamAhead, Shooting};
         let (target, states) = (Target::State(model.target_state()), model.state_names());
         let mut all = Self::ladder(model);
         all.extend([
             Self::new("beam_explore", KnownModel, Beam, Target::Entropy),
             Self::exploit_only("beam_exploit_only", Beam, target),
             Self::new("clairvoyant_shooting", NextTruth, Shooting, target),
+            Self::new("clairvoyant_ahead", NextTruth, BeamAhead, target),
         ]);
         for (family, estimator) in [
             ("learned", Learned),
@@ -287,7 +291,7 @@ impl Policy {
     /// The benchmark's ladder under a model, from the least to the most informed.
     pub fn ladder(model: &Model) -> Vec<Self> {
         use EstimatorKind::{KnownModel, NextTruth, None, Spatial, Truth};
-        use PlannerKind::{Beam, RandomWalk, Shooting};
+        use PlannerKind::{Beam, BeamAhead, RandomWalk, Shooting};
         let target = Target::State(model.target_state());
         let states = model.state_names().into_iter().enumerate();
         let others = states.filter(|(state, _)| *state != model.target_state());
@@ -308,6 +312,7 @@ impl Policy {
             Self::new("spatial_beam", Spatial, Beam, target),
             Self::new("oracle_shooting", Truth, Shooting, target),
             Self::new("oracle_beam", Truth, Beam, target),
+            Self::new("oracle_ahead", Truth, BeamAhead, target),
             Self {
                 choice: Choice::Rule,
                 ..Self::new("oracle_policy", Truth, Beam, target)
@@ -443,10 +448,13 @@ mod tests {
                  shooting_exploit_only beam_exploit",
             ),
             ("spatial_filter", "spatial_shooting spatial_beam"),
-            ("truth", "oracle_shooting oracle_beam oracle_policy"),
+            (
+                "truth",
+                "oracle_shooting oracle_beam oracle_ahead oracle_policy",
+            ),
             ("next_truth", "clairvoyant_beam"),
             ("known_model", "beam_explore beam_exploit_only"),
-            ("next_truth", "clairvoyant_shooting"),
+            ("next_truth", "clairvoyant_shooting clairvoyant_ahead"),
             ("learned_filter", "learned_shooting learned_beam"),
             (
                 "learned_spatial_filter",

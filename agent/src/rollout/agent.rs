@@ -131,6 +131,15 @@ impl Agent {
         plan_team(planner, &values, robots, self.n_moves, random, ROUNDS)
     }
 
+    /// As [`Self::plan`], on a belief other than the agent's.
+    #[cfg(test)]
+    pub(crate) fn plan_on(&mut self, belief: &Belief, robots: &[Cell], step: u64) -> Vec<Plan> {
+        let own = self.estimate.replace(belief.clone());
+        let plans = self.plan(robots, step);
+        self.estimate = own;
+        plans
+    }
+
     /// All options from a robot's cell, with what they promise.
     pub fn propose(&mut self, robot: Cell) -> Vec<Proposal> {
         self.options.propose(&self.outlook(), robot)

@@ -23,6 +23,10 @@ pub const DEFAULT_WIDTH: usize = 50;
 #[derive(Debug)]
 pub struct BeamSearch {
     width: usize,
+    /// Worth of a move's cell beside that of the move before it.
+    discount: f32,
+    /// Worth of the next move's cell: a power of the discount.
+    weight: f32,
     window: Window,
     /// A random number for each cell of the window (Zobrist, 1970): a set's hash is their exclusive
     /// or, so that it does not depend on the order of the visits.
@@ -76,6 +80,8 @@ impl BeamSearch {
         assert!(width > 0, "beam search: expected a width of at least one");
         Self {
             width,
+            discount: 1.0,
+            weight: 1.0,
             window: Window::default(),
             cell_hashes: Vec::new(),
             beam: Vec::new(),
@@ -89,12 +95,18 @@ impl BeamSearch {
         }
     }
 
+    /// Makes each move's cell worth `discount` times as much as that of the move before it; 1 at first.
+    pub fn set_discount(&mut self, discount: f32) {
+        self.discount = discount;
+    }
+
     /// The best path that a beam of the given width finds in the window.
     fn search(&mut self, width: usize, n_moves: usize) -> Plan {
         self.begin(width);
         for _ in 0..n_moves {
             self.expand();
             self.select(width);
+            self.weight *= self.discount;
         }
         let rank = |state: &State| (ordered_bits(state.score), !state.hash);
         let best = (0..self.beam.len()).max_by_key(|&index| rank(&self.beam[index]));
@@ -122,6 +134,7 @@ impl BeamSearch {
         self.next_visited.clear();
         self.next_visited.resize(width * n_words, 0);
         self.history.clear();
+        self.weight = 1.0;
         self.beam.clear();
         self.beam.push(State {
             row: self.window.start.0 as u32,
@@ -165,7 +178,7 @@ impl BeamSearch {
         let state = State {
             row,
             col,
-            score: before.score + self.window.gains[cell][again as usize],
+            score: before.score + self.weight * self.window.gains[cell][again as usize],
             hash: before.hash ^ (cell_hash & again.wrapping_sub(1)),
         };
         let origin = Origin {

@@ -1,18 +1,17 @@
-//! Planners of one robot, filters and summaries.
+//! Planners of one robot, options and filters.
 
 use crate::fields::{Field, fields, objectives, paths};
 use emberwatch_belief::Belief;
-use emberwatch_belief::estimation::summary::{N_BLOCKS, summarise, summary_length};
 use emberwatch_belief::estimation::{BayesFilter, Estimator};
 use emberwatch_belief::planning::{
-    BeamSearch, CellValues, Integration, Objective, Plan, Planner, PlanningProblem, RandomWalk,
-    Shooting, Target,
+    Ahead, BeamSearch, CellValues, Integration, Memory, Objective, OptionPlanner, Outlook, Plan,
+    Planner, PlanningProblem, RandomWalk, Shooting, Target,
 };
 use proptest::prelude::*;
 use protocol::frame::{Frame, UNOBSERVED};
 use protocol::path::fly;
 use protocol::randomness::{Purpose, split_mix, stream};
-use protocol::{Cell, Model, Move, Probabilities, Shape};
+use protocol::{Cell, Grid, Model, Move, Probabilities, Shape};
 use rand_chacha::rand_core::Rng;
 
 /// The score from `protocol::path::fly`, whose flight says nothing of revisits.
@@ -32,13 +31,14 @@ fn score_of_flight(values: &CellValues, start: Cell, moves: &[Move]) -> f32 {
             .sum::<f32>()
 }
 
-fn planners() -> [Box<dyn Planner>; 5] {
+fn planners() -> [Box<dyn Planner>; 6] {
     [
         Box::new(RandomWalk),
         Box::new(Shooting::new(20, Integration::ClampEachMove)),
         Box::new(Shooting::new(20, Integration::ClampSum)),
         Box::new(BeamSearch::new(1)),
         Box::new(BeamSearch::new(20)),
+        Box::new(Ahead::new(20)),
     ]
 }
 
@@ -71,29 +71,17 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..Default::default() })]
 
     #[test]
-    fn a_summary_is_of_its_models_length_and_from_0_to_1(
+    fn options_are_planned_on_every_grid_with_features_of_their_size(
         (belief, robot, n_moves) in (1..5_usize).prop_flat_map(beliefs),
     ) {
-        let n_states = belief.n_states();
-        let summary = summarise(&belief, robot, n_moves);
-        prop_assert_eq!(summary.len(), summary_length(n_states));
-        prop_assert!(summary.iter().all(|number| (0.0..=1.0).contains(number)));
-        // The states' means sum to one: over the grid, near the robot and in each block.
-        let (n_layers, n_blocks) = (n_states + 1, N_BLOCKS * N_BLOCKS);
-        let sums = |first: usize, stride: usize| -> f32 {
-            summary[first..].iter().step_by(stride).take(n_states).sum()
-        };
-        let firsts = [(0, 1), (n_layers, 1)].into_iter();
-        let blocks = (0..n_blocks).map(|block| (2 * n_layers + block, n_blocks));
-        for (first, stride) in firsts.chain(blocks) {
-            let sum = sums(first, stride);
-            prop_assert!((sum - 1.0).abs() < 1e-4, "{} at {}", sum, first);
+        let n_moves = n_moves.max(1);
+        let memory = Memory::new(belief.shape());
+        let outlook = Outlook::new(&belief, belief.n_states() - 1, &memory, n_moves);
+        for proposal in OptionPlanner::new(4).propose(&outlook, robot) {
+            prop_assert_eq!(proposal.plan.moves.len(), n_moves);
+            prop_assert!(proposal.features.iter().all(|number| (0.0..=7.0).contains(number)));
         }
     }
-}
-
-proptest! {
-    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(200) })]
 
     #[test]
     fn a_plan_has_its_moves_and_the_score_it_reports(
@@ -188,7 +176,7 @@ proptest! {
             let values = values.iter().take(shape.n_cells());
             let bytes: Vec<u8> = values.map(|&v| if v < 3 { v } else { UNOBSERVED }).collect();
             let frame = Frame::from_bytes(shape, 3, &bytes).expect("valid frame");
-            filter.correct(&frame).expect("no probability is zero");
+            filter.correct(&frame, None).expect("no probability is zero");
             let posterior = filter.belief().view().to_owned();
             prop_assert!(Belief::from_probabilities(posterior).is_ok());
             filter.predict();
@@ -257,4 +245,19 @@ fn the_cost_of_a_plan_does_not_grow_with_the_grid() {
         BeamSearch::new(30).plan(&field.problem(&values))
     };
     assert_eq!(plan(small), plan(large));
+}
+
+#[test]
+fn a_plan_of_several_paths_sets_out_for_what_one_cannot_reach() {
+    let shape = Shape::new(16, 8).expect("valid sides");
+    let mut states = Grid::zeros(shape.dim());
+    states[[15, 0]] = 1;
+    let field = Field {
+        belief: Belief::from_states(&states, 2).expect("valid states"),
+        starts: vec![Cell { row: 0, col: 0 }],
+        n_moves: 4,
+    };
+    let values = Objective::new(Target::State(1)).values(&field.belief);
+    let plan = Ahead::new(50).plan(&field.problem(&values));
+    assert_eq!((plan.moves, plan.score), (vec![Move::Down; 4], 0.0));
 }

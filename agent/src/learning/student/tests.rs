@@ -1,16 +1,20 @@
 //! Which belief students plan on.
 
 use crate::config::AgentConfig;
-use crate::learning::student::decisions::{Decisions, DecisionsStudent};
+use crate::learning::checkpoint::Contents;
+use crate::learning::learner::Learner;
+use crate::learning::student::decisions::{Base, DecisionsStudent};
 use crate::learning::student::filter::FilterStudent;
 use crate::learning::student::network::{NetworkStudent, Progress};
 use crate::learning::student::{Student, Worlds};
 use crate::policy::{EstimatorKind, PlannerKind, Policy};
+use crate::rollout::Robot;
 use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
-use emberwatch_belief::planning::action::{Action, ActionSet};
-use emberwatch_belief::planning::{BasisKind, Objective, PlanningProblem, Target};
+use emberwatch_belief::planning::{
+    BasisKind, Memory, Objective, OptionPlanner, Outlook, PlanningProblem, Target,
+};
 use protocol::client::Observation;
 use protocol::message::{RobotResult, WorldResult};
 use protocol::randomness::split_mix;
@@ -90,11 +94,14 @@ fn path(
 
 /// One step: the path, and the posterior after its frame.
 fn fly(student: &mut impl Student, step: u64) -> (Vec<Move>, Belief) {
-    let path = student.plan().remove(0);
-    student.see(vec![observation(step)]).expect("possible");
-    let posterior = student.rollout(0).agent.belief().clone();
-    student.predict();
-    (path, posterior)
+    let (mut path, mut posterior) = (Vec::new(), None);
+    let mut fly = |paths: &[Vec<Move>]| {
+        path = paths[0].clone();
+        Ok(vec![observation(step)])
+    };
+    let mut look = |_: usize, robot: &Robot| posterior = Some(robot.agent.belief().clone());
+    student.step(&mut fly, &mut look).expect("possible");
+    (path, posterior.expect("a look"))
 }
 
 /// A frozen student must plan on one of the beliefs. `paths`: what it may choose among on a belief, where
@@ -153,18 +160,67 @@ fn students_plan_on_the_belief_that_settings_say() {
         });
         let model = Model::wildfire();
         let filter = BayesFilter::known(&model, Belief::uniform(3, worlds().shape)).expect("valid");
-        let decisions = Decisions::first(&model, &config.decisions, 0);
-        let student = DecisionsStudent::new(decisions, filter, &model, worlds(), config);
-        let actions = ActionSet::beam(&model);
-        let beam = learned_beam();
-        check(student, basis, |belief, _, step| {
-            let path = |action: &Action| {
-                let random = (config.planner_seed(0), step);
-                let mut planner = config.planner(&beam);
-                let plans = action.plan(&mut *planner, belief, &[ROBOT], worlds().n_moves, random);
-                plans[0].moves.clone()
-            };
-            actions.actions().iter().map(path).collect()
+        let base = Base::known(EstimatorKind::KnownModel, filter, &model);
+        let student = DecisionsStudent::new(base, None, worlds(), config).expect("new");
+        // The robot remembers what every step showed, and never earns.
+        let memory = |step: u64| {
+            let mut memory = Memory::new(worlds().shape);
+            (0..step).for_each(|step| {
+                memory.see(&observation(step).frame);
+                if step > 0 {
+                    memory.earn(0.0, worlds().n_moves);
+                }
+            });
+            memory
+        };
+        check(student, basis, |belief, target, step| {
+            let outlook = Outlook::new(belief, target, &memory(step + 1), worlds().n_moves);
+            let mut planner = OptionPlanner::new(config.decisions.beam_width);
+            let paths = planner.propose(&outlook, ROBOT).into_iter();
+            paths.map(|proposal| proposal.plan.moves).collect()
         });
+    }
+}
+
+/// What a checkpoint of decisions holds after so many steps in a row.
+fn learn(student: &mut DecisionsStudent, steps: std::ops::Range<u64>) -> Contents {
+    for step in steps {
+        fly(student, step);
+        student.learn().expect("finite");
+    }
+    student.contents().expect("whole")
+}
+
+#[test]
+fn decisions_resume_bit_for_bit() {
+    let mut config = config(BasisKind::Estimate);
+    (
+        config.decisions.learning.batch,
+        config.decisions.updates_per_step,
+    ) = (4, 1.0);
+    for kind in [EstimatorKind::LearnedOwn, EstimatorKind::LearnedSpatial] {
+        let dimensions = Dimensions {
+            n_states: 3,
+            n_observations: 3,
+            kernel: (3, 3),
+            sees_own_state: kind.sees_own_state(),
+        };
+        let learned = Learner::new(dimensions, worlds().shape, &config).learned();
+        let base = Base::learned(kind, learned, worlds().shape);
+        let mut student = DecisionsStudent::new(base, None, worlds(), &config).expect("new");
+        student.attach(vec![observation(0)]).expect("possible");
+        let left = learn(&mut student, 1..20);
+        let base = Base::saved(&left, worlds().shape)
+            .expect("whole")
+            .expect("a filter");
+        let resumed = DecisionsStudent::new(base, Some(&left), worlds(), &config);
+        let mut resumed = resumed.expect("its own");
+        let n_gone_on = resumed.attach(vec![observation(19)]).expect("possible");
+        assert_eq!(n_gone_on, 1);
+        let contents = [&mut student, &mut resumed].map(|student| learn(student, 20..40));
+        assert!(
+            contents[0] == contents[1] && student.n_updates() > 20,
+            "{kind:?}"
+        );
     }
 }

@@ -67,13 +67,13 @@ __version__ = VERSION
 #: Steps after which an episode is truncated, unless `gymnasium.make` is told otherwise.
 MAX_EPISODE_STEPS = 1000
 
-for _module, _kind, _steps in (
-    ("env", "Wildfire", MAX_EPISODE_STEPS),
-    ("moves_env", "WildfireMoves", 64 * MAX_EPISODE_STEPS),
-    ("objective_env", "WildfireObjective", MAX_EPISODE_STEPS),
+for _module, _kind, _version, _steps in (
+    ("env", "Wildfire", 0, MAX_EPISODE_STEPS),
+    ("moves_env", "WildfireMoves", 0, 64 * MAX_EPISODE_STEPS),
+    ("objective_env", "WildfireObjective", 1, MAX_EPISODE_STEPS),
 ):
     gymnasium.register(  # pyright: ignore[reportUnknownMemberType]
-        f"emberwatch/{_kind}-v0",
+        f"emberwatch/{_kind}-v{_version}",
         entry_point=f"emberwatch.{_module}:{_kind}Env",
         vector_entry_point=f"emberwatch.{_module}:{_kind}VectorEnv",
         max_episode_steps=_steps,

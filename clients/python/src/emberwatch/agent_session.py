@@ -35,11 +35,22 @@ from emberwatch.wire import StepAnswer
 _LEASE_LOST: Final = 3
 
 _CHOICES: Final = {
-    "estimator": ("known_model", "spatial_filter"),
-    "planner": ("beam", "shooting"),
+    "estimator": (
+        None,
+        "known_model",
+        "spatial_filter",
+        "learned_filter",
+        "learned_spatial_filter",
+        "learned_own_filter",
+        "learned_own_spatial_filter",
+    ),
     "prior": ("simulated", "initial", "uniform"),
     "agent": ("own", "running"),
 }
+
+#: Objectives of an agent that serves decisions, and numbers that describe the plan for each.
+_N_OBJECTIVES: Final = 8
+_N_FEATURES: Final = 26
 
 
 class AgentSession(Session):
@@ -48,11 +59,13 @@ class AgentSession(Session):
     Its answers' frames are empty unless there is a render mode.
     """
 
-    def __init__(self, settings: Settings, arguments: Mapping[str, str], n_worlds: int = 1) -> None:
-        """`arguments` are `estimator`, `planner`, `prior` and `agent` of the environment."""
+    def __init__(
+        self, settings: Settings, arguments: Mapping[str, str | None], n_worlds: int = 1
+    ) -> None:
+        """`arguments` are `estimator`, `checkpoint`, `prior` and `agent` of the environment."""
         for name, choices in _CHOICES.items():
             if arguments[name] not in choices:
-                expected = f"one of {', '.join(choices)}"
+                expected = f"one of {', '.join(map(str, choices))}"
                 raise invalid(name, expected, repr(arguments[name]))
         if arguments["agent"] == "running" and settings.instance is None:
             raise InvalidArgumentError("agent='running': expected instance=..., where it runs")
@@ -63,20 +76,18 @@ class AgentSession(Session):
         super().__init__(settings, n_worlds)
         if self.spec.n_robots > 1:
             raise _no_team()
-        if self.spec.model is None:
-            has_none = "recorded worlds have none"
-            hides = has_none if self.spec.is_recorded else "the server does not reveal its own"
-            raise InvalidArgumentError(f"model: expected one, as {hides}")
-        n_objectives = self.spec.model.n_states + 1
+        if self.spec.model is None and not self.spec.is_recorded:
+            raise InvalidArgumentError("model: expected one, as the server does not reveal its own")
         #: Of one world.
-        self.action_space: Final = spaces.Discrete(n_objectives)
-        self.space: Final = spaces.Box(0.0, 1.0, (18 * n_objectives + 2,), np.float32)
+        self.action_space: Final = spaces.Discrete(_N_OBJECTIVES)
+        shape = _N_OBJECTIVES, _N_FEATURES
+        self.space: Final = spaces.Box(-np.inf, np.inf, shape, np.float32)
         self._arguments = arguments
         self._own_agent: Program | None = None
         self._decisions: Decisions | None = None
         self._frames: Newest[Frame] | None = None
-        #: What the agent believes of each world, in a few numbers; new after each answer.
-        self.summaries = np.zeros((n_worlds, *self.space.shape), np.float32)
+        #: What the plans of each world promise; new after each answer.
+        self.features = np.zeros((n_worlds, *self.space.shape), np.float32)
         #: The cells of each world's last path, where there is a render mode.
         self.paths: list[NDArray[np.intp]] = []
 
@@ -141,7 +152,8 @@ class AgentSession(Session):
     def _start_agent(self, instance: str) -> Decisions:
         settings = self.settings
         flags = {"instance": instance, "world": settings.world, "worlds": self.n_worlds, "wait": 0}
-        flags |= {name: self._arguments[name] for name in ("estimator", "planner", "prior")}
+        given = {name: self._arguments[name] for name in ("estimator", "checkpoint", "prior")}
+        flags |= {name: value for name, value in given.items() if value is not None}
         if settings.instance is not None and settings.model is not None:
             flags["model"] = str(settings.model)
         command = ["serve-decisions", *(f"--{flag}={value}" for flag, value in flags.items())]
@@ -183,11 +195,11 @@ class AgentSession(Session):
         return self._answer(decisions)
 
     def _answer(self, decisions: tuple[Decision, ...]) -> StepAnswer:
-        """Takes in the summaries; the rest as the server would tell it."""
-        spec, expected = self.spec, self.summaries.shape
-        self.summaries = np.array([made.summary for made in decisions], np.float32)
-        if self.summaries.shape != expected:
-            raise bad_answer("decisions", f"summaries of shape {expected}", self.summaries.shape)
+        """Takes in the features; the rest as the server would tell it."""
+        spec, expected = self.spec, self.features.shape
+        self.features = self._asked().features(decisions)
+        if self.features.shape != expected:
+            raise bad_answer("decisions", f"features of shape {expected}", self.features.shape)
         header = wire.StepReply(
             first_robot=self.settings.world,
             n_robots=len(decisions),
@@ -239,8 +251,8 @@ def _robot(made: Decision) -> bytes:
     return wire.ROBOT.pack(made.reward, made.reward, *counts, *cell, *cell, 0, 0)
 
 
-class Summaries:
-    """Observations of worlds that an agent acts on: its summaries of the beliefs."""
+class Features:
+    """Observations of worlds that an agent acts on: what its plans promise."""
 
     def __init__(self, session: AgentSession) -> None:
         self._session = session
@@ -254,7 +266,7 @@ class Summaries:
 
     def all(self, frames: NDArray[np.uint8], robots: NDArray[np.int64]) -> NDArray[np.float32]:
         """The observations of all worlds, stacked."""
-        return self._session.summaries
+        return self._session.features
 
 
 class AgentSessionOwner:
@@ -264,10 +276,10 @@ class AgentSessionOwner:
 
     @property
     def objectives(self) -> tuple[str, ...]:
-        """What each action plans for, once the environment has been reset."""
+        """The names of the actions, once the environment has been reset."""
         return self._agent.info.objectives
 
     @property
-    def summary_names(self) -> tuple[str, ...]:
-        """What each number of an observation is, once the environment has been reset."""
-        return self._agent.info.summary
+    def feature_names(self) -> tuple[str, ...]:
+        """The names of an observation's columns, once the environment has been reset."""
+        return self._agent.info.features

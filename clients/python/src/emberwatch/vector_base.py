@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from emberwatch.agent_session import Summaries
+from emberwatch.agent_session import Features
 from emberwatch.arguments import as_seed
 from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, wants_to_resume
 from emberwatch.errors import invalid
@@ -35,7 +35,7 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
     def __init__(
         self,
         session: Session,
-        observations: Observations | Summaries,
+        observations: Observations | Features,
         action_space: spaces.Space[Any],
         *,
         max_episode_steps: int | None,
