@@ -3,7 +3,7 @@
 use crate::commands::{agent, check};
 use crate::trainings::Place;
 use agent::learning::checkpoint::{self, Contents};
-use agent::learning::student::network::{KIND, SavedNetwork};
+use agent::learning::learners::network::{KIND, SavedNetwork};
 use protocol::Move;
 use std::path::Path;
 use tests::harness::{AGENT, Server, fly};

@@ -2,10 +2,10 @@
 
 use agent::acting::decider::{Assignment, Decider};
 use agent::acting::mission::prepare;
+use agent::client::errors;
 use agent::config::AgentConfig;
 use agent::learning::learned::Learned;
 use agent::policy::EstimatorKind;
-use agent::server::errors;
 use protocol::Client;
 use protocol::channels::{ChannelError, Instance};
 use protocol::client::Claim;

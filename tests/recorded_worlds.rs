@@ -2,7 +2,7 @@
 
 use crate::commands::{agent, check, check_table};
 use crate::recording::{read, read_whole, start_recorder, start_replay, stop, truths};
-use agent::server::truth::TruthFeed;
+use agent::client::truth::TruthFeed;
 use ndarray::{Array3, ArrayView2, Axis};
 use ndarray_npy::WriteNpyExt;
 use protocol::channels::Instance;

@@ -3,9 +3,9 @@
 use crate::commands::{agent, check, check_table};
 use crate::trainings::Place;
 use agent::learning::checkpoint::{self, Contents};
-use agent::learning::learner::KIND;
-use agent::learning::learner::Learner;
-use agent::learning::student::filter::SavedFilter;
+use agent::learning::learners::filter::SavedFilter;
+use agent::learning::learners::filter::fit::KIND;
+use agent::learning::learners::filter::fit::Learner;
 use protocol::Move;
 use rustix::process::Signal;
 use std::ffi::OsString;

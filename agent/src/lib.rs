@@ -7,7 +7,7 @@
 //! - [`acting`] -- one world of a running server, for a policy or for a learner outside
 //! - [`learning`] -- models that are learned while acting, and their checkpoints
 //! - [`rollout`] -- an agent, and the one step that all of these take
-//! - [`server`] -- the ends of the wire
+//! - [`client`] -- the ends of the wire
 //! - [`config`] -- settings
 //! - [`mod@file`] -- files written whole or not at all
 //! - [`policy`] -- policies by name
@@ -17,10 +17,10 @@
 
 pub mod acting;
 pub mod benchmark;
+pub mod client;
 pub mod config;
 pub mod estimation;
 pub mod file;
 pub mod learning;
 pub mod policy;
 pub mod rollout;
-pub mod server;

@@ -11,9 +11,9 @@ pub mod options;
 pub mod outlook;
 mod planner;
 pub mod random_walk;
+mod reach;
 pub mod shooting;
 pub mod team;
-mod window;
 
 pub use ahead::Ahead;
 pub use beam::BeamSearch;

@@ -5,14 +5,14 @@
 
 use crate::acting::handover::{leave, resume};
 use crate::acting::registry::{self, Task};
+use crate::client::errors::refused;
+use crate::client::feed::{Feed, View};
+use crate::client::info::connect;
 use crate::config::AgentConfig;
 use crate::learning::learned::Learned;
 use crate::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::rollout::agent::Agent;
 use crate::rollout::{Rollout, Seen, in_parallel, see_all};
-use crate::server::errors::refused;
-use crate::server::feed::{Feed, View};
-use crate::server::info::connect;
 use anyhow::Result;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;

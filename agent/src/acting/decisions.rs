@@ -5,8 +5,8 @@
 
 use crate::acting::decider::{Assignment, Decider};
 use crate::acting::mission::prepare;
+use crate::client::errors::{is_outage, refusal};
 use crate::estimation::first_belief::first_belief;
-use crate::server::errors::{is_outage, refusal};
 use anyhow::{Result, ensure};
 use emberwatch_belief::estimation::Prior;
 use protocol::Model;

@@ -1,8 +1,8 @@
 //! How an agent goes on with what another believed: from the belief that it left with the server, or
 //! else from the frames that the server keeps.
 
+use crate::client::left_belief::{leave_belief, left_belief};
 use crate::rollout::{Rollout, Seen};
-use crate::server::left_belief::{leave_belief, left_belief};
 use anyhow::Result;
 use protocol::Client;
 use protocol::connection::ConnectionError;

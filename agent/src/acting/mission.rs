@@ -1,9 +1,9 @@
 //! What an agent is told to do on one world of a running server, and whether that server can be acted on.
 
+use crate::client::errors::refused;
+use crate::client::info::connect;
 use crate::config::AgentConfig;
 use crate::learning::learned::Learned;
-use crate::server::errors::refused;
-use crate::server::info::connect;
 use anyhow::{Result, bail, ensure};
 use protocol::Model;
 use protocol::channels::Instance;

@@ -3,14 +3,14 @@
 use crate::acting::handover::{catch_up, leave, resume, take_over_left};
 use crate::acting::mission::{Company, Mission, info_of, model_of, recorded_states};
 use crate::acting::registry::{self, Task, needs_model};
+use crate::client::errors::is_late;
+use crate::client::feed::{Feed, View};
+use crate::client::info::{connect, is_belief_left};
+use crate::client::truth::TruthFeed;
 use crate::estimation::first_belief::first_belief;
 use crate::policy::{EstimatorKind, Policy};
 use crate::rollout::agent::Agent;
 use crate::rollout::{Rollout, Seen};
-use crate::server::errors::is_late;
-use crate::server::feed::{Feed, View};
-use crate::server::info::{connect, is_belief_left};
-use crate::server::truth::TruthFeed;
 use anyhow::{Result, ensure};
 use emberwatch_belief::estimation::Prior;
 use emberwatch_belief::estimation::belief::Belief;

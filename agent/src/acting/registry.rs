@@ -3,8 +3,8 @@
 use crate::config::AgentConfig;
 use crate::estimation::AutoencoderEstimator;
 use crate::learning::learned::Learned;
-use crate::learning::learner::LearnedModel;
-use crate::learning::student::decisions::LearnedDecisions;
+use crate::learning::learners::decisions::LearnedDecisions;
+use crate::learning::learners::filter::fit::LearnedModel;
 use crate::policy::{Choice, EstimatorKind, Policy, numbered_states};
 use crate::rollout::agent::{Agent, Chooser, Decider, OptionChooser, Setup};
 use anyhow::{Context, Result, ensure};

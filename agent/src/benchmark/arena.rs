@@ -7,13 +7,13 @@
 use crate::acting::mission::recorded_states;
 use crate::acting::registry::{self, Task, needs_model};
 use crate::benchmark::team::Team;
+use crate::client::info::connect;
+use crate::client::truth::TruthFeed;
 use crate::config::AgentConfig;
 use crate::learning::learned::Learned;
 use crate::policy::Policy;
 use crate::rollout::Seen;
 use crate::rollout::agent::Agent;
-use crate::server::info::connect;
-use crate::server::truth::TruthFeed;
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::planning::team::robot_seed;

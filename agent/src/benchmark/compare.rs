@@ -3,13 +3,13 @@
 use crate::benchmark::arena::Arena;
 use crate::benchmark::report::{PolicyRun, Snapshot};
 use crate::benchmark::team::Team;
+use crate::client::feed::{Feed, View};
 use crate::config::AgentConfig;
 use crate::estimation::first_belief::first_belief;
 use crate::learning::learned::Learned;
 use crate::policy::{EstimatorKind, Policy};
 use crate::rollout::agent::Agent;
 use crate::rollout::{Rollout, Turn, in_parallel, paths_of, predict_all, see_all};
-use crate::server::feed::{Feed, View};
 use anyhow::{Context, Result, ensure};
 use emberwatch_belief::brier::brier_score;
 use emberwatch_belief::estimation::belief::Belief;

@@ -11,10 +11,10 @@ use agent::benchmark::report::{
     render_table, write_csv, write_events,
 };
 use agent::benchmark::team::Team;
+use agent::client::launch::OwnDashboard;
 use agent::config::{AgentConfig, AgentFlags};
 use agent::learning::learned::Learned;
 use agent::policy::{EstimatorKind, Policy};
-use agent::server::launch::OwnDashboard;
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 use emberwatch_belief::merit::RECENT_STEPS;

@@ -3,12 +3,12 @@
 use super::shared::{WaitFlag, make_folder, parse_seconds};
 use super::worlds::GridFlags;
 use agent::benchmark::report::training::draw_training;
+use agent::client::launch::OwnServer;
 use agent::config::{AgentFlags, LearnerKind, Preset};
 use agent::learning::checkpoint::Contents;
 use agent::learning::learned::Learned;
-use agent::learning::train::{CHECKPOINT, Training, train};
+use agent::learning::train::{CHECKPOINT, TrainingSpec, train};
 use agent::policy::EstimatorKind;
-use agent::server::launch::OwnServer;
 use anyhow::{Context, Result, anyhow, ensure};
 use clap::Args;
 use network::DeviceKind;
@@ -111,7 +111,7 @@ impl TrainCommand {
         learn(&instance, &training, contents, &stop)
     }
 
-    fn training(&self) -> Result<Training> {
+    fn training(&self) -> Result<TrainingSpec> {
         let mut config = self.settings.effective()?;
         config.learner = self.learner.unwrap_or(config.learner);
         if let Some(name) = &self.estimator {
@@ -131,7 +131,7 @@ impl TrainCommand {
             _ => 0,
         };
         let device = self.device.open()?;
-        Ok(Training {
+        Ok(TrainingSpec {
             worlds: self.world..last,
             takeover: self.takeover,
             steps: self.steps.unwrap_or(steps),
@@ -146,14 +146,14 @@ impl TrainCommand {
     }
 
     /// Whether a training of decisions was left while its filter was learned.
-    fn goes_on_with_filter(&self, training: &Training) -> bool {
+    fn goes_on_with_filter(&self, training: &TrainingSpec) -> bool {
         needs_filter(training)
             && training.filter_folder().join(CHECKPOINT).exists()
             && !training.out.join(CHECKPOINT).exists()
     }
 
     /// The server, and itself if it was started: dropped, it stops.
-    fn server(&self, training: &Training) -> Result<(Instance, Option<OwnServer>)> {
+    fn server(&self, training: &TrainingSpec) -> Result<(Instance, Option<OwnServer>)> {
         if let Some(name) = &self.instance {
             return Ok((Instance::new(name)?, None));
         }
@@ -185,7 +185,7 @@ impl TrainCommand {
 }
 
 /// Whether decisions are to be learned on the belief of a filter that is yet to be learned.
-fn needs_filter(training: &Training) -> bool {
+fn needs_filter(training: &TrainingSpec) -> bool {
     let estimator = training.config.decisions.estimator;
     training.config.learner == LearnerKind::Decisions
         && estimator.is_learned()
@@ -195,7 +195,7 @@ fn needs_filter(training: &Training) -> bool {
 /// Trains, and says what that gave.
 fn learn(
     instance: &Instance,
-    training: &Training,
+    training: &TrainingSpec,
     contents: Option<Contents>,
     stop: &AtomicBool,
 ) -> Result<()> {

@@ -1,10 +1,10 @@
 //! What checkpoints hold, by kind: all that policies on a learned belief need.
 
 use crate::learning::checkpoint::{self, Contents, wrong};
-use crate::learning::learner::{self, LearnedModel};
-use crate::learning::student::decisions::{self, LearnedDecisions};
-use crate::learning::student::filter::SavedFilter;
-use crate::learning::student::network;
+use crate::learning::learners::decisions::{self, LearnedDecisions};
+use crate::learning::learners::filter::SavedFilter;
+use crate::learning::learners::filter::fit::{self, LearnedModel};
+use crate::learning::learners::network;
 use crate::policy::{Choice, EstimatorKind, Policy};
 use ::network::Device;
 use anyhow::{Context, Result, ensure};
@@ -15,8 +15,8 @@ use std::sync::Arc;
 
 /// Kinds of checkpoints that policies act on.
 const KINDS: [&str; 4] = [
-    learner::KIND,
-    learner::OWN_KIND,
+    fit::KIND,
+    fit::OWN_KIND,
     network::KIND,
     decisions::KIND,
 ];
@@ -55,8 +55,8 @@ impl Learned {
 
     fn add(&mut self, kind: &'static str, contents: Contents, device: &Device) -> Result<()> {
         let twice = match kind {
-            learner::KIND => self.filter.replace(filter(&contents, false)?).is_some(),
-            learner::OWN_KIND => self.own_filter.replace(filter(&contents, true)?).is_some(),
+            fit::KIND => self.filter.replace(filter(&contents, false)?).is_some(),
+            fit::OWN_KIND => self.own_filter.replace(filter(&contents, true)?).is_some(),
             decisions::KIND => self.add_decisions(&contents)?,
             _ => {
                 let network = network::Progress::read(&contents, device)?;
@@ -72,9 +72,9 @@ impl Learned {
         let (decisions, model) = LearnedDecisions::read(contents)?;
         if let Some(model) = model {
             let (filter, kind) = if decisions.estimator.sees_own_state() {
-                (&mut self.own_filter, learner::OWN_KIND)
+                (&mut self.own_filter, fit::OWN_KIND)
             } else {
-                (&mut self.filter, learner::KIND)
+                (&mut self.filter, fit::KIND)
             };
             let is_other = filter
                 .replace(model.clone())
@@ -132,7 +132,7 @@ impl Learned {
 }
 
 fn filter(contents: &Contents, sees_own_state: bool) -> Result<LearnedModel> {
-    let mut saved = contents.state::<SavedFilter>()?.learner;
+    let mut saved = contents.state::<SavedFilter>()?.fit;
     let dimensions = Dimensions {
         sees_own_state,
         ..saved.trainer.dimensions()

@@ -40,12 +40,12 @@ pub struct ModelUpdate {
     pub loss: Option<f64>,
     /// The model's step size, if it was updated.
     pub rate: Option<f64>,
-    /// What [`crate::learning::student::Student::columns`] names.
+    /// What [`crate::learning::learners::Learner::columns`] names.
     pub more: Vec<Option<f64>>,
 }
 
 impl ModelUpdate {
-    /// No update, after so many; `n_more`: length of [`crate::learning::student::Student::columns`].
+    /// No update, after so many; `n_more`: length of [`crate::learning::learners::Learner::columns`].
     pub fn nothing(number: u64, n_more: usize) -> Self {
         Self {
             number,

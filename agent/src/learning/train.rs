@@ -2,21 +2,21 @@
 //!
 //! The learner is told the grid, the number of observations and each path's reward and frame; the
 //! model that a server may reveal is read only where decisions are learned. One message steps all robots.
-//! What is learned, and how it acts meanwhile, is a [`Student`]'s.
+//! What is learned, and how it acts meanwhile, is a [`Learner`]'s.
 
 mod events;
-mod students;
-mod training;
+mod learners;
+mod spec;
 
-pub use self::training::{CHECKPOINT, Training};
+pub use self::spec::{CHECKPOINT, TrainingSpec};
 
 use self::events::Events;
-use self::students::student;
+use self::learners::learner;
+use crate::client::feed::{Feed, View};
+use crate::client::info::connect;
 use crate::learning::checkpoint::{self, Contents};
+use crate::learning::learners::Learner;
 use crate::learning::metrics::{FROZEN, METRICS, Metrics, ModelUpdate, Tick};
-use crate::learning::student::Student;
-use crate::server::feed::{Feed, View};
-use crate::server::info::connect;
 use anyhow::{Result, bail};
 use emberwatch_belief::estimation::scoring::Score;
 use protocol::Client;
@@ -49,18 +49,18 @@ pub struct TrainSummary {
 }
 
 /// Trains on a server until the steps are done, the time is over or `stop` is set; saves in any case.
-/// `contents`: what [`Training::check`] gave.
+/// `contents`: what [`TrainingSpec::check`] gave.
 pub fn train(
     instance: &Instance,
-    training: &Training,
+    spec: &TrainingSpec,
     contents: Option<Contents>,
     stop: &AtomicBool,
 ) -> Result<TrainSummary> {
-    let mut trainer = Trainer::attach(instance, training, contents)?;
-    let deadline = training.time_limit.map(|limit| Instant::now() + limit);
-    let outcome = trainer.act(training, stop, deadline);
-    let saved = trainer.save(training);
-    trainer.summary.times = trainer.student.times();
+    let mut training_loop = TrainingLoop::attach(instance, spec, contents)?;
+    let deadline = spec.time_limit.map(|limit| Instant::now() + limit);
+    let outcome = training_loop.act(spec, stop, deadline);
+    let saved = training_loop.save(spec);
+    training_loop.summary.times = training_loop.learner.times();
     match (outcome, saved) {
         (Ok(()), saved) => saved?,
         (Err(problem), Ok(())) => return Err(problem),
@@ -68,16 +68,16 @@ pub fn train(
             bail!("{problem:#}; what was learned is lost: {also:#}");
         }
     }
-    trainer.client.release()?;
-    if let Some(feed) = trainer.feed {
+    training_loop.client.release()?;
+    if let Some(feed) = training_loop.feed {
         feed.end();
     }
-    Ok(trainer.summary)
+    Ok(training_loop.summary)
 }
 
-struct Trainer {
+struct TrainingLoop {
     client: Client,
-    student: Box<dyn Student>,
+    learner: Box<dyn Learner>,
     metrics: Metrics,
     events: Events,
     feed: Option<Feed>,
@@ -94,47 +94,47 @@ struct Told {
     score: Score,
 }
 
-impl Trainer {
+impl TrainingLoop {
     fn attach(
         instance: &Instance,
-        training: &Training,
+        spec: &TrainingSpec,
         contents: Option<Contents>,
     ) -> Result<Self> {
-        let place = training.out.join(CHECKPOINT);
+        let place = spec.out.join(CHECKPOINT);
         let connection = connect(instance)?;
         let claim = Claim {
-            robots: training.robots(connection.info())?,
-            takeover: training.takeover,
+            robots: spec.robots(connection.info())?,
+            takeover: spec.takeover,
             time_to_live: Some(LEASE),
         };
         let mut client = Client::acquire(connection, &claim)?;
-        let mut student = student(training, &client, contents.as_ref(), &place)?;
-        let metrics = metrics(training, &*student)?;
-        let events = events(training, &*student)?;
-        if training.freeze {
-            student.freeze();
+        let mut learner = learner(spec, &client, contents.as_ref(), &place)?;
+        let metrics = metrics(spec, &*learner)?;
+        let events = events(spec, &*learner)?;
+        if spec.freeze {
+            learner.freeze();
         }
         let mut observations = client.observe(client.robots())?;
         let over = ended(&client, &observations);
         for (robot, seen) in reset(&mut client, &over)? {
             observations[(robot - client.robots().start) as usize] = seen;
         }
-        let attached = student.attach(observations);
-        let n_gone_on = attached.map_err(|problem| training.stopped(problem, &*student))?;
+        let attached = learner.attach(observations);
+        let n_gone_on = attached.map_err(|problem| spec.stopped(problem, &*learner))?;
         let n_new = client.robots().len() - n_gone_on;
-        if training.resume && n_new > 0 {
+        if spec.resume && n_new > 0 {
             let robots = n_new;
             tracing::info!(
                 robots,
                 "not where the checkpoint left them: beliefs begin again"
             );
         }
-        let belief = student.belief();
+        let belief = learner.belief();
         let feed = belief.map(|(belief, _)| Feed::open(instance, belief));
         let now = Instant::now();
         Ok(Self {
             client,
-            student,
+            learner,
             metrics,
             events,
             feed,
@@ -146,31 +146,30 @@ impl Trainer {
 
     fn act(
         &mut self,
-        training: &Training,
+        spec: &TrainingSpec,
         stop: &AtomicBool,
         deadline: Option<Instant>,
     ) -> Result<()> {
         let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
-        let is_done = |steps: u64| training.steps > 0 && steps >= training.steps;
+        let is_done = |steps: u64| spec.steps > 0 && steps >= spec.steps;
         while !is_done(self.summary.steps) && !stop.load(Ordering::Relaxed) && !is_over() {
             let tick = self.step();
-            let tick = tick.map_err(|problem| training.stopped(problem, &*self.student))?;
-            let updates = match training.freeze {
+            let tick = tick.map_err(|problem| spec.stopped(problem, &*self.learner))?;
+            let updates = match spec.freeze {
                 true => Ok(Vec::new()),
-                false => self.student.learn(),
+                false => self.learner.learn(),
             };
-            let mut updates =
-                updates.map_err(|problem| training.stopped(problem, &*self.student))?;
-            self.summary.updates = self.student.n_updates();
+            let mut updates = updates.map_err(|problem| spec.stopped(problem, &*self.learner))?;
+            self.summary.updates = self.learner.n_updates();
             if updates.is_empty() {
-                let n_more = self.student.columns().len();
+                let n_more = self.learner.columns().len();
                 updates.push(ModelUpdate::nothing(self.summary.updates, n_more));
             }
             self.metrics.add(&tick, &updates)?;
-            self.events.add(&tick, &updates, &*self.student)?;
-            self.report(&tick, training.steps);
+            self.events.add(&tick, &updates, &*self.learner)?;
+            self.report(&tick, spec.steps);
             if self.saved.elapsed() > SAVE_INTERVAL {
-                self.save(training)?;
+                self.save(spec)?;
             }
         }
         Ok(())
@@ -179,20 +178,20 @@ impl Trainer {
     /// One step of each robot; worlds at the end of their episodes begin again.
     fn step(&mut self) -> Result<Tick> {
         let start = Instant::now();
-        let paths = self.student.plan();
+        let paths = self.learner.plan();
         let planning = start.elapsed() / paths.len().max(1) as u32;
         let robots = self.client.robots();
-        let observations = if self.student.wants_full_frames() {
+        let observations = if self.learner.wants_full_frames() {
             self.client.step_full(robots, &paths)?
         } else {
             self.client.step(robots, &paths)?
         };
         let over = ended(&self.client, &observations);
-        let tick = self.student.see(observations)?;
+        let tick = self.learner.see(observations)?;
         self.show(planning);
-        self.student.predict();
+        self.learner.predict();
         for (robot, observation) in reset(&mut self.client, &over)? {
-            self.student.begin(robot, observation)?;
+            self.learner.begin(robot, observation)?;
         }
         self.summary.steps += tick.n_worlds;
         self.summary.reward += tick.reward;
@@ -206,22 +205,22 @@ impl Trainer {
             return;
         };
         for index in feed.turn(robots.len()) {
-            let (number, rollout) = (robots.start + index as u32, self.student.rollout(index));
+            let (number, rollout) = (robots.start + index as u32, self.learner.rollout(index));
             let mut view = View::of(rollout, number / team, number..number + 1, planning);
-            view.intent.policy = format!("train {}", self.student.kind());
+            view.intent.policy = format!("train {}", self.learner.kind());
             feed.show(&view);
         }
     }
 
     /// Writes the checkpoint, unless nothing is learned, and the metrics.
-    fn save(&mut self, training: &Training) -> Result<()> {
+    fn save(&mut self, spec: &TrainingSpec) -> Result<()> {
         self.saved = Instant::now();
-        if !training.freeze {
-            let contents = self.student.contents();
-            let mut contents = contents.map_err(|error| training.stopped(error, &*self.student))?;
-            contents.settings = toml::to_string(&training.config)?;
-            let place = training.out.join(CHECKPOINT);
-            checkpoint::write(&place, self.student.kind(), &contents)?;
+        if !spec.freeze {
+            let contents = self.learner.contents();
+            let mut contents = contents.map_err(|error| spec.stopped(error, &*self.learner))?;
+            contents.settings = toml::to_string(&spec.config)?;
+            let place = spec.out.join(CHECKPOINT);
+            checkpoint::write(&place, self.learner.kind(), &contents)?;
         }
         self.metrics.flush()?;
         self.events.flush()
@@ -239,7 +238,7 @@ impl Trainer {
         tracing::info!(
             world_steps = tick.world_steps,
             of = of,
-            updates = self.student.n_updates(),
+            updates = self.learner.n_updates(),
             log_likelihood = told.score.mean(),
             mean_reward = (self.summary.reward - told.reward) / steps.max(1) as f64,
             "training"
@@ -290,20 +289,20 @@ fn reset(client: &mut Client, worlds: &[u32]) -> Result<Vec<(u32, Observation)>,
 }
 
 /// The file of metrics: a run without learning has one of its own.
-fn metrics(training: &Training, student: &dyn Student) -> Result<Metrics> {
-    let (columns, world_steps) = (student.columns(), student.world_steps());
-    match (training.freeze, training.resume) {
-        (true, _) => Metrics::begin(&training.out.join(FROZEN), columns),
-        (false, true) => Metrics::go_on(&training.out.join(METRICS), columns, world_steps),
-        (false, false) => Metrics::begin(&training.out.join(METRICS), columns),
+fn metrics(spec: &TrainingSpec, learner: &dyn Learner) -> Result<Metrics> {
+    let (columns, world_steps) = (learner.columns(), learner.world_steps());
+    match (spec.freeze, spec.resume) {
+        (true, _) => Metrics::begin(&spec.out.join(FROZEN), columns),
+        (false, true) => Metrics::go_on(&spec.out.join(METRICS), columns, world_steps),
+        (false, false) => Metrics::begin(&spec.out.join(METRICS), columns),
     }
 }
 
 /// The file of TensorBoard's events: a run without learning has a folder of its own, and begins again.
-fn events(training: &Training, student: &dyn Student) -> Result<Events> {
-    match (training.freeze, training.resume) {
-        (true, _) => Events::begin(&training.out.join(FROZEN_EVENTS), 0),
-        (false, true) => Events::begin(&training.out, student.world_steps()),
-        (false, false) => Events::begin(&training.out, 0),
+fn events(spec: &TrainingSpec, learner: &dyn Learner) -> Result<Events> {
+    match (spec.freeze, spec.resume) {
+        (true, _) => Events::begin(&spec.out.join(FROZEN_EVENTS), 0),
+        (false, true) => Events::begin(&spec.out, learner.world_steps()),
+        (false, false) => Events::begin(&spec.out, 0),
     }
 }

@@ -5,12 +5,12 @@ use agent::config::AgentConfig;
 use agent::estimation::Follower;
 use agent::learning::checkpoint::{Contents, WrongDigest, decode, encode};
 use agent::learning::learned::Learned;
-use agent::learning::learner::{self, Learner};
+use agent::learning::learners::decisions::{self, Decisions};
+use agent::learning::learners::filter::fit::{self, FilterFit};
+use agent::learning::learners::filter::{FilterLearner, SavedFilter};
+use agent::learning::learners::network::{self, Position, SavedNetwork};
+use agent::learning::learners::{Student, Worlds};
 use agent::learning::reward::RewardEstimate;
-use agent::learning::student::decisions::{self, Decisions};
-use agent::learning::student::filter::{FilterStudent, SavedFilter};
-use agent::learning::student::network::{self, Position, SavedNetwork};
-use agent::learning::student::{Student, Worlds};
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use ndarray::{Array3, Axis};
@@ -98,8 +98,8 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
         learned = Learned::from_bytes(&bytes);
     }
     let Ok(learned) = learned else { return false };
-    let one = (learned.filter, learner::KIND, dimensions(false));
-    let own = (learned.own_filter, learner::OWN_KIND, dimensions(true));
+    let one = (learned.filter, fit::KIND, dimensions(false));
+    let own = (learned.own_filter, fit::OWN_KIND, dimensions(true));
     for (filter, kind, dimensions) in [one, own] {
         let Some(filter) = filter else { continue };
         let likelihood = filter.tables.likelihood_array();
@@ -109,7 +109,7 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
             "likelihoods sum to {sums}"
         );
         let (_, contents) = decode(&[kind], &bytes).expect("read before");
-        if let Ok(mut student) = FilterStudent::resume(&contents, dimensions, worlds(), &config()) {
+        if let Ok(mut student) = FilterLearner::resume(&contents, dimensions, worlds(), &config()) {
             let again = student.contents().expect("no device");
             let saved: SavedFilter = again.state().expect("its state");
             // More takes its time. Numbers that are finite may be too large to work with.
@@ -162,10 +162,10 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
         ..decisions().to_contents()
     };
     vec![
-        ("filter", encoded(learner::KIND, filter(dimensions(false)))),
+        ("filter", encoded(fit::KIND, filter(dimensions(false)))),
         (
             "own_filter",
-            encoded(learner::OWN_KIND, filter(dimensions(true))),
+            encoded(fit::OWN_KIND, filter(dimensions(true))),
         ),
         ("autoencoder", encoded(network::KIND, small)),
         // Asked for 30 GiB once.
@@ -177,7 +177,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
 /// A learner that has seen some frames.
 fn filter(dimensions: Dimensions) -> Contents {
     let (shape, config) = (worlds().shape, config());
-    let mut learner = Learner::new(dimensions, shape, &config);
+    let mut learner = FilterFit::new(dimensions, shape, &config);
     let belief = Belief::uniform(2, shape);
     learner.begin(0);
     for value in [0, 1, 1, 0, 1] {

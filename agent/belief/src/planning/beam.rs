@@ -6,7 +6,7 @@
 //! of beginnings that agree in both only the best goes on.
 
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
-use crate::planning::window::Window;
+use crate::planning::reach::Reach;
 use protocol::path::Move;
 use protocol::randomness::split_mix;
 
@@ -27,13 +27,13 @@ pub struct BeamSearch {
     discount: f32,
     /// Worth of the next move's cell: a power of the discount.
     weight: f32,
-    window: Window,
-    /// A random number for each cell of the window (Zobrist, 1970): a set's hash is their exclusive
+    reach: Reach,
+    /// A random number for each cell of the reach (Zobrist, 1970): a set's hash is their exclusive
     /// or, so that it does not depend on the order of the visits.
     cell_hashes: Vec<u64>,
     beam: Vec<State>,
     next_beam: Vec<State>,
-    /// For each state of the beam, one bit per cell of the window.
+    /// For each state of the beam, one bit per cell of the reach.
     visited: Vec<u64>,
     next_visited: Vec<u64>,
     candidates: Vec<Candidate>,
@@ -82,7 +82,7 @@ impl BeamSearch {
             width,
             discount: 1.0,
             weight: 1.0,
-            window: Window::default(),
+            reach: Reach::default(),
             cell_hashes: Vec::new(),
             beam: Vec::new(),
             next_beam: Vec::new(),
@@ -100,7 +100,7 @@ impl BeamSearch {
         self.discount = discount;
     }
 
-    /// The best path that a beam of the given width finds in the window.
+    /// The best path that a beam of the given width finds in the reach.
     fn search(&mut self, width: usize, n_moves: usize) -> Plan {
         self.begin(width);
         for _ in 0..n_moves {
@@ -118,8 +118,8 @@ impl BeamSearch {
     }
 
     fn look_at(&mut self, problem: &PlanningProblem<'_>) {
-        self.window.look_at(problem);
-        let n_cells = self.window.n_cells();
+        self.reach.look_at(problem);
+        let n_cells = self.reach.n_cells();
         let known = self.cell_hashes.len() as u64;
         let missing = known..(n_cells as u64).max(known);
         self.cell_hashes
@@ -137,15 +137,15 @@ impl BeamSearch {
         self.weight = 1.0;
         self.beam.clear();
         self.beam.push(State {
-            row: self.window.start.0 as u32,
-            col: self.window.start.1 as u32,
+            row: self.reach.start.0 as u32,
+            col: self.reach.start.1 as u32,
             score: 0.0,
             hash: 0,
         });
     }
 
     fn words_per_state(&self) -> usize {
-        self.window.n_cells().div_ceil(64)
+        self.reach.n_cells().div_ceil(64)
     }
 
     /// Lists the states one move on from the beam, each once with its best score.
@@ -170,15 +170,15 @@ impl BeamSearch {
     #[inline]
     fn successor(&self, index: usize, step: Move) -> (Candidate, u64) {
         let before = self.beam[index];
-        let (row, col) = self.window.after(step, before.row, before.col);
-        let cell = self.window.index(row, col);
+        let (row, col) = self.reach.after(step, before.row, before.col);
+        let cell = self.reach.index(row, col);
         // 1 or 0, used as index and mask: what is random must not become a branch.
         let again = self.visited[index * self.words_per_state() + cell / 64] >> (cell % 64) & 1;
         let cell_hash = self.cell_hashes[cell];
         let state = State {
             row,
             col,
-            score: before.score + self.weight * self.window.gains[cell][again as usize],
+            score: before.score + self.weight * self.reach.gains[cell][again as usize],
             hash: before.hash ^ (cell_hash & again.wrapping_sub(1)),
         };
         let origin = Origin {
@@ -215,7 +215,7 @@ impl BeamSearch {
             let Candidate { state, origin } = self.candidates[index as usize];
             let before = origin.state as usize * n_words;
             visited.copy_from_slice(&self.visited[before..][..n_words]);
-            let cell = self.window.index(state.row, state.col);
+            let cell = self.reach.index(state.row, state.col);
             visited[cell / 64] |= 1 << (cell % 64);
             self.next_beam.push(state);
             self.history.push(origin);

@@ -1,7 +1,7 @@
 //! Random shooting: the best of N uniformly random move sequences (the end of paper section III.D).
 
 use crate::planning::planner::{Plan, Planner, PlanningProblem};
-use crate::planning::window::Window;
+use crate::planning::reach::Reach;
 use protocol::grid::{Cell, Shape};
 use protocol::path::Move;
 use protocol::randomness::{Purpose, stream};
@@ -38,7 +38,7 @@ pub enum Integration {
 pub struct Shooting {
     n_samples: usize,
     integration: Integration,
-    window: Window,
+    reach: Reach,
     slots: Vec<Slot>,
     stamp: u32,
     /// Random bits of [`LANES`] samples, sample by sample.
@@ -47,10 +47,10 @@ pub struct Shooting {
     cells: Vec<[(i16, i16); LANES]>,
 }
 
-/// A cell of the window, with all that a visit reads or writes in one place.
+/// A cell of the reach, with all that a visit reads or writes in one place.
 #[derive(Debug, Clone, Copy)]
 struct Slot {
-    /// As in [`Window::gains`].
+    /// As in [`Reach::gains`].
     gains: [f32; 2],
     /// The sample that was last here.
     stamp: u32,
@@ -91,7 +91,7 @@ impl Shooting {
         Self {
             n_samples,
             integration,
-            window: Window::default(),
+            reach: Reach::default(),
             slots: Vec::new(),
             stamp: 0,
             words: Vec::new(),
@@ -106,10 +106,10 @@ impl Shooting {
     }
 
     fn prepare(&mut self, problem: &PlanningProblem<'_>) {
-        self.window.look_at(problem);
+        self.reach.look_at(problem);
         let slot = |&gains| Slot { gains, stamp: 0 };
         self.slots.clear();
-        self.slots.extend(self.window.gains.iter().map(slot));
+        self.slots.extend(self.reach.gains.iter().map(slot));
         self.stamp = 0;
         self.words.clear();
         self.words
@@ -122,9 +122,9 @@ impl Shooting {
     ///
     /// All lanes do the same arithmetic on `i16`, which the compiler turns into vector instructions.
     fn integrate<const CLAMP_SUM: bool>(&mut self) {
-        let Window {
+        let Reach {
             rows, cols, start, ..
-        } = self.window;
+        } = self.reach;
         let (bottom, right) = (rows as i16 - 1, cols as i16 - 1);
         let (mut row, mut col) = ([start.0 as i16; LANES], [start.1 as i16; LANES]);
         let n_words = self.words.len() / LANES;
@@ -160,7 +160,7 @@ impl Shooting {
         let mut score = 0.0;
         for cells in &self.cells {
             let (row, col) = cells[lane];
-            let slot = &mut self.slots[row as usize * self.window.cols + col as usize];
+            let slot = &mut self.slots[row as usize * self.reach.cols + col as usize];
             score += slot.gains[usize::from(slot.stamp == self.stamp)];
             slot.stamp = self.stamp;
         }

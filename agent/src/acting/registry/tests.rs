@@ -1,10 +1,10 @@
 //! Which belief an agent plans on, and what its decisions go by.
 
 use super::*;
-use crate::learning::learner::Learner;
-use crate::learning::student::Worlds;
-use crate::learning::student::decisions::SHAPE;
-use crate::learning::student::network::Progress;
+use crate::learning::learners::Worlds;
+use crate::learning::learners::decisions::SHAPE;
+use crate::learning::learners::filter::fit::FilterFit;
+use crate::learning::learners::network::Progress;
 use ::network::{Device, Dqn, DqnSettings, DqnShape};
 use anyhow::Result;
 use protocol::randomness::split_mix;
@@ -103,7 +103,7 @@ fn every_policy_plans_on_the_belief_that_settings_say() {
             kernel: (3, 3),
             sees_own_state,
         };
-        Some(Learner::new(dimensions, shape(), &AgentConfig::default()).learned())
+        Some(FilterFit::new(dimensions, shape(), &AgentConfig::default()).learned())
     };
     let learned = Learned {
         filter: filter(false),

@@ -6,7 +6,7 @@ pub use self::neighbours::Neighbours;
 
 use crate::config::{AgentConfig, LearningConfig};
 use crate::learning::checkpoint::{Contents, check, check_counts};
-use crate::learning::filter::{Trainer, Update};
+use crate::learning::filter::{Optimiser, Update};
 use crate::learning::replay::Replay;
 use crate::learning::reward::{RewardEstimate, met};
 use ::network::NamedTensor;
@@ -26,7 +26,7 @@ pub const OWN_KIND: &str = "learned_own_filter";
 const SUFFIXES: [&str; 3] = ["", ".first_moment", ".second_moment"];
 
 /// More updates than a step of all worlds earns.
-const MAX_OWED: f64 = 2e6;
+const MAX_EARNED: f64 = 2e6;
 
 /// What was learned: all that acting on it needs.
 #[derive(Debug, Clone, PartialEq)]
@@ -52,26 +52,26 @@ impl LearnedModel {
 
 /// Learns from frames as they come. A checkpoint holds it as it is, its tensors apart.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Learner {
-    pub trainer: Trainer,
+pub struct FilterFit {
+    pub optimiser: Optimiser,
     pub reward: RewardEstimate,
     /// World steps seen, of all worlds together.
     pub world_steps: u64,
     /// Updates that steps have earned and that are not made yet.
-    pub owed: f64,
+    pub earned: f64,
     replay: Replay,
     neighbours: Neighbours,
 }
 
-impl Learner {
+impl FilterFit {
     /// Before the first frame.
     pub fn new(dimensions: Dimensions, shape: Shape, config: &AgentConfig) -> Self {
         let parameters = Parameters::first(dimensions, config.seed);
         Self {
-            trainer: Trainer::new(parameters, shape, config.learning, config.seed),
+            optimiser: Optimiser::new(parameters, shape, config.learning, config.seed),
             reward: RewardEstimate::new(dimensions.n_states),
             world_steps: 0,
-            owed: 0.0,
+            earned: 0.0,
             replay: replay(&config.learning),
             neighbours: Neighbours::default(),
         }
@@ -80,7 +80,7 @@ impl Learner {
     /// A world's track begins, for the first time or again.
     pub fn begin(&mut self, world: u32) {
         self.replay.begin(world);
-        self.neighbours.begin(world, self.trainer.cut().0.n_cells());
+        self.neighbours.begin(world, self.optimiser.cut().0.n_cells());
     }
 
     pub fn has_track(&self, world: u32) -> bool {
@@ -105,7 +105,7 @@ impl Learner {
         let met = met(posterior, visited.iter().copied());
         self.reward.add(&met, reward);
         self.world_steps += 1;
-        self.owed += self.trainer.config().updates_per_step;
+        self.earned += self.optimiser.config().updates_per_step;
     }
 
     /// Makes the updates that the steps since the last call have earned.
@@ -115,23 +115,23 @@ impl Learner {
     pub fn learn(&mut self) -> Result<Vec<Update>> {
         let mut updates = Vec::new();
         let target = self.reward.target();
-        while self.owed >= 1.0 {
-            self.owed -= 1.0;
-            updates.extend(self.trainer.update(&mut self.replay, target)?);
+        while self.earned >= 1.0 {
+            self.earned -= 1.0;
+            updates.extend(self.optimiser.update(&mut self.replay, target)?);
         }
         Ok(updates)
     }
 
     /// Forgets all frames, and every world's track; what was learned from them stays.
     pub fn forget(&mut self) {
-        self.replay = replay(self.trainer.config());
-        self.trainer.leave_replay();
-        self.owed = 0.0;
+        self.replay = replay(self.optimiser.config());
+        self.optimiser.leave_replay();
+        self.earned = 0.0;
         self.neighbours.forget_worlds();
     }
 
     pub fn learned(&self) -> LearnedModel {
-        let parameters = self.trainer.parameters();
+        let parameters = self.optimiser.parameters();
         let last = parameters.dimensions.n_states - 1;
         let target = self.reward.target().unwrap_or(last);
         let correlations = self.neighbours.correlations_of(target);
@@ -139,7 +139,7 @@ impl Learner {
     }
 
     pub fn kind(&self) -> &'static str {
-        if self.trainer.dimensions().sees_own_state {
+        if self.optimiser.dimensions().sees_own_state {
             OWN_KIND
         } else {
             KIND
@@ -147,13 +147,13 @@ impl Learner {
     }
 
     pub fn n_updates(&self) -> u64 {
-        self.trainer.adam.n_steps
+        self.optimiser.adam.n_steps
     }
 
     /// Parameters and moments by name.
     pub fn named_tensors(&self) -> Vec<NamedTensor> {
-        let adam = &self.trainer.adam;
-        let parts = [self.trainer.parameters(), &adam.first, &adam.second];
+        let adam = &self.optimiser.adam;
+        let parts = [self.optimiser.parameters(), &adam.first, &adam.second];
         let named = |(suffix, part): (&str, &Parameters)| {
             let shapes = part.dimensions.shapes();
             [0, 1, 2].map(|at| {
@@ -183,8 +183,8 @@ impl Learner {
             Ok(part)
         };
         let [parameters, first, second] = SUFFIXES.map(part);
-        self.trainer.set_parameters(parameters?);
-        (self.trainer.adam.first, self.trainer.adam.second) = (first?, second?);
+        self.optimiser.set_parameters(parameters?);
+        (self.optimiser.adam.first, self.optimiser.adam.second) = (first?, second?);
         contents.check_squares()?;
         self.reward.check(dimensions.n_states)
     }
@@ -202,13 +202,13 @@ impl Learner {
         config: &AgentConfig,
     ) -> Result<Self> {
         saved.load(contents, dimensions)?;
-        let mut learner = Self::new(dimensions, shape, config);
-        if saved.trainer.cut() == learner.trainer.cut() {
-            let fits = (0.0..MAX_OWED).contains(&saved.owed);
-            check(fits, "owed", format!("0 to {MAX_OWED}"), saved.owed)?;
-            learner.owed = saved.owed;
+        let mut fit = Self::new(dimensions, shape, config);
+        if saved.optimiser.cut() == fit.optimiser.cut() {
+            let fits = (0.0..MAX_EARNED).contains(&saved.earned);
+            check(fits, "earned", format!("0 to {MAX_EARNED}"), saved.earned)?;
+            fit.earned = saved.earned;
             let (n_states, n_observations) = (dimensions.n_states, dimensions.n_observations);
-            let replay = &mut learner.replay;
+            let replay = &mut fit.replay;
             replay.resume(saved.replay, shape, n_states, n_observations)?;
             let n_cells = shape.n_cells();
             let (name, expected) = ("neighbours.ages", format!("those of {n_cells} cells"));
@@ -216,11 +216,11 @@ impl Learner {
         } else {
             saved.neighbours.forget_worlds();
         }
-        learner.trainer.resume(saved.trainer)?;
-        learner.reward = saved.reward;
-        learner.neighbours = saved.neighbours;
-        learner.world_steps = saved.world_steps;
-        Ok(learner)
+        fit.optimiser.resume(saved.optimiser)?;
+        fit.reward = saved.reward;
+        fit.neighbours = saved.neighbours;
+        fit.world_steps = saved.world_steps;
+        Ok(fit)
     }
 }
 
@@ -252,51 +252,51 @@ mod tests {
         config
     }
 
-    fn see(learner: &mut Learner, values: &[u8]) {
+    fn see(fit: &mut FilterFit, values: &[u8]) {
         let belief = Belief::uniform(3, shape());
         for &value in values {
             let frame = Frame::from_bytes(shape(), 2, &[value, 255, 1]).expect("a frame");
-            let learned = learner.learned();
-            learner.see(4, &frame, Some(&belief), &learned);
+            let learned = fit.learned();
+            fit.see(4, &frame, Some(&belief), &learned);
             let visited: Vec<usize> = frame.observed().map(|(cell, _)| cell).collect();
-            learner.reward(&belief, &visited, 0.3);
-            learner.learn().expect("finite");
+            fit.reward(&belief, &visited, 0.3);
+            fit.learn().expect("finite");
         }
     }
 
-    fn learner() -> Learner {
-        let mut learner = Learner::new(DIMENSIONS, shape(), &config());
-        learner.begin(4);
-        see(&mut learner, &[0, 1, 1, 0, 1, 1, 0]);
-        learner
+    fn fit() -> FilterFit {
+        let mut fit = FilterFit::new(DIMENSIONS, shape(), &config());
+        fit.begin(4);
+        see(&mut fit, &[0, 1, 1, 0, 1, 1, 0]);
+        fit
     }
 
-    fn contents(learner: &Learner) -> Contents {
-        Contents::new(learner.named_tensors(), learner)
+    fn contents(fit: &FilterFit) -> Contents {
+        Contents::new(fit.named_tensors(), fit)
     }
 
     fn resume(
         contents: &Contents,
         dimensions: Dimensions,
         config: &AgentConfig,
-    ) -> Result<Learner, String> {
-        let learner = contents
+    ) -> Result<FilterFit, String> {
+        let fit = contents
             .state()
-            .and_then(|saved| Learner::resume(saved, contents, dimensions, shape(), config));
-        learner.map_err(|error| error.to_string())
+            .and_then(|saved| FilterFit::resume(saved, contents, dimensions, shape(), config));
+        fit.map_err(|error| error.to_string())
     }
 
     #[test]
     fn a_learner_resumes_alike_unless_its_replay_is_cut_otherwise() {
-        let mut learner = learner();
-        assert!(learner.n_updates() > 0);
-        let stored = contents(&learner);
+        let mut fit = fit();
+        assert!(fit.n_updates() > 0);
+        let stored = contents(&fit);
         let mut same = resume(&stored, DIMENSIONS, &config()).expect("whole");
         assert!(same.has_track(4) && contents(&same) == stored);
-        let later = |learner: &mut Learner| see(learner, &[1, 0, 0, 1, 1]);
-        later(&mut learner);
+        let later = |fit: &mut FilterFit| see(fit, &[1, 0, 0, 1, 1]);
+        later(&mut fit);
         later(&mut same);
-        assert!(contents(&same) == contents(&learner) && contents(&same) != stored);
+        assert!(contents(&same) == contents(&fit) && contents(&same) != stored);
         let mut config = config();
         config.learning.streams = 3;
         let other = resume(&stored, DIMENSIONS, &config).expect("whole");
@@ -309,7 +309,7 @@ mod tests {
         let other = |change: fn(&mut Dimensions), words: &str| {
             let mut dimensions = DIMENSIONS;
             change(&mut dimensions);
-            let error = resume(&contents(&learner()), dimensions, &config()).expect_err(words);
+            let error = resume(&contents(&fit()), dimensions, &config()).expect_err(words);
             assert_eq!(error, words);
         };
         other(
@@ -320,8 +320,8 @@ mod tests {
             |dimensions| dimensions.n_observations = 4,
             "likelihood: expected shape [3, 4], got [3, 2]",
         );
-        let forged = |change: fn(&mut Contents, &mut Learner), words: &str| {
-            let (mut contents, mut saved) = (contents(&learner()), learner());
+        let forged = |change: fn(&mut Contents, &mut FilterFit), words: &str| {
+            let (mut contents, mut saved) = (contents(&fit()), fit());
             change(&mut contents, &mut saved);
             contents.set_state(&saved);
             let error = resume(&contents, DIMENSIONS, &config()).expect_err(words);
@@ -339,19 +339,19 @@ mod tests {
             "kernel.second_moment: expected numbers from 0 on, got -0.5",
         );
         forged(
-            |_, saved| saved.owed = 1e300,
-            "owed: expected 0 to 2000000, got 1",
+            |_, saved| saved.earned = 1e300,
+            "earned: expected 0 to 2000000, got 1",
         );
         forged(
             |_, saved| saved.reward.rewards[1] = f64::NAN,
             "reward.rewards: expected 3 finite numbers, got NaN",
         );
         forged(
-            |_, saved| saved.trainer.adam.n_steps = u64::MAX,
+            |_, saved| saved.optimiser.adam.n_steps = u64::MAX,
             "n_updates: expected at most",
         );
         forged(
-            |_, saved| saved.trainer.streams.clear(),
+            |_, saved| saved.optimiser.streams.clear(),
             "streams: expected 2, got 0",
         );
     }

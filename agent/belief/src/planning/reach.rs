@@ -1,4 +1,4 @@
-//! The [`Window`]: the part of the grid that a path can reach, so that a plan's cost depends on the
+//! The [`Reach`]: the part of the grid that a path can reach, so that a plan's cost depends on the
 //! path's length and not on the grid's size.
 
 use crate::planning::planner::PlanningProblem;
@@ -7,20 +7,20 @@ use protocol::path::Move;
 
 /// The rectangle of cells within T rows and T columns of the start, with what they are worth.
 ///
-/// Where it ends inside the grid no path of T moves gets past it, so clamping to the window is
+/// Where it ends inside the grid no path of T moves gets past it, so clamping to the reach is
 /// clamping to the grid.
 #[derive(Debug, Default)]
-pub(super) struct Window {
+pub(super) struct Reach {
     pub rows: usize,
     pub cols: usize,
-    /// Where the robot starts, in window coordinates.
+    /// Where the robot starts, in reach coordinates.
     pub start: (usize, usize),
     /// Score of the first visit of each cell, and of each later visit; row-major.
     pub gains: Vec<[f32; 2]>,
 }
 
-impl Window {
-    /// Becomes the window of a problem, keeping its memory.
+impl Reach {
+    /// Becomes the reach of a problem, keeping its memory.
     pub fn look_at(&mut self, problem: &PlanningProblem<'_>) {
         let (values, n_moves) = (problem.values, problem.n_moves);
         let shape = values.shape();
@@ -53,7 +53,7 @@ impl Window {
         row as usize * self.cols + col as usize
     }
 
-    /// Where a move takes the robot; off the window it stays, as [`Move::apply`] has it on the grid.
+    /// Where a move takes the robot; off the reach it stays, as [`Move::apply`] has it on the grid.
     #[inline]
     pub fn after(&self, step: Move, row: u32, col: u32) -> (u32, u32) {
         match step {

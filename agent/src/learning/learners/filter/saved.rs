@@ -1,8 +1,8 @@
 //! A learned filter in a checkpoint: the learner, and where its robots are.
 
 use crate::learning::checkpoint::check_belief;
-use crate::learning::learner::Learner;
-use crate::learning::student::base::{Place, place};
+use crate::learning::learners::base::{Place, place};
+use crate::learning::learners::filter::fit::FilterFit;
 use crate::rollout::Rollout;
 use crate::rollout::agent::Agent;
 use anyhow::Result;
@@ -16,7 +16,7 @@ use std::ops::Range;
 /// All of a learned filter's checkpoint but the tensors.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct SavedFilter {
-    pub learner: Learner,
+    pub fit: FilterFit,
     pub worlds: BTreeMap<u32, SavedWorld>,
 }
 

@@ -1,4 +1,4 @@
-//! What every student does, and what it is told.
+//! What every learner does, and what it is told.
 
 use crate::config::AgentConfig;
 use crate::learning::checkpoint::Contents;
@@ -56,7 +56,7 @@ impl Worlds {
 /// Which step of which run a robot saw, and from where: seed, episode, step k, row, column.
 pub type Place = [u64; 5];
 
-pub trait Student {
+pub trait Learner {
     /// How its checkpoints call it.
     fn kind(&self) -> &'static str;
 

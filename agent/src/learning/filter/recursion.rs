@@ -6,7 +6,7 @@
 //! (truncated backpropagation). Gradients are zero far from the cells that later frames visit, and
 //! only the region where they are not is computed.
 
-use crate::learning::filter::correlation::Region;
+use crate::learning::filter::convolution::Region;
 use crate::learning::filter::layout::Layout;
 use crate::learning::filter::operator::Operator;
 use crate::learning::replay::Sighting;
@@ -25,7 +25,7 @@ pub struct Outcome {
 
 /// The recursion with its work space: give each thread its own.
 #[derive(Debug, Clone)]
-pub struct Window {
+pub struct Recursion {
     operator: Operator,
     tables: Tables,
     /// Posteriors of each frame, and the predictor after the last.
@@ -48,7 +48,7 @@ struct Seen {
     value: usize,
 }
 
-impl Window {
+impl Recursion {
     /// For windows of up to `n_frames` frames.
     pub fn new(tables: Tables, shape: Shape, n_frames: usize) -> Self {
         let dimensions = tables.dimensions;
@@ -85,7 +85,7 @@ impl Window {
         end: &mut [f32],
     ) -> Outcome {
         Arch::new().dispatch(Pass {
-            window: self,
+            recursion: self,
             start,
             frames,
             end,
@@ -221,9 +221,9 @@ impl Window {
     }
 }
 
-/// One call of [`Window::run`].
+/// One call of [`Recursion::run`].
 struct Pass<'a> {
-    window: &'a mut Window,
+    recursion: &'a mut Recursion,
     start: Option<&'a [f32]>,
     frames: &'a [Vec<Sighting>],
     end: &'a mut [f32],
@@ -236,23 +236,25 @@ impl WithSimd for Pass<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> Outcome {
-        let (window, n_frames) = (self.window, self.frames.len());
+        let (recursion, n_frames) = (self.recursion, self.frames.len());
         let mut outcome = Outcome {
-            gradient: window.tables.dimensions.lengths().map(|n| vec![0.0; n]),
+            gradient: recursion.tables.dimensions.lengths().map(|n| vec![0.0; n]),
             log_likelihood: 0.0,
             n_seen: 0,
         };
-        window.begin(self.start);
+        recursion.begin(self.start);
         for (frame, sightings) in self.frames.iter().enumerate() {
-            outcome.log_likelihood += window.correct(frame, sightings);
+            outcome.log_likelihood += recursion.correct(frame, sightings);
             outcome.n_seen += sightings.len();
-            window.predict(simd, frame);
+            recursion.predict(simd, frame);
         }
-        window.layout().unload(&window.planes[n_frames], self.end);
-        window.backward(simd, n_frames, &mut outcome);
-        window.operator.end_gradient(&mut outcome.gradient[0]);
+        recursion
+            .layout()
+            .unload(&recursion.planes[n_frames], self.end);
+        recursion.backward(simd, n_frames, &mut outcome);
+        recursion.operator.end_gradient(&mut outcome.gradient[0]);
         if self.start.is_none() {
-            window.add_initial_gradient(&mut outcome);
+            recursion.add_initial_gradient(&mut outcome);
         }
         outcome
     }

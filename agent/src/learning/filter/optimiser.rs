@@ -8,7 +8,7 @@
 use crate::config::LearningConfig;
 use crate::learning::checkpoint::{check, check_counts, check_numbers};
 use crate::learning::filter::adam::Adam;
-use crate::learning::filter::window::{Outcome, Window};
+use crate::learning::filter::recursion::{Outcome, Recursion};
 use crate::learning::replay::{Block, Replay};
 use anyhow::{Result, anyhow};
 use emberwatch_belief::estimation::parameters::{Dimensions, Parameters};
@@ -24,7 +24,7 @@ const N_PARTS: usize = 8;
 
 /// Learns the parameters; holds all that a later update depends on but the replay.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Trainer {
+pub struct Optimiser {
     parameters: Parameters,
     pub adam: Adam,
     config: LearningConfig,
@@ -35,7 +35,7 @@ pub struct Trainer {
     lap: Vec<u64>,
     n_laps: u64,
     #[serde(skip)]
-    windows: Vec<Window>,
+    recursions: Vec<Recursion>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -57,7 +57,7 @@ pub(crate) struct Stream {
     end: Vec<f32>,
 }
 
-impl Trainer {
+impl Optimiser {
     /// Before the first update; the streams are not yet in any block.
     pub fn new(parameters: Parameters, shape: Shape, config: LearningConfig, seed: u64) -> Self {
         let tables = parameters.tables();
@@ -77,7 +77,7 @@ impl Trainer {
             streams: vec![stream; config.streams],
             lap: Vec::new(),
             n_laps: 0,
-            windows: vec![Window::new(tables, shape, config.window); N_PARTS],
+            recursions: vec![Recursion::new(tables, shape, config.window); N_PARTS],
         }
     }
 
@@ -220,16 +220,16 @@ impl Trainer {
         let tables = self.parameters.tables();
         let length = self.config.window;
         let part = self.streams.len().div_ceil(N_PARTS);
-        let parts = self.streams.par_chunks_mut(part).zip(&mut self.windows);
-        let outcomes = parts.flat_map_iter(|(streams, window)| {
-            window.set(&tables);
+        let parts = self.streams.par_chunks_mut(part).zip(&mut self.recursions);
+        let outcomes = parts.flat_map_iter(|(streams, recursion)| {
+            recursion.set(&tables);
             streams.iter_mut().filter_map(move |stream| {
                 let block = replay.block(stream.block?)?;
                 let first = stream.n_done * length;
                 let is_first = block.start.is_none() && first == 0;
                 let start = (!is_first).then_some(&*stream.belief);
                 let end = block.frames.len().min(first + length);
-                Some(window.run(start, &block.frames[first..end], &mut stream.end))
+                Some(recursion.run(start, &block.frames[first..end], &mut stream.end))
             })
         });
         outcomes.collect()

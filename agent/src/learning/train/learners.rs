@@ -1,13 +1,13 @@
-//! Which student the settings ask for.
+//! Which learner the settings ask for.
 
 use crate::config::{AgentConfig, LearnerKind};
 use crate::estimation::first_belief::first_belief;
 use crate::learning::checkpoint::Contents;
-use crate::learning::student::decisions::{Base, DecisionsStudent};
-use crate::learning::student::filter::FilterStudent;
-use crate::learning::student::network::{self, NetworkStudent};
-use crate::learning::student::{Student, Worlds};
-use crate::learning::train::training::Training;
+use crate::learning::learners::decisions::{Base, DecisionsLearner};
+use crate::learning::learners::filter::FilterLearner;
+use crate::learning::learners::network::{self, NetworkLearner};
+use crate::learning::learners::{Learner, Worlds};
+use crate::learning::train::spec::TrainingSpec;
 use anyhow::{Context, Result, bail, ensure};
 use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::parameters::Dimensions;
@@ -16,13 +16,13 @@ use protocol::{Client, Model, Shape};
 use std::path::Path;
 
 /// What the settings say that learns, going on from a checkpoint's contents if there are any.
-pub fn student(
-    training: &Training,
+pub fn learner(
+    spec: &TrainingSpec,
     client: &Client,
     contents: Option<&Contents>,
     place: &Path,
-) -> Result<Box<dyn Student>> {
-    let (info, config) = (client.info(), &training.config);
+) -> Result<Box<dyn Learner>> {
+    let (info, config) = (client.info(), &spec.config);
     let worlds = Worlds {
         shape: client.shape(),
         n_observations: info.n_observations,
@@ -34,43 +34,43 @@ pub fn student(
         LearnerKind::Filter | LearnerKind::OwnFilter => {
             let dimensions = dimensions(config, worlds.n_observations)?;
             Box::new(match contents {
-                Some(contents) => FilterStudent::resume(contents, dimensions, worlds, config)
+                Some(contents) => FilterLearner::resume(contents, dimensions, worlds, config)
                     .with_context(of_file)?,
-                None => FilterStudent::new(dimensions, worlds, config),
+                None => FilterLearner::new(dimensions, worlds, config),
             })
         }
         LearnerKind::Autoencoder => {
-            let mut progress = network::Progress::first(&worlds, config, &training.device)?;
+            let mut progress = network::Progress::first(&worlds, config, &spec.device)?;
             if let Some(contents) = contents {
                 progress.load(contents).with_context(of_file)?;
             }
             let full_frames = config.autoencoder.full_frames;
-            let wants = progress.position.iterations < full_frames && !training.freeze;
+            let wants = progress.position.iterations < full_frames && !spec.freeze;
             if wants && info.coverage == CoverageRule::Path {
                 bail!(
                     "autoencoder.full_frames: {full_frames} frames that show every cell need a server with \
                      --coverage client or full, or the setting 0"
                 );
             }
-            Box::new(NetworkStudent::new(progress, worlds, config))
+            Box::new(NetworkLearner::new(progress, worlds, config))
         }
         LearnerKind::Decisions => {
             let saved = contents.map(|contents| Base::saved(contents, worlds.shape));
             let base = match saved.transpose().with_context(of_file)?.flatten() {
                 Some(base) => base,
-                None => base(training, info, worlds.shape)?,
+                None => base(spec, info, worlds.shape)?,
             };
-            let student = DecisionsStudent::new(base, contents, worlds, config);
-            Box::new(student.with_context(of_file)?)
+            let learner = DecisionsLearner::new(base, contents, worlds, config);
+            Box::new(learner.with_context(of_file)?)
         }
     })
 }
 
 /// What keeps the beliefs that decisions are learned on: a filter that was learned, or that of the server's model.
-fn base(training: &Training, info: &ServerInfo, shape: Shape) -> Result<Base> {
-    let (kind, config) = (training.config.decisions.estimator, &training.config);
+fn base(spec: &TrainingSpec, info: &ServerInfo, shape: Shape) -> Result<Base> {
+    let (kind, config) = (spec.config.decisions.estimator, &spec.config);
     if kind.is_learned() {
-        let filter = training.learned.filter(kind);
+        let filter = spec.learned.filter(kind);
         let filter = filter.context("decisions: expected a checkpoint of a filter, got none")?;
         let (expected, got) = (info.n_observations, filter.tables.dimensions.n_observations);
         ensure!(

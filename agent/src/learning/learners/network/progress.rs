@@ -5,8 +5,8 @@ use crate::estimation::Follower;
 use crate::learning::checkpoint::{
     Contents, check, check_belief, check_counts, check_numbers, wrong,
 };
+use crate::learning::learners::base::{Place, Worlds, place};
 use crate::learning::reward::RewardEstimate;
-use crate::learning::student::base::{Place, Worlds, place};
 use crate::policy::Policy;
 use crate::rollout::Rollout;
 use ::network::{

@@ -8,9 +8,9 @@ pub use self::saved::{LearnedDecisions, SavedDecisions};
 use self::saved::SavedRun;
 use crate::config::AgentConfig;
 use crate::learning::checkpoint::Contents;
-use crate::learning::learner::LearnedModel;
+use crate::learning::learners::base::{Learner, Worlds, without_truth};
+use crate::learning::learners::filter::fit::LearnedModel;
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::learning::student::base::{Student, Worlds, without_truth};
 use crate::policy::{EstimatorKind, PlannerKind, Policy, numbered_states};
 use crate::rollout::{Rollout, in_parallel, predict_all, see_all};
 use ::network::{Dqn, DqnShape, Track, Transition};
@@ -49,7 +49,7 @@ pub struct Base {
 }
 
 /// A DQN over options that learns on several worlds.
-pub struct DecisionsStudent {
+pub struct DecisionsLearner {
     worlds: Worlds,
     config: AgentConfig,
     base: Base,
@@ -117,7 +117,7 @@ impl Base {
     }
 }
 
-impl DecisionsStudent {
+impl DecisionsLearner {
     /// Before the first step, or going on from a checkpoint of decisions on such a base.
     pub fn new(
         base: Base,
@@ -126,7 +126,7 @@ impl DecisionsStudent {
         config: &AgentConfig,
     ) -> Result<Self> {
         let target = Target::State(base.target);
-        let mut student = Self {
+        let mut learner = Self {
             policy: Policy::new("decisions", base.kind, PlannerKind::Beam, target),
             base,
             dqn: Dqn::new(config.decisions.settings(), SHAPE, config.seed),
@@ -140,9 +140,9 @@ impl DecisionsStudent {
             config: config.clone(),
         };
         if let Some(contents) = contents {
-            student.load(contents)?;
+            learner.load(contents)?;
         }
-        Ok(student)
+        Ok(learner)
     }
 
     /// An agent before it takes in what its world shows.
@@ -237,7 +237,7 @@ impl Run {
     }
 }
 
-impl Student for DecisionsStudent {
+impl Learner for DecisionsLearner {
     fn kind(&self) -> &'static str {
         KIND
     }

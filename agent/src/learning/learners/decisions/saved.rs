@@ -1,11 +1,11 @@
 //! Decisions in a checkpoint: the DQN, what the belief's filter learned, and where the robots are.
 
-use super::{Base, DecisionsStudent, Held, Run, SHAPE};
+use super::{Base, DecisionsLearner, Held, Run, SHAPE};
 use crate::learning::checkpoint::{
     Contents, check, check_belief, check_counts, check_numbers, wrong,
 };
-use crate::learning::learner::LearnedModel;
-use crate::learning::student::base::{Place, place};
+use crate::learning::learners::base::{Place, place};
+use crate::learning::learners::filter::fit::LearnedModel;
 use crate::policy::EstimatorKind;
 use crate::rollout::Rollout;
 use ::network::{Dqn, NamedTensor, SavedDqn, Track};
@@ -137,7 +137,7 @@ impl SavedDecisions {
     }
 }
 
-impl DecisionsStudent {
+impl DecisionsLearner {
     pub(super) fn saved(&self) -> Contents {
         let runs = self.runs.iter().map(Run::saved);
         let model = self.base.model.as_ref();

@@ -1,6 +1,7 @@
 //! Learns the filter's parameters on several worlds at once: robots walk at random first, then plan on
 //! the belief of the filter as it is.
 
+pub mod fit;
 mod saved;
 
 pub use self::saved::SavedFilter;
@@ -8,9 +9,9 @@ pub use self::saved::SavedFilter;
 use self::saved::SavedWorld;
 use crate::config::AgentConfig;
 use crate::learning::checkpoint::Contents;
-use crate::learning::learner::{LearnedModel, Learner};
+use crate::learning::learners::base::{Learner, Worlds, without_truth};
+use crate::learning::learners::filter::fit::{FilterFit, LearnedModel};
 use crate::learning::metrics::{ModelUpdate, Tick};
-use crate::learning::student::base::{Student, Worlds, without_truth};
 use crate::policy::{EstimatorKind, PlannerKind, Policy, numbered_states};
 use crate::rollout::{Rollout, in_parallel, predict_all, see_all};
 use anyhow::Result;
@@ -23,10 +24,10 @@ use protocol::{Move, path};
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-pub struct FilterStudent {
+pub struct FilterLearner {
     worlds: Worlds,
     config: AgentConfig,
-    learner: Learner,
+    fit: FilterFit,
     learned: LearnedModel,
     rollouts: Vec<Rollout>,
     /// What was planned last, of each robot: its belief then, and its path.
@@ -38,11 +39,11 @@ pub struct FilterStudent {
     learning: Duration,
 }
 
-impl FilterStudent {
-    /// A student before its first frame.
+impl FilterLearner {
+    /// A learner before its first frame.
     pub fn new(dimensions: Dimensions, worlds: Worlds, config: &AgentConfig) -> Self {
-        let learner = Learner::new(dimensions, worlds.shape, config);
-        Self::of(learner, BTreeMap::new(), worlds, config)
+        let fit = FilterFit::new(dimensions, worlds.shape, config);
+        Self::of(fit, BTreeMap::new(), worlds, config)
     }
 
     pub fn resume(
@@ -52,28 +53,28 @@ impl FilterStudent {
         config: &AgentConfig,
     ) -> Result<Self> {
         let SavedFilter {
-            learner,
+            fit,
             worlds: mut left,
         } = contents.state()?;
-        let shape = learner.trainer.shape;
-        let learner = Learner::resume(learner, contents, dimensions, worlds.shape, config)?;
+        let shape = fit.optimiser.shape;
+        let fit = FilterFit::resume(fit, contents, dimensions, worlds.shape, config)?;
         let mut all = left.values();
         all.try_for_each(|world| world.check(dimensions.n_states, shape))?;
         if shape != worlds.shape {
             left.clear();
         }
-        Ok(Self::of(learner, left, worlds, config))
+        Ok(Self::of(fit, left, worlds, config))
     }
 
     fn of(
-        learner: Learner,
+        fit: FilterFit,
         left: BTreeMap<u32, SavedWorld>,
         worlds: Worlds,
         config: &AgentConfig,
     ) -> Self {
         Self {
-            learned: learner.learned(),
-            learner,
+            learned: fit.learned(),
+            fit,
             left,
             worlds,
             config: config.clone(),
@@ -97,9 +98,9 @@ impl FilterStudent {
 
     /// A robot that has taken in what its world shows, with a track that begins there.
     fn begun(&mut self, world: u32, observation: Observation) -> Result<Rollout> {
-        self.learner.begin(world);
+        self.fit.begin(world);
         let frame = &observation.frame;
-        self.learner.see(world, frame, None, &self.learned);
+        self.fit.see(world, frame, None, &self.learned);
         let mut rollout = self.rollout_at(observation);
         rollout.correct()?;
         rollout.agent.predict();
@@ -116,22 +117,22 @@ impl FilterStudent {
         Policy::new(name, estimator, PlannerKind::Beam, target)
     }
 
-    /// Worlds whose robots walk at random: all at first, some for good; none of a frozen student.
+    /// Worlds whose robots walk at random: all at first, some for good; none of a frozen learner.
     fn n_walking(&self) -> usize {
         if self.is_frozen {
             return 0;
         }
         let learning = &self.config.learning;
-        if self.learner.world_steps < learning.explore_steps {
+        if self.fit.world_steps < learning.explore_steps {
             return self.rollouts.len();
         }
         (learning.explore_share * self.rollouts.len() as f64).round() as usize
     }
 }
 
-impl Student for FilterStudent {
+impl Learner for FilterLearner {
     fn kind(&self) -> &'static str {
-        self.learner.kind()
+        self.fit.kind()
     }
 
     fn columns(&self) -> &'static [&'static str] {
@@ -143,12 +144,11 @@ impl Student for FilterStudent {
         let mut n_gone_on = 0;
         if !SavedWorld::any_is_of(&self.left, worlds.clone(), &observations) {
             // Frames of other worlds, perhaps of another model.
-            self.learner.forget();
+            self.fit.forget();
         }
         for (world, observation) in worlds.zip(observations) {
             let left = self.left.get(&world);
-            let left =
-                left.filter(|left| left.is_of(&observation) && self.learner.has_track(world));
+            let left = left.filter(|left| left.is_of(&observation) && self.fit.has_track(world));
             let rollout = if let Some(left) = left {
                 let mut rollout = self.rollout_at(observation);
                 left.restore(&mut rollout.agent);
@@ -171,7 +171,7 @@ impl Student for FilterStudent {
     fn plan(&mut self) -> Vec<Vec<Move>> {
         let start = Instant::now();
         if !self.is_frozen {
-            self.learned = self.learner.learned();
+            self.learned = self.fit.learned();
         }
         let (n_walking, tables) = (self.n_walking(), &self.learned.tables);
         let objective = self.config.objective(&self.policy());
@@ -202,14 +202,14 @@ impl Student for FilterStudent {
             let (belief, observation) = (rollout.agent.belief(), rollout.observation());
             let reward = observation.robot.reward;
             let flight = path::fly(self.worlds.shape, turn.before.robot.cell(), &plan.moves);
-            self.learner
+            self.fit
                 .see(world, &observation.frame, Some(predictor), &self.learned);
-            self.learner.reward(belief, &flight.visited, reward);
+            self.fit.reward(belief, &flight.visited, reward);
             tick.reward += reward;
             tick.score += turn.score.unwrap_or_default();
         }
         tick.n_worlds = self.rollouts.len() as u64;
-        tick.world_steps = self.learner.world_steps;
+        tick.world_steps = self.fit.world_steps;
         Ok(tick)
     }
 
@@ -223,7 +223,7 @@ impl Student for FilterStudent {
 
     fn learn(&mut self) -> Result<Vec<ModelUpdate>> {
         let start = Instant::now();
-        let updates = self.learner.learn();
+        let updates = self.fit.learn();
         self.learning += start.elapsed();
         let update = |update: crate::learning::filter::Update| ModelUpdate {
             number: update.number,
@@ -239,11 +239,11 @@ impl Student for FilterStudent {
     }
 
     fn world_steps(&self) -> u64 {
-        self.learner.world_steps
+        self.fit.world_steps
     }
 
     fn n_updates(&self) -> u64 {
-        self.learner.n_updates()
+        self.fit.n_updates()
     }
 
     fn belief(&self) -> Option<(&Belief, usize)> {
@@ -255,8 +255,8 @@ impl Student for FilterStudent {
         let saved = self.rollouts.iter().map(SavedWorld::of);
         let worlds: BTreeMap<_, _> = self.worlds.numbers.clone().zip(saved).collect();
         // As `SavedFilter`, without a copy of the learner.
-        let state = (&self.learner, worlds);
-        Ok(Contents::new(self.learner.named_tensors(), &state))
+        let state = (&self.fit, worlds);
+        Ok(Contents::new(self.fit.named_tensors(), &state))
     }
 
     fn times(&self) -> Vec<(&'static str, Duration)> {

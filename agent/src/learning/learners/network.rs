@@ -15,9 +15,9 @@ use anyhow::Result;
 use crate::config::AgentConfig;
 use crate::estimation::{AutoencoderEstimator, Follower};
 use crate::learning::checkpoint::Contents;
+use crate::learning::learners::base::{Learner, Worlds, place, without_truth};
 use crate::learning::metrics::{ModelUpdate, Tick};
 use crate::learning::reward::met;
-use crate::learning::student::base::{Student, Worlds, place, without_truth};
 use crate::policy::{Policy, numbered_states};
 use crate::rollout::{Rollout, predict_all, see_all};
 use ::network::{Transition, Window};
@@ -31,7 +31,7 @@ pub const KIND: &str = "autoencoder";
 const COLUMNS: [&str; 5] = ["dqn_loss", "dqn_rate", "action", "action_value", "epsilon"];
 
 /// An autoencoder and a DQN that are learned.
-pub struct NetworkStudent {
+pub struct NetworkLearner {
     worlds: Worlds,
     config: AgentConfig,
     progress: Progress,
@@ -52,7 +52,7 @@ struct Decision {
     path: Vec<Move>,
 }
 
-impl NetworkStudent {
+impl NetworkLearner {
     /// Goes on from some progress, or begins.
     pub fn new(progress: Progress, worlds: Worlds, config: &AgentConfig) -> Self {
         Self {
@@ -153,7 +153,7 @@ impl NetworkStudent {
     }
 }
 
-impl Student for NetworkStudent {
+impl Learner for NetworkLearner {
     fn kind(&self) -> &'static str {
         KIND
     }

@@ -7,4 +7,4 @@ pub mod network;
 #[cfg(test)]
 mod tests;
 
-pub use self::base::{Student, Worlds};
+pub use self::base::{Learner, Worlds};

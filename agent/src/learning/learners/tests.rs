@@ -1,12 +1,12 @@
-//! Which belief students plan on.
+//! Which belief learners plan on.
 
 use crate::config::AgentConfig;
 use crate::learning::checkpoint::Contents;
-use crate::learning::learner::Learner;
-use crate::learning::student::decisions::{Base, DecisionsStudent};
-use crate::learning::student::filter::FilterStudent;
-use crate::learning::student::network::{NetworkStudent, Progress};
-use crate::learning::student::{Student, Worlds};
+use crate::learning::learners::decisions::{Base, DecisionsLearner};
+use crate::learning::learners::filter::FilterLearner;
+use crate::learning::learners::filter::fit::FilterFit;
+use crate::learning::learners::network::{NetworkLearner, Progress};
+use crate::learning::learners::{Learner, Worlds};
 use crate::policy::{EstimatorKind, PlannerKind, Policy};
 use crate::rollout::Robot;
 use emberwatch_belief::estimation::BayesFilter;
@@ -93,30 +93,30 @@ fn path(
 }
 
 /// One step: the path, and the posterior after its frame.
-fn fly(student: &mut impl Student, step: u64) -> (Vec<Move>, Belief) {
+fn fly(learner: &mut impl Learner, step: u64) -> (Vec<Move>, Belief) {
     let (mut path, mut posterior) = (Vec::new(), None);
     let mut fly = |paths: &[Vec<Move>]| {
         path = paths[0].clone();
         Ok(vec![observation(step)])
     };
     let mut look = |_: usize, robot: &Robot| posterior = Some(robot.agent.belief().clone());
-    student.step(&mut fly, &mut look).expect("possible");
+    learner.step(&mut fly, &mut look).expect("possible");
     (path, posterior.expect("a look"))
 }
 
-/// A frozen student must plan on one of the beliefs. `paths`: what it may choose among on a belief, where
+/// A frozen learner must plan on one of the beliefs. `paths`: what it may choose among on a belief, where
 /// a state pays most, at a step.
 fn check(
-    mut student: impl Student,
+    mut learner: impl Learner,
     basis: BasisKind,
     paths: impl Fn(&Belief, usize, u64) -> Vec<Vec<Move>>,
 ) {
-    student.freeze();
-    student.attach(vec![observation(0)]).expect("possible");
+    learner.freeze();
+    learner.attach(vec![observation(0)]).expect("possible");
     let (mut all, mut before) = ([true; 2], None);
     for step in 1..9 {
-        let (path, estimate) = fly(&mut student, step);
-        let (predictor, target) = student.belief().expect("a belief");
+        let (path, estimate) = fly(&mut learner, step);
+        let (predictor, target) = learner.belief().expect("a belief");
         let now = [&estimate, predictor].map(|belief| paths(belief, target, step));
         let Some(paths) = before.replace(now) else {
             continue;
@@ -129,7 +129,7 @@ fn check(
         BasisKind::Estimate => [true, false],
         BasisKind::Predictor => [false, true],
     };
-    assert_eq!(all, expected, "{}, {basis:?}", student.kind());
+    assert_eq!(all, expected, "{}, {basis:?}", learner.kind());
 }
 
 #[test]
@@ -142,8 +142,8 @@ fn students_plan_on_the_belief_that_settings_say() {
             kernel: (3, 3),
             sees_own_state: false,
         };
-        let student = FilterStudent::new(dimensions, worlds(), config);
-        check(student, basis, |belief, target, step| {
+        let learner = FilterLearner::new(dimensions, worlds(), config);
+        check(learner, basis, |belief, target, step| {
             let policy = learned_beam();
             let objective = Objective {
                 target: Target::State(target),
@@ -152,8 +152,8 @@ fn students_plan_on_the_belief_that_settings_say() {
             vec![path(config, &policy, objective, belief, step)]
         });
         let progress = Progress::first(&worlds(), config, &::network::Device::Cpu);
-        let student = NetworkStudent::new(progress.expect("a network"), worlds(), config);
-        check(student, basis, |belief, _, step| {
+        let learner = NetworkLearner::new(progress.expect("a network"), worlds(), config);
+        check(learner, basis, |belief, _, step| {
             let choices = Policy::network_choices(3);
             let path = |choice| path(config, choice, config.objective(choice), belief, step);
             choices.iter().map(path).collect()
@@ -161,7 +161,7 @@ fn students_plan_on_the_belief_that_settings_say() {
         let model = Model::wildfire();
         let filter = BayesFilter::known(&model, Belief::uniform(3, worlds().shape)).expect("valid");
         let base = Base::known(EstimatorKind::KnownModel, filter, &model);
-        let student = DecisionsStudent::new(base, None, worlds(), config).expect("new");
+        let learner = DecisionsLearner::new(base, None, worlds(), config).expect("new");
         // The robot remembers what every step showed, and never earns.
         let memory = |step: u64| {
             let mut memory = Memory::new(worlds().shape);
@@ -173,7 +173,7 @@ fn students_plan_on_the_belief_that_settings_say() {
             });
             memory
         };
-        check(student, basis, |belief, target, step| {
+        check(learner, basis, |belief, target, step| {
             let outlook = Outlook::new(belief, target, &memory(step + 1), worlds().n_moves);
             let mut planner = OptionPlanner::new(config.decisions.beam_width);
             let paths = planner.propose(&outlook, ROBOT).into_iter();
@@ -183,12 +183,12 @@ fn students_plan_on_the_belief_that_settings_say() {
 }
 
 /// What a checkpoint of decisions holds after so many steps in a row.
-fn learn(student: &mut DecisionsStudent, steps: std::ops::Range<u64>) -> Contents {
+fn learn(learner: &mut DecisionsLearner, steps: std::ops::Range<u64>) -> Contents {
     for step in steps {
-        fly(student, step);
-        student.learn().expect("finite");
+        fly(learner, step);
+        learner.learn().expect("finite");
     }
-    student.contents().expect("whole")
+    learner.contents().expect("whole")
 }
 
 #[test]
@@ -205,21 +205,21 @@ fn decisions_resume_bit_for_bit() {
             kernel: (3, 3),
             sees_own_state: kind.sees_own_state(),
         };
-        let learned = Learner::new(dimensions, worlds().shape, &config).learned();
+        let learned = FilterFit::new(dimensions, worlds().shape, &config).learned();
         let base = Base::learned(kind, learned, worlds().shape);
-        let mut student = DecisionsStudent::new(base, None, worlds(), &config).expect("new");
-        student.attach(vec![observation(0)]).expect("possible");
-        let left = learn(&mut student, 1..20);
+        let mut learner = DecisionsLearner::new(base, None, worlds(), &config).expect("new");
+        learner.attach(vec![observation(0)]).expect("possible");
+        let left = learn(&mut learner, 1..20);
         let base = Base::saved(&left, worlds().shape)
             .expect("whole")
             .expect("a filter");
-        let resumed = DecisionsStudent::new(base, Some(&left), worlds(), &config);
+        let resumed = DecisionsLearner::new(base, Some(&left), worlds(), &config);
         let mut resumed = resumed.expect("its own");
         let n_gone_on = resumed.attach(vec![observation(19)]).expect("possible");
         assert_eq!(n_gone_on, 1);
-        let contents = [&mut student, &mut resumed].map(|student| learn(student, 20..40));
+        let contents = [&mut learner, &mut resumed].map(|learner| learn(learner, 20..40));
         assert!(
-            contents[0] == contents[1] && student.n_updates() > 20,
+            contents[0] == contents[1] && learner.n_updates() > 20,
             "{kind:?}"
         );
     }

@@ -1,6 +1,6 @@
 //! Connections of this program, and what a server tells on one without a lease.
 
-use crate::server::errors::is_away;
+use crate::client::errors::is_away;
 use protocol::Connection;
 use protocol::channels::Instance;
 use protocol::client::STEP_TIMEOUT;

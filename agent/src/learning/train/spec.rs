@@ -3,9 +3,9 @@
 use crate::config::{AgentConfig, LearnerKind};
 use crate::learning::checkpoint::{self, Contents};
 use crate::learning::learned::Learned;
-use crate::learning::learner;
-use crate::learning::student::filter::SavedFilter;
-use crate::learning::student::{Student, decisions, network};
+use crate::learning::learners::filter::SavedFilter;
+use crate::learning::learners::filter::fit;
+use crate::learning::learners::{Learner, decisions, network};
 use ::network::Device;
 use anyhow::{Context, Result, anyhow, bail, ensure};
 use protocol::connection::ConnectionError;
@@ -18,7 +18,7 @@ use std::time::Duration;
 pub const CHECKPOINT: &str = "checkpoint.safetensors";
 
 #[derive(Debug, Clone)]
-pub struct Training {
+pub struct TrainingSpec {
     /// The worlds, with all their robots.
     pub worlds: Range<u32>,
     pub takeover: bool,
@@ -35,7 +35,7 @@ pub struct Training {
     pub learned: Learned,
 }
 
-impl Training {
+impl TrainingSpec {
     /// Checks folder and number of worlds, before a server is held or started for them; returns the
     /// contents of the checkpoint to go on from.
     pub fn check(&self) -> Result<Option<Contents>> {
@@ -47,8 +47,8 @@ impl Training {
         );
         let n_worlds = self.worlds.len();
         let kind = match self.config.learner {
-            LearnerKind::Filter => learner::KIND,
-            LearnerKind::OwnFilter => learner::OWN_KIND,
+            LearnerKind::Filter => fit::KIND,
+            LearnerKind::OwnFilter => fit::OWN_KIND,
             LearnerKind::Autoencoder if n_worlds != 1 => {
                 bail!(
                     "--worlds: expected 1 for the autoencoder, which follows one world, got {n_worlds}"
@@ -82,7 +82,7 @@ impl Training {
         };
         filter.resume = self.resume && filter.out.join(CHECKPOINT).exists();
         let learned = match filter.check()? {
-            Some(contents) => contents.state::<SavedFilter>()?.learner.world_steps,
+            Some(contents) => contents.state::<SavedFilter>()?.fit.world_steps,
             None => 0,
         };
         filter.steps = decisions.filter_steps.saturating_sub(learned);
@@ -109,14 +109,14 @@ impl Training {
         Ok(first..end)
     }
 
-    /// The error for a student that cannot go on; what it learned is saved when training ends.
-    pub(super) fn stopped(&self, problem: anyhow::Error, student: &dyn Student) -> anyhow::Error {
+    /// The error for a learner that cannot go on; what it learned is saved when training ends.
+    pub(super) fn stopped(&self, problem: anyhow::Error, learner: &dyn Learner) -> anyhow::Error {
         if problem.is::<ConnectionError>() {
             return problem;
         }
         anyhow!(
             "after {} world steps: {problem:#}; what was learned before is in {}",
-            student.world_steps(),
+            learner.world_steps(),
             self.out.join(CHECKPOINT).display()
         )
     }

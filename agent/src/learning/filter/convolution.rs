@@ -15,7 +15,7 @@ const WIDE: usize = 4;
 
 /// `to[m] = base[m] + sum_n sum_a w[m, n, a] from[n, . + a]`.
 #[derive(Debug, Clone)]
-pub(super) struct Correlation {
+pub(super) struct Convolution {
     layout: Layout,
     n_from: usize,
     /// `w[to, from, row, col]`.
@@ -32,7 +32,7 @@ pub(super) enum Base<'a> {
     Planes,
 }
 
-impl Correlation {
+impl Convolution {
     pub(super) fn new(layout: Layout, n_from: usize, weights: Vec<f32>) -> Self {
         Self {
             layout,
