@@ -135,7 +135,7 @@ fn filter(contents: &Contents, sees_own_state: bool) -> Result<LearnedModel> {
     let mut saved = contents.state::<SavedFilter>()?.fit;
     let dimensions = Dimensions {
         sees_own_state,
-        ..saved.trainer.dimensions()
+        ..saved.optimiser.dimensions()
     };
     let dimensions = dimensions.check();
     let dimensions = dimensions.map_err(|error| wrong("dimensions", "those of a filter", error))?;
