@@ -146,7 +146,9 @@ class WildfireEnv(WorldEnv):
         """Begins an episode; see the class, *Starting State*."""
         self._answer = answer = self._begin(seed, options)
         self._observations.reset(ONE_ROW, answer.frames)
-        return self._seen(answer, answer.result())
+        seen = self._seen(answer, answer.result())
+        self._session.finish()
+        return seen
 
     def step(
         self, action: NDArray[np.integer[Any]]
@@ -160,6 +162,7 @@ class WildfireEnv(WorldEnv):
             RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
         """
         moves = as_moves(action, 1, self._spec.n_moves)
+        self._session.begin_step()
         self._answer = answer = self._session.step(moves)
         self._update(self._observations, answer)
         result = answer.result()
@@ -167,6 +170,7 @@ class WildfireEnv(WorldEnv):
             self._trace(result.robot, moves.reshape(-1))
         observation, info = self._seen(answer, result)
         reward, world = paid(result, self._pays), result.world
+        self._session.finish()
         return observation, reward, bool(world.terminated), bool(world.truncated), info
 
     def _seen(self, answer: StepAnswer, result: StepResult) -> tuple[Any, dict[str, Any]]:

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from emberwatch.base import NOTHING_TO_DRAW
+from emberwatch.base import NOTHING_TO_DRAW, as_options
 from emberwatch.env import WildfireVectorEnv
 from emberwatch.errors import InvalidArgumentError, invalid
 from emberwatch.moves_env import MovesReward, WildfireMovesVectorEnv
@@ -100,7 +100,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         """Begins an episode; of the options, only `resume` counts, see `WildfireEnv`."""
-        known = {key: value for key, value in (options or {}).items() if key == "resume"}
+        known = {key: value for key, value in as_options(options).items() if key == "resume"}
         seen, infos = self._worlds.reset(seed=seed, options=known)
         self.agents = list(self.possible_agents)
         return self._by_agent(seen), self._infos(infos)

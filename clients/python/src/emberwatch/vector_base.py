@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from emberwatch.agent_session import Summaries
 from emberwatch.arguments import as_seed
-from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, wants_to_resume
+from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, as_options, wants_to_resume
 from emberwatch.errors import invalid
 from emberwatch.observations import Observations, cells_of, of_row
-from emberwatch.session import Session, SessionOwner
+from emberwatch.owner import SessionOwner
+from emberwatch.session import Session
 from emberwatch.settings import Settings, draw_seed
 from emberwatch.view import View, fly
 from emberwatch.wire import RESULT_DTYPE, StepAnswer
@@ -84,20 +85,27 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
             options: `reset_mask`, `(num_envs,)` booleans, at least one true, the same for all
                 robots of a world; or `resume`, see `WildfireEnv`.
         """
-        rest = dict(options or {})
+        rest = as_options(options)
         mask = self._check_mask(rest.pop("reset_mask", None))
         seeds = self._check_seeds(seed)
         resumes = wants_to_resume(rest, seed)
         if not mask.all() and not self.is_open:
             raise gymnasium.error.ResetNeeded("reset_mask: expected a reset of all worlds before")
+        if not mask.all() and self._session.is_unfinished:
+            raise gymnasium.error.ResetNeeded(
+                "reset_mask: expected all worlds, as an earlier step or reset did not finish"
+            )
         self.closed = False
+        self._session.begin_reset()
         chosen = np.flatnonzero(mask).tolist()
         if resumes:
             self._take(self._session.resume())
             self._reset_episodes(chosen)
         else:
             self._restart(chosen, seeds)
-        return self._seen(), self._infos(mask)
+        outcome = self._seen(), self._infos(mask)
+        self._session.finish()
+        return outcome
 
     def step(
         self, actions: NDArray[np.integer[Any]]
@@ -115,13 +123,16 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
                 f"rows {np.flatnonzero(over).tolist()}: the episode is over; reset with "
                 "options={'reset_mask': ...}"
             )
+        self._session.begin_step()
         flown = ~over
         self._exchanged = np.zeros_like(flown)
         rewards = self._fly(chosen, flown)
         self._elapsed += flown
         if over.any():
             self._restart(np.flatnonzero(over).tolist(), [None] * self._session.n_worlds)
-        return self._outcome(flown, rewards)
+        outcome = self._outcome(flown, rewards)
+        self._session.finish()
+        return outcome
 
     def render(self) -> tuple[Any, ...] | None:
         """The picture of each robot, as `WildfireEnv.render` draws it."""

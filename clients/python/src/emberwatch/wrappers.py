@@ -4,6 +4,8 @@ A frame shows a path; the belief is what all frames so far say about every cell.
 without memory, the belief is the better observation.
 """
 
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, SupportsFloat
 
@@ -15,7 +17,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from emberwatch.belief import Filter
-from emberwatch.errors import InvalidArgumentError, invalid
+from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.model import Model
 from emberwatch.prior import PriorKind, prior_of
 
@@ -85,27 +87,43 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
     def filter(self) -> Filter:
         """The filter of the current episode, for its entropy or its belief in double precision."""
         if self._filter is None:
-            raise gymnasium.error.ResetNeeded("BeliefObservation: call reset before anything else")
+            raise gymnasium.error.ResetNeeded(
+                "BeliefObservation: call reset first, also after a step that did not finish"
+            )
         return self._filter
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        observation, info = self.env.reset(seed=seed, options=options)
+        with self._between():
+            observation, info = self.env.reset(seed=seed, options=options)
         self._step = int(info.get("step", 0))
-        self._filter = Filter(self._model, prior=self._prior)
-        self._filter.correct(_frame_of(observation))  # empty, but where an episode is resumed
+        belief = Filter(self._model, prior=self._prior)
+        belief.correct(_frame_of(observation))  # empty, but where an episode is resumed
+        self._filter = belief
         return self._observe(observation), info
 
     def step(self, action: ActType) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         belief = self.filter
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        with self._between():
+            observation, reward, terminated, truncated, info = self.env.step(action)
         before, self._step = self._step, int(info.get("step", self._step + 1))
         for _ in range(before, self._step):
             belief.predict()
         if self._step > before:
             belief.correct(_frame_of(observation))
+        self._filter = belief
         return self._observe(observation), reward, terminated, truncated, info
+
+    @contextmanager
+    def _between(self) -> Generator[None]:
+        """Without a belief until what the environment does now is taken in; a refusal keeps it."""
+        belief, self._filter = self._filter, None
+        try:
+            yield
+        except (EmberwatchError, gymnasium.error.Error):
+            self._filter = belief
+            raise
 
     def _observe(self, observation: Any) -> Any:
         belief: NDArray[Any] = self.filter.belief
