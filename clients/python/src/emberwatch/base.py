@@ -40,7 +40,7 @@ Reward: TypeAlias = Literal["share", "team", "marginal"]
 ONE_ROW: Final = np.ones(1, np.bool_)
 
 
-class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):
+class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """One robot of a private or a running server."""
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]

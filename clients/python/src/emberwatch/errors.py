@@ -3,7 +3,7 @@
 Subclasses exist only where a caller acts differently.
 """
 
-from typing import Final
+from typing import Final, Self
 
 
 class EmberwatchError(Exception):
@@ -20,7 +20,9 @@ class EmberwatchError(Exception):
 
     code: str = "unknown"
 
-    def __init__(self, message: str, code: str | None = None, detail: int = 0) -> None:
+    def __init__(self, message: str | Self, code: str | None = None, detail: int = 0) -> None:
+        if isinstance(message, EmberwatchError):  # made again, as `AsyncVectorEnv` does
+            message, code, detail = str(message), code or message.code, detail or message.detail
         super().__init__(message)
         self.code = code or self.code
         self.detail = detail

@@ -1,7 +1,11 @@
 """What environments of one world and of many tell of their session."""
 
+from copy import copy
 from typing import Any
 
+from gymnasium.envs.registration import EnvSpec
+
+from emberwatch.arguments import as_json
 from emberwatch.model import Model
 from emberwatch.session import Session
 from emberwatch.settings import WorldSpec
@@ -11,6 +15,18 @@ class SessionOwner:
     """What environments of one world and of many tell of their session."""
 
     _session: Session
+    _made_by: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What `gymnasium.make` made it of; its keywords are as JSON has them."""
+        return self._made_by
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._made_by = made_by = copy(spec)
+        if made_by is not None:
+            made_by.kwargs = as_json(made_by.kwargs)
 
     @property
     def model(self) -> Model | None:
@@ -44,10 +60,15 @@ class SessionOwner:
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies, which only a closed environment has: no two may act on the same worlds."""
-        if self.is_open:
-            raise TypeError(
-                f"copy or pickle: expected a closed environment, got a {type(self).__name__} "
-                "that acts on a server's worlds: close it first, or make another with "
-                "gymnasium.make(env.spec); Client.snapshot and Lease.fork copy worlds"
-            )
-        return vars(self).copy()
+        return state_of(self, self.is_open, "gymnasium.make(env.spec)")
+
+
+def state_of(environment: object, is_open: bool, maker: str) -> dict[str, Any]:
+    """What a copy or a pickle of a closed environment holds; `maker` is how to make another."""
+    if is_open:
+        raise TypeError(
+            f"copy or pickle: expected a closed environment, got a {type(environment).__name__} "
+            f"that acts on a server's worlds: close it first, or make another with {maker}; "
+            "Client.snapshot and Lease.fork copy worlds"
+        )
+    return vars(environment).copy()

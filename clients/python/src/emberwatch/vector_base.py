@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from emberwatch.agent_session import Summaries
-from emberwatch.arguments import as_seed
+from emberwatch.arguments import as_array, as_integer, as_seed
 from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, as_options, wants_to_resume
 from emberwatch.errors import invalid
 from emberwatch.observations import Observations, cells_of, of_row
@@ -27,7 +27,9 @@ from emberwatch.view import View, fly
 from emberwatch.wire import RESULT_DTYPE, StepAnswer
 
 
-class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]):
+class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
+    SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDArray[Any]]
+):
     """Many robots, stepped together."""
 
     # Until it is made: Gymnasium 1.2 closes what failed to be made, too.
@@ -306,9 +308,12 @@ class WorldVectorEnv(SessionOwner, VectorEnv[Any, NDArray[np.integer[Any]], NDAr
         if seed is None:
             return [None] * n_worlds
         # Checked before any world's generator is replaced.
-        if isinstance(seed, int | np.integer):
-            return [as_seed(int(seed) + world) for world in range(n_worlds)]
-        if not hasattr(seed, "__len__") or len(seed) != self.num_envs:
+        first = as_integer(seed)
+        if first is not None:
+            return [as_seed(first + world) for world in range(n_worlds)]
+        if isinstance(seed, np.ndarray):
+            seed = as_array(seed, "seed", "integers").tolist()
+        if not isinstance(seed, Sequence) or len(seed) != self.num_envs:
             raise invalid("seed", f"an integer, None or {self.num_envs} of them", repr(seed))
         seeds = [None if one is None else as_seed(one) for one in seed]
         return seeds[:: self._spec.n_robots]

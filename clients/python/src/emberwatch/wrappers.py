@@ -14,8 +14,9 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.core import ActType
 from gymnasium.utils import RecordConstructorArgs
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from emberwatch.arguments import as_json
 from emberwatch.belief import Filter
 from emberwatch.errors import EmberwatchError, InvalidArgumentError, invalid
 from emberwatch.model import Model
@@ -54,8 +55,8 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 
     ## Arguments
     `env` observes the frame, a `Box` of shape (H, W, 1) and type uint8, or a `Dict` with
-    ``"frame"``. `model`, a `Model`, its name or the path of its file, is for servers that do not
-    reveal theirs; else it is ``env.unwrapped.model``.
+    ``"frame"``. `model`, a `Model`, its name, or the path or the text of its file, is for servers
+    that do not reveal theirs; else it is ``env.unwrapped.model``.
     """
 
     def __init__(
@@ -64,10 +65,13 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
         *,
         keep: bool = False,
         dtype: Literal["float32", "uint8"] = "float32",
-        prior: PriorKind | NDArray[np.floating] | None = None,
+        prior: PriorKind | ArrayLike | None = None,
         model: Model | str | Path | None = None,
     ) -> None:
-        RecordConstructorArgs.__init__(self, keep=keep, dtype=dtype, prior=prior, model=model)
+        text = model.toml if isinstance(model, Model) else as_json(model)
+        RecordConstructorArgs.__init__(
+            self, keep=keep, dtype=dtype, prior=as_json(prior), model=text
+        )
         gymnasium.Wrapper.__init__(self, env)  # pyright: ignore[reportUnknownMemberType]
         if dtype not in ("float32", "uint8"):
             raise invalid("dtype", "'float32' or 'uint8'", repr(dtype))
@@ -148,6 +152,8 @@ class BeliefObservation(gymnasium.Wrapper[Any, ActType, Any, ActType], RecordCon
 def _model_of(env: gymnasium.Env[Any, Any], model: Model | str | Path | None) -> Model:
     if isinstance(model, Model):
         return model
+    if isinstance(model, str) and "\n" in model:
+        return Model.from_toml(model)
     if model is not None:
         return Model.named(model)
     revealed = getattr(env.unwrapped, "model", None)
