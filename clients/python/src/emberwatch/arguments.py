@@ -4,7 +4,7 @@ import operator
 from collections.abc import Iterable, Mapping
 from enum import Enum
 from os import PathLike, fspath
-from typing import Any, SupportsIndex, cast
+from typing import Any, SupportsIndex, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,13 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 from emberwatch import wire
 from emberwatch.errors import invalid
 
+_Value = TypeVar("_Value")
+
 
 def as_seed(seed: object) -> int:
     """Checks a world's seed: an integer of Python, NumPy or another library."""
     number = as_integer(seed)
     if number is not None and 0 <= number < 2**64:
         return number
-    raise invalid("seed", "an integer within 0 to 2**64 - 1", _told(seed))
+    raise invalid("seed", "an integer within 0 to 2**64 - 1", told(seed))
 
 
 def as_integer(value: object) -> int | None:
@@ -36,13 +38,22 @@ def as_seeds(
 ) -> list[dict[str, int | None]]:
     """Checks the seeds of a reset, one for each world, and names them as its request does."""
     chosen = list(worlds)
-    given = [None] * len(chosen) if seeds is None else list(seeds)
+    given = [None] * len(chosen) if seeds is None else as_list(seeds, "seeds")
     if len(given) != len(chosen):
         raise invalid("seeds", len(chosen), len(given))
     return [
         {"world": world, "seed": None if seed is None else as_seed(seed)}
         for world, seed in zip(chosen, given, strict=True)
     ]
+
+
+def as_list(values: Iterable[_Value], subject: str) -> list[_Value]:
+    """What a caller gives for each world."""
+    try:
+        return list(values)
+    except Exception as error:  # of any kind, as of `as_array`
+        got = f"{type(values).__name__}: {error}"
+        raise invalid(subject, "one for each world", got) from None
 
 
 def as_array(value: object, subject: str, expected: str) -> NDArray[Any]:
@@ -65,7 +76,7 @@ def _is_masked(value: object) -> bool:
     return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(cast("Any", value)))
 
 
-def _told(value: object) -> str:
+def told(value: object) -> str:
     """What a caller gave, or what it says instead of showing itself."""
     try:
         return repr(value)
@@ -94,7 +105,7 @@ def as_choice(action: object, n_choices: int) -> int:
     given = as_array(action, "action", expected)
     if given.size == 1 and given.dtype.kind in "iu" and 0 <= int(given.item()) < n_choices:
         return int(given.item())
-    raise invalid("action", expected, _told(action))
+    raise invalid("action", expected, told(action))
 
 
 def as_choices(actions: object, n_worlds: int, n_choices: int) -> NDArray[np.uint8]:

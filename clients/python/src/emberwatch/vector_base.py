@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from emberwatch.agent_session import Summaries
-from emberwatch.arguments import as_array, as_integer, as_seed
+from emberwatch.arguments import as_array, as_integer, as_seed, told
 from emberwatch.base import NOTHING_TO_DRAW, REPORTED, WorldEnv, as_options, wants_to_resume
 from emberwatch.errors import invalid
 from emberwatch.observations import Observations, cells_of, of_row
@@ -314,7 +314,7 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         if isinstance(seed, np.ndarray):
             seed = as_array(seed, "seed", "integers").tolist()
         if not isinstance(seed, Sequence) or len(seed) != self.num_envs:
-            raise invalid("seed", f"an integer, None or {self.num_envs} of them", repr(seed))
+            raise invalid("seed", f"an integer, None or {self.num_envs} of them", told(seed))
         seeds = [None if one is None else as_seed(one) for one in seed]
         return seeds[:: self._spec.n_robots]
 
@@ -323,8 +323,9 @@ class WorldVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         if mask is None:
             return np.ones(shape, np.bool_)
         got = f"{mask.dtype} {mask.shape}" if hasattr(mask, "dtype") else repr(mask.__class__)
-        if got != f"bool {shape}" or not mask.any():
-            raise invalid("reset_mask", f"an array {shape} of bool with at least one True", got)
+        if got != f"bool {shape}" or np.ma.is_masked(mask) or not mask.any():
+            expected = f"an array {shape} of bool with at least one True, none masked"
+            raise invalid("reset_mask", expected, got)
         worlds = mask.reshape(-1, self._spec.n_robots)
         if (worlds.any(axis=1) != worlds.all(axis=1)).any():
             raise invalid("reset_mask", "all robots of a world or none", "some")
