@@ -79,7 +79,7 @@ class WildfireEnv(WorldEnv):
     seed: `reset(seed=s)` begins the same episode here, in the vector environment and in Rust. A
     reset without a seed draws the next one from `np_random`. The robot is at `start`, and nothing
     has been observed. `reset(options={"resume": True})` begins nothing but goes on from
-    where the world stands, such as after another agent.
+    where the world stands, such as after another agent, or after a step that was interrupted.
 
     ## Episode End
 
@@ -160,6 +160,8 @@ class WildfireEnv(WorldEnv):
             LeaseLostError: If another client took the world over.
             ServerGoneError: If the server has ended; the next reset starts or finds another.
             RequestTimeoutError: If it does not answer; the world may have moved: reset or resume.
+            EmberwatchError: With code `"interrupted"` if an earlier step or reset did not finish,
+                as after Ctrl-C: reset or resume. Nothing is sent.
         """
         moves = as_moves(action, 1, self._spec.n_moves)
         self._session.begin_step()

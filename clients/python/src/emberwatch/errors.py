@@ -11,8 +11,9 @@ class EmberwatchError(Exception):
 
     Attributes:
         code: The cause. A refusal has the name of its status (PROTOCOL.md section 5), such as
-            `"busy"`, and changed nothing in the world. Others: `"closed"`, `"forked"` (shared
-            memory does not survive `fork`), `"channel"` (iceoryx2 failed), `"bad_answer"` (client
+            `"busy"`, and changed nothing in the world. Others: `"closed"`, `"interrupted"` (an
+            earlier step or reset did not finish: reset or resume), `"forked"` (shared memory does
+            not survive `fork`), `"channel"` (iceoryx2 failed), `"bad_answer"` (client
             and server are not of one release), `"program"` (could not be started, or failed),
             `"impossible_frame"`, `"recording"`.
         detail: The number that comes with a refusal; its meaning depends on the status.
