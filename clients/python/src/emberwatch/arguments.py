@@ -122,7 +122,8 @@ def as_choices(actions: object, n_worlds: int, n_choices: int) -> NDArray[np.uin
 
 def as_moves(paths: ArrayLike, n_worlds: int, n_moves: int) -> NDArray[np.uint8]:
     """Checks paths, `(n_worlds, T)` or for one world `(T,)`, and makes them bytes."""
-    given = as_array(paths, "action", "an array of moves")
+    is_read = type(paths) is np.ndarray
+    given = paths if is_read else as_array(paths, "action", "an array of moves")
     if given.shape != (n_worlds, n_moves) and (n_worlds != 1 or given.shape != (n_moves,)):
         one = f" or ({n_moves},)" if n_worlds == 1 else ""
         raise invalid("action", f"shape ({n_worlds}, {n_moves}){one}", given.shape)

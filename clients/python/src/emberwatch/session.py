@@ -46,9 +46,10 @@ _SHUTDOWN_TIMEOUT: Final = 0.5
 #: After these the worlds are no longer held, or stand elsewhere than expected.
 LOST: Final = (LeaseLostError, RequestTimeoutError, ServerGoneError)
 
-#: Why a step or reset of the environment has not finished: the error's code, and its words.
-_INTERRUPTED: Final = "interrupted", "step or reset did not finish (Ctrl-C or an error)"
-_TIMED_OUT: Final = "closed", "step timed out"
+#: Why there is no next step: the error's code, and its words.
+_INTERRUPTED: Final = "interrupted", "an earlier step or reset did not finish (Ctrl-C or an error)"
+_TIMED_OUT: Final = "closed", "an earlier step timed out"
+_CLOSED: Final = "closed", "the environment is closed"
 
 
 class Session:
@@ -68,8 +69,8 @@ class Session:
         self._program: Program | None = None
         self._truth: Newest[Truth] | None = None
         self._has_warned = False
-        #: Why the last step or reset has not finished, so that the worlds may have moved unseen.
-        self._unfinished: tuple[str, str] | None = None
+        #: Why there is no next step, such as one that did not finish: worlds may have moved unseen.
+        self._unfinished: tuple[str, str] | None = _CLOSED
         #: Whether the worlds may have moved since it began: a refusal alone changes nothing.
         self._has_moved = False
         #: Whether the server may still have a request of an unfinished step or reset.
@@ -105,22 +106,15 @@ class Session:
         return self._lease is not None
 
     def begin_step(self) -> None:
-        """Refuses a step after one that did not finish."""
-        if not self.is_open:
-            raise not_reset()
+        """Refuses a step before a reset, and after what did not finish."""
         if self._unfinished is not None:
-            code, words = self._unfinished
-            raise EmberwatchError(
-                f"an earlier {words}, and the world may have moved: reset, or go on from "
-                "where it stands with reset(options={'resume': True})",
-                code,
-            )
+            raise self._no_step()
         self._has_moved = False
         self._unfinished = _INTERRUPTED
 
     def begin_reset(self) -> None:
         """Before a reset of all worlds, or of some."""
-        self._is_torn = self._has_moved = self.is_open and self._unfinished is not None
+        self._is_torn = self._has_moved = self.is_unfinished
         self._unfinished = _INTERRUPTED
 
     def finish(self) -> None:
@@ -129,8 +123,8 @@ class Session:
 
     @property
     def is_unfinished(self) -> bool:
-        """Whether only a reset of all worlds, or resuming, can go on."""
-        return self.is_open and self._unfinished is not None
+        """Whether worlds may have moved unseen: then all are reset, or resumed."""
+        return self._unfinished not in (None, _CLOSED)
 
     def resume(self) -> StepAnswer:
         """Goes on from where the worlds stand, such as after another agent."""
@@ -224,6 +218,7 @@ class Session:
 
         May be called again, also after it was interrupted.
         """
+        self._unfinished = _CLOSED
         lease, self._lease = self._lease, None
         client, program = self._client, self._program
         try:
@@ -262,7 +257,8 @@ class Session:
             if settings.truth:
                 self._truth = Newest(partial(TruthReader, client.instance), self._worlds)
             self._hold(client)  # the last, as it is open from then on
-            self._is_torn = False
+            self._is_torn, self._has_moved = False, True
+            self._unfinished = _INTERRUPTED
         except BaseException:
             self.close()
             raise
@@ -349,6 +345,16 @@ class Session:
         except EmberwatchError as error:
             self._refused(error)
             raise
+
+    def _no_step(self) -> EmberwatchError:
+        if self._unfinished is None or self._unfinished is _CLOSED:
+            return not_reset()
+        code, words = self._unfinished
+        return EmberwatchError(
+            f"{words}, and the world may have moved: reset, or go on from where it stands with "
+            "reset(options={'resume': True})",
+            code,
+        )
 
     def _opened(self) -> Lease:
         if self._lease is None:
