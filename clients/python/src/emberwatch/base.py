@@ -1,6 +1,7 @@
 """What the environments of one robot share: its session, its pictures, its beginning."""
 
 from collections.abc import Mapping
+from operator import attrgetter
 from typing import Any, ClassVar, Final, Literal, TypeAlias, cast
 
 import gymnasium
@@ -27,6 +28,9 @@ REPORTED: Final = {
     "n_visited": "robot",
     "n_hits": "robot",
 }
+
+#: Their values, as a tuple.
+_reported: Final = attrgetter(*(f"{part}.{name}" for name, part in REPORTED.items()))
 
 #: What a robot's step can pay, and the field of a result that says it.
 REWARDS: Final = {
@@ -112,9 +116,7 @@ class WorldEnv(SessionOwner, gymnasium.Env[Any, Any]):  # pyright: ignore[report
         self._path = fly(result.start, path[: result.n_moves], self._spec)
 
     def _describe(self, answer: StepAnswer, result: StepResult) -> dict[str, Any]:
-        info: dict[str, Any] = {
-            name: getattr(getattr(result, part), name) for name, part in REPORTED.items()
-        }
+        info: dict[str, Any] = dict(zip(REPORTED, _reported(result), strict=True))
         if self._robot is not None:
             info["n_missed"] = self._n_missed
         if self._reveals:
