@@ -26,7 +26,7 @@ from emberwatch.observer import Frame, Newest, Observer
 from emberwatch.ports import RESET_TIMEOUT
 from emberwatch.programs import Program
 from emberwatch.replies import Decision, DecisionsInfo
-from emberwatch.session import LOST, Session, not_reset, timed_out_before
+from emberwatch.session import Session, not_reset
 from emberwatch.settings import Settings
 from emberwatch.view import fly
 from emberwatch.wire import StepAnswer
@@ -107,26 +107,29 @@ class AgentSession(Session):
     def decide(self, objectives: NDArray[np.uint8], moved: NDArray[np.bool_]) -> StepAnswer:
         """One step of the worlds `moved`, each for its objective; returns how all stand."""
         agent = self._asked()
-        if self._is_lost:
-            raise timed_out_before()
         worlds = zip(objectives.tolist(), moved.tolist(), strict=True)
         asked = [objective if moves else None for objective, moves in worlds]
-        try:
+        with self._told():
             decisions = agent.decide(asked, timeout=self.settings.timeout)
-        except LOST as error:
-            raise self._lost(error) from None
+        self._has_moved = True
         return self._answer(decisions)
 
     def close(self) -> None:
         """Ends the agent and the private server, if they are its own. May be called again."""
-        for part in (self._frames, self._decisions):
-            if part is not None:
-                part.close()
-        self._frames = self._decisions = None
-        agent, self._own_agent = self._own_agent, None
-        if agent is not None:
-            agent.stop()
-        super().close()
+        decisions, self._decisions = self._decisions, None
+        try:
+            if decisions is not None:
+                decisions.close()
+        finally:
+            super().close()
+
+    def _drop(self) -> None:
+        if self._frames is not None:
+            self._frames.close()
+        if self._own_agent is not None:
+            self._own_agent.stop()
+        self._frames = self._own_agent = None
+        super()._drop()
 
     def _hold(self, client: Client) -> None:
         """Starts the agent, which acquires the worlds."""
@@ -139,15 +142,17 @@ class AgentSession(Session):
         if self._arguments["agent"] == "own":
             self._decisions = self._start_agent(instance)
             return
-        self._decisions = decisions = connect_with_retry(
+        decisions = connect_with_retry(
             self.settings.timeout, partial(self._connect_to_agent, instance)
         )
         if decisions.worlds != self._worlds:
+            decisions.close()
             first, last = decisions.worlds[0], decisions.worlds[-1]
             raise InvalidArgumentError(
                 f"agent='running': expected one of worlds {self._worlds[0]} to {self._worlds[-1]}, "
                 f"got one of {first} to {last}"
             )
+        self._decisions = decisions
 
     def _start_agent(self, instance: str) -> Decisions:
         settings = self.settings
@@ -182,17 +187,18 @@ class AgentSession(Session):
         return Decisions(instance, self.settings.world, timeout=self.settings.timeout)
 
     def _restart(self, worlds: Sequence[int], seeds: Sequence[int]) -> StepAnswer:
-        return self._began(self._asked().reset(seeds, worlds=worlds))
+        decisions = self._asked().reset(seeds, worlds=worlds)
+        self._has_moved = True
+        return self._answer(decisions)
 
     def _observe(self) -> StepAnswer:
         if self._program is not None and self._program.exit_code() is not None:
             # An agent answers from memory until it notices.
             raise ServerGoneError(f"the server of instance {self.instance!r} has ended")
-        return self._began(self._asked().last(timeout=self.settings.timeout))
+        return self._answer(self._asked().last(timeout=self.settings.timeout))
 
-    def _began(self, decisions: tuple[Decision, ...]) -> StepAnswer:
-        self._is_lost = False
-        return self._answer(decisions)
+    def _settle(self) -> None:
+        """The agent answers one request after the other: those before are done, or are dropped."""
 
     def _answer(self, decisions: tuple[Decision, ...]) -> StepAnswer:
         """Takes in the features; the rest as the server would tell it."""

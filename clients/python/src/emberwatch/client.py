@@ -182,6 +182,6 @@ def connect_with_retry(wait: float, connect: Callable[[], _Connection]) -> _Conn
             if not left > 0:
                 raise
             if not waits:
-                _log.warning("%s; waiting up to %g s for it", error, wait)
+                _log.warning(f"{error}; waiting up to {wait:g} s for it")
             waits = True
             time.sleep(min(_RETRY, left))

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from emberwatch.arguments import as_choice, as_seeds
+from emberwatch.arguments import as_choice, as_list, as_seeds
 from emberwatch.connection import Connection
 from emberwatch.errors import NoServerError, bad_answer
 from emberwatch.ports import RESET_TIMEOUT, STEP_TIMEOUT
@@ -69,7 +69,10 @@ class Decisions(Connection):
             LeaseLostError: If another client took a world over; the agent ends.
             EmberwatchError: With code `"bad_objective"` or `"episode_over"`. Nothing is done.
         """
-        asked = [None if one is None else as_choice(one, 2**64) for one in objectives]
+        asked = [
+            None if one is None else as_choice(one, 2**64)
+            for one in as_list(objectives, "objectives")
+        ]
         return self._ask({"op": "decide", "objectives": asked}, timeout)
 
     def last(self, *, timeout: float = STEP_TIMEOUT) -> tuple[Decision, ...]:

@@ -9,6 +9,7 @@ import os
 import select
 import time
 import weakref
+from traceback import clear_frames
 from typing import Any, Final, Generic, TypeVar
 
 from emberwatch import wire
@@ -167,8 +168,9 @@ class RequestPort(Generic[Reply]):
         if self._peer.has_ended():
             # A new server on the instance would take the request, but knows nothing of it.
             raise self._peer.gone()
-        pending = self._send(header, payload)
+        pending = response = None
         try:
+            pending = self._send(header, payload)
             if pending.number_of_server_connections == 0:
                 raise self._peer.gone()
             self._peer.notify()
@@ -178,9 +180,14 @@ class RequestPort(Generic[Reply]):
             )
             length = response.payload().len()
             return reply, bytearray(_array(length).from_address(response.payload_ptr))
+        except BaseException as error:
+            # Its traceback, which a notebook keeps, keeps what is lent alive, too.
+            clear_frames(error.__traceback__)
+            raise
         finally:
-            # The traceback of an error keeps `pending` alive, but the next request needs its place.
-            pending.delete()
+            response = None
+            if pending is not None:
+                pending.delete()  # the next request needs its place
 
     def _send(self, header: bytes, payload: bytes) -> Any:
         deadline = time.perf_counter() + _RELEASE_TIMEOUT

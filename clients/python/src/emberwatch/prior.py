@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from emberwatch import programs
+from emberwatch.arguments import as_array
 from emberwatch.belief import initial_prior, uniform_prior
 from emberwatch.errors import EmberwatchError, invalid
 from emberwatch.model import Model
@@ -49,7 +50,7 @@ def simulated_prior(model: Model, *, height: int, width: int, burn_in: int) -> N
 
 
 def prior_of(
-    prior: PriorKind | NDArray[np.floating] | None,
+    prior: PriorKind | ArrayLike | None,
     model: Model,
     *,
     height: int,
@@ -61,9 +62,10 @@ def prior_of(
         prior = "simulated" if burn_in > 0 else "initial"
     if not isinstance(prior, str):
         expected = (model.n_states, height, width)
-        if prior.shape != expected:
-            raise invalid("prior", f"shape {expected}", prior.shape)
-        return prior
+        given = as_array(prior, "prior", f"an array of shape {expected}")
+        if given.shape != expected:
+            raise invalid("prior", f"shape {expected}", given.shape)
+        return given
     if prior == "simulated":
         return simulated_prior(model, height=height, width=width, burn_in=burn_in)
     simple = {"initial": initial_prior, "uniform": uniform_prior}

@@ -241,7 +241,7 @@ def _robots(settings: Settings, n_rows: int | None, n_robots: int) -> range:
             raise invalid("robot", f"0 to {n_robots - 1}", settings.robot)
         return range(first + settings.robot, first + settings.robot + 1)
     n_rows = n_robots if n_rows is None else n_rows
-    if n_rows % n_robots:
+    if n_rows // n_robots * n_robots != n_rows:
         raise InvalidArgumentError(
             f"robots: expected one robot in a world, got {n_robots}: fly one of them with "
             "robot=..., all of a world with emberwatch.parallel_env, or of several worlds with "

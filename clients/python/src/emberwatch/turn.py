@@ -88,6 +88,7 @@ def _wait(path: Path, limit: float) -> FileIO | None:
     """The lock, which ends with its last reference; None if a stopped or frozen process has it."""
     start = time.monotonic()
     holder, since = None, start
+    lock = None
     try:
         while True:
             lock = _open(path)
@@ -113,8 +114,13 @@ def _wait(path: Path, limit: float) -> FileIO | None:
                     raise EmberwatchError(f"{path}: {problem}", "channel") from None
                 time.sleep(_INTERVAL)
             lock.close()
-    except OSError as error:
-        raise cannot_create(path, error) from None
+    except BaseException as error:
+        if lock is not None:
+            lock.close()  # the error's traceback would keep it
+        # One without a number is not the system's: a signal's handler may raise a TimeoutError.
+        if isinstance(error, OSError) and error.errno is not None:
+            raise cannot_create(path, error) from None
+        raise
 
 
 def _open(path: Path) -> FileIO:
