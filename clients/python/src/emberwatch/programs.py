@@ -81,7 +81,7 @@ def _run(name: str, arguments: Sequence[str], timeout: float) -> subprocess.Comp
             command,
             env=os.environ | {"RUST_LOG": "warn"},
             capture_output=True,
-            text=True,
+            encoding="utf-8",
             errors="replace",
             stdin=subprocess.DEVNULL,
             timeout=timeout,
