@@ -7,11 +7,12 @@ a dead one. The turn is a `flock`, which ends with its process.
 import errno
 import fcntl
 import os
+import re
 import threading
 import time
 import weakref
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import FileIO
 from pathlib import Path
 from typing import Final
@@ -74,6 +75,14 @@ def process_state(pid: int) -> str | None:
         return None
 
 
+def pid_namespace() -> int | None:
+    """The PID namespace of this process, by its number; None if the system does not say."""
+    with suppress(OSError):
+        found = re.fullmatch(r"pid:\[(\d+)\]", os.readlink("/proc/self/ns/pid"))
+        return int(found[1]) if found else None
+    return None
+
+
 def cannot_create(path: Path, error: OSError) -> EmberwatchError:
     """The error of a file or folder that the system does not let be used."""
     remedy = (
@@ -109,7 +118,8 @@ def _wait(path: Path, limit: float) -> FileIO | None:
                 # Not ">": "not a number" would never end.
                 if not now - start < limit:
                     lock.close()
-                    problem = f"expected the lock within {limit} s, got it held by pid {holder}"
+                    who = f"pid {holder}" if holder else "a process of another PID namespace"
+                    problem = f"expected the lock within {limit} s, got it held by {who}"
                     raise EmberwatchError(f"{path}: {problem}", "channel") from None
                 time.sleep(_INTERVAL)
             lock.close()
