@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from failures import fails
@@ -207,7 +208,7 @@ def test_too_few_descriptors_are_called_so() -> None:
 
 
 def test_a_low_limit_on_file_sizes_is_called_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (1024, 1024))
+    monkeypatch.setattr(resource, "getrlimit", Mock(return_value=(1024, 1024)))
     with fails("channel", match="file sizes up to 512 KiB must be allowed, got 1 KiB"):
         resources.check_room()
 

@@ -2,10 +2,10 @@
 //! its part when it comes, so that few clients take little, and a server writes only where there is memory.
 
 use super::ports::PortConfig;
-use anyhow::{Result, ensure};
+use anyhow::{Result, anyhow};
 use protocol::channels::{
-    ChannelError, FRAME_BUFFER, MAX_CLIENTS, MAX_OBSERVERS, MAX_TRUTH_READERS, SHARED_MEMORY,
-    TRUTH_BUFFER,
+    ChannelError, FRAME_BUFFER, MAX_CLIENTS, MAX_OBSERVERS, MAX_TRUTH_READERS, TRUTH_BUFFER,
+    check_room,
 };
 use protocol::responder::JSON_SLICE;
 use protocol::shared_memory::MessageMemory;
@@ -87,17 +87,6 @@ pub fn check_shared_memory(config: &PortConfig) -> Result<()> {
     let frames = bytes(samples(MAX_OBSERVERS, FRAME_BUFFER), config.frame_bytes);
     let truth = bytes(samples(MAX_TRUTH_READERS, TRUTH_BUFFER), config.n_cells);
     let needed = FIXED_BYTES + answers + frames + if config.publish_truth { truth } else { 0 };
-    let Ok(status) = rustix::fs::statvfs(SHARED_MEMORY) else {
-        return Ok(());
-    };
-    let free = status.f_bavail * status.f_frsize;
-    ensure!(
-        needed <= free,
-        "shared memory: expected {} MiB free in {SHARED_MEMORY}, got {} MiB; free some, give the container more \
-         (docker: --shm-size), or serve fewer worlds or robots, or a smaller \
-         grid",
-        needed.div_ceil(1 << 20),
-        free >> 20
-    );
-    Ok(())
+    check_room(needed)
+        .map_err(|error| anyhow!("{error}, or serve fewer worlds or robots, or a smaller grid"))
 }

@@ -108,11 +108,10 @@ impl Connection {
         let listener = services.listener(Channel::WakeClient)?;
         let control = control_service
             .client_builder()
-            .initial_max_slice_len(CONTROL_SLICE);
-        let control = control
+            .initial_max_slice_len(CONTROL_SLICE)
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
-            .create();
-        let control = control.map_err(limited_error("create a control client", "16 clients"))?;
+            .create()
+            .map_err(limited_error("create a control client", "16 clients"))?;
         fill_ports(&node, true)?;
         let entries = Entries::of(&node)?;
         let exchange = Exchange {

@@ -130,6 +130,9 @@ pub(crate) fn not_usable(path: &std::path::Path, error: std::io::Error) -> Chann
                 "{error}: channels need a {SHARED_MEMORY} that can be written to; as root, \
                  `mount -o remount,rw {SHARED_MEMORY}`, or mount a tmpfs there"
             ),
+            std::io::ErrorKind::StorageFull => {
+                format!("{error}: free some, or give the container more (docker: --shm-size)")
+            }
             _ => error.to_string(),
         },
     )

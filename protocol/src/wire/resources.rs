@@ -34,6 +34,13 @@ pub(super) fn check_room_for_ports(message_bytes: usize) -> Result<(), ChannelEr
 /// # Errors
 /// If not.
 pub fn check_room(n_bytes: u64) -> Result<(), ChannelError> {
+    let limit = getrlimit(Resource::Fsize).current.unwrap_or(u64::MAX);
+    if limit < n_bytes {
+        let (needed, limit) = (in_words(n_bytes), in_words(limit));
+        return no_room(format!(
+            "expected a limit on file sizes (`ulimit -f`) of at least {needed}, got {limit}"
+        ));
+    }
     let Ok(found) = statvfs(SHARED_MEMORY) else {
         return Ok(());
     };

@@ -85,11 +85,12 @@ def pid_namespace() -> int | None:
 
 def cannot_create(path: Path, error: OSError) -> EmberwatchError:
     """The error of a file or folder that the system does not let be used."""
-    remedy = (
-        ": channels need a /dev/shm that can be written to; as root, "
-        "`mount -o remount,rw /dev/shm`, or mount a tmpfs there"
-    )
-    remedy = remedy if error.errno == errno.EROFS else ""
+    remedies = {
+        errno.EROFS: ": channels need a /dev/shm that can be written to; as root, "
+        "`mount -o remount,rw /dev/shm`, or mount a tmpfs there",
+        errno.ENOSPC: ": free some, or give the container more (docker: --shm-size)",
+    }
+    remedy = remedies.get(error.errno or 0, "")
     return EmberwatchError(f"create {path}: {error.strerror}{remedy}", "channel")
 
 
