@@ -186,6 +186,22 @@ print(next(iter(observer)).result.step)
     assert (ended.returncode, ended.stdout) == (0, "200 True\n201\n"), ended
 
 
+def test_a_long_answer_without_room_is_refused_and_kills_no_server(apart: Run) -> None:
+    code = """
+flags = ["--instance=lab", "--worlds=256", "--robots=8", "--height=5", "--width=5", "--moves=4"]
+server = Program("emberwatch-server", [*flags, "--burn-in=0"])
+client = server.wait_for(lambda: emberwatch.connect("lab", wait=20))
+fill()
+tell("status", client.status)
+os.unlink("/dev/shm/filler")
+print(len(client.status().worlds))
+"""
+    ended = apart(code, "size=128m")
+    refusal, n_worlds = ended.stdout.splitlines()
+    assert refusal.startswith("status no_memory shared memory: expected"), ended
+    assert n_worlds == "256", ended
+
+
 def test_too_few_files_in_shared_memory_are_called_so(apart: Run) -> None:
     code = """
 tell("connect", lambda: emberwatch.connect("lab"))
@@ -209,7 +225,7 @@ def test_too_few_descriptors_are_called_so() -> None:
 
 def test_a_low_limit_on_file_sizes_is_called_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resource, "getrlimit", Mock(return_value=(1024, 1024)))
-    with fails("channel", match="file sizes up to 512 KiB must be allowed, got 1 KiB"):
+    with fails("channel", match="expected a limit on file sizes of at least 512 KiB, got 1 KiB"):
         resources.check_room()
 
 

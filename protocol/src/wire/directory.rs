@@ -1,7 +1,7 @@
 //! The user's own directory and prefix for channel files, and iceoryx2's configuration for them.
 
 use super::error::{ChannelError, Ipc};
-use super::resources::ipc_error;
+use super::resources::{REMEDY, ipc_error};
 use iceoryx2::node::Node;
 use iceoryx2::prelude::{Config, FileName, Path, SemanticString};
 use std::cell::Cell;
@@ -131,7 +131,7 @@ pub(crate) fn not_usable(path: &std::path::Path, error: std::io::Error) -> Chann
                  `mount -o remount,rw {SHARED_MEMORY}`, or mount a tmpfs there"
             ),
             std::io::ErrorKind::StorageFull => {
-                format!("{error}: free some, or give the container more (docker: --shm-size)")
+                format!("{error}: {REMEDY}")
             }
             _ => error.to_string(),
         },

@@ -64,9 +64,9 @@ pub enum ChannelError {
         instance: String,
     },
     /// There is too little shared memory.
-    #[error("shared memory: {problem}; free some, or give the container more (docker: --shm-size)")]
+    #[error("shared memory: {problem}")]
     NoRoom {
-        /// What was expected, and what there is.
+        /// What was expected, what there is, and what to do.
         problem: String,
     },
     /// All places that a channel has are taken.

@@ -12,6 +12,9 @@ use std::os::fd::OwnedFd;
 /// Where iceoryx2 keeps shared memory: a folder that every user may write to.
 pub const SHARED_MEMORY: &str = "/dev/shm";
 
+/// What to do if it is full.
+pub(super) const REMEDY: &str = "free some, or give the container more (docker: --shm-size)";
+
 /// What the ports of a client or an observer take, beside its longest messages: 190 KiB (measured).
 const PORT_BYTES: u64 = 512 << 10;
 
@@ -38,7 +41,7 @@ pub fn check_room(n_bytes: u64) -> Result<(), ChannelError> {
     if limit < n_bytes {
         let (needed, limit) = (in_words(n_bytes), in_words(limit));
         return no_room(format!(
-            "expected a limit on file sizes (`ulimit -f`) of at least {needed}, got {limit}"
+            "expected a limit on file sizes of at least {needed}, got {limit}; raise it (`ulimit -f`)"
         ));
     }
     let Ok(found) = statvfs(SHARED_MEMORY) else {
@@ -55,7 +58,8 @@ pub fn check_room(n_bytes: u64) -> Result<(), ChannelError> {
     if found.f_files > 0 && found.f_favail < PORT_FILES {
         let free = found.f_favail;
         return no_room(format!(
-            "expected room for {PORT_FILES} files in {SHARED_MEMORY}, got {free}"
+            "expected room for {PORT_FILES} files in {SHARED_MEMORY}, got {free}; remove some, or allow more (mount -o \
+             nr_inodes)"
         ));
     }
     Ok(())

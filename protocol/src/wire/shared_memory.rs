@@ -4,7 +4,7 @@
 use super::channel_files::ChannelFiles;
 use super::directory::directory_error;
 use super::error::{ChannelError, Ipc};
-use super::resources::{SHARED_MEMORY, check_room, in_words, no_room};
+use super::resources::{REMEDY, SHARED_MEMORY, check_room, in_words, no_room};
 use iceoryx2::node::Node;
 use rustix::fs::{FallocateFlags, fallocate};
 use rustix::io::Errno;
@@ -127,7 +127,7 @@ fn fill(path: &Path, file: &File, n_bytes: u64) -> Result<(), ChannelError> {
             Err(errno @ (Errno::NOSPC | Errno::NOMEM | Errno::DQUOT)) => {
                 let needed = in_words(n_bytes);
                 return no_room(format!(
-                    "expected {needed} in {SHARED_MEMORY}, got: {errno}"
+                    "expected {needed} in {SHARED_MEMORY}, got: {errno}; {REMEDY}"
                 ));
             }
             Err(errno) => return Err(directory_error(path, errno.to_string())),

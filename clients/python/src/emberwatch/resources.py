@@ -29,10 +29,9 @@ def check_room(message_bytes: int = 0) -> None:
     needed = _PORT_BYTES + message_bytes
     limit, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
     if limit != resource.RLIM_INFINITY and limit < needed:
-        expected = f"file sizes up to {_size(needed)}"
+        expected = f"expected a limit on file sizes of at least {_size(needed)}"
         raise EmberwatchError(
-            f"{expected} must be allowed, got {_size(limit)}; raise the limit (`ulimit -f`)",
-            "channel",
+            f"shared memory: {expected}, got {_size(limit)}; raise it (`ulimit -f`)", "channel"
         )
     found = os.statvfs(SHARED_MEMORY)
     free = found.f_bavail * found.f_frsize
@@ -41,7 +40,11 @@ def check_room(message_bytes: int = 0) -> None:
     # A file system without a limit says 0 of 0.
     if found.f_files > 0 and found.f_favail < _PORT_FILES:
         got = found.f_favail
-        raise _no_room(f"expected room for {_PORT_FILES} files in {SHARED_MEMORY}, got {got}")
+        raise EmberwatchError(
+            f"shared memory: expected room for {_PORT_FILES} files in {SHARED_MEMORY}, got {got}; "
+            "remove some, or allow more (mount -o nr_inodes)",
+            "channel",
+        )
 
 
 def fill(paths: Iterable[Path]) -> None:
