@@ -25,6 +25,7 @@ use protocol::connection::ConnectionError;
 use protocol::control::{ServerInfo, WorldSeed};
 use protocol::decisions::{AgentInfo, Decision};
 use protocol::message::{Status, VERSION};
+use protocol::program::pid_namespace;
 use protocol::{Client, Model, Move};
 use std::ops::Range;
 use std::os::fd::BorrowedFd;
@@ -343,6 +344,7 @@ fn agent_info(task: &Assignment, model: &Model, server: &ServerInfo) -> AgentInf
         protocol: VERSION,
         build: env!("CARGO_PKG_VERSION").into(),
         pid: std::process::id(),
+        pid_namespace: pid_namespace(),
         instance: task.instance.name().into(),
         first_world: task.worlds.start,
         n_worlds: task.worlds.len() as u32,

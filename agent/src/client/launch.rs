@@ -1,8 +1,10 @@
 //! A server or a dashboard of our own: found, started, waited for, and stopped whatever happens.
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use protocol::channels::Instance;
 use protocol::connection::Connection;
+use std::collections::hash_map::RandomState;
+use std::hash::BuildHasher;
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
 use std::os::unix::process::CommandExt;
@@ -35,7 +37,9 @@ impl OwnServer {
     /// Starts `emberwatch-server` with the given arguments on an instance of its own, and waits until
     /// it answers. It ends with this process, however that ends.
     pub fn start(program: Option<PathBuf>, arguments: &[String]) -> Result<Self> {
-        let instance = Instance::new(&format!("private-{}", std::process::id()))?;
+        // A process of this number may have one in another container that shares /dev/shm.
+        let random = RandomState::new().hash_one(0);
+        let instance = Instance::new(&format!("private-{}-{random:016x}", std::process::id()))?;
         let mut command = private(program.unwrap_or_else(|| beside_this("emberwatch-server")));
         command
             .args(["--instance", instance.name()])
@@ -58,7 +62,15 @@ impl OwnServer {
                 "emberwatch-agent (starting)",
                 Duration::from_secs(1),
             ) {
-                Ok(_) => return Ok(()),
+                Ok(connection) => {
+                    let (instance, pid) = (self.instance.name(), connection.info().pid);
+                    let expected = self.program.0.id();
+                    ensure!(
+                        pid == expected,
+                        "instance {instance}: expected the server that was started, pid {expected}, got pid {pid}"
+                    );
+                    return Ok(());
+                }
                 Err(error) if Instant::now() > deadline => return Err(error.into()),
                 Err(_) => std::thread::sleep(Duration::from_millis(10)),
             }

@@ -14,12 +14,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 /// Kinds of checkpoints that policies act on.
-const KINDS: [&str; 4] = [
-    fit::KIND,
-    fit::OWN_KIND,
-    network::KIND,
-    decisions::KIND,
-];
+const KINDS: [&str; 4] = [fit::KIND, fit::OWN_KIND, network::KIND, decisions::KIND];
 
 #[derive(Debug, Clone, Default)]
 pub struct Learned {

@@ -66,6 +66,9 @@ pub struct AgentInfo {
     pub build: String,
     /// The agent's process.
     pub pid: u32,
+    /// The PID namespace of this number, as Linux numbers it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pid_namespace: Option<u64>,
     /// The instance of its server.
     pub instance: String,
     /// The first world it acts on.

@@ -15,7 +15,7 @@ class EmberwatchError(Exception):
             earlier step or reset did not finish: reset or resume), `"forked"` (shared memory does
             not survive `fork`), `"channel"` (iceoryx2 failed), `"bad_answer"` (client
             and server are not of one release), `"program"` (could not be started, or failed),
-            `"impossible_frame"`, `"recording"`.
+            `"pid_namespace"` (the server is in another one), `"impossible_frame"`, `"recording"`.
         detail: The number that comes with a refusal; its meaning depends on the status.
     """
 
@@ -107,6 +107,7 @@ STATUSES: Final = (
         "world, and a step of several worlds needs them all",
     ),
     ("no_such_robot", "no such robot: the server has robots 0 to {last}"),
+    ("no_memory", "shared memory is full: free some, and ask again"),
 )
 
 _CLASSES: Final = {"lease_lost": LeaseLostError, "agent_ends": ServerGoneError}

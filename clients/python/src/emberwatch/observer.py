@@ -139,13 +139,14 @@ class Reader(Closable, Generic[_Sample]):
             self._node = node = Node(instance)
             try:
                 factory = node.open_publications(service, header, readers, buffer, publishers)
-                with channel_errors(f"read {service} (are there more than {readers} readers?)"):
+                with channel_errors(f"read {service}", f"{readers} readers"):
                     port = factory.subscriber_builder().buffer_size(buffer).create()
                     self._subscriber: Any = node.keep(port)
                     if publishers == 1:  # the server, which publishes the current state on this
                         wake = node.keep(node.open_wake("wake-server").notifier_builder())
                         node.keep(wake.create()).notify()
                     node.remember_files()
+                    node.fill_ports()
             except BaseException:
                 node.close()
                 raise

@@ -80,7 +80,8 @@ impl FilterFit {
     /// A world's track begins, for the first time or again.
     pub fn begin(&mut self, world: u32) {
         self.replay.begin(world);
-        self.neighbours.begin(world, self.optimiser.cut().0.n_cells());
+        self.neighbours
+            .begin(world, self.optimiser.cut().0.n_cells());
     }
 
     pub fn has_track(&self, world: u32) -> bool {
