@@ -33,7 +33,12 @@ OUTSIDE = {
 #: An index for readers of the repository; the site has its navigation.
 LEFT_OUT = {"docs/README.md"}
 
+#: The home page has no list of pages at its side.
+HOME = "---\nhide: [navigation]\n---\n\n"
+
 FENCE = re.compile(r"^(```.*?^```$)", re.MULTILINE | re.DOTALL)
+#: What follows the language of a fence means something to tests alone.
+INFO = re.compile(r"\A(```\w+)[^\n]*")
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\((?![a-z]+:|#)([^()\s#]+)(#[^()\s]*)?\)")
 NAMED = re.compile(r"(?<!\[)`([\w./-]+\.md)`")
 
@@ -52,13 +57,17 @@ def pages() -> dict[str, str]:
 
 def linked(text: str, source: str, found: dict[str, str]) -> str:
     """A document with links of the site; a link to what the site lacks stays as its words."""
-    here = posixpath.dirname(found[source]) or "."
+    here, n_pictures = posixpath.dirname(found[source]) or ".", 0
 
     def link(match: re.Match[str]) -> str:
+        nonlocal n_pictures
         mark, words, target, anchor = match.groups()
+        n_pictures += bool(mark)
         path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
         if path in found:
-            return f"{mark}[{words}]({posixpath.relpath(found[path], here)}{anchor or ''})"
+            # All pictures but the first are loaded when they come into sight.
+            later = "{loading=lazy}" if mark and n_pictures > 1 else ""
+            return f"{mark}[{words}]({posixpath.relpath(found[path], here)}{anchor or ''}){later}"
         if (ROOT / path).exists():
             return words
         raise SystemExit(f"{source}: expected a file of the repository, got {target}")
@@ -70,9 +79,12 @@ def linked(text: str, source: str, found: dict[str, str]) -> str:
         return f"[{match[0]}]({posixpath.relpath(page, here)})"
 
     parts = FENCE.split(text)
-    return "".join(
-        part if part.startswith("```") else NAMED.sub(name, LINK.sub(link, part)) for part in parts
-    )
+    for index, part in enumerate(parts):
+        if part.startswith("```"):
+            parts[index] = INFO.sub(r"\1", part)
+        else:
+            parts[index] = NAMED.sub(name, LINK.sub(link, part))
+    return "".join(parts)
 
 
 def page_of(notebook: dict[str, Any], name: str) -> str:
@@ -105,7 +117,8 @@ def main() -> None:
             shutil.copy(path, place.with_suffix(".ipynb"))
             place.write_text(page_of(json.loads(path.read_text("utf-8")), path.name), "utf-8")
         elif path.suffix == ".md":
-            place.write_text(linked(path.read_text("utf-8"), source, found), "utf-8")
+            text = linked(path.read_text("utf-8"), source, found)
+            place.write_text(HOME + text if page == "index.md" else text, "utf-8")
         else:
             shutil.copy(path, place)
 
