@@ -46,7 +46,9 @@ def moves() -> None:
     env = gymnasium.make("emberwatch/WildfireMoves-v0", observation=parts, **SMALL, **SHOWN)
     seen, _ = env.reset(seed=1000)
     for k in range(30):
-        path = beam_search(seen["belief"][None, :, :, 2], seen["robot"][None], 16, rng=env.np_random)
+        path = beam_search(
+            seen["belief"][None, :, :, 2], seen["robot"][None], 16, rng=env.np_random
+        )
         for move in path[0] if k < 29 else path[0][:10]:
             seen = env.step(move)[0]
     save("moves", env.render())
