@@ -22,8 +22,7 @@ from PIL import Image
 def shown(source: str, names: dict[str, Any]) -> list[dict[str, Any]]:
     """Runs a cell; what it prints, and the value of its last line, as a notebook keeps them."""
     body = ast.parse(source).body
-    shows = bool(body) and isinstance(body[-1], ast.Expr) and not source.rstrip().endswith(";")
-    last = body.pop() if shows else None
+    last = body.pop() if body and isinstance(body[-1], ast.Expr) else None
     printed, value = io.StringIO(), None
     with contextlib.redirect_stdout(printed):
         exec(compile(ast.Module(body, []), "cell", "exec"), names)
