@@ -139,6 +139,16 @@ fn the_index_of_documents_is_complete() {
 }
 
 #[test]
+fn the_readme_shows_the_example_of_the_crate() {
+    let example = |text: &'static str| {
+        let (_, rest) = text.split_once("```rust,no_run\n").expect("an example");
+        rest.split_once("```").expect("its end").0
+    };
+    let of_crate = example(include_str!("../README.md"));
+    assert_eq!(example(include_str!("../../README.md")), of_crate);
+}
+
+#[test]
 fn rooms_use_only_those_below_them() {
     let rooms = rooms();
     for name in ["agent", "env-server", "protocol"] {
