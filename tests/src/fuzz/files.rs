@@ -9,7 +9,7 @@ use agent::learning::learners::decisions::{self, Decisions};
 use agent::learning::learners::filter::fit::{self, FilterFit};
 use agent::learning::learners::filter::{FilterLearner, SavedFilter};
 use agent::learning::learners::network::{self, Position, SavedNetwork};
-use agent::learning::learners::{Student, Worlds};
+use agent::learning::learners::{Learner, Worlds};
 use agent::learning::reward::RewardEstimate;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
@@ -109,11 +109,11 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
             "likelihoods sum to {sums}"
         );
         let (_, contents) = decode(&[kind], &bytes).expect("read before");
-        if let Ok(mut student) = FilterLearner::resume(&contents, dimensions, worlds(), &config()) {
-            let again = student.contents().expect("no device");
+        if let Ok(mut learner) = FilterLearner::resume(&contents, dimensions, worlds(), &config()) {
+            let again = learner.contents().expect("no device");
             let saved: SavedFilter = again.state().expect("its state");
             // More takes its time. Numbers that are finite may be too large to work with.
-            let _ = (saved.learner.owed < 8.0).then(|| student.learn());
+            let _ = (saved.fit.earned < 8.0).then(|| learner.learn());
         }
     }
     if let Some(contents) = learned.decisions {
@@ -177,19 +177,19 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
 /// A learner that has seen some frames.
 fn filter(dimensions: Dimensions) -> Contents {
     let (shape, config) = (worlds().shape, config());
-    let mut learner = FilterFit::new(dimensions, shape, &config);
+    let mut fit = FilterFit::new(dimensions, shape, &config);
     let belief = Belief::uniform(2, shape);
-    learner.begin(0);
+    fit.begin(0);
     for value in [0, 1, 1, 0, 1] {
         let frame = Frame::from_bytes(shape, 2, &[value, 255, 1]).expect("a frame");
-        let learned = learner.learned();
-        learner.see(0, &frame, Some(&belief), &learned);
-        learner.reward(&belief, &[0, 2], 0.5);
-        learner.learn().expect("finite");
+        let learned = fit.learned();
+        fit.see(0, &frame, Some(&belief), &learned);
+        fit.reward(&belief, &[0, 2], 0.5);
+        fit.learn().expect("finite");
     }
-    let tensors = learner.named_tensors();
+    let tensors = fit.named_tensors();
     let state = SavedFilter {
-        learner,
+        fit,
         worlds: BTreeMap::new(),
     };
     Contents::new(tensors, &state)

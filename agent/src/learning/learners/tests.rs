@@ -8,7 +8,6 @@ use crate::learning::learners::filter::fit::FilterFit;
 use crate::learning::learners::network::{NetworkLearner, Progress};
 use crate::learning::learners::{Learner, Worlds};
 use crate::policy::{EstimatorKind, PlannerKind, Policy};
-use crate::rollout::Robot;
 use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
@@ -94,14 +93,11 @@ fn path(
 
 /// One step: the path, and the posterior after its frame.
 fn fly(learner: &mut impl Learner, step: u64) -> (Vec<Move>, Belief) {
-    let (mut path, mut posterior) = (Vec::new(), None);
-    let mut fly = |paths: &[Vec<Move>]| {
-        path = paths[0].clone();
-        Ok(vec![observation(step)])
-    };
-    let mut look = |_: usize, robot: &Robot| posterior = Some(robot.agent.belief().clone());
-    learner.step(&mut fly, &mut look).expect("possible");
-    (path, posterior.expect("a look"))
+    let path = learner.plan().remove(0);
+    learner.see(vec![observation(step)]).expect("possible");
+    let posterior = learner.rollout(0).agent.belief().clone();
+    learner.predict();
+    (path, posterior)
 }
 
 /// A frozen learner must plan on one of the beliefs. `paths`: what it may choose among on a belief, where
@@ -133,7 +129,7 @@ fn check(
 }
 
 #[test]
-fn students_plan_on_the_belief_that_settings_say() {
+fn learners_plan_on_the_belief_that_settings_say() {
     for basis in [BasisKind::Predictor, BasisKind::Estimate] {
         let config = &config(basis);
         let dimensions = Dimensions {
