@@ -5,15 +5,18 @@ use agent::config::AgentConfig;
 use agent::estimation::Follower;
 use agent::learning::checkpoint::{Contents, WrongDigest, decode, encode};
 use agent::learning::learned::Learned;
-use agent::learning::learners::decisions::{self, Decisions};
+use agent::learning::learners::decisions::{self, Base, DecisionsLearner};
 use agent::learning::learners::filter::fit::{self, FilterFit};
 use agent::learning::learners::filter::{FilterLearner, SavedFilter};
 use agent::learning::learners::network::{self, Position, SavedNetwork};
 use agent::learning::learners::{Learner, Worlds};
 use agent::learning::reward::RewardEstimate;
+use agent::policy::EstimatorKind;
+use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use ndarray::{Array3, Axis};
+use network::{Dqn, DqnShape};
 use protocol::model::ModelFile;
 use protocol::{Dynamics, Frame, Model, Shape, Transition};
 use std::collections::BTreeMap;
@@ -116,9 +119,6 @@ pub fn checkpoint(bytes: &[u8]) -> bool {
             let _ = (saved.fit.earned < 8.0).then(|| learner.learn());
         }
     }
-    if let Some(contents) = learned.decisions {
-        let _ = decisions().load(&contents);
-    }
     true
 }
 
@@ -149,8 +149,17 @@ fn config() -> AgentConfig {
     config
 }
 
-fn decisions() -> Decisions {
-    Decisions::first(&Model::wildfire(), &AgentConfig::default().decisions, 0)
+fn decisions() -> Contents {
+    let (model, shape) = (Model::wildfire(), worlds().shape);
+    let filter = BayesFilter::known(&model, Belief::uniform(3, shape)).expect("valid");
+    let base = Base::known(EstimatorKind::KnownModel, filter, &model);
+    let learner = DecisionsLearner::new(base, None, worlds(), &AgentConfig::default());
+    learner.expect("nothing to read").contents().expect("whole")
+}
+
+fn dqn() -> Dqn {
+    let settings = AgentConfig::default().dqn.settings();
+    Dqn::new(settings, DqnShape::of_actions(4, 4), 0)
 }
 
 pub fn checkpoint_seeds() -> Vec<Seed> {
@@ -159,7 +168,7 @@ pub fn checkpoint_seeds() -> Vec<Seed> {
     // The tensors of networks would be too long for a corpus.
     let decisions = Contents {
         tensors: BTreeMap::new(),
-        ..decisions().to_contents()
+        ..decisions()
     };
     vec![
         ("filter", encoded(fit::KIND, filter(dimensions(false)))),
@@ -202,13 +211,13 @@ fn autoencoder(side: usize, length: usize) -> Contents {
         shape: Shape::new(side, side).expect("a grid"),
         n_observations: 3,
         counters: [0, 0],
-        dqn: decisions().dqn.saved(),
+        dqn: dqn().saved(),
         frames: Vec::new(),
         tracks: Vec::new(),
         position: Position {
             follower: Follower::at(vec![0.0; length], Belief::uniform(3, cell)),
             estimate: None,
-            track: decisions().dqn.track(),
+            track: dqn().track(),
             reward: RewardEstimate::new(3),
             iterations: 0,
             place: None,
