@@ -99,7 +99,7 @@ fn filter(c: &mut Criterion) {
             &format!("learned filter: correct + predict{kernels}"),
             |b| {
                 b.iter(|| {
-                    filter.correct(&frame, None).expect("possible");
+                    filter.correct(&frame).expect("possible");
                     filter.predict();
                 });
             },

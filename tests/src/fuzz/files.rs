@@ -16,7 +16,7 @@ use emberwatch_belief::estimation::BayesFilter;
 use emberwatch_belief::estimation::belief::Belief;
 use emberwatch_belief::estimation::parameters::Dimensions;
 use ndarray::{Array3, Axis};
-use network::{Dqn, DqnShape};
+use ::network::{Dqn, DqnShape};
 use protocol::model::ModelFile;
 use protocol::{Dynamics, Frame, Model, Shape, Transition};
 use std::collections::BTreeMap;
