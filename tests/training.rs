@@ -5,13 +5,13 @@ use crate::trainings::Place;
 use agent::learning::checkpoint::{self, Contents};
 use agent::learning::learners::filter::SavedFilter;
 use agent::learning::learners::filter::fit::KIND;
-use agent::learning::learners::filter::fit::Learner;
+use agent::learning::learners::filter::fit::FilterFit;
 use protocol::Move;
 use rustix::process::Signal;
 use std::ffi::OsString;
 use std::path::Path;
 use tempfile::TempDir;
-use tests::harness::{AGENT, LIMIT, Program, SMALL, Server, fly, repository, run};
+use tests::harness::{AGENT, LIMIT, Program, SMALL, Server, fly, run};
 
 /// A private server with small worlds.
 const WORLDS: &str = "--worlds 2 --height 6 --width 9 --moves 5 --burn-in 60";
@@ -36,8 +36,8 @@ fn read(checkpoint: &Path) -> Contents {
     contents
 }
 
-fn learner(contents: &Contents) -> Learner {
-    contents.state::<SavedFilter>().expect("its state").learner
+fn learner(contents: &Contents) -> FilterFit {
+    contents.state::<SavedFilter>().expect("its state").fit
 }
 
 fn bytes(path: &Path) -> Vec<u8> {
