@@ -33,7 +33,7 @@ use kernel::{Kernel, invert, uniform};
 use lanes::{LANES, Words};
 use mixture::Mixture;
 use parents::Parents;
-use places::{OFF_GRID, Places};
+use places::{OFF_GRID, Places, centre};
 use rand::Rng;
 use std::sync::Arc;
 
@@ -184,11 +184,6 @@ impl Tables {
         }
         sums
     }
-}
-
-/// Where the cell itself lies, relative to its home.
-fn centre(offsets: &[usize]) -> usize {
-    offsets[offsets.len() / 2]
 }
 
 /// What keys the bytes and the draws of a step.

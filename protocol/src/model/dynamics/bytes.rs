@@ -12,12 +12,11 @@
 //! alone, so that `f` there is the likeliest outcome, and a cell that stays as it is for certain takes its byte alone.
 
 use super::super::grid::Shape;
-use super::centre;
 use super::lanes::{
     FastOwn, FastTap, LANES, blend, blend_own, fast_taps, fill, high_bits, list_lanes, transposed,
 };
 use super::mixture::Mixture;
-use super::places::Places;
+use super::places::{Places, centre};
 use std::iter::zip;
 use std::ops::Range;
 
