@@ -1,6 +1,6 @@
 //! Planners of one robot, filters and summaries.
 
-use crate::fields::{Field, fields, objectives, paths};
+use super::fields::{Field, fields, objectives, paths};
 use agent::Belief;
 use agent::estimation::summary::{N_BLOCKS, summarise, summary_length};
 use agent::estimation::{BayesFilter, Estimator};

@@ -1,6 +1,6 @@
 //! Plans of several robots.
 
-use crate::fields::{Field, RANDOM, fields, objectives, paths};
+use super::fields::{Field, RANDOM, fields, objectives, paths};
 use agent::planning::team::{ROUNDS, plan_team, robot_seed};
 use agent::planning::{
     BeamSearch, CellValues, Integration, Objective, Plan, Planner, Shooting, Target,
