@@ -21,7 +21,7 @@ const MAX_WORLDS: u32 = 1024;
 /// The name of the default model.
 const WILDFIRE: &str = "wildfire";
 
-/// Every setting; `config/server.toml` says what each means, and `flags.rs`.
+/// Every setting; `config/server.toml` and `flags.rs` explain each.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ServerConfig {
@@ -52,12 +52,12 @@ pub struct ServerConfig {
     pub snapshot_keep: u32,
 }
 
-/// Settings that were checked, and what they name.
+/// Checked settings, with the model and the recorded worlds that they name.
 #[derive(Debug, Clone)]
 pub struct Checked {
     pub config: ServerConfig,
     pub instance: Instance,
-    /// Of recorded worlds an unchanging one.
+    /// That of recorded worlds has no changes.
     pub model: Model,
     pub shape: Shape,
     pub recorded: Option<CheckedStates>,

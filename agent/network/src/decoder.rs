@@ -3,7 +3,7 @@
 
 use crate::batch_norm::BatchNorm;
 use crate::dropout::Mask;
-use crate::observation::Observation;
+use crate::observation_matrix::ObservationMatrix;
 use crate::ops::decoder::Layers;
 use crate::pass::Pass;
 use crate::shape::{DECODER_CHANNELS, NetworkShape};
@@ -82,7 +82,7 @@ impl Decoder {
     pub fn loss(
         &self,
         hidden: &Tensor,
-        observation: &Observation,
+        observation: &ObservationMatrix,
         pass: &Pass<'_>,
     ) -> Result<Tensor> {
         if self.is_stock {

@@ -94,7 +94,7 @@ pub struct Ports {
     truth_service: Option<TruthService>,
     entries: Entries,
     _node: Node<Ipc>,
-    /// Last, so that all else is dropped within it.
+    /// Dropped last, so that everything else is removed within this turn.
     end: Option<Turn>,
 }
 

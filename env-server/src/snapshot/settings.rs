@@ -82,7 +82,7 @@ impl Settings {
         }
     }
 
-    /// Checks that these, of a file, are a server's own.
+    /// Checks that these settings of a file are those of a server.
     pub fn check(&self, server: &Self) -> Result<(), SnapshotError> {
         let other = |setting: &str, expected: &str, got: &str| {
             let problem = format!("{setting}: expected {expected} as this server's, got {got}");
