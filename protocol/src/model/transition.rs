@@ -13,7 +13,7 @@
 //!
 //! Two things make it fast, both without a change of meaning. The belief is copied into planes with
 //! a margin of zeros, so no cell is special and many are computed at once. And taps that weigh alike are added up
-//! before they are multiplied ([`rows`]). Every lane does the same operations in the same order and none is fused, so
+//! before they are multiplied (`rows.rs`). Every lane does the same operations in the same order and none is fused, so
 //! results are bit-identical on every platform.
 
 mod layout;
