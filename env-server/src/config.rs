@@ -219,12 +219,12 @@ impl ServerConfig {
         (self.burn_in, self.model) = (0, String::new());
         let checksum = file.sequences.checksum();
         let (symmetries, offset) = (self.states_symmetries, self.states_offset);
-        let recorded = Recorded::new(file.sequences.arrays, file.shape, symmetries, offset);
-        let recorded = recorded.map_err(|most| ConfigError::Range {
-            setting: "states_offset",
-            expected: format!("0 to {most}, as the shortest sequence allows"),
-            got: offset.to_string(),
-        })?;
+        let recorded = Recorded::new(file.sequences.arrays, file.shape, symmetries, offset)
+            .map_err(|most| ConfigError::Range {
+                setting: "states_offset",
+                expected: format!("0 to {most}, as the shortest sequence allows"),
+                got: offset.to_string(),
+            })?;
         let description = toml::to_string(&file.description);
         let states = CheckedStates {
             description: description.expect("invariant: a description was read from TOML"),

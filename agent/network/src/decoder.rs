@@ -46,8 +46,10 @@ impl Decoder {
             .get_with_hints(dims, "weight", init)?;
         let level = |level: usize| {
             let from = DECODER_CHANNELS[level];
-            let to = DECODER_CHANNELS.get(level + 1).copied();
-            let to = to.unwrap_or(shape.n_states);
+            let to = DECODER_CHANNELS
+                .get(level + 1)
+                .copied()
+                .unwrap_or(shape.n_states);
             let (dims, init) = (
                 (from, to, KERNEL, KERNEL),
                 uniform_init(to * KERNEL * KERNEL),

@@ -76,8 +76,10 @@ pub fn record(options: &RecordOptions, stop: &AtomicBool) -> Result<RecordSummar
     // Before observing: a fast agent would fill an observer's buffer while this waits for the answer.
     let first_server = Connection::open(&options.instance, NAME, HELLO_TIMEOUT);
     // The truth first, so that every recorded frame has its hidden states.
-    let truths = options.truth.then(|| Observer::truth(&options.instance));
-    let truths = truths.transpose()?;
+    let truths = options
+        .truth
+        .then(|| Observer::truth(&options.instance))
+        .transpose()?;
     let frames = Observer::frames(&options.instance)?.eager();
     let file = || format!("--out {}", options.out.display());
     let created = create(&options.out, options.overwrite).with_context(file)?;

@@ -329,8 +329,9 @@ fn publish<H: Header>(
     header: H,
     bytes: &[u8],
 ) -> Result<usize, String> {
-    let sample = publisher.loan_slice_uninit(bytes.len());
-    let mut sample = sample.map_err(|error| format!("{error:?}"))?;
+    let mut sample = publisher
+        .loan_slice_uninit(bytes.len())
+        .map_err(|error| format!("{error:?}"))?;
     *sample.user_header_mut() = header;
     let sent = sample.write_from_slice(bytes).send();
     sent.map_err(|error| format!("{error:?}"))

@@ -99,8 +99,11 @@ impl Settings {
             ));
         }
         for (index, (setting, expected)) in server.others.iter().enumerate() {
-            let got = self.others.get(index).filter(|(name, _)| name == setting);
-            let got = got.map_or("nothing", |(_, value)| value);
+            let got = self
+                .others
+                .get(index)
+                .filter(|(name, _)| name == setting)
+                .map_or("nothing", |(_, value)| value);
             if got != expected {
                 return Err(other(setting, expected, got));
             }

@@ -104,8 +104,9 @@ impl Bytes {
         let mut n_undecided = 0;
         for ((home, lanes), on_grid) in band.step_by(LANES).zip(chunks).zip(on_grid) {
             let bits = high_bits(lanes) & on_grid;
-            let to = undecided[n_undecided..].first_chunk_mut();
-            let to = to.expect("invariant: LANES more than a band has");
+            let to = undecided[n_undecided..]
+                .first_chunk_mut()
+                .expect("invariant: LANES more than a band has");
             list_lanes(bits, home as u32, to);
             n_undecided += bits.count_ones() as usize;
         }
